@@ -1,0 +1,38 @@
+# Two commands on a fresh machine: `make app` and `make test`. Both set up what they need.
+
+PYTHON ?= python3
+PORT ?= 5006
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: app test bench table2 clean
+
+app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
+	$(BIN)/python -m app --port $(PORT) $(CAPTURE)
+
+test: $(VENV)/.test ## everything that CI checks
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q core/tests --cov --cov-fail-under=95
+	$(BIN)/python -m pytest
+
+bench: $(VENV)/.test ## slider to changed pixels, through a real browser
+	$(BIN)/python -m tests.latency
+
+table2: $(VENV)/.app ## the paper's Table 2 beside ours
+	$(BIN)/python -m core table2
+
+# Stamps: made again when what they depend on has changed.
+$(VENV)/.app: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[app]'
+	touch $@
+
+$(VENV)/.test: $(VENV)/.app
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[app,test]'
+	sh tests/install_browser.sh $(BIN)/python
+	touch $@
+
+clean: ## remove what the other commands made
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage
