@@ -1,0 +1,128 @@
+"""A capture: what a simulation and a file both give, and what every estimator takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Acquisition, Floats, Pulse
+from core.blocks import Blocks, to_blocks
+from core.checks import require
+from core.trigger import coates_rate
+
+COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
+
+
+class CaptureError(ValueError):
+    """A file that cannot be read as a capture: names the file, the field, the value, the remedy."""
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Histograms of trigger times, one for each pixel.
+
+    Parameters
+    ----------
+    cube : ndarray, shape (row, col, bin)
+        Counts as uint8, uint16 or uint32. Made read-only.
+    acquisition : Acquisition
+        Gate, bins and pulses; its ``n_bins`` is the cube's last axis.
+    pulse : Pulse
+        Shape of an echo.
+    truth_range_m : ndarray, shape (row, col), optional
+        True range in metres, NaN where there is no target; None for a capture without truth.
+    signal : ndarray, shape (row, col), optional
+        True signal photons per pulse, where known.
+    background : float, optional
+        True background photons per pulse over the gate, where known.
+    source : str
+        Where it came from and, for a file, what was guessed.
+
+    Raises
+    ------
+    ValueError
+        If shapes or types do not fit each other.
+    """
+
+    cube: NDArray[np.unsignedinteger]
+    acquisition: Acquisition
+    pulse: Pulse = field(default_factory=Pulse)
+    truth_range_m: Floats | None = None
+    signal: Floats | None = None
+    background: float | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        cube = self.cube
+        require(
+            "cube",
+            f"{cube.dtype} array of shape {cube.shape}",
+            cube.ndim == 3 and cube.dtype in COUNT_TYPES and min(cube.shape) > 0,
+            "uint8, uint16 or uint32 counts of shape (row, col, bin), none of them 0",
+        )
+        require(
+            "n_bins",
+            self.acquisition.n_bins,
+            self.acquisition.n_bins == cube.shape[2],
+            f"{cube.shape[2]}, the cube's last axis",
+        )
+        for name in ("truth_range_m", "signal"):
+            image = getattr(self, name)
+            if image is not None:
+                fits = image.shape == self.shape
+                require(name, f"shape {image.shape}", fits, f"shape {self.shape}, that of the cube")
+        cube.setflags(write=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.cube.shape[:2]
+
+    @cached_property
+    def counts(self) -> NDArray[np.int64]:
+        """Detections of each pixel, shape (row, col)."""
+        return np.asarray(self.cube.sum(axis=2, dtype=np.int64))
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """The cube laid out for kernels that treat many pixels at once; made once."""
+        return to_blocks(self.cube)
+
+    @property
+    def armed_pulses(self) -> int | None:
+        """Pulses sent, if these are first photons; None where pulses are unknown or fire twice."""
+        n_pulses = self.acquisition.n_pulses
+        return n_pulses if n_pulses is not None and self.counts.max() <= n_pulses else None
+
+    @property
+    def echo_bins(self) -> int:
+        """Whole bins that hold the middle four fifths of an echo, at least 1."""
+        begin_s, end_s = self.pulse.span_s
+        return max(1, math.ceil((end_s - begin_s) / self.acquisition.bin_width_s))
+
+    @cached_property
+    def typical_flux(self) -> tuple[float, float]:
+        """Signal and background photons per pulse, as the data themselves suggest.
+
+        Over some thousand pixels: the strongest window of an echo's width, its third quartile (many
+        pixels may see no target), over the rest of the gate. At a low SBR the strongest window is
+        often noise, so the signal is then that of the faintest echo that can be seen. Per pixel
+        instead of per pulse where `armed_pulses` is None.
+        """
+        counts = self.cube.reshape(-1, self.cube.shape[2])
+        if len(counts) > 1024:  # at random: a regular step could miss what stands in columns
+            counts = counts[np.random.default_rng(0).choice(len(counts), 1024, replace=False)]
+        rate = counts.astype(float)
+        if self.armed_pulses is not None:
+            rate = np.nan_to_num(coates_rate(counts, self.armed_pulses), posinf=1.0)
+        n_bins, width = rate.shape[1], min(self.echo_bins, rate.shape[1])
+        until = np.pad(np.cumsum(rate, axis=1), ((0, 0), (1, 0)))
+        strongest = (until[:, width:] - until[:, :-width]).max(axis=1)
+        rest = float(np.median(until[:, -1] - strongest))
+        per_bin = rest / max(n_bins - width, 1)
+        signal = float(np.quantile(strongest, 0.75)) - per_bin * width
+        return max(signal, 0.0), per_bin * n_bins

@@ -1,0 +1,1 @@
+"""Studies that anyone can run again: settings as data, rows as records, tables as Markdown."""

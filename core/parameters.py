@@ -1,0 +1,88 @@
+"""Settings as frozen dataclasses whose fields know their meaning, unit and bounds.
+
+The app's controls and the command line's options are made from this metadata, so that a limit or a
+sentence of help is written once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import Field, dataclass, field, fields
+from numbers import Integral, Real
+from typing import Any
+
+from core.checks import require
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number: its symbol, the range worth exploring, and what is refused.
+
+    Parameters
+    ----------
+    symbol : str
+        As written in the literature.
+    low, high : float
+        Sensible range, that of a slider.
+    log : bool
+        Whether the range is best walked by factors.
+    whole : bool
+        Whether only integers make sense.
+    unit : str
+        Empty for a pure number.
+    least, most : float
+        Smallest and largest value accepted at all.
+    open_below : bool
+        Whether `least` itself is refused.
+    """
+
+    symbol: str
+    low: float
+    high: float
+    log: bool = False
+    whole: bool = False
+    unit: str = ""
+    least: float = -math.inf
+    most: float = math.inf
+    open_below: bool = False
+
+    def check(self, name: str, value: object) -> None:
+        """Raise ``ValueError`` unless `value` is acceptable."""
+        kind, noun = (Integral, "an integer") if self.whole else (Real, "a number")
+        relation = "above" if self.open_below else "from"
+        accepted = isinstance(value, kind) and not isinstance(value, bool)
+        if accepted:
+            above: Any = value
+            accepted = self.least <= above <= self.most
+            accepted = accepted and not (self.open_below and above == self.least)
+        bounds = f"{noun} {relation} {self.least:g} to {self.most:g}"
+        require(name, value, bool(accepted), bounds)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of a few named ways."""
+
+    symbol: str
+    options: tuple[str, ...]
+
+    def check(self, name: str, value: object) -> None:
+        """Raise ``ValueError`` unless `value` is one of the options."""
+        require(name, value, value in self.options, " or ".join(map(repr, self.options)))
+
+
+def parameter(default: Any, spec: Number | Choice, help: str) -> Any:
+    """A dataclass field with its specification and a line of help."""
+    return field(default=default, metadata={"spec": spec, "help": help})
+
+
+def spec_of(dataclass_field: Field[Any]) -> Number | Choice:
+    """The specification that `parameter` gave to a field."""
+    spec: Number | Choice = dataclass_field.metadata["spec"]
+    return spec
+
+
+def check_fields(settings: Any) -> None:
+    """Check every field of a settings object against its own specification."""
+    for each in fields(settings):
+        spec_of(each).check(each.name, getattr(settings, each.name))

@@ -1,0 +1,99 @@
+"""Captures from files: one format a module, one function for all.
+
+A new format is a module with a ``read(path, request) -> Capture`` and a line in `READERS`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from core.acquisition import Pulse
+from core.capture import Capture, CaptureError
+from core.checks import require
+from core.readers import matlab, npy, npz
+from core.readers.guards import MAX_CUBE_BYTES
+from core.readers.request import Request
+
+__all__ = ["MAX_CUBE_BYTES", "READERS", "read_capture"]
+
+READERS: dict[str, Callable[[Path, Request], Capture]] = {
+    ".npz": npz.read,
+    ".npy": npy.read,
+    ".mat": matlab.read,
+}
+
+
+def read_capture(
+    path: str | os.PathLike[str],
+    *,
+    time_unit_s: float | None = None,
+    bin_width_s: float | None = None,
+    gate_delay_s: float | None = None,
+    n_bins: int | None = None,
+    n_pulses: int | None = None,
+    variable: str | None = None,
+    pulse: Pulse | None = None,
+    pixel_angle_rad: float | None = None,
+) -> Capture:
+    """Read a capture from a file; its suffix tells the format.
+
+    What is None comes from the file, or is guessed where the file does not say; ``.source`` of the
+    answer tells every guess. `core.readers.npz`, `npy` and `matlab` describe the formats,
+    `core.readers.arrivals` the rules for guessing.
+
+    Parameters
+    ----------
+    path : path-like
+        An ``.npz``, ``.npy`` or ``.mat`` file.
+    time_unit_s : float, optional
+        Unit of the arrival times in seconds; only for a file that holds such.
+    bin_width_s : float, optional
+        Width of a bin in seconds.
+    gate_delay_s : float, optional
+        Time from the pulse to the first bin in seconds. Photons before are dropped.
+    n_bins : int, optional
+        Bins in the gate. Photons after are dropped; a cube must have just as many.
+    n_pulses : int, optional
+        Pulses sent for each pixel. Never guessed.
+    variable : str, optional
+        Name of the array to read, where the file holds several.
+    pulse : Pulse, optional
+        Shape of an echo.
+    pixel_angle_rad : float, optional
+        Angle between neighbouring pixels in radians.
+
+    Returns
+    -------
+    Capture
+
+    Raises
+    ------
+    CaptureError
+        Whatever is wrong with the file or its description: names the file, the field, its value
+        and the remedy.
+    """
+    path = Path(path)
+    try:
+        require("path", str(path), path.is_file(), "an existing file")
+        suffix = path.suffix.lower()
+        require("suffix", path.suffix, suffix in READERS, "one of " + ", ".join(READERS))
+        request = Request(
+            time_unit_s=time_unit_s,
+            bin_width_s=bin_width_s,
+            gate_delay_s=gate_delay_s,
+            n_bins=n_bins,
+            n_pulses=n_pulses,
+            variable=variable,
+            pulse=pulse,
+            pixel_angle_rad=pixel_angle_rad,
+        )
+        return READERS[suffix](path, request)
+    except ValueError as error:
+        raise CaptureError(f"{path.name}: {error}") from error
+    except Exception as error:  # from a closed folder to memory too small: the promise is one type
+        raise CaptureError(
+            f"{path.name}: cannot be read ({type(error).__name__}: {error}): "
+            "give a whole file that may be opened and fits in memory."
+        ) from error

@@ -1,0 +1,212 @@
+"""The project's own layout: a NumPy ``.npz`` archive, compressed or not.
+
+==================  ==============  ==========================================================
+field               shape           meaning
+==================  ==============  ==========================================================
+``format``          text            ``"firstphoton-capture-1"``; may be absent
+``cube``            (row, col, bin) counts, unsigned; the only field that must be there
+``bin_width_s``     scalar          width of a bin in seconds
+``gate_delay_s``    scalar          time from the pulse to the first bin in seconds
+``n_pulses``        scalar          pulses sent for each pixel; 0 or absent: unknown
+``pixel_angle_rad`` scalar          angle between neighbouring pixels in radians; absent: unknown
+``pulse_shape``     text            ``"gamma"``, ``"gaussian"`` or ``"measured"``
+``pulse_tau_s``     scalar          time constant, standard deviation or sample spacing
+``pulse_samples``   (sample,)       the measured pulse; empty or absent for the others
+``truth_range_m``   (row, col)      true range in metres, NaN without a target; may be absent
+``signal``          (row, col)      true signal photons per pulse; may be absent
+``background``      scalar          true background photons per pulse and gate; may be absent
+``source``          text            where the capture came from; may be absent
+==================  ==============  ==========================================================
+
+Text is an array of one unicode string. Where timing or pulse are absent they are guessed: bins of
+1 ns, a gate that opens with the pulse, and the default pulse. An archive of other names opens too
+if exactly one array has three axes, or if ``variable`` names one; its pulse is then guessed to be a
+Gaussian of one bin.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile, ZipInfo
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Floats, Pulse
+from core.capture import COUNT_TYPES, Capture
+from core.checks import require
+from core.readers.dense import dense_capture, require_cube, whole_counts
+from core.readers.guards import decoding, require_fits
+from core.readers.npy import read_array, read_header
+from core.readers.request import Request
+
+FORMAT = "firstphoton-capture-1"
+
+_TIMING = ("bin_width_s", "gate_delay_s", "pixel_angle_rad")
+_PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
+_TRUTH = ("truth_range_m", "signal", "background")
+_FIELDS = ("format", "n_pulses", "source", *_TIMING, *_PULSE, *_TRUTH)
+
+
+def fields(capture: Capture) -> dict[str, NDArray[Any]]:
+    """The arrays that this layout keeps of a capture."""
+    acquisition, pulse = capture.acquisition, capture.pulse
+    kept = {
+        "format": FORMAT,
+        "cube": capture.cube,
+        "bin_width_s": acquisition.bin_width_s,
+        "gate_delay_s": acquisition.gate_delay_s,
+        "n_pulses": acquisition.n_pulses or 0,
+        "pixel_angle_rad": acquisition.pixel_angle_rad,
+        "pulse_shape": pulse.shape,
+        "pulse_tau_s": pulse.tau_s,
+        "pulse_samples": np.array(pulse.samples, float),
+        "truth_range_m": capture.truth_range_m,
+        "signal": capture.signal,
+        "background": capture.background,
+        "source": capture.source or None,
+    }
+    return {name: np.asarray(value) for name, value in kept.items() if value is not None}
+
+
+def read(path: Path, request: Request) -> Capture:
+    """Read our own layout, or the one cube of an archive."""
+    with decoding("the archive"):
+        archive = ZipFile(path)
+    with archive:
+        names = _names(archive)
+        name = _choose(archive, names, request.variable)
+        cube = _array(archive, name)
+        origin = f"{path.name}, variable {name}"
+        if name != "cube":
+            return dense_capture(whole_counts(cube, name), origin, request)
+        stored = {field: _array(archive, field) for field in names if field in _FIELDS}
+    return _own(cube, stored, origin, request)
+
+
+def _own(
+    cube: NDArray[Any], stored: Mapping[str, NDArray[Any]], origin: str, request: Request
+) -> Capture:
+    """A capture from the fields of our layout."""
+    version = _text(stored, "format", FORMAT)
+    require("format", version, version == FORMAT, FORMAT)
+    known: dict[str, Any] = {name: _number(stored, name) for name in _TIMING}
+    known |= {"n_pulses": _n_pulses(stored), "pulse": _pulse(stored)}
+    request = replace(
+        request,
+        **{name: value for name, value in known.items() if getattr(request, name) is None},
+    )
+    as_stored = cube.dtype.newbyteorder("=") in COUNT_TYPES
+    counts = _as_stored(cube) if as_stored else whole_counts(cube, "cube")
+    capture = dense_capture(counts, _text(stored, "source", origin), request, guessed_pulse=Pulse())
+    return replace(
+        capture,
+        truth_range_m=_image(stored, "truth_range_m"),
+        signal=_image(stored, "signal"),
+        background=_number(stored, "background"),
+    )
+
+
+def _as_stored(cube: NDArray[Any]) -> NDArray[np.unsignedinteger]:
+    """An unsigned cube in its own type, in the byte order and layout of this machine."""
+    require_cube(cube, "cube")
+    return np.ascontiguousarray(cube, cube.dtype.newbyteorder("="))
+
+
+def _pulse(stored: Mapping[str, NDArray[Any]]) -> Pulse | None:
+    if not any(name in stored for name in _PULSE):
+        return None
+    tau_s = _number(stored, "pulse_tau_s")
+    if tau_s is None:
+        raise ValueError("pulse_tau_s = None is not accepted: give a time beside the shape.")
+    samples = stored.get("pulse_samples", np.empty(0))
+    _require_reals("pulse_samples", samples)
+    shape = _text(stored, "pulse_shape", "gamma")
+    return Pulse(tau_s, shape=shape, samples=tuple(samples.astype(float).ravel().tolist()))  # type: ignore[arg-type]
+
+
+def _n_pulses(stored: Mapping[str, NDArray[Any]]) -> int | None:
+    value = _number(stored, "n_pulses") or 0.0
+    require("n_pulses", value, value >= 0 and value.is_integer(), "a whole number, 0 if not known")
+    return int(value) or None
+
+
+def _number(stored: Mapping[str, NDArray[Any]], name: str) -> float | None:
+    if name not in stored:
+        return None
+    _require_reals(name, stored[name])
+    require(name, f"array of shape {stored[name].shape}", stored[name].size == 1, "one number")
+    return float(stored[name].item())
+
+
+def _text(stored: Mapping[str, NDArray[Any]], name: str, default: str) -> str:
+    if name not in stored:
+        return default
+    text = stored[name]
+    what = f"{text.dtype} array of shape {text.shape}"
+    require(name, what, text.dtype.kind == "U" and text.size == 1, "one unicode string")
+    return str(text.item())
+
+
+def _image(stored: Mapping[str, NDArray[Any]], name: str) -> Floats | None:
+    if name not in stored:
+        return None
+    _require_reals(name, stored[name])
+    return np.asarray(stored[name], np.float64)
+
+
+def _require_reals(name: str, array: NDArray[Any]) -> None:
+    require(name, f"array of {array.dtype}", array.dtype.kind in "biuf", "real numbers")
+
+
+def _names(archive: ZipFile) -> list[str]:
+    """Names of the arrays in the archive, none of them twice."""
+    counted = Counter(archive.namelist())
+    for name, times in counted.items():
+        require(f"arrays named {name!r}", times, times == 1, "each name once")
+    return [name.removesuffix(".npy") for name in counted if name.endswith(".npy")]
+
+
+def _choose(archive: ZipFile, names: list[str], variable: str | None) -> str:
+    """Name of the cube: the one asked for, or ``cube``, or the only array with three axes."""
+    listed = ", ".join(names) or "none"
+    if variable is not None:
+        require(
+            "variable", variable, variable in names, f"the name of an array; the file has {listed}"
+        )
+        return variable
+    if "cube" in names:
+        return "cube"
+    cubes = [name for name in names if len(_header(archive, name)) == 3]
+    remedy = f"as variable the name of a (row, col, bin) array; the file has {listed}"
+    require("variable", ", ".join(cubes) or None, len(cubes) == 1, remedy)
+    return cubes[0]
+
+
+def _header(archive: ZipFile, name: str) -> tuple[int, ...]:
+    info = _info(archive, name)
+    with decoding(name), archive.open(info) as file:
+        return read_header(file, name)[0]
+
+
+def _array(archive: ZipFile, name: str) -> NDArray[Any]:
+    info = _info(archive, name)
+    with decoding(name):
+        file = archive.open(info)
+    with file:
+        return read_array(file, info.file_size, name)
+
+
+def _info(archive: ZipFile, name: str) -> ZipInfo:
+    """The archive's entry for an array, once its size and compression proved harmless."""
+    info = archive.getinfo(f"{name}.npy")
+    require_fits(name, info.file_size)
+    method = info.compress_type
+    # LZMA's header sizes its own buffers, up to 4 GiB.
+    plain = method in (ZIP_STORED, ZIP_DEFLATED)
+    require(f"compression method of {name}", method, plain, "0 (stored) or 8 (deflated)")
+    return info

@@ -1,0 +1,171 @@
+"""From a scene to a capture: exact draws of what a first-photon detector records.
+
+The first photon of a pulse arrives after time ``t`` with probability ``exp(-Λ(t))``, ``Λ`` being
+the expected photons before ``t``. So ``1 - exp(-Λ)`` at the bin edges is the distribution of the
+trigger bin, and one uniform number a pulse, looked up in it, is an exact draw: over the pulses of a
+pixel exactly the multinomial of Eq. 1, "no trigger" included.
+
+Each pixel has its own stream of random numbers, keyed by (seed, pixel): the cube is the same for
+any number of threads, and neighbouring settings share their randomness, so that a slider moves the
+scene and not the dice.
+"""
+
+from __future__ import annotations
+
+from numbers import Integral
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from core.acquisition import Acquisition, Floats, Flux, Pulse
+from core.capture import Capture
+from core.checks import require
+from core.parallel import COMPILED, KERNEL_LOCK, PARALLEL
+from core.scene import Scene
+
+# Beyond this many pulses numpy's multinomial is faster: its time does not grow with them.
+PULSES_DRAWN_ONE_BY_ONE = 8192
+
+
+def simulate(
+    scene: Scene,
+    acquisition: Acquisition,
+    flux: Flux,
+    pulse: Pulse = Pulse(),
+    seed: int = 0,
+) -> Capture:
+    """Draw one first-photon histogram for each pixel of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        Ranges and reflectivities; a pixel without a target sees background alone.
+    acquisition : Acquisition
+        Gate, bins and pulses.
+    flux : Flux
+        Signal photons per pulse at reflectivity 1, and background.
+    pulse : Pulse
+        Shape of the echo; its time zero lies at the surface.
+    seed : int
+        The same seed gives the same capture, for any number of threads.
+
+    Returns
+    -------
+    Capture
+        With its truth: range, signal and background.
+
+    Raises
+    ------
+    ValueError
+        If the number of pulses is not known or 2**32 or more, or the seed is not an integer from 0
+        to 2**63 - 1.
+    """
+    n_pulses = acquisition.n_pulses
+    if n_pulses is None:
+        raise ValueError("n_pulses = None is not accepted: give the number of pulses to simulate.")
+    require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
+    whole = isinstance(seed, Integral)
+    require("seed", seed, whole and 0 <= seed < 2**63, "an integer from 0 to 2**63 - 1")
+    shape = np.shape(scene.range_m)
+    has_target = np.isfinite(scene.range_m)
+    reflectivity = np.ones(shape) if scene.reflectivity is None else scene.reflectivity
+    signal = np.where(has_target, flux.signal * reflectivity, 0.0)
+    onset_bin = acquisition.range_m_to_bin(scene.range_m)
+    triggered = _triggered_by_each_edge(onset_bin, signal, flux.background, pulse, acquisition)
+    cube = np.zeros((signal.size, acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32)
+    if n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
+        with KERNEL_LOCK:
+            _draw_pulses(triggered, n_pulses, np.uint64(seed), cube)
+    else:
+        _draw_multinomial(triggered, n_pulses, seed, cube)
+    return Capture(
+        cube.reshape(*shape, acquisition.n_bins),
+        acquisition,
+        pulse,
+        truth_range_m=np.array(scene.range_m, float),
+        signal=signal,
+        background=flux.background,
+        source=f"simulated, seed {seed}",
+    )
+
+
+def _triggered_by_each_edge(
+    onset_bin: Floats, signal: Floats, background: float, pulse: Pulse, acquisition: Acquisition
+) -> Floats:
+    """Probability ``1 - exp(-Λ)`` to have fired before each bin edge, shape (pixel, n_bins + 1)."""
+    onset_bin, signal = onset_bin.reshape(-1), signal.reshape(-1, 1)
+    n_edges = acquisition.n_bins + 1
+    uniform = background * np.linspace(0.0, 1.0, n_edges)
+    triggered = np.empty((onset_bin.size, n_edges))
+    # Some pixels at a time: temporaries of the whole cube cost ten times their arithmetic.
+    pixels_at_once = max(1, 2**15 // n_edges)
+    for first in range(0, onset_bin.size, pixels_at_once):
+        some = slice(first, first + pixels_at_once)
+        before = pulse.cumulative(onset_bin[some], acquisition.n_bins, acquisition.bin_width_s)
+        before -= before[:, :1].copy()  # the part of an echo that came before the gate opened
+        before *= signal[some]
+        before += uniform
+        np.expm1(np.negative(before, out=before), out=before)
+        np.negative(before, out=triggered[some])
+    return triggered
+
+
+def _draw_multinomial(
+    triggered: Floats, n_pulses: int, seed: int, cube: NDArray[np.unsignedinteger]
+) -> None:
+    probability = np.diff(triggered, axis=-1, append=1.0)
+    cube[:] = np.random.default_rng(seed).multinomial(n_pulses, probability)[:, :-1]
+
+
+@njit(**COMPILED, inline="always")
+def _splitmix64(state):  # type: ignore[no-untyped-def]
+    """Output of the SplitMix64 generator (Steele, Lea & Flood 2014) at a state."""
+    z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(**COMPILED)
+def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
+    """Add `n_pulses` first-photon draws to `counts`, whose last element stands for "no trigger".
+
+    ``fired_by[k]`` is the probability to have fired by the end of bin k; its last element, above 1,
+    ends every search. The guide holds, for each of its cells of ``[0, 1)``, the bin in which the
+    cell's lowest number falls. `uniform` is room for a batch of numbers: drawn apart from their
+    use, they are computed several at a time.
+    """
+    k = np.uint64(0)
+    for cell in range(guide.size):
+        while fired_by[k] <= cell / guide.size:
+            k += np.uint64(1)
+        guide[cell] = k
+    done = 0
+    while done < n_pulses:
+        batch = min(uniform.size, n_pulses - done)
+        for i in range(batch):
+            state = key + np.uint64(done + i) * np.uint64(0x9E3779B97F4A7C15)
+            uniform[i] = np.float64(_splitmix64(state) >> np.uint64(11)) * 2.0**-53
+        for i in range(batch):
+            k = np.uint64(guide[np.uint64(uniform[i] * guide.size)])
+            # One step without a jump settles nearly every draw; a mispredicted jump costs five.
+            k += np.uint64(fired_by[k] <= uniform[i])
+            while fired_by[k] <= uniform[i]:
+                k += np.uint64(1)
+            counts[k] += 1
+        done += batch
+
+
+@njit(**PARALLEL)
+def _draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-def]
+    n_pixels, n_bins = cube.shape
+    for pixel in prange(n_pixels):
+        fired_by = np.full(n_bins + 1, 2.0)
+        fired_by[:n_bins] = triggered[pixel, 1:]
+        guide = np.empty(256, np.uint32)
+        uniform = np.empty(64)
+        counts = np.zeros(n_bins + 1, np.int64)
+        key = _splitmix64(_splitmix64(seed + np.uint64(1)) + np.uint64(pixel))
+        _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts)
+        for k in range(n_bins):
+            cube[pixel, k] = counts[k]

@@ -1,0 +1,218 @@
+"""Bins, times and metres; pulses as integrals over bins; photons per pulse."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.constants import speed_of_light
+from scipy.integrate import quad
+
+from core.acquisition import Acquisition, Flux, Pulse
+
+BIN_S = 1e-9
+SAMPLES = (0.0, 1.0, 4.0, 6.0, 3.0, 0.5)
+PULSES = {
+    "gamma": Pulse(1e-9),
+    "long gamma": Pulse(4e-9),
+    "gaussian": Pulse.gaussian(0.8e-9),
+    "measured": Pulse.measured(SAMPLES, 0.5e-9),
+}
+any_pulse = pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
+
+
+def density(pulse: Pulse, time_s: float) -> float:
+    """Photons per second `time_s` after the pulse's time zero."""
+    t = time_s / pulse.tau_s
+    if pulse.shape == "gamma":
+        return t * math.exp(-t) / pulse.tau_s if t > 0 else 0.0
+    if pulse.shape == "gaussian":
+        return math.exp(-t * t / 2) / math.sqrt(2 * math.pi) / pulse.tau_s
+    inside = 0 <= t < len(pulse.samples)
+    return pulse.samples[int(t)] / sum(pulse.samples) / pulse.tau_s if inside else 0.0
+
+
+def test_bins_become_metres_at_half_the_speed_of_light() -> None:
+    acquisition = Acquisition(n_bins=10, bin_width_s=2e-9, gate_delay_s=100e-9)
+    expected_m = [(100e-9 + k * 2e-9) * speed_of_light / 2 for k in (0, 1, 7.5, 10)]
+    # Three roundings, of a relative 1.1e-16 each.
+    np.testing.assert_allclose(acquisition.bin_to_range_m([0, 1, 7.5, 10]), expected_m, rtol=1e-15)
+    assert acquisition.bin_length_m == pytest.approx(2e-9 * speed_of_light / 2, rel=1e-15)
+
+
+@given(st.floats(-1e4, 1e4), st.floats(1e-12, 1e-6), st.floats(-1e-3, 1e-3))
+def test_bins_survive_the_way_to_metres_and_back(
+    position: float, width_s: float, delay_s: float
+) -> None:
+    acquisition = Acquisition(bin_width_s=width_s, gate_delay_s=delay_s)
+    back = acquisition.range_m_to_bin(acquisition.bin_to_range_m(position))
+    # Four roundings of the time since the pulse, gate delay included, seen in bins.
+    tolerance = 4 * np.finfo(float).eps * (abs(position) + abs(delay_s) / width_s)
+    assert abs(back - position) <= tolerance
+
+
+def test_shape_and_nan_survive_conversion() -> None:
+    bins = np.array([[0.0, np.nan], [2.0, 3.0]])
+    acquisition = Acquisition()
+    np.testing.assert_array_equal(np.isnan(acquisition.bin_to_range_m(bins)), np.isnan(bins))
+    np.testing.assert_array_equal(np.isnan(acquisition.range_m_to_bin(bins)), np.isnan(bins))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("n_bins", 0),
+        ("bin_width_s", 0.0),
+        ("bin_width_s", np.inf),
+        ("bin_width_s", np.nan),
+        ("gate_delay_s", np.nan),
+        ("gate_delay_s", -np.inf),
+        ("n_pulses", 0),
+        ("n_pulses", -3),
+        ("pixel_angle_rad", 0.0),
+        ("pixel_angle_rad", 1.0),
+    ],
+)
+def test_impossible_acquisitions_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=rf"{name} = .*{value}.* is not accepted: give "):
+        Acquisition(**{name: value})
+
+
+def test_what_a_file_does_not_say_may_be_none() -> None:
+    acquisition = Acquisition(n_pulses=None, pixel_angle_rad=None)
+    assert (acquisition.n_pulses, acquisition.pixel_angle_rad) == (None, None)
+
+
+@any_pulse
+@pytest.mark.parametrize("onset_bin", [20.0, 20.37, -1.6, 38.9])
+def test_bin_probability_is_the_pulse_integrated_over_the_bin(
+    pulse: Pulse, onset_bin: float
+) -> None:
+    corners = [i * pulse.tau_s for i in range(len(SAMPLES) + 1)]  # where a measured pulse jumps
+    expected = []
+    for k in range(40):
+        begin_s, end_s = (k - onset_bin) * BIN_S, (k + 1 - onset_bin) * BIN_S
+        inside = [corner for corner in corners if begin_s < corner < end_s] or None
+        expected.append(
+            quad(lambda t: density(pulse, t), begin_s, end_s, points=inside, epsabs=1e-12)[0]
+        )
+    # Tenfold the quadrature's own bound.
+    np.testing.assert_allclose(
+        pulse.bin_probability(onset_bin, 40, BIN_S), expected, rtol=0, atol=1e-11
+    )
+
+
+@any_pulse
+@given(st.floats(-1e3, 1e3), st.integers(1, 60), st.floats(1e-11, 1e-7))
+def test_shares_are_probabilities(
+    pulse: Pulse, onset_bin: float, n_bins: int, bin_s: float
+) -> None:
+    share = pulse.bin_probability(onset_bin, n_bins, bin_s)
+    assert share.shape == (n_bins,)
+    assert (share >= 0).all()
+    assert share.sum() <= 1 + 1e-12
+
+
+@any_pulse
+def test_a_gate_that_holds_the_whole_echo_loses_nothing(pulse: Pulse) -> None:
+    onset = np.array([[50.0, 50.25], [60.5, 75.0]])
+    share = pulse.bin_probability(onset, 400, BIN_S)
+    assert share.shape == (2, 2, 400)
+    np.testing.assert_allclose(share.sum(axis=-1), 1, rtol=1e-12)
+
+
+@any_pulse
+def test_no_echo_leaves_nothing(pulse: Pulse) -> None:
+    assert (pulse.bin_probability([np.nan, np.nan], 30, BIN_S) == 0).all()
+
+
+@any_pulse
+def test_echoes_far_outside_the_gate_leave_nothing(pulse: Pulse) -> None:
+    # 200 bins are 50 time constants of the longest pulse: exp(-50) of it is left.
+    assert pulse.bin_probability(-200.0, 30, BIN_S).max() < 1e-19 + 2 * np.finfo(float).eps
+    assert (pulse.bin_probability(230.0, 30, BIN_S) == 0).all()
+
+
+@any_pulse
+def test_a_gate_cuts_an_echo_where_it_opens_and_closes(pulse: Pulse) -> None:
+    early, late = pulse.bin_probability([-2.0, 28.0], 30, BIN_S)
+    whole = pulse.bin_probability(100.0, 400, BIN_S)
+    # The same photons, counted from another edge: differences of shares round at 1.1e-16.
+    np.testing.assert_allclose(early, whole[102:132], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(late, whole[72:102], rtol=0, atol=1e-15)
+
+
+@any_pulse
+def test_a_later_echo_is_the_same_echo_later(pulse: Pulse) -> None:
+    near, far = pulse.bin_probability([30.25, 37.25], 60, BIN_S)
+    np.testing.assert_allclose(far[7:], near[:-7], rtol=0, atol=1e-15)
+
+
+def test_papers_pulse_peaks_at_tau_and_is_as_wide_as_stated() -> None:
+    share = Pulse(1e-9).bin_probability(0.0, 6000, 1e-12)
+    assert abs(share.argmax() - 1000) <= 1
+    above = np.flatnonzero(share >= share.max() / 2)
+    assert (above[-1] - above[0]) / 1000 == pytest.approx(2.446, abs=0.002)  # the grid is .001
+
+
+def test_gaussian_is_centred_on_its_delay() -> None:
+    share = Pulse.gaussian(1.3e-9).bin_probability(20.0, 40, BIN_S)
+    np.testing.assert_allclose(share, share[::-1], rtol=0, atol=1e-15)
+
+
+def test_measured_pulse_is_its_samples() -> None:
+    share = Pulse.measured([1, 3], BIN_S).bin_probability(2.0, 6, BIN_S)
+    np.testing.assert_allclose(share, [0, 0, 0.25, 0.75, 0, 0], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-9, 1e-3])
+@pytest.mark.parametrize(
+    "of",
+    [Pulse, Pulse.gaussian, lambda s: Pulse.measured(SAMPLES, s)],
+    ids=["gamma", "gaussian", "measured"],
+)
+def test_span_holds_the_middle_four_fifths(of: Any, scale: float) -> None:
+    pulse = of(scale)
+    # Quantiles are solved for to 2e-12 of a time constant, in which a pulse changes by less.
+    np.testing.assert_allclose(pulse.cdf(pulse.span_s), [0.1, 0.9], rtol=0, atol=1e-11)
+
+
+def test_pulses_are_values() -> None:
+    assert Pulse.measured([1, 3], BIN_S) == Pulse.measured(np.array([1.0, 3.0]), BIN_S)
+    assert len({Pulse(), Pulse(1e-9), Pulse.gaussian(1e-9)}) == 2
+
+
+@pytest.mark.parametrize("tau_s", [0.0, -1e-9, np.inf, np.nan])
+def test_impossible_durations_are_refused(tau_s: float) -> None:
+    with pytest.raises(ValueError, match=r"tau_s = .* is not accepted: give positive, in seconds"):
+        Pulse(tau_s)
+
+
+@pytest.mark.parametrize("samples", [[], [0, 0], [1, -1], [1, np.nan], [1, np.inf]])
+def test_impossible_samples_are_refused(samples: list[float]) -> None:
+    with pytest.raises(ValueError, match=r"samples = .*non-negative numbers, not all zero"):
+        Pulse.measured(samples, BIN_S)
+
+
+def test_unknown_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"shape = 'square' .*gamma or gaussian or measured"):
+        Pulse(shape="square")  # type: ignore[arg-type]
+
+
+def test_background_follows_from_the_signal_to_background_ratio() -> None:
+    assert Flux(signal=0.3, sbr=0.06).background == 0.3 / 0.06
+    assert Flux(sbr=math.inf).background == 0
+    assert Flux(signal=0.0).background == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("signal", -0.1), ("signal", np.inf), ("signal", np.nan), ("sbr", 0.0), ("sbr", np.nan)],
+)
+def test_impossible_fluxes_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=rf"{name} = {value} is not accepted: give "):
+        Flux(**{name: value})

@@ -1,0 +1,295 @@
+"""One contract for every registered estimator: a new one is covered by being registered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from scipy import stats
+
+from core import tracking
+from core.acquisition import Acquisition, Flux, Pulse
+from core.capture import Capture
+from core.estimators import ESTIMATORS, RangeImage, estimate
+from core.scene import Scene, uniform
+from core.simulate import simulate
+from core.tracking import PRESETS, TrackingParameters
+from core.trigger import rate_per_bin, trigger_probability
+
+SIZE = 8 if numba.config.DISABLE_JIT else 48  # rows and columns where many pixels are wanted
+THREADS = sorted({1, numba.config.NUMBA_NUM_THREADS})
+
+# Every estimator as it comes, and the tracker also as the paper prints it.
+CASES = {name: (name, estimator.parameters()) for name, estimator in ESTIMATORS.items()}
+CASES["tracking as printed"] = ("tracking", PRESETS["as printed"])
+
+every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+every_estimator = pytest.mark.parametrize("method", ESTIMATORS)
+
+
+@pytest.fixture(autouse=True)
+def _quick_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numpy's multinomial, which test_simulate shows to draw alike, is quick without a compiler."""
+    monkeypatch.setattr(import_module("core.simulate"), "PULSES_DRAWN_ONE_BY_ONE", 0)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts the number of threads back."""
+    before = numba.get_num_threads()
+    yield
+    numba.set_num_threads(before)
+
+
+def simulated(size: int = 8, n_pulses: int = 1000, sbr: float = 0.06, **more: Any) -> Capture:
+    scene = uniform(64)
+    range_m = scene.range_m[:size, :size].copy()
+    range_m[0, 0] = np.nan
+    return simulate(Scene(range_m), Acquisition(n_pulses=n_pulses), Flux(sbr=sbr), **more)
+
+
+def capture_of(cube: Any, n_pulses: int | None = 1000, dtype: type = np.uint16) -> Capture:
+    cube = np.array(cube, dtype)
+    return Capture(cube, Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses))
+
+
+def assert_contract(capture: Capture, image: RangeImage) -> None:
+    for field in (image.range_m, image.bin, image.score, image.confidence):
+        assert field.shape == capture.shape
+        assert field.dtype == np.float64
+    assert image.valid.shape == capture.shape
+    assert image.valid.dtype == np.bool_
+    for field in (image.range_m, image.bin):
+        np.testing.assert_array_equal(np.isnan(field), ~image.valid)
+    assert np.isfinite(image.score).all()
+    assert ((image.confidence >= 0) & (image.confidence <= 1)).all()
+    assert (image.confidence[~image.valid] == 0).all()
+    answered = image.bin[image.valid]
+    assert ((answered >= 0) & (answered <= capture.acquisition.n_bins)).all()
+    np.testing.assert_array_equal(image.range_m, capture.acquisition.bin_to_range_m(image.bin))
+
+
+def one_hot(n_bins: int, count: int) -> np.ndarray:
+    return np.eye(n_bins)[np.newaxis] * count
+
+
+CAPTURES: dict[str, Callable[[], Capture]] = {
+    "simulated": simulated,
+    "one pixel": lambda: capture_of(simulated().cube[3:4, 3:4]),
+    "empty": lambda: capture_of(np.zeros((3, 4, 100))),
+    "constant": lambda: capture_of(np.full((3, 4, 100), 9)),
+    "one photon in each bin": lambda: capture_of(one_hot(100, 1)),
+    "every pulse in one bin": lambda: capture_of(one_hot(100, 1000)),
+    "full counters": lambda: capture_of(np.full((3, 4, 100), 2**16 - 1)),
+    "full narrow counters": lambda: capture_of(np.full((3, 4, 100), 2**8 - 1), dtype=np.uint8),
+    "full wide counters": lambda: capture_of(np.full((3, 4, 100), 2**32 - 1), dtype=np.uint32),
+    "one bin": lambda: capture_of(np.arange(12).reshape(3, 4, 1)),
+    "one bin, every pulse": lambda: capture_of(np.full((3, 4, 1), 1000)),
+    "two bins": lambda: capture_of(np.arange(24).reshape(3, 4, 2)),
+    "three bins": lambda: capture_of(np.arange(36).reshape(3, 4, 3)),
+    "pulses unknown": lambda: capture_of(simulated().cube, n_pulses=None),
+    "pulses unknown, one bin": lambda: capture_of(np.arange(12).reshape(3, 4, 1), n_pulses=None),
+    "several photons a pulse": lambda: capture_of(simulated().cube, n_pulses=10),
+    "one pulse": lambda: capture_of(one_hot(100, 1), n_pulses=1),
+    "no background": lambda: simulated(sbr=np.inf),
+    "a photon in two pixels": lambda: simulated(n_pulses=1),
+    "wide counts": lambda: capture_of(simulated().cube, dtype=np.uint32),
+}
+
+
+@every_case
+@pytest.mark.parametrize("build", CAPTURES.values(), ids=CAPTURES)
+def test_answers_keep_the_contract(build: Callable[[], Capture], case: tuple[str, Any]) -> None:
+    capture = build()
+    before = capture.cube.copy()
+    image = estimate(capture, *case)
+    assert_contract(capture, image)
+    np.testing.assert_array_equal(capture.cube, before)
+    again = estimate(capture, *case)
+    np.testing.assert_array_equal(again.bin, image.bin)
+    np.testing.assert_array_equal(again.confidence, image.confidence)
+
+
+@every_case
+def test_no_photon_gives_no_answer(case: tuple[str, Any]) -> None:
+    cube = simulated().cube.copy()
+    cube[2] = 0
+    image = estimate(capture_of(cube), *case)
+    assert not image.valid[2].any()
+    assert image.valid.any()
+
+
+PULSES = {
+    "gamma": Pulse(1e-9),
+    "long gamma": Pulse(3e-9),
+    "gaussian": Pulse.gaussian(1e-9),
+    "long gaussian": Pulse.gaussian(3e-9),
+    "measured": Pulse.measured([0, 0, 1, 4, 6, 4, 3, 2, 1, 0.5], 0.5e-9),
+}
+
+
+@every_case
+@pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
+def test_strong_echoes_are_ranged_without_lag(pulse: Pulse, case: tuple[str, Any]) -> None:
+    onset_bin = np.random.default_rng(0).uniform(25, 85, (SIZE, SIZE))
+    acquisition = Acquisition(n_pulses=1000)
+    scene = Scene(acquisition.bin_to_range_m(onset_bin))
+    capture = simulate(scene, acquisition, Flux(0.5, 5.0), pulse)
+    error = estimate(capture, *case).bin - onset_bin
+    assert abs(np.median(error)) < 0.5
+    # What is left spreads by rounding to whole bins and by the pulse's own length.
+    assert (np.abs(error) < 1 + capture.echo_bins).mean() > 0.95
+
+
+@every_estimator
+def test_depths_do_not_bias_a_strong_echo(method: str) -> None:
+    onset_bin = np.repeat(np.linspace(25, 85, 13), 64).reshape(13, 64)
+    acquisition = Acquisition(n_pulses=1000)
+    scene = Scene(acquisition.bin_to_range_m(onset_bin))
+    error = estimate(simulate(scene, acquisition, Flux(0.5, 5.0)), method).bin - onset_bin
+    # Whole bins: an onset on a bin's edge may fall to either side of it.
+    assert (np.abs(np.median(error, axis=1)) <= 1).all()
+
+
+def lone_echo(onset_bin: float = 40.3, n_pulses: int = 1000, **acquisition: Any) -> Capture:
+    """Four pixels that see the same echo, to the last count, and nothing else."""
+    setting = Acquisition(n_pulses=n_pulses, **acquisition)
+    pulse = Pulse(setting.bin_width_s)
+    rate = rate_per_bin(np.full((2, 2), onset_bin), np.full((2, 2), 0.4), 0.0, pulse, setting)
+    counts = np.rint(trigger_probability(rate) * n_pulses).astype(np.uint16)
+    return Capture(counts, setting, pulse)
+
+
+@every_estimator
+@pytest.mark.parametrize("later", [1, 7, 33])
+def test_a_later_echo_gives_a_later_answer(method: str, later: int) -> None:
+    capture = lone_echo()
+    shifted = Capture(np.roll(capture.cube, later, axis=2), capture.acquisition, capture.pulse)
+    near, far = estimate(capture, method), estimate(shifted, method)
+    assert near.valid.all()
+    # Bins near a hundred, minus the same lag: two roundings.
+    np.testing.assert_allclose(far.bin - near.bin, later, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(far.score, near.score)
+
+
+@every_case
+def test_counts_and_pulses_have_no_unit(case: tuple[str, Any]) -> None:
+    one = simulated()
+    four = capture_of(4 * one.cube, n_pulses=4000)  # a power of two, so that ties stay ties
+    np.testing.assert_array_equal(estimate(four, *case).bin, estimate(one, *case).bin)
+
+
+@every_case
+def test_time_has_no_unit(case: tuple[str, Any]) -> None:
+    one = lone_echo()
+    two = lone_echo(bin_width_s=2e-9, gate_delay_s=560e-9)  # exactly doubled
+    np.testing.assert_array_equal(two.cube, one.cube)
+    near, far = estimate(one, *case), estimate(two, *case)
+    np.testing.assert_array_equal(far.bin, near.bin)
+    np.testing.assert_array_equal(far.confidence, near.confidence)
+    np.testing.assert_array_equal(far.range_m, 2 * near.range_m)
+
+
+def assert_same(found: RangeImage, expected: RangeImage) -> None:
+    for field in ("range_m", "bin", "score", "confidence", "valid"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(expected, field))
+
+
+@every_case
+@pytest.mark.parametrize("n_threads", THREADS)
+@pytest.mark.usefixtures("threads")
+def test_answers_do_not_depend_on_threads(
+    monkeypatch: pytest.MonkeyPatch, case: tuple[str, Any], n_threads: int
+) -> None:
+    capture = simulated(size=14)
+    serial = estimate(capture, *case)
+    monkeypatch.setattr(tracking, "SERIAL_BELOW", 0)
+    numba.set_num_threads(n_threads)
+    assert_same(estimate(capture, *case), serial)
+
+
+@every_estimator
+def test_pixels_are_ranged_one_by_one(method: str) -> None:
+    capture = simulated(size=14)
+    order = np.random.default_rng(1).permutation(14 * 14)
+    shuffled = capture_of(capture.cube.reshape(1, 196, 100)[:, order])
+    expected, found = estimate(capture, method), estimate(shuffled, method)
+    for field in ("range_m", "bin", "score", "confidence", "valid"):
+        np.testing.assert_array_equal(
+            getattr(found, field)[0], getattr(expected, field).ravel()[order]
+        )
+
+
+@every_case
+def test_narrow_counts_are_ranged_like_wide_ones(case: tuple[str, Any]) -> None:
+    cube = np.minimum(4 * simulated().cube, 255)  # sums beyond what a narrow count can hold
+    narrow, wide = (estimate(capture_of(cube, 4000, t), *case) for t in (np.uint8, np.uint32))
+    assert_same(narrow, wide)
+
+
+@every_case
+@pytest.mark.parametrize("sbr", [0.03, 0.06, 0.2])
+@pytest.mark.parametrize("tau_s", [1e-9, 3e-9])
+def test_noise_seldom_earns_confidence(tau_s: float, sbr: float, case: tuple[str, Any]) -> None:
+    sky = Scene(np.full((2 * SIZE, 2 * SIZE), np.nan))
+    image = estimate(simulate(sky, Acquisition(), Flux(sbr=sbr), Pulse(tau_s), seed=3), *case)
+    # Nine tenths of confidence is one false alarm in ten at most, and by chance a few more.
+    alarms = np.count_nonzero(image.confidence > 0.9)
+    assert alarms <= stats.binom.ppf(1 - 1e-4, image.confidence.size, 0.1)
+
+
+@every_case
+def test_strong_echoes_earn_confidence(case: tuple[str, Any]) -> None:
+    image = estimate(simulated(sbr=0.5), *case)
+    expected = np.full((8, 8), True)
+    expected[0, 0] = False  # no target
+    # 104 detections over a background of 8: gross errors alone are unsure.
+    assert (image.confidence > 0.99)[expected].mean() > 0.8
+
+
+def test_no_lag_is_known_where_no_echo_can_be_found() -> None:
+    blind = TrackingParameters(t_n=1000)
+    capture = simulated()
+    assert ESTIMATORS["tracking"].lag_bins(capture, blind) == 0
+    assert not estimate(capture, "tracking", blind).valid.any()
+
+
+def test_peak_is_the_first_of_the_largest_bins() -> None:
+    cube = np.zeros((1, 2, 50))
+    cube[0, 0, [20, 30]] = 7
+    cube[0, 1, 10] = 3
+    capture = capture_of(cube)
+    lag = ESTIMATORS["peak"].lag_bins(capture, ESTIMATORS["peak"].parameters())
+    np.testing.assert_allclose(estimate(capture, "peak").bin + lag, [[20, 10]], rtol=1e-15)
+    np.testing.assert_array_equal(estimate(capture, "peak").score, [[7, 3]])
+
+
+def test_settings_may_be_given_field_by_field() -> None:
+    capture = simulated()
+    assert_same(
+        estimate(capture, "tracking", m=2.0, t_n=30),
+        estimate(capture, "tracking", TrackingParameters(m=2.0, t_n=30)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fields", "words"),
+    [
+        (("sonar",), {}, r"method = 'sonar' .*'tracking' or "),
+        (("peak",), {"width": 3}, r"width = 3 .*one of \[\]"),
+        (("tracking",), {"M": 3}, r"M = 3 .*'l', 'n', 'h', 'm'"),
+        (("tracking",), {"m": -1.0}, r"m = -1\.0 "),
+        (("tracking", "as printed"), {}, r"settings = 'as printed' .*TrackingParameters"),
+        (("tracking", TrackingParameters()), {"m": 2.0}, r"settings = .*or single fields"),
+        (("tracking",), {"weight": "survival"}, r"weight = 'survival' needs the number of pulses"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(
+    arguments: tuple[Any, ...], fields: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        estimate(capture_of(simulated().cube, n_pulses=None), *arguments, **fields)

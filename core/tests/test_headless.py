@@ -1,0 +1,48 @@
+"""Core runs where there is no screen, and none of the app's libraries."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import core
+
+PACKAGE = Path(core.__file__).parent
+SOURCES = sorted(path for path in PACKAGE.rglob("*.py") if "tests" not in path.parts)
+SCREEN = {"app", "bokeh", "holoviews", "panel", "panel_material_ui", "param", "pyvista", "vtk"}
+
+
+def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=PACKAGE.parent, capture_output=True, text=True, check=True
+    )
+
+
+def test_importing_all_of_core_brings_no_screen_library() -> None:
+    modules = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in SOURCES]
+    names = ", ".join(name.removesuffix(".__init__") for name in modules)
+    loaded = run_python("-c", f"import sys, {names}; print(*sys.modules)").stdout.split()
+    assert {"core.tracking", "core.readers.npz", "core.experiments.recommend"} <= set(loaded)
+    assert not SCREEN & {name.partition(".")[0] for name in loaded}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_no_source_imports_a_screen_library(path: Path) -> None:
+    imported = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0  # absolute imports alone, so that none slips by
+            imported.add(node.module or "")
+    assert not SCREEN & {name.partition(".")[0] for name in imported}
+
+
+def test_core_is_a_command() -> None:
+    printed = run_python("-m", "core", "--help").stdout
+    for command in ("table2", "recommend"):
+        assert command in printed

@@ -1,0 +1,241 @@
+"""Simulated captures follow Eq. 1 exactly, by seed, whatever the number of threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import import_module
+
+import numba
+import numpy as np
+import pytest
+from scipy import stats
+
+from core.acquisition import Acquisition, Flux, Pulse
+from core.capture import Capture
+from core.scene import Scene
+from core.simulate import simulate
+from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
+
+module = import_module("core.simulate")  # the package's attribute of that name is the function
+
+# Draws of a large sample: six microseconds each where the kernels are plain Python.
+DRAWS = 50_000 if numba.config.DISABLE_JIT else 2_000_000
+# By chance, one fixed seed in ten thousand would fall below.
+SIGNIFICANCE = 1e-4
+
+ACQUISITION = Acquisition(n_bins=60, n_pulses=500)
+ONSET_BIN = 22.3
+PIXELS = DRAWS // 500
+THREADS = sorted({1, numba.config.NUMBA_NUM_THREADS})
+
+each_way = pytest.mark.parametrize("one_by_one_up_to", [8192, 0], ids=["one by one", "multinomial"])
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts the number of threads back."""
+    before = numba.get_num_threads()
+    yield
+    numba.set_num_threads(before)
+
+
+def wall(n_pixels: int, onset_bin: float = ONSET_BIN) -> Scene:
+    """One row of pixels that all see the same range; NaN for the open sky."""
+    return Scene(np.full((1, n_pixels), ACQUISITION.bin_to_range_m(onset_bin)))
+
+
+def outcomes(capture: Capture) -> np.ndarray:
+    """How often each bin triggered over all pixels, and, last, how often none did."""
+    bins = capture.cube.sum(axis=(0, 1), dtype=np.int64)
+    n_pulses = capture.acquisition.n_pulses or 0
+    return np.append(bins, capture.cube[..., 0].size * n_pulses - bins.sum())
+
+
+def expected_share(flux: Flux, pulse: Pulse, onset_bin: float = ONSET_BIN) -> np.ndarray:
+    rate = rate_per_bin(onset_bin, flux.signal, flux.background, pulse, ACQUISITION)
+    return np.append(trigger_probability(rate), no_trigger_probability(rate))
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("flux", "pulse"),
+    [
+        (Flux(0.1041, 0.06), Pulse()),
+        (Flux(1.5, 0.5), Pulse.gaussian(2e-9)),
+        (Flux(0.05, 4.0), Pulse.measured([1, 2, 5, 2], 1e-9)),
+    ],
+    ids=["paper", "strong", "faint"],
+)
+def test_histograms_follow_equation_1(
+    monkeypatch: pytest.MonkeyPatch, flux: Flux, pulse: Pulse, one_by_one_up_to: int
+) -> None:
+    monkeypatch.setattr(module, "PULSES_DRAWN_ONE_BY_ONE", one_by_one_up_to)
+    found = outcomes(simulate(wall(PIXELS), ACQUISITION, flux, pulse, seed=1))
+    expected = expected_share(flux, pulse) * found.sum()
+    assert expected.min() > 5  # where chi-square holds
+    assert stats.chisquare(found, expected).pvalue > SIGNIFICANCE
+
+
+@each_way
+def test_detections_of_a_pixel_vary_binomially(
+    monkeypatch: pytest.MonkeyPatch, one_by_one_up_to: int
+) -> None:
+    monkeypatch.setattr(module, "PULSES_DRAWN_ONE_BY_ONE", one_by_one_up_to)
+    flux = Flux(0.1041, 0.06)
+    counts = simulate(wall(PIXELS), ACQUISITION, flux, seed=2).counts
+    share = 1 - expected_share(flux, Pulse())[-1]
+    squares = ((counts - 500 * share) ** 2).sum() / (500 * share)
+    # Squared deviations over their variance are chi-square; five in six pulses trigger here, so
+    # that a Poisson variance would be six times too large.
+    lower, upper = stats.chi2.ppf([SIGNIFICANCE / 2, 1 - SIGNIFICANCE / 2], counts.size)
+    assert lower < squares / (1 - share) < upper
+    assert squares < lower
+
+
+def test_both_ways_of_drawing_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    one_by_one = outcomes(simulate(wall(PIXELS), ACQUISITION, Flux(), seed=3))
+    monkeypatch.setattr(module, "PULSES_DRAWN_ONE_BY_ONE", 0)
+    multinomial = outcomes(simulate(wall(PIXELS), ACQUISITION, Flux(), seed=3))
+    assert (one_by_one != multinomial).any()
+    assert stats.chi2_contingency([one_by_one, multinomial]).pvalue > SIGNIFICANCE
+
+
+@pytest.mark.parametrize("n_pulses", [8192, 8193])
+def test_many_pulses_are_all_accounted_for(n_pulses: int) -> None:
+    certain = Acquisition(n_bins=3, gate_delay_s=0.0, n_pulses=n_pulses)
+    cube = simulate(wall(1, np.nan), certain, Flux(1.0, 1 / 90)).cube
+    # Thirty photons a bin: one pulse in 1e13 has none in the first.
+    np.testing.assert_array_equal(cube, [[[n_pulses, 0, 0]]])
+
+
+@pytest.mark.parametrize(
+    ("n_pulses", "dtype"), [(1, np.uint16), (2**16 - 1, np.uint16), (2**16, np.uint32)]
+)
+def test_counts_fit_their_type(n_pulses: int, dtype: type) -> None:
+    certain = Acquisition(n_bins=1, n_pulses=n_pulses)
+    cube = simulate(wall(1, np.nan), certain, Flux(1.0, 1 / 50)).cube
+    assert cube.dtype == dtype
+    assert cube.item() == n_pulses
+
+
+@pytest.mark.parametrize("n_threads", THREADS)
+@pytest.mark.usefixtures("threads")
+def test_cube_depends_on_the_seed_alone(n_threads: int) -> None:
+    scene, acquisition = wall(97), Acquisition(n_bins=60, n_pulses=100)
+    first = simulate(scene, acquisition, Flux(), seed=7).cube
+    numba.set_num_threads(n_threads)
+    np.testing.assert_array_equal(simulate(scene, acquisition, Flux(), seed=7).cube, first)
+    assert (simulate(scene, acquisition, Flux(), seed=8).cube != first).any(axis=2).all()
+
+
+def test_pixels_are_independent_of_their_neighbours_and_of_the_next_seed() -> None:
+    few = Acquisition(n_bins=10, n_pulses=20)
+    scene = Scene(np.full((40, 50), np.nan))
+    one, next_seed = (simulate(scene, few, Flux(1.0, 1.0), seed=seed).counts for seed in (4, 5))
+    pairs = [
+        (one[:, :-1], one[:, 1:]),
+        (one[:-1], one[1:]),
+        (one, next_seed),
+        (one[:, 1:], next_seed[:, :-1]),
+    ]
+    for left, right in pairs:
+        # Standard deviation of the correlation of n independent pairs: 1 / sqrt(n).
+        assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 4 / np.sqrt(left.size)
+
+
+def splitmix64(state: np.ndarray) -> np.ndarray:
+    z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+def twin_cube(triggered: np.ndarray, n_pulses: int, seed: int) -> np.ndarray:
+    """One uniform number a pulse, looked up in the distribution of its first photon's bin."""
+    pixel = np.arange(len(triggered), dtype=np.uint64)[:, np.newaxis]
+    with np.errstate(over="ignore"):  # uint64 wraps round
+        key = splitmix64(splitmix64(np.array([[seed]], np.uint64) + np.uint64(1)) + pixel)
+        step = np.arange(n_pulses, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        uniform = (splitmix64(key + step) >> np.uint64(11)).astype(float) * 2.0**-53
+    n_bins = triggered.shape[1] - 1
+    cube = np.zeros((len(triggered), n_bins), np.int64)
+    for row, u, counts in zip(triggered, uniform, cube, strict=True):
+        bins = np.searchsorted(row[1:], u, side="right")
+        counts[:] = np.bincount(bins, minlength=n_bins + 1)[:n_bins]
+    return cube
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**63 - 1])
+@pytest.mark.parametrize(
+    ("n_bins", "n_pulses", "flux"),
+    [
+        (1, 63, Flux(0.5, 1.0)),
+        (2, 64, Flux(0.5, 1.0)),
+        (100, 65, Flux(0.1, 0.03)),
+        (100, 300, Flux(0.0, 1.0)),  # no photon at all
+        (100, 130, Flux(90.0, np.inf)),  # every pulse triggers in the echo's first bins
+        (700, 200, Flux(0.3, 0.1)),  # several bins to a cell of the guide
+    ],
+)
+def test_draws_equal_a_plain_twin_bit_for_bit(
+    n_bins: int, n_pulses: int, flux: Flux, seed: int
+) -> None:
+    acquisition = Acquisition(n_bins=n_bins, n_pulses=n_pulses)
+    onset_bin = np.array([np.nan, -1.5, 0.0, n_bins / 2, n_bins - 0.5])
+    scene = Scene(acquisition.bin_to_range_m(onset_bin[np.newaxis]))
+    capture = simulate(scene, acquisition, flux, seed=seed)
+    assert capture.signal is not None
+    onset_bin = acquisition.range_m_to_bin(scene.range_m)
+    triggered = module._triggered_by_each_edge(
+        onset_bin, capture.signal, flux.background, Pulse(), acquisition
+    )
+    np.testing.assert_array_equal(capture.cube[0], twin_cube(triggered, n_pulses, seed))
+
+
+def test_distribution_of_the_first_photon_is_equation_1_summed() -> None:
+    onset_bin, signal = np.array([ONSET_BIN, np.nan, -2.5]), np.array([2.0, 0.0, 2.0])
+    triggered = module._triggered_by_each_edge(onset_bin, signal, 3.0, Pulse(), ACQUISITION)
+    rate = rate_per_bin(onset_bin, signal, 3.0, Pulse(), ACQUISITION)
+    expected = np.cumsum(trigger_probability(rate), axis=1)
+    assert (triggered[:, 0] == 0).all()
+    # Sixty sums of numbers below 1.
+    np.testing.assert_allclose(triggered[:, 1:], expected, rtol=0, atol=60 * np.finfo(float).eps)
+
+
+def test_the_truth_travels_with_the_capture() -> None:
+    range_m = np.array([[50.0, np.nan, 45.0]])
+    scene = Scene(range_m, reflectivity=np.array([[0.5, 1.0, 2.0]]))
+    acquisition, pulse = Acquisition(n_pulses=10), Pulse(2e-9)
+    capture = simulate(scene, acquisition, Flux(0.2, 0.1), pulse, seed=9)
+    assert capture.acquisition is acquisition
+    assert capture.pulse is pulse
+    assert capture.background == Flux(0.2, 0.1).background
+    assert "seed 9" in capture.source
+    np.testing.assert_array_equal(capture.signal, [[0.1, 0.0, 0.4]])
+    range_m[:] = 0.0  # the capture keeps its own
+    np.testing.assert_array_equal(capture.truth_range_m, [[50.0, np.nan, 45.0]])
+
+
+def test_a_surface_that_reflects_nothing_is_no_target() -> None:
+    sky = simulate(wall(30, np.nan), ACQUISITION, Flux()).cube
+    black = simulate(
+        Scene(wall(30).range_m, reflectivity=np.zeros((1, 30))), ACQUISITION, Flux()
+    ).cube
+    np.testing.assert_array_equal(black, sky)
+
+
+def test_a_stronger_background_moves_the_scene_and_not_the_dice() -> None:
+    weak, strong = (simulate(wall(30), ACQUISITION, Flux(sbr=sbr)).cube for sbr in (0.08, 0.07))
+    # With the same dice every pulse triggers as early as before, or earlier.
+    earlier = np.cumsum(strong, axis=2, dtype=int) - np.cumsum(weak, axis=2, dtype=int)
+    assert (earlier >= 0).all()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_impossible_seeds_are_refused(seed: int) -> None:
+    with pytest.raises(ValueError, match=rf"seed = {seed} .*from 0 to 2\*\*63 - 1"):
+        simulate(wall(1), ACQUISITION, Flux(), seed=seed)
+
+
+def test_an_unknown_number_of_pulses_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"n_pulses = None .*number of pulses to simulate"):
+        simulate(wall(1), Acquisition(n_pulses=None), Flux())

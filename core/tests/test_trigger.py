@@ -1,0 +1,117 @@
+"""Eq. 1 as probabilities, its differences, and the way back to rates."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from core.acquisition import Acquisition, Pulse
+from core.trigger import (
+    coates_rate,
+    first_difference,
+    no_trigger_probability,
+    rate_per_bin,
+    trigger_probability,
+)
+
+FULL_RANGE = st.sampled_from([0.0, 1e-12, 1e6]) | st.floats(0, 30)
+
+
+def equation_1(rate: list[float]) -> list[float]:
+    """``P_k = exp(-Σ_{i<k} λ_i) · (1 - exp(-λ_k))``, one bin at a time."""
+    return [math.exp(-math.fsum(rate[:k])) * -math.expm1(-rate[k]) for k in range(len(rate))]
+
+
+@given(
+    hnp.arrays(float, hnp.array_shapes(min_dims=1, max_dims=3, max_side=40), elements=FULL_RANGE)
+)
+@example(np.array([0.3, 1e6]))
+@example(np.array([1e-12, 0.0, 1e6, 1.0]))
+def test_probabilities_sum_to_one(rate: np.ndarray) -> None:
+    probability, none = trigger_probability(rate), no_trigger_probability(rate)
+    assert probability.shape == rate.shape
+    assert none.shape == rate.shape[:-1]
+    for part in (probability, none):
+        assert (part >= 0).all()
+        assert (part <= 1).all()
+    np.testing.assert_allclose(probability.sum(axis=-1) + none, 1, rtol=0, atol=1e-12)
+
+
+@given(st.lists(FULL_RANGE, min_size=1, max_size=60))
+@example([0.3, 1e6])
+def test_trigger_probability_is_equation_1(rate: list[float]) -> None:
+    # x·exp(-x) < 0.4, so that a sum of n rates rounds at n · 1.1e-16 or less, seen in exp.
+    tolerance = len(rate) * np.finfo(float).eps
+    np.testing.assert_allclose(trigger_probability(rate), equation_1(rate), rtol=0, atol=tolerance)
+
+
+def test_faint_rates_keep_their_digits() -> None:
+    rate = [1e-15, 2e-15, 3e-15]
+    # The first photon shadows the later ones by 6e-15 at most.
+    np.testing.assert_allclose(trigger_probability(rate), rate, rtol=1e-14)
+
+
+def test_a_certain_photon_hides_what_follows() -> None:
+    probability = trigger_probability([0.3, np.inf, 0.5])
+    np.testing.assert_allclose(probability, [1 - math.exp(-0.3), math.exp(-0.3), 0], rtol=1e-15)
+
+
+@pytest.mark.parametrize("low", [-1e-9, -np.inf, np.nan])
+def test_impossible_rates_are_refused(low: float) -> None:
+    for probability in (trigger_probability, no_trigger_probability):
+        with pytest.raises(ValueError, match=rf"rate = {low} .*non-negative"):
+            probability([0.1, low])
+
+
+@given(hnp.arrays(float, (3, 20), elements=st.floats(0, 1)))
+def test_first_differences_add_up_to_what_they_came_from(probability: np.ndarray) -> None:
+    difference = first_difference(probability)
+    assert (difference[:, 0] == 0).all()
+    back = probability[:, :1] + np.cumsum(difference, axis=1)
+    np.testing.assert_allclose(
+        back, probability, rtol=0, atol=20 * np.finfo(float).eps
+    )  # 20 sums below 1
+
+
+def test_rates_add_echo_and_background() -> None:
+    acquisition = Acquisition(n_bins=80)
+    rate = rate_per_bin([[30.0, np.nan]], [[0.4, 0.4]], 1.6, Pulse(), acquisition)
+    assert rate.shape == (1, 2, 80)
+    # Behind bin 30 lie 50 time constants of the pulse.
+    np.testing.assert_allclose(rate.sum(axis=-1), [[0.4 + 1.6, 1.6]], rtol=1e-12)
+    np.testing.assert_allclose(rate[0, 1], 1.6 / 80, rtol=1e-15)
+
+
+@given(hnp.arrays(float, (3, 20), elements=st.just(0.0) | st.floats(1e-9, 0.25)))
+def test_coates_gives_the_rates_back(rate: np.ndarray) -> None:
+    n_pulses = 10**15
+    counts = np.rint(trigger_probability(rate) * n_pulses).astype(np.int64)
+    still_armed = no_trigger_probability(rate).min() * n_pulses
+    # Every count is off by rounding to a whole one, and by 2 more where the product rounds.
+    tolerance = 3 * rate.shape[1] / still_armed
+    np.testing.assert_allclose(coates_rate(counts, n_pulses), rate, rtol=0, atol=tolerance)
+
+
+def test_coates_counts_only_armed_pulses() -> None:
+    expected = [math.log(10 / 8), math.log(8 / 5), 0.0, math.log(5 / 4)]
+    np.testing.assert_allclose(coates_rate([2, 3, 0, 1], 10), expected, rtol=1e-15)
+
+
+def test_coates_says_when_nothing_is_left_to_tell() -> None:
+    np.testing.assert_array_equal(coates_rate([0, 5, 0, 0], 5), [0, np.inf, np.nan, np.nan])
+
+
+def test_coates_accepts_any_counts_dtype_and_leaves_it_alone() -> None:
+    counts = np.array([[1, 2], [0, 3]], np.uint8)
+    np.testing.assert_array_equal(coates_rate(counts, 300), coates_rate(counts.tolist(), 300))
+    np.testing.assert_array_equal(counts, [[1, 2], [0, 3]])
+
+
+def test_more_detections_than_pulses_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"n_pulses = 5 .*at least 6, the detections of a pixel"):
+        coates_rate([[1, 1], [3, 3]], 5)

@@ -1,0 +1,413 @@
+"""The paper's heart: two tracking differentiators, and the echo as their difference.
+
+A tracking differentiator (TD) follows a signal ``s`` as fast as a bound ``r`` on its acceleration
+allows (Xie et al., Electronics 2026, 15, 2816, Eqs. 4-5; the control function is Han's ``fhan``)::
+
+    d  = r·h0          d0 = h0·d          y = x1 - s[k] + h0·x2
+    a0 = sqrt(d² + 8·r·|y|)
+    a  = x2 + (a0 - d)/2 · sign(y)   if |y| > d0,   else   x2 + y/h0
+    fh = -r·sign(a)                  if |a| > d,    else   -r·a/d
+    x1' = x1 + h·x2                  x2' = x2 + h·fh
+
+The small scale ``r_small = l·σ`` follows the trend, the large one ``r_large = n·r_small`` the jump;
+their positive difference is the residual, the residual times a weight is the enhanced signal, and
+the largest enhanced signal is the echo (Eqs. 6-15).
+
+`tracking_signals` computes this as written, in float64; its signals hold the ``x1'`` of each step.
+`track` computes the position alone, for whole captures, from the same recursion with its units
+divided out: with ``K = (m·h)²·l·σ`` and ``S = s/K, X1 = x1/K, X2 = h0·x2/K`` the small scale has
+``R = 1``, the large one ``R = n``, and ::
+
+    Y   = X1 + X2 - S
+    A   = X2 + copysign(sqrt(R²/4 + 2·R·|Y|) - R/2   if |Y| > R,   else   |Y|,   Y)
+    X1' = X1 + X2/m            X2' = X2 - clamp(A, -R, R)/m
+
+so that σ scales the input, ``(m·h)²·l`` is one parameter, and no division is left in the loop.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from core.acquisition import Floats
+from core.blocks import LANES, Blocks, lane_rows, lane_sigma
+from core.checks import require
+from core.parallel import COMPILED, KERNEL_LOCK, PARALLEL, SERIAL_BELOW
+from core.parameters import Choice, Number, check_fields, parameter
+
+Weight = Literal["cubic", "exponential", "survival", "none"]
+Start = Literal["zero", "mean"]
+SigmaFrom = Literal["gate", "before T_n"]
+
+
+@dataclass(frozen=True)
+class TrackingParameters:
+    """Settings of the dual-scale tracking differentiator; the defaults are the recommended preset.
+
+    Each field's meaning, unit and bounds are in its metadata (`core.parameters`).
+
+    Raises
+    ------
+    ValueError
+        If a value lies outside its bounds.
+    """
+
+    l: float = parameter(  # noqa: E741 - the paper's letter
+        0.004,
+        Number("l", 1e-4, 1.0, log=True, least=0.0, most=1e6),
+        "Speed of the small scale, r_small = l·σ: smaller follows only the slow trend.",
+    )
+    n: float = parameter(
+        1000.0,
+        Number("n", 1.0, 1e4, log=True, least=0.0, most=1e9),
+        "Large scale over small scale, r_large = n·r_small: larger follows the echo's jump faster.",
+    )
+    h: float = parameter(
+        1.0,
+        Number("h", 0.25, 4.0, log=True, least=0.0, most=1e6, open_below=True, unit="bins"),
+        "Step of the integration. Only (m·h)²·l, m, n and T_n move a range: h and l are one knob.",
+    )
+    m: float = parameter(
+        1.25,
+        Number("m", 0.9, 5.0, least=1e-3, most=1e6),
+        "Smoothing, h0 = m·h: delays by 2m - 1 bins. At 1 a pure delay; below about 0.8 chaotic, "
+        "and unstable at ½.",
+    )
+    alpha: float = parameter(
+        1.0,
+        Number("α", 0.1, 30.0, log=True, least=0.0, most=1e6),
+        "Strength of the weight. With the cubic weight, as printed, it scales every bin alike and "
+        "cannot move a range; with the exponential weight it can.",
+    )
+    t_n: int = parameter(
+        20,
+        Number("T_n", 0, 99, whole=True, least=0, most=2**31 - 1, unit="bins"),
+        "First bin in which an echo may lie: everything before is taken for noise and ignored.",
+    )
+    weight: Weight = parameter(
+        "none",
+        Choice("Weight", ("none", "survival", "cubic", "exponential")),
+        "What the residual is multiplied by: nothing, 1 / share of pulses still armed (undoes the "
+        "decay by pile-up), α·(k/N)³ as printed, or exp(α·(k/N)³).",
+    )
+    start: Start = parameter(
+        "mean",
+        Choice("Start", ("mean", "zero")),
+        "First value of both scales: the mean of the first five bins, or zero, whose start-up jump "
+        "T_n must hide.",
+    )
+    sigma_from: SigmaFrom = parameter(
+        "gate",
+        Choice("σ from", ("gate", "before T_n")),
+        "Bins whose standard deviation is σ: the whole gate (Eq. 6) or those before T_n "
+        "(Algorithm 1). The paper prints both.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+PRESETS: dict[str, TrackingParameters] = {
+    "recommended": TrackingParameters(),
+    "as printed": TrackingParameters(
+        l=0.001, n=1000.0, h=1.0, m=1.5, alpha=1.0, t_n=20, weight="cubic", start="zero"
+    ),
+}
+
+
+class Signals(NamedTuple):
+    """Every stage of the estimator, each of the histogram's shape (..., bin), in counts."""
+
+    raw: Floats
+    small: Floats
+    large: Floats
+    residual: Floats
+    weight: Floats
+    enhanced: Floats
+    sigma: Floats
+    """Standard deviation of the histogram, shape (...)."""
+    position_bin: Floats
+    """Bin of the largest enhanced signal, shape (...); NaN where there is none."""
+
+
+# A residual below this share of the largest count is rounding: both scales moved alike.
+ROUNDING_32 = float(16 * np.finfo(np.float32).eps)
+
+START_BINS = 5
+
+
+def tracking_signals(
+    histogram: ArrayLike, parameters: TrackingParameters, n_pulses: int | None = None
+) -> Signals:
+    """Every stage of the estimator, as written in the paper and in float64.
+
+    Parameters
+    ----------
+    histogram : array_like, shape (..., bin)
+        Counts, or expected counts.
+    parameters : TrackingParameters
+    n_pulses : int, optional
+        Pulses sent; needed by the weight "survival" only.
+
+    Returns
+    -------
+    Signals
+
+    Raises
+    ------
+    ValueError
+        If the histogram has no bins, or the weight "survival" lacks `n_pulses`.
+    """
+    raw = np.asarray(histogram, float)
+    require("histogram", f"shape {raw.shape}", raw.ndim > 0 and raw.shape[-1] > 0, "(..., bin)")
+    rows = raw.reshape(-1, raw.shape[-1])
+    small, large = np.empty_like(rows), np.empty_like(rows)
+    sigma_bins = _sigma_bins(parameters, rows.shape[1])
+    sigma = rows[:, :sigma_bins].std(axis=1) if sigma_bins else np.zeros(len(rows))
+    r_small = float(parameters.l) * sigma
+    mean = rows[:, :START_BINS].mean(axis=1)
+    first = mean if parameters.start == "mean" else np.zeros_like(mean)
+    for scale, r in ((small, r_small), (large, float(parameters.n) * r_small)):
+        _differentiate_rows(rows, r, float(parameters.h), float(parameters.m), first, scale)
+    residual = np.maximum(large - small, 0.0)
+    residual[~(residual > ROUNDING_32 * rows.max(axis=1, keepdims=True))] = 0.0
+    weight = np.broadcast_to(_weights(rows.shape[1], parameters), rows.shape)
+    pulses = _pulses_for_survival(parameters, n_pulses)
+    if pulses is not None:
+        armed = pulses - (np.cumsum(rows, axis=1) - rows)
+        weight = weight * pulses / np.maximum(armed, 1.0)
+    enhanced = residual * weight
+    found = enhanced.max(axis=1) > 0
+    position = np.where(found, np.argmax(enhanced, axis=1), np.nan)
+    shape = raw.shape
+    return Signals(
+        raw,
+        small.reshape(shape),
+        large.reshape(shape),
+        residual.reshape(shape),
+        weight.reshape(shape),
+        enhanced.reshape(shape),
+        sigma.reshape(shape[:-1]),
+        position.reshape(shape[:-1]),
+    )
+
+
+def track(
+    blocks: Blocks, parameters: TrackingParameters, n_pulses: int | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Position of the echo in every pixel, without the signals that lead there.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        Counts, as `to_blocks` lays them out.
+    parameters : TrackingParameters
+    n_pulses : int, optional
+        Pulses sent; needed by the weight "survival" only.
+
+    Returns
+    -------
+    position_bin : ndarray, shape (pixel,)
+        As `Signals.position_bin`; NaN where there is none.
+    score : ndarray, shape (pixel,)
+        The enhanced signal there, in counts; 0 where there is none.
+    """
+    n_blocks, n_bins, _ = blocks.counts.shape
+    weight = _weights(n_bins, parameters)
+    top = weight.max() or 1.0
+    settings = _Settings(
+        k_per_sigma=float((parameters.m * parameters.h) ** 2 * parameters.l),
+        n=float(parameters.n),
+        m=float(parameters.m),
+        start_bins=min(START_BINS, n_bins) if parameters.start == "mean" else 0,
+        n_pulses=_pulses_for_survival(parameters, n_pulses) or 0,
+    )
+    sigma_bins = _sigma_bins(parameters, n_bins)
+    sigma = blocks.sigma if sigma_bins == n_bins else lane_sigma(blocks.counts, sigma_bins)
+    position = np.empty((n_blocks, LANES), np.float32)
+    score = np.empty_like(position)
+    lanes = _Lanes(sigma, blocks.largest, position, score)
+    kernel = _track_parallel if blocks.counts.size > SERIAL_BELOW else _track_serial
+    with KERNEL_LOCK:
+        kernel(blocks.counts, lanes, (weight / top).astype(np.float32), settings)
+    pixels = slice(blocks.n_pixels)
+    return position.ravel()[pixels], score.ravel()[pixels] * top
+
+
+class _Lanes(NamedTuple):
+    """One number a pixel, each of shape (block, LANES): what goes in, and what comes out."""
+
+    sigma: NDArray[np.float64]
+    largest: NDArray[np.float64]
+    position: NDArray[np.float32]
+    score: NDArray[np.float32]
+
+
+class _Settings(NamedTuple):
+    """What the kernel needs to know; 0 in `start_bins` and `n_pulses` means "not used"."""
+
+    k_per_sigma: float
+    n: float
+    m: float
+    start_bins: int
+    n_pulses: int
+
+
+def _sigma_bins(parameters: TrackingParameters, n_bins: int) -> int:
+    return n_bins if parameters.sigma_from == "gate" else min(parameters.t_n, n_bins)
+
+
+def _pulses_for_survival(parameters: TrackingParameters, n_pulses: int | None) -> int | None:
+    if parameters.weight != "survival":
+        return None
+    if n_pulses is None:
+        raise ValueError(
+            "weight = 'survival' needs the number of pulses, which is not known here: "
+            "give n_pulses, or choose another weight."
+        )
+    return n_pulses
+
+
+def _weights(n_bins: int, parameters: TrackingParameters) -> Floats:
+    """The part of the weight that is the same for every pixel (Eq. 13), shape (bin,)."""
+    bins = np.arange(n_bins)
+    rise = (bins / n_bins) ** 3
+    if parameters.weight == "cubic":
+        weight = parameters.alpha * rise
+    elif parameters.weight == "exponential":
+        weight = np.exp(np.minimum(parameters.alpha * rise, 600.0))  # times a count, still finite
+    else:
+        weight = np.ones(n_bins)
+    return np.where(bins >= parameters.t_n, weight, 0.0)
+
+
+@njit(**COMPILED)
+def _differentiate(s, r, h, m, x1, out):  # type: ignore[no-untyped-def]
+    """One tracking differentiator over one row, the equations as written."""
+    h0 = m * h
+    d = r * h0
+    d0 = h0 * d
+    x2 = 0.0
+    for k in range(s.size):
+        y = x1 - s[k] + h0 * x2
+        if abs(y) > d0:
+            a0 = math.sqrt(d * d + 8.0 * r * abs(y))
+            a = x2 + (a0 - d) / 2.0 * np.sign(y)
+        else:
+            a = x2 + y / h0
+        # With r = 0 the second form is 0/0: nothing may accelerate.
+        fh = -r * np.sign(a) if abs(a) > d else (-r * a / d if d > 0.0 else 0.0)
+        x1, x2 = x1 + h * x2, x2 + h * fh
+        out[k] = x1
+
+
+@njit(**COMPILED)
+def _differentiate_rows(rows, r, h, m, first, out):  # type: ignore[no-untyped-def]
+    for i in range(rows.shape[0]):
+        _differentiate(rows[i], r[i], h, m, first[i], out[i])
+
+
+# The kernel's registers: one row of LANES float32 each, at a constant place in one array, which is
+# what lets the compiler keep 16 pixels in a vector and see that no two rows overlap.
+_X1_SMALL, _X2_SMALL, _X1_LARGE, _X2_LARGE = 0 * LANES, 1 * LANES, 2 * LANES, 3 * LANES
+_SCALE, _FLOOR, _WEIGHT, _ARMED = 4 * LANES, 5 * LANES, 6 * LANES, 7 * LANES
+_BEST, _AT = 8 * LANES, 9 * LANES
+_ROWS = 10
+
+_ALTERNATING = np.float32(1e-20)  # keeps a filter at rest out of the slow subnormal numbers
+_SCALED_MAX = 1e18  # a count beyond this many K: squares still fit a float32, echoes no longer show
+
+
+@njit(**COMPILED)
+def _track_block(b, blocks, lanes, weight, settings, row):  # type: ignore[no-untyped-def]
+    """Position and score of the pixels of block `b`; `row` is scratch.
+
+    See the module's docstring for the recursion.
+    """
+    counts = blocks[b]
+    _prepare_rows(counts, lanes.sigma[b], lanes.largest[b], settings, row)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    quarter, half, two = np.float32(0.25), np.float32(0.5), np.float32(2.0)
+    r = np.float32(settings.n)
+    r_quarter, r_half, r_two = quarter * r * r, half * r, two * r
+    per_m = np.float32(1.0 / settings.m)
+    for k in range(counts.shape[0]):
+        if settings.n_pulses > 0:
+            for i in range(LANES):
+                row[_WEIGHT + i] = weight[k] * settings.n_pulses / max(row[_ARMED + i], one)
+                row[_ARMED + i] -= np.float32(counts[k, i])
+        else:
+            for i in range(LANES):
+                row[_WEIGHT + i] = weight[k]
+        bin_number = np.float32(k)
+        offset = _ALTERNATING if k & 1 else -_ALTERNATING
+        for i in range(LANES):
+            s = row[_SCALE + i] * np.float32(counts[k, i]) + offset
+
+            x1, x2 = row[_X1_SMALL + i], row[_X2_SMALL + i]
+            y = x1 + x2 - s
+            t = abs(y)
+            a = x2 + math.copysign(math.sqrt(quarter + two * t) - half if t > one else t, y)
+            a = a if a < one else one
+            a = a if a > -one else -one
+            small = x1 + x2 * per_m
+            row[_X1_SMALL + i], row[_X2_SMALL + i] = small, x2 - a * per_m
+
+            x1, x2 = row[_X1_LARGE + i], row[_X2_LARGE + i]
+            y = x1 + x2 - s
+            t = abs(y)
+            a = x2 + math.copysign(math.sqrt(r_quarter + r_two * t) - r_half if t > r else t, y)
+            a = a if a < r else r
+            a = a if a > -r else -r
+            large = x1 + x2 * per_m
+            row[_X1_LARGE + i], row[_X2_LARGE + i] = large, x2 - a * per_m
+
+            residual = large - small
+            enhanced = residual * row[_WEIGHT + i] if residual > row[_FLOOR + i] else zero
+            best = row[_BEST + i]
+            row[_AT + i] = bin_number if enhanced > best else row[_AT + i]
+            row[_BEST + i] = enhanced if enhanced > best else best
+    for i in range(LANES):
+        found = row[_BEST + i] > zero
+        lanes.position[b, i] = row[_AT + i] if found else np.nan
+        lanes.score[b, i] = row[_BEST + i] / row[_SCALE + i] if found else zero
+
+
+@njit(**COMPILED)
+def _prepare_rows(counts, sigma, largest, settings, row):  # type: ignore[no-untyped-def]
+    """Scale, floor and start value of each lane; everything else zero."""
+    row[:] = 0.0
+    for k in range(settings.start_bins):
+        for i in range(LANES):
+            row[_X1_SMALL + i] += np.float32(counts[k, i])
+    for i in range(LANES):
+        k_unit = settings.k_per_sigma * sigma[i]
+        ranged = 0.0 < largest[i] < _SCALED_MAX * k_unit
+        scale = 1.0 / k_unit if ranged else 0.0
+        row[_SCALE + i] = scale
+        # Never below what the alternating offset does to a filter at rest.
+        floor = max(scale * largest[i] * ROUNDING_32, 1e-18)
+        row[_FLOOR + i] = floor if ranged else np.inf
+        if settings.start_bins > 0:
+            row[_X1_SMALL + i] *= np.float32(scale / settings.start_bins)
+        row[_X1_LARGE + i] = row[_X1_SMALL + i]
+        row[_ARMED + i] = settings.n_pulses
+
+
+@njit(**COMPILED)
+def _track_serial(blocks, lanes, weight, settings):  # type: ignore[no-untyped-def]
+    row = lane_rows(_ROWS)
+    for b in range(blocks.shape[0]):
+        _track_block(b, blocks, lanes, weight, settings, row)
+
+
+@njit(**PARALLEL)
+def _track_parallel(blocks, lanes, weight, settings):  # type: ignore[no-untyped-def]
+    for b in prange(blocks.shape[0]):
+        _track_block(b, blocks, lanes, weight, settings, lane_rows(_ROWS))

@@ -1,0 +1,29 @@
+"""Compile ahead of the first use."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.acquisition import Acquisition, Flux
+from core.capture import Capture
+from core.estimators import ESTIMATORS, estimate
+from core.parallel import SERIAL_BELOW
+from core.scene import Scene
+from core.simulate import simulate
+from core.tracking import PRESETS, tracking_signals
+
+
+def warm_up() -> None:
+    """Enter every kernel once, so that no later call pays for its compilation.
+
+    Seconds on a new machine; compiled code is then kept on disk, and a second start takes a tenth.
+    """
+    acquisition = Acquisition(n_pulses=1)
+    scene = Scene(np.full((1, 1), 50.0), acquisition=acquisition)
+    small = simulate(scene, acquisition, Flux())
+    pixels = SERIAL_BELOW // acquisition.n_bins + 1
+    large = Capture(np.zeros((pixels, 1, acquisition.n_bins), np.uint16), acquisition)
+    for capture in (small, large):
+        for method in ESTIMATORS:
+            estimate(capture, method)
+    tracking_signals(small.cube, PRESETS["recommended"])
