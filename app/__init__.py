@@ -1,0 +1,1 @@
+"""The Panel app: everything that needs a screen. It uses `core` by its public names only."""

@@ -1,0 +1,160 @@
+"""Controls made from the metadata of frozen dataclasses: one knob or select for each field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import panel as pn
+import panel_material_ui as pmui
+import param
+from panel.custom import Child, JSComponent
+
+from core.parameters import Number, spec_of
+
+Settings = TypeVar("Settings")
+
+
+class Knob(JSComponent):
+    """A number with a slider, a field to type in, its unit, a line of help and a reset.
+
+    Only values between `low` and `high` can be set; the field says so when something else is typed.
+    """
+
+    value = param.Number(default=0.0)
+    initial = param.Number(default=0.0, doc="What the reset button returns to.")
+    low = param.Number(default=0.0)
+    high = param.Number(default=1.0)
+    log = param.Boolean(default=False)
+    whole = param.Boolean(default=False)
+    label = param.String(default="")
+    unit = param.String(default="")
+    help = param.String(default="")
+
+    _esm = Path(__file__).with_name("knob.js")
+    _stylesheets: ClassVar = [Path(__file__).with_name("knob.css")]
+
+    @classmethod
+    def of(cls, spec: Number, value: float, help: str) -> Knob:
+        """The knob of a field."""
+        return cls(
+            value=value,
+            initial=value,
+            low=spec.low,
+            high=spec.high,
+            log=spec.log,
+            whole=spec.whole,
+            label=spec.symbol,
+            unit=spec.unit,
+            help=help,
+            sizing_mode="stretch_width",
+            margin=(0, 8, 2, 8),
+        )
+
+
+class SettingsPanel(Generic[Settings]):
+    """The controls of one settings object.
+
+    Parameters
+    ----------
+    settings : dataclass
+        Frozen, its fields made by `core.parameters.parameter`.
+    changed : callable
+        Called with the new settings object after each change by the user.
+    """
+
+    def __init__(self, settings: Settings, changed: Callable[[Settings], None]) -> None:
+        self._settings = settings
+        self._changed = changed
+        self._silent = False
+        self.controls: dict[str, Any] = {}
+        for each in fields(settings):  # type: ignore[arg-type]
+            spec, value, help = spec_of(each), getattr(settings, each.name), each.metadata["help"]
+            control = (
+                Knob.of(spec, value, help)
+                if isinstance(spec, Number)
+                else pmui.Select(
+                    label=spec.symbol,
+                    value=value,
+                    options=list(spec.options),
+                    description=help,
+                    size="small",
+                    sizing_mode="stretch_width",
+                    margin=(8, 8, 4, 8),
+                )
+            )
+            control.param.watch(self._collect, "value")
+            self.controls[each.name] = control
+
+    @property
+    def layout(self) -> pn.Column:
+        """All controls, in the order of the fields."""
+        return pn.Column(*self.controls.values(), sizing_mode="stretch_width", margin=0)
+
+    def show(self, settings: Settings) -> None:
+        """Set every control without reporting a change."""
+        self._silent = True
+        try:
+            for name, control in self.controls.items():
+                control.value = getattr(settings, name)
+        finally:
+            self._silent = False
+        self._settings = settings
+
+    def _collect(self, _event: param.parameterized.Event) -> None:
+        if self._silent:
+            return
+        values = {name: control.value for name, control in self.controls.items()}
+        whole = {n for n, c in self.controls.items() if isinstance(c, Knob) and c.whole}
+        values = {n: round(v) if n in whole else v for n, v in values.items()}
+        self._settings = replace(self._settings, **values)  # type: ignore[type-var]
+        self._changed(self._settings)
+
+
+class Facts(JSComponent):
+    """A list of named values; updating it costs the page no new layout."""
+
+    facts = param.List(default=[], doc="Name, value and one line of help, each a string.")
+    timed = param.Boolean(default=False, doc="Whether the page adds how long its drawing took.")
+    narrow = param.Boolean(default=False, doc="Whether the page is as narrow as a phone.")
+
+    _esm = Path(__file__).with_name("facts.js")
+    _stylesheets: ClassVar = [Path(__file__).with_name("facts.css")]
+
+
+class PixelKeys(JSComponent):
+    """Holds a picture that takes the keyboard: arrow keys move the pixel, with Shift by eight."""
+
+    child = Child()
+    pixel = param.NumericTuple(default=(0, 0), length=2, doc="Row and column.")
+    shape = param.NumericTuple(default=(1, 1), length=2, doc="Rows and columns of the image.")
+    label = param.String(default="", doc="What a screen reader says of the picture.")
+
+    _esm = """
+    export function render({ model, el }) {
+      const root = document.createElement("div");
+      root.style.cssText = "width: 100%; height: 100%; display: flex; border-radius: 6px";
+      root.tabIndex = 0;
+      root.dataset.part = "image";
+      root.setAttribute("role", "application");
+      root.append(model.get_child("child"));
+      const describe = () => root.setAttribute("aria-label", model.label);
+      model.on("label", describe);
+      describe();
+      const moves = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+      root.addEventListener("keydown", (event) => {
+        const move = moves[event.key];
+        if (!move) return;
+        event.preventDefault();
+        window.firstphotonInput = performance.now();
+        const step = event.shiftKey ? 8 : 1;
+        model.pixel = model.pixel.map((at, axis) =>
+          Math.min(model.shape[axis] - 1, Math.max(0, at + step * move[axis])),
+        );
+      });
+      return root;
+    }
+    """
+    _stylesheets: ClassVar = ["div:focus-visible { outline: 2px solid #4c8dff }"]

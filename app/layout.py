@@ -1,0 +1,324 @@
+"""The page: where everything stands. The only module that knows the template."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+from panel.util import edit_readonly
+from panel_material_ui.template.base import Meta
+
+from app import words
+from app.controls import SettingsPanel
+from app.session import Session
+from app.state import Reading
+from app.store import Answer, Source, file_source
+from app.theme import DARK, LIGHT, SIZES
+from core import PRESETS, TrackingParameters
+from core.readers import READERS
+
+MAX_UPLOAD_BYTES = 100 * 2**20
+
+CUSTOM = "custom"
+
+READING_LABELS = {
+    "time_unit_s": "Time unit (s)",
+    "bin_width_s": "Bin width (s)",
+    "gate_delay_s": "Gate opens after (s)",
+    "n_bins": "Bins",
+    "n_pulses": "Pulses sent",
+    "variable": "Variable",
+}
+THEME = {
+    mode: {
+        "palette": {"primary": {"main": main}, "background": {"default": page, "paper": paper}},
+        "typography": {"fontSize": 13},
+        "components": {
+            "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": bar, "color": "#ffffff"}}},
+            "MuiToolbar": {"styleOverrides": {"root": {"minHeight": "48px !important"}}},
+        },
+    }
+    for mode, main, bar, page, paper in (
+        ("light", "#0b6e85", "#0b566b", "#ffffff", LIGHT.paper),
+        ("dark", "#4fb3cb", "#0c3a48", "#0f141a", DARK.paper),
+    )
+}
+
+# One screen on a laptop: image over cloud on the left, the pixel's plots on the right. Below
+# 900 px the parts follow each other.
+BOARD = """
+:host { display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
+  gap: 10px; height: max(560px, calc(100vh - 162px)) !important; }
+@media (max-width: 900px) {
+  :host { display: flex !important; flex: none !important; flex-direction: column;
+    height: auto !important; }
+}
+"""
+COLUMN = """
+:host { display: flex !important; flex-direction: column; gap: 8px; height: 100%; min-height: 0; }
+@media (max-width: 900px) { :host { height: auto !important; flex: none !important; } }
+"""
+CARD = """
+:host { flex: 1 1 0 !important; min-height: 0; overflow: hidden; border-radius: 8px;
+  border: 1px solid var(--mui-palette-divider, #d5dbe2);
+  background: var(--mui-palette-background-paper, #fff); }
+@media (max-width: 900px) { :host { flex: none !important; height: 330px !important; } }
+"""
+
+
+class Page(pmui.Page):
+    """The template, but for two habits that do not suit this page.
+
+    It would restyle the plots, whose sizes and colours are those of `app.theme`; and it would draw
+    itself anew twice for every message, to show for a moment that the server is busy.
+    """
+
+    def __init__(self, **params: Any) -> None:
+        super().__init__(**params)
+        with edit_readonly(self):
+            self.busy = False
+
+    def get_root(self, doc: Any = None, comm: Any = None, preprocess: bool = True) -> Any:
+        """The page's model, told which parts of Bokeh's plots not to restyle."""
+        root = super().get_root(doc, comm, preprocess)
+        root.data._custom_theme = list(SIZES)
+        return root
+
+
+def build_page(sources: Mapping[str, Source]) -> pmui.Page:
+    """A new page with a session of its own."""
+    return Layout(sources).page
+
+
+class Layout:
+    """Widgets around one session."""
+
+    def __init__(self, sources: Mapping[str, Source]) -> None:
+        session = self.session = Session(sources)
+        state = session.state
+        self._uploads: list[TemporaryDirectory[str]] = []
+        self._alert = pmui.Alert("", severity="warning", visible=False, sizing_mode="stretch_width")
+        self._provenance = pmui.Typography("", variant="caption", sizing_mode="stretch_width")
+        self._progress = pmui.LinearProgress(
+            visible=False, variant="indeterminate", sizing_mode="stretch_width", margin=0
+        )
+        self._source = _select(
+            "Scene or capture",
+            self._titles(),
+            state.source,
+            "A built-in scene to simulate, or a capture from a file.",
+        )
+        self._file = pmui.FileInput(
+            label="Open a capture file",
+            accept=",".join(READERS),
+            max_file_size=MAX_UPLOAD_BYTES,
+            variant="outlined",
+            size="small",
+            sizing_mode="stretch_width",
+            margin=(4, 8),
+        )
+        self._light = SettingsPanel(state.light, lambda new: state.param.update(light=new))
+        self._viewing = SettingsPanel(state.viewing, lambda new: state.param.update(viewing=new))
+        self._tracking = SettingsPanel(state.tracking, self._tracking_changed)
+        self._preset = _select(
+            "Preset",
+            [*PRESETS, CUSTOM],
+            "recommended",
+            "recommended: the best on random depths. as printed: the paper's text, literally.",
+        )
+        self._reading = {
+            name: pmui.TextInput(
+                label=label,
+                placeholder="guess",
+                size="small",
+                sizing_mode="stretch_width",
+                margin=(6, 8, 2, 8),
+            )
+            for name, label in READING_LABELS.items()
+        }
+        self.page = self._build()
+        self._announce(session.answer)
+        self._listen()
+
+    def _listen(self) -> None:
+        session = self.session
+        session.announce, session.complain = self._announce, self._complain
+        session.waiting = lambda is_waiting: self._progress.param.update(visible=is_waiting)
+        self._source.param.watch(lambda event: self._go_to(event.new), "value")
+        self._file.param.watch(lambda event: self._upload(event.new), "value")
+        self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
+        self.page.param.watch(lambda event: session.paint(event.new), "dark_theme")
+        if session.is_served:
+            # On a phone the controls would cover what they control.
+            pn.state.onload(lambda: self.page.param.update(sidebar_open=not session.figures.narrow))
+            pn.state.on_session_destroyed(lambda _: self._forget_uploads())
+            pn.config.exception_handler = session.fail  # of this session alone
+
+    def _titles(self) -> dict[str, str]:
+        """Key of each source by its title; of two files of one name the second is told apart."""
+        titles: dict[str, str] = {}
+        for key, source in self.session.sources.items():
+            again = sum(title.startswith(source.title) for title in titles)
+            titles[f"{source.title} ({again + 1})" if source.title in titles else source.title] = (
+                key
+            )
+        return titles
+
+    # What the session tells the page
+
+    def _complain(self, sentence: str) -> None:
+        self._alert.param.update(object=sentence, visible=bool(sentence))
+
+    def _announce(self, answer: Answer) -> None:
+        is_scene = answer.request.source.is_scene
+        self._source.value = self.session.state.source
+        self._light_card.visible, self._reading_card.visible = is_scene, not is_scene
+        self._provenance.object = words.provenance(answer)
+        self._viewing.show(self.session.state.viewing)
+        own = self.session.own_field_of_view_deg
+        self._viewing.controls["field_of_view_deg"].initial = own
+        self._tracking.controls["t_n"].high = max(answer.capture.acquisition.n_bins - 1, 1)
+
+    # What the user does
+
+    def _go_to(self, key: str) -> None:
+        if key != self.session.state.source:
+            for field in self._reading.values():
+                field.value = ""
+            self.session.state.param.update(source=key, reading=Reading())
+
+    def _tracking_changed(self, settings: TrackingParameters) -> None:
+        names = [name for name, preset in PRESETS.items() if preset == settings]
+        self._preset.value = names[0] if names else CUSTOM
+        self.session.state.tracking = settings
+
+    def _preset_changed(self, name: str) -> None:
+        if name in PRESETS:
+            self._tracking.show(PRESETS[name])
+            self.session.state.tracking = PRESETS[name]
+
+    def _upload(self, content: bytes | None) -> None:
+        if not content:
+            return
+        folder = TemporaryDirectory(prefix="firstphoton-")
+        self._uploads.append(folder)
+        # A name from outside: only its last part, and only harmless letters of that.
+        name = re.sub(r"[^\w.-]+", "_", Path(self._file.filename).name)[-80:].lstrip(".")
+        path = Path(folder.name) / (name or "upload")
+        path.write_bytes(content)
+        key = f"file {len(self.session.sources)}"
+        self.session.sources[key] = file_source(path)
+        self._source.options = self._titles()
+        self._source.value = key
+
+    def _read_again(self) -> None:
+        try:
+            self.session.state.reading = Reading.from_text(
+                {name: field.value for name, field in self._reading.items()}
+            )
+        except ValueError as error:
+            self._complain(str(error))
+
+    def _forget_uploads(self) -> None:
+        for folder in self._uploads:
+            folder.cleanup()
+
+    # Where everything stands
+
+    def _build(self) -> Page:
+        main = pn.Column(
+            self._progress,
+            self.session.figures,
+            self._alert,
+            self._board(),
+            self._provenance,
+            sizing_mode="stretch_both",
+            margin=(4, 12),
+        )
+        return Page(
+            title="firstphoton",
+            sidebar=self._sidebar(),
+            main=[main],
+            sidebar_width=330,
+            theme_config=THEME,
+            meta=Meta(title="firstphoton", description=words.ONE_LINE),
+        )
+
+    def _sidebar(self) -> list[Any]:
+        session = self.session
+        read_again = pmui.Button(label="Read again", size="small", margin=(6, 8))
+        read_again.on_click(lambda _: self._read_again())
+        self._light_card = _part("Light and recording", self._light.layout)
+        self._reading_card = _part("How to read the file", *self._reading.values(), read_again)
+        difference = pmui.Switch.from_param(
+            session.state.param.difference, label="First difference", size="small", margin=(0, 8)
+        )
+        cloud_file = pmui.FileDownload(
+            callback=session.cloud_file,
+            filename="firstphoton_cloud.ply",
+            label="Cloud as PLY",
+            variant="outlined",
+            size="small",
+            margin=(6, 8),
+        )
+        return [
+            self._source,
+            self._file,
+            self._light_card,
+            self._reading_card,
+            _part("Tracking differentiator", self._preset, self._tracking.layout),
+            _part("View", self._viewing.layout, difference, cloud_file),
+            _part("What is this?", pmui.Typography(words.EXPLANATION, margin=8), is_open=False),
+        ]
+
+    def _board(self) -> pn.Column:
+        session, state = self.session, self.session.state
+        image_kind = _choice("What the image shows", state.param.image)
+        cloud_color = _choice("What the cloud is coloured by", state.param.cloud_color)
+        left = (_card(image_kind, session.image_keys), _card(cloud_color, session.cloud))
+        right = (session.numbers, *map(_card, session.signals.panes))
+        columns = (
+            pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
+            for content in (left, right)
+        )
+        return pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both")
+
+
+def _select(label: str, options: Any, value: str, help: str) -> pmui.Select:
+    return pmui.Select(
+        label=label,
+        options=options,
+        value=value,
+        description=help,
+        size="small",
+        sizing_mode="stretch_width",
+        margin=(8, 8, 4, 8),
+    )
+
+
+def _choice(help: str, parameter: Any) -> pmui.RadioButtonGroup:
+    return pmui.RadioButtonGroup.from_param(
+        parameter, label="", description=help, size="small", margin=(4, 6, 0, 6)
+    )
+
+
+def _part(title: str, *content: Any, is_open: bool = True) -> pmui.Card:
+    """A part of the sidebar that folds."""
+    return pmui.Card(
+        *content,
+        title=title,
+        title_variant="subtitle2",
+        collapsed=not is_open,
+        variant="outlined",
+        sizing_mode="stretch_width",
+        margin=(4, 6),
+    )
+
+
+def _card(*content: Any) -> pn.Column:
+    return pn.Column(*content, stylesheets=[CARD], sizing_mode="stretch_both", margin=0)

@@ -1,0 +1,236 @@
+"""One user's session: connects what is chosen, what is computed and what is shown."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from io import BytesIO
+
+import numpy as np
+import panel as pn
+import param
+
+from app import words
+from app.cloud import PointCloud, export_bytes, point_cloud
+from app.controls import Facts, PixelKeys
+from app.jobs import LatestWins
+from app.looks import color_values, image_of, shown
+from app.state import CLOUD_COLORS, IMAGES, NEED_TRUTH, State
+from app.store import Answer, Request, Source, compute, inspect, is_wrong
+from app.theme import WRONG_COLOR, palette
+from app.views import ImageView, SignalPlots
+
+log = logging.getLogger(__name__)
+
+WAIT_MS = 200
+"""What takes longer than this is shown to be under way."""
+
+REST_MS = 60
+"""Image and cloud are drawn this much after the pixel's plots, which are what the eye follows."""
+
+
+class Session:
+    """State, answer and views of one page.
+
+    Parameters
+    ----------
+    sources : mapping of str to Source
+        What can be looked at; copied, so that an upload belongs to this session alone.
+
+    Attributes
+    ----------
+    own_field_of_view_deg : float
+        The field of view that suits the present capture.
+    announce : callable
+        Called with each new answer, after its plots have been drawn.
+    complain : callable
+        Called with a sentence when something failed, and with an empty one when it works again.
+    waiting : callable
+        Called with True when an answer takes long, and with False when it is there.
+    """
+
+    def __init__(self, sources: Mapping[str, Source]) -> None:
+        self.sources = dict(sources)
+        self.state = State(source=next(iter(sources)))
+        self.signals = SignalPlots()
+        self.image = ImageView(self._choose_pixel)
+        self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
+        self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
+        self.figures = Facts(timed=True, sizing_mode="stretch_width")
+        self.numbers = Facts(sizing_mode="stretch_width", margin=0)
+        self.announce: Callable[[Answer], None] = lambda answer: None
+        self.complain: Callable[[str], None] = lambda sentence: None
+        self.waiting: Callable[[bool], None] = lambda is_waiting: None
+        self._page = pn.state.curdoc
+        self._jobs: LatestWins[Answer] = LatestWins(self._on_page)
+        self._rest_is_due = self._unanswered = False
+        self.answer = compute(self._request(), None)
+        self.paint(dark=False)
+        self._show(self.answer, first=True)
+        self._watch()
+
+    @property
+    def is_served(self) -> bool:
+        """Whether there is a browser on the other side."""
+        return self._page is not None and self._page.session_context is not None
+
+    def _watch(self) -> None:
+        watch = self.state.param.watch
+        watch(lambda *_: self._ask(), ["source", "light", "reading", "tracking"])
+        watch(lambda *_: self._draw_pixel(), ["pixel", "difference"])
+        watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
+        self.image_keys.param.watch(lambda event: self._choose_pixel(*event.new), "pixel")
+        self.cloud.param.watch(lambda event: self._pick(event.new), "selected")
+
+    def paint(self, dark: bool) -> None:
+        """Follow the page from light to dark and back."""
+        with pn.io.hold(self._page):
+            self.signals.paint(palette(dark))
+            self.image.paint(palette(dark))
+            self.cloud.dark = dark
+
+    def _request(self) -> Request:
+        state = self.state
+        return Request(self.sources[state.source], state.light, state.reading, state.tracking)
+
+    def _ask(self) -> None:
+        work = partial(compute, self._request(), self.answer)
+        self._jobs.submit(work, self._show, self.fail)
+        self._unanswered = True
+        if self.is_served:
+            self._page.add_timeout_callback(self._admit_waiting, WAIT_MS)
+
+    def _admit_waiting(self) -> None:
+        if self._unanswered:
+            self.waiting(True)
+
+    def _settle(self, answer: Answer) -> None:
+        self._unanswered = False
+        self.waiting(False)
+        self.announce(answer)
+
+    def _on_page(self, act: Callable[[], None]) -> None:
+        if self.is_served:
+            self._page.add_next_tick_callback(act)
+        else:
+            act()
+
+    def fail(self, error: Exception) -> None:
+        """Tell the page of an error, and stay usable."""
+        log.warning("a request failed", exc_info=error)
+        # What cannot be opened is left again; other settings stay, for the user to mend.
+        with param.discard_events(self.state):
+            self.state.source = self._key(self.answer.request.source)
+        self._settle(self.answer)
+        self.complain(words.failure(error))
+
+    def _key(self, source: Source) -> str:
+        return next(key for key, known in self.sources.items() if known is source)
+
+    def _show(self, answer: Answer, first: bool = False) -> None:
+        previous, self.answer = self.answer, answer
+        same_source = answer.request.source is previous.request.source
+        if first or not same_source or answer.capture.shape != previous.capture.shape:
+            self._enter(answer)
+        self.complain(words.lack(answer))
+        self._draw_pixel()
+        if first or not self.is_served:
+            self._draw_rest()
+        elif not self._rest_is_due:
+            self._rest_is_due = True
+            self._page.add_timeout_callback(self._draw_rest, REST_MS)
+        self._settle(answer)
+
+    def _enter(self, answer: Answer) -> None:
+        """Come to a capture of another kind: its own pixel, field of view and camera."""
+        rows, cols = answer.capture.shape
+        self.image_keys.shape = (rows, cols)
+        self.image.enter(rows, cols)
+        has_truth = answer.capture.truth_range_m is not None
+        for name, kinds in (("image", IMAGES), ("cloud_color", CLOUD_COLORS)):
+            possible = [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
+            self.state.param[name].objects = possible
+            if getattr(self.state, name) not in possible:
+                setattr(self.state, name, possible[0])
+        self.own_field_of_view_deg = float(f"{_field_of_view_deg(answer):.3g}")
+        viewing = replace(self.state.viewing, field_of_view_deg=self.own_field_of_view_deg)
+        self.state.param.update(pixel=_pixel_to_start_with(answer), viewing=viewing)
+
+    def _choose_pixel(self, row: int, col: int) -> None:
+        rows, cols = self.answer.capture.shape
+        self.state.pixel = (min(max(row, 0), rows - 1), min(max(col, 0), cols - 1))
+
+    def _pick(self, index: int) -> None:
+        if index >= 0:
+            self._choose_pixel(*divmod(index, self.answer.capture.shape[1]))
+
+    def _draw_pixel(self) -> None:
+        """The pixel's plots and numbers, and the frames that mark it."""
+        row, col = self.state.pixel
+        pixel = inspect(self.answer, row, col)
+        numbers = words.pixel_numbers(self.answer, pixel)
+        with pn.io.hold(self._page):
+            self.signals.update(pixel, self.answer.capture.acquisition, self.state.difference)
+            self.image.mark(row, col)
+            self.image_keys.pixel = (row, col)
+            self.cloud.selected = row * self.answer.capture.shape[1] + col
+            self.numbers.facts = numbers
+            self.figures.facts = words.figure_strip(self.answer)
+
+    def _draw_rest(self) -> None:
+        """The image and the cloud."""
+        self._rest_is_due = False
+        answer, state = self.answer, self.state
+        with pn.io.hold(self._page):
+            self.image.update(*image_of(answer, state.image, state.viewing.least_confidence))
+            self._draw_cloud()
+
+    def _draw_cloud(self) -> None:
+        answer, state = self.answer, self.state
+        visible = shown(answer, state.viewing.least_confidence)
+        values, look = color_values(answer, state.cloud_color)
+        wrong = is_wrong(answer)
+        angle_rad = np.radians(state.viewing.field_of_view_deg) / answer.capture.shape[1]
+        range_m = np.where(visible, answer.run.image.range_m, np.nan)
+        self._cloud = point_cloud(range_m, angle_rad, confidence=answer.run.image.confidence)
+        self._cloud["rgb"] = look.rgb(values[visible])
+        crosses = None if wrong is None else wrong[visible]
+        self.cloud.draw(self._cloud, self._cloud["rgb"], crosses, scene_id=self._scene_id())
+        self.cloud.caption = words.cloud_caption(
+            answer, self._cloud.n_points, None if crosses is None else int(crosses.sum())
+        )
+
+    def cloud_file(self) -> BytesIO:
+        """The cloud as it is shown, as a PLY file."""
+        return BytesIO(export_bytes(self._cloud, ".ply"))
+
+    def _scene_id(self) -> str:
+        """Changes when the camera should start anew."""
+        state, shape = self.state, self.answer.capture.shape
+        return f"{state.source} {shape} {state.viewing.field_of_view_deg}"
+
+
+def _pixel_to_start_with(answer: Answer) -> tuple[int, int]:
+    """The answered pixel nearest to the centre, among those that have a target if that is known."""
+    truth_m = answer.capture.truth_range_m
+    image = answer.run.image
+    good = image.confidence >= 0.9 if truth_m is None else np.isfinite(truth_m)
+    rows, cols = answer.capture.shape
+    row, col = np.nonzero(good) if good.any() else np.nonzero(np.ones((rows, cols), bool))
+    nearest = np.argmin((row - rows / 2) ** 2 + (col - cols / 2) ** 2)
+    return int(row[nearest]), int(col[nearest])
+
+
+def _field_of_view_deg(answer: Answer) -> float:
+    """Width of the image as the capture states it; else so that it is about as wide as deep."""
+    cols = answer.capture.shape[1]
+    angle_rad = answer.capture.acquisition.pixel_angle_rad
+    if angle_rad is None:
+        image = answer.run.image
+        range_m = image.range_m[image.confidence >= 0.9]
+        range_m = range_m if range_m.size else answer.capture.acquisition.bin_to_range_m([0.0, 1.0])
+        low, high = np.percentile(range_m, [5, 95])
+        return float(np.clip(np.degrees((high - low) / max(high, 1e-3)), 0.001, 120.0))
+    return float(np.degrees(angle_rad * cols))

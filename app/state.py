@@ -1,0 +1,121 @@
+"""What a session's user has chosen: parameters only, each already a frozen object of `core`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import param
+
+from core import Acquisition, Flux, TrackingParameters
+from core.checks import require
+from core.parameters import Number, check_fields, parameter
+
+
+@dataclass(frozen=True)
+class Light:
+    """How a built-in scene is lit and recorded."""
+
+    sbr: float = parameter(
+        0.06,
+        Number("SBR", 0.01, 10.0, log=True, least=0.0, open_below=True),
+        "Signal over background, both in photons per pulse over the whole gate. Daylight: < 0.1.",
+    )
+    ppp: float = parameter(
+        0.1041,
+        Number("PPP", 0.001, 10.0, log=True, least=0.0, unit="photons per pulse"),
+        "Signal photons detected per pulse, were the detector always armed.",
+    )
+    n_pulses: int = parameter(
+        1000,
+        Number("Pulses", 10, 100_000, log=True, whole=True, least=1),
+        "Pulses sent for each pixel: more make the histogram smoother, and take longer to record.",
+    )
+    seed: int = parameter(
+        0,
+        Number("Seed", 0, 999, whole=True, least=0),
+        "Which throw of the dice: the same seed gives the same capture again.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @property
+    def flux(self) -> Flux:
+        """Signal and background."""
+        return Flux(self.ppp, self.sbr)
+
+    def acquisition(self, of_scene: Acquisition) -> Acquisition:
+        """The scene's instrument setting, with this number of pulses."""
+        return replace(of_scene, n_pulses=self.n_pulses)
+
+
+@dataclass(frozen=True)
+class Viewing:
+    """How the answer is shown; changes no figure."""
+
+    least_confidence: float = parameter(
+        0.9,
+        Number("Show from confidence", 0.0, 1.0, least=0.0),
+        "Answers below are hidden in image and cloud, not in the figures. 0 shows what the "
+        "estimator makes of pure noise, too.",
+    )
+    field_of_view_deg: float = parameter(
+        5.0,
+        Number("Field of view", 0.001, 120.0, log=True, unit="degrees", least=0.0, open_below=True),
+        "Width of the image as seen from the sensor: sets how wide the cloud is, in metres.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a file is to be read; None lets the reader guess."""
+
+    time_unit_s: float | None = None
+    bin_width_s: float | None = None
+    gate_delay_s: float | None = None
+    n_bins: int | None = None
+    n_pulses: int | None = None
+    variable: str | None = None
+
+    @classmethod
+    def from_text(cls, typed: Mapping[str, str]) -> Reading:
+        """What was typed into one field each; an empty field leaves the reader to guess.
+
+        Raises
+        ------
+        ValueError
+            If something that should be a number is not: names the field and the text.
+        """
+        values: dict[str, Any] = {}
+        for name, text in typed.items():
+            convert = str if name == "variable" else int if name.startswith("n_") else float
+            try:
+                values[name] = convert(text.strip()) if text.strip() else None
+            except ValueError:
+                kind = "a whole number" if convert is int else "a number such as 1e-9"
+                require(name, text, False, f"{kind}, or nothing to let the reader guess")
+        return cls(**values)
+
+
+IMAGES = ("Estimate", "Truth", "Error", "Counts")
+CLOUD_COLORS = ("Range", "Error", "Counts")
+NEED_TRUTH = ("Truth", "Error")
+
+
+class State(param.Parameterized):
+    """Everything a user can choose."""
+
+    source = param.String(default="car", doc="Key of the catalogue.")
+    light = param.ClassSelector(class_=Light, default=Light())
+    reading = param.ClassSelector(class_=Reading, default=Reading())
+    tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
+    pixel = param.NumericTuple(default=(31, 24), length=2, doc="Row and column on show.")
+    image = param.Selector(default="Estimate", objects=list(IMAGES))
+    cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
+    viewing = param.ClassSelector(class_=Viewing, default=Viewing())
+    difference = param.Boolean(default=False, doc="Whether the first difference is drawn.")

@@ -1,0 +1,186 @@
+"""A session's capture and answer: runs `core`, holds read-only results, knows no widget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from app.state import Light, Reading
+from core import (
+    ESTIMATORS,
+    Capture,
+    Run,
+    Scene,
+    Signals,
+    TrackingParameters,
+    first_difference,
+    rate_per_bin,
+    read_capture,
+    run,
+    scenes,
+    simulate,
+    tracking_signals,
+    trigger_probability,
+)
+
+ASSETS = Path(__file__).resolve().parent.parent / "assets"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Something to look at: a built-in scene to simulate, or a file to read."""
+
+    title: str
+    load: Callable[[Light, Reading], Capture]
+    is_scene: bool
+
+
+def scene_source(title: str, name: str, **arguments: Any) -> Source:
+    """A built-in scene of `core.scenes`."""
+
+    @cache
+    def scene() -> Scene:
+        return scenes[name](**arguments)
+
+    def load(light: Light, _reading: Reading) -> Capture:
+        return simulate(
+            scene(), light.acquisition(scene().acquisition), light.flux, seed=light.seed
+        )
+
+    return Source(title, load, is_scene=True)
+
+
+def file_source(path: Path, title: str | None = None) -> Source:
+    """A capture file."""
+    return Source(
+        title or path.name,
+        lambda _light, reading: read_capture(path, **asdict(reading)),
+        is_scene=False,
+    )
+
+
+def built_in_sources() -> dict[str, Source]:
+    """What every session starts with."""
+    return {
+        "car": scene_source("Car at 50 m", "car"),
+        "car_256": scene_source("Car at 50 m, 256 × 256", "car", size=256),
+        "building": scene_source("Building at 830–860 m", "building"),
+        "staircase": scene_source("Staircase through the gate", "staircase"),
+        "uniform": scene_source("Random depths", "uniform"),
+        "sample": file_source(ASSETS / "sample_capture.npz", "Sample capture (file)"),
+    }
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be computed."""
+
+    source: Source
+    light: Light
+    reading: Reading
+    tracking: TrackingParameters
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was computed, and from what."""
+
+    request: Request
+    run: Run
+    capture_s: float
+    """Seconds spent simulating or reading."""
+
+    @property
+    def capture(self) -> Capture:
+        """The capture that was ranged."""
+        return self.run.capture
+
+
+def compute(request: Request, previous: Answer | None) -> Answer:
+    """Answer a request; what the previous answer already holds is not computed again."""
+    if previous is not None and _same_capture(request, previous.request):
+        capture, capture_s = previous.capture, previous.capture_s
+    else:
+        started = perf_counter()
+        capture = request.source.load(request.light, request.reading)
+        capture_s = perf_counter() - started
+    return Answer(request, run(capture, "tracking", request.tracking), capture_s)
+
+
+def _same_capture(one: Request, other: Request) -> bool:
+    return (one.source, one.light, one.reading) == (other.source, other.light, other.reading)
+
+
+@dataclass(frozen=True)
+class Pixel:
+    """Everything about one pixel; bins are fractional, NaN where there is nothing."""
+
+    row: int
+    col: int
+    signals: Signals
+    expected: np.ndarray[Any, Any] | None
+    """The model's expected counts, where the truth is known."""
+    difference: np.ndarray[Any, Any]
+    truth_bin: float
+    answer_bin: float
+    range_m: float
+    truth_m: float
+    confidence: float
+    counts: int
+
+
+def inspect(answer: Answer, row: int, col: int) -> Pixel:
+    """Every stage of the estimator for one pixel of an answer."""
+    capture, image = answer.capture, answer.run.image
+    acquisition, histogram = capture.acquisition, capture.cube[row, col]
+    truth_m = np.nan if capture.truth_range_m is None else float(capture.truth_range_m[row, col])
+    expected = _expected_counts(capture, row, col)
+    return Pixel(
+        row,
+        col,
+        tracking_signals(histogram, answer.request.tracking, acquisition.n_pulses),
+        expected,
+        first_difference(histogram),
+        float(acquisition.range_m_to_bin(truth_m)),
+        float(image.bin[row, col]),
+        float(image.range_m[row, col]),
+        truth_m,
+        float(image.confidence[row, col]),
+        int(capture.counts[row, col]),
+    )
+
+
+def _expected_counts(capture: Capture, row: int, col: int) -> np.ndarray[Any, Any] | None:
+    acquisition = capture.acquisition
+    if (
+        capture.truth_range_m is None
+        or capture.signal is None
+        or capture.background is None
+        or acquisition.n_pulses is None
+    ):
+        return None
+    onset_bin = acquisition.range_m_to_bin(capture.truth_range_m[row, col])
+    rate = rate_per_bin(
+        onset_bin, capture.signal[row, col], capture.background, capture.pulse, acquisition
+    )
+    return trigger_probability(rate) * acquisition.n_pulses
+
+
+def is_wrong(answer: Answer, tolerance_bins: float = 3.0) -> np.ndarray[Any, Any] | None:
+    """Answers off by more than `tolerance_bins`, or without a target; None without truth."""
+    truth_m, image = answer.capture.truth_range_m, answer.run.image
+    if truth_m is None:
+        return None
+    tolerance_m = tolerance_bins * answer.capture.acquisition.bin_length_m
+    return np.asarray(image.valid & ~(np.abs(image.range_m - truth_m) <= tolerance_m))
+
+
+def lag_bins(answer: Answer) -> float:
+    """The estimator's lag that was taken out of every range of the answer."""
+    return ESTIMATORS["tracking"].lag_bins(answer.capture, answer.request.tracking)

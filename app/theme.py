@@ -1,0 +1,108 @@
+"""Colours and sizes, once for light and once for dark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import colorcet
+
+FONT = "Roboto, system-ui, sans-serif"
+
+RANGE_COLORS: list[str] = colorcet.bgyw[:-12]  # perceptually uniform; its white end would vanish
+ERROR_COLORS: list[str] = colorcet.diverging_bwr_20_95_c54
+COUNT_COLORS: list[str] = colorcet.fire[30:-20]
+WRONG_COLOR = "#e8206a"
+OUTSIDE_COLOR = "#8d949c"
+"""Of answers beyond both ends of a range image's colour scale."""
+
+
+@dataclass(frozen=True)
+class Palette:
+    """Colours of one mode; the signals' hues are those of Okabe and Ito, told apart by everyone."""
+
+    text: str
+    muted: str
+    grid: str
+    paper: str
+    raw: str
+    expected: str
+    small: str
+    large: str
+    residual: str
+    enhanced: str
+    weight: str
+    truth: str
+    answer: str
+
+
+LIGHT = Palette(
+    text="#1c2430",
+    muted="#5a6675",
+    grid="#e3e8ee",
+    paper="#ffffff",
+    raw="#b9c3cf",
+    expected="#1c2430",
+    small="#0072b2",
+    large="#d55e00",
+    residual="#009e73",
+    enhanced="#8e4585",
+    weight="#7a8696",
+    truth="#009e73",
+    answer="#c2185b",
+)
+DARK = Palette(
+    text="#e8edf3",
+    muted="#a3afbd",
+    grid="#2c3642",
+    paper="#161c24",
+    raw="#4d5a69",
+    expected="#e8edf3",
+    small="#56b4e9",
+    large="#ff9e4a",
+    residual="#2fd6a5",
+    enhanced="#e39bd0",
+    weight="#8996a6",
+    truth="#2fd6a5",
+    answer="#ff6fa3",
+)
+
+
+def palette(dark: bool) -> Palette:
+    """The colours of the mode."""
+    return DARK if dark else LIGHT
+
+
+# Sizes of all plots, by Bokeh model.
+SIZES: dict[str, dict[str, object]] = {
+    "Title": {"text_font_size": "12px", "text_font": FONT, "standoff": 2},
+    "Axis": {
+        "axis_label_text_font": FONT,
+        "axis_label_text_font_size": "11px",
+        "axis_label_text_font_style": "normal",
+        "axis_label_standoff": 1,
+        "major_label_text_font": FONT,
+        "major_label_text_font_size": "11px",
+        "major_tick_out": 3,
+        "minor_tick_line_color": None,
+    },
+    "Legend": {
+        "label_text_font": FONT,
+        "label_text_font_size": "11px",
+        "label_standoff": 4,
+        "label_height": 13,
+        "glyph_height": 13,
+        "glyph_width": 16,
+        "border_line_color": None,
+        "margin": 2,
+        "padding": 1,
+        "spacing": 7,
+    },
+    "ColorBar": {
+        "background_fill_color": None,
+        "title_text_font": FONT,
+        "title_text_font_size": "11px",
+        "title_text_font_style": "normal",
+        "major_label_text_font": FONT,
+        "major_label_text_font_size": "11px",
+    },
+}

@@ -1,0 +1,276 @@
+"""Thin viewers: a rendered plot, and how new values get into it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import bokeh.models
+import holoviews as hv
+import numpy as np
+import panel as pn
+from bokeh.events import DoubleTap, Tap
+from bokeh.models import (
+    BasicTicker,
+    ColorBar,
+    CustomJS,
+    CustomJSTickFormatter,
+    DataRange1d,
+    LinearAxis,
+    Range1d,
+)
+from numpy.typing import ArrayLike, NDArray
+
+from app import plots
+from app.looks import Look
+from app.store import Pixel
+from app.theme import LIGHT, SIZES, Palette
+from core import Acquisition
+
+Array = NDArray[Any]
+
+
+class Plot:
+    """A HoloViews overlay, rendered once; new values go into the sources of its layers.
+
+    Parameters
+    ----------
+    overlay : hv.Overlay
+    layers : sequence of str
+        A palette's name for each element of the overlay, in their order.
+    """
+
+    def __init__(self, overlay: hv.Overlay, layers: Sequence[str]) -> None:
+        rendered = hv.renderer("bokeh").get_plot(overlay)
+        self.figure = rendered.state
+        handles = [each.handles for each in rendered.subplots.values()]
+        self.layers = dict(zip(layers, handles, strict=True))
+        reset = CustomJS(args={"figure": self.figure}, code="figure.reset.emit()")
+        self.figure.js_on_event(DoubleTap, reset)
+
+    def source(self, layer: str) -> Any:
+        """The data source of a layer."""
+        return self.layers[layer]["source"]
+
+    def write(self, layer: str, **columns: ArrayLike) -> None:
+        """Replace columns of a layer; only what changed travels, as float32."""
+        data = self.source(layer).data
+        for name, values in columns.items():
+            new = np.asarray(values, np.float32)
+            if not np.array_equal(data[name], new, equal_nan=True):
+                data[name] = new
+
+    def show(self, layer: str, visible: bool) -> None:
+        """Draw a layer, and its line in the legend, or leave them out."""
+        renderer = self.layers[layer]["glyph_renderer"]
+        if renderer.visible == visible:
+            return
+        renderer.visible = visible
+        for legend in self.figure.legend:
+            for item in legend.items:
+                if renderer in item.renderers:
+                    item.visible = visible
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        paint_frame(self.figure, colors)
+        for layer, handles in self.layers.items():
+            glyph, color = handles["glyph"], getattr(colors, layer)
+            glyph.line_color = color
+            if hasattr(glyph, "fill_color"):
+                glyph.fill_color = color
+
+
+def paint_frame(figure: Any, colors: Palette) -> None:
+    """Colours of all that surrounds the data."""
+    figure.title.text_color = colors.text
+    for axis in figure.axis:
+        axis.axis_label_text_color = axis.major_label_text_color = colors.muted
+        axis.axis_line_color = axis.major_tick_line_color = colors.muted
+    figure.grid.grid_line_color = colors.grid
+    for legend in figure.legend:
+        legend.label_text_color = colors.text
+        legend.background_fill_color = legend.inactive_fill_color = colors.paper
+    for bar in figure.select(ColorBar):
+        bar.title_text_color = bar.major_label_text_color = colors.muted
+
+
+class SignalPlots:
+    """The pixel's three plots, linked on the bin axis, with metres along the top of the first."""
+
+    def __init__(self) -> None:
+        one = np.zeros(1)
+        self.histogram = Plot(plots.histogram(one, one, one, one, LIGHT), plots.HISTOGRAM_LAYERS)
+        self.residual = Plot(plots.residual(one, one, LIGHT), plots.RESIDUAL_LAYERS)
+        self.enhanced = Plot(plots.enhanced(one, one, LIGHT), plots.ENHANCED_LAYERS)
+        self._acquisition: Acquisition | None = None
+        self._bins = Range1d(0, 1)
+        self._metres = CustomJSTickFormatter(
+            args={"start": 0.0, "step": 1.0}, code="return (start + step * tick).toFixed(1)"
+        )
+        for plot in self._plots:
+            figure = plot.figure
+            figure.x_range, figure.y_range = self._bins, Range1d(0, 1)
+            figure.min_border_left, figure.min_border_right = 46, 14
+            figure.min_border_top = figure.min_border_bottom = 4
+            figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
+        metres = LinearAxis(formatter=self._metres, axis_label="Range (m)")
+        self.histogram.figure.add_layout(metres, "above")
+
+    @property
+    def panes(self) -> list[pn.pane.Bokeh]:
+        """The three plots, from top to bottom."""
+        return [_pane(plot) for plot in self._plots]
+
+    @property
+    def _plots(self) -> tuple[Plot, Plot, Plot]:
+        return self.histogram, self.residual, self.enhanced
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        for plot in self._plots:
+            plot.paint(colors)
+
+    def update(self, pixel: Pixel, acquisition: Acquisition, with_difference: bool) -> None:
+        """Show a pixel."""
+        if acquisition != self._acquisition:
+            self._follow(acquisition)
+        signals, nothing = pixel.signals, np.full(acquisition.n_bins, np.nan)
+        expected = nothing if pixel.expected is None else pixel.expected
+        self.histogram.write("raw", top=signals.raw)
+        self.histogram.write("expected", counts=expected)
+        self.histogram.write("small", counts=signals.small)
+        self.histogram.write("large", counts=signals.large)
+        self.histogram.show("expected", pixel.expected is not None)
+        self._frame(self.histogram, pixel, 0.0, signals.raw, signals.large, expected)
+
+        difference = pixel.difference if with_difference else nothing
+        self.residual.write("residual", residual=signals.residual)
+        self.residual.write("raw", residual=difference)
+        self.residual.show("raw", with_difference)
+        low = float(np.nanmin(difference)) if with_difference else 0.0
+        self._frame(self.residual, pixel, low, signals.residual, difference)
+
+        top = float(signals.enhanced.max()) or 1.0
+        weight = signals.weight * (0.8 * top / (signals.weight.max() or 1.0))
+        self.enhanced.write("enhanced", enhanced=signals.enhanced)
+        self.enhanced.write("weight", enhanced=weight)
+        self._frame(self.enhanced, pixel, 0.0, signals.enhanced, weight)
+
+    def _follow(self, acquisition: Acquisition) -> None:
+        """Lay out the axes for another gate."""
+        self._acquisition = acquisition
+        n_bins = acquisition.n_bins
+        self._bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
+        start, step = float(acquisition.bin_to_range_m(0)), acquisition.bin_length_m
+        self._metres.args = {"start": start, "step": step}
+        edges, centres = plots.edges(n_bins), plots.centres(n_bins)
+        empty = np.zeros(n_bins)
+        bars = {"left": edges[:-1], "right": edges[1:], "top": empty, "bottom": empty}
+        self.histogram.source("raw").data = bars
+        for plot, column, layers in (
+            (self.histogram, "counts", ("expected", "small", "large")),
+            (self.residual, "residual", ("raw", "residual")),
+            (self.enhanced, "enhanced", ("weight", "enhanced")),
+        ):
+            for layer in layers:
+                plot.source(layer).data = {"bin": centres, column: empty}
+
+    @staticmethod
+    def _frame(plot: Plot, pixel: Pixel, low: float, *curves: Array) -> None:
+        """Fit the vertical axis, and draw truth and answer from bottom to top."""
+        highest = max(float(np.nanmax(curve, initial=0.0)) for curve in curves)
+        vertical = plot.figure.y_range
+        end, start = _round_up(highest * 1.15), -_round_up(-low * 1.05)
+        if (start, end) != (vertical.start, vertical.end):
+            vertical.update(start=start, end=end, reset_start=start, reset_end=end)
+        (column,) = (name for name in plot.source("truth").data if name != "bin")
+        for layer, position in (("truth", pixel.truth_bin), ("answer", pixel.answer_bin)):
+            x, y = plots.marker_line(position, end)
+            plot.write(layer, **{"bin": x, column: y})
+            plot.show(layer, bool(np.isfinite(position)))
+
+
+def _pane(plot: Plot) -> pn.pane.Bokeh:
+    """A place that the plot fills."""
+    for model in plot.figure.references():
+        for kind, sizes in SIZES.items():
+            if isinstance(model, getattr(bokeh.models, kind)):
+                model.update(**sizes)
+    return pn.pane.Bokeh(plot.figure, sizing_mode="stretch_both", margin=0)
+
+
+def _round_up(value: float) -> float:
+    """The next of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten: an axis that rests."""
+    if value <= 0.0:
+        return 0.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(
+        step * power
+        for step in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 12)
+        if step * power >= value
+    )
+
+
+class ImageView:
+    """The image to navigate by; a tap chooses a pixel.
+
+    Parameters
+    ----------
+    tapped : callable
+        Called with the row and column of a tapped pixel.
+    """
+
+    def __init__(self, tapped: Callable[[int, int], None]) -> None:
+        self._plot = Plot(
+            plots.range_image(np.zeros((2, 2)), 0.0, 1.0), ("picture", "shadow", "frame")
+        )
+        self._shape = (0, 0)
+        self.figure = self._plot.figure
+        self.pane = _pane(self._plot)
+        self.figure.match_aspect = True
+        self.figure.x_range = DataRange1d(range_padding=0, renderers=[])
+        self.figure.y_range = DataRange1d(range_padding=0, flipped=True, renderers=[])
+        picture = self._plot.layers["picture"]
+        for ranges in (self.figure.x_range, self.figure.y_range):
+            ranges.renderers = [picture["glyph_renderer"]]
+        self._mapper = picture["color_mapper"]
+        (self._bar,) = self.figure.select(ColorBar)
+
+        def tap(event: Tap) -> None:
+            row, col = math.floor(event.y + 0.5), math.floor(event.x + 0.5)
+            if 0 <= row < self._shape[0] and 0 <= col < self._shape[1]:
+                tapped(row, col)
+
+        self.figure.on_event(Tap, tap)
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        paint_frame(self.figure, colors)
+
+    def enter(self, rows: int, cols: int) -> None:
+        """Make room for an image of another size."""
+        self._shape = (rows, cols)
+        blank = [np.full((rows, cols), np.nan, np.float32)]
+        corner = {"x": [-0.5], "y": [-0.5], "dw": [cols], "dh": [rows]}
+        self._plot.source("picture").data = {"image": blank, **corner}
+
+    def update(self, image: Array, look: Look) -> None:
+        """Show an image (row, col); NaN is left blank."""
+        self._plot.source("picture").data["image"] = [np.asarray(image, np.float32)]
+        self._mapper.update(
+            low=look.low,
+            high=look.high,
+            palette=look.colors,
+            low_color=look.outside,
+            high_color=look.outside,
+        )
+        self._bar.title = look.unit
+        self.figure.title.text = look.title
+
+    def mark(self, row: int, col: int) -> None:
+        """Frame a pixel."""
+        left, bottom, right, top = plots.pixel_frame(row, col)
+        for layer in ("shadow", "frame"):
+            self._plot.write(layer, left=[left], bottom=[bottom], right=[right], top=[top])

@@ -1,0 +1,109 @@
+"""The served app and a real browser, for tests and benchmarks."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO
+from urllib.request import urlopen
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+ROOT = Path(__file__).resolve().parent.parent
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+ARGUMENTS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+def browser_path() -> str | None:
+    """The machine's own browser; None leaves it to the one that Playwright has installed."""
+    named = os.environ.get("BROWSER_PATH")
+    return named or next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A running browser without a window; fails, and says so, where there is none."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=browser_path(), args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def serving(*captures: Path) -> Iterator[str]:
+    """The app in a process of its own, at the address that is yielded."""
+    port = _free_port()
+    command = [sys.executable, "-m", "app", "--port", str(port), *map(str, captures)]
+    # Into a file: a pipe that nobody reads would stop the server once it is full.
+    with (
+        TemporaryFile("w+") as log,
+        subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT) as server,
+    ):
+        try:
+            yield _when_up(f"http://127.0.0.1:{port}/", server, log)
+        finally:
+            server.terminate()
+
+
+def open_page(
+    browser: Browser,
+    address: str,
+    width: int = 1440,
+    height: int = 900,
+    prepare: str = "",
+    watch: Callable[[Page], None] = lambda page: None,
+) -> Page:
+    """A page of its own session, drawn and ready for input.
+
+    `prepare` is a script to run first, `watch` is shown the page before it loads anything.
+    """
+    context = browser.new_context(viewport={"width": width, "height": height})
+    page = context.new_page()
+    watch(page)
+    page.add_init_script(prepare)
+    page.goto(address)
+    page.locator("dl.timed div").first.wait_for()
+    page.locator(".stage canvas").wait_for()
+    page.wait_for_function("document.readyState === 'complete'")
+    return page
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _when_up(
+    address: str, server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 120.0
+) -> str:
+    """The address, once it answers; a first start compiles the kernels."""
+    until = time.monotonic() + limit_s
+    while time.monotonic() < until:
+        if server.poll() is not None:
+            log.seek(0)
+            raise RuntimeError(f"the app stopped at once:\n{log.read()}")
+        try:
+            urlopen(f"{address}favicon.ico", timeout=5).close()
+        except OSError:
+            time.sleep(0.2)
+        else:
+            return address
+    raise TimeoutError(f"the app did not answer at {address} within {limit_s:.0f} s")

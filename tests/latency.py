@@ -1,0 +1,127 @@
+"""From a user's hand to changed pixels, through a real browser: ``python -m tests.latency``.
+
+Each move presses an arrow key on a slider of the served app, at 64 × 64 pixels and 100 bins. The
+page itself keeps the time: of the key, of messages to and from the server, and of every stroke on a
+canvas. "Plots" are the pixel's three plots, "everything" includes the image and the 3D cloud, which
+are drawn after them on purpose.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass, fields
+
+import numpy as np
+from playwright.sync_api import Page
+
+from tests.browser import chromium, open_page, serving
+
+# Runs before the page's own scripts. Times are in milliseconds, `paints` one per canvas and stroke.
+STOPWATCH = """
+window.watch = { key: 0, sent: 0, received: 0, paints: [] };
+addEventListener("keydown", () => {
+  watch = { key: performance.now(), sent: 0, received: 0, paints: [] };
+}, true);
+const send = WebSocket.prototype.send;
+WebSocket.prototype.send = function (data) {
+  if (!watch.sent) watch.sent = performance.now();
+  return send.call(this, data);
+};
+const listen = Object.getOwnPropertyDescriptor(WebSocket.prototype, "onmessage");
+Object.defineProperty(WebSocket.prototype, "onmessage", {
+  set(handler) {
+    listen.set.call(this, (event) => {
+      if (event.data instanceof ArrayBuffer && !watch.received) watch.received = performance.now();
+      return handler(event);
+    });
+  },
+});
+const part = (canvas) => {
+  for (let node = canvas; node; node = node.parentNode ?? node.host) {
+    if (node.dataset?.part) return node.dataset.part;
+    if (node === document) return "plots";
+  }
+  return "none"; // drawn beside the page, as a step towards a picture on it
+};
+const observe = (prototype, names) => {
+  for (const name of names) {
+    const draw = prototype[name];
+    prototype[name] = function (...values) {
+      const result = draw.apply(this, values);
+      const place = this.drawArrays ? "cloud" : part(this.canvas);
+      if (place !== "none") watch.paints.push([performance.now(), place]);
+      return result;
+    };
+  }
+};
+const strokes = ["stroke", "fill", "fillRect", "drawImage", "fillText"];
+observe(CanvasRenderingContext2D.prototype, strokes);
+observe(WebGL2RenderingContext.prototype, ["drawArrays", "drawElements"]);
+"""
+
+
+@dataclass(frozen=True)
+class Move:
+    """Milliseconds from the key press to ..."""
+
+    server: float
+    """... the answer's arrival in the browser."""
+    plots: float
+    """... the last stroke of the pixel's plots."""
+    everything: float
+    """... the last stroke of image and cloud."""
+
+
+def moves(page: Page, label: str, count: int) -> list[Move]:
+    """Press the arrow keys on a slider, to and fro, and wait each time until all is drawn."""
+    slider = page.get_by_role("slider", name=label, exact=True)
+    slider.focus()
+    taken = []
+    for n in range(count):
+        slider.press("ArrowRight" if n // 10 % 2 else "ArrowLeft")
+        page.wait_for_timeout(500)
+        watch = page.evaluate("watch")
+        plots = max(at for at, part in watch["paints"] if part == "plots")
+        everything = max(at for at, _ in watch["paints"])
+        taken.append(
+            Move(
+                watch["received"] - watch["key"],
+                plots - watch["key"],
+                everything - watch["key"],
+            )
+        )
+    return taken
+
+
+def as_markdown(taken: dict[str, list[Move]]) -> str:
+    """Median and 95th percentile of each part, a row a slider."""
+    lines = [
+        "| slider | answer in the browser, ms (95 %) | plots painted | image and cloud painted |",
+        "|---|---|---|---|",
+    ]
+    for label, each in taken.items():
+        cells = []
+        for part in fields(Move):
+            times = [getattr(move, part.name) for move in each]
+            cells.append(f"{np.median(times):.0f} ({np.percentile(times, 95):.0f})")
+        lines.append(f"| {label} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure and print; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.latency", description=__doc__)
+    parser.add_argument("--moves", type=int, default=60, help="moves of each slider")
+    chosen = parser.parse_args(arguments)
+    with serving() as address, chromium() as browser:
+        page = open_page(browser, address, prepare=STOPWATCH)
+        page.wait_for_timeout(3000)
+        sliders = ("l", "T_n in bins", "SBR")
+        taken = {label: moves(page, label, chosen.moves) for label in sliders}
+    print(as_markdown(taken))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,228 @@
+import numpy as np
+import pytest
+import pyvista as pv
+
+from app.cloud import (
+    PointCloud,
+    export_bytes,
+    pixel_index,
+    point_cloud,
+    sight_lines,
+    spacing_m,
+    view_bounds,
+)
+from app.theme import palette
+
+ANGLE = 2e-3
+
+
+@pytest.fixture
+def range_m():
+    """A slanted surface with two holes, odd sizes so that one pixel looks straight ahead."""
+    row, col = np.mgrid[0:21, 0:33]
+    image = 50 + 0.02 * row - 0.03 * col
+    image[3, 5] = np.nan
+    image[20, 32] = np.inf
+    return image
+
+
+@pytest.fixture
+def cloud(range_m):
+    counts = np.arange(range_m.size, dtype=np.uint16).reshape(range_m.shape)
+    rgb = np.stack([counts % 256, counts // 256, 0 * counts], axis=-1).astype(np.uint8)
+    return point_cloud(range_m, ANGLE, error_m=range_m - 50, counts=counts, rgb=rgb)
+
+
+def angle_between(a, b):
+    return 2 * np.arcsin(np.linalg.norm(a - b, axis=-1) / 2)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (21, 33), (64, 64), (256, 256)])
+def test_lines_of_sight_are_unit_vectors_around_the_optical_axis(shape):
+    lines = sight_lines(shape, ANGLE)
+    assert lines.shape == (*shape, 3)
+    np.testing.assert_allclose(np.linalg.norm(lines, axis=-1), 1)
+    mean = lines.mean(axis=(0, 1))
+    np.testing.assert_allclose(mean / np.linalg.norm(mean), [0, 1, 0], atol=1e-12)
+
+
+def test_neighbours_at_the_centre_are_one_pixel_angle_apart():
+    lines = sight_lines((21, 33), ANGLE)
+    centre = lines[10, 16]
+    for neighbour in (lines[9, 16], lines[11, 16], lines[10, 15], lines[10, 17]):
+        assert angle_between(centre, neighbour) == pytest.approx(ANGLE, rel=1e-9)
+    # The pinhole's projection onto a flat detector narrows the angle away from the axis.
+    assert angle_between(lines[10, 0], lines[10, 1]) < ANGLE
+
+
+def test_coordinates_are_right_away_and_up():
+    lines = sight_lines((21, 33), ANGLE)
+    np.testing.assert_array_equal(lines[10, 16], [0, 1, 0])
+    assert np.all(np.diff(lines[..., 0], axis=1) > 0)  # the last column is on the right
+    assert np.all(np.diff(lines[..., 2], axis=0) < 0)  # row 0 is the top
+    right, away, up = lines[10, 17] - lines[10, 16], lines[10, 16], lines[9, 16] - lines[10, 16]
+    assert np.dot(np.cross(right, away), up) > 0  # right-handed
+
+
+def test_each_point_lies_at_its_range_on_its_line_of_sight(cloud, range_m):
+    points = np.asarray(cloud.points)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), cloud["range_m"], rtol=1e-12)
+    lines = sight_lines(range_m.shape, ANGLE)[cloud["row"], cloud["col"]]
+    np.testing.assert_allclose(points, cloud["range_m"][:, np.newaxis] * lines, rtol=1e-12)
+
+
+def test_only_finite_pixels_become_points(cloud, range_m):
+    assert cloud.n_points == cloud.n_verts == np.isfinite(range_m).sum() == range_m.size - 2
+    pixels = set(zip(cloud["row"], cloud["col"], strict=True))
+    assert (3, 5) not in pixels
+    assert (20, 32) not in pixels
+
+
+def test_a_point_leads_back_to_its_pixel(cloud, range_m):
+    np.testing.assert_array_equal(range_m[cloud["row"], cloud["col"]], cloud["range_m"])
+    np.testing.assert_array_equal(range_m.ravel()[pixel_index(cloud)], cloud["range_m"])
+    np.testing.assert_array_equal(pixel_index(cloud), cloud["counts"])
+    np.testing.assert_allclose(cloud["error_m"], cloud["range_m"] - 50)
+
+
+def test_an_image_of_another_size_is_refused(range_m):
+    with pytest.raises(ValueError, match=r"error_m has shape \(2, 2\).*\(21, 33\)"):
+        point_cloud(range_m, ANGLE, error_m=np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"range_m has shape \(3,\)"):
+        point_cloud([1, 2, 3], ANGLE)
+
+
+def test_spacing_is_the_distance_between_neighbours():
+    wall = point_cloud(np.full((9, 9), 840.0), ANGLE)
+    points = np.asarray(wall.points).reshape(9, 9, 3)
+    assert spacing_m(wall) == pytest.approx(np.linalg.norm(points[4, 4] - points[4, 5]), rel=1e-4)
+
+
+def test_bounds_hold_the_target_and_not_the_scattered_points(rng):
+    row, col = np.mgrid[0:64, 0:64]
+    truth = np.where(col < 32, 50 + 0.02 * row, 55.0)
+    range_m = np.where(rng.random(truth.shape) < 0.5, rng.uniform(30, 300, truth.shape), truth)
+    target, mixed = point_cloud(truth, ANGLE), point_cloud(range_m, ANGLE)
+    bounds = np.array(view_bounds(mixed))
+    exact = np.array(target.bounds)
+    assert np.all(bounds[::2] <= exact[::2] + 0.2)
+    assert np.all(bounds[1::2] >= exact[1::2] - 0.2)
+    assert bounds[3] - bounds[2] < 2 * (exact[3] - exact[2])
+
+
+def test_bounds_of_a_target_that_fills_the_gate_hold_nearly_all(rng):
+    cloud = point_cloud(rng.uniform(100, 200, (64, 64)), ANGLE)
+    _, _, near, far, _, _ = view_bounds(cloud)
+    assert near == pytest.approx(100, abs=1.5)
+    assert far == pytest.approx(200, abs=1.5)
+
+
+def test_bounds_look_only_at_the_points_to_keep(cloud):
+    left = view_bounds(cloud, cloud["col"] < 10)
+    assert left[1] < view_bounds(cloud)[1]
+    assert view_bounds(cloud, np.zeros(cloud.n_points, bool)) == view_bounds(cloud)
+
+
+def test_a_flat_wall_has_bounds_with_a_volume():
+    bounds = np.array(view_bounds(point_cloud(np.full((1, 1), 21e3), ANGLE)))
+    assert np.all(bounds[1::2] > bounds[::2])
+
+
+def test_a_cloud_without_points():
+    cloud = point_cloud(np.full((4, 4), np.nan), ANGLE, counts=np.zeros((4, 4)))
+    assert cloud.n_points == 0
+    assert view_bounds(cloud) == []
+    assert spacing_m(cloud) == 0
+    pane = PointCloud()
+    pane.draw(cloud, np.zeros((0, 3), np.uint8), scene_id="empty")
+    assert pane.positions == pane.pixels == pane.wrong == b""
+    assert pane.bounds == []
+    seen = point_cloud(np.full((4, 4), 50.0), ANGLE)
+    pane.draw(seen, np.zeros((16, 3), np.uint8), scene_id="empty")
+    assert pane.bounds == view_bounds(seen)
+    assert b"element vertex 0" in export_bytes(cloud, ".ply")
+
+
+def test_vtp_keeps_every_array(cloud, tmp_path):
+    path = tmp_path / "cloud.vtp"
+    path.write_bytes(export_bytes(cloud, ".vtp"))
+    again = pv.read(path)
+    np.testing.assert_array_equal(again.points, cloud.points)
+    assert set(again.point_data) == set(cloud.point_data)
+    for name in cloud.point_data:
+        np.testing.assert_array_equal(again[name], cloud[name])
+    assert again.field_data["pixel_angle_rad"] == ANGLE
+
+
+def test_ply_is_read_with_points_and_colours(cloud, tmp_path):
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(export_bytes(cloud, ".ply"))
+    again = pv.read(path)
+    np.testing.assert_allclose(again.points, cloud.points, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(again["RGB"], cloud["rgb"])
+
+
+def test_ply_carries_every_image_of_one_component(cloud):
+    header, _, body = export_bytes(cloud, ".ply").partition(b"end_header\n")
+    types = {"float": "<f4", "int": "<i4", "uchar": "u1"}
+    fields = [line.split()[1:] for line in header.decode().splitlines() if "property" in line]
+    table = np.frombuffer(body, [(name, types[kind]) for kind, name in fields])
+    assert len(table) == cloud.n_points
+    for name in ("range_m", "error_m", "counts", "row", "col"):
+        np.testing.assert_allclose(table[name], cloud[name], rtol=1e-6)
+
+
+def test_another_suffix_is_refused(cloud):
+    with pytest.raises(ValueError, match=r"'\.stl'.*'\.ply' or '\.vtp'"):
+        export_bytes(cloud, ".stl")
+
+
+def test_drawing_fills_the_buffers_in_one_update(cloud):
+    pane = PointCloud()
+    wrong = cloud["row"] == 4
+    updates = []
+    pane.param.watch(
+        lambda *events: updates.append({event.name for event in events}),
+        ["positions", "colors", "pixels", "wrong", "spacing_m", "bounds", "scene_id"],
+    )
+    pane.draw(cloud, cloud["rgb"], wrong, scene_id="slope")
+    assert len(updates) == 1
+    assert {"positions", "colors", "pixels", "wrong", "scene_id"} <= updates[0]
+    positions = np.frombuffer(pane.positions, "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(positions, cloud.points, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(np.frombuffer(pane.colors, "u1").reshape(-1, 3), cloud["rgb"])
+    np.testing.assert_array_equal(np.frombuffer(pane.pixels, "<i4"), pixel_index(cloud))
+    np.testing.assert_array_equal(np.frombuffer(pane.wrong, bool), wrong)
+
+
+def test_bounds_change_with_the_scene_or_when_given(cloud, range_m):
+    pane = PointCloud()
+    pane.draw(cloud, cloud["rgb"], scene_id="first")
+    first = pane.bounds
+    farther = point_cloud(range_m + 100, ANGLE, rgb=np.zeros((*range_m.shape, 3), np.uint8))
+    pane.draw(farther, farther["rgb"], scene_id="first")
+    assert pane.bounds == first
+    pane.draw(farther, farther["rgb"], scene_id="second")
+    assert pane.bounds[2] > first[3]
+    pane.draw(farther, farther["rgb"], bounds=(0, 1, 2, 3, 4, 5))
+    assert pane.bounds == [0, 1, 2, 3, 4, 5]
+
+
+def test_colours_and_marks_must_fit_the_points(cloud):
+    pane = PointCloud()
+    with pytest.raises(ValueError, match="rgb has shape"):
+        pane.draw(cloud, np.zeros((2, 3), np.uint8))
+    with pytest.raises(ValueError, match="wrong has shape"):
+        pane.draw(cloud, cloud["rgb"], np.zeros(2, bool))
+
+
+def test_colours_follow_the_page():
+    pane = PointCloud(dark=True)
+    assert (pane.ink, pane.paper) == (palette(True).text, palette(True).paper)
+    pane.dark = False
+    assert (pane.ink, pane.paper) == (palette(False).text, palette(False).paper)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
