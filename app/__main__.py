@@ -11,6 +11,7 @@ import panel as pn
 import core
 from app import latency
 from app.layout import MAX_UPLOAD_BYTES, build_page
+from app.state import Light, Reading
 from app.store import built_in_sources, file_source
 from core.readers import READERS
 
@@ -25,14 +26,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--address", default="127.0.0.1", help="default: this machine only")
     parser.add_argument("--show", action="store_true", help="open a browser")
     chosen = parser.parse_args(arguments)
-    for path in chosen.captures:
+    # The files given come first: the page opens on them.
+    given = {f"path {n}": file_source(p, shared=True) for n, p in enumerate(chosen.captures)}
+    for source in given.values():
         try:
-            print(core.read_capture(path).source, flush=True)
+            print(source.load(Light(), Reading()).source, flush=True)
         except core.CaptureError as error:
             parser.error(str(error))
-    # The files given come first: the page opens on them.
-    sources = {f"path {n}": file_source(path) for n, path in enumerate(chosen.captures)}
-    sources |= built_in_sources()
+    sources = given | built_in_sources()
     print("Compiling what is not compiled yet ...", flush=True)
     core.warm_up()
     latency.tune()

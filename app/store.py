@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -16,7 +16,6 @@ from core import (
     ESTIMATORS,
     Capture,
     Run,
-    Scene,
     Signals,
     TrackingParameters,
     first_difference,
@@ -44,25 +43,23 @@ class Source:
 def scene_source(title: str, name: str, **arguments: Any) -> Source:
     """A built-in scene of `core.scenes`."""
 
-    @cache
-    def scene() -> Scene:
-        return scenes[name](**arguments)
+    build = cache(partial(scenes[name], **arguments))
 
     def load(light: Light, _reading: Reading) -> Capture:
-        return simulate(
-            scene(), light.acquisition(scene().acquisition), light.flux, seed=light.seed
-        )
+        scene = build()
+        return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
     return Source(title, load, is_scene=True)
 
 
-def file_source(path: Path, title: str | None = None) -> Source:
-    """A capture file."""
-    return Source(
-        title or path.name,
-        lambda _light, reading: read_capture(path, **asdict(reading)),
-        is_scene=False,
-    )
+def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
+    """A capture file; one that all sessions share is kept once it is read."""
+
+    def read(reading: Reading) -> Capture:
+        return read_capture(path, **asdict(reading))
+
+    get = lru_cache(maxsize=1)(read) if shared else read
+    return Source(title or path.name, lambda _light, reading: get(reading), is_scene=False)
 
 
 def built_in_sources() -> dict[str, Source]:
