@@ -128,8 +128,8 @@ class PixelKeys(JSComponent):
     """Holds a picture that takes the keyboard: arrow keys move the pixel, with Shift by eight."""
 
     child = Child()
-    pixel = param.NumericTuple(default=(0, 0), length=2, doc="Row and column.")
-    shape = param.NumericTuple(default=(1, 1), length=2, doc="Rows and columns of the image.")
+    pixel = param.List(default=[0, 0], item_type=int, doc="Row and column.")
+    shape = param.List(default=[1, 1], item_type=int, doc="Rows and columns of the image.")
     label = param.String(default="", doc="What a screen reader says of the picture.")
 
     _esm = """

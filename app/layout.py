@@ -141,6 +141,7 @@ class Layout:
             )
             for name, label in READING_LABELS.items()
         }
+        self._announced: Source | None = None
         self.page = self._build()
         self._announce(session.answer)
         self._listen()
@@ -177,6 +178,11 @@ class Layout:
     def _announce(self, answer: Answer) -> None:
         is_scene = answer.request.source.is_scene
         self._source.value = self.session.state.source
+        if answer.request.source is not self._announced:
+            self._announced = answer.request.source
+            for name, field in self._reading.items():
+                value = getattr(answer.request.reading, name)
+                field.value = "" if value is None else str(value)
         self._light_card.visible, self._reading_card.visible = is_scene, not is_scene
         self._provenance.object = words.provenance(answer)
         self._viewing.show(self.session.state.viewing)
@@ -188,8 +194,6 @@ class Layout:
 
     def _go_to(self, key: str) -> None:
         if key != self.session.state.source:
-            for field in self._reading.values():
-                field.value = ""
             self.session.state.param.update(source=key, reading=Reading())
 
     def _tracking_changed(self, settings: TrackingParameters) -> None:

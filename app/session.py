@@ -121,8 +121,10 @@ class Session:
         """Tell the page of an error, and stay usable."""
         log.warning("a request failed", exc_info=error)
         # What cannot be opened is left again; other settings stay, for the user to mend.
-        with param.discard_events(self.state):
-            self.state.source = self._key(self.answer.request.source)
+        request, state = self.answer.request, self.state
+        if self.sources[state.source] is not request.source:
+            with param.discard_events(state):
+                state.param.update(source=self._key(request.source), reading=request.reading)
         self._settle(self.answer)
         self.complain(words.failure(error))
 
@@ -146,7 +148,7 @@ class Session:
     def _enter(self, answer: Answer) -> None:
         """Come to a capture of another kind: its own pixel, field of view and camera."""
         rows, cols = answer.capture.shape
-        self.image_keys.shape = (rows, cols)
+        self.image_keys.shape = [rows, cols]
         self.image.enter(rows, cols)
         has_truth = answer.capture.truth_range_m is not None
         for name, kinds in (("image", IMAGES), ("cloud_color", CLOUD_COLORS)):
@@ -174,7 +176,7 @@ class Session:
         with pn.io.hold(self._page):
             self.signals.update(pixel, self.answer.capture.acquisition, self.state.difference)
             self.image.mark(row, col)
-            self.image_keys.pixel = (row, col)
+            self.image_keys.pixel = [row, col]
             self.cloud.selected = row * self.answer.capture.shape[1] + col
             self.numbers.facts = numbers
             self.figures.facts = words.figure_strip(self.answer)

@@ -8,9 +8,11 @@ import colorcet
 
 FONT = "Roboto, system-ui, sans-serif"
 
-RANGE_COLORS: list[str] = colorcet.bgyw[:-12]  # perceptually uniform; its white end would vanish
-ERROR_COLORS: list[str] = colorcet.diverging_bwr_20_95_c54
-COUNT_COLORS: list[str] = colorcet.fire[30:-20]
+RANGE_COLORS: list[str] = colorcet.palette["bgyw"][
+    :-12
+]  # perceptually uniform; its white end would vanish
+ERROR_COLORS: list[str] = colorcet.palette["diverging_bwr_20_95_c54"]
+COUNT_COLORS: list[str] = colorcet.palette["fire"][30:-20]
 WRONG_COLOR = "#e8206a"
 OUTSIDE_COLOR = "#8d949c"
 """Of answers beyond both ends of a range image's colour scale."""
