@@ -11,6 +11,7 @@ import param
 from core import Acquisition, Flux, TrackingParameters
 from core.checks import require
 from core.parameters import Number, check_fields, parameter
+from core.readers.request import Request
 
 
 @dataclass(frozen=True)
@@ -71,16 +72,8 @@ class Viewing:
         check_fields(self)
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(Request):
     """How a file is to be read; None lets the reader guess."""
-
-    time_unit_s: float | None = None
-    bin_width_s: float | None = None
-    gate_delay_s: float | None = None
-    n_bins: int | None = None
-    n_pulses: int | None = None
-    variable: str | None = None
 
     @classmethod
     def from_text(cls, typed: Mapping[str, str]) -> Reading:
