@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 .PHONY: app test bench table2 clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
-	$(BIN)/python -m app --port $(PORT) $(CAPTURE)
+	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
 
 test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/ruff check .

@@ -1,1 +1,1 @@
-"""The Panel app: everything that needs a screen. It uses `core` by its public names only."""
+"""The Panel app: everything that needs a screen. It uses `core` by its documented names only."""

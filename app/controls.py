@@ -124,13 +124,49 @@ class Facts(JSComponent):
     _stylesheets: ClassVar = [Path(__file__).with_name("facts.css")]
 
 
+class Sentence(JSComponent):
+    """Text, shown letter by letter: nothing of it, a file's name say, becomes part of the page."""
+
+    text = param.String(default="")
+    warning = param.Boolean(default=False, doc="Whether it tells of something that went wrong.")
+
+    _esm = """
+    export function render({ model }) {
+      const root = document.createElement("div");
+      if (model.warning) root.setAttribute("role", "alert");
+      const show = () => {
+        root.textContent = model.text;
+        root.className = model.text === "" ? "" : model.warning ? "warning" : "note";
+      };
+      model.on("text", show);
+      show();
+      return root;
+    }
+    """
+    _stylesheets: ClassVar = [
+        """
+        .note, .warning {
+          font: 12px/1.4 var(--mui-font-family, Roboto, system-ui, sans-serif);
+          color: var(--mui-palette-text-primary, #1c2430);
+        }
+        .warning {
+          font-size: 14px; margin: 4px 0; padding: 8px 12px; border-radius: 4px;
+          border: 1px solid #ed6c02; border-left-width: 6px;
+        }
+        """
+    ]
+
+
 class PixelKeys(JSComponent):
     """Holds a picture that takes the keyboard: arrow keys move the pixel, with Shift by eight."""
 
     child = Child()
     pixel = param.List(default=[0, 0], item_type=int, doc="Row and column.")
     shape = param.List(default=[1, 1], item_type=int, doc="Rows and columns of the image.")
-    label = param.String(default="", doc="What a screen reader says of the picture.")
+    label = param.String(
+        default="Range image. Arrow keys move the pixel on show, with Shift by eight.",
+        doc="What a screen reader says of the picture.",
+    )
 
     _esm = """
     export function render({ model, el }) {
@@ -148,7 +184,6 @@ class PixelKeys(JSComponent):
         const move = moves[event.key];
         if (!move) return;
         event.preventDefault();
-        window.firstphotonInput = performance.now();
         const step = event.shiftKey ? 8 : 1;
         model.pixel = model.pixel.map((at, axis) =>
           Math.min(model.shape[axis] - 1, Math.max(0, at + step * move[axis])),

@@ -28,7 +28,7 @@ export function render({ model }) {
     const painted = new MessageChannel();
     painted.port1.onmessage = () => {
       write(drawn, arrival);
-      if (input !== undefined) write(hand, input);
+      if (arrival - input < 5000) write(hand, input); // else that move changed no figure
     };
     // A message sent in an animation frame is delivered after that frame has been painted.
     requestAnimationFrame(() => painted.port2.postMessage(null));

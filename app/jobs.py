@@ -1,4 +1,4 @@
-"""Work off the page's thread: one worker for all sessions, the latest request of each wins."""
+"""Work off the page's thread: of each session's requests the latest wins."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from typing import Generic, TypeVar
 
 Result = TypeVar("Result")
 
-# One worker: the kernels use all cores by themselves, and must not be entered twice at once.
-_WORKER = ThreadPoolExecutor(max_workers=1, thread_name_prefix="firstphoton")
+# A session has one request under way; a file being read does not hold up the others. Kernels that
+# use all cores take turns by a lock of their own.
+_WORKERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="firstphoton")
 
 
 class LatestWins(Generic[Result]):
@@ -46,21 +47,28 @@ class LatestWins(Generic[Result]):
                 outcome = partial(done, work())
             except Exception as error:  # whatever it is, the page must tell it
                 outcome = partial(failed, error)
-            self._on_page(partial(self._finish, outcome))
+            self._on_page(partial(self._finish, outcome, failed))
 
         with self._lock:
             if self._busy:
                 self._waiting = attempt
                 return
             self._busy = True
-        _WORKER.submit(attempt)
+        _WORKERS.submit(attempt)
 
-    def _finish(self, draw: Callable[[], None]) -> None:
+    @property
+    def has_more(self) -> bool:
+        """Whether another request waits for its turn."""
+        return self._waiting is not None
+
+    def _finish(self, draw: Callable[[], None], failed: Callable[[Exception], None]) -> None:
         try:
             draw()
+        except Exception as error:  # an answer that cannot be drawn is told like one that is none
+            failed(error)
         finally:
             with self._lock:
                 following, self._waiting = self._waiting, None
                 self._busy = following is not None
             if following is not None:
-                _WORKER.submit(following)
+                _WORKERS.submit(following)

@@ -14,7 +14,7 @@ from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
 from app import words
-from app.controls import SettingsPanel
+from app.controls import Sentence, SettingsPanel
 from app.session import Session
 from app.state import Reading
 from app.store import Answer, Source, file_source
@@ -32,6 +32,7 @@ READING_LABELS = {
     "gate_delay_s": "Gate opens after (s)",
     "n_bins": "Bins",
     "n_pulses": "Pulses sent",
+    "pulse": "Echo's standard deviation (s)",
     "variable": "Variable",
 }
 THEME = {
@@ -80,6 +81,10 @@ class Page(pmui.Page):
 
     def __init__(self, **params: Any) -> None:
         super().__init__(**params)
+        # Params keep this watcher of the whole server's state, and with it the page, for ever.
+        for _, watcher in self._param__private.ref_watchers:
+            pn.state.param.unwatch(watcher)
+        self._param__private.ref_watchers = []
         with edit_readonly(self):
             self.busy = False
 
@@ -102,8 +107,8 @@ class Layout:
         session = self.session = Session(sources)
         state = session.state
         self._uploads: list[TemporaryDirectory[str]] = []
-        self._alert = pmui.Alert("", severity="warning", visible=False, sizing_mode="stretch_width")
-        self._provenance = pmui.Typography("", variant="caption", sizing_mode="stretch_width")
+        self._alert = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
+        self._provenance = Sentence(sizing_mode="stretch_width")
         self._progress = pmui.LinearProgress(
             visible=False, variant="indeterminate", sizing_mode="stretch_width", margin=0
         )
@@ -157,7 +162,7 @@ class Layout:
         if session.is_served:
             # On a phone the controls would cover what they control.
             pn.state.onload(lambda: self.page.param.update(sidebar_open=not session.figures.narrow))
-            pn.state.on_session_destroyed(lambda _: self._forget_uploads())
+            pn.state.on_session_destroyed(lambda _: self._forget())
             pn.config.exception_handler = session.fail  # of this session alone
 
     def _titles(self) -> dict[str, str]:
@@ -173,7 +178,7 @@ class Layout:
     # What the session tells the page
 
     def _complain(self, sentence: str) -> None:
-        self._alert.param.update(object=sentence, visible=bool(sentence))
+        self._alert.text = sentence[:2000]
 
     def _announce(self, answer: Answer) -> None:
         is_scene = answer.request.source.is_scene
@@ -181,10 +186,9 @@ class Layout:
         if answer.request.source is not self._announced:
             self._announced = answer.request.source
             for name, field in self._reading.items():
-                value = getattr(answer.request.reading, name)
-                field.value = "" if value is None else str(value)
+                field.value = answer.request.reading.as_text(name)
         self._light_card.visible, self._reading_card.visible = is_scene, not is_scene
-        self._provenance.object = words.provenance(answer)
+        self._provenance.text = words.provenance(answer)[:2000]
         self._viewing.show(self.session.state.viewing)
         own = self.session.own_field_of_view_deg
         self._viewing.controls["field_of_view_deg"].initial = own
@@ -215,6 +219,7 @@ class Layout:
         name = re.sub(r"[^\w.-]+", "_", Path(self._file.filename).name)[-80:].lstrip(".")
         path = Path(folder.name) / (name or "upload")
         path.write_bytes(content)
+        self._file.value = None  # it lies in the folder now; the same file can be chosen again
         key = f"file {len(self.session.sources)}"
         self.session.sources[key] = file_source(path)
         self._source.options = self._titles()
@@ -228,7 +233,9 @@ class Layout:
         except ValueError as error:
             self._complain(str(error))
 
-    def _forget_uploads(self) -> None:
+    def _forget(self) -> None:
+        """Let go of what a closed page would leave behind."""
+        pn.config._session_config.pop(self.session.page, None)
         for folder in self._uploads:
             folder.cleanup()
 

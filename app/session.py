@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
+from time import perf_counter
 
 import numpy as np
 import panel as pn
@@ -63,9 +64,11 @@ class Session:
         self.announce: Callable[[Answer], None] = lambda answer: None
         self.complain: Callable[[str], None] = lambda sentence: None
         self.waiting: Callable[[bool], None] = lambda is_waiting: None
-        self._page = pn.state.curdoc
+        self.page = pn.state.curdoc
+        self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self._on_page)
-        self._rest_is_due = self._unanswered = False
+        self._rest_is_due = False
+        self._asked_s: float | None = None
         self.answer = compute(self._request(), None)
         self.paint(dark=False)
         self._show(self.answer, first=True)
@@ -74,7 +77,7 @@ class Session:
     @property
     def is_served(self) -> bool:
         """Whether there is a browser on the other side."""
-        return self._page is not None and self._page.session_context is not None
+        return self.page is not None and self.page.session_context is not None
 
     def _watch(self) -> None:
         watch = self.state.param.watch
@@ -86,7 +89,7 @@ class Session:
 
     def paint(self, dark: bool) -> None:
         """Follow the page from light to dark and back."""
-        with pn.io.hold(self._page):
+        with pn.io.hold(self.page):
             self.signals.paint(palette(dark))
             self.image.paint(palette(dark))
             self.cloud.dark = dark
@@ -96,36 +99,58 @@ class Session:
         return Request(self.sources[state.source], state.light, state.reading, state.tracking)
 
     def _ask(self) -> None:
-        work = partial(compute, self._request(), self.answer)
-        self._jobs.submit(work, self._show, self.fail)
-        self._unanswered = True
-        if self.is_served:
-            self._page.add_timeout_callback(self._admit_waiting, WAIT_MS)
+        request = self._request()
+        work = partial(compute, request, self.answer)
+        self._jobs.submit(work, self._show, partial(self._failed, request))
+        if self._asked_s is None:
+            self._await()
+
+    def _await(self) -> None:
+        self._asked_s = perf_counter()
+        self._later(self._admit_waiting, WAIT_MS)
 
     def _admit_waiting(self) -> None:
-        if self._unanswered:
+        """Show that an answer is under way, if the oldest open request is that old."""
+        if self._asked_s is not None and perf_counter() - self._asked_s >= 0.9e-3 * WAIT_MS:
             self.waiting(True)
 
     def _settle(self, answer: Answer) -> None:
-        self._unanswered = False
+        self._asked_s = None
         self.waiting(False)
         self.announce(answer)
+        if self._jobs.has_more:
+            self._await()
 
     def _on_page(self, act: Callable[[], None]) -> None:
-        if self.is_served:
-            self._page.add_next_tick_callback(act)
-        else:
+        if not self._served:
             act()
+        elif self.is_served:  # else the page is gone, and nobody left to see it
+            self.page.add_next_tick_callback(act)
+
+    def _later(self, act: Callable[[], None], after_ms: int) -> None:
+        """Do something on the page's thread, after a while; its failure is told like any other."""
+
+        def attempt() -> None:
+            try:
+                act()
+            except Exception as error:  # whatever it is, the page must tell it
+                self.fail(error)
+
+        if self.is_served:
+            self.page.add_timeout_callback(attempt, after_ms)
+
+    def _failed(self, request: Request, error: Exception) -> None:
+        """Return to what the picture shows, unless the user has moved on."""
+        shown, state = self.answer.request, self.state
+        if request == self._request():
+            with param.discard_events(state):
+                state.param.update(source=self._key(shown.source), reading=shown.reading)
+        self._settle(self.answer)
+        self.fail(error)
 
     def fail(self, error: Exception) -> None:
         """Tell the page of an error, and stay usable."""
         log.warning("a request failed", exc_info=error)
-        # What cannot be opened is left again; other settings stay, for the user to mend.
-        request, state = self.answer.request, self.state
-        if self.sources[state.source] is not request.source:
-            with param.discard_events(state):
-                state.param.update(source=self._key(request.source), reading=request.reading)
-        self._settle(self.answer)
         self.complain(words.failure(error))
 
     def _key(self, source: Source) -> str:
@@ -133,8 +158,8 @@ class Session:
 
     def _show(self, answer: Answer, first: bool = False) -> None:
         previous, self.answer = self.answer, answer
-        same_source = answer.request.source is previous.request.source
-        if first or not same_source or answer.capture.shape != previous.capture.shape:
+        seen = (answer.request.source, answer.request.reading)
+        if first or seen != (previous.request.source, previous.request.reading):
             self._enter(answer)
         self.complain(words.lack(answer))
         self._draw_pixel()
@@ -142,7 +167,7 @@ class Session:
             self._draw_rest()
         elif not self._rest_is_due:
             self._rest_is_due = True
-            self._page.add_timeout_callback(self._draw_rest, REST_MS)
+            self._later(self._draw_rest, REST_MS)
         self._settle(answer)
 
     def _enter(self, answer: Answer) -> None:
@@ -173,7 +198,7 @@ class Session:
         row, col = self.state.pixel
         pixel = inspect(self.answer, row, col)
         numbers = words.pixel_numbers(self.answer, pixel)
-        with pn.io.hold(self._page):
+        with pn.io.hold(self.page):
             self.signals.update(pixel, self.answer.capture.acquisition, self.state.difference)
             self.image.mark(row, col)
             self.image_keys.pixel = [row, col]
@@ -185,7 +210,7 @@ class Session:
         """The image and the cloud."""
         self._rest_is_due = False
         answer, state = self.answer, self.state
-        with pn.io.hold(self._page):
+        with pn.io.hold(self.page):
             self.image.update(*image_of(answer, state.image, state.viewing.least_confidence))
             self._draw_cloud()
 
@@ -194,12 +219,15 @@ class Session:
         visible = shown(answer, state.viewing.least_confidence)
         values, look = color_values(answer, state.cloud_color)
         wrong = is_wrong(answer)
-        angle_rad = np.radians(state.viewing.field_of_view_deg) / answer.capture.shape[1]
+        half_rad = np.radians(state.viewing.field_of_view_deg) / 2
+        angle_rad = float(np.arctan(2 * np.tan(half_rad) / answer.capture.shape[1]))
         range_m = np.where(visible, answer.run.image.range_m, np.nan)
         self._cloud = point_cloud(range_m, angle_rad, confidence=answer.run.image.confidence)
-        self._cloud["rgb"] = look.rgb(values[visible])
+        rgb = look.rgb(values[visible])
+        if rgb.size:  # PyVista keeps no empty array
+            self._cloud["rgb"] = rgb
         crosses = None if wrong is None else wrong[visible]
-        self.cloud.draw(self._cloud, self._cloud["rgb"], crosses, scene_id=self._scene_id())
+        self.cloud.draw(self._cloud, rgb, crosses, scene_id=self._scene_id())
         self.cloud.caption = words.cloud_caption(
             answer, self._cloud.n_points, None if crosses is None else int(crosses.sum())
         )
@@ -210,8 +238,9 @@ class Session:
 
     def _scene_id(self) -> str:
         """Changes when the camera should start anew."""
-        state, shape = self.state, self.answer.capture.shape
-        return f"{state.source} {shape} {state.viewing.field_of_view_deg}"
+        answer = self.answer
+        acquisition = replace(answer.capture.acquisition, n_pulses=None)
+        return f"{self._key(answer.request.source)} {answer.capture.shape} {acquisition}"
 
 
 def _pixel_to_start_with(answer: Answer) -> tuple[int, int]:
@@ -235,4 +264,4 @@ def _field_of_view_deg(answer: Answer) -> float:
         range_m = range_m if range_m.size else answer.capture.acquisition.bin_to_range_m([0.0, 1.0])
         low, high = np.percentile(range_m, [5, 95])
         return float(np.clip(np.degrees((high - low) / max(high, 1e-3)), 0.001, 120.0))
-    return float(np.degrees(angle_rad * cols))
+    return float(np.degrees(2 * np.arctan(cols / 2 * np.tan(angle_rad))))

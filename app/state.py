@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import param
 
-from core import Acquisition, Flux, TrackingParameters
+from core import Acquisition, Flux, Pulse, TrackingParameters
 from core.checks import require
 from core.parameters import Number, check_fields, parameter
 from core.readers.request import Request
@@ -30,7 +30,7 @@ class Light:
     )
     n_pulses: int = parameter(
         1000,
-        Number("Pulses", 10, 100_000, log=True, whole=True, least=1),
+        Number("Pulses", 10, 50_000, log=True, whole=True, least=1),
         "Pulses sent for each pixel: more make the histogram smoother, and take longer to record.",
     )
     seed: int = parameter(
@@ -72,6 +72,18 @@ class Viewing:
         check_fields(self)
 
 
+def _gaussian(text: str) -> Pulse:
+    return Pulse.gaussian(float(text))
+
+
+_CONVERT: dict[str, Callable[[str], Any]] = {
+    "variable": str,
+    "n_bins": int,
+    "n_pulses": int,
+    "pulse": _gaussian,
+}
+
+
 class Reading(Request):
     """How a file is to be read; None lets the reader guess."""
 
@@ -86,13 +98,20 @@ class Reading(Request):
         """
         values: dict[str, Any] = {}
         for name, text in typed.items():
-            convert = str if name == "variable" else int if name.startswith("n_") else float
+            convert = _CONVERT.get(name, float)
             try:
                 values[name] = convert(text.strip()) if text.strip() else None
             except ValueError:
                 kind = "a whole number" if convert is int else "a number such as 1e-9"
                 require(name, text, False, f"{kind}, or nothing to let the reader guess")
         return cls(**values)
+
+    def as_text(self, name: str) -> str:
+        """A field as it would be typed."""
+        value = getattr(self, name)
+        if isinstance(value, Pulse):
+            value = value.tau_s
+        return "" if value is None else str(value)
 
 
 IMAGES = ("Estimate", "Truth", "Error", "Counts")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from time import perf_counter
@@ -13,7 +13,6 @@ import numpy as np
 
 from app.state import Light, Reading
 from core import (
-    ESTIMATORS,
     Capture,
     Run,
     Signals,
@@ -27,6 +26,9 @@ from core import (
     tracking_signals,
     trigger_probability,
 )
+from core.checks import require
+
+MOST_PIXELS = 2**20
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
 
@@ -56,7 +58,10 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
     """A capture file; one that all sessions share is kept once it is read."""
 
     def read(reading: Reading) -> Capture:
-        return read_capture(path, **asdict(reading))
+        capture = read_capture(path, **vars(reading))
+        pixels = capture.shape[0] * capture.shape[1]
+        require("pixels", pixels, pixels <= MOST_PIXELS, f"at most {MOST_PIXELS:,} to this page")
+        return capture
 
     get = lru_cache(maxsize=1)(read) if shared else read
     return Source(title or path.name, lambda _light, reading: get(reading), is_scene=False)
@@ -141,7 +146,7 @@ def inspect(answer: Answer, row: int, col: int) -> Pixel:
     return Pixel(
         row,
         col,
-        tracking_signals(histogram, answer.request.tracking, acquisition.n_pulses),
+        tracking_signals(histogram, answer.request.tracking, capture.armed_pulses),
         expected,
         first_difference(histogram),
         float(acquisition.range_m_to_bin(truth_m)),
@@ -176,8 +181,3 @@ def is_wrong(answer: Answer, tolerance_bins: float = 3.0) -> np.ndarray[Any, Any
         return None
     tolerance_m = tolerance_bins * answer.capture.acquisition.bin_length_m
     return np.asarray(image.valid & ~(np.abs(image.range_m - truth_m) <= tolerance_m))
-
-
-def lag_bins(answer: Answer) -> float:
-    """The estimator's lag that was taken out of every range of the answer."""
-    return ESTIMATORS["tracking"].lag_bins(answer.capture, answer.request.tracking)

@@ -11,6 +11,10 @@ from app.store import Answer, Pixel
 Fact = tuple[str, str, str]
 """Name, value, and a line of help."""
 
+FIELD_OF_VIEW_UNKNOWN = (
+    " The file does not tell the field of view: widths and heights of the cloud are a guess (View)."
+)
+
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
 
 EXPLANATION = """
@@ -20,9 +24,10 @@ Two tracking differentiators follow it: the *small scale* follows the slow decay
 the sudden echo. Their positive difference, the *residual*, times a *weight*, has its largest value
 about two bins behind the echo; that lag is known from the model and taken out.
 
-**What moves a range.** Only (m·h)²·l, m, n and T_n: l and h are one knob. α, with the weight as
-printed (cubic), multiplies every bin alike and can move nothing; with the *exponential* weight it
-can. The weight as printed hides a guess that targets are far; *none* is what works best here.
+**What moves a range.** Of l and h only (m·h)²·l counts: they are one knob. m, n, T_n, the weight,
+the start and σ each move ranges. α, with the weight as printed (cubic), multiplies every bin alike
+and can move nothing; with the *exponential* weight it can. The weight as printed hides a guess that
+targets are far; *none* is what works best here.
 
 **Recommended** was searched on random depths over the gate and other seeds than the reported ones;
 **as printed** is the paper's text taken literally.
@@ -35,7 +40,11 @@ def figure_strip(answer: Answer) -> list[Fact]:
     strip = []
     if figures:
         strip = [
-            ("RMSE", _number(figures["rmse_m"], "m"), "Root mean square error over target pixels."),
+            (
+                "RMSE",
+                _number(figures["rmse_m"], "m"),
+                "Root mean square error over target pixels with an answer.",
+            ),
             ("Within 1 bin", _share(figures["rd_1_bin"]), "Share of target pixels: RD(1 bin)."),
             (
                 "Within 3 bins",
@@ -43,6 +52,9 @@ def figure_strip(answer: Answer) -> list[Fact]:
                 "Share of target pixels: RD(3 bins), as the paper most plausibly means it.",
             ),
         ]
+        if figures["coverage"] < 1:
+            help = "Share of target pixels with an answer; the RMSE is over these."
+            strip.append(("Answered", _share(figures["coverage"]), help))
     made = "Simulated in" if answer.request.source.is_scene else "Read in"
     strip += [
         (made, _milliseconds(answer.capture_s), "Time to make the capture."),
@@ -102,6 +114,7 @@ def provenance(answer: Answer) -> str:
         f"gate {opens_ns:.6g} to {closes_ns:.6g} ns "
         f"({float(acquisition.bin_to_range_m(0)):.6g} to "
         f"{float(acquisition.bin_to_range_m(acquisition.n_bins)):.6g} m)."
+        + (FIELD_OF_VIEW_UNKNOWN if acquisition.pixel_angle_rad is None else "")
     )
 
 

@@ -75,6 +75,12 @@ class Capture:
             if image is not None:
                 fits = image.shape == self.shape
                 require(name, f"shape {image.shape}", fits, f"shape {self.shape}, that of the cube")
+        if self.signal is not None:
+            low, high = float(np.min(self.signal)), float(np.max(self.signal))
+            require("signal", (low, high), 0 <= low <= high < np.inf, "finite photons, 0 or more")
+        if self.background is not None:
+            finite = 0 <= self.background < np.inf
+            require("background", self.background, finite, "finite photons, 0 or more")
         cube.setflags(write=False)
 
     @property

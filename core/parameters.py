@@ -1,7 +1,7 @@
 """Settings as frozen dataclasses whose fields know their meaning, unit and bounds.
 
-The app's controls and the command line's options are made from this metadata, so that a limit or a
-sentence of help is written once.
+The app's controls are made from this metadata, so that a limit or a sentence of help is written
+once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The one path from a capture to an answer and its figures: app, command line and experiments."""
+"""The path from a capture to an answer and its figures."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class TrackingParameters:
     h: float = parameter(
         1.0,
         Number("h", 0.25, 4.0, log=True, least=0.0, most=1e6, open_below=True, unit="bins"),
-        "Step of the integration. Only (m·h)²·l, m, n and T_n move a range: h and l are one knob.",
+        "Step of the integration. Only (m·h)²·l counts: h and l are one knob.",
     )
     m: float = parameter(
         1.25,
@@ -88,7 +88,8 @@ class TrackingParameters:
     t_n: int = parameter(
         20,
         Number("T_n", 0, 99, whole=True, least=0, most=2**31 - 1, unit="bins"),
-        "First bin in which an echo may lie: everything before is taken for noise and ignored.",
+        "First bin in which the residual may peak, about two bins behind the echo's onset: what "
+        "comes before is taken for noise.",
     )
     weight: Weight = parameter(
         "none",
@@ -268,8 +269,8 @@ def _pulses_for_survival(parameters: TrackingParameters, n_pulses: int | None) -
         return None
     if n_pulses is None:
         raise ValueError(
-            "weight = 'survival' needs the number of pulses, which is not known here: "
-            "give n_pulses, or choose another weight."
+            "weight = 'survival' needs the number of pulses, which is not known here, or smaller "
+            "than a pixel's detections: give n_pulses, or choose another weight."
         )
     return n_pulses
 

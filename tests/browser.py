@@ -79,9 +79,8 @@ def open_page(
     watch(page)
     page.add_init_script(prepare)
     page.goto(address)
-    page.locator("dl.timed div").first.wait_for()
-    page.locator(".stage canvas").wait_for()
-    page.wait_for_function("document.readyState === 'complete'")
+    page.locator(".stage[data-camera]").wait_for()
+    page.wait_for_function("Bokeh.documents[0].is_idle")
     return page
 
 

@@ -105,7 +105,7 @@ class Estimator:
             onset, np.full(onset.size, signal), background, capture.pulse, acquisition
         )
         expected = rate if n_pulses is None else trigger_probability(rate) * n_pulses
-        score = self.curve(expected, parameters, acquisition.n_pulses)
+        score = self.curve(expected, parameters, n_pulses)
         since_onset = np.arange(n_bins) - onset[:, np.newaxis]
         reach = 10 + 3 * capture.echo_bins
         score = np.where((np.abs(since_onset) <= reach) & (score > 0), score, 0.0)

@@ -9,7 +9,7 @@ from core.tracking import TrackingParameters, track, tracking_signals
 
 
 def _locate(capture: Capture, parameters: TrackingParameters) -> tuple[Floats, Floats]:
-    position, score = track(capture.blocks, parameters, capture.acquisition.n_pulses)
+    position, score = track(capture.blocks, parameters, capture.armed_pulses)
     return position.reshape(capture.shape).astype(float), score.reshape(capture.shape).astype(float)
 
 

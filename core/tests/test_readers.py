@@ -716,6 +716,7 @@ def captures(draw: st.DrawFn) -> Capture:
     dtype = draw(st.sampled_from([np.uint8, np.uint16, np.uint32]))
     cube = draw(hnp.arrays(dtype, hnp.array_shapes(min_dims=3, max_dims=3, max_side=5)))
     images = st.none() | hnp.arrays(np.float64, cube.shape[:2])
+    photons = st.none() | hnp.arrays(np.float64, cube.shape[:2], elements=st.floats(0, 1e6))
     acquisition = draw(acquisitions)
     return Capture(
         cube,
@@ -728,7 +729,7 @@ def captures(draw: st.DrawFn) -> Capture:
         ),
         draw(pulses),
         truth_range_m=draw(images),
-        signal=draw(images),
+        signal=draw(photons),
         background=draw(st.none() | st.floats(0, 1e6)),
         source=draw(st.text(st.characters(exclude_characters="\0", codec="utf-8"))),
     )

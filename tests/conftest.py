@@ -1,0 +1,96 @@
+"""What the tests of the app share: the served app, a browser, watched pages, real captures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.sync_api import Browser, ConsoleMessage, Page
+
+from tests.browser import chromium, open_page, serving
+
+CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "captures"
+
+OWN_SCHEMES = ("data", "blob")
+
+
+@pytest.fixture(scope="session")
+def address() -> Iterator[str]:
+    """Where the app is served for all tests."""
+    with serving() as running_at:
+        yield running_at
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """One browser for all tests. Where there is none the tests fail: they are never skipped."""
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def troubles() -> list[str]:
+    """What the pages complained of that the present test opened or uses."""
+    return []
+
+
+@pytest.fixture(scope="session")
+def open_watched(
+    browser: Browser, troubles: list[str], request: pytest.FixtureRequest
+) -> Callable[..., Page]:
+    """Opens a page of the app and notes its errors and whatever it asks of other machines."""
+
+    def note_console(message: ConsoleMessage) -> None:
+        if message.type == "error":
+            troubles.append(f"console: {message.text}")
+
+    def note_url(url: str) -> None:
+        parts = urlsplit(url)
+        if parts.hostname not in ("127.0.0.1", "localhost") and parts.scheme not in OWN_SCHEMES:
+            troubles.append(f"request to another machine: {url}")
+
+    def watch(page: Page) -> None:
+        page.on("console", note_console)
+        page.on("pageerror", lambda error: troubles.append(f"page error: {error}"))
+        page.on("request", lambda asked: note_url(asked.url))
+        page.on("websocket", lambda socket: note_url(socket.url))
+
+    def open_(address: str | None = None, **options: Any) -> Page:
+        address = address or request.getfixturevalue("address")
+        return open_page(browser, address, watch=watch, **options)
+
+    return open_
+
+
+@pytest.fixture
+def page(open_watched: Callable[..., Page], troubles: list[str]) -> Iterator[Callable[..., Page]]:
+    """Opens pages of sessions of their own; none of them may have had a trouble."""
+    opened: list[Page] = []
+
+    def open_(*arguments: Any, **options: Any) -> Page:
+        opened.append(open_watched(*arguments, **options))
+        return opened[-1]
+
+    yield open_
+    found, troubles[:] = list(troubles), []
+    for each in opened:
+        each.context.close()
+    assert found == []
+
+
+@pytest.fixture
+def real_capture() -> Callable[[str], Path]:
+    """Path of a published capture; these are too large, and not ours, to keep in the project."""
+
+    def find(name: str) -> Path:
+        path = CAPTURES / name
+        if not path.exists():
+            reason = f"{path} is absent: the published captures are kept beside the checkout"
+            (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+        return path
+
+    return find

@@ -1,0 +1,851 @@
+"""The app without a browser: what was chosen, what was computed, and what the page says of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import asdict, fields, replace
+from queue import SimpleQueue
+
+import numpy as np
+import pytest
+import pyvista as pv
+from bokeh.document import Document
+
+import core
+from app import looks, plots, words
+from app.controls import Knob, SettingsPanel
+from app.jobs import LatestWins
+from app.layout import CUSTOM, Layout
+from app.state import Light, Reading, Viewing
+from app.store import Request, built_in_sources, compute, file_source, inspect, is_wrong
+from app.theme import DARK, LIGHT, OUTSIDE_COLOR
+from app.views import ImageView, Plot, SignalPlots
+from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
+from core.parameters import Number, spec_of
+
+NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
+
+
+def until(condition):
+    """Wait for the worker's thread."""
+    limit = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < limit
+        time.sleep(0.005)
+
+
+def ask(source="car", **chosen):
+    choices = {"light": Light(), "reading": Reading(), "tracking": TrackingParameters()} | chosen
+    known = built_in_sources()
+    return Request(known[source] if isinstance(source, str) else source, **choices)
+
+
+@pytest.fixture(scope="module")
+def car():
+    """The car, with a truth and with pixels that see no target."""
+    return compute(ask("car"), None)
+
+
+@pytest.fixture(scope="module")
+def sample():
+    """A file, without truth."""
+    return compute(ask("sample"), None)
+
+
+@pytest.fixture
+def small_capture(rng):
+    """Other sizes than the built-in scenes, and nothing known but the counts."""
+    cube = rng.poisson(5, (4, 6, 37)).astype(np.uint16)
+    cube[:, :, 20] += 60
+    return Capture(cube, Acquisition(37, 2e-9, 1e-6, None, 1e-3), source="made here")
+
+
+@pytest.fixture
+def small_file(small_capture, tmp_path):
+    path = tmp_path / "small.npz"
+    save_capture(small_capture, path)
+    return path
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+# -- what was chosen -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "changes"),
+    [
+        (Light(), {"sbr": 0.0}),
+        (Light(), {"ppp": -1.0}),
+        (Light(), {"n_pulses": 0}),
+        (Light(), {"n_pulses": 1.5}),
+        (Light(), {"seed": -1}),
+        (Viewing(), {"least_confidence": -0.1}),
+        (Viewing(), {"field_of_view_deg": 0.0}),
+    ],
+)
+def test_impossible_settings_are_refused_by_name(settings, changes):
+    (name,) = changes
+    with pytest.raises(ValueError, match=name):
+        replace(settings, **changes)
+
+
+def test_light_is_the_flux_and_the_pulses_of_an_acquisition():
+    light = Light(sbr=0.5, ppp=0.2, n_pulses=77)
+    assert (light.flux.sbr, light.flux.signal) == (0.5, 0.2)
+    gate = Acquisition(n_bins=40, gate_delay_s=1e-6)
+    assert light.acquisition(gate) == replace(gate, n_pulses=77)
+
+
+def test_typed_text_tells_how_to_read_a_file():
+    typed = {
+        "time_unit_s": "",
+        "bin_width_s": " 1e-9 ",
+        "gate_delay_s": "0",
+        "n_bins": "200",
+        "n_pulses": "  ",
+        "variable": " Ts ",
+    }
+    assert Reading.from_text(typed) == Reading(None, 1e-9, 0.0, 200, None, "Ts")
+    assert Reading.from_text(dict.fromkeys(typed, "")) == Reading()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "remedy"),
+    [
+        ("n_bins", "2.5", "a whole number"),
+        ("n_pulses", "many", "a whole number"),
+        ("bin_width_s", "1 ns", "a number such as 1e-9"),
+    ],
+)
+def test_text_that_is_no_number_is_refused_with_a_remedy(name, text, remedy):
+    with pytest.raises(ValueError, match=rf"{name}.*{text}.*{remedy}"):
+        Reading.from_text({name: text})
+
+
+# -- what was computed -----------------------------------------------------------------------------
+
+
+def test_only_what_changed_is_computed_again(car):
+    other_settings = compute(ask("car", tracking=PRESETS["as printed"]), car)
+    assert other_settings.capture is not car.capture  # another catalogue's scene is another source
+    request = replace(car.request, tracking=PRESETS["as printed"])
+    other_settings = compute(request, car)
+    assert other_settings.capture is car.capture
+    assert other_settings.capture_s == car.capture_s
+    assert not np.array_equal(other_settings.run.image.bin, car.run.image.bin)
+    for change in ({"light": Light(seed=1)}, {"source": built_in_sources()["staircase"]}):
+        assert compute(replace(car.request, **change), car).capture is not car.capture
+
+
+def test_an_answer_is_what_core_computes(car):
+    scene, light = core.scenes["car"](), Light()
+    capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
+    run = core.run(capture, "tracking", TrackingParameters())
+    np.testing.assert_array_equal(car.run.image.range_m, run.image.range_m)
+    assert car.run.figures == run.figures
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_pixel_shows_the_stages_of_its_own_estimate(car, preset):
+    answer = compute(replace(car.request, tracking=PRESETS[preset]), car)
+    pixel = inspect(answer, 32, 30)
+    histogram = answer.capture.cube[32, 30]
+    expected = tracking_signals(histogram, PRESETS[preset], 1000)
+    for stage, values in expected._asdict().items():
+        np.testing.assert_array_equal(getattr(pixel.signals, stage), values)
+    np.testing.assert_array_equal(pixel.signals.raw, histogram)
+    np.testing.assert_array_equal(pixel.difference, core.first_difference(histogram))
+    acquisition = answer.capture.acquisition
+    assert pixel.range_m == answer.run.image.range_m[32, 30]
+    assert pixel.truth_m == answer.capture.truth_range_m[32, 30]
+    assert acquisition.bin_to_range_m(pixel.answer_bin) == pytest.approx(pixel.range_m)
+    assert acquisition.bin_to_range_m(pixel.truth_bin) == pytest.approx(pixel.truth_m)
+    assert pixel.confidence == answer.run.image.confidence[32, 30]
+    assert pixel.counts == histogram.sum()
+
+
+def test_the_expected_counts_are_those_of_many_throws(car):
+    many = compute(ask("car", light=Light(n_pulses=100_000)), None)
+    pixel = inspect(many, 32, 30)
+    np.testing.assert_allclose(pixel.signals.raw, pixel.expected, atol=5 * np.sqrt(4000))
+    assert pixel.expected.sum() == pytest.approx(pixel.counts, rel=0.01)
+
+
+def test_without_truth_nothing_is_expected_of_a_pixel(sample):
+    pixel = inspect(sample, 32, 32)
+    assert pixel.expected is None
+    assert np.isnan(pixel.truth_m)
+    assert np.isnan(pixel.truth_bin)
+    assert is_wrong(sample) is None
+
+
+def test_wrong_is_an_answer_far_off_or_without_a_target(car):
+    wrong = is_wrong(car)
+    truth_m, image = car.capture.truth_range_m, car.run.image
+    np.testing.assert_array_equal(wrong[np.isnan(truth_m)], image.valid[np.isnan(truth_m)])
+    target = np.isfinite(truth_m)
+    assert 1 - wrong[target].mean() == pytest.approx(car.run.figures["rd_3_bins"], abs=1e-9)
+    assert is_wrong(car, 0.1).sum() > wrong.sum()
+
+
+def test_a_file_is_a_source(small_file, small_capture):
+    source = file_source(small_file)
+    assert source.title == "small.npz"
+    assert not source.is_scene
+    read = source.load(Light(), Reading())
+    np.testing.assert_array_equal(read.cube, small_capture.cube)
+    again = source.load(Light(), Reading(bin_width_s=3e-9))
+    assert again.acquisition.bin_width_s == 3e-9
+
+
+@pytest.mark.parametrize("key", built_in_sources())
+def test_every_built_in_source_gives_an_answer(key):
+    answer = compute(ask(key), None)
+    assert answer.run.image.valid.any()
+    assert bool(answer.run.figures) == answer.request.source.is_scene
+    assert answer.capture.source
+
+
+def test_sources_have_names_of_their_own():
+    titles = [source.title for source in built_in_sources().values()]
+    assert len(set(titles)) == len(titles)
+
+
+# -- off the page's thread -------------------------------------------------------------------------
+
+
+class Desk:
+    """Requests that wait for a word, and what became of them."""
+
+    def __init__(self, on_page=lambda act: act()):
+        self.jobs = LatestWins(on_page)
+        self.ran, self.done, self.failed = [], [], []
+        self.go = threading.Event()
+
+    def submit(self, name):
+        def work():
+            self.ran.append(name)
+            assert self.go.wait(20)
+            return name
+
+        self.jobs.submit(work, self.done.append, self.failed.append)
+
+
+def test_the_latest_request_wins_and_the_overtaken_never_run():
+    desk = Desk()
+    for name in range(5):
+        desk.submit(name)
+    desk.go.set()
+    until(lambda: 4 in desk.done)
+    assert desk.ran == desk.done == [0, 4]
+
+
+def test_nothing_is_computed_ahead_of_a_page_that_is_still_drawing():
+    waiting_to_be_drawn = []
+    desk = Desk(on_page=waiting_to_be_drawn.append)
+    desk.go.set()
+    desk.submit("first")
+    until(lambda: waiting_to_be_drawn)
+    for name in ("second", "third"):
+        desk.submit(name)
+    time.sleep(0.05)
+    assert desk.ran == ["first"]
+    waiting_to_be_drawn.pop()()
+    until(lambda: waiting_to_be_drawn)
+    waiting_to_be_drawn.pop()()
+    assert desk.ran == desk.done == ["first", "third"]
+
+
+def test_a_failure_is_told_and_the_next_request_runs():
+    desk = Desk()
+    desk.go.set()
+    desk.jobs.submit(lambda: 1 / 0, desk.done.append, desk.failed.append)
+    until(lambda: desk.failed)
+    assert isinstance(desk.failed[0], ZeroDivisionError)
+    desk.submit("next")
+    until(lambda: desk.done == ["next"])
+
+
+def test_an_answer_that_cannot_be_drawn_is_told_and_does_not_stop_the_next():
+    drawings = []
+    desk = Desk(on_page=drawings.append)
+    desk.go.set()
+    desk.jobs.submit(lambda: 0, lambda _: 1 / 0, desk.failed.append)
+    desk.submit("next")
+    until(lambda: drawings)
+    drawings.pop()()
+    assert isinstance(desk.failed[0], ZeroDivisionError)
+    until(lambda: drawings)
+    drawings.pop()()
+    assert desk.done == ["next"]
+
+
+def test_a_slow_request_of_one_session_holds_up_no_other():
+    slow, quick = Desk(), Desk()
+    slow.submit("slow")
+    quick.go.set()
+    quick.submit("quick")
+    until(lambda: quick.done)
+    assert not slow.done
+    slow.go.set()
+    until(lambda: slow.done)
+
+
+# -- colours ---------------------------------------------------------------------------------------
+
+
+def test_truth_and_estimate_share_one_scale(car):
+    truth, of_truth = looks.image_of(car, "Truth", 0.9)
+    estimate, of_estimate = looks.image_of(car, "Estimate", 0.9)
+    assert (of_truth.low, of_truth.high) == (of_estimate.low, of_estimate.high)
+    assert of_truth.colors == of_estimate.colors
+    assert of_truth.low < np.nanmin(truth) < np.nanmax(truth) < of_truth.high
+    np.testing.assert_array_equal(truth, car.capture.truth_range_m)
+    known = np.isfinite(estimate)
+    np.testing.assert_array_equal(estimate[known], car.run.image.range_m[known])
+
+
+@pytest.mark.parametrize("kind", ["Estimate", "Error"])
+def test_answers_below_the_confidence_are_left_blank(car, kind):
+    confidence = car.run.image.confidence
+    for least in (0.0, 0.5, 0.99):
+        image, _ = looks.image_of(car, kind, least)
+        blank = confidence < least
+        if kind == "Error":
+            blank |= np.isnan(car.capture.truth_range_m)
+        np.testing.assert_array_equal(np.isnan(image), blank | ~car.run.image.valid)
+
+
+def test_error_is_estimate_minus_truth_around_zero(car):
+    error, look = looks.image_of(car, "Error", 0.0)
+    expected = car.run.image.range_m - car.capture.truth_range_m
+    np.testing.assert_array_equal(error, expected)
+    assert look.low == -look.high < 0
+    assert look.unit == "m"
+
+
+def test_counts_are_those_of_the_capture(car):
+    counts, look = looks.image_of(car, "Counts", 1.0)
+    np.testing.assert_array_equal(counts, car.capture.counts)
+    assert (look.low, look.high, look.unit) == (counts.min(), counts.max(), "counts")
+
+
+def test_without_truth_the_scale_fits_confident_answers(sample):
+    image, look = looks.image_of(sample, "Truth", 0.9)
+    assert look.title == "Estimated range"
+    inside = (image > look.low) & (image < look.high)
+    assert inside.sum() >= 0.95 * np.isfinite(image).sum()
+
+
+def test_a_colour_for_every_value():
+    look = looks.Look("", "", 0.0, 1.0, ["#000000", "#808080", "#ffffff"], OUTSIDE_COLOR)
+    grey = [int(OUTSIDE_COLOR[at : at + 2], 16) for at in (1, 3, 5)]
+    rgb = look.rgb(np.array([-0.01, 0.0, 0.5, 1.0, 1.01]))
+    np.testing.assert_array_equal(rgb, [grey, [0] * 3, [128] * 3, [255] * 3, grey])
+    assert rgb.dtype == np.uint8
+    without = replace(look, outside=None).rgb(np.array([-9.0, 9.0]))
+    np.testing.assert_array_equal(without, [[0] * 3, [255] * 3])
+
+
+# -- words -----------------------------------------------------------------------------------------
+
+
+def names(facts):
+    return {name for name, _, _ in facts}
+
+
+def test_figures_and_numbers_are_cores(car):
+    figures = {name: value for name, value, _ in words.figure_strip(car)}
+    assert figures["RMSE"] == f"{car.run.figures['rmse_m']:.4g} m"
+    assert figures["Within 3 bins"] == f"{100 * car.run.figures['rd_3_bins']:.1f} %"
+    numbers = {name: value for name, value, _ in words.pixel_numbers(car, inspect(car, 32, 30))}
+    image, sigma, settings = car.run.image, car.capture.cube[32, 30].std(), TrackingParameters()
+    assert numbers["Pixel"] == "row 32, col 30"
+    assert numbers["Estimate"] == f"{image.range_m[32, 30]:.4g} m"
+    assert numbers["Truth"] == f"{car.capture.truth_range_m[32, 30]:.4g} m"
+    assert numbers["σ"] == f"{sigma:.4g} counts"
+    assert numbers["r small"] == f"{settings.l * sigma:.4g}"
+    assert numbers["r large"] == f"{settings.n * settings.l * sigma:.4g}"
+    assert numbers["Pulses that fired"] == f"{car.capture.counts[32, 30] / 10:.1f} %"
+
+
+def test_what_needs_a_truth_is_left_out_without_one(car, sample):
+    def said(answer):
+        pixel = inspect(answer, 32, 32)
+        return names(words.figure_strip(answer)) | names(words.pixel_numbers(answer, pixel))
+
+    assert said(car) >= NEED_TRUTH
+    assert said(car) - said(sample) == NEED_TRUTH | {"Simulated in"}
+    assert "wrong" in words.cloud_caption(car, 10, 3)
+    assert "wrong" not in words.cloud_caption(sample, 10, None)
+
+
+def test_a_pixel_without_a_target_says_so(car):
+    row, col = np.argwhere(np.isnan(car.capture.truth_range_m))[0]
+    numbers = {name: value for name, value, _ in words.pixel_numbers(car, inspect(car, row, col))}
+    assert numbers["Truth"] == "no target"
+    assert numbers["Error"] == "–"
+
+
+def test_pulses_that_are_not_known_are_not_counted(small_file):
+    answer = compute(ask(file_source(small_file)), None)
+    said = names(words.pixel_numbers(answer, inspect(answer, 0, 0)))
+    assert "Pulses that fired" not in said
+
+
+def test_the_page_is_told_plain_text_only(car, sample):
+    for answer in (car, sample):
+        pixel = inspect(answer, 32, 32)
+        facts = words.figure_strip(answer) + words.pixel_numbers(answer, pixel)
+        texts = [text for fact in facts for text in fact]
+        texts += [words.provenance(answer), words.cloud_caption(answer, 1, 1)]
+        assert all(texts)
+        assert not [text for text in texts if "<" in text or "&" in text]
+
+
+def test_provenance_tells_size_and_gate(car):
+    sentence = words.provenance(car)
+    for part in ("64 × 64 pixels", "100 bins of 1 ns", "280 to 380 ns", "41.9709 to 56.9606 m"):
+        assert part in sentence
+
+
+def test_a_failure_is_a_sentence_with_a_remedy():
+    assert words.failure(ValueError("l is bad: give more.")).startswith("l is bad: give more. The")
+    unforeseen = words.failure(KeyError("secret"))
+    assert "KeyError" in unforeseen
+    assert "secret" not in unforeseen
+    assert "change them back" in unforeseen
+
+
+# -- plots -----------------------------------------------------------------------------------------
+
+
+def test_the_histogram_plot_carries_what_it_was_given(rng):
+    counts, expected, small, large = rng.random((4, 12))
+    overlay = plots.histogram(counts, expected, small, large, LIGHT)
+    layers = {element.label: element for element in overlay}
+    np.testing.assert_array_equal(layers["raw histogram"].dimension_values("counts"), counts)
+    np.testing.assert_array_equal(layers["raw histogram"].edges, np.arange(13))
+    curves = {"expected": expected, "small scale": small, "large scale": large}
+    for label, values in curves.items():
+        np.testing.assert_array_equal(layers[label].dimension_values("counts"), values)
+        np.testing.assert_array_equal(layers[label].dimension_values("bin"), np.arange(12) + 0.5)
+    assert list(layers) == ["raw histogram", *curves, "truth", "answer"]
+
+
+def test_residual_and_enhanced_plots_carry_what_they_were_given(rng):
+    one, other = rng.random((2, 12))
+    residual = {each.label: each for each in plots.residual(one, other, LIGHT)}
+    np.testing.assert_array_equal(residual["residual"].dimension_values("residual"), one)
+    difference = residual["first difference of the raw histogram"]
+    np.testing.assert_array_equal(difference.dimension_values("residual"), other)
+    enhanced = {each.label: each for each in plots.enhanced(one, other, LIGHT)}
+    np.testing.assert_array_equal(enhanced["enhanced"].dimension_values("enhanced"), one)
+    weight = enhanced["weight (scaled to fit)"]
+    np.testing.assert_array_equal(weight.dimension_values("enhanced"), other)
+
+
+def test_the_image_plot_has_row_0_at_the_top(rng):
+    image = rng.random((3, 5))
+    picture, *frames = plots.range_image(image, 0.0, 1.0)
+    values = picture.dimension_values("value", flat=False)
+    np.testing.assert_array_equal(picture.interface.coords(picture, "row"), np.arange(3))
+    np.testing.assert_array_equal(values, image)
+    assert len(frames) == 2
+
+
+def test_every_plot_has_a_title_a_legend_and_labels_with_units():
+    signals, image = SignalPlots(), ImageView(lambda row, col: None)
+    figures = [pane.object for pane in signals.panes]
+    assert [figure.yaxis.axis_label for figure in figures] == [
+        "Counts",
+        "Counts",
+        "Counts × weight",
+    ]
+    for figure in figures:
+        assert figure.title.text
+        assert "Bin" in [axis.axis_label for axis in figure.xaxis]
+        assert figure.legend.items
+    assert "Range (m)" in [axis.axis_label for axis in figures[0].xaxis]
+    assert (image.figure.xaxis.axis_label, image.figure.yaxis.axis_label) == ("Column", "Row")
+    assert image.figure.y_range.flipped
+
+
+# -- views -----------------------------------------------------------------------------------------
+
+
+def test_only_changed_columns_travel_and_as_float32():
+    ones = np.ones(8)
+    plot = Plot(plots.residual(ones, ones, LIGHT), plots.RESIDUAL_LAYERS)
+    plot.write("residual", residual=ones)
+    page, sent = Document(), []
+    page.add_root(plot.figure)
+    page.on_change(sent.append)
+    plot.write("residual", residual=ones, bin=plots.centres(8))
+    assert sent == []
+    plot.write("residual", residual=2 * ones, bin=plots.centres(8))
+    (event,) = sent
+    assert event.cols == ["residual"]
+    assert columns(plot, "residual")["residual"].dtype == np.float32
+
+
+def columns(plot, layer):
+    return plot.source(layer).data
+
+
+def test_a_pixels_stages_stand_in_its_plots(car):
+    views, pixel = SignalPlots(), inspect(car, 32, 30)
+    views.update(pixel, car.capture.acquisition, with_difference=True)
+    signals = pixel.signals
+    drawn = {
+        "raw": (columns(views.histogram, "raw")["top"], signals.raw),
+        "expected": (columns(views.histogram, "expected")["counts"], pixel.expected),
+        "small": (columns(views.histogram, "small")["counts"], signals.small),
+        "large": (columns(views.histogram, "large")["counts"], signals.large),
+        "residual": (columns(views.residual, "residual")["residual"], signals.residual),
+        "difference": (columns(views.residual, "raw")["residual"], pixel.difference),
+        "enhanced": (columns(views.enhanced, "enhanced")["enhanced"], signals.enhanced),
+    }
+    for name, (found, expected) in drawn.items():
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6, err_msg=name)
+    for plot in (views.histogram, views.residual, views.enhanced):
+        np.testing.assert_allclose(columns(plot, "truth")["bin"], pixel.truth_bin, rtol=1e-6)
+        np.testing.assert_allclose(columns(plot, "answer")["bin"], pixel.answer_bin, rtol=1e-6)
+        shown = [curve.max() for curve in (signals.raw, signals.large)]
+        assert plot is not views.histogram or plot.figure.y_range.end >= max(shown)
+
+
+def test_another_gate_lays_the_axes_anew(car, small_file):
+    views = SignalPlots()
+    views.update(inspect(car, 32, 30), car.capture.acquisition, with_difference=False)
+    answer = compute(ask(file_source(small_file)), None)
+    views.update(inspect(answer, 1, 2), answer.capture.acquisition, with_difference=False)
+    for pane in views.panes:
+        assert (pane.object.x_range.start, pane.object.x_range.end) == (0, 37)
+    for plot in (views.histogram, views.residual, views.enhanced):
+        for layer in plot.layers:
+            lengths = {len(column) for column in columns(plot, layer).values()}
+            assert lengths == ({2} if layer in ("truth", "answer") else {37}), layer
+    start_m, step_m = 149.896229, 0.299792458
+    metres = views.histogram.figure.above[0].formatter
+    assert metres.args == pytest.approx({"start": start_m, "step": step_m})
+
+
+def legend(plot):
+    return {item.label.value: item.visible for item in plot.figure.legend.items}
+
+
+def test_lines_that_have_no_place_are_not_drawn(car, sample):
+    views = SignalPlots()
+    for answer, has_truth in ((car, True), (sample, False), (car, True)):
+        pixel = inspect(answer, 32, 30)
+        views.update(pixel, answer.capture.acquisition, with_difference=False)
+        for plot in (views.histogram, views.residual, views.enhanced):
+            assert plot.layers["truth"]["glyph_renderer"].visible == has_truth
+            assert legend(plot)["truth"] == has_truth
+            assert legend(plot)["answer"]
+        assert legend(views.histogram)["expected"] == has_truth
+        assert not legend(views.residual)["first difference of the raw histogram"]
+
+
+def test_an_image_is_shown_with_its_scale_and_its_frame(car):
+    view = ImageView(lambda row, col: None)
+    view.enter(64, 64)
+    image, look = looks.image_of(car, "Estimate", 0.9)
+    view.update(image, look)
+    view.mark(3, 5)
+    (picture,) = (r for r in view.figure.renderers if "image" in r.data_source.data)
+    drawn = picture.data_source.data["image"][0]
+    np.testing.assert_array_equal(drawn, image.astype(np.float32))
+    assert drawn.dtype == np.float32
+    mapper = picture.glyph.color_mapper
+    assert (mapper.low, mapper.high, mapper.low_color) == (look.low, look.high, OUTSIDE_COLOR)
+    assert view.figure.title.text == look.title
+    frames = [r.data_source.data for r in view.figure.renderers if r is not picture]
+    for data in frames:
+        middle = (data["left"][0] + data["right"][0]) / 2, (data["top"][0] + data["bottom"][0]) / 2
+        assert middle == (5, 3)
+
+
+def test_plots_follow_the_page_into_the_dark():
+    views = SignalPlots()
+    for palette in (DARK, LIGHT):
+        views.paint(palette)
+        for plot in (views.histogram, views.residual, views.enhanced):
+            assert plot.figure.title.text_color == palette.text
+            assert plot.layers["answer"]["glyph"].line_color == palette.answer
+
+
+# -- controls --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", [TrackingParameters(), Light(), Viewing()])
+def test_every_field_has_a_control_made_from_its_metadata(settings):
+    controls = SettingsPanel(settings, lambda new: None).controls
+    assert list(controls) == [each.name for each in fields(settings)]
+    for each in fields(settings):
+        control, spec = controls[each.name], spec_of(each)
+        assert control.value == getattr(settings, each.name)
+        assert control.label == spec.symbol
+        if isinstance(spec, Number):
+            assert (control.low, control.high) == (spec.low, spec.high)
+            assert (control.log, control.whole) == (spec.log, spec.whole)
+            assert (control.unit, control.help) == (spec.unit, each.metadata["help"])
+            assert control.low <= control.initial <= control.high
+        else:
+            assert tuple(control.options) == spec.options
+            assert control.description == each.metadata["help"]
+
+
+def test_a_change_is_reported_as_new_settings():
+    reported = []
+    panel = SettingsPanel(Light(), reported.append)
+    panel.controls["n_pulses"].value = 500.0
+    assert reported == [replace(Light(), n_pulses=500)]
+    assert isinstance(reported[0].n_pulses, int)
+    panel.controls["sbr"].value = 1.0
+    assert reported[1:] == [replace(Light(), n_pulses=500, sbr=1.0)]
+
+
+def test_showing_settings_reports_nothing():
+    reported = []
+    panel = SettingsPanel(TrackingParameters(), reported.append)
+    panel.show(PRESETS["as printed"])
+    shown = {name: control.value for name, control in panel.controls.items()}
+    assert shown == asdict(PRESETS["as printed"])
+    assert reported == []
+    panel.controls["l"].value = 0.5
+    assert reported == [replace(PRESETS["as printed"], l=0.5)]
+
+
+# -- the whole page --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def layout(monkeypatch):
+    """A page; what is to be done on its thread waits for `next_answer`."""
+    acts = SimpleQueue()
+    monkeypatch.setattr("app.session.LatestWins", lambda on_page: LatestWins(acts.put))
+    page = Layout(built_in_sources())
+    page.acts, page.heard, tell = acts, [""], page.session.complain
+    page.session.complain = lambda sentence: (page.heard.append(sentence), tell(sentence))
+    return page
+
+
+def next_answer(layout):
+    """Let the page draw what the worker gives it next, and return what it then shows."""
+    layout.acts.get(timeout=20)()
+    return layout.session.answer
+
+
+def complaint(layout):
+    """The sentence that the session told its page last, empty for none."""
+    return layout.heard[-1]
+
+
+def open_file(layout, path):
+    """Go to a file; what an upload does once its content is stored."""
+    layout.session.sources[path.name] = file_source(path)
+    layout.session.state.param.update(source=path.name, reading=Reading())
+
+
+def control(layout, label):
+    (found,) = layout.page.select(lambda each: getattr(each, "label", None) == label)
+    return found
+
+
+def told(facts):
+    return {name: value for name, value, _ in facts.facts}
+
+
+def test_a_page_is_complete_and_answered(layout):
+    session = layout.session
+    assert told(session.figures)["RMSE"] == f"{session.answer.run.figures['rmse_m']:.4g} m"
+    assert told(session.numbers)["Pixel"] == "row {}, col {}".format(*session.state.pixel)
+    assert np.isfinite(session.answer.capture.truth_range_m[session.state.pixel])
+    shown = looks.shown(session.answer, 0.9).sum()
+    assert len(session.cloud.positions) == 12 * shown
+    assert f"{shown:,} of 4,096" in session.cloud.caption
+    model = layout.page.get_root()
+    kinds = [type(part).__name__ for part in model.references()]
+    assert kinds.count("figure") == 4
+    assert sum(kind.startswith("PointCloud") for kind in kinds) == 1
+
+
+@pytest.mark.parametrize("key", built_in_sources())
+def test_every_source_can_be_drawn_in_every_way(layout, key):
+    session = layout.session
+    if key != session.state.source:
+        control(layout, "Scene or capture").value = key
+        assert next_answer(layout).request.source is session.sources[key]
+    assert complaint(layout) == ""
+    for kind in session.state.param.image.objects:
+        session.state.image = kind
+        assert session.image.figure.title.text
+    for kind in session.state.param.cloud_color.objects:
+        session.state.cloud_color = kind
+        assert len(session.cloud.colors) == len(session.cloud.positions) / 4
+
+
+def test_a_tracking_parameter_changes_the_answer(layout):
+    before, figures = layout.session.answer, told(layout.session.figures)
+    control(layout, "l").value = 0.05
+    answer = next_answer(layout)
+    assert answer.request.tracking == TrackingParameters(l=0.05)
+    assert answer.capture is before.capture
+    assert told(layout.session.figures)["RMSE"] == f"{answer.run.figures['rmse_m']:.4g} m"
+    assert told(layout.session.figures)["RMSE"] != figures["RMSE"]
+
+
+def test_presets_set_all_controls_and_a_change_makes_them_custom(layout):
+    preset = control(layout, "Preset")
+    preset.value = "as printed"
+    assert next_answer(layout).request.tracking == PRESETS["as printed"]
+    assert (control(layout, "m").value, control(layout, "Weight").value) == (1.5, "cubic")
+    control(layout, "m").value = 2.0
+    assert preset.value == CUSTOM
+    assert next_answer(layout).request.tracking == replace(PRESETS["as printed"], m=2.0)
+    control(layout, "m").value = 1.5
+    assert preset.value == "as printed"
+
+
+def test_a_file_that_cannot_be_read_leaves_the_picture_and_says_why(layout, tmp_path):
+    path = tmp_path / "noise.npz"
+    path.write_bytes(b"nothing of the kind")
+    before = layout.session.answer
+    open_file(layout, path)
+    assert next_answer(layout) is before
+    assert "noise.npz" in complaint(layout)
+    assert "still shows the last settings" in complaint(layout)
+    assert control(layout, "Scene or capture").value == layout.session.state.source == "car"
+    control(layout, "SBR").value = 1.0
+    assert next_answer(layout).request.light.sbr == 1.0
+    assert complaint(layout) == ""
+
+
+def test_a_failure_keeps_how_the_present_file_is_read(layout, small_file, tmp_path):
+    open_file(layout, small_file)
+    next_answer(layout)
+    layout.session.state.reading = Reading(bin_width_s=3e-9)
+    assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9
+    open_file(layout, tmp_path / "absent.npz")
+    next_answer(layout)
+    assert "absent.npz" in complaint(layout)
+    control(layout, "l").value = 0.01
+    assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9
+
+
+def test_a_weight_that_needs_pulses_is_refused_where_they_are_not_known(layout, small_file):
+    open_file(layout, small_file)
+    before = next_answer(layout)
+    control(layout, "Weight").value = "survival"
+    assert next_answer(layout) is before
+    assert "weight = 'survival' needs the number of pulses" in complaint(layout)
+    control(layout, "Weight").value = "none"
+    assert next_answer(layout) is not before
+    assert complaint(layout) == ""
+
+
+def test_typed_text_changes_how_a_file_is_read(layout, small_file):
+    open_file(layout, small_file)
+    before = next_answer(layout)
+    control(layout, "Bin width (s)").value = "wide"
+    control(layout, "Read again").clicks += 1
+    assert layout.session.answer is before
+    assert layout.session.state.reading == Reading()
+    control(layout, "Bin width (s)").value = "3e-9"
+    control(layout, "Read again").clicks += 1
+    assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9
+
+
+def test_a_capture_without_truth_hides_what_needs_one(layout, real_capture):
+    session = layout.session
+    session.state.param.update(image="Error", cloud_color="Error")
+    open_file(layout, real_capture("21km_K11_night.mat"))
+    assert next_answer(layout).capture.shape == (256, 256)
+    assert session.state.param.image.objects == ["Estimate", "Counts"]
+    assert session.state.param.cloud_color.objects == ["Range", "Counts"]
+    assert (session.state.image, session.state.cloud_color) == ("Estimate", "Range")
+    assert not NEED_TRUTH & (set(told(session.figures)) | set(told(session.numbers)))
+    assert not any(session.cloud.wrong)
+    control(layout, "Scene or capture").value = "car"
+    assert next_answer(layout).request.source.is_scene
+    assert session.state.param.image.objects == ["Estimate", "Truth", "Error", "Counts"]
+
+
+@pytest.mark.parametrize("counts", [0, 1])
+def test_a_capture_without_any_answer_is_shown_as_such(layout, tmp_path, counts):
+    path = tmp_path / "silence.npz"
+    save_capture(Capture(np.full((3, 5, 40), counts, np.uint16), Acquisition(40)), path)
+    open_file(layout, path)
+    answer = next_answer(layout)
+    assert answer.request.source.title == "silence.npz"
+    assert not answer.run.image.valid.any()
+    assert "No pixel has an answer" in complaint(layout)
+    assert told(layout.session.numbers)["Estimate"] == "–"
+    assert layout.session.cloud.positions == b""
+    assert layout.session.cloud.caption.startswith("0 of 15 answers")
+
+
+def test_a_gate_that_ends_before_t_n_is_told(layout, tmp_path):
+    path = tmp_path / "short.npz"
+    cube = np.ones((3, 5, 9), np.uint16)
+    cube[:, :, 5] = 9
+    save_capture(Capture(cube, Acquisition(9)), path)
+    open_file(layout, path)
+    next_answer(layout)
+    assert "T_n = 20 leaves no bin of 9" in complaint(layout)
+    assert control(layout, "T_n").high == 8
+    control(layout, "T_n").value = 3
+    next_answer(layout)
+    assert complaint(layout) == ""
+
+
+def test_a_pixel_can_be_chosen_by_point_and_by_key(layout):
+    session = layout.session
+    session.cloud.selected = 10 * 64 + 20
+    assert session.state.pixel == tuple(session.image_keys.pixel) == (10, 20)
+    session.image_keys.pixel = [11, 20]  # a list, as the browser sends it
+    assert session.cloud.selected == 11 * 64 + 20
+    assert told(session.numbers)["Pixel"] == "row 11, col 20"
+
+
+def test_the_cloud_file_holds_the_points_on_show(layout, tmp_path):
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(layout.session.cloud_file().read())
+    shown = looks.shown(layout.session.answer, layout.session.state.viewing.least_confidence)
+    range_m = layout.session.answer.run.image.range_m[shown]
+    points = pv.read(path).points
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), range_m, rtol=1e-6)
+
+
+def test_hidden_answers_leave_the_cloud_but_not_the_figures(layout):
+    session, figures = layout.session, told(layout.session.figures)
+    confidence = session.answer.run.image.confidence
+    for least in (0.0, 0.5, 1.0):
+        control(layout, "Show from confidence").value = least
+        assert len(session.cloud.positions) / 12 == (confidence >= least).sum()
+        assert told(session.figures) == figures
+
+
+def test_controls_fit_the_capture_they_are_for(layout, small_file):
+    open_file(layout, small_file)
+    answer = next_answer(layout)
+    assert control(layout, "T_n").high == 36
+    field_of_view = control(layout, "Field of view")
+    width_deg = np.degrees(answer.capture.shape[1] * answer.capture.acquisition.pixel_angle_rad)
+    assert field_of_view.value == field_of_view.initial == pytest.approx(width_deg, rel=0.01)
+
+
+def test_sessions_share_no_control_and_no_source(layout):
+    other = Layout(built_in_sources())
+    knobs = [set(map(id, each.page.select(Knob))) for each in (layout, other)]
+    assert len(knobs[0]) == len(knobs[1]) > 0
+    assert not knobs[0] & knobs[1]
+    layout.session.sources["mine"] = layout.session.sources["car"]
+    assert "mine" not in other.session.sources
