@@ -391,9 +391,9 @@ def test_a_quick_drag_leaves_no_queue_and_ends_at_the_last_value(car_page):
     sbr = float(field(car_page, "SBR").input_value())
     assert sbr > 1
     expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Light(sbr=sbr))))
-    # What was under way at release and the answer to the last value: 60 moves left no queue.
+    # A few were under way at release, more on a busy machine; a queue would hold most of the 60.
     assert before_release > 2
-    assert car_page.evaluate("answers") - before_release <= 4
+    assert car_page.evaluate("answers") - before_release <= 12
 
 
 def test_typed_values_are_taken_or_refused_with_a_sentence(car_page):
