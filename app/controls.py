@@ -66,7 +66,7 @@ class SettingsPanel(Generic[Settings]):
     """
 
     def __init__(self, settings: Settings, changed: Callable[[Settings], None]) -> None:
-        self._initial = self._settings = settings
+        self._settings = settings
         self._changed = changed
         self._silent = False
         self.controls: dict[str, Any] = {}
@@ -90,10 +90,8 @@ class SettingsPanel(Generic[Settings]):
 
     @property
     def layout(self) -> pn.Column:
-        """All controls, in the order of the fields, and a button that resets them."""
-        reset = pmui.Button(label="Reset all", variant="text", size="small", margin=(0, 8))
-        reset.on_click(lambda _: self._reset())
-        return pn.Column(*self.controls.values(), reset, sizing_mode="stretch_width", margin=0)
+        """All controls, in the order of the fields."""
+        return pn.Column(*self.controls.values(), sizing_mode="stretch_width", margin=0)
 
     def show(self, settings: Settings) -> None:
         """Set every control without reporting a change."""
@@ -104,12 +102,6 @@ class SettingsPanel(Generic[Settings]):
         finally:
             self._silent = False
         self._settings = settings
-
-    def _reset(self) -> None:
-        knobs = {name: c.initial for name, c in self.controls.items() if isinstance(c, Knob)}
-        initial = replace(self._initial, **knobs)  # type: ignore[type-var]
-        self.show(initial)
-        self._changed(initial)
 
     def _collect(self, _event: param.parameterized.Event) -> None:
         if self._silent:
