@@ -1,6 +1,6 @@
 """Range estimation from first-photon (Geiger-mode APD) lidar captures, without a screen."""
 
-from core import metrics
+from core import limits, metrics
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
@@ -36,6 +36,7 @@ __all__ = [
     "coates_rate",
     "estimate",
     "first_difference",
+    "limits",
     "metrics",
     "no_trigger_probability",
     "rate_per_bin",

@@ -1,17 +1,18 @@
 """How far an answer is from the truth.
 
 Metrics look at target pixels, those with a finite truth. A target pixel without an answer counts as
-not restored; the root mean square and the bias are over answered pixels, which is why `coverage`
-belongs beside them.
+not restored; errors and their means are over answered pixels, which is why `coverage` belongs
+beside them.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
 from core.acquisition import Floats
@@ -34,15 +35,35 @@ def errors_m(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
 
 def rmse_m(range_m: ArrayLike, truth_m: ArrayLike) -> float:
     """Root mean square error in metres over answered target pixels; NaN where there are none."""
-    error = errors_m(range_m, truth_m)
-    error = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean(error**2))) if error.size else math.nan
+    return _root_mean_square(_answered(range_m, truth_m))
+
+
+def mae_m(range_m: ArrayLike, truth_m: ArrayLike) -> float:
+    """Mean absolute error in metres over answered target pixels; NaN where there are none."""
+    return _mean(np.abs(_answered(range_m, truth_m)))
+
+
+def inlier_rmse_m(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: float) -> float:
+    """Root mean square error in metres over target pixels within `tolerance_m` of the truth.
+
+    How well an echo is placed once it is found; `restoration_degree` says how often it is. NaN
+    where no pixel is within the tolerance.
+    """
+    error = _answered(range_m, truth_m)
+    return _root_mean_square(error[_within(error, tolerance_m)])
 
 
 def bias_m(range_m: ArrayLike, truth_m: ArrayLike) -> float:
+    """Mean error in metres over answered target pixels; NaN where there are none.
+
+    A few answers at the other end of the gate move it; `median_error_m` is the shift of the many.
+    """
+    return _mean(_answered(range_m, truth_m))
+
+
+def median_error_m(range_m: ArrayLike, truth_m: ArrayLike) -> float:
     """Median error in metres over answered target pixels; NaN where there are none."""
-    error = errors_m(range_m, truth_m)
-    error = error[np.isfinite(error)]
+    error = _answered(range_m, truth_m)
     return float(np.median(error)) if error.size else math.nan
 
 
@@ -55,8 +76,7 @@ def coverage(range_m: ArrayLike, truth_m: ArrayLike) -> float:
 def restored(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: float) -> tuple[int, int]:
     """How many target pixels lie within `tolerance_m` of the truth, and how many there are."""
     error = errors_m(range_m, truth_m)
-    # Half a micrometre of grace: a tolerance of whole bins is met by an error of whole bins.
-    return int(np.count_nonzero(np.abs(error) <= tolerance_m + 5e-7)), error.size
+    return int(np.count_nonzero(_within(error, tolerance_m))), error.size
 
 
 def restoration_degree(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: float) -> float:
@@ -66,6 +86,88 @@ def restoration_degree(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: floa
     """
     hits, targets = restored(range_m, truth_m, tolerance_m)
     return hits / targets if targets else math.nan
+
+
+def rd_variance(rd_per_repetition: ArrayLike) -> float:
+    """Variance of the restoration degree over Monte-Carlo repetitions.
+
+    The paper does not define its "Var"; this reading fits the size of its numbers. Where pixels are
+    independent and equally hard it is ``RD (1 - RD) / pixels``.
+
+    Parameters
+    ----------
+    rd_per_repetition : array_like, shape (repetition,)
+        At least 2.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer.
+    """
+    rd = np.asarray(rd_per_repetition, float)
+    require("rd_per_repetition", f"shape {rd.shape}", rd.ndim == 1 and rd.size >= 2, "2 or more")
+    return float(np.var(rd, ddof=1))
+
+
+def estimator_variance_m2(range_m: ArrayLike, truth_m: ArrayLike) -> float:
+    """Variance in square metres of a pixel's answers over repetitions, averaged over target pixels.
+
+    Parameters
+    ----------
+    range_m : array_like, shape (repetition, row, col)
+        Answers to captures of one scene that differ in their seed; NaN where there is none.
+    truth_m : array_like, shape (row, col)
+        NaN where there is no target.
+
+    Returns
+    -------
+    float
+        Pixels with fewer than 2 answers have no variance and are left out; NaN where all are.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit each other.
+    """
+    answer, truth = np.asarray(range_m, float), np.asarray(truth_m, float)
+    fits = answer.ndim == truth.ndim + 1 and answer.shape[1:] == truth.shape
+    require("range_m", f"shape {answer.shape}", fits, f"(repetition, *{truth.shape})")
+    answer = answer[:, np.isfinite(truth)]
+    answer = answer[:, np.isfinite(answer).sum(axis=0) >= 2]
+    return _mean(np.nanvar(answer, axis=0, ddof=1))
+
+
+@dataclass(frozen=True)
+class Detection:
+    """How well an estimator tells target from no target; NaN where a share is of nothing."""
+
+    precision: float
+    """Share of answered pixels that have a target."""
+    recall: float
+    """Share of target pixels that are answered."""
+    false_alarm_rate: float
+    """Share of pixels without a target that are answered."""
+
+
+def precision_recall(valid: ArrayLike, truth_m: ArrayLike) -> Detection:
+    """Judge the decision whether there is a target, not where.
+
+    Parameters
+    ----------
+    valid : array_like of bool, shape (row, col)
+        Where the estimator answers.
+    truth_m : array_like, shape (row, col)
+        NaN where there is no target.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ.
+    """
+    answered, target = np.asarray(valid, bool), np.isfinite(np.asarray(truth_m, float))
+    fits = answered.shape == target.shape
+    require("valid", f"shape {answered.shape}", fits, f"{target.shape}")
+    return Detection(_mean(target[answered]), _mean(answered[target]), _mean(answered[~target]))
 
 
 @dataclass(frozen=True)
@@ -96,3 +198,21 @@ def wilson(hits: int, trials: int, level: float = 0.95) -> Interval:
     half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
     half /= 1 + z * z / trials
     return Interval(share, min(max(centre - half, 0.0), share), max(min(centre + half, 1.0), share))
+
+
+def _answered(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
+    error = errors_m(range_m, truth_m)
+    return error[np.isfinite(error)]
+
+
+def _within(error_m: Floats, tolerance_m: float) -> NDArray[np.bool_]:
+    # Half a micrometre of grace: a tolerance of whole bins is met by an error of whole bins.
+    return np.asarray(np.abs(error_m) <= tolerance_m + 5e-7)
+
+
+def _mean(values: NDArray[Any]) -> float:
+    return float(np.mean(values)) if values.size else math.nan
+
+
+def _root_mean_square(values: Floats) -> float:
+    return math.sqrt(_mean(values**2))

@@ -18,8 +18,9 @@ class Run:
     Parameters
     ----------
     figures : dict
-        ``rmse_m``, ``bias_m``, ``coverage``, ``rd_1_bin``, ``rd_2_bins``, ``rd_3_bins``; empty
-        where the capture has no truth: nothing is shown rather than nonsense.
+        ``rmse_m``, ``mae_m``, ``inlier_rmse_m`` (within 3 bins), ``bias_m``, ``median_error_m``,
+        ``coverage``, ``rd_1_bin``, ``rd_2_bins``, ``rd_3_bins``; empty where the capture has no
+        truth: nothing is shown rather than nonsense.
     estimate_s : float
         Seconds spent estimating.
     """
@@ -30,7 +31,9 @@ class Run:
     estimate_s: float
 
 
-def run(capture: Capture, method: str, settings: Any = None) -> Run:
+def run(
+    capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
+) -> Run:
     """Range a capture and compare the answer with its truth, if it has one.
 
     Parameters
@@ -40,9 +43,11 @@ def run(capture: Capture, method: str, settings: Any = None) -> Run:
         A key of `ESTIMATORS`.
     settings : object, optional
         The method's own settings; its defaults where None.
+    false_alarm : float, optional
+        As `core.estimate` takes it.
     """
     started = perf_counter()
-    image = estimate(capture, method, settings)
+    image = estimate(capture, method, settings, false_alarm=false_alarm)
     seconds = perf_counter() - started
     return Run(capture, image, _figures(capture, image), seconds)
 
@@ -54,7 +59,10 @@ def _figures(capture: Capture, image: RangeImage) -> dict[str, float]:
     bin_m = capture.acquisition.bin_length_m
     return {
         "rmse_m": metrics.rmse_m(image.range_m, truth_m),
+        "mae_m": metrics.mae_m(image.range_m, truth_m),
+        "inlier_rmse_m": metrics.inlier_rmse_m(image.range_m, truth_m, 3 * bin_m),
         "bias_m": metrics.bias_m(image.range_m, truth_m),
+        "median_error_m": metrics.median_error_m(image.range_m, truth_m),
         "coverage": metrics.coverage(image.range_m, truth_m),
         "rd_1_bin": metrics.restoration_degree(image.range_m, truth_m, bin_m),
         "rd_2_bins": metrics.restoration_degree(image.range_m, truth_m, 2 * bin_m),

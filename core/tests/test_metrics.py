@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from core import metrics
@@ -23,8 +26,26 @@ def test_only_target_pixels_count() -> None:
 
 def test_figures_of_a_small_image() -> None:
     assert metrics.rmse_m(RANGE_M, TRUTH_M) == pytest.approx(math.sqrt((0.09 + 0.16 + 1.0) / 4))
-    assert metrics.bias_m(RANGE_M, TRUTH_M) == pytest.approx(-0.2)
+    assert metrics.mae_m(RANGE_M, TRUTH_M) == pytest.approx((0.3 + 0.4 + 1.0) / 4)
+    assert metrics.bias_m(RANGE_M, TRUTH_M) == pytest.approx((0.3 - 0.4 - 1.0) / 4)
+    assert metrics.median_error_m(RANGE_M, TRUTH_M) == pytest.approx(-0.2)
     assert metrics.coverage(RANGE_M, TRUTH_M) == 4 / 5
+
+
+@pytest.mark.parametrize(
+    ("tolerance_m", "squares"), [(0.1, [0]), (0.3, [0, 0.09]), (0.5, [0, 0.09, 0.16])]
+)
+def test_inliers_lie_within_the_tolerance(tolerance_m: float, squares: list[float]) -> None:
+    found = metrics.inlier_rmse_m(RANGE_M, TRUTH_M, tolerance_m)
+    assert found == pytest.approx(math.sqrt(sum(squares) / len(squares)), abs=1e-13)
+
+
+def test_with_a_wide_tolerance_all_answers_are_inliers() -> None:
+    assert metrics.inlier_rmse_m(RANGE_M, TRUTH_M, 99.0) == metrics.rmse_m(RANGE_M, TRUTH_M)
+
+
+def test_without_an_inlier_there_is_no_error_of_inliers() -> None:
+    assert math.isnan(metrics.inlier_rmse_m(TRUTH_M + 2, TRUTH_M, 1.0))
 
 
 @pytest.mark.parametrize(("tolerance_m", "hits"), [(0.0, 1), (0.3, 2), (0.4, 3), (0.99, 3), (1, 4)])
@@ -42,24 +63,35 @@ def test_whole_bins_of_error_meet_a_tolerance_of_whole_bins() -> None:
     assert metrics.restoration_degree(truth_m + 3.001 * bin_m, truth_m, 3 * bin_m) == 0
 
 
+ERRORS = (
+    metrics.rmse_m,
+    metrics.mae_m,
+    metrics.bias_m,
+    metrics.median_error_m,
+)
+
+
 def test_a_perfect_answer_has_perfect_figures() -> None:
-    assert metrics.rmse_m(TRUTH_M, TRUTH_M) == 0
-    assert metrics.bias_m(TRUTH_M, TRUTH_M) == 0
+    for figure in ERRORS:
+        assert figure(TRUTH_M, TRUTH_M) == 0
+    assert metrics.inlier_rmse_m(TRUTH_M, TRUTH_M, 0.0) == 0
     assert metrics.coverage(TRUTH_M, TRUTH_M) == 1
     assert metrics.restoration_degree(TRUTH_M, TRUTH_M, 0.0) == 1
 
 
 def test_nothing_to_compare_gives_nan() -> None:
     no_target = np.full((2, 2), np.nan)
-    for figure in (metrics.rmse_m, metrics.bias_m, metrics.coverage):
+    for figure in (*ERRORS, metrics.coverage):
         assert math.isnan(figure(np.ones((2, 2)), no_target))
-    assert math.isnan(metrics.restoration_degree(np.ones((2, 2)), no_target, 1.0))
+    for within in (metrics.restoration_degree, metrics.inlier_rmse_m):
+        assert math.isnan(within(np.ones((2, 2)), no_target, 1.0))
 
 
 def test_no_answers_restore_nothing() -> None:
     no_answer = np.full((2, 2), np.nan)
-    assert math.isnan(metrics.rmse_m(no_answer, np.ones((2, 2))))
-    assert math.isnan(metrics.bias_m(no_answer, np.ones((2, 2))))
+    for figure in ERRORS:
+        assert math.isnan(figure(no_answer, np.ones((2, 2))))
+    assert math.isnan(metrics.inlier_rmse_m(no_answer, np.ones((2, 2)), 1.0))
     assert metrics.coverage(no_answer, np.ones((2, 2))) == 0
     assert metrics.restored(no_answer, np.ones((2, 2)), 1.0) == (0, 4)
 
@@ -99,3 +131,88 @@ def test_wilson_covers_the_truth_as_often_as_it_promises(share: float) -> None:
 def test_impossible_shares_are_refused(hits: int, trials: int, level: float, name: str) -> None:
     with pytest.raises(ValueError, match=rf"{name} = .* is not accepted"):
         metrics.wilson(hits, trials, level)
+
+
+@given(hnp.arrays(float, (3, 4), elements=st.floats(-50, 50)))
+def test_errors_are_of_one_size(error_m: np.ndarray) -> None:
+    truth_m = np.full(error_m.shape, 50.0)
+    range_m = truth_m + error_m
+    mae_m, rmse_m = metrics.mae_m(range_m, truth_m), metrics.rmse_m(range_m, truth_m)
+    rounding = 1e-12  # a dozen sums of numbers below 100
+    assert abs(metrics.bias_m(range_m, truth_m)) <= mae_m + rounding
+    assert abs(metrics.median_error_m(range_m, truth_m)) <= 2 * mae_m + rounding
+    assert mae_m <= rmse_m + rounding
+    spread = metrics.errors_m(range_m, truth_m).std()
+    assert rmse_m**2 == pytest.approx(metrics.bias_m(range_m, truth_m) ** 2 + spread**2, abs=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.6, 0.98])
+def test_variance_of_rd_is_that_of_independent_pixels(share: float) -> None:
+    pixels, repetitions = 4096, 2000
+    rd = np.random.default_rng(0).binomial(pixels, share, repetitions) / pixels
+    expected = share * (1 - share) / pixels
+    # Shares of 4096 pixels are Gaussian enough for a χ² of their variance.
+    least, most = stats.chi2.ppf([1e-4, 1 - 1e-4], repetitions - 1) / (repetitions - 1)
+    assert least <= metrics.rd_variance(rd) / expected <= most
+
+
+def test_variance_of_rd_of_two_repetitions() -> None:
+    assert metrics.rd_variance([0.9, 0.8]) == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize("rd", [[], [0.9], 0.9, [[0.9, 0.8]]])
+def test_variance_of_rd_needs_repetitions(rd: object) -> None:
+    with pytest.raises(ValueError, match=r"rd_per_repetition = .*2 or more"):
+        metrics.rd_variance(rd)  # type: ignore[arg-type]
+
+
+def test_variance_of_an_estimator_leaves_out_what_has_none() -> None:
+    truth_m = np.array([[50.0, 50.0, 50.0, 50.0, np.nan]])
+    answers = [
+        [50.0, 51.0, np.nan, np.nan, 1.0],
+        [52.0, 51.0, 50.0, np.nan, 9.0],
+        [np.nan, 51.0, np.nan, np.nan, 5.0],
+    ]
+    range_m = np.array(answers)[:, np.newaxis]
+    # Variances 2 and 0; the third pixel has one answer, the fourth none, the last no target.
+    assert metrics.estimator_variance_m2(range_m, truth_m) == pytest.approx(1.0)
+    assert math.isnan(metrics.estimator_variance_m2(range_m[:1], truth_m))
+    assert math.isnan(metrics.estimator_variance_m2(range_m, np.full((1, 5), np.nan)))
+
+
+def test_variance_of_an_estimator_is_not_that_of_the_scene() -> None:
+    rng = np.random.default_rng(0)
+    truth_m, sd_m, repetitions = rng.uniform(40, 60, (8, 8)), 0.3, 50
+    range_m = truth_m + 5 + rng.normal(0, sd_m, (repetitions, 8, 8))
+    degrees = 64 * (repetitions - 1)
+    least, most = stats.chi2.ppf([1e-4, 1 - 1e-4], degrees) / degrees
+    assert least <= metrics.estimator_variance_m2(range_m, truth_m) / sd_m**2 <= most
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (4, 3, 2), (4, 4, 2, 3)])
+def test_repetitions_must_fit_the_truth(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"range_m = 'shape .*\(repetition, \*\(2, 3\)\)"):
+        metrics.estimator_variance_m2(np.ones(shape), TRUTH_M)
+
+
+def test_detection_counts_answers_and_targets() -> None:
+    truth_m = np.array([[50.0, 51.0, 52.0, 53.0], [np.nan, np.nan, np.nan, 54.0]])
+    valid = np.array([[True, True, True, False], [True, False, False, False]])
+    found = metrics.precision_recall(valid, truth_m)
+    assert found == metrics.Detection(precision=3 / 4, recall=3 / 5, false_alarm_rate=1 / 3)
+
+
+def test_shares_of_nothing_are_nan() -> None:
+    target, none = np.ones((2, 2)), np.full((2, 2), np.nan)
+    silent = metrics.precision_recall(np.zeros((2, 2), bool), target)
+    assert math.isnan(silent.precision)
+    assert silent.recall == 0
+    assert math.isnan(silent.false_alarm_rate)
+    empty = metrics.precision_recall(np.ones((2, 2), bool), none)
+    assert (empty.precision, empty.false_alarm_rate) == (0, 1)
+    assert math.isnan(empty.recall)
+
+
+def test_decisions_of_another_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"valid = 'shape \(3, 2\)' .*\(2, 3\)"):
+        metrics.precision_recall(np.ones((3, 2), bool), TRUTH_M)
