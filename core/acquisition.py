@@ -150,15 +150,16 @@ class Pulse:
     @cached_property
     def span_s(self) -> tuple[float, float]:
         """Times after time zero by which a tenth and nine tenths of the photons have arrived."""
-        longest = len(self.samples) + 10.0
+        return self.quantile_s(0.1), self.quantile_s(0.9)
 
-        def quantile_s(share: float) -> float:
-            def excess(t: float) -> float:
-                return float(self.cdf(t * self.tau_s)) - share
+    def quantile_s(self, share: float) -> float:
+        """Time after time zero by which `share` of the photons, in (0, 1), have arrived."""
+        longest = len(self.samples) + 40.0
 
-            return self.tau_s * float(brentq(excess, -longest, longest))
+        def excess(t: float) -> float:
+            return float(self.cdf(t * self.tau_s)) - share
 
-        return quantile_s(0.1), quantile_s(0.9)
+        return self.tau_s * float(brentq(excess, -longest, longest))
 
     def cumulative(self, onset_bin: ArrayLike, n_bins: int, bin_width_s: float) -> Floats:
         """Share of the photons before each bin edge.

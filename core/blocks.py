@@ -29,7 +29,12 @@ class Blocks(NamedTuple):
 
 
 def to_blocks(cube: NDArray[np.unsignedinteger]) -> Blocks:
-    """Lay out a cube (..., bin) in blocks, pixels in their order."""
+    """Lay out a cube (..., bin) in blocks, pixels in their order.
+
+    Counts that fit are uint16 there, whatever they come as: kernels are compiled for each type.
+    """
+    if cube.dtype == np.uint8 or (cube.dtype == np.uint32 and cube.max(initial=0) < 2**16):
+        cube = cube.astype(np.uint16)
     n_bins = cube.shape[-1]
     pixels = cube.reshape(-1, n_bins)
     n_pixels = pixels.shape[0]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,6 @@ from numpy.typing import NDArray
 from core.acquisition import Acquisition, Floats, Pulse
 from core.blocks import Blocks, to_blocks
 from core.checks import require
-from core.trigger import coates_rate
 
 COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
 
@@ -110,25 +111,19 @@ class Capture:
         begin_s, end_s = self.pulse.span_s
         return max(1, math.ceil((end_s - begin_s) / self.acquisition.bin_width_s))
 
-    @cached_property
-    def typical_flux(self) -> tuple[float, float]:
-        """Signal and background photons per pulse, as the data themselves suggest.
 
-        Over some thousand pixels: the strongest window of an echo's width, its third quartile (many
-        pixels may see no target), over the rest of the gate. At a low SBR the strongest window is
-        often noise, so the signal is then that of the faintest echo that can be seen. Per pixel
-        instead of per pulse where `armed_pulses` is None.
-        """
-        counts = self.cube.reshape(-1, self.cube.shape[2])
-        if len(counts) > 1024:  # at random: a regular step could miss what stands in columns
-            counts = counts[np.random.default_rng(0).choice(len(counts), 1024, replace=False)]
-        rate = counts.astype(float)
-        if self.armed_pulses is not None:
-            rate = np.nan_to_num(coates_rate(counts, self.armed_pulses), posinf=1.0)
-        n_bins, width = rate.shape[1], min(self.echo_bins, rate.shape[1])
-        until = np.pad(np.cumsum(rate, axis=1), ((0, 0), (1, 0)))
-        strongest = (until[:, width:] - until[:, :-width]).max(axis=1)
-        rest = float(np.median(until[:, -1] - strongest))
-        per_bin = rest / max(n_bins - width, 1)
-        signal = float(np.quantile(strongest, 0.75)) - per_bin * width
-        return max(signal, 0.0), per_bin * n_bins
+Found = TypeVar("Found")
+
+
+def once_per_capture(find: Callable[[Capture], Found]) -> Callable[[Capture], Found]:
+    """Keep what a function finds in a capture for as long as the capture lives."""
+
+    @wraps(find)
+    def kept(capture: Capture) -> Found:
+        known = capture.__dict__  # where cached_property keeps its values, too
+        if find.__qualname__ not in known:
+            known[find.__qualname__] = find(capture)
+        found: Found = known[find.__qualname__]
+        return found
+
+    return kept

@@ -74,13 +74,13 @@ class TrackingParameters:
         "Step of the integration. Only (m·h)²·l counts: h and l are one knob.",
     )
     m: float = parameter(
-        1.25,
+        1.4,
         Number("m", 0.9, 5.0, least=1e-3, most=1e6),
         "Smoothing, h0 = m·h: delays by 2m - 1 bins. At 1 a pure delay; below about 0.8 chaotic, "
         "and unstable at ½.",
     )
     alpha: float = parameter(
-        1.0,
+        0.15,
         Number("α", 0.1, 30.0, log=True, least=0.0, most=1e6),
         "Strength of the weight. With the cubic weight, as printed, it scales every bin alike and "
         "cannot move a range; with the exponential weight it can.",
@@ -92,7 +92,7 @@ class TrackingParameters:
         "comes before is taken for noise.",
     )
     weight: Weight = parameter(
-        "none",
+        "exponential",
         Choice("Weight", ("none", "survival", "cubic", "exponential")),
         "What the residual is multiplied by: nothing, 1 / share of pulses still armed (undoes the "
         "decay by pile-up), α·(k/N)³ as printed, or exp(α·(k/N)³).",

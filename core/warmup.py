@@ -10,7 +10,7 @@ from core.estimators import ESTIMATORS, estimate
 from core.parallel import SERIAL_BELOW
 from core.scene import Scene
 from core.simulate import simulate
-from core.tracking import PRESETS, tracking_signals
+from core.tracking import PRESETS, track, tracking_signals
 
 
 def warm_up() -> None:
@@ -23,7 +23,7 @@ def warm_up() -> None:
     small = simulate(scene, acquisition, Flux())
     pixels = SERIAL_BELOW // acquisition.n_bins + 1
     large = Capture(np.zeros((pixels, 1, acquisition.n_bins), np.uint16), acquisition)
-    for capture in (small, large):
-        for method in ESTIMATORS:
-            estimate(capture, method)
+    for method in ESTIMATORS:
+        estimate(small, method)
+    track(large.blocks, PRESETS["recommended"])
     tracking_signals(small.cube, PRESETS["recommended"])

@@ -6,18 +6,48 @@ from typing import Any
 
 from core.capture import Capture
 from core.checks import require
-from core.estimators import peak, tracking
-from core.estimators.base import Estimator, RangeImage
+from core.estimators import (
+    cfar,
+    chi,
+    coates,
+    kde,
+    likelihood,
+    log_matched_filter,
+    matched_filter,
+    oracle,
+    peak,
+    shi,
+    tracking,
+    unmixing,
+)
+from core.estimators.base import FALSE_ALARM, Estimator, RangeImage
 
-__all__ = ["ESTIMATORS", "Estimator", "RangeImage", "estimate"]
+__all__ = ["ESTIMATORS", "FALSE_ALARM", "Estimator", "RangeImage", "estimate"]
 
 ESTIMATORS: dict[str, Estimator] = {
     "tracking": tracking.ESTIMATOR,
     "peak": peak.ESTIMATOR,
+    "matched_filter": matched_filter.ESTIMATOR,
+    "log_matched_filter": log_matched_filter.ESTIMATOR,
+    "coates": coates.ESTIMATOR,
+    "kde": kde.ESTIMATOR,
+    "shi": shi.ESTIMATOR,
+    "chi": chi.ESTIMATOR,
+    "cfar": cfar.ESTIMATOR,
+    "unmixing": unmixing.ESTIMATOR,
+    "likelihood": likelihood.ESTIMATOR,
+    "oracle": oracle.ESTIMATOR,
 }
 
 
-def estimate(capture: Capture, method: str, settings: Any = None, **parameters: Any) -> RangeImage:
+def estimate(
+    capture: Capture,
+    method: str,
+    settings: Any = None,
+    *,
+    false_alarm: float | None = None,
+    **parameters: Any,
+) -> RangeImage:
     """Range every pixel of a capture.
 
     Parameters
@@ -27,6 +57,9 @@ def estimate(capture: Capture, method: str, settings: Any = None, **parameters: 
         A key of `ESTIMATORS`.
     settings : object, optional
         The method's settings as its own dataclass, ``ESTIMATORS[method].parameters``.
+    false_alarm : float, optional
+        Answer only where the score exceeds what this share of pixels without an echo would show;
+        every pixel that saw a photon is answered where None.
     **parameters
         The same, field by field, where `settings` is not given.
 
@@ -37,7 +70,8 @@ def estimate(capture: Capture, method: str, settings: Any = None, **parameters: 
     Raises
     ------
     ValueError
-        If the method is unknown, or a parameter is unknown or out of its bounds.
+        If the method is unknown, a parameter is unknown or out of its bounds, or the method needs
+        what the capture does not know.
     """
     require("method", method, method in ESTIMATORS, " or ".join(map(repr, ESTIMATORS)))
     estimator = ESTIMATORS[method]
@@ -49,4 +83,4 @@ def estimate(capture: Capture, method: str, settings: Any = None, **parameters: 
     else:
         fits = isinstance(settings, estimator.parameters) and not parameters
         require("settings", settings, fits, f"{estimator.parameters.__name__}, or single fields")
-    return estimator(capture, settings)
+    return estimator(capture, settings, false_alarm)

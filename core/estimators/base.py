@@ -1,4 +1,4 @@
-"""What all estimators share: signature, calibration of the lag, strength of evidence."""
+"""What all estimators share: signature, calibration of the lag, confidence, "no target"."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
+from core import posterior
 from core.acquisition import Floats
-from core.capture import Capture
-from core.parallel import COMPILED
+from core.capture import Capture, once_per_capture
+from core.parameters import Number
+from core.posterior import Conditions, Light
+from core.spatial import pooled
 from core.trigger import rate_per_bin, trigger_probability
 
 
@@ -31,8 +32,9 @@ class RangeImage:
     score : ndarray of float
         The estimator's score at its answer; its unit is the estimator's own.
     confidence : ndarray of float
-        Probability that noise alone would nowhere in the gate have shown as large an excess over
-        its neighbourhood as the answer does, in [0, 1]; 0 where `valid` is False.
+        Probability that there is a surface within 3 bins of the answer, by the exact first-photon
+        likelihood and the light that the capture itself tells of (`core.posterior`): among pixels
+        told 0.9, nine in ten are right, whichever estimator answers. 0 where `valid` is False.
     valid : ndarray of bool
         Whether there is an answer.
     """
@@ -42,6 +44,13 @@ class RangeImage:
     score: Floats
     confidence: Floats
     valid: NDArray[np.bool_]
+
+
+FALSE_ALARM = Number("False alarms", 1e-3, 1.0, log=True, least=1e-3, most=1.0)
+"""Share of the pixels without an echo that may be answered; 1 answers all of them."""
+
+NULL_SIDE = 256
+"""Rows and columns of the echo-free image on which a detection threshold is found."""
 
 
 @dataclass(frozen=True)
@@ -54,38 +63,105 @@ class Estimator:
         As shown to people.
     parameters : type
         Frozen dataclass of its settings.
-    locate : callable
-        ``(capture, parameters) -> (position_bin, score)``, each of shape (row, col): the bin of the
-        best score, NaN where there is none.
     curve : callable
-        ``(histogram, parameters, n_pulses) -> score``, shape (..., bin): the same score for every
-        bin.
-    first_bin : callable
+        ``(histogram, conditions, parameters) -> score``, both of shape (..., bin): the score of
+        each bin, larger where an echo is more plausible.
+    locate : callable, optional
+        ``(capture, light, parameters) -> (position_bin, score)``, each of shape (row, col), NaN
+        where there is none: a quicker way to the largest of the curve, or a finer one.
+    reach : callable, optional
+        ``parameters -> pixels``, odd: rows and columns of the neighbourhood whose counts are added
+        before `curve` sees them.
+    first_bin : callable, optional
         ``parameters -> bin`` before which the estimator gives no answer.
+    finds_delay : bool
+        Whether positions are delays of the surface already, with no lag to be calibrated.
+    light : callable
+        ``capture -> Light`` that the estimator is told; raises ``ValueError`` where it is not
+        known.
+    reconstructed : str
+        Where the original was not available: from what the method was reconstructed.
+    null_side : int
+        Rows and columns of the echo-free image on which a detection threshold is found.
     """
 
     title: str
     parameters: type[Any]
-    locate: Callable[[Capture, Any], tuple[Floats, Floats]]
-    curve: Callable[[Floats, Any, int | None], Floats]
-    first_bin: Callable[[Any], int]
+    curve: Callable[[Floats, Conditions, Any], Floats]
+    locate: Callable[[Capture, Light, Any], tuple[Floats, Floats]] | None = None
+    reach: Callable[[Any], int] = lambda _: 1
+    first_bin: Callable[[Any], int] = lambda _: 0
+    finds_delay: bool = False
+    light: Callable[[Capture], Light] = posterior.light_of
+    reconstructed: str = ""
+    null_side: int = NULL_SIDE
 
-    def __call__(self, capture: Capture, parameters: Any) -> RangeImage:
-        """Range every pixel of a capture."""
-        position, score = self.locate(capture, parameters)
-        lag = self.lag_bins(capture, parameters)
-        bins = np.clip(position - lag, 0.0, capture.acquisition.n_bins)
-        valid = np.isfinite(bins)
+    def __call__(
+        self, capture: Capture, parameters: Any, false_alarm: float | None = None
+    ) -> RangeImage:
+        """Range every pixel of a capture.
+
+        Parameters
+        ----------
+        capture : Capture
+        parameters : object
+            Of type `Estimator.parameters`.
+        false_alarm : float, optional
+            Answer only where the score exceeds what this share of pixels without an echo shows;
+            every pixel is answered where None or 1.
+
+        Raises
+        ------
+        ValueError
+            If `false_alarm` is not within the bounds of `FALSE_ALARM`.
+        """
+        bins, score = self.delays(capture, parameters, false_alarm)
         return RangeImage(
             range_m=capture.acquisition.bin_to_range_m(bins),
             bin=bins,
             score=score,
-            confidence=_confidence(capture, bins),
-            valid=valid,
+            confidence=posterior.near(capture, bins),
+            valid=np.isfinite(bins),
         )
 
+    def delays(
+        self, capture: Capture, parameters: Any, false_alarm: float | None = None
+    ) -> tuple[Floats, Floats]:
+        """`RangeImage.bin` and `RangeImage.score` alone: the estimator without what it is worth."""
+        if false_alarm is not None:
+            FALSE_ALARM.check("false_alarm", false_alarm)
+        position, score = self._best(capture, self.light(capture), parameters)
+        if false_alarm is not None and false_alarm < 1:
+            least = self.threshold(capture, parameters, false_alarm)
+            position = np.where(score > least, position, np.nan)
+        lag = 0.0 if self.finds_delay else self.lag_bins(capture, parameters)
+        return np.clip(position - lag, 0.0, capture.acquisition.n_bins), score
+
+    def curves(self, capture: Capture, row: int, col: int, parameters: Any) -> Floats:
+        """The score of each bin for one pixel, shape (bin,)."""
+        light, reach = self.light(capture), self.reach(parameters)
+        around = pooled(capture.cube, reach)[row, col] if reach > 1 else capture.cube[row, col]
+        given = conditions_of(capture, light, reach)
+        here = np.s_[row : row + 1, col : col + 1]
+        conditions = given._replace(signal=given.signal[here], background=given.background[here])
+        return self.curve(around[np.newaxis, np.newaxis].astype(float), conditions, parameters)[
+            0, 0
+        ]
+
+    def threshold(self, capture: Capture, parameters: Any, false_alarm: float) -> float:
+        """The score that a share `false_alarm` of pixels without an echo exceeds.
+
+        Found on an image that sees the capture's own background and nothing else.
+        """
+        whole = tuple(_whole(self.null_side, size) for size in capture.shape)
+        some = np.s_[: whole[0], : whole[1]]
+        null = Capture(_null_cube(capture)[some].copy(), capture.acquisition, capture.pulse)
+        light = self.light(capture).of_pixels(_null_pixels(capture)[some])
+        _, score = self._best(null, light, parameters)
+        return float(np.quantile(score, 1 - false_alarm))
+
     def lag_bins(self, capture: Capture, parameters: Any) -> float:
-        """How far behind the surface's delay the best score of a noise-free echo lies.
+        """How far behind the surface's delay a noise-free echo adds most to the score.
 
         Echoes as strong as the capture's own, over its own background, are put at all fractions of
         a bin at some places of the gate; their median lag is the calibration. It moves a little
@@ -96,67 +172,108 @@ class Estimator:
         float
             Lag in bins; 0 where no echo can be found at all (every bin excluded, say).
         """
-        acquisition, (signal, background) = capture.acquisition, capture.typical_flux
-        n_bins, n_pulses = acquisition.n_bins, capture.armed_pulses
+        n_bins = capture.acquisition.n_bins
+        given = conditions_of(capture, self.light(capture), self.reach(parameters))
+        given = given._replace(
+            signal=np.asarray(given.signal.mean()), background=np.asarray(given.background.mean())
+        )
         first = max(self.first_bin(parameters), 0.1 * n_bins)
         places = np.round(np.linspace(first, 0.9 * n_bins, 8))
         onset = (places[:, np.newaxis] + np.arange(8) / 8).ravel()
-        rate = rate_per_bin(
-            onset, np.full(onset.size, signal), background, capture.pulse, acquisition
+        # Not the largest score but the largest that the echo adds: noise-free, a falling background
+        # is still there, and where an echo is weak it would take the scores near it for the echo's.
+        added = self.curve(_expected(onset, given), given, parameters) - self.curve(
+            _expected(onset, given._replace(signal=np.zeros(()))), given, parameters
         )
-        expected = rate if n_pulses is None else trigger_probability(rate) * n_pulses
-        score = self.curve(expected, parameters, n_pulses)
-        since_onset = np.arange(n_bins) - onset[:, np.newaxis]
-        reach = 10 + 3 * capture.echo_bins
-        score = np.where((np.abs(since_onset) <= reach) & (score > 0), score, 0.0)
-        found = score.max(axis=1) > 0
+        found = added.max(axis=1) > 0
         if not found.any():
             return 0.0
-        return float(np.median(score.argmax(axis=1)[found] - onset[found]))
+        return float(np.median(added.argmax(axis=1)[found] - onset[found]))
+
+    def _best(self, capture: Capture, light: Light, parameters: Any) -> tuple[Floats, Floats]:
+        """Bin and value of the largest score, each of shape (row, col)."""
+        locate = self.locate or self._largest
+        position, score = locate(capture, light, parameters)
+        seen = capture.counts > 0
+        return np.where(seen, position, np.nan), np.where(seen, score, 0.0)
+
+    def _largest(self, capture: Capture, light: Light, parameters: Any) -> tuple[Floats, Floats]:
+        reach = self.reach(parameters)
+        cube = pooled(capture.cube, reach) if reach > 1 else capture.cube
+        given = conditions_of(capture, light, reach)
+        position, score = np.empty((2, *capture.shape))
+        # Some rows at a time: temporaries of the whole cube cost more than their arithmetic.
+        rows_at_once = max(1, 2**16 // cube[0].size)
+        for first in range(0, capture.shape[0], rows_at_once):
+            rows = slice(first, first + rows_at_once)
+            some = given._replace(signal=given.signal[rows], background=given.background[rows])
+            curve = self.curve(cube[rows].astype(float), some, parameters)
+            position[rows] = curve.argmax(axis=2)
+            score[rows] = curve.max(axis=2)
+        return position, score
 
 
-def _confidence(capture: Capture, onset_bin: Floats) -> Floats:
-    """`RangeImage.confidence` of answers at `onset_bin` (row, col)."""
-    begin_s, _ = capture.pulse.span_s
-    width = capture.echo_bins
-    begin = np.floor(onset_bin + begin_s / capture.acquisition.bin_width_s)
-    first = np.where(np.isfinite(begin), begin, -1).astype(np.int64)
-    z = np.empty(first.shape)
-    _excess(capture.cube, first, width, capture.armed_pulses or 0, z)
-    places = capture.acquisition.n_bins / width
-    return np.where(np.isfinite(onset_bin), ndtr(z) ** places, 0.0)
+def conditions_of(capture: Capture, light: Light, reach: int = 1) -> Conditions:
+    """What an estimator knows of a capture's histograms, `reach` x `reach` of them added."""
+    n_pulses = capture.armed_pulses
+    more = 1 if n_pulses else reach * reach  # photons are counted per pixel where pulses are not
+    signal, background = light.typical_signal, light.typical_background
+    return Conditions(
+        capture.acquisition,
+        capture.pulse,
+        n_pulses * reach * reach if n_pulses else None,
+        signal * more,
+        background * more,
+        float(signal.mean() / background.mean()),
+    )
 
 
-_FLANK = 3  # windows' widths on either side that tell the background
+def _expected(onset_bin: Floats, given: Conditions) -> Floats:
+    """Expected counts of echoes at some delays, shape (delay, bin)."""
+    signal = np.full(onset_bin.size, given.signal)
+    rate = rate_per_bin(onset_bin, signal, float(given.background), given.pulse, given.acquisition)
+    return rate if given.n_pulses is None else trigger_probability(rate) * given.n_pulses
 
 
-@njit(**COMPILED)
-def _excess(cube, first, width, n_pulses, z):  # type: ignore[no-untyped-def]
-    """Standard deviations by which a window's counts exceed what its flanks let expect.
+_PATCH = 64  # rows and columns that stay together, for what looks at neighbours
 
-    A bin is expected to count in proportion to the pulses still armed; `n_pulses` of 0 means that
-    all of them always are. The square root of a Poisson count has a standard deviation of 1/2
-    whatever its mean (Anscombe 1948), also where counts are few.
+
+def _whole(side: int, size: int) -> int:
+    """About `side` rows or columns: as many as whole patches of an image of `size` have."""
+    patch = min(_PATCH, size)
+    return max(1, round(side / patch)) * patch
+
+
+@once_per_capture
+def _null_pixels(capture: Capture) -> NDArray[np.intp]:
+    """Pixels of the capture, in patches drawn at random, whose background an echo-free image sees.
+
+    Flat indices, shape (row, col).
     """
-    rows, cols, n_bins = cube.shape
-    for row in range(rows):
-        for col in range(cols):
-            begin = min(max(first[row, col], 0), n_bins)
-            end = min(begin + width, n_bins)
-            low, high = max(begin - _FLANK * width, 0), min(end + _FLANK * width, n_bins)
-            fired = 0.0
-            for k in range(low):
-                fired += cube[row, col, k]
-            inside, outside, armed_inside, armed_outside = 0.0, 0.0, 0.0, 0.0
-            for k in range(low, high):
-                count = float(cube[row, col, k])
-                armed = n_pulses - fired if n_pulses > 0 else 1.0
-                if begin <= k < end:
-                    inside += count
-                    armed_inside += armed
-                else:
-                    outside += count
-                    armed_outside += armed
-                fired += count
-            expected = outside * armed_inside / armed_outside if armed_outside > 0 else 0.0
-            z[row, col] = 2.0 * (math.sqrt(inside + 0.375) - math.sqrt(expected + 0.375))
+    rows, cols = capture.shape
+    # A large gate's image would not fit: fewer pixels then, and a coarser threshold.
+    side = min(NULL_SIDE, math.isqrt(2**23 // capture.acquisition.n_bins))
+    high, wide = min(_PATCH, rows), min(_PATCH, cols)
+    down, across = _whole(side, rows) // high, _whole(side, cols) // wide
+    rng = np.random.default_rng(0)
+    top = rng.integers(rows - high + 1, size=(down, 1, across, 1))
+    left = rng.integers(cols - wide + 1, size=(down, 1, across, 1))
+    row = top + np.arange(high)[:, np.newaxis, np.newaxis]
+    col = left + np.arange(wide)
+    return np.asarray((row * cols + col).reshape(down * high, across * wide))
+
+
+@once_per_capture
+def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
+    """Counts of pixels that see the capture's background alone, shape (row, col, bin)."""
+    rng = np.random.default_rng(1)
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.armed_pulses
+    pixels = _null_pixels(capture)
+    background = posterior.light_of(capture).of_pixels(pixels).typical_background
+    rate = np.repeat(background[..., np.newaxis] / n_bins, n_bins, axis=2)
+    if n_pulses is None:
+        return rng.poisson(rate).astype(np.uint32)
+    chance = trigger_probability(rate)
+    none = 1 - chance.sum(axis=2, keepdims=True)
+    drawn = rng.multinomial(n_pulses, np.concatenate([chance, np.maximum(none, 0)], axis=2))
+    return drawn[..., :-1].astype(capture.cube.dtype)

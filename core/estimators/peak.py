@@ -9,6 +9,7 @@ import numpy as np
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
+from core.posterior import Conditions, Light
 
 
 @dataclass(frozen=True)
@@ -16,15 +17,14 @@ class PeakParameters:
     """The peak has no settings."""
 
 
-def _locate(capture: Capture, parameters: PeakParameters) -> tuple[Floats, Floats]:
+def _locate(capture: Capture, light: Light, parameters: PeakParameters) -> tuple[Floats, Floats]:
     position = capture.cube.argmax(axis=2)
     height = np.take_along_axis(capture.cube, position[..., np.newaxis], axis=2)[..., 0]
-    score = height.astype(float)
-    return np.where(score > 0, position, np.nan), score
+    return position.astype(float), height.astype(float)
 
 
-def _curve(histogram: Floats, parameters: PeakParameters, n_pulses: int | None) -> Floats:
-    return np.asarray(histogram, float)
+def _curve(histogram: Floats, conditions: Conditions, parameters: PeakParameters) -> Floats:
+    return histogram
 
 
-ESTIMATOR = Estimator("Peak of the histogram", PeakParameters, _locate, _curve, lambda _: 0)
+ESTIMATOR = Estimator("Peak of the histogram", PeakParameters, _curve, _locate)

@@ -5,22 +5,25 @@ from __future__ import annotations
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
+from core.posterior import Conditions, Light
 from core.tracking import TrackingParameters, track, tracking_signals
 
 
-def _locate(capture: Capture, parameters: TrackingParameters) -> tuple[Floats, Floats]:
+def _locate(
+    capture: Capture, light: Light, parameters: TrackingParameters
+) -> tuple[Floats, Floats]:
     position, score = track(capture.blocks, parameters, capture.armed_pulses)
     return position.reshape(capture.shape).astype(float), score.reshape(capture.shape).astype(float)
 
 
-def _curve(histogram: Floats, parameters: TrackingParameters, n_pulses: int | None) -> Floats:
-    return tracking_signals(histogram, parameters, n_pulses).enhanced
+def _curve(histogram: Floats, conditions: Conditions, parameters: TrackingParameters) -> Floats:
+    return tracking_signals(histogram, parameters, conditions.n_pulses).enhanced
 
 
 ESTIMATOR = Estimator(
     "Dual-scale tracking differentiator",
     TrackingParameters,
-    _locate,
     _curve,
-    lambda parameters: parameters.t_n,
+    _locate,
+    first_bin=lambda parameters: parameters.t_n,
 )

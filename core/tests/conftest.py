@@ -18,3 +18,11 @@ def pytest_configure(config: pytest.Config) -> None:
             "filterwarnings",
             r"ignore:overflow encountered in scalar (add|multiply):RuntimeWarning:core\.simulate",
         )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what would take hours where nothing is compiled; it runs where kernels are."""
+    if numba.config.DISABLE_JIT:
+        left_out = [item for item in items if item.get_closest_marker("compiled")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]

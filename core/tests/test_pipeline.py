@@ -19,6 +19,8 @@ from core.scene import Scene
 from core.simulate import simulate
 from core.tracking import PRESETS
 
+pytestmark = pytest.mark.compiled
+
 
 def simulated() -> Capture:
     range_m = np.linspace(45, 56, 24).reshape(4, 6)
@@ -38,7 +40,10 @@ def test_a_run_is_the_estimate_and_its_figures(method: str) -> None:
     assert truth_m is not None
     assert done.figures == {
         "rmse_m": metrics.rmse_m(image.range_m, truth_m),
+        "mae_m": metrics.mae_m(image.range_m, truth_m),
+        "inlier_rmse_m": metrics.inlier_rmse_m(image.range_m, truth_m, 3 * bin_m),
         "bias_m": metrics.bias_m(image.range_m, truth_m),
+        "median_error_m": metrics.median_error_m(image.range_m, truth_m),
         "coverage": metrics.coverage(image.range_m, truth_m),
         "rd_1_bin": metrics.restoration_degree(image.range_m, truth_m, bin_m),
         "rd_2_bins": metrics.restoration_degree(image.range_m, truth_m, 2 * bin_m),

@@ -1,0 +1,65 @@
+"""The exact first-photon likelihood, with the light estimated from the capture.
+
+No estimator that looks at single pixels can find more of them than this one does with the true
+light (`core.estimators.oracle`), where all delays are equally likely; see `core.posterior`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from core.acquisition import Floats
+from core.capture import Capture
+from core.estimators.base import Estimator
+from core.parameters import Choice, Number, check_fields, parameter
+from core.posterior import Conditions, Light, log_likelihood_ratio, most_likely
+
+Depths = Literal["alike", "learned"]
+
+
+@dataclass(frozen=True)
+class LikelihoodParameters:
+    """Settings of the likelihood.
+
+    Raises
+    ------
+    ValueError
+        If a value lies outside its bounds.
+    """
+
+    steps_per_bin: int = parameter(
+        2,
+        Number("Steps per bin", 1, 8, whole=True, least=1, most=64),
+        "Delays tried within each bin; a parabola refines between them.",
+    )
+    depths: Depths = parameter(
+        "alike",
+        Choice("Depths", ("alike", "learned")),
+        "What is held of a surface's depth beforehand: all depths of the gate are alike, or the "
+        "image's other pixels tell which ones occur.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+def locate(
+    capture: Capture, light: Light, parameters: LikelihoodParameters
+) -> tuple[Floats, Floats]:
+    """Delay of the largest posterior density, and its log likelihood ratio to no echo."""
+    if parameters.depths == "alike":
+        light = replace(light, depth=np.ones_like(light.depth))
+    return most_likely(capture, light, parameters.steps_per_bin)
+
+
+def curve(histogram: Floats, conditions: Conditions, parameters: LikelihoodParameters) -> Floats:
+    """The log likelihood ratio for the typical signal and background."""
+    return log_likelihood_ratio(histogram, conditions)
+
+
+ESTIMATOR = Estimator(
+    "Likelihood, light estimated", LikelihoodParameters, curve, locate, finds_delay=True
+)

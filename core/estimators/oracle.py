@@ -1,0 +1,47 @@
+"""The exact first-photon likelihood, told the true light: what physics allows a single pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.capture import Capture, once_per_capture
+from core.estimators.base import Estimator
+from core.estimators.likelihood import LikelihoodParameters, curve, locate
+from core.posterior import Light
+
+
+@once_per_capture
+def true_light(capture: Capture) -> Light:
+    """The light of a simulated capture.
+
+    Raises
+    ------
+    ValueError
+        If the capture does not know its light.
+    """
+    if capture.signal is None or capture.background is None:
+        raise ValueError(
+            "method = 'oracle' needs the true signal and background, which only a simulated "
+            "capture knows: take 'likelihood', which estimates them."
+        )
+    target = capture.signal[capture.signal > 0]
+    # A pixel without a target is asked where the echo would be, were there a typical one.
+    typical = float(target.mean()) if target.size else 1.0
+    signal = np.where(capture.signal > 0, capture.signal, typical)
+    background = np.full(capture.shape, max(capture.background, 1e-12))
+    return Light(
+        np.stack([np.zeros(capture.shape), signal]),
+        np.stack([background, background]),
+        np.array([0.0, 1.0]),
+        np.ones(capture.acquisition.n_bins),
+    )
+
+
+ESTIMATOR = Estimator(
+    "Oracle: likelihood told the true light",
+    LikelihoodParameters,
+    curve,
+    locate,
+    finds_delay=True,
+    light=true_light,
+)

@@ -1,0 +1,582 @@
+"""What a pixel's counts say about where its surface is: the exact first-photon likelihood.
+
+With background ``b`` and signal ``s_k(d) = S p_k(d)`` photons per pulse in bin ``k``, ``n_k``
+detections and ``A_k`` pulses still armed, the log likelihood of an echo at delay ``d`` is, beside
+that of no echo, ::
+
+    T(d) = Σ_k [ n_k ln((1 - exp(-b - s_k)) / (1 - exp(-b))) - (A_k - n_k) s_k ]
+
+which is exact for the trigger probabilities of Eq. 1. Where the number of pulses is not known, or
+where a pulse may fire more than once, counts are taken for Poisson: ``ln(1 + s_k / b)`` and ``-
+s_k``, with photons per pixel instead of per pulse.
+
+Neither ``S`` nor ``b`` is told. How often which signal occurs in the capture is estimated from all
+of its pixels (`light_of`: the nonparametric maximum likelihood of a mixing distribution, Kiefer &
+Wolfowitz 1956, on a grid of levels, "no echo" being one of them), and each pixel's answer is then
+the average over the levels: an empirical Bayes posterior, all delays within the gate being equally
+likely beforehand. Its mass around an answer is that answer's probability of being right, whichever
+estimator gave it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from core.acquisition import Acquisition, Floats, Pulse
+from core.blocks import LANES, to_blocks
+from core.capture import Capture, once_per_capture
+from core.parallel import COMPILED, PARALLEL, entering
+
+TOLERANCE_BINS = 3
+"""An answer is right within this many bins: the tolerance that reproduces the paper's tables."""
+
+
+class Conditions(NamedTuple):
+    """What is known of histograms (..., bin) besides their counts."""
+
+    acquisition: Acquisition
+    pulse: Pulse
+    n_pulses: int | None
+    """Pulses sent, where counts are first photons; None where that is not known."""
+    signal: Floats
+    """Signal photons per pulse, (...) or scalar; per histogram where `n_pulses` is None."""
+    background: Floats
+    """Background photons per pulse over the gate, likewise."""
+    contrast: float
+    """Signal over background, both as they are on average over the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The light that each pixel may have seen: some levels of signal, and how often each occurs.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (level, row, col)
+        Signal photons per pulse; the first level is 0, "no echo".
+    background : ndarray, shape (level, row, col)
+        Background photons per pulse over the gate, if the signal is of that level.
+    share : ndarray, shape (level,)
+        Share of the pixels at each level; sums to 1.
+    depth : ndarray, shape (bin,)
+        How much more often than in others a surface's delay falls in each bin; 1 on average.
+    """
+
+    signal: Floats
+    background: Floats
+    share: Floats
+    depth: Floats
+
+    @property
+    def typical_signal(self) -> Floats:
+        """Mean signal of the pixels that see an echo, shape (row, col)."""
+        share = self.share[1:]
+        share = share / share.sum() if share.sum() > 0 else np.full(share.size, 1 / share.size)
+        return np.asarray(np.tensordot(share, self.signal[1:], axes=1))
+
+    @property
+    def typical_background(self) -> Floats:
+        """Mean background, shape (row, col)."""
+        return np.asarray(np.tensordot(self.share, self.background, axes=1))
+
+    def of_pixels(self, pixels: NDArray[np.intp]) -> Light:
+        """The light of some pixels, given as flat indices of shape (row, col)."""
+        flat = (len(self.share), -1)
+        return Light(
+            self.signal.reshape(flat)[:, pixels],
+            self.background.reshape(flat)[:, pixels],
+            self.share,
+            self.depth,
+        )
+
+
+class Posterior(NamedTuple):
+    """What is known of each pixel's delay once its counts are known."""
+
+    near: NDArray[np.float32]
+    """Probability that there is a surface, and within `TOLERANCE_BINS` of each bin's beginning;
+    shape (row, col, bin)."""
+    surface: Floats
+    """Probability that there is a surface at all, shape (row, col)."""
+
+
+LEVELS = 12  # of signal, besides none
+_SPREAD = 200.0  # the strongest level over the faintest
+_SAMPLE = 1024  # pixels from which the light is estimated
+_STEPS = 300  # of expectation and maximisation
+_DEPTH_STEPS = 30
+_SMOOTHING_BINS = 2.0
+_ALIKE = 0.1  # share of the surfaces of which nothing is learned
+_MISSED = 2.0  # log likelihood that faint levels must be worth to be kept
+_RARE = 1e-3  # levels with a smaller share are left out
+
+
+@once_per_capture
+def light_of(capture: Capture) -> Light:
+    """Signal levels, their shares, and each pixel's background, as the capture itself tells.
+
+    The total of a pixel's rates (Coates 1968) is signal and background together. What a level of
+    signal leaves of it is background, drawn towards the image's mean background as far as its
+    scatter is what chance alone makes (James & Stein 1961, the chance being Greenwood's 1926
+    variance): where all pixels see the same background, all are given the same.
+    """
+    total, chance = _totals(capture)
+    flat = capture.cube.reshape(total.size, -1)
+    # At random: a regular step could miss what stands in columns.
+    pixels = np.sort(np.random.default_rng(0).permutation(total.size)[:_SAMPLE])[np.newaxis]
+    levels = _levels(flat[pixels[0]], capture)
+    alike = np.ones(flat.shape[1])
+    # Mean and variance of the signal over pixels: while nothing is known, each level is everyone's.
+    mean, variance = levels[:, np.newaxis, np.newaxis], 0.0
+
+    def light(pixels: NDArray[np.intp], share: Floats, depth: Floats) -> Light:
+        background = _backgrounds(levels, total, chance + variance, mean, capture)
+        signal = np.broadcast_to(levels[:, np.newaxis, np.newaxis], background.shape)
+        return Light(signal, background, share, depth).of_pixels(pixels)
+
+    lit = light(pixels, np.full(levels.size, 1 / levels.size), alike)
+    share = _shares(_level_evidence(_prepare(capture, flat[pixels], lit, 1)))
+    mean = np.asarray(share @ levels)
+    variance = float(share @ (levels - mean) ** 2)
+    kept = share > _RARE
+    kept[0] = True
+    if not kept[1:].any():  # an echo so rare that the sample missed it
+        kept[-1], share[-1] = True, _RARE
+    levels, share = levels[kept], share[kept] / share[kept].sum()
+    prepared = _prepare(capture, flat[pixels], light(pixels, share, alike), 1)
+    share, depth = _shares_and_depths(_level_densities(prepared), share)
+    return light(np.arange(total.size).reshape(total.shape), share, depth)
+
+
+def _totals(capture: Capture) -> tuple[Floats, float]:
+    """Each pixel's total rate (row, col), and its variance by chance alone.
+
+    Coates' rates add up to ``ln(M / (M - Σ n))`` over the gate, M being the pulses sent, and
+    Greenwood's variances to ``1 / (M - Σ n) - 1 / M``. A logarithm of few is too small on average,
+    by half its variance: over an image that would be taken for background.
+    """
+    n_pulses = capture.armed_pulses
+    if n_pulses is None:
+        return capture.counts.astype(float), float(capture.counts.mean())  # Poisson
+    unfired = np.maximum(n_pulses - capture.counts, 0.5)
+    variance = 1 / unfired - 1 / n_pulses
+    return np.log(n_pulses / unfired) - variance / 2, float(variance.mean())
+
+
+def _backgrounds(
+    levels: Floats, total: Floats, unrelated: float, mean_signal: Floats, capture: Capture
+) -> Floats:
+    """Background of each pixel were its signal of each level, shape (level, row, col).
+
+    `unrelated` is the variance of the totals that no difference in background makes; `mean_signal`
+    is the mean of the pixels' signals, or what it would be for each level.
+    """
+    scatter = float(total.var())
+    kept = max(0.0, 1 - unrelated / scatter) if scatter > 0 else 0.0
+    left = total - levels[:, np.newaxis, np.newaxis]
+    everywhere = total.mean() - mean_signal
+    # Half a count more than nothing: what was never seen may still be there.
+    least = 0.5 / (capture.armed_pulses or 1)
+    return np.asarray(np.maximum(everywhere + kept * (left - everywhere), least))
+
+
+def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture) -> Floats:
+    """None, and signals up to that of the strongest echoes among pixels (pixel, bin)."""
+    top = _strongest(pixels, capture)
+    return np.concatenate([[0.0], np.geomspace(top / _SPREAD, top, LEVELS)])
+
+
+def _strongest(pixels: NDArray[np.unsignedinteger], capture: Capture) -> float:
+    """Signal of the strongest echoes among pixels (pixel, bin), at least one detection."""
+    rate, _ = rate_and_armed(pixels.astype(float), capture.armed_pulses)
+    width = min(capture.echo_bins, rate.shape[1])
+    until = np.pad(np.cumsum(rate, axis=1), ((0, 0), (1, 0)))
+    inside = (until[:, width:] - until[:, :-width]).max(axis=1)
+    excess = inside - until[:, -1] * width / rate.shape[1]
+    return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.armed_pulses or 1))
+
+
+def _shares(evidence: Floats) -> Floats:
+    """Shares of the levels that make the evidence (pixel, level; logarithms) most likely.
+
+    One pixel more is counted as having no echo: that none was seen is no proof that none occurs.
+    The faintest levels cannot be told from no echo, and sharing pixels out among them is arbitrary:
+    these are counted as having no echo, as long as the likelihood does not miss the others.
+    """
+    n_pixels, n_levels = evidence.shape
+    likelihood = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+    share = np.full(n_levels, 1 / n_levels)
+    for _ in range(_STEPS):  # expectation and maximisation (Laird 1978)
+        share = share * (likelihood / (likelihood @ share)[:, np.newaxis]).sum(axis=0)
+        share[0] += 1.0
+        share /= n_pixels + 1.0
+    least = np.log(likelihood @ share).sum() - _MISSED
+    for faintest in range(1, n_levels - 1):
+        simpler = share.copy()
+        simpler[0], simpler[faintest] = share[0] + share[faintest], 0.0
+        mixture = likelihood @ simpler
+        if mixture.min() == 0 or np.log(mixture).sum() < least:
+            break
+        share = simpler
+    return share
+
+
+def _shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Floats, Floats]:
+    """Shares of the levels and of the delays that make densities (pixel, level, bin) most likely.
+
+    The first level, no echo, has the same density at all delays. Few steps, from delays that are
+    all alike and smoothed each time, and a part of the pixels that stays so: pixels are too few to
+    tell a share for each bin.
+    """
+    n_pixels, _, n_bins = density.shape
+    none, some = density[:, 0, 0].astype(float), density[:, 1:].reshape(-1, n_bins)
+    depth = np.full(n_bins, 1 / n_bins)
+    for _ in range(_DEPTH_STEPS):
+        mass = (some @ depth.astype(np.float32)).reshape(n_pixels, -1) * share[1:]
+        total = none * share[0] + mass.sum(axis=1)
+        found = depth * ((share[1:] / total[:, np.newaxis]).ravel().astype(np.float32) @ some)
+        share = np.concatenate(
+            [[1 + (none * share[0] / total).sum()], (mass.T / total).sum(axis=1)]
+        )
+        share = np.maximum(share / share.sum(), 1e-12)  # never quite impossible
+        found = gaussian_filter1d(found, _SMOOTHING_BINS, mode="nearest")
+        depth = (1 - _ALIKE) * found / found.sum() + _ALIKE / n_bins
+    return share, depth * n_bins
+
+
+@once_per_capture
+def posterior_of(capture: Capture) -> Posterior:
+    """Where each pixel's surface may be, in the light of `light_of`."""
+    prepared = _prepare(capture, capture.cube, light_of(capture), 1)
+    n_blocks, n_bins, _ = prepared.counts.shape
+    near = np.empty((n_blocks, LANES, n_bins), np.float32)
+    surface = np.empty((n_blocks, LANES))
+    bins = np.arange(n_bins)
+    low, high = np.maximum(bins - TOLERANCE_BINS, 0), np.minimum(bins + TOLERANCE_BINS, n_bins)
+    for some, density, top in _densities(prepared):
+        until = np.pad(np.cumsum(density, axis=1), ((0, 0), (1, 0), (0, 0)))
+        # In units of the larger of the two, so that neither overflows.
+        unit = np.maximum(top, prepared.log_share[0])
+        seen = np.exp(top - unit) * until[:, -1] / n_bins
+        surface[some] = seen / (seen + np.exp(prepared.log_share[0] - unit))
+        mass = until[:, high] - until[:, low]
+        mass *= (surface[some] / until[:, -1])[:, np.newaxis].astype(np.float32)
+        near[some] = mass.transpose(0, 2, 1)
+    pixels = slice(capture.shape[0] * capture.shape[1])
+    return Posterior(
+        near.reshape(-1, n_bins)[pixels].reshape(capture.cube.shape),
+        surface.reshape(-1)[pixels].reshape(capture.shape),
+    )
+
+
+def near(capture: Capture, bins: Floats) -> Floats:
+    """Probability that the surface lies within `TOLERANCE_BINS` of a delay, shape (row, col).
+
+    Parameters
+    ----------
+    capture : Capture
+    bins : ndarray, shape (row, col)
+        Delays in fractional bins, from 0 to n_bins; the probability is 0 where NaN.
+    """
+    table = posterior_of(capture).near
+    last = table.shape[2] - 1
+    at = np.clip(np.nan_to_num(bins), 0, last)
+    below = np.minimum(at.astype(np.intp), max(last - 1, 0))
+    above = np.minimum(below + 1, last)
+    pair = np.take_along_axis(table, np.stack([below, above], axis=2), axis=2)
+    between = pair[..., 0] + (at - below) * (pair[..., 1] - pair[..., 0])
+    return np.where(np.isnan(bins), 0.0, np.clip(between, 0.0, 1.0))
+
+
+def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Floats, Floats]:
+    """The delay of the largest posterior density.
+
+    Returns
+    -------
+    delay_bin : ndarray, shape (row, col)
+        In fractional bins, refined between the steps by a parabola through the density's logarithm.
+    score : ndarray, shape (row, col)
+        Logarithm of its likelihood over that of no echo.
+    """
+    prepared = _prepare(capture, capture.cube, light, steps_per_bin)
+    delay, score = np.empty((2, prepared.counts.shape[0], LANES))
+    for some, density, top in _densities(prepared):
+        at = density.argmax(axis=1)[:, np.newaxis]
+        last = density.shape[1] - 1
+        around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
+        # A neighbour of density 0 has a logarithm too, far below.
+        log = np.log(np.maximum(np.take_along_axis(density, around, axis=1), 1e-30))
+        left, middle, right = log.astype(float).transpose(1, 0, 2)
+        curvature = np.minimum(left - 2 * middle + right, -1e-9)
+        inside = (at[:, 0] > 0) & (at[:, 0] < last)
+        shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
+        delay[some] = (at[:, 0] + 0.5 + shift) / steps_per_bin
+        score[some] = top + middle
+    pixels, shape = slice(capture.shape[0] * capture.shape[1]), capture.shape
+    return delay.reshape(-1)[pixels].reshape(shape), score.reshape(-1)[pixels].reshape(shape)
+
+
+def rate_and_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Floats]:
+    """Rate of each bin with the pile-up undone (Coates 1968), and the pulses that tell of it.
+
+    Parameters
+    ----------
+    histogram : ndarray, shape (..., bin)
+        Counts, or expected counts.
+    n_pulses : int or None
+        Pulses sent; None where that is not known, or where a pulse fires more than once.
+
+    Returns
+    -------
+    rate : ndarray, shape (..., bin)
+        Detections per pulse were the detector always armed. A bin in which every armed pulse fired
+        counts half a pulse less, so that its rate is finite; those behind it count 0. The counts
+        themselves where `n_pulses` is None.
+    armed : ndarray, shape (..., bin)
+        Pulses armed before each bin; 1 everywhere where `n_pulses` is None.
+    """
+    if n_pulses is None:
+        return histogram, np.ones_like(histogram)
+    armed = n_pulses - np.cumsum(histogram, axis=-1) + histogram
+    fired = np.divide(histogram, armed, out=np.zeros_like(histogram), where=armed > 0)
+    most = 1 - 0.5 / np.maximum(armed, 1.0)
+    return np.asarray(-np.log1p(-np.minimum(fired, most))), np.maximum(armed, 0.0)
+
+
+def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
+    """``T(d)`` of the module's docstring at each bin's beginning, as written.
+
+    Parameters
+    ----------
+    histogram : ndarray, shape (..., bin)
+    conditions : Conditions
+
+    Returns
+    -------
+    ndarray, shape (..., bin)
+    """
+    acquisition, n_pulses = conditions.acquisition, conditions.n_pulses
+    n_bins = acquisition.n_bins
+    echo = conditions.pulse.bin_probability(np.arange(n_bins), n_bins, acquisition.bin_width_s)
+    s = np.asarray(conditions.signal)[..., np.newaxis, np.newaxis] * echo
+    b = np.asarray(conditions.background)[..., np.newaxis, np.newaxis] / n_bins
+    if n_pulses is None:
+        gain, unfired = np.log1p(s / b), np.ones_like(histogram)
+    else:
+        gain = np.log(np.expm1(-(b + s)) / np.expm1(-b))
+        unfired = n_pulses - np.cumsum(histogram, axis=-1)
+    return np.asarray((gain @ histogram[..., np.newaxis] - s @ unfired[..., np.newaxis])[..., 0])
+
+
+class _Prepared(NamedTuple):
+    """A cube and its light, as the kernels take them."""
+
+    counts: NDArray[np.uint32]
+    """Shape (block, bin, LANES); of one type, as kernels take a quarter of a minute to compile."""
+    signal: Floats
+    """Shape (level, block, LANES)."""
+    background: Floats
+    log_share: Floats
+    depth: NDArray[np.float32]
+    """`Light.depth`, shape (delay,)."""
+    echo: NDArray[np.float32]
+    """Share of an echo's photons per bin, shape (step, tap)."""
+    first_tap: int
+    """Bins from a delay to its echo's first tap."""
+    n_pulses: int
+    """0 where not known."""
+    n_pixels: int
+
+
+_TAIL = 1e-3  # of an echo's photons, on either side, which are left out
+
+
+def _prepare(
+    capture: Capture, cube: NDArray[np.unsignedinteger], light: Light, steps_per_bin: int
+) -> _Prepared:
+    acquisition, pulse = capture.acquisition, capture.pulse
+    n_bins, width_s = acquisition.n_bins, acquisition.bin_width_s
+    begin = math.floor(max(pulse.quantile_s(_TAIL) / width_s, -n_bins))
+    end = math.ceil(min(pulse.quantile_s(1 - _TAIL) / width_s, n_bins)) + 1
+    # Delays stand for the step around them, so that whole steps fill the gate and any whole bins.
+    onset = (np.arange(steps_per_bin) + 0.5) / steps_per_bin - begin
+    echo = pulse.bin_probability(onset, end - begin, width_s).astype(np.float32)
+    blocks = capture.blocks if cube is capture.cube else to_blocks(cube)
+    log_share = np.log(np.maximum(light.share, np.finfo(float).tiny))
+    return _Prepared(
+        blocks.counts.astype(np.uint32, copy=False),
+        _lanes(light.signal),
+        _lanes(light.background),
+        log_share,
+        np.repeat(light.depth, steps_per_bin).astype(np.float32),
+        echo,
+        begin,
+        capture.armed_pulses or 0,
+        blocks.n_pixels,
+    )
+
+
+def _lanes(image: Floats) -> Floats:
+    """(level, row, col) as (level, block, LANES); the last block is filled up with its last."""
+    flat = image.reshape(len(image), -1)
+    filled = np.pad(flat, ((0, 0), (0, -flat.shape[1] % LANES)), mode="edge")
+    return np.ascontiguousarray(filled.reshape(len(image), -1, LANES))
+
+
+def _level_evidence(prepared: _Prepared) -> Floats:
+    """Log likelihood of each level over that of no echo, all delays alike; (pixel, level)."""
+    log = np.concatenate([log for _, log in _log_likelihoods(prepared)])
+    top = log.max(axis=2)
+    mean = np.exp(log - top[:, :, np.newaxis]).mean(axis=2)
+    evidence = top + np.log(mean, dtype=float)
+    return np.asarray(evidence.transpose(0, 2, 1).reshape(-1, log.shape[1])[: prepared.n_pixels])
+
+
+def _level_densities(prepared: _Prepared) -> NDArray[np.float32]:
+    """Likelihood of each level and delay over the pixel's largest; (pixel, level, delay)."""
+    log = np.concatenate([log for _, log in _log_likelihoods(prepared)])
+    log -= log.max(axis=(1, 2), keepdims=True)
+    density = np.exp(log, out=log).transpose(0, 3, 1, 2)
+    return density.reshape(-1, *log.shape[1:3])[: prepared.n_pixels]
+
+
+def _densities(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32], Floats]]:
+    """Likelihood of each delay over that of no echo, all levels of signal weighted.
+
+    Yields
+    ------
+    blocks : slice
+    density : ndarray, shape (block, delay, LANES)
+        In units of ``exp(top)``.
+    top : ndarray, shape (block, LANES)
+    """
+    weight = prepared.log_share[1:, np.newaxis, np.newaxis].astype(np.float32)
+    for some, log in _log_likelihoods(prepared):
+        weighted = log[:, 1:] + weight
+        top = weighted.max(axis=(1, 2), keepdims=True)
+        weighted -= top
+        density = np.exp(weighted, out=weighted).sum(axis=1)
+        density *= prepared.depth[:, np.newaxis]
+        yield some, density, top[:, 0, 0].astype(float)
+
+
+def _log_likelihoods(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """Log likelihood of each level and delay over that of no echo, some blocks at a time.
+
+    Yields
+    ------
+    blocks : slice
+    log : ndarray, shape (block, level, delay, LANES)
+    """
+    n_levels, n_blocks, _ = prepared.signal.shape
+    n_delays = prepared.counts.shape[1] * prepared.echo.shape[0]
+    at_once = max(1, _AT_ONCE // (n_levels * n_delays * LANES))
+    for first in range(0, n_blocks, at_once):
+        some = slice(first, min(first + at_once, n_blocks))
+        log = np.empty((some.stop - first, n_levels, n_delays, LANES), np.float32)
+        with entering(prepared.counts.size):
+            _fill_blocks(first, prepared, log)
+        yield some, log
+
+
+_AT_ONCE = 2**19  # numbers: what is made of them should find them in the cache
+
+
+@njit(**COMPILED)
+def _fill_reach(b, prepared, fired, unfired, reach):  # type: ignore[no-untyped-def]
+    """Counts and unfired pulses of a block as float32, and Σ_k (A_k - n_k) p_k(d) of each delay."""
+    n_bins = fired.shape[0]
+    n_steps, n_taps = prepared.echo.shape
+    armed = np.full(LANES, float(prepared.n_pulses))
+    for k in range(n_bins):
+        for i in range(LANES):
+            count = prepared.counts[b, k, i]
+            armed[i] -= count
+            fired[k, i] = count
+            unfired[k, i] = armed[i] if prepared.n_pulses > 0 else 1.0
+    for d in range(n_bins * n_steps):
+        step, first = d % n_steps, d // n_steps + prepared.first_tap
+        reach[d, :] = 0.0
+        for tap in range(max(0, -first), min(n_taps, n_bins - first)):
+            p = prepared.echo[step, tap]
+            for i in range(LANES):
+                reach[d, i] += p * unfired[first + tap, i]
+
+
+@njit(**COMPILED)
+def _fill_level(b, level, prepared, fired, reach, gain, ratio):  # type: ignore[no-untyped-def]
+    """T(d) of one level into `ratio`, (delay, LANES)."""
+    n_bins = fired.shape[0]
+    n_steps, n_taps = prepared.echo.shape
+    for i in range(LANES):
+        signal = prepared.signal[level, b, i]
+        background = prepared.background[level, b, i] / n_bins
+        bare = -math.expm1(-background)
+        for step in range(n_steps):
+            for tap in range(n_taps):
+                s = signal * prepared.echo[step, tap]
+                if prepared.n_pulses > 0:
+                    # 1 - exp(-b - s) is what no echo gives, and what it leaves times 1 - exp(-s).
+                    odds = 1.0 - math.expm1(-s) * (1.0 - bare) / bare
+                    gain[step, tap, i] = math.log(odds)
+                else:
+                    gain[step, tap, i] = math.log1p(s / background)
+    for d in range(n_bins * n_steps):
+        step, first = d % n_steps, d // n_steps + prepared.first_tap
+        for i in range(LANES):
+            ratio[d, i] = -np.float32(prepared.signal[level, b, i]) * reach[d, i]
+        for tap in range(max(0, -first), min(n_taps, n_bins - first)):
+            for i in range(LANES):
+                ratio[d, i] += gain[step, tap, i] * fired[first + tap, i]
+
+
+@njit(**COMPILED)
+def _flat_likelihood(b, level, prepared, fired, unfired, flat):  # type: ignore[no-untyped-def]
+    """Log likelihood of the level's background alone, over that of the first level's.
+
+    `fired` and `unfired` are summed over the bins here.
+    """
+    n_bins = prepared.counts.shape[1]
+    for i in range(LANES):
+        here = prepared.background[level, b, i] / n_bins
+        bare = prepared.background[0, b, i] / n_bins
+        odds = math.expm1(-here) / math.expm1(-bare) if prepared.n_pulses > 0 else here / bare
+        flat[i] = fired[i] * math.log(odds) - unfired[i] * (here - bare)
+
+
+@njit(**COMPILED)
+def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
+    """Log likelihood of each level and delay over that of no echo; (level, delay, LANES)."""
+    n_levels, n_delays, _ = log.shape
+    n_bins = prepared.counts.shape[1]
+    n_steps, n_taps = prepared.echo.shape
+    fired, unfired = np.empty((2, n_bins, LANES), np.float32)
+    reach = np.empty((n_delays, LANES), np.float32)
+    gain = np.empty((n_steps, n_taps, LANES), np.float32)
+    all_fired, all_unfired, flat = np.zeros((3, LANES))
+    _fill_reach(b, prepared, fired, unfired, reach)
+    for k in range(n_bins):
+        for i in range(LANES):
+            all_fired[i] += fired[k, i]
+            all_unfired[i] += unfired[k, i]
+    log[0] = 0.0
+    for level in range(1, n_levels):
+        _fill_level(b, level, prepared, fired, reach, gain, log[level])
+        _flat_likelihood(b, level, prepared, all_fired, all_unfired, flat)
+        for d in range(n_delays):
+            for i in range(LANES):
+                log[level, d, i] += np.float32(flat[i])
+
+
+@njit(**PARALLEL)
+def _fill_blocks(first, prepared, log):  # type: ignore[no-untyped-def]
+    for b in prange(log.shape[0]):
+        _fill_block(first + b, prepared, log[b])

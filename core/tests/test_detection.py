@@ -1,0 +1,238 @@
+"""Detection at a chosen rate of false alarms, for every registered estimator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from scipy import stats
+
+from core.acquisition import Acquisition, Flux
+from core.capture import Capture
+from core.estimators import ESTIMATORS, FALSE_ALARM, base, estimate
+from core.scene import Scene
+from core.simulate import simulate
+
+# Milliseconds a pixel where the kernels are plain Python.
+SIZE = 8 if numba.config.DISABLE_JIT else 40  # rows and columns of captures
+NULL_SIDE = 8 if numba.config.DISABLE_JIT else 64  # of the images on which thresholds are found
+N_BINS = 40
+FOUR_SIGMA = float(stats.norm.sf(4))
+
+every_estimator = pytest.mark.parametrize("method", ESTIMATORS)
+
+SEES_NEIGHBOURS = {"chi": 7, "unmixing": 7}
+"""Rows and columns of the pixels whose counts may change an answer, beside `Estimator.reach`."""
+
+
+def reach_of(method: str) -> int:
+    return SEES_NEIGHBOURS.get(method, ESTIMATORS[method].reach(ESTIMATORS[method].parameters()))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _quick() -> Iterator[None]:
+    """Small images of no echo, and numpy's multinomial, which test_simulate shows to draw alike."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(base, "NULL_SIDE", NULL_SIDE)
+        patch.setattr(import_module("core.simulate"), "PULSES_DRAWN_ONE_BY_ONE", 0)
+        yield
+
+
+def simulated(onset_bin: np.ndarray, seed: int, **flux: float) -> Capture:
+    """Echoes at some delays, (row, col), NaN where there is none."""
+    acquisition = Acquisition(n_bins=N_BINS)
+    scene = Scene(acquisition.bin_to_range_m(onset_bin))
+    return simulate(scene, acquisition, Flux(**flux), seed=seed)
+
+
+def delays(share: float) -> np.ndarray:
+    """Delays for the first columns, `share` of them, and NaN for the others."""
+    onset_bin = np.random.default_rng(1).uniform(22, N_BINS - 8, (SIZE, SIZE))
+    onset_bin[:, round(share * SIZE) :] = np.nan
+    return onset_bin
+
+
+@pytest.fixture(scope="module")
+def sky(_quick: None) -> Capture:
+    return simulated(delays(0.0), seed=7, sbr=0.1)
+
+
+@pytest.fixture(scope="module")
+def uneven(_quick: None) -> Capture:
+    """Rows that see no echo, the later ones three times as much background."""
+    dark, bright = (
+        simulated(delays(0.0)[: SIZE // 2], seed=10 + i, signal=0.1, sbr=0.3 / (1 + 2 * i))
+        for i in (0, 1)
+    )
+    cube = np.concatenate([dark.cube, bright.cube])
+    return Capture(cube, dark.acquisition, signal=np.zeros((SIZE, SIZE)), background=0.7)
+
+
+@pytest.fixture(scope="module")
+def half(_quick: None) -> Capture:
+    return simulated(delays(0.5), seed=8, sbr=0.1)
+
+
+@pytest.fixture(scope="module")
+def unseen(half: Capture) -> Capture:
+    """The same, but for a row of pixels that saw nothing."""
+    cube = half.cube.copy()
+    cube[0] = 0
+    return replace(half, cube=cube)
+
+
+@pytest.fixture(scope="module")
+def strong(_quick: None) -> Capture:
+    """Strong echoes, all from about one depth, as who looks at the neighbours expects."""
+    onset_bin = np.random.default_rng(1).uniform(28, 29, (SIZE, SIZE))
+    return simulated(onset_bin, seed=9, signal=0.5, sbr=5.0)
+
+
+def expected_alarms(false_alarm: float, n_null: float, n_pixels: float) -> tuple[float, float]:
+    """Fewest and most alarms among `n_pixels`, the threshold being found on `n_null` others.
+
+    The r-th largest of n scores is exceeded with a probability that is Beta(r, n + 1 - r)
+    distributed, so that alarms are beta-binomial; the threshold lies between two of the scores.
+    """
+    n_null, n_pixels = math.floor(n_null), math.floor(n_pixels)
+    rank = false_alarm * (n_null - 1) + 1  # from above, and so many scores are as large or larger
+    above, below = math.floor(rank), math.ceil(rank)
+    low = stats.betabinom.ppf(FOUR_SIGMA, n_pixels, above, n_null + 1 - above)
+    most = stats.betabinom.ppf(1 - FOUR_SIGMA, n_pixels, below, max(n_null + 1 - below, 1))
+    return float(low), float(most)
+
+
+def assert_alarms(method: str, capture: Capture, empty: np.ndarray, false_alarm: float) -> None:
+    """As many false alarms among the `empty` pixels (row, col) as were allowed."""
+    image = estimate(capture, method, false_alarm=false_alarm)
+    parameters = ESTIMATORS[method].parameters()
+    least = ESTIMATORS[method].threshold(capture, parameters, false_alarm)
+    # Neighbours that share counts say as much as one of them, at worst.
+    reach = reach_of(method)
+    some = np.zeros(capture.shape, bool)
+    some[reach // 2 :: reach, reach // 2 :: reach] = True
+    some &= empty
+    side = base._whole(min(base.NULL_SIDE, ESTIMATORS[method].null_side), SIZE)
+    n_null = side**2 / reach**2
+    low, most = expected_alarms(false_alarm, n_null, np.count_nonzero(some))
+    assert np.count_nonzero(image.valid[some]) <= most
+    # Scores that are counts are often equal: fewer exceed the threshold, but no fewer reach it.
+    assert np.count_nonzero(image.score[some] >= least) >= low
+
+
+@every_estimator
+@pytest.mark.parametrize("false_alarm", [0.1, 0.01])
+def test_false_alarms_of_an_empty_image_are_as_many_as_allowed(
+    sky: Capture, method: str, false_alarm: float
+) -> None:
+    assert_alarms(method, sky, np.full(sky.shape, True), false_alarm)
+
+
+@every_estimator
+def test_false_alarms_over_an_uneven_background_are_as_many_as_allowed(
+    uneven: Capture, method: str
+) -> None:
+    assert_alarms(method, uneven, np.full(uneven.shape, True), 0.1)
+
+
+@every_estimator
+def test_false_alarms_beside_targets_are_as_many_as_allowed(half: Capture, method: str) -> None:
+    empty = np.full(half.shape, True)
+    empty[:, : SIZE // 2 + reach_of(method) // 2] = False  # whose counts have no part of an echo's
+    assert_alarms(method, half, empty, 0.1)
+
+
+def same(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.array_equal(one, other, equal_nan=True))
+
+
+@every_estimator
+def test_every_pixel_is_answered_where_all_false_alarms_are_allowed(
+    half: Capture, method: str
+) -> None:
+    expected = estimate(half, method)
+    for all_allowed in (1, 1.0, None):
+        image = estimate(half, method, false_alarm=all_allowed)
+        for field in ("range_m", "bin", "score", "confidence", "valid"):
+            assert same(getattr(image, field), getattr(expected, field))
+
+
+@every_estimator
+def test_a_stricter_threshold_leaves_some_of_the_answers(half: Capture, method: str) -> None:
+    looser = estimate(half, method)
+    for false_alarm in (0.5, 0.1, 0.01, 0.001):
+        image = estimate(half, method, false_alarm=false_alarm)
+        assert not (image.valid & ~looser.valid).any()
+        for field in ("range_m", "bin", "confidence"):
+            expected = getattr(looser, field)[image.valid]
+            np.testing.assert_array_equal(getattr(image, field)[image.valid], expected)
+        np.testing.assert_array_equal(image.score, looser.score)
+        assert np.isnan(image.range_m[~image.valid]).all()
+        assert np.isnan(image.bin[~image.valid]).all()
+        assert (image.confidence[~image.valid] == 0).all()
+        looser = image
+    # Each would leave one pixel in a thousand of an empty image, and this one is half empty.
+    assert looser.valid.sum() < 0.75 * looser.valid.size
+
+
+@every_estimator
+def test_strong_echoes_stay(strong: Capture, method: str) -> None:
+    image = estimate(strong, method, false_alarm=0.001)
+    assert image.valid.mean() > 0.95
+    # What is left is rounding to whole bins, and the pulse's own length.
+    error = image.range_m - strong.truth_range_m
+    assert (np.abs(error[image.valid]) < 4 * strong.acquisition.bin_length_m).mean() > 0.95
+
+
+@every_estimator
+def test_a_pixel_that_saw_nothing_is_no_detection(unseen: Capture, method: str) -> None:
+    assert not estimate(unseen, method, false_alarm=0.5).valid[0].any()
+
+
+def told(cube: np.ndarray, n_pulses: int | None = 1000) -> Capture:
+    """Counts, and a light for the oracle to be told."""
+    light: dict[str, Any] = {"signal": np.full(cube.shape[:2], 0.1), "background": 1.7}
+    return Capture(cube, Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses), **light)
+
+
+CAPTURES = {
+    "one photon": told(np.eye(20, dtype=np.uint16)[np.newaxis, :1]),
+    "one bin": told(np.arange(12, dtype=np.uint16).reshape(3, 4, 1)),
+    "empty": told(np.zeros((3, 4, 20), np.uint16)),
+    "full narrow counters": told(np.full((3, 4, 20), 255, np.uint8)),
+    "pulses unknown": told(np.full((3, 4, 20), 3, np.uint32), n_pulses=None),
+}
+
+
+@every_estimator
+@pytest.mark.parametrize("capture", CAPTURES.values(), ids=CAPTURES)
+def test_thresholds_are_always_defined(capture: Capture, method: str) -> None:
+    parameters = ESTIMATORS[method].parameters()
+    least = [ESTIMATORS[method].threshold(capture, parameters, p) for p in (1.0, 0.1, 0.001)]
+    assert np.isfinite(least).all()
+    assert (np.diff(least) >= 0).all()
+
+
+def test_a_long_gates_threshold_is_found_on_fewer_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(base, "NULL_SIDE", 256)
+    for n_bins in (2**14, 2**20):
+        capture = told(np.zeros((1, 1, n_bins), np.uint16))
+        side = base._null_pixels(capture).shape[0]
+        assert side == max(1, math.isqrt(2**23 // n_bins)) < 256
+
+
+def test_what_is_no_share_of_false_alarms_is_refused(half: Capture) -> None:
+    for bad in (0, 0.0, -0.1, 0.0001, 1.001, 2, math.nan, math.inf, "x", True):
+        with pytest.raises(ValueError, match=r"false_alarm = .* is not accepted"):
+            estimate(half, "peak", false_alarm=bad)  # type: ignore[arg-type]
+
+
+def test_the_strictest_share_is_accepted(half: Capture) -> None:
+    assert FALSE_ALARM.least == 0.001
+    assert estimate(half, "peak", false_alarm=FALSE_ALARM.least).valid.shape == half.shape

@@ -1,0 +1,784 @@
+"""The posterior of the delay: against its equations line by line, and against what comes true."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import pytest
+from scipy import stats
+
+from core import posterior
+from core.acquisition import Acquisition, Flux, Pulse
+from core.capture import Capture
+from core.estimators import estimate
+from core.posterior import Conditions, Light, Posterior, light_of, most_likely, near, posterior_of
+from core.scene import Scene
+from core.simulate import simulate
+from core.trigger import coates_rate, rate_per_bin, trigger_probability
+
+# Milliseconds a pixel where the kernels are plain Python.
+SIZE = 8 if numba.config.DISABLE_JIT else 32  # rows and columns where light is estimated
+CALIBRATION_SIZE = 8 if numba.config.DISABLE_JIT else 64
+N_BINS = 30  # in the gate where light is estimated
+THREADS = sorted({1, numba.config.NUMBA_NUM_THREADS})
+EPS_32 = float(np.finfo(np.float32).eps)
+BIN_S = 1e-9
+FOUR_SIGMA = float(stats.norm.sf(4))
+
+PULSES = {
+    "gamma": Pulse(1e-9),
+    "long gamma": Pulse(6e-9),  # longer than the gate
+    "gaussian": Pulse.gaussian(1.5e-9),  # begins before its delay
+    "measured": Pulse.measured([0, 1, 4, 6, 3, 0.5], 0.7e-9),
+    "late": Pulse.measured([0] * 60 + [1], 1e-9),  # comes when the gate has closed
+}
+any_pulse = pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
+pulses_known = pytest.mark.parametrize("n_pulses", [200, None], ids=["first photons", "photons"])
+
+
+@pytest.fixture(autouse=True)
+def _quick_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numpy's multinomial, which test_simulate shows to draw alike, is quick without a compiler."""
+    monkeypatch.setattr(import_module("core.simulate"), "PULSES_DRAWN_ONE_BY_ONE", 0)
+
+
+@pytest.fixture(autouse=True)
+def _small_blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the kernels are plain Python, a block that is filled up costs what a full one does.
+
+    The tracker's are laid out when it is imported, and stay as they are.
+    """
+    if numba.config.DISABLE_JIT and "uniform_captures" not in request.fixturenames:
+        monkeypatch.setattr(import_module("core.blocks"), "LANES", 16)
+        monkeypatch.setattr(posterior, "LANES", 16)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts the number of threads back."""
+    before = numba.get_num_threads()
+    yield
+    numba.set_num_threads(before)
+
+
+def capture_of(cube: Any, n_pulses: int | None = 1000, pulse: Pulse = Pulse()) -> Capture:
+    cube = np.asarray(cube)
+    if cube.dtype.kind != "u":
+        cube = cube.astype(np.uint16)
+    return Capture(cube, Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses), pulse)
+
+
+# --- The twin: one pixel, one level, one delay at a time, in float64. ---
+
+
+def log_likelihood(counts: np.ndarray, rate: np.ndarray, n_pulses: int | None) -> float:
+    """Logarithm of the counts' probability, but for what no rate changes."""
+    if n_pulses is None:
+        return float((counts * np.log(rate) - rate).sum())
+    unfired = n_pulses - np.cumsum(counts)
+    return float((counts * np.log(-np.expm1(-rate)) - unfired * rate).sum())
+
+
+class Twin(NamedTuple):
+    delay: np.ndarray
+    """In bins, (delay,)."""
+    log_levels: np.ndarray
+    """Likelihood of each level over that of no echo, (pixel, level, delay)."""
+    log_density: np.ndarray
+    """The same, levels and delays weighted by their shares, (pixel, delay)."""
+    evidence: np.ndarray
+    """Likelihood of each level, all delays alike, over that of no echo, (pixel, level)."""
+    rounding: np.ndarray
+    """How far single precision may put a log likelihood off, (pixel,)."""
+
+
+def twin(capture: Capture, light: Light, steps_per_bin: int) -> Twin:
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.armed_pulses
+    tail = 1e-3  # of an echo's photons, on either side, is left out
+    first = math.floor(max(capture.pulse.quantile_s(tail) / BIN_S, -n_bins))
+    last = math.ceil(min(capture.pulse.quantile_s(1 - tail) / BIN_S, n_bins))
+    delay = (np.arange(n_bins * steps_per_bin) + 0.5) / steps_per_bin
+    pixels = capture.cube.reshape(-1, n_bins).astype(float)
+    of_levels = np.empty((len(pixels), len(light.share), delay.size))
+    rounding = np.zeros(len(pixels))
+    for i, counts in enumerate(pixels):
+        for level in range(len(light.share)):
+            signal = light.signal.reshape(len(light.share), -1)[level, i]
+            background = light.background.reshape(len(light.share), -1)[:, i] / n_bins
+            nothing = log_likelihood(counts, np.full(n_bins, background[0]), n_pulses)
+            for j, d in enumerate(delay):
+                echo = capture.pulse.bin_probability(d, n_bins, BIN_S)
+                since = np.arange(n_bins) - math.floor(d)
+                echo[(since < first) | (since > last)] = 0.0
+                rate = background[level] + signal * echo
+                of_levels[i, level, j] = log_likelihood(counts, rate, n_pulses) - nothing
+                # A product and a sum for each tap of the echo, and some roundings besides.
+                unfired = 1.0 if n_pulses is None else n_pulses - np.cumsum(counts)
+                terms = counts @ np.log(rate / background[level]) + signal * (unfired * echo).sum()
+                roundings = 2 * (last - first + 1) + 8
+                rounding[i] = max(rounding[i], roundings * EPS_32 * terms)
+        rounding[i] += 4 * EPS_32 * np.abs(of_levels[i]).max()  # level and offset, put together
+    with np.errstate(divide="ignore"):
+        log_share = np.log(light.share)[1:, np.newaxis]
+    log_depth = np.log([light.depth[math.floor(d)] for d in delay])
+    return Twin(
+        delay,
+        of_levels,
+        np.logaddexp.reduce(of_levels[:, 1:] + log_share, axis=1) + log_depth,
+        np.logaddexp.reduce(of_levels, axis=2) - math.log(delay.size),
+        rounding,
+    )
+
+
+OF_SUMS = 64 * EPS_32  # sums of up to so many float32, none of them negative
+
+
+def histograms(n_bins: int, n_pulses: int | None, pulse: Pulse) -> np.ndarray:
+    """Echoes all over the gate and at its edges, and what else histograms may be."""
+    delay = np.array([0.0, 0.3, n_bins / 2, n_bins - 1.6, n_bins - 0.1])
+    acquisition = Acquisition(n_bins=n_bins)
+    rate = rate_per_bin(delay, np.full(delay.shape, 0.4), 0.8, pulse, acquisition)
+    sent = n_pulses or 200
+    drawn = np.random.default_rng(3).binomial(sent, trigger_probability(rate))
+    drawn = drawn * sent // np.maximum(drawn.sum(axis=1, keepdims=True), sent)
+    empty, constant = np.zeros(n_bins), np.full(n_bins, sent // n_bins)
+    first, last = sent * np.eye(n_bins)[[0, -1]]
+    return np.concatenate([drawn, [empty, constant, first, last]])
+
+
+def light_for(n_pixels: int, n_bins: int, n_pulses: int | None) -> Light:
+    """Three levels; backgrounds of every pixel and level, and depths, none like another."""
+    photons = 200 if n_pulses is None else 1
+    signal = np.repeat([[[0.0]], [[0.08]], [[0.5]]], n_pixels, axis=2)
+    rng = np.random.default_rng(4)
+    background = rng.uniform(0.3, 1.5, signal.shape)
+    depth = rng.uniform(0.5, 1.5, n_bins)
+    share = np.array([0.3, 0.5, 0.2])
+    return Light(signal * photons, background * photons, share, depth / depth.mean())
+
+
+def in_rows(light: Light, rows: int) -> Light:
+    shape = (len(light.share), rows, -1)
+    return replace(
+        light, signal=light.signal.reshape(shape), background=light.background.reshape(shape)
+    )
+
+
+def assert_equals_twin(
+    monkeypatch: pytest.MonkeyPatch, capture: Capture, light: Light, steps_per_bin: int
+) -> None:
+    n_bins = capture.acquisition.n_bins
+    expected = twin(capture, light, steps_per_bin)
+    shape = capture.shape
+    far = expected.rounding[:, np.newaxis]
+
+    prepared = posterior._prepare(capture, capture.cube, light, steps_per_bin)
+    evidence, densities = posterior._level_evidence(prepared), posterior._level_densities(prepared)
+    assert evidence.shape == (capture.counts.size, len(light.share))
+    assert (np.abs(evidence - expected.evidence) <= far + OF_SUMS).all()
+    assert densities.shape == (*evidence.shape, expected.delay.size)
+    largest = expected.log_levels.max(axis=(1, 2), keepdims=True)
+    atol = np.expm1(2 * far)[..., np.newaxis] + EPS_32
+    assert (np.abs(densities - np.exp(expected.log_levels - largest)) <= atol).all()
+
+    # At the delay found there is no less than elsewhere, and the score is what there is.
+    delay, score = (x.ravel() for x in most_likely(capture, light, steps_per_bin))
+    at = np.clip((delay * steps_per_bin).astype(int), 0, expected.delay.size - 1)
+    highest = expected.log_density.max(axis=1)
+    pixels = np.arange(delay.size)
+    assert (expected.log_density[pixels, at] >= highest - 2 * (expected.rounding + OF_SUMS)).all()
+    assert (np.abs(score - highest) <= expected.rounding + OF_SUMS).all()
+    for i, peak in enumerate(expected.log_density):
+        k = int(peak.argmax())
+        others = np.delete(peak, k).max(initial=-math.inf)
+        if peak[k] - others <= 10 * far[i, 0] + 1e-3:
+            continue  # rounding may choose another
+        if k in (0, peak.size - 1):
+            assert delay[i] == expected.delay[k]
+        else:
+            left, middle, right = np.maximum(peak[k - 1 : k + 2], peak[k] - 69)
+            curvature = left - 2 * middle + right
+            vertex = expected.delay[k] + 0.5 * (left - right) / curvature / steps_per_bin
+            # Densities end at 1e-30 in units of a level's largest: exp(-69) of the sum, or about.
+            blur = 4 * (far[i, 0] + OF_SUMS) + 2.0 * (middle - min(left, right) > 67)
+            assert delay[i] == pytest.approx(vertex, abs=blur / -curvature / steps_per_bin)
+
+    if steps_per_bin > 1:
+        return  # the posterior is made in whole bins
+    monkeypatch.setattr(posterior, "light_of", lambda _: light)
+    found_posterior = posterior_of(capture)
+    with np.errstate(divide="ignore"):
+        nothing = np.log(light.share[0])
+    log_each = expected.log_density - math.log(expected.delay.size)
+    total = np.logaddexp(np.logaddexp.reduce(log_each, axis=1), nothing)
+    each = np.exp(log_each - total[:, np.newaxis])
+    within = np.abs(expected.delay[:, np.newaxis] - np.arange(n_bins)) < posterior.TOLERANCE_BINS
+    # Odds are off by a factor, of two likelihoods, at most.
+    atol = np.expm1(2 * (far + OF_SUMS)) + 4 * EPS_32
+    assert found_posterior.near.shape == (*shape, n_bins)
+    assert found_posterior.near.dtype == np.float32
+    assert (np.abs(found_posterior.near.reshape(-1, n_bins) - each @ within) <= atol).all()
+    surface = found_posterior.surface.ravel()
+    assert (np.abs(surface - each.sum(axis=1)) <= atol[:, 0]).all()
+
+
+@any_pulse
+@pulses_known
+@pytest.mark.parametrize("steps_per_bin", [1, 2, 4])
+def test_kernels_are_the_equations(
+    monkeypatch: pytest.MonkeyPatch, pulse: Pulse, n_pulses: int | None, steps_per_bin: int
+) -> None:
+    cube = histograms(12, n_pulses, pulse)[np.newaxis]
+    capture = capture_of(cube, n_pulses, pulse)
+    assert capture.armed_pulses == n_pulses
+    light = light_for(*cube.shape[1:], n_pulses)
+    assert_equals_twin(monkeypatch, capture, light, steps_per_bin)
+
+
+@any_pulse
+@pulses_known
+@pytest.mark.parametrize("n_bins", [1, 2, 5])
+def test_kernels_are_the_equations_in_short_gates(
+    monkeypatch: pytest.MonkeyPatch, pulse: Pulse, n_pulses: int | None, n_bins: int
+) -> None:
+    cube = histograms(n_bins, n_pulses, pulse)[np.newaxis]
+    light = light_for(*cube.shape[1:], n_pulses)
+    for steps_per_bin in (1, 2):
+        capture = capture_of(cube, n_pulses, pulse)
+        assert_equals_twin(monkeypatch, capture, light, steps_per_bin)
+
+
+@pytest.mark.parametrize(
+    "share", [[0.0, 0.7, 0.3], [1 - 1e-9, 1e-9, 0.0], [0.2, 0.0, 0.8]], ids=str
+)
+def test_kernels_are_the_equations_for_any_shares(
+    monkeypatch: pytest.MonkeyPatch, share: list[float]
+) -> None:
+    cube = histograms(12, 200, Pulse())[np.newaxis]
+    light = light_for(*cube.shape[1:], 200)
+    light = replace(light, share=np.array(share))
+    assert_equals_twin(monkeypatch, capture_of(cube, 200), light, 1)
+
+
+def test_pixels_of_all_blocks_are_the_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = histograms(12, 200, Pulse())
+    cube = np.concatenate([np.roll(one, shift, axis=1) for shift in range(8)]).reshape(8, 9, 12)
+    light = in_rows(light_for(72, 12, 200), 8)  # more than one block of pixels
+    assert_equals_twin(monkeypatch, capture_of(cube, 200), light, 1)
+
+
+def test_blocks_may_be_treated_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    cube = np.tile(histograms(12, 200, Pulse()), (15, 1))[np.newaxis, : 2 * posterior.LANES + 7]
+    cube[0, posterior.LANES :] = np.roll(cube[0, posterior.LANES :], 3, axis=1)
+    light = light_for(*cube.shape[1:], 200)
+    found = []
+    for at_once in (2**20, 1):
+        monkeypatch.setattr(posterior, "_AT_ONCE", at_once)
+        found.append(most_likely(capture_of(cube, 200), light, 2))
+    np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+def test_any_unsigned_counts_give_the_same(dtype: type) -> None:
+    cube = histograms(12, 200, Pulse())[np.newaxis]
+    expected = posterior_of(capture_of(cube.astype(np.uint16), 200))
+    found = posterior_of(capture_of(cube.astype(dtype), 200))
+    np.testing.assert_array_equal(found.near, expected.near)
+    np.testing.assert_array_equal(found.surface, expected.surface)
+
+
+def assert_probabilities(capture: Capture) -> None:
+    """All of it finite and within its bounds; what warns raises."""
+    found = posterior_of(capture)
+    # Sums of float32 shares of a sum.
+    assert ((found.near >= 0) & (found.near <= 1 + 1e-6)).all()
+    assert ((found.surface >= 0) & (found.surface <= 1)).all()
+    assert (found.near <= found.surface[..., np.newaxis] + 1e-6).all()
+    n_bins = capture.acquisition.n_bins
+    for steps_per_bin in (1, 2):
+        delay, score = most_likely(capture, light_of(capture), steps_per_bin)
+        assert ((delay >= 0) & (delay <= n_bins)).all()
+        assert np.isfinite(score).all()
+    for bins in (0.0, n_bins / 3, n_bins, math.nan):
+        chance = near(capture, np.full(capture.shape, bins))
+        assert ((chance >= 0) & (chance <= 1)).all()
+
+
+@pytest.mark.parametrize("n_pulses", [None, 1, 3, 1000])
+@pytest.mark.parametrize("n_bins", [1, 2, 9])
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_light_and_posterior_are_always_defined(
+    count: int, n_bins: int, n_pulses: int | None
+) -> None:
+    cube = np.zeros((2, 3, n_bins))
+    cube[..., 0] = count
+    for some in (cube, cube[:1, :1]):
+        capture = capture_of(some, n_pulses)
+        light = light_of(capture)
+        assert (np.isfinite(light.signal) & (light.signal >= 0)).all()
+        assert (np.isfinite(light.background) & (light.background > 0)).all()
+        assert (light.signal[0] == 0).all()
+        assert ((light.share >= 0) & (light.share[0] <= 1)).all()
+        assert light.share.sum() == pytest.approx(1, rel=1e-12)
+        assert light.depth.shape == (n_bins,)
+        assert (light.depth > 0).all()
+        assert light.depth.mean() == pytest.approx(1, rel=1e-12)
+        for typical in (light.typical_signal, light.typical_background):
+            assert typical.shape == capture.shape
+            assert (np.isfinite(typical) & (typical > 0)).all()
+        assert_probabilities(capture)
+
+
+@any_pulse
+@pulses_known
+def test_any_pulse_gives_probabilities(pulse: Pulse, n_pulses: int | None) -> None:
+    for n_bins in (1, 12):
+        cube = histograms(n_bins, n_pulses, pulse)[np.newaxis]
+        assert_probabilities(capture_of(cube, n_pulses, pulse))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+@pytest.mark.parametrize("n_pulses", [None, 1, 1000, 2**32 - 1])
+def test_full_counters_give_probabilities(dtype: type, n_pulses: int | None) -> None:
+    full = np.iinfo(dtype).max
+    cube = np.zeros((1, 4, 12), dtype)
+    cube[0, 0] = full
+    cube[0, 1, 0] = cube[0, 2, -1] = cube[0, 3, 5] = full
+    assert_probabilities(capture_of(cube, n_pulses))
+    if n_pulses is not None:
+        fired = min(full, n_pulses)  # every pulse, or as many as can be counted
+        assert_probabilities(capture_of(np.minimum(cube[:, 1:], dtype(fired)), n_pulses))
+
+
+# --- The likelihood, by an independent route. ---
+
+
+@any_pulse
+@pulses_known
+def test_log_likelihood_ratio_is_that_of_the_distribution(
+    pulse: Pulse, n_pulses: int | None
+) -> None:
+    n_bins = 15
+    acquisition = Acquisition(n_bins=n_bins, n_pulses=n_pulses)
+    counts = histograms(n_bins, n_pulses, pulse).astype(int)
+    photons = 200 if n_pulses is None else 1
+    signal = np.linspace(0.02, 0.6, len(counts)) * photons
+    background = np.linspace(2.0, 0.2, len(counts)) * photons
+    conditions = Conditions(acquisition, pulse, n_pulses, signal, background, 0.1)
+    found = posterior.log_likelihood_ratio(counts.astype(float), conditions)
+    for i, histogram in enumerate(counts):
+
+        def log_probability(onset_bin: float, histogram: np.ndarray = histogram, i: int = i) -> Any:
+            rate = rate_per_bin(onset_bin, signal[i], background[i], pulse, acquisition)
+            if n_pulses is None:
+                return stats.poisson.logpmf(histogram, rate).sum()
+            chance = trigger_probability(rate)
+            none = [1 - chance.sum()]
+            left = [n_pulses - histogram.sum()]
+            return stats.multinomial.logpmf(
+                np.concatenate([histogram, left]), n_pulses, np.concatenate([chance, none])
+            )
+
+        expected = [log_probability(d) - log_probability(math.nan) for d in range(n_bins)]
+        # Differences of logarithms in the thousands, and of a probability from 1.
+        np.testing.assert_allclose(found[i], expected, rtol=1e-8, atol=1e-8)
+
+
+def test_log_likelihood_ratio_takes_one_light_for_all() -> None:
+    counts = histograms(12, 200, Pulse()).reshape(3, 3, 12)
+    acquisition = Acquisition(n_bins=12)
+    one = Conditions(acquisition, Pulse(), 200, np.float64(0.2), np.float64(1.1), 0.2)
+    each = one._replace(signal=np.full((3, 3), 0.2), background=np.full((3, 3), 1.1))
+    found = posterior.log_likelihood_ratio(counts, one)
+    assert found.shape == (3, 3, 12)
+    np.testing.assert_allclose(found, posterior.log_likelihood_ratio(counts, each), rtol=1e-12)
+
+
+def test_rate_and_armed_undo_the_pile_up() -> None:
+    counts = np.random.default_rng(0).multinomial(300, np.full(21, 1 / 21), size=(4, 5))[..., :-1]
+    counts[0, 0, 8:] = 0
+    counts[0, 0, 8] = 300 - counts[0, 0].sum()  # the last pulses armed
+    rate, armed = posterior.rate_and_armed(counts.astype(float), 300)
+    expected = coates_rate(counts, 300)
+    finite = np.isfinite(expected)
+    assert 0.9 < finite.mean() < 1
+    np.testing.assert_allclose(rate[finite], expected[finite], rtol=1e-12)
+    np.testing.assert_array_equal(armed[0, 0, 9:], 0)
+    np.testing.assert_array_equal(rate[0, 0, 9:], 0)
+    np.testing.assert_array_equal(armed, 300 - np.cumsum(counts, axis=-1) + counts)
+
+
+@pytest.mark.parametrize("last", [1, 7, 100])
+def test_the_last_pulses_count_half_a_pulse_less(last: int) -> None:
+    rate, armed = posterior.rate_and_armed(np.array([100.0 - last, last, 0.0]), 100)
+    assert armed[1] == last
+    # ln(A / (A - n)) with n = A - 1/2
+    np.testing.assert_allclose(rate[1:], [math.log(2 * last), 0.0], rtol=1e-12)
+
+
+def test_expected_counts_are_undone_as_well() -> None:
+    given = rate_per_bin(4.0, 0.5, 1.5, Pulse(), Acquisition(n_bins=12))
+    rate, _ = posterior.rate_and_armed(trigger_probability(given) * 50, 50)
+    np.testing.assert_allclose(rate, given, rtol=1e-12)
+
+
+def test_rates_are_counts_where_pulses_are_unknown() -> None:
+    counts = np.arange(12.0).reshape(3, 4)
+    rate, armed = posterior.rate_and_armed(counts, None)
+    np.testing.assert_array_equal(rate, counts)
+    np.testing.assert_array_equal(armed, np.ones((3, 4)))
+
+
+# --- The light. ---
+
+SIGNAL, BACKGROUND, N_PULSES = 0.3, 0.6, 1000
+
+
+def drawn(
+    signal: Any,
+    background: Any = BACKGROUND,
+    n_pulses: int = N_PULSES,
+    *,
+    onset_bin: Any = None,
+    known: bool = True,
+    seed: int = 0,
+) -> Capture:
+    """Echoes of a signal over a background, each for all or per pixel.
+
+    Delays are drawn from all over the gate's front, so that nothing is lost behind it, if not told.
+    """
+    shape = (SIZE, SIZE)
+    rng = np.random.default_rng(seed)
+    anywhere = rng.uniform(0, N_BINS - 8, shape)
+    onset_bin = anywhere if onset_bin is None else np.broadcast_to(onset_bin, shape)
+    acquisition = Acquisition(n_bins=N_BINS, n_pulses=n_pulses if known else None)
+    signal = np.broadcast_to(signal, shape)
+    rate = rate_per_bin(onset_bin, signal, 0.0, Pulse(), acquisition)
+    rate += np.broadcast_to(background, shape)[..., np.newaxis] / N_BINS
+    if not known:
+        return Capture(rng.poisson(rate * n_pulses).astype(np.uint16), acquisition)
+    chance = trigger_probability(rate)
+    none = 1 - chance.sum(axis=2, keepdims=True)
+    counts = rng.multinomial(n_pulses, np.concatenate([chance, none], axis=2))[..., :-1]
+    return Capture(counts.astype(np.uint16), acquisition)
+
+
+def chance_variance(total: float, n_pulses: int = N_PULSES) -> float:
+    """Variance of ``ln(M / (M - n))``, n of M pulses having fired at a rate `total`."""
+    return math.expm1(total) / n_pulses
+
+
+def columns(left: float, right: float) -> np.ndarray:
+    """Two values, one in every other column."""
+    return np.where(np.arange(SIZE) % 2 == 0, left, right)
+
+
+HALF_A_STEP = posterior._SPREAD ** (0.5 / (posterior.LEVELS - 1))
+"""A signal is found as the level next to it, or spread over the two."""
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["first photons", "photons"])
+@pytest.mark.parametrize("signal", [0.1, 0.3])
+def test_light_of_finds_signal_and_background(signal: float, known: bool) -> None:
+    light = light_of(drawn(signal, known=known))
+    photons = 1 if known else N_PULSES
+    found = float(light.typical_signal.mean()) / photons
+    assert signal / HALF_A_STEP < found < signal * HALF_A_STEP
+    # Beside the one pixel that is added none is without an echo.
+    assert light.share[0] < 2 / SIZE**2
+    total = float(light.typical_background.mean()) / photons + (1 - light.share[0]) * found
+    expected = signal + BACKGROUND
+    variance = chance_variance(expected) if known else expected / N_PULSES
+    assert total == pytest.approx(expected, abs=4 * math.sqrt(variance) / SIZE)
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["first photons", "photons"])
+def test_light_of_tells_half_with_an_echo_from_half_without(known: bool) -> None:
+    capture = drawn(columns(SIGNAL, 0.0), known=known)
+    light = light_of(capture)
+    # 300 detections in some bins leave no doubt; one pixel without an echo is added.
+    assert light.share[0] == pytest.approx(0.5, abs=2 / SIZE**2)
+    found = light.typical_signal.mean() / (1 if known else N_PULSES)
+    assert SIGNAL / HALF_A_STEP < found < SIGNAL * HALF_A_STEP
+    # But at the end of the gate, where an echo is hardly seen.
+    sure = np.abs(posterior_of(capture).surface - columns(1, 0)) < 0.01
+    assert sure.mean() > 0.95
+
+
+def test_light_of_tells_half_with_a_faint_echo_from_half_without() -> None:
+    light = light_of(drawn(columns(0.06, 0.0)))
+    # An echo of 60 detections stands out of 20 a bin, though not in each pixel: some doubt is left
+    # beside the scatter of a share that a sample of pixels tells.
+    assert light.share[0] == pytest.approx(0.5, abs=4 * 0.5 / SIZE)
+
+
+def test_light_of_an_echo_free_image_has_none() -> None:
+    capture = drawn(0.0)
+    light = light_of(capture)
+    assert light.share[0] > 0.99
+    assert len(light.share) == 2  # one that the sample may have missed, and no more
+    assert (posterior_of(capture).surface < 0.5).all()
+
+
+def test_light_of_finds_two_reflectivities() -> None:
+    light = light_of(drawn(columns(0.08, 0.4)))
+    between = math.sqrt(0.08 * 0.4)
+    level = light.signal[:, 0, 0]
+    dark, bright = level[1:] < between, level[1:] > between
+    share = light.share[1:]
+    # 80 detections and 400, known to 1 in 5: none is taken for the other.
+    assert share[dark].sum() == pytest.approx(0.5, abs=2 / SIZE**2)
+    assert share[bright].sum() == pytest.approx(0.5, abs=2 / SIZE**2)
+    for some, signal in ((dark, 0.08), (bright, 0.4)):
+        found = share[some] @ level[1:][some] / share[some].sum()
+        assert signal / HALF_A_STEP < found < signal * HALF_A_STEP
+
+
+def test_background_is_one_where_chance_alone_makes_it_scatter() -> None:
+    light = light_of(drawn(SIGNAL))
+    # A variance of n numbers scatters by sqrt(2 / n) of itself: more than that is not kept.
+    excess = 4 * math.sqrt(2) / SIZE
+    scatter = math.sqrt(chance_variance(SIGNAL + BACKGROUND) * (1 + excess))
+    assert light.typical_background.std() <= excess * scatter
+
+
+def test_background_is_one_where_signal_alone_differs() -> None:
+    light = light_of(drawn(columns(SIGNAL, 0.0)))
+    # Totals differ by the signal, and backgrounds by no more than what levels miss of it.
+    assert light.background[0].std() < 0.5 * SIGNAL / 2
+
+
+def test_background_that_differs_is_not_drawn_to_its_mean() -> None:
+    background = np.linspace(0.3, 1.2, SIZE)
+    light = light_of(drawn(0.1, background))
+    error = light.typical_background - background
+    # As good as each pixel's own total, or better: errors are what chance makes.
+    chance = np.mean([chance_variance(0.1 + b) for b in background])
+    assert (error - error.mean()).var() <= chance * (1 + 4 * math.sqrt(2) / SIZE)
+    assert np.polyfit(background, light.typical_background.mean(axis=0), 1)[0] > 0.9
+
+
+def test_totals_are_of_the_background_and_scatter_by_chance() -> None:
+    n_pulses, background, n_pixels = 30, 0.9, 40_000
+    fired = np.random.default_rng(0).binomial(n_pulses, -math.expm1(-background), (200, 200))
+    total, chance = posterior._totals(capture_of(fired[..., np.newaxis], n_pulses))
+    variance = chance_variance(background, n_pulses)
+    # To the first order in 1 / pulses; the next is a quarter of it, so few are the pulses.
+    assert total.mean() == pytest.approx(
+        background, abs=0.25 * variance / 2 + 4 * math.sqrt(variance / n_pixels)
+    )
+    assert chance == pytest.approx(variance, rel=0.25)
+    assert total.var() == pytest.approx(chance, rel=0.25)
+
+
+def test_depths_that_are_alike_are_found_alike() -> None:
+    depth = light_of(drawn(SIGNAL)).depth
+    # Echoes begin in bins 0 to 21; a pixel or more in each, over five bins of smoothing.
+    excess = 4 / math.sqrt(5 * SIZE**2 / (N_BINS - 8))
+    expected = (1 - posterior._ALIKE) * N_BINS / (N_BINS - 8)
+    assert (np.abs(depth[3:18] / expected - 1) < 0.15 + excess).all()
+    assert depth[-4:].mean() < 0.5
+
+
+def test_depths_that_occur_are_learned() -> None:
+    light = light_of(drawn(0.1, onset_bin=10.0))
+    assert light.depth[6:15].sum() > 0.7 * N_BINS
+    # But none is ruled out.
+    assert light.depth.min() > 0.05
+
+
+def test_light_does_not_depend_on_the_order_of_pixels() -> None:
+    capture = drawn(columns(SIGNAL, 0.0), columns(0.6, 0.4)[::-1])
+    assert SIZE**2 <= posterior._SAMPLE  # beyond, some are drawn
+    order = np.random.default_rng(2).permutation(SIZE**2)
+    cube = capture.cube.reshape(1, SIZE**2, N_BINS)[:, order]
+    one, other = light_of(capture), light_of(capture_of(cube, N_PULSES))
+    # Sums round as their order has it, which a hundred steps may magnify.
+    np.testing.assert_allclose(other.share, one.share, rtol=0, atol=1e-9)
+    for field in ("signal", "background"):
+        expected = getattr(one, field).reshape(len(one.share), 1, -1)[:, :, order]
+        np.testing.assert_allclose(getattr(other, field), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("empty_column", range(4))
+def test_light_is_not_fooled_by_a_picket_fence(empty_column: int) -> None:
+    size = SIZE if numba.config.DISABLE_JIT else 64  # more than are looked at
+    acquisition = Acquisition(n_bins=N_BINS, n_pulses=50_000)
+    onset_bin = np.full((size, size), 12.0)
+    onset_bin[:, empty_column::4] = np.nan
+    rate = rate_per_bin(onset_bin, np.full((size, size), 0.5), 1.5, Pulse(), acquisition)
+    counts = np.rint(trigger_probability(rate) * 50_000).astype(np.uint16)
+    light = light_of(Capture(counts, acquisition))
+    drawn_by_chance = math.sqrt(0.25 * 0.75 / posterior._SAMPLE)
+    assert light.share[0] == pytest.approx(0.25, abs=4 * drawn_by_chance)
+    # The strongest level is what the middle four fifths of an echo hold, or more.
+    found = light.typical_signal.mean()
+    assert 0.8 * 0.5 / HALF_A_STEP < found <= 0.5
+
+
+def test_light_of_pixels_is_theirs() -> None:
+    light = in_rows(light_for(6, 12, 200), 2)
+    some = light.of_pixels(np.array([[4, 0], [4, 5]]))
+    assert some.signal.shape == some.background.shape == (3, 2, 2)
+    np.testing.assert_array_equal(some.background[:, 0, 0], light.background[:, 1, 1])
+    np.testing.assert_array_equal(some.background[:, 1], light.background[:, 1, 1:])
+    np.testing.assert_array_equal(some.share, light.share)
+    np.testing.assert_array_equal(some.depth, light.depth)
+
+
+def test_typical_light_is_the_mean_light() -> None:
+    share = np.array([0.5, 0.1, 0.4])
+    signal = np.array([0.0, 1.0, 2.0]).reshape(3, 1, 1)
+    light = Light(signal, np.array([3.0, 2.0, 1.0]).reshape(3, 1, 1), share, np.ones(9))
+    # Of the pixels that see an echo; of all.
+    np.testing.assert_allclose(light.typical_signal, [[(0.1 * 1 + 0.4 * 2) / 0.5]], rtol=1e-12)
+    np.testing.assert_allclose(light.typical_background, [[1.5 + 0.2 + 0.4]], rtol=1e-12)
+    dark = Light(signal, signal, np.array([1.0, 0.0, 0.0]), np.ones(9))
+    np.testing.assert_allclose(dark.typical_signal, [[1.5]], rtol=1e-12)
+
+
+# --- From the posterior to an answer's probability. ---
+
+
+@pytest.fixture
+def table(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], Capture]:
+    """Gives a capture of one row whose posterior is a given table (col, bin)."""
+
+    def told(rows: Any) -> Capture:
+        rows = np.atleast_2d(np.asarray(rows, np.float32))[np.newaxis]
+        known = Posterior(rows, np.ones(rows.shape[:2]))
+        monkeypatch.setattr(posterior, "posterior_of", lambda _: known)
+        return capture_of(np.zeros(rows.shape))
+
+    return told
+
+
+def test_near_interpolates_between_bins(table: Callable[[Any], Capture]) -> None:
+    capture = table([[0.25, 0.5, 0.0], [1.0, 0.0, 0.5]])
+    for bins, expected in (
+        (0.0, [0.25, 1.0]),
+        (0.5, [0.375, 0.5]),
+        (1.0, [0.5, 0.0]),
+        (1.75, [0.125, 0.375]),
+        (2.0, [0.0, 0.5]),
+    ):
+        np.testing.assert_array_equal(near(capture, np.full((1, 2), bins)), [expected])
+    np.testing.assert_array_equal(near(capture, np.array([[0.5, 1.75]])), [[0.375, 0.375]])
+
+
+def test_near_is_nothing_where_there_is_no_answer(table: Callable[[Any], Capture]) -> None:
+    capture = table(np.full((2, 3), 0.5))
+    np.testing.assert_array_equal(near(capture, np.array([[math.nan, 1.0]])), [[0.0, 0.5]])
+
+
+@pytest.mark.parametrize("rows", [[0.25, 0.5, 0.75], [0.25]], ids=["three bins", "one bin"])
+def test_near_ends_at_the_gates_edges(table: Callable[[Any], Capture], rows: Any) -> None:
+    capture = table(rows)
+    assert near(capture, np.array([[0.0]])) == 0.25
+    for beyond in (len(rows) - 0.5, len(rows)):
+        assert near(capture, np.array([[beyond]])) == rows[-1]
+
+
+def test_near_is_a_probability_though_sums_round(table: Callable[[Any], Capture]) -> None:
+    capture = table([1 + 2e-7, -1e-9])
+    for bins in (0.0, 1.0):
+        assert 0 <= near(capture, np.array([[bins]])) <= 1
+
+
+def test_nothing_seen_leaves_every_delay_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    share = np.array([0.6, 0.4])
+    level = np.array([0.0, 1e-9]).reshape(2, 1, 1)  # an echo too faint to be missed
+    light = Light(level, np.ones((2, 1, 1)), share, np.ones(40))
+    monkeypatch.setattr(posterior, "light_of", lambda _: light)
+    found = posterior_of(capture_of(np.zeros((1, 1, 40))))
+    expected = 0.4 * (np.minimum(np.arange(40) + 3, 40) - np.maximum(np.arange(40) - 3, 0)) / 40
+    np.testing.assert_allclose(found.near[0, 0], expected, rtol=1e-5)
+    np.testing.assert_allclose(found.surface, 0.4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("n_threads", THREADS)
+@pytest.mark.usefixtures("threads")
+def test_nothing_depends_on_threads(n_threads: int) -> None:
+    cube = np.tile(histograms(12, 200, Pulse()), (15, 1))[np.newaxis, : 2 * posterior.LANES + 7]
+    numba.set_num_threads(1)
+    one = capture_of(cube, 200)
+    light, expected, peaks = light_of(one), posterior_of(one), most_likely(one, light_of(one), 2)
+    numba.set_num_threads(n_threads)
+    other = capture_of(cube, 200)
+    np.testing.assert_array_equal(light_of(other).share, light.share)
+    np.testing.assert_array_equal(posterior_of(other).near, expected.near)
+    np.testing.assert_array_equal(posterior_of(other).surface, expected.surface)
+    np.testing.assert_array_equal(most_likely(other, light, 2), peaks)
+
+
+# --- Calibration: what is told comes true as often. ---
+
+
+@pytest.fixture(scope="module")
+def uniform_captures() -> list[tuple[Capture, np.ndarray]]:
+    """Depths all over the gate, at two ratios of signal to background, and the delays."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(import_module("core.simulate"), "PULSES_DRAWN_ONE_BY_ONE", 0)
+        captures = []
+        for seed, sbr in enumerate((0.03, 0.06)):
+            acquisition = Acquisition()
+            rng = np.random.default_rng(seed)
+            onset_bin = rng.uniform(0, acquisition.n_bins, (CALIBRATION_SIZE, CALIBRATION_SIZE))
+            scene = Scene(acquisition.bin_to_range_m(onset_bin))
+            captures.append((simulate(scene, acquisition, Flux(sbr=sbr), seed=seed), onset_bin))
+        return captures
+
+
+def assert_calibrated(answers: list[tuple[Capture, np.ndarray, np.ndarray]]) -> None:
+    """As many of the answers (capture, delay, true delay) are right as was told."""
+    chance = np.concatenate([near(capture, bins).ravel() for capture, bins, _ in answers])
+    error = np.concatenate([np.abs(bins - truth).ravel() for _, bins, truth in answers])
+    right = error <= posterior.TOLERANCE_BINS
+    # The posterior is made in whole bins: half a bin is more than it can tell.
+    doubtful = np.abs(error - posterior.TOLERANCE_BINS) < 0.5
+    variance = (chance * (1 - chance)).sum() + 0.25 * np.count_nonzero(doubtful)
+    assert abs(chance.sum() - np.count_nonzero(right)) <= 4 * math.sqrt(variance)
+    tenth = np.minimum((chance * 10).astype(int), 9)
+    for i in range(10):
+        some = (tenth == i) & ~doubtful
+        told = chance[some].mean() if some.any() else 0.0
+        low, high = stats.binom.ppf([FOUR_SIGMA, 1 - FOUR_SIGMA], np.count_nonzero(some), told)
+        assert low <= np.count_nonzero(right[some]) <= high or not some.any()
+
+
+@pytest.mark.parametrize("method", ["likelihood", "tracking"])
+def test_confidence_is_the_share_of_right_answers(
+    uniform_captures: list[tuple[Capture, np.ndarray]], method: str
+) -> None:
+    answers = []
+    for capture, truth in uniform_captures:
+        image = estimate(capture, method)
+        assert image.valid.all()
+        np.testing.assert_array_equal(image.confidence, near(capture, image.bin))
+        answers.append((capture, image.bin, truth))
+    assert_calibrated(answers)
+
+
+@pytest.mark.parametrize("bins", [50.0, 10.5, 1.0, 96.0])
+def test_even_a_silly_answers_chance_is_known(
+    uniform_captures: list[tuple[Capture, np.ndarray]], bins: float
+) -> None:
+    assert_calibrated(
+        [(each, np.full(each.shape, bins), truth) for each, truth in uniform_captures]
+    )
+
+
+def test_surfaces_are_as_many_as_were_told() -> None:
+    capture = drawn(columns(0.06, 0.0), seed=1)
+    surface = posterior_of(capture).surface
+    assert surface[:, ::2].mean() > 0.8
+    assert surface[:, 1::2].mean() < 0.2
+    n, told = surface.size, float(surface.mean())
+    low, high = stats.binom.ppf([FOUR_SIGMA, 1 - FOUR_SIGMA], n, told)
+    assert low <= n / 2 <= high
