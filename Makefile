@@ -5,7 +5,7 @@ PORT ?= 5006
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: app test bench table2 clean
+.PHONY: app test bench paper table2 uniform calibration clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
@@ -14,23 +14,32 @@ test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q core/tests --cov --cov-fail-under=95
-	$(BIN)/python -m pytest
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q core/tests --cov --cov-report=
+	$(BIN)/python -m pytest --cov --cov-append --cov-fail-under=95
 
 bench: $(VENV)/.test ## slider to changed pixels, through a real browser
 	$(BIN)/python -m tests.latency
 
+paper: $(VENV)/.app ## every figure and table of the paper beside ours, as one page in paper/
+	$(BIN)/python -m core paper $(if $(REPETITIONS),--repetitions $(REPETITIONS)) $(if $(FIELD),--field "$(FIELD)")
+
 table2: $(VENV)/.app ## the paper's Table 2 beside ours
 	$(BIN)/python -m core table2
+
+uniform: $(VENV)/.app ## every method on depths uniform over the gate
+	$(BIN)/python -m core uniform
+
+calibration: $(VENV)/.app ## is a confidence of 0.9 right nine times in ten?
+	$(BIN)/python -m core calibration
 
 # Stamps: made again when what they depend on has changed.
 $(VENV)/.app: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[app]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[app,paper]'
 	touch $@
 
 $(VENV)/.test: $(VENV)/.app
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[app,test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[app,paper,test]'
 	sh tests/install_browser.sh $(BIN)/python
 	touch $@
 
