@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Integral
@@ -160,6 +161,31 @@ class Pulse:
             return float(self.cdf(t * self.tau_s)) - share
 
         return self.tau_s * float(brentq(excess, -longest, longest))
+
+    def taps(
+        self, n_bins: int, bin_width_s: float, delay_bin: ArrayLike = 0.0
+    ) -> tuple[Floats, int]:
+        """An echo as a filter sees it: all but a thousandth of its photons on either side.
+
+        Parameters
+        ----------
+        n_bins : int
+            Bins in the gate: no more of them before or after the delay count.
+        bin_width_s : float
+        delay_bin : array_like, any shape
+            Delays from 0 to 1, in bins after the beginning of bin 0.
+
+        Returns
+        -------
+        share : ndarray, shape (..., tap)
+            Share of the echo's photons in each bin.
+        first : int
+            The bin of the first tap.
+        """
+        first = math.floor(max(self.quantile_s(1e-3) / bin_width_s, -n_bins))
+        end = math.ceil(min(self.quantile_s(1 - 1e-3) / bin_width_s, n_bins)) + 1
+        delay = np.asarray(delay_bin, float) - first
+        return self.bin_probability(delay, end - first, bin_width_s), first
 
     def cumulative(self, onset_bin: ArrayLike, n_bins: int, bin_width_s: float) -> Floats:
         """Share of the photons before each bin edge.

@@ -396,19 +396,13 @@ class _Prepared(NamedTuple):
     n_pixels: int
 
 
-_TAIL = 1e-3  # of an echo's photons, on either side, which are left out
-
-
 def _prepare(
     capture: Capture, cube: NDArray[np.unsignedinteger], light: Light, steps_per_bin: int
 ) -> _Prepared:
-    acquisition, pulse = capture.acquisition, capture.pulse
-    n_bins, width_s = acquisition.n_bins, acquisition.bin_width_s
-    begin = math.floor(max(pulse.quantile_s(_TAIL) / width_s, -n_bins))
-    end = math.ceil(min(pulse.quantile_s(1 - _TAIL) / width_s, n_bins)) + 1
+    acquisition = capture.acquisition
     # Delays stand for the step around them, so that whole steps fill the gate and any whole bins.
-    onset = (np.arange(steps_per_bin) + 0.5) / steps_per_bin - begin
-    echo = pulse.bin_probability(onset, end - begin, width_s).astype(np.float32)
+    delay = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
+    echo, first = capture.pulse.taps(acquisition.n_bins, acquisition.bin_width_s, delay)
     blocks = capture.blocks if cube is capture.cube else to_blocks(cube)
     log_share = np.log(np.maximum(light.share, np.finfo(float).tiny))
     return _Prepared(
@@ -417,8 +411,8 @@ def _prepare(
         _lanes(light.background),
         log_share,
         np.repeat(light.depth, steps_per_bin).astype(np.float32),
-        echo,
-        begin,
+        echo.astype(np.float32),
+        first,
         capture.armed_pulses or 0,
         blocks.n_pixels,
     )

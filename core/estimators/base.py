@@ -144,9 +144,8 @@ class Estimator:
         given = conditions_of(capture, light, reach)
         here = np.s_[row : row + 1, col : col + 1]
         conditions = given._replace(signal=given.signal[here], background=given.background[here])
-        return self.curve(around[np.newaxis, np.newaxis].astype(float), conditions, parameters)[
-            0, 0
-        ]
+        one = around[np.newaxis, np.newaxis].astype(float)
+        return np.asarray(self.curve(one, conditions, parameters)[0, 0])
 
     def threshold(self, capture: Capture, parameters: Any, false_alarm: float) -> float:
         """The score that a share `false_alarm` of pixels without an echo exceeds.

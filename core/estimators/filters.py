@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from scipy.ndimage import correlate1d
 
 from core.acquisition import Floats
 from core.posterior import Conditions
 
-_TAIL = 1e-3  # of an echo's photons, on either side, which a filter leaves out
-
 
 def echo_shape(conditions: Conditions) -> tuple[Floats, int]:
-    """Share of an echo's photons in each bin, and the bins from its delay to the first of them."""
-    n_bins, width_s = conditions.acquisition.n_bins, conditions.acquisition.bin_width_s
-    pulse = conditions.pulse
-    begin = math.floor(max(pulse.quantile_s(_TAIL) / width_s, -n_bins))
-    end = math.ceil(min(pulse.quantile_s(1 - _TAIL) / width_s, n_bins))
-    return pulse.bin_probability(-begin, max(end - begin, 1), width_s), begin
+    """`Pulse.taps` of an echo that begins with a bin."""
+    acquisition = conditions.acquisition
+    return conditions.pulse.taps(acquisition.n_bins, acquisition.bin_width_s)
 
 
 def correlate(values: Floats, taps: Floats, first: int) -> Floats:

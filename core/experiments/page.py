@@ -16,7 +16,7 @@ INTRODUCTION = (
     "simulations, and where the paper does not print a setting (pulses, pulse length, tolerance) "
     "they use what makes its tables come out: 1000 pulses, 1 ns, 3 bins.",
     "Printed values stand beside ours, with the difference and a 95 % interval. A difference "
-    "within it is chance; a larger one has a cause, and ours is not always the better: methods marked "
+    "within it is chance; a larger one has a cause, and ours is not always better: those marked "
     "as reconstructions were rebuilt from abstracts.",
     "Read first: 'The limit' (what one pixel can tell at all), 'Where the answers lie when there "
     "is no echo' (what a method assumes about range without saying so), and 'Restoration degree "

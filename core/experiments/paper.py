@@ -443,8 +443,8 @@ def agreement(capture: Capture, name: str) -> Table:
     )
 
 
-def model_items() -> Iterator[Item]:
-    """Everything that needs no repetitions."""
+def model_items(size: int = 64) -> Iterator[Item]:
+    """Everything that needs no repetitions; `size` squared pixels tell of places in the gate."""
     yield figure_1()
     yield figure_2()
     yield from figure_4()
@@ -457,8 +457,8 @@ def model_items() -> Iterator[Item]:
     yield limits()
     yield arithmetic()
     for sbr in (0.06, 0.03):
-        yield echo_free(sbr)
-        yield by_place(sbr)
+        yield echo_free(sbr, size)
+        yield by_place(sbr, size)
 
 
 def _probability(flux: Flux, onset_bin: float, signal: float) -> Floats:

@@ -29,6 +29,7 @@ from core.tracking import PRESETS, TrackingParameters
 pytestmark = pytest.mark.compiled
 
 CAR = Condition("car", 0.06)
+SIZE = 24  # rows and columns that tell of places in the gate
 PEAK = Method("peak", "peak", ESTIMATORS["peak"].parameters())
 BLIND = Method("blind", "tracking", TrackingParameters(t_n=1000))
 
@@ -226,7 +227,7 @@ def test_tables_stand_beside_what_is_printed(quick: Results) -> None:
 
 @pytest.fixture(scope="module")
 def items() -> dict[str, Item]:
-    return {item.key: item for item in paper.model_items()}
+    return {item.key: item for item in paper.model_items(SIZE)}
 
 
 def test_every_figure_is_there(items: dict[str, Item]) -> None:
@@ -301,7 +302,7 @@ def test_by_place_tells_what_a_target_at_50_m_does_not(items: dict[str, Item]) -
     expected = right_bin_probability(place, 0.1041, 0.1041 / 0.06, paper.PULSE, paper.GATE)
     np.testing.assert_allclose(limit, expected, atol=0.01)
     # Single-pixel methods cannot pass it, but for chance and the approximation's .025.
-    chance = 4 * np.sqrt(0.25 / 64**2) + 0.025
+    chance = 4 * np.sqrt(0.25 / SIZE**2) + 0.025
     assert (plot.curves["oracle"] <= limit + chance).all()
 
 
