@@ -275,4 +275,4 @@ def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     chance = trigger_probability(rate)
     none = 1 - chance.sum(axis=2, keepdims=True)
     drawn = rng.multinomial(n_pulses, np.concatenate([chance, np.maximum(none, 0)], axis=2))
-    return drawn[..., :-1].astype(capture.cube.dtype)
+    return drawn[..., :-1].astype(np.uint16 if n_pulses < 2**16 else np.uint32)
