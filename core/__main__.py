@@ -91,7 +91,8 @@ def _estimate(chosen: argparse.Namespace) -> None:
         ("pixels answered", int(found.image.valid.sum())),
         ("of them confident (0.9 and more)", int((found.image.confidence >= 0.9).sum())),
         *found.figures.items(),
-        ("seconds", found.estimate_s),
+        ("seconds for light and confidence", found.light_s),
+        ("seconds for the method", found.estimate_s),
     ]
     print(as_markdown((ESTIMATORS[chosen.method].title, ""), rows))
 

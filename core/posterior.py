@@ -110,8 +110,8 @@ class Posterior(NamedTuple):
 
 LEVELS = 12  # of signal, besides none
 _SPREAD = 200.0  # the strongest level over the faintest
-_SAMPLE = 1024  # pixels from which the light is estimated
-_STEPS = 300  # of expectation and maximisation
+_SAMPLE = 512  # pixels from which the light is estimated
+_STEPS = 100  # of expectation and maximisation
 _DEPTH_STEPS = 30
 _SMOOTHING_BINS = 2.0
 _ALIKE = 0.1  # share of the surfaces of which nothing is learned

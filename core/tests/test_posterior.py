@@ -49,6 +49,12 @@ def _quick_draws(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
+def _whole_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The light of a small image is told by all of its pixels: chance is in the counts alone."""
+    monkeypatch.setattr(posterior, "_SAMPLE", 1024)
+
+
+@pytest.fixture(autouse=True)
 def _small_blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the kernels are plain Python, a block that is filled up costs what a full one does.
 
