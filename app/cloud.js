@@ -14,6 +14,7 @@ const CLICK_MOVE_PX = 4 // a press that moves less than this is a click, not a d
 const PICK_PX = 12
 const KEY_TURN = Math.PI / 36
 const KEY_ZOOM = 1.15
+const CAMERA_EVENT = "firstphoton:camera" // a linked camera has moved
 const MAX_PIXEL_RATIO = 2 // more costs frames and shows nothing
 
 /* How one point is painted; p runs over the point's square from -1 to 1. A disc with a darker rim,
@@ -115,6 +116,11 @@ class Orbit {
   distance = 1
   homeDistance = 1
   focal = [0, 0, 0]
+
+  /* Look from where another camera does. */
+  follow({azimuth, elevation, distance, homeDistance, focal}) {
+    Object.assign(this, {azimuth, elevation, distance, homeDistance, focal: [...focal]})
+  }
 
   basis() {
     const [sa, ca] = [Math.sin(this.azimuth), Math.cos(this.azimuth)]
@@ -358,6 +364,8 @@ class CloudView {
       this.schedule()
     })
     this.resizing.observe(stage)
+    this.onCamera = ({detail}) => this.follow(detail)
+    window.addEventListener(CAMERA_EVENT, this.onCamera)
   }
 
   mark(...what) {
@@ -500,6 +508,28 @@ class CloudView {
     this.atHome = true
   }
 
+  /* Tell the other clouds of the page where the camera is; each view has a module of its own. */
+  share() {
+    const {link} = this.model
+    if (!link) return
+    const detail = {link, from: this, orbit: this.orbit, atHome: this.atHome}
+    window.dispatchEvent(new CustomEvent(CAMERA_EVENT, {detail}))
+  }
+
+  follow({link, from, orbit, atHome}) {
+    if (from === this || !link || link !== this.model.link) return
+    this.orbit.follow(orbit)
+    this.atHome = atHome
+    this.schedule()
+  }
+
+  /* Back to the home view, by hand: linked clouds come along. */
+  homeByHand() {
+    this.goHome(this.stage.clientWidth, this.stage.clientHeight)
+    this.share()
+    this.schedule()
+  }
+
   placeCamera() {
     const camera = this.renderer.getActiveCamera()
     camera.setViewAngle(VIEW_ANGLE_DEG)
@@ -547,6 +577,7 @@ class CloudView {
 
   moved() {
     this.atHome = false
+    this.share()
     this.schedule()
   }
 
@@ -602,6 +633,7 @@ class CloudView {
   delete() {
     this.dead = true
     this.resizing.disconnect()
+    window.removeEventListener(CAMERA_EVENT, this.onCamera)
     cancelAnimationFrame(this.frame)
     this.release()
   }
@@ -679,8 +711,8 @@ function listenToKeys(stage, view) {
     "+": () => view.zoom(KEY_ZOOM),
     "=": () => view.zoom(KEY_ZOOM), // the plus key without shift
     "-": () => view.zoom(1 / KEY_ZOOM),
-    0: () => view.mark("home"),
-    Home: () => view.mark("home"),
+    0: () => view.homeByHand(),
+    Home: () => view.homeByHand(),
   }
   stage.addEventListener("keydown", (event) => {
     const action = actions[event.key]
@@ -703,7 +735,7 @@ export function render({model}) {
   const problem = element("div", {class: "problem", role: "alert"})
   const view = new CloudView(model, stage, problem)
   const tools = element("div", {class: "tools", role: "group", "aria-label": "3D view"},
-    button("Home view (0)", HOME_ICON, () => view.mark("home")),
+    button("Home view (0)", HOME_ICON, () => view.homeByHand()),
     button("Save picture (PNG)", SAVE_ICON, () => view.save()))
   const root = element("div", {class: "cloud"}, element("style", {}, STYLE),
     stage, caption, tools, problem)

@@ -253,6 +253,10 @@ class PointCloud(pn.custom.JSComponent):
 
     home = param.Event(doc="Reset the camera.")
 
+    link = param.String(
+        default="", doc="Clouds of a page that share this name share their camera; empty for none."
+    )
+
     dark = param.Boolean(default=False, doc="Take ink and paper from the dark palette.")
 
     ink = param.Color(default=palette(dark=False).text, doc="Colour of text, as #rrggbb.")

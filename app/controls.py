@@ -124,16 +124,34 @@ class Facts(JSComponent):
     _stylesheets: ClassVar = [Path(__file__).with_name("facts.css")]
 
 
+class Table(JSComponent):
+    """A table of numbers; its column headers are buttons that sort the rows."""
+
+    title = param.String(default="", doc="What a screen reader says of the table.")
+    columns = param.List(default=[], doc="Title, line of help, and 1 or -1: which end comes first.")
+    rows = param.List(
+        default=[],
+        doc="""Of each row a dict of ``name``, ``note`` on it, ``color`` and ``dash`` of its line,
+        ``cells`` of text, value to sort by and a smaller second line, a ``message`` in place of
+        cells, and ``last``: whether it stays below the others.""",
+    )
+
+    _esm = Path(__file__).with_name("table.js")
+    _stylesheets: ClassVar = [Path(__file__).with_name("table.css")]
+
+
 class Sentence(JSComponent):
     """Text, shown letter by letter: nothing of it, a file's name say, becomes part of the page."""
 
     text = param.String(default="")
     warning = param.Boolean(default=False, doc="Whether it tells of something that went wrong.")
+    live = param.Boolean(default=False, doc="Whether a screen reader reads out each new text.")
 
     _esm = """
     export function render({ model }) {
       const root = document.createElement("div");
       if (model.warning) root.setAttribute("role", "alert");
+      else if (model.live) root.setAttribute("role", "status");
       const show = () => {
         root.textContent = model.text;
         root.className = model.text === "" ? "" : model.warning ? "warning" : "note";
@@ -158,7 +176,12 @@ class Sentence(JSComponent):
 
 
 class PixelKeys(JSComponent):
-    """Holds a picture that takes the keyboard: arrow keys move the pixel, with Shift by eight."""
+    """Holds a picture that takes the keyboard: arrow keys move the pixel, with Shift by eight.
+
+    Without a picture it gives the keyboard to the column in which it stands. Plots that come to a
+    page already drawn must stand in columns alone: Bokeh would lay out those within an ESM
+    component before they are there.
+    """
 
     child = Child()
     pixel = param.List(default=[0, 0], item_type=int, doc="Row and column.")
@@ -170,12 +193,26 @@ class PixelKeys(JSComponent):
 
     _esm = """
     export function render({ model, el }) {
-      const root = document.createElement("div");
-      root.style.cssText = "width: 100%; height: 100%; display: flex; border-radius: 6px";
+      const frame = document.createElement("div");
+      if (model.child) {
+        frame.style.cssText = "width: 100%; height: 100%; display: flex; border-radius: 6px";
+        frame.append(model.get_child("child"));
+        listen(model, frame);
+      } else {
+        const outside = (node) => node.getRootNode().host;
+        const find = () => {
+          const column = outside(el) && outside(outside(el));
+          column ? listen(model, column) : requestAnimationFrame(find);
+        };
+        find();
+      }
+      return frame;
+    }
+
+    function listen(model, root) {
       root.tabIndex = 0;
       root.dataset.part = "image";
       root.setAttribute("role", "application");
-      root.append(model.get_child("child"));
       const describe = () => root.setAttribute("aria-label", model.label);
       model.on("label", describe);
       describe();
@@ -189,7 +226,6 @@ class PixelKeys(JSComponent):
           Math.min(model.shape[axis] - 1, Math.max(0, at + step * move[axis])),
         );
       });
-      return root;
     }
     """
     _stylesheets: ClassVar = ["div:focus-visible { outline: 2px solid #4c8dff }"]

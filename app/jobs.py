@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from threading import Lock
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Result = TypeVar("Result")
 
@@ -72,3 +73,97 @@ class LatestWins(Generic[Result]):
                 self._busy = following is not None
             if following is not None:
                 _WORKERS.submit(following)
+
+
+@dataclass(frozen=True)
+class Step(Generic[Result]):
+    """A piece of long work."""
+
+    work: Callable[[], Result]
+    """Runs on the worker."""
+    draw: Callable[[Result], None]
+    """Runs on the page, with what `work` returned."""
+
+
+class InSteps:
+    """Work too long for one request, step by step: between steps it can pause, or end.
+
+    All but the steps' work belongs to the page's thread.
+
+    Parameters
+    ----------
+    on_page : callable
+        Runs a function on the session's page thread, soon.
+    told : callable
+        Called when something of the following has changed.
+    failed : callable
+        Called with what went wrong in a step; the steps behind it are not done.
+
+    Attributes
+    ----------
+    done : int
+        Steps done so far.
+    is_running : bool
+        Whether there are steps to do and nobody has cancelled them.
+    """
+
+    def __init__(
+        self,
+        on_page: Callable[[Callable[[], None]], None],
+        told: Callable[[], None],
+        failed: Callable[[Exception], None],
+    ) -> None:
+        self._jobs: LatestWins[Any] = LatestWins(on_page)
+        self._told = told
+        self._failed = failed
+        self._steps: Sequence[Step[Any]] = ()
+        self._asked = 0
+        self._is_paused = False
+        self.done = 0
+        self.is_running = False
+
+    @property
+    def of(self) -> int:
+        """Steps in all."""
+        return len(self._steps)
+
+    def start(self, steps: Sequence[Step[Any]]) -> None:
+        """Begin with the first of these steps; what else was to be done is forgotten."""
+        self._steps = list(steps)  # a list of its own tells this start from others
+        self.done = self._asked = 0
+        self.is_running = bool(steps)
+        self._told()
+        self._go_on()
+
+    def cancel(self) -> None:
+        """Do no further step, and draw none."""
+        self.is_running = False
+        self._told()
+
+    def pause(self, is_paused: bool) -> None:
+        """Begin no step for a while, or go on."""
+        self._is_paused = is_paused
+        self._go_on()
+
+    def _go_on(self) -> None:
+        # One step at a time: the next is asked for when the last has been drawn.
+        if self.is_running and not self._is_paused and self._asked == self.done:
+            self._asked += 1
+            step, steps = self._steps[self.done], self._steps
+            self._jobs.submit(
+                step.work, partial(self._arrived, steps, step), partial(self._ended, steps)
+            )
+
+    def _arrived(self, steps: Sequence[Step[Any]], step: Step[Any], result: Any) -> None:
+        if steps is not self._steps or not self.is_running:
+            return  # cancelled, or overtaken by another start
+        step.draw(result)
+        self.done += 1
+        self.is_running = self.done < self.of
+        self._told()
+        self._go_on()
+
+    def _ended(self, steps: Sequence[Step[Any]], error: Exception) -> None:
+        if steps is self._steps and self.is_running:
+            self.cancel()
+            self._failed(error)

@@ -14,7 +14,11 @@ from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
 from app import words
+from app.compare import Compare
 from app.controls import Sentence, SettingsPanel
+from app.pages import Pages, View, let_pages_come
+from app.paper import Paper
+from app.parts import card, choice, part, select
 from app.session import Session
 from app.state import Reading
 from app.store import Answer, Source, file_source
@@ -49,6 +53,11 @@ THEME = {
         ("dark", "#4fb3cb", "#0c3a48", "#0f141a", DARK.paper),
     )
 }
+IN_THE_BAR = {
+    "& .MuiToggleButton-root": {"color": "#ffffff", "borderColor": "#ffffff80"},
+    "& .MuiToggleButton-root.Mui-selected": {"color": "#0b3f4c", "backgroundColor": "#ffffff"},
+    "& .MuiToggleButton-root.Mui-selected:hover": {"backgroundColor": "#e3eef1"},
+}
 
 # One screen on a laptop: image over cloud on the left, the pixel's plots on the right. Below
 # 900 px the parts follow each other.
@@ -63,12 +72,6 @@ BOARD = """
 COLUMN = """
 :host { display: flex !important; flex-direction: column; gap: 8px; height: 100%; min-height: 0; }
 @media (max-width: 900px) { :host { height: auto !important; flex: none !important; } }
-"""
-CARD = """
-:host { flex: 1 1 0 !important; min-height: 0; overflow: hidden; border-radius: 8px;
-  border: 1px solid var(--mui-palette-divider, #d5dbe2);
-  background: var(--mui-palette-background-paper, #fff); }
-@media (max-width: 900px) { :host { flex: none !important; height: 330px !important; } }
 """
 
 
@@ -108,11 +111,11 @@ class Layout:
         state = session.state
         self._uploads: list[TemporaryDirectory[str]] = []
         self._alert = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
-        self._provenance = Sentence(sizing_mode="stretch_width")
+        self._provenance = Sentence(sizing_mode="stretch_width", margin=(4, 12))
         self._progress = pmui.LinearProgress(
             visible=False, variant="indeterminate", sizing_mode="stretch_width", margin=0
         )
-        self._source = _select(
+        self._source = select(
             "Scene or capture",
             self._titles(),
             state.source,
@@ -130,7 +133,7 @@ class Layout:
         self._light = SettingsPanel(state.light, lambda new: state.param.update(light=new))
         self._viewing = SettingsPanel(state.viewing, lambda new: state.param.update(viewing=new))
         self._tracking = SettingsPanel(state.tracking, self._tracking_changed)
-        self._preset = _select(
+        self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
             "recommended",
@@ -147,6 +150,15 @@ class Layout:
             for name, label in READING_LABELS.items()
         }
         self._announced: Source | None = None
+        self.pages = Pages(
+            {
+                "Explore": self._explore,
+                "Compare": lambda: Compare(session).view,
+                "Paper": lambda: Paper(session, self._put_away).view,
+            },
+            label="",
+        )
+        self.pages.choice.param.update(sx=IN_THE_BAR, margin=(0, 12))
         self.page = self._build()
         self._announce(session.answer)
         self._listen()
@@ -158,8 +170,9 @@ class Layout:
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._file.param.watch(lambda event: self._upload(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
-        self.page.param.watch(lambda event: session.paint(event.new), "dark_theme")
+        self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if session.is_served:
+            let_pages_come(session.page)
             # On a phone the controls would cover what they control.
             pn.state.onload(lambda: self.page.param.update(sidebar_open=not session.figures.narrow))
             pn.state.on_session_destroyed(lambda _: self._forget())
@@ -193,6 +206,12 @@ class Layout:
         own = self.session.own_field_of_view_deg
         self._viewing.controls["field_of_view_deg"].initial = own
         self._tracking.controls["t_n"].high = max(answer.capture.acquisition.n_bins - 1, 1)
+        self.pages.follow(answer)
+
+    def _put_away(self, is_away: bool) -> None:
+        """Put away what belongs to the session's capture, or bring it back."""
+        self._provenance.visible = not is_away
+        self.page.sidebar_open = not (is_away or self.session.figures.narrow)
 
     # What the user does
 
@@ -242,30 +261,43 @@ class Layout:
     # Where everything stands
 
     def _build(self) -> Page:
-        main = pn.Column(
+        head = pn.Column(
             self._progress,
-            self.session.figures,
             self._alert,
-            self._board(),
-            self._provenance,
-            sizing_mode="stretch_both",
-            margin=(4, 12),
+            sizing_mode="stretch_width",
+            margin=(4, 12, 0, 12),
         )
         return Page(
             title="firstphoton",
             sidebar=self._sidebar(),
-            main=[main],
+            # In the bar, where it costs the plots no height.
+            header=[self.pages.choice],
+            main=[head, *self.pages.mains.values(), self._provenance],
             sidebar_width=330,
             theme_config=THEME,
             meta=Meta(title="firstphoton", description=words.ONE_LINE),
         )
 
     def _sidebar(self) -> list[Any]:
-        session = self.session
         read_again = pmui.Button(label="Read again", size="small", margin=(6, 8))
         read_again.on_click(lambda _: self._read_again())
-        self._light_card = _part("Light and recording", self._light.layout)
-        self._reading_card = _part("How to read the file", *self._reading.values(), read_again)
+        self._light_card = part("Light and recording", self._light.layout)
+        self._reading_card = part("How to read the file", *self._reading.values(), read_again)
+        first, *others = self.pages.asides.values()
+        return [
+            self._source,
+            self._file,
+            *others,
+            self._light_card,
+            self._reading_card,
+            part("Tracking differentiator", self._preset, self._tracking.layout),
+            first,
+            part("What is this?", pmui.Typography(words.EXPLANATION, margin=8), is_open=False),
+        ]
+
+    def _explore(self) -> View:
+        """The page that looks into the tracking differentiator."""
+        session = self.session
         difference = pmui.Switch.from_param(
             session.state.param.difference, label="First difference", size="small", margin=(0, 8)
         )
@@ -277,59 +309,21 @@ class Layout:
             size="small",
             margin=(6, 8),
         )
-        return [
-            self._source,
-            self._file,
-            self._light_card,
-            self._reading_card,
-            _part("Tracking differentiator", self._preset, self._tracking.layout),
-            _part("View", self._viewing.layout, difference, cloud_file),
-            _part("What is this?", pmui.Typography(words.EXPLANATION, margin=8), is_open=False),
-        ]
+        return View(
+            [session.figures, self._board()],
+            [part("View", self._viewing.layout, difference, cloud_file)],
+            show=session.show,
+            paint=session.paint,
+        )
 
     def _board(self) -> pn.Column:
         session, state = self.session, self.session.state
-        image_kind = _choice("What the image shows", state.param.image)
-        cloud_color = _choice("What the cloud is coloured by", state.param.cloud_color)
-        left = (_card(image_kind, session.image_keys), _card(cloud_color, session.cloud))
-        right = (session.numbers, *map(_card, session.signals.panes))
+        image_kind = choice("What the image shows", state.param.image)
+        cloud_color = choice("What the cloud is coloured by", state.param.cloud_color)
+        left = (card(image_kind, session.image_keys), card(cloud_color, session.cloud))
+        right = (session.numbers, *map(card, session.signals.panes))
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
             for content in (left, right)
         )
         return pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both")
-
-
-def _select(label: str, options: Any, value: str, help: str) -> pmui.Select:
-    return pmui.Select(
-        label=label,
-        options=options,
-        value=value,
-        description=help,
-        size="small",
-        sizing_mode="stretch_width",
-        margin=(8, 8, 4, 8),
-    )
-
-
-def _choice(help: str, parameter: Any) -> pmui.RadioButtonGroup:
-    return pmui.RadioButtonGroup.from_param(
-        parameter, label="", description=help, size="small", margin=(4, 6, 0, 6)
-    )
-
-
-def _part(title: str, *content: Any, is_open: bool = True) -> pmui.Card:
-    """A part of the sidebar that folds."""
-    return pmui.Card(
-        *content,
-        title=title,
-        title_variant="subtitle2",
-        collapsed=not is_open,
-        variant="outlined",
-        sizing_mode="stretch_width",
-        margin=(4, 6),
-    )
-
-
-def _card(*content: Any) -> pn.Column:
-    return pn.Column(*content, stylesheets=[CARD], sizing_mode="stretch_both", margin=0)

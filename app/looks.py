@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyvista as pv
 from numpy.typing import NDArray
 
-from app.store import Answer
+from app.cloud import point_cloud
+from app.state import Viewing
+from app.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS, OUTSIDE_COLOR, RANGE_COLORS
 
 Array = NDArray[Any]
@@ -53,13 +56,16 @@ def image_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array,
 
     Parameters
     ----------
-    kind : {"Estimate", "Truth", "Error", "Counts"}
+    kind : {"Estimate", "Truth", "Error", "Counts", "Confidence"}
         "Truth" and "Error" of a capture without truth are the estimate.
     """
     capture, image = answer.capture, answer.run.image
     truth_m = capture.truth_range_m
     if kind == "Counts":
         return capture.counts.astype(float), _count_look(capture.counts)
+    if kind == "Confidence":
+        sure = np.where(shown(answer, least_confidence), image.confidence, np.nan)
+        return sure, Look("Confidence: probability of being right", "", 0.0, 1.0, COUNT_COLORS)
     if kind == "Error" and truth_m is not None:
         reach_m = ERROR_SCALE_BINS * capture.acquisition.bin_length_m
         error_m = np.where(shown(answer, least_confidence), image.range_m - truth_m, np.nan)
@@ -73,6 +79,23 @@ def image_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array,
 def color_values(answer: Answer, kind: str) -> tuple[Array, Look]:
     """Values (row, col) that colour a cloud by "Range", "Error" or "Counts", and their look."""
     return image_of(answer, "Estimate" if kind == "Range" else kind, 0.0)
+
+
+def cloud_of(
+    answer: Answer, kind: str, viewing: Viewing
+) -> tuple[pv.PolyData, NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """The cloud of an answer, its points' colours, and which are wrong; None without truth."""
+    visible = shown(answer, viewing.least_confidence)
+    values, look = color_values(answer, kind)
+    half_rad = np.radians(viewing.field_of_view_deg) / 2
+    angle_rad = float(np.arctan(2 * np.tan(half_rad) / answer.capture.shape[1]))
+    range_m = np.where(visible, answer.run.image.range_m, np.nan)
+    cloud = point_cloud(range_m, angle_rad, confidence=answer.run.image.confidence)
+    rgb = look.rgb(values[visible])
+    if rgb.size:  # PyVista keeps no empty array
+        cloud["rgb"] = rgb
+    wrong = is_wrong(answer)
+    return cloud, rgb, None if wrong is None else wrong[visible]
 
 
 def _range_look(answer: Answer, title: str) -> Look:

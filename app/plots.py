@@ -1,4 +1,4 @@
-"""Plots as pure functions: arrays in, HoloViews elements out.
+"""Plots as pure functions: arrays in, HoloViews elements or Bokeh figures out.
 
 They are declared once. When values change, `app.views` writes the changed columns to the rendered
 plots: building a plot again would take ten times as long as drawing it.
@@ -10,9 +10,12 @@ from typing import Any
 
 import holoviews as hv
 import numpy as np
+from bokeh.models import DataRange1d, Legend, LegendItem, LinearColorMapper
+from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from app.theme import RANGE_COLORS, Palette
+from app.theme import OUTSIDE_COLOR, RANGE_COLORS, Palette, method_style
+from core.experiments import items, paper
 
 Array = NDArray[Any]
 
@@ -28,9 +31,9 @@ RESIDUAL_LAYERS = ("raw", "residual", "truth", "answer")
 ENHANCED_LAYERS = ("weight", "enhanced", "truth", "answer")
 
 
-def marker_line(position_bin: float, height: float) -> tuple[Array, Array]:
-    """Coordinates of an upright line from 0 to `height`; of nothing at NaN."""
-    return np.full(2, position_bin), np.array([0.0, height])
+def marker_line(position_bin: float, top: float, bottom: float = 0.0) -> tuple[Array, Array]:
+    """Coordinates of an upright line; of nothing at NaN."""
+    return np.full(2, position_bin), np.array([bottom, top])
 
 
 def edges(n_bins: int) -> Array:
@@ -167,3 +170,151 @@ def range_image(image: Array, low: float, high: float) -> hv.Overlay:
 def pixel_frame(row: int, col: int) -> tuple[float, float, float, float]:
     """Left, bottom, right and top of a frame around a pixel that leaves the pixel itself free."""
     return col - 1.5, row - 1.5, col + 1.5, row + 1.5
+
+
+def score_curves(colors: Palette) -> hv.Overlay:
+    """Scores of each bin, a line for each method, with the truth and the methods' answers."""
+    unit = hv.Dimension("score", label="Score, scaled")
+    nothing = np.full(1, np.nan)
+    layers = [
+        hv.Path([np.full((1, 2), np.nan)], [BIN, unit]).opts(line_width=1.8),
+        _curve(*marker_line(np.nan, 1.0), unit, "truth").opts(
+            color=colors.truth, line_width=2.5, line_dash="4 2"
+        ),
+        hv.Scatter((nothing, nothing), BIN, unit, label="answer, own lag removed").opts(
+            marker="inverted_triangle", size=9, line_width=0
+        ),
+    ]
+    return _panel(layers, "Score of each bin: 0 is a curve's median, 1 its maximum").opts(
+        hv.opts.Overlay(legend_position="right", legend_cols=1)
+    )
+
+
+def reliability(colors: Palette) -> hv.Overlay:
+    """Share right against confidence told, a line for each method, and the diagonal."""
+    told = hv.Dimension("told", label="Confidence told")
+    right = hv.Dimension("right", label="Share right within 3 bins")
+    ends, nothing = np.array([0.0, 1.0]), np.full(1, np.nan)
+    layers = [
+        hv.Curve((ends, ends), told, right, label="honest").opts(
+            color=colors.muted, line_width=1, line_dash="dashed"
+        ),
+        hv.Path([np.full((1, 2), np.nan)], [told, right]).opts(line_width=1.8),
+        hv.Scatter((nothing, nothing), told, right).opts(size=6, line_width=0),
+    ]
+    return _panel(layers, "Reliability: on the dashed line confidence is honest").opts(
+        hv.opts.Overlay(show_legend=False)
+    )
+
+
+# Curves of the studies that have a colour of their own, by the palette's names, and their dashes.
+STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
+    "histogram": ("raw", []),
+    "small scale": ("small", []),
+    "large scale": ("large", []),
+    "residual": ("residual", []),
+    "largest residual, no noise": ("residual", []),
+    "largest of noise alone, median": ("muted", [6, 3]),
+    "largest of noise alone, 95 %": ("text", [6, 3]),
+    "limit: probability of the right bin": ("text", [2, 4]),
+    "echo's onset": ("truth", [4, 2]),
+    "truth": ("truth", [4, 2]),
+    "answer, lag included": ("answer", []),
+    "the echo above": ("answer", []),
+}
+METHOD_PLACES = {method.name: place for place, method in enumerate(paper.COMPARED)}
+BARS = "histogram"
+"""The curve that is drawn as bars."""
+
+
+def curves(item: items.Plot, colors: Palette) -> Any:
+    """A Bokeh figure of a study's curves, and upright lines at its marks, as named renderers.
+
+    Without HoloViews, which would take five times as long: these are built while someone waits.
+    """
+    drawing = figure(
+        title=item.title,
+        x_axis_label=item.x_label,
+        y_axis_label=item.y_label,
+        sizing_mode="stretch_both",
+        min_height=120,
+        tools="xbox_zoom",
+        toolbar_location=None,
+        outline_line_color=None,
+    )
+    lines = {name: (item.x, values) for name, values in item.curves.items()}
+    lines |= {name: marker_line(place, 1.0) for name, place in item.marks.items()}
+    entries = []
+    for name, (color, dash) in curve_styles(item, colors).items():
+        x, y = lines[name]
+        if name == BARS:
+            renderer = drawing.vbar(x=x, top=y, width=1.0, color=color, line_width=0, name=name)
+        else:
+            renderer = drawing.line(x, y, color=color, line_dash=dash, line_width=2, name=name)
+        entries.append(LegendItem(label=name.replace("_", " "), renderers=[renderer]))
+    many = len(entries) > 6
+    # Room for the legend, the same for all: plots above each other stay aligned.
+    drawing.min_border_right = 196 if many else 14
+    legend = Legend(
+        items=entries,
+        orientation="vertical" if many else "horizontal",
+        click_policy="hide",
+        background_fill_alpha=0.0,
+    )
+    drawing.add_layout(legend, "right" if many else "above")
+    return drawing
+
+
+def curve_styles(item: items.Plot, colors: Palette) -> dict[str, tuple[str, list[int]]]:
+    """Colour and dashes of each curve and mark; of a method by its place among all methods."""
+    styles = {}
+    for place, name in enumerate((*item.curves, *item.marks)):
+        if name in STUDY_COLORS:
+            of_palette, dash = STUDY_COLORS[name]
+            styles[name] = (getattr(colors, of_palette), dash)
+        else:
+            styles[name] = method_style(METHOD_PLACES.get(name, place), colors)
+    return styles
+
+
+def pictures(item: items.Pictures) -> list[Any]:
+    """A Bokeh figure for each image (row, col), row 0 at the top; they share colours and view.
+
+    Each has the renderers "picture", and "shadow" and "frame" around a pixel.
+    """
+    mapper = LinearColorMapper(
+        palette=RANGE_COLORS,
+        low=item.low,
+        high=item.high,
+        low_color=OUTSIDE_COLOR,
+        high_color=OUTSIDE_COLOR,
+        nan_color="rgba(0, 0, 0, 0)",
+    )
+    across, down = DataRange1d(range_padding=0), DataRange1d(range_padding=0, flipped=True)
+    drawings, shown = [], []
+    for name, image in item.images.items():
+        rows, cols = image.shape
+        drawing = figure(
+            title=name,
+            x_range=across,
+            y_range=down,
+            match_aspect=True,
+            tools="box_zoom,tap",
+            toolbar_location=None,
+            outline_line_color=None,
+        )
+        place = {"x": -0.5, "y": -0.5, "dw": cols, "dh": rows}
+        shown.append(drawing.image([image], **place, color_mapper=mapper, name="picture"))
+        left, bottom, right, top = ([side] for side in pixel_frame(0, 0))
+        for layer, color, width in (("shadow", "#000000", 4), ("frame", "#ffffff", 1.6)):
+            drawing.quad(
+                *(left, right, top, bottom),
+                fill_alpha=0,
+                line_color=color,
+                line_width=width,
+                name=layer,
+            )
+        drawings.append(drawing)
+    for ranges in (across, down):  # frames do not widen the view
+        ranges.renderers = shown
+    return drawings

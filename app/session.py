@@ -14,12 +14,12 @@ import panel as pn
 import param
 
 from app import words
-from app.cloud import PointCloud, export_bytes, point_cloud
+from app.cloud import PointCloud, export_bytes
 from app.controls import Facts, PixelKeys
 from app.jobs import LatestWins
-from app.looks import color_values, image_of, shown
+from app.looks import cloud_of, image_of
 from app.state import CLOUD_COLORS, IMAGES, NEED_TRUTH, State
-from app.store import Answer, Request, Source, compute, inspect, is_wrong
+from app.store import Answer, Request, Source, compute, inspect
 from app.theme import WRONG_COLOR, palette
 from app.views import ImageView, SignalPlots
 
@@ -56,7 +56,7 @@ class Session:
         self.sources = dict(sources)
         self.state = State(source=next(iter(sources)))
         self.signals = SignalPlots()
-        self.image = ImageView(self._choose_pixel)
+        self.image = ImageView(self.choose_pixel)
         self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
         self.figures = Facts(timed=True, sizing_mode="stretch_width")
@@ -66,11 +66,11 @@ class Session:
         self.waiting: Callable[[bool], None] = lambda is_waiting: None
         self.page = pn.state.curdoc
         self._served = self.is_served
-        self._jobs: LatestWins[Answer] = LatestWins(self._on_page)
+        self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._rest_is_due = False
+        self._is_hidden = self._is_outdated = False
         self._asked_s: float | None = None
         self.answer = compute(self._request(), None)
-        self.paint(dark=False)
         self._show(self.answer, first=True)
         self._watch()
 
@@ -84,8 +84,8 @@ class Session:
         watch(lambda *_: self._ask(), ["source", "light", "reading", "tracking"])
         watch(lambda *_: self._draw_pixel(), ["pixel", "difference"])
         watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
-        self.image_keys.param.watch(lambda event: self._choose_pixel(*event.new), "pixel")
-        self.cloud.param.watch(lambda event: self._pick(event.new), "selected")
+        self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
+        self.cloud.param.watch(lambda event: self.pick(event.new), "selected")
 
     def paint(self, dark: bool) -> None:
         """Follow the page from light to dark and back."""
@@ -93,6 +93,14 @@ class Session:
             self.signals.paint(palette(dark))
             self.image.paint(palette(dark))
             self.cloud.dark = dark
+
+    def show(self, is_on_screen: bool) -> None:
+        """Draw only what is on screen; what was missed is drawn when it comes back."""
+        self._is_hidden = not is_on_screen
+        if is_on_screen and self._is_outdated:
+            self._is_outdated = False
+            self._draw_pixel()
+            self._draw_rest()
 
     def _request(self) -> Request:
         state = self.state
@@ -121,7 +129,8 @@ class Session:
         if self._jobs.has_more:
             self._await()
 
-    def _on_page(self, act: Callable[[], None]) -> None:
+    def on_page(self, act: Callable[[], None]) -> None:
+        """Do something on the page's thread, soon, if the page is still there."""
         if not self._served:
             act()
         elif self.is_served:  # else the page is gone, and nobody left to see it
@@ -185,16 +194,21 @@ class Session:
         viewing = replace(self.state.viewing, field_of_view_deg=self.own_field_of_view_deg)
         self.state.param.update(pixel=_pixel_to_start_with(answer), viewing=viewing)
 
-    def _choose_pixel(self, row: int, col: int) -> None:
+    def choose_pixel(self, row: int, col: int) -> None:
+        """Show another pixel; one outside the image means the nearest inside."""
         rows, cols = self.answer.capture.shape
         self.state.pixel = (min(max(row, 0), rows - 1), min(max(col, 0), cols - 1))
 
-    def _pick(self, index: int) -> None:
+    def pick(self, index: int) -> None:
+        """Show the pixel of this place in the flattened image; -1 is none."""
         if index >= 0:
-            self._choose_pixel(*divmod(index, self.answer.capture.shape[1]))
+            self.choose_pixel(*divmod(index, self.answer.capture.shape[1]))
 
     def _draw_pixel(self) -> None:
         """The pixel's plots and numbers, and the frames that mark it."""
+        if self._is_hidden:
+            self._is_outdated = True
+            return
         row, col = self.state.pixel
         pixel = inspect(self.answer, row, col)
         numbers = words.pixel_numbers(self.answer, pixel)
@@ -209,6 +223,9 @@ class Session:
     def _draw_rest(self) -> None:
         """The image and the cloud."""
         self._rest_is_due = False
+        if self._is_hidden:
+            self._is_outdated = True
+            return
         answer, state = self.answer, self.state
         with pn.io.hold(self.page):
             self.image.update(*image_of(answer, state.image, state.viewing.least_confidence))
@@ -216,18 +233,8 @@ class Session:
 
     def _draw_cloud(self) -> None:
         answer, state = self.answer, self.state
-        visible = shown(answer, state.viewing.least_confidence)
-        values, look = color_values(answer, state.cloud_color)
-        wrong = is_wrong(answer)
-        half_rad = np.radians(state.viewing.field_of_view_deg) / 2
-        angle_rad = float(np.arctan(2 * np.tan(half_rad) / answer.capture.shape[1]))
-        range_m = np.where(visible, answer.run.image.range_m, np.nan)
-        self._cloud = point_cloud(range_m, angle_rad, confidence=answer.run.image.confidence)
-        rgb = look.rgb(values[visible])
-        if rgb.size:  # PyVista keeps no empty array
-            self._cloud["rgb"] = rgb
-        crosses = None if wrong is None else wrong[visible]
-        self.cloud.draw(self._cloud, rgb, crosses, scene_id=self._scene_id())
+        self._cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing)
+        self.cloud.draw(self._cloud, rgb, crosses, scene_id=self.scene_id())
         self.cloud.caption = words.cloud_caption(
             answer, self._cloud.n_points, None if crosses is None else int(crosses.sum())
         )
@@ -236,7 +243,7 @@ class Session:
         """The cloud as it is shown, as a PLY file."""
         return BytesIO(export_bytes(self._cloud, ".ply"))
 
-    def _scene_id(self) -> str:
+    def scene_id(self) -> str:
         """Changes when the camera should start anew."""
         answer = self.answer
         acquisition = replace(answer.capture.acquisition, n_pulses=None)

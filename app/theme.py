@@ -35,6 +35,8 @@ class Palette:
     weight: str
     truth: str
     answer: str
+    methods: tuple[str, ...]
+    """Of methods side by side, none of them the truth's; `method_style` adds dashes."""
 
 
 LIGHT = Palette(
@@ -51,6 +53,7 @@ LIGHT = Palette(
     weight="#7a8696",
     truth="#009e73",
     answer="#c2185b",
+    methods=("#0072b2", "#d55e00", "#8e4585", "#a67c00", "#1c2430", "#3f9fd8"),
 )
 DARK = Palette(
     text="#e8edf3",
@@ -66,12 +69,22 @@ DARK = Palette(
     weight="#8996a6",
     truth="#2fd6a5",
     answer="#ff6fa3",
+    methods=("#56b4e9", "#ff9e4a", "#e39bd0", "#e3c34a", "#e8edf3", "#7f8cff"),
 )
 
 
 def palette(dark: bool) -> Palette:
     """The colours of the mode."""
     return DARK if dark else LIGHT
+
+
+DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2])
+
+
+def method_style(place: int, colors: Palette) -> tuple[str, list[int]]:
+    """Colour and dashes of the line of the method picked at a place, 0 being the first."""
+    again, hue = divmod(place, len(colors.methods))
+    return colors.methods[hue], DASHES[again % len(DASHES)]
 
 
 # Sizes of all plots, by Bokeh model.

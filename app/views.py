@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import bokeh.models
@@ -31,21 +31,19 @@ from core import Acquisition
 Array = NDArray[Any]
 
 
-class Plot:
-    """A HoloViews overlay, rendered once; new values go into the sources of its layers.
+class Layers:
+    """A figure that stays; new values go into the sources of its layers.
 
     Parameters
     ----------
-    overlay : hv.Overlay
-    layers : sequence of str
-        A palette's name for each element of the overlay, in their order.
+    figure : bokeh.plotting.figure
+    layers : mapping
+        Of each layer the "source", the "glyph" and the "glyph_renderer".
     """
 
-    def __init__(self, overlay: hv.Overlay, layers: Sequence[str]) -> None:
-        rendered = hv.renderer("bokeh").get_plot(overlay)
-        self.figure = rendered.state
-        handles = [each.handles for each in rendered.subplots.values()]
-        self.layers = dict(zip(layers, handles, strict=True))
+    def __init__(self, figure: Any, layers: Mapping[str, Mapping[str, Any]]) -> None:
+        self.figure = figure
+        self.layers = layers
         reset = CustomJS(args={"figure": self.figure}, code="figure.reset.emit()")
         self.figure.js_on_event(DoubleTap, reset)
 
@@ -72,6 +70,22 @@ class Plot:
                 if renderer in item.renderers:
                     item.visible = visible
 
+
+class Plot(Layers):
+    """A HoloViews overlay, rendered once.
+
+    Parameters
+    ----------
+    overlay : hv.Overlay
+    layers : sequence of str
+        A palette's name for each element of the overlay, in their order.
+    """
+
+    def __init__(self, overlay: hv.Overlay, layers: Sequence[str]) -> None:
+        rendered = hv.renderer("bokeh").get_plot(overlay)
+        handles = [each.handles for each in rendered.subplots.values()]
+        super().__init__(rendered.state, dict(zip(layers, handles, strict=True)))
+
     def paint(self, colors: Palette) -> None:
         """Take on the colours of the mode."""
         paint_frame(self.figure, colors)
@@ -96,6 +110,22 @@ def paint_frame(figure: Any, colors: Palette) -> None:
         bar.title_text_color = bar.major_label_text_color = colors.muted
 
 
+class MetreAxis:
+    """Metres along the top of a plot over bins."""
+
+    def __init__(self, figure: Any) -> None:
+        self._formatter = CustomJSTickFormatter(
+            args={"start": 0.0, "step": 1.0}, code="return (start + step * tick).toFixed(1)"
+        )
+        axis = LinearAxis(formatter=self._formatter, axis_label="Range (m)")
+        figure.add_layout(axis, "above")
+
+    def follow(self, acquisition: Acquisition) -> None:
+        """Take on another gate."""
+        start, step = float(acquisition.bin_to_range_m(0)), acquisition.bin_length_m
+        self._formatter.args = {"start": start, "step": step}
+
+
 class SignalPlots:
     """The pixel's three plots, linked on the bin axis, with metres along the top of the first."""
 
@@ -106,22 +136,18 @@ class SignalPlots:
         self.enhanced = Plot(plots.enhanced(one, one, LIGHT), plots.ENHANCED_LAYERS)
         self._acquisition: Acquisition | None = None
         self._bins = Range1d(0, 1)
-        self._metres = CustomJSTickFormatter(
-            args={"start": 0.0, "step": 1.0}, code="return (start + step * tick).toFixed(1)"
-        )
         for plot in self._plots:
             figure = plot.figure
             figure.x_range, figure.y_range = self._bins, Range1d(0, 1)
             figure.min_border_left, figure.min_border_right = 46, 14
             figure.min_border_top = figure.min_border_bottom = 4
             figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
-        metres = LinearAxis(formatter=self._metres, axis_label="Range (m)")
-        self.histogram.figure.add_layout(metres, "above")
+        self._metres = MetreAxis(self.histogram.figure)
 
     @property
     def panes(self) -> list[pn.pane.Bokeh]:
         """The three plots, from top to bottom."""
-        return [_pane(plot) for plot in self._plots]
+        return [pane_of(plot.figure) for plot in self._plots]
 
     @property
     def _plots(self) -> tuple[Plot, Plot, Plot]:
@@ -163,8 +189,7 @@ class SignalPlots:
         self._acquisition = acquisition
         n_bins = acquisition.n_bins
         self._bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
-        start, step = float(acquisition.bin_to_range_m(0)), acquisition.bin_length_m
-        self._metres.args = {"start": start, "step": step}
+        self._metres.follow(acquisition)
         edges, centres = plots.edges(n_bins), plots.centres(n_bins)
         empty = np.zeros(n_bins)
         bars = {"left": edges[:-1], "right": edges[1:], "top": empty, "bottom": empty}
@@ -182,7 +207,7 @@ class SignalPlots:
         """Fit the vertical axis, and draw truth and answer from bottom to top."""
         highest = max(float(np.nanmax(curve, initial=0.0)) for curve in curves)
         vertical = plot.figure.y_range
-        end, start = _round_up(highest * 1.15), -_round_up(-low * 1.05)
+        end, start = round_up(highest * 1.15), -round_up(-low * 1.05)
         if (start, end) != (vertical.start, vertical.end):
             vertical.update(start=start, end=end, reset_start=start, reset_end=end)
         (column,) = (name for name in plot.source("truth").data if name != "bin")
@@ -192,16 +217,16 @@ class SignalPlots:
             plot.show(layer, bool(np.isfinite(position)))
 
 
-def _pane(plot: Plot) -> pn.pane.Bokeh:
-    """A place that the plot fills."""
-    for model in plot.figure.references():
+def pane_of(figure: Any) -> pn.pane.Bokeh:
+    """A place that the figure fills."""
+    for model in figure.references():
         for kind, sizes in SIZES.items():
             if isinstance(model, getattr(bokeh.models, kind)):
                 model.update(**sizes)
-    return pn.pane.Bokeh(plot.figure, sizing_mode="stretch_both", margin=0)
+    return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
 
 
-def _round_up(value: float) -> float:
+def round_up(value: float) -> float:
     """The next of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten: an axis that rests."""
     if value <= 0.0:
         return 0.0
@@ -228,7 +253,7 @@ class ImageView:
         )
         self._shape = (0, 0)
         self.figure = self._plot.figure
-        self.pane = _pane(self._plot)
+        self.pane = pane_of(self.figure)
         self.figure.match_aspect = True
         self.figure.x_range = DataRange1d(range_padding=0, renderers=[])
         self.figure.y_range = DataRange1d(range_padding=0, flipped=True, renderers=[])
@@ -244,6 +269,17 @@ class ImageView:
                 tapped(row, col)
 
         self.figure.on_event(Tap, tap)
+
+    def join(self, first: ImageView) -> None:
+        """Become one of several side by side, with one view, and one scale that stands by them."""
+        self._bar.visible = False
+        self.figure.xaxis.axis_label = self.figure.yaxis.axis_label = None
+        if first is self:
+            return
+        for name in ("x_range", "y_range"):
+            shared = getattr(first.figure, name)
+            shared.renderers = [*shared.renderers, *getattr(self.figure, name).renderers]
+            setattr(self.figure, name, shared)
 
     def paint(self, colors: Palette) -> None:
         """Take on the colours of the mode."""

@@ -42,23 +42,23 @@ def figure_strip(answer: Answer) -> list[Fact]:
         strip = [
             (
                 "RMSE",
-                _number(figures["rmse_m"], "m"),
+                number(figures["rmse_m"], "m"),
                 "Root mean square error over target pixels with an answer.",
             ),
-            ("Within 1 bin", _share(figures["rd_1_bin"]), "Share of target pixels: RD(1 bin)."),
+            ("Within 1 bin", share(figures["rd_1_bin"]), "Share of target pixels: RD(1 bin)."),
             (
                 "Within 3 bins",
-                _share(figures["rd_3_bins"]),
+                share(figures["rd_3_bins"]),
                 "Share of target pixels: RD(3 bins), as the paper most plausibly means it.",
             ),
         ]
         if figures["coverage"] < 1:
             help = "Share of target pixels with an answer; the RMSE is over these."
-            strip.append(("Answered", _share(figures["coverage"]), help))
+            strip.append(("Answered", share(figures["coverage"]), help))
     made = "Simulated in" if answer.request.source.is_scene else "Read in"
     strip += [
-        (made, _milliseconds(answer.capture_s), "Time to make the capture."),
-        ("Estimated in", _milliseconds(answer.run.estimate_s), "Time to range every pixel."),
+        (made, milliseconds(answer.capture_s), "Time to make the capture."),
+        ("Estimated in", milliseconds(answer.run.estimate_s), "Time to range every pixel."),
     ]
     return strip
 
@@ -70,28 +70,28 @@ def pixel_numbers(answer: Answer, pixel: Pixel) -> list[Fact]:
     r_small = tracking.l * sigma
     entries = [
         ("Pixel", f"row {pixel.row}, col {pixel.col}", "Arrow keys on the image move it."),
-        ("Estimate", _number(pixel.range_m, "m"), "Range of the surface, lag removed."),
+        ("Estimate", number(pixel.range_m, "m"), "Range of the surface, lag removed."),
     ]
     if answer.capture.truth_range_m is not None:
-        truth = "no target" if math.isnan(pixel.truth_m) else _number(pixel.truth_m, "m")
+        truth = "no target" if math.isnan(pixel.truth_m) else number(pixel.truth_m, "m")
         error_m = pixel.range_m - pixel.truth_m
         entries += [
             ("Truth", truth, "Where the surface is."),
-            ("Error", _number(error_m, "m", sign=True), "Estimate minus truth."),
+            ("Error", number(error_m, "m", sign=True), "Estimate minus truth."),
         ]
     entries += [
         (
             "Confidence",
-            _share(pixel.confidence),
+            share(pixel.confidence),
             "Probability that noise alone would nowhere have shown such an excess.",
         ),
-        ("σ", _number(sigma, "counts"), "Standard deviation of the histogram."),
-        ("r small", _number(r_small, ""), "l·σ, bound of the small scale's acceleration."),
-        ("r large", _number(tracking.n * r_small, ""), "n·l·σ, that of the large scale."),
+        ("σ", number(sigma, "counts"), "Standard deviation of the histogram."),
+        ("r small", number(r_small, ""), "l·σ, bound of the small scale's acceleration."),
+        ("r large", number(tracking.n * r_small, ""), "n·l·σ, that of the large scale."),
         ("Detections", f"{pixel.counts:,}", "Counts in this pixel's histogram."),
     ]
     if n_pulses is not None:
-        fired = _share(pixel.counts / n_pulses)
+        fired = share(pixel.counts / n_pulses)
         entries.append(("Pulses that fired", fired, "Share of pulses with a detection."))
     return entries
 
@@ -141,16 +141,19 @@ def failure(error: Exception) -> str:
     )
 
 
-def _number(value: float, unit: str, sign: bool = False) -> str:
+def number(value: float, unit: str, sign: bool = False) -> str:
+    """A number with its unit; a dash where there is none."""
     if not np.isfinite(value):
         return "–"
     text = f"{value:+.4g}" if sign else f"{value:.4g}" if abs(value) < 1000 else f"{value:,.2f}"
     return f"{text} {unit}".strip()
 
 
-def _share(value: float) -> str:
+def share(value: float) -> str:
+    """A share in percent; a dash where there is none."""
     return "–" if math.isnan(value) else f"{100 * value:.1f} %"
 
 
-def _milliseconds(seconds: float) -> str:
+def milliseconds(seconds: float) -> str:
+    """A duration as one reads it."""
     return f"{1000 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"

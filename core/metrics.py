@@ -8,6 +8,7 @@ beside them.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -216,3 +217,41 @@ def _mean(values: NDArray[Any]) -> float:
 
 def _root_mean_square(values: Floats) -> float:
     return math.sqrt(_mean(values**2))
+
+
+@dataclass(frozen=True)
+class Told:
+    """The answers whose confidence falls in one tenth (of a reliability diagram)."""
+
+    confidence: float
+    """Their mean confidence."""
+    right: Interval
+    """Share of them within 3 bins of a surface."""
+    count: int
+
+
+def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[Told]:
+    """Answers by tenths of confidence; tenths without answers are left out.
+
+    Parameters
+    ----------
+    confidence : ndarray, shape (answer,)
+        What was told, in [0, 1].
+    right : ndarray of bool, shape (answer,)
+    """
+    tenth = np.minimum((confidence * 10).astype(int), 9)
+    return [
+        Told(
+            float(confidence[tenth == k].mean()),
+            wilson(int(right[tenth == k].sum()), int((tenth == k).sum())),
+            int((tenth == k).sum()),
+        )
+        for k in range(10)
+        if (tenth == k).any()
+    ]
+
+
+def calibration_error(told: Sequence[Told]) -> float:
+    """Expected calibration error: mean distance of confidence from the share that is right."""
+    count = sum(each.count for each in told)
+    return sum(each.count * abs(each.confidence - each.right.value) for each in told) / count

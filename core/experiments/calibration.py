@@ -13,23 +13,10 @@ from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage
 from core.experiments.printed import TABLE_2
 from core.experiments.trials import Condition
-from core.metrics import Interval, wilson
+from core.metrics import Told, calibration_error, reliability
 from core.posterior import TOLERANCE_BINS
 
-BINS = 10
-
 METHODS = ("likelihood", "tracking", "coates", "peak")
-
-
-@dataclass(frozen=True)
-class Told:
-    """The answers whose confidence falls in one tenth."""
-
-    confidence: float
-    """Their mean confidence."""
-    right: Interval
-    """Share of them within 3 bins of a surface."""
-    count: int
 
 
 def told_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, NDArray[np.bool_]]:
@@ -45,26 +32,6 @@ def told_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, NDArray
     truth_bin = capture.acquisition.range_m_to_bin(capture.truth_range_m)
     error = np.abs(np.nan_to_num(image.bin - truth_bin, nan=np.inf))
     return image.confidence[image.valid], (error <= TOLERANCE_BINS)[image.valid]
-
-
-def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[Told]:
-    """Answers by tenths of confidence; tenths without answers are left out."""
-    tenth = np.minimum((confidence * BINS).astype(int), BINS - 1)
-    return [
-        Told(
-            float(confidence[tenth == k].mean()),
-            wilson(int(right[tenth == k].sum()), int((tenth == k).sum())),
-            int((tenth == k).sum()),
-        )
-        for k in range(BINS)
-        if (tenth == k).any()
-    ]
-
-
-def calibration_error(told: Sequence[Told]) -> float:
-    """Expected calibration error: mean distance of confidence from the share that is right."""
-    count = sum(each.count for each in told)
-    return sum(each.count * abs(each.confidence - each.right.value) for each in told) / count
 
 
 @dataclass(frozen=True)

@@ -373,17 +373,6 @@ def test_markdown_has_a_line_for_each_row() -> None:
 # --- Calibration
 
 
-def test_reliability_compares_like_with_like() -> None:
-    confidence = np.array([0.05, 0.95, 0.95, 0.95, 0.95, 1.0])
-    right = np.array([False, True, True, True, False, True])
-    low, high = calibration.reliability(confidence, right)
-    assert (low.count, high.count) == (1, 5)
-    assert (low.right.value, high.right.value) == (0, 0.8)
-    assert high.confidence == pytest.approx(0.96)
-    expected = (1 * 0.05 + 5 * 0.16) / 6
-    assert calibration.calibration_error([low, high]) == pytest.approx(expected)
-
-
 def test_confidence_is_calibrated_over_the_six_sbrs() -> None:
     found = list(calibration.reports(range(2)))
     overall = [r for r in found if r.sbr is None and r.method in ("likelihood", "tracking")]

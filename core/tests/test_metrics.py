@@ -216,3 +216,14 @@ def test_shares_of_nothing_are_nan() -> None:
 def test_decisions_of_another_shape_are_refused() -> None:
     with pytest.raises(ValueError, match=r"valid = 'shape \(3, 2\)' .*\(2, 3\)"):
         metrics.precision_recall(np.ones((3, 2), bool), TRUTH_M)
+
+
+def test_reliability_compares_like_with_like() -> None:
+    confidence = np.array([0.05, 0.95, 0.95, 0.95, 0.95, 1.0])
+    right = np.array([False, True, True, True, False, True])
+    low, high = metrics.reliability(confidence, right)
+    assert (low.count, high.count) == (1, 5)
+    assert (low.right.value, high.right.value) == (0, 0.8)
+    assert high.confidence == pytest.approx(0.96)
+    expected = (1 * 0.05 + 5 * 0.16) / 6
+    assert metrics.calibration_error([low, high]) == pytest.approx(expected)

@@ -1,0 +1,478 @@
+"""The page that puts methods side by side: what is picked, what is computed, what is shown."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import panel as pn
+import panel_material_ui as pmui
+
+from app import ranking_words
+from app.cloud import view_bounds
+from app.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table
+from app.jobs import LatestWins
+from app.looks import cloud_of, image_of
+from app.method_views import (
+    CurvePlot,
+    Picture,
+    ReliabilityPlot,
+    ScaleBar,
+    Style,
+    answer_bin,
+    title_of,
+)
+from app.pages import View
+from app.parts import card, part
+from app.ranking import Result, Task, Yardstick, run_task, score_curves, yardstick
+from app.session import Session
+from app.state import Viewing
+from app.store import Answer
+from app.theme import method_style, palette
+from core import ESTIMATORS
+from core.estimators import FALSE_ALARM
+
+log = logging.getLogger(__name__)
+
+FIRST_PICKS = ("peak", "coates", "likelihood", "tracking", "oracle")
+
+MOST_PICTURES = 6
+
+CLOUDS = "3D clouds"
+KINDS = {"Range": "Estimate", "Error": "Error", "Confidence": "Confidence", CLOUDS: "Estimate"}
+"""What the pictures may show, and what `app.looks` calls it."""
+
+IMAGE_HEIGHT, CLOUD_HEIGHT = 216, 320
+
+GRID = """
+:host {{ display: grid !important; gap: 8px; width: 100%;
+  grid-template-columns: repeat({columns}, minmax(0, 1fr)); }}
+@media (max-width: 900px) {{ :host {{ grid-template-columns: repeat({few}, minmax(0, 1fr)); }} }}
+.scroll-button {{ display: none; }}
+"""
+CLOUDS_IN_A_ROW = 3
+
+BELOW = """
+:host { display: grid !important; gap: 8px; height: 290px;
+  grid-template: minmax(0, 1fr) / minmax(0, 5fr) minmax(0, 3fr); }
+@media (max-width: 900px) {
+  :host { display: flex !important; flex-direction: column; height: 670px !important; }
+}
+"""
+HEAD = """
+:host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 4px 12px; }
+"""
+
+
+class Compare:
+    """The page's controls and views around one session.
+
+    A method's answer is kept for as long as the capture and the method's settings stay: only what
+    is missing is computed, one method after another on the worker, and only while the page is on
+    screen.
+
+    Parameters
+    ----------
+    session : Session
+        Whose capture is ranged; the tracking differentiator has the session's own settings.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._jobs: LatestWins[Any] = LatestWins(session.on_page)
+        self._curve_jobs: LatestWins[Any] = LatestWins(session.on_page)
+        self._capture = session.answer.capture
+        self._results: dict[Task, Result | str] = {}
+        self._measure: Yardstick | None = None
+        self._is_busy = self._is_stopped = self._is_on_screen = False
+        self._dark = False
+        self._settings = {method: each.parameters() for method, each in ESTIMATORS.items()}
+        self._viewing = Viewing(0.0, session.state.viewing.field_of_view_deg)
+        self._scene_id = ""
+        self._bounds: list[float] = []
+        self._make_controls()
+        self._make_views()
+        self._enter()
+        session.state.param.watch(lambda _: self._choose_pixel(), "pixel")
+
+    @property
+    def view(self) -> View:
+        """The page."""
+        return View(self._main(), self._aside(), self._show, self._follow, self._paint)
+
+    # Controls and views
+
+    def _make_controls(self) -> None:
+        picks = [method for method in ESTIMATORS if method in FIRST_PICKS]
+        self._picks = pmui.CheckBoxGroup(
+            label="Methods to compare",
+            options={title_of(method): method for method in ESTIMATORS},
+            value=picks,
+            sizing_mode="stretch_width",
+            margin=(0, 8),
+        )
+        self._picks.param.watch(lambda _: self._picked(), "value")
+        self._false_alarm = Knob.of(
+            FALSE_ALARM,
+            1.0,
+            "Share of the pixels without an echo that may be answered: lower, and a method answers "
+            "only where its score exceeds what noise alone would show. 1 answers all.",
+        )
+        self._false_alarm.param.watch(lambda _: self._refresh(), "value")
+        self._panels = {
+            method: part(each.title, self._panel(method).layout, is_open=False)
+            for method, each in ESTIMATORS.items()
+            if method != "tracking" and fields(each.parameters)
+        }
+        self._view_panel = SettingsPanel(self._viewing, self._viewing_changed)
+        self._kind = pmui.RadioButtonGroup(
+            options=list(KINDS),
+            value="Range",
+            label="",
+            description="What the pictures show, on one scale for all methods.",
+            size="small",
+            width=345,
+            margin=0,
+        )
+        self._kind.param.watch(lambda _: self._draw_pictures(), "value")
+        self._bar = pmui.LinearProgress(
+            variant="determinate", value=0, width=160, margin=(14, 0), visible=False
+        )
+        self._status = Sentence(live=True, margin=(8, 0, 0, 0))
+        self._stop = pmui.Button(
+            label="Cancel",
+            size="small",
+            variant="outlined",
+            margin=0,
+            visible=False,
+        )
+        self._stop.on_click(lambda _: self._stop_or_go_on())
+
+    def _panel(self, method: str) -> SettingsPanel[Any]:
+        def changed(settings: Any) -> None:
+            self._settings[method] = settings
+            self._refresh()
+
+        return SettingsPanel(self._settings[method], changed)
+
+    def _make_views(self) -> None:
+        self._pictures: list[Picture] = []
+        self._keys = PixelKeys(
+            label="Pictures of the methods. Arrow keys move the pixel, with Shift by eight.",
+            width=0,
+            height=0,
+            margin=0,
+            styles={"position": "absolute"},
+        )
+        self._grid = pn.Column(
+            self._keys,
+            sizing_mode="stretch_width",
+            margin=0,
+        )
+        self._keys.param.watch(lambda event: self._session.choose_pixel(*event.new), "pixel")
+        self._scale = ScaleBar()
+        self._remarks = Sentence(sizing_mode="stretch_width", margin=(2, 0))
+        self._curves = CurvePlot()
+        self._facts = Facts(sizing_mode="stretch_width", margin=(2, 0))
+        self._reliability = ReliabilityPlot()
+        self._no_reliability = Sentence(text=ranking_words.RELIABILITY_UNKNOWN, margin=12)
+        self._table = Table(
+            title="Methods by their figures; a column's header sorts.",
+            sizing_mode="stretch_width",
+            margin=(6, 0),
+        )
+
+    def _main(self) -> list[Any]:
+        head = pn.Row(
+            self._kind,
+            self._bar,
+            self._status,
+            self._stop,
+            stylesheets=[HEAD],
+            sizing_mode="stretch_width",
+            margin=(4, 0),
+        )
+        reliability = card(self._reliability.pane, self._no_reliability)
+        below = pn.Column(
+            card(self._curves.pane),
+            reliability,
+            stylesheets=[BELOW],
+            sizing_mode="stretch_width",
+            height=290,
+        )
+        return [
+            head,
+            self._grid,
+            self._scale.pane,
+            self._remarks,
+            self._facts,
+            below,
+            self._table,
+        ]
+
+    def _aside(self) -> list[Any]:
+        explanation = pmui.Typography(ranking_words.EXPLANATION, margin=8)
+        return [
+            part("Methods", self._picks, self._false_alarm),
+            *self._panels.values(),
+            part("View of the pictures", self._view_panel.layout, is_open=False),
+            part("How to read this page", explanation, is_open=False),
+        ]
+
+    # What the app tells the page
+
+    def _show(self, is_on_screen: bool) -> None:
+        self._is_on_screen = is_on_screen
+        if is_on_screen:
+            self._refresh()
+
+    def _follow(self, _answer: Answer) -> None:
+        self._refresh()
+
+    def _paint(self, dark: bool) -> None:
+        self._dark, colors = dark, palette(dark)
+        with pn.io.hold(self._session.page):
+            self._scale.paint(colors)
+            self._reliability.paint(colors)
+            self._curves.paint(colors, self._styles())
+            for picture in self._pictures:
+                self._paint_picture(picture)
+            self._draw_figures()
+
+    # What the user does
+
+    def _picked(self) -> None:
+        self._is_stopped = False
+        self._refresh()
+
+    def _viewing_changed(self, viewing: Viewing) -> None:
+        self._viewing = viewing
+        self._draw_pictures()
+
+    def _stop_or_go_on(self) -> None:
+        self._is_stopped = not self._is_stopped
+        self._go_on()
+
+    def _choose_pixel(self) -> None:
+        # A new capture's pixel is chosen before its answer is announced: that draws it, too.
+        if self._is_on_screen and self._session.answer.capture is self._capture:
+            self._mark_pixel()
+            self._ask_curves()
+
+    # What is computed
+
+    @property
+    def _tasks(self) -> dict[str, Task]:
+        """What is picked, in the order of the registry."""
+        settings = self._settings | {"tracking": self._session.answer.request.tracking}
+        return {
+            method: Task(method, settings[method], self._false_alarm.value)
+            for method in ESTIMATORS
+            if method in self._picks.value
+        }
+
+    def _styles(self) -> dict[str, Style]:
+        colors = palette(self._dark)
+        return {method: method_style(place, colors) for place, method in enumerate(self._tasks)}
+
+    def _refresh(self) -> None:
+        """Show what is known of the present capture, and compute what is not."""
+        if not self._is_on_screen:
+            return
+        if self._session.answer.capture is not self._capture:
+            self._enter()
+        tasks = self._tasks
+        for method, panel in self._panels.items():
+            panel.visible = method in tasks
+        self._draw_pictures()
+        self._draw_figures()
+        self._choose_pixel()
+        self._go_on()
+
+    def _enter(self) -> None:
+        """Come to another capture: nothing is known of it yet."""
+        session = self._session
+        self._capture = session.answer.capture
+        self._results, self._measure, self._is_stopped = {}, None, False
+        self._keys.shape = list(self._capture.shape)
+        has_truth = self._capture.truth_range_m is not None
+        kinds = [kind for kind in KINDS if has_truth or kind != "Error"]
+        if self._kind.value not in kinds:
+            self._kind.value = "Range"
+        self._kind.options = kinds
+        self._reliability.pane.visible, self._no_reliability.visible = has_truth, not has_truth
+        if session.scene_id() != self._scene_id:
+            self._scene_id = session.scene_id()
+            own = session.own_field_of_view_deg
+            self._viewing = replace(self._viewing, field_of_view_deg=own)
+            self._view_panel.show(self._viewing)
+            self._view_panel.controls["field_of_view_deg"].initial = own
+            cloud, _, wrong = cloud_of(session.answer, "Range", session.state.viewing)
+            self._bounds = view_bounds(cloud, None if wrong is None else ~wrong)
+        for picture in self._pictures:
+            picture.image.enter(*self._capture.shape)
+
+    def _go_on(self) -> None:
+        """Compute the next that is missing, unless something is under way or nothing is wanted."""
+        missing = [task for task in self._tasks.values() if task not in self._results]
+        is_idle = self._is_stopped or not self._is_on_screen
+        if not (self._is_busy or is_idle):
+            if missing:
+                self._submit(partial(run_task, missing[0], self._session.answer), missing[0])
+            elif self._measure is None:
+                self._submit(partial(yardstick, self._capture), None)
+        self._tell_progress(missing)
+
+    def _submit(self, work: Callable[[], Any], task: Task | None) -> None:
+        self._is_busy = True
+        arrived = partial(self._arrived, self._capture, task)
+        self._jobs.submit(work, arrived, arrived)
+
+    def _arrived(self, capture: Any, task: Task | None, outcome: Any) -> None:
+        """Keep and show what was computed, or why it could not be, and go on."""
+        self._is_busy = False
+        if isinstance(outcome, Exception) and not isinstance(outcome, ValueError):
+            log.warning("a method failed", exc_info=outcome)
+        if capture is self._capture:
+            if task is None:
+                failed = isinstance(outcome, Exception)
+                self._measure = Yardstick(None, None) if failed else outcome
+            elif isinstance(outcome, Exception):
+                self._results[task] = ranking_words.problem(outcome)
+            else:
+                self._results[task] = outcome
+        if self._is_on_screen:
+            with pn.io.hold(self._session.page):
+                self._draw_pictures()
+                self._draw_figures()
+                self._choose_pixel()
+                self._go_on()
+
+    def _answers(self) -> dict[str, Answer]:
+        """The answers that are there, by method."""
+        found = {method: self._results.get(task) for method, task in self._tasks.items()}
+        return {m: each.answer for m, each in found.items() if isinstance(each, Result)}
+
+    def _ask_curves(self) -> None:
+        answers, pixel = self._answers(), self._session.state.pixel
+        tasks = {method: task for method, task in self._tasks.items() if method in answers}
+        self._curve_jobs.submit(
+            partial(score_curves, self._capture, tasks, *pixel),
+            partial(self._draw_curves, answers, pixel),
+            self._session.fail,
+        )
+
+    # What is drawn
+
+    def _tell_progress(self, missing: list[Task]) -> None:
+        total = len(self._tasks)
+        is_running = self._is_busy and bool(missing)
+        done = total - len(missing)
+        current = missing[0].method if is_running else None
+        self._status.text = ranking_words.progress(done, total, current)
+        self._bar.param.update(value=100 * done // max(total, 1), visible=is_running)
+        self._stop.label = "Cancel" if not self._is_stopped else "Go on"
+        self._stop.visible = bool(missing)
+
+    def _pictured(self) -> list[str]:
+        """Methods that have a picture: the first ones, but for those that failed."""
+        working = [m for m, t in self._tasks.items() if not isinstance(self._results.get(t), str)]
+        return working[:MOST_PICTURES]
+
+    def _draw_pictures(self) -> None:
+        answers, methods = self._answers(), self._pictured()
+        with pn.io.hold(self._session.page):
+            clouds = self._kind.value == CLOUDS
+            columns = max(min(len(methods), CLOUDS_IN_A_ROW if clouds else MOST_PICTURES), 1)
+            self._grid.stylesheets = [GRID.format(columns=columns, few=1 if clouds else 3)]
+            least = self._viewing.least_confidence
+            _, look = image_of(self._session.answer, KINDS[self._kind.value], least)
+            self._scale.update(look)
+            self._make_pictures(len(methods))
+            for picture, method in zip(self._pictures, methods, strict=False):
+                picture.title.text = title_of(method)
+                picture.dim(method not in answers)
+                picture.resize(CLOUD_HEIGHT if clouds else IMAGE_HEIGHT)
+                if method in answers and clouds:
+                    self._draw_cloud(picture, method, answers[method])
+                elif method in answers:
+                    values, _ = image_of(answers[method], KINDS[self._kind.value], least)
+                    picture.draw_image(values, look)
+
+    def _draw_cloud(self, picture: Picture, method: str, answer: Answer) -> None:
+        cloud, rgb, wrong = cloud_of(answer, "Range", self._viewing)
+        view = picture.show_cloud(self._dark)
+        view.label = f"Point cloud: {title_of(method)}. Arrow keys turn all clouds together."
+        view.draw(cloud, rgb, wrong, scene_id=self._scene_id, bounds=self._bounds)
+
+    def _make_pictures(self, count: int) -> None:
+        """Have this many pictures in the grid; what they need is made once."""
+        while len(self._pictures) < count:
+            picture = Picture(self._session.choose_pixel, self._session.pick, IMAGE_HEIGHT)
+            self._pictures.append(picture)
+            picture.image.join(self._pictures[0].image)
+            picture.image.enter(*self._capture.shape)
+            self._paint_picture(picture)
+        cards = [*(picture.card for picture in self._pictures[:count]), self._keys]
+        if cards != self._grid.objects:
+            self._grid.objects = cards
+
+    def _paint_picture(self, picture: Picture) -> None:
+        picture.image.paint(palette(self._dark))
+        if picture.cloud is not None:
+            picture.cloud.dark = self._dark
+
+    def _draw_figures(self) -> None:
+        """The table, the reliability diagram, and what else is to be said."""
+        tasks, capture, styles = self._tasks, self._capture, self._styles()
+        found = {method: self._results.get(task) for method, task in tasks.items()}
+        self._table.param.update(
+            columns=ranking_words.columns(capture),
+            rows=ranking_words.rows(capture, tasks, self._results, self._measure, styles),
+        )
+        lines = {
+            method: (each.verdict.told, each.verdict.right)
+            for method, each in found.items()
+            if isinstance(each, Result) and each.verdict is not None
+        }
+        self._reliability.update(lines, styles)
+        answered = sum(not isinstance(each, str) for each in found.values())
+        self._remarks.text = ranking_words.remarks(capture, answered, len(self._pictured()))
+
+    def _mark_pixel(self) -> None:
+        row, col = self._session.state.pixel
+        answers = self._answers()
+        with pn.io.hold(self._session.page):
+            self._keys.pixel = [row, col]
+            self._facts.facts = ranking_words.pixel_facts(
+                self._session.answer, self._measure, row, col
+            )
+            for picture, method in zip(self._pictures, self._pictured(), strict=False):
+                picture.image.mark(row, col)
+                known = method in answers
+                text = ranking_words.caption(answers[method], row, col) if known else ""
+                picture.caption.text = text
+                if picture.cloud is not None:
+                    picture.cloud.selected = row * self._capture.shape[1] + col
+
+    def _draw_curves(
+        self, answers: dict[str, Answer], pixel: tuple[int, int], curves: dict[str, Any]
+    ) -> None:
+        tasks = self._tasks
+        answers = {method: each for method, each in answers.items() if method in tasks}
+        if pixel != self._session.state.pixel or not answers:
+            return  # the user has moved on
+        acquisition, truth_m = self._capture.acquisition, self._capture.truth_range_m
+        truth = np.nan if truth_m is None else float(truth_m[pixel])
+        with pn.io.hold(self._session.page):
+            self._curves.update(
+                {method: curve for method, curve in curves.items() if method in answers},
+                {method: answer_bin(each, *pixel) for method, each in answers.items()},
+                float(acquisition.range_m_to_bin(truth)),
+                acquisition,
+                self._styles(),
+            )
