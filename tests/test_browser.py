@@ -120,6 +120,12 @@ def colors(picture: np.ndarray) -> Counter[str]:
     return Counter(dict(zip(names, counts.tolist(), strict=True)))
 
 
+def about(picture: np.ndarray, color: str) -> int:
+    """How many pixels are about of a colour: a thin line may fall between two of them."""
+    wanted = [int(color[i : i + 2], 16) for i in (1, 3, 5)]
+    return int((np.linalg.norm(picture.astype(float) - wanted, axis=2) < 110).sum())
+
+
 def n_ranges(picture: np.ndarray) -> int:
     """How many colours of the scale of ranges occur."""
     return len(colors(picture).keys() & set(RANGE_COLORS))
@@ -200,11 +206,10 @@ def test_every_part_of_the_page_is_drawn(car_page):
         ("residual", ("residual", "truth", "answer")),
         ("enhanced", ("enhanced", "truth", "answer")),
     ):
-        drawn = colors(shown[plot])
-        # A line in the legend alone has some thirty pixels.
-        assert [line for line in lines if drawn[getattr(LIGHT, line)] < 80] == []
+        # A line in the legend alone has some sixty pixels.
+        assert [line for line in lines if about(shown[plot], getattr(LIGHT, line)) < 100] == []
     assert n_ranges(shown["cloud"]) > 15  # fewer than on the image: points have darker rims
-    assert colors(shown["cloud"])[WRONG_COLOR] > 20
+    assert about(shown["cloud"], WRONG_COLOR) > 10  # a handful of crosses
     expect(stage(car_page)).to_have_attribute("data-points", re.compile(r"^\d{4}$"))
 
 
@@ -469,7 +474,7 @@ def test_a_real_capture_is_ranged_and_its_guesses_are_told(page, real_capture):
     # The pulses are not known, so neither is the share of them that survives.
     choose(new, "Weight", "survival")
     expect(warning(new)).to_contain_text("needs the number of pulses")
-    choose(new, "Weight", "none")
+    choose(new, "Weight", "exponential")
     expect(warning(new)).to_be_hidden()
     choose(new, "Scene or capture", "Car at 50 m")
     expect(fact(new, "RMSE")).to_have_text(rmse(car()))
