@@ -236,12 +236,12 @@ class Compare:
     def _paint(self, dark: bool) -> None:
         self._dark, colors = dark, palette(dark)
         with pn.io.hold(self._session.page):
-            self._scale.paint(colors)
-            self._reliability.paint(colors)
-            self._curves.paint(colors, self._styles())
+            for each in (self._scale, self._reliability, self._curves):
+                each.paint(colors)
             for picture in self._pictures:
                 self._paint_picture(picture)
             self._draw_figures()
+            self._choose_pixel()
 
     # What the user does
 

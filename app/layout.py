@@ -57,16 +57,18 @@ IN_THE_BAR = {
     "& .MuiToggleButton-root": {"color": "#ffffff", "borderColor": "#ffffff80"},
     "& .MuiToggleButton-root.Mui-selected": {"color": "#0b3f4c", "backgroundColor": "#ffffff"},
     "& .MuiToggleButton-root.Mui-selected:hover": {"backgroundColor": "#e3eef1"},
+    "@media (max-width: 500px)": {
+        "& .MuiToggleButton-root": {"padding": "5px 4px", "fontSize": "10px"},
+    },
 }
 
 # One screen on a laptop: image over cloud on the left, the pixel's plots on the right. Below
 # 900 px the parts follow each other.
 BOARD = """
 :host { display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
-  gap: 10px; height: max(560px, calc(100vh - 162px)) !important; }
+  gap: 10px; flex: none !important; height: max(560px, calc(100vh - 125px)) !important; }
 @media (max-width: 900px) {
-  :host { display: flex !important; flex: none !important; flex-direction: column;
-    height: auto !important; }
+  :host { display: flex !important; flex-direction: column; height: auto !important; }
 }
 """
 COLUMN = """
@@ -158,7 +160,7 @@ class Layout:
             },
             label="",
         )
-        self.pages.choice.param.update(sx=IN_THE_BAR, margin=(0, 12))
+        self.pages.choice.param.update(sx=IN_THE_BAR, margin=(0, 0, 0, 8))
         self.page = self._build()
         self._announce(session.answer)
         self._listen()

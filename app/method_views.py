@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -140,28 +140,20 @@ class Lines:
     """The lines of a plot, one for each method, in one layer: a layer each would take longer."""
 
     def __init__(self, plot: Plot) -> None:
-        self._source = plot.source("lines")
-        self._source.data = {name: [] for name in ("xs", "ys", "color", "dash", "title")}
+        self.source = plot.source("lines")
+        self.source.data = {name: [] for name in ("xs", "ys", "color", "dash", "title")}
         color, dash = {"field": "color"}, {"field": "dash"}
         plot.layers["lines"]["glyph"].update(line_color=color, line_dash=dash)
 
     def update(self, lines: Mapping[str, tuple[Array, Array]], styles: Mapping[str, Style]) -> None:
         """Draw other lines, by method."""
-        self._source.data = {
+        self.source.data = {
             "xs": [x.astype(np.float32) for x, _ in lines.values()],
             "ys": [y.astype(np.float32) for _, y in lines.values()],
             "title": [TITLES[method] for method in lines],
-            **self._colored(lines, styles),
+            "color": [styles[method][0] for method in lines],
+            "dash": [styles[method][1] or "solid" for method in lines],
         }
-
-    def paint(self, methods: Iterable[str], styles: Mapping[str, Style]) -> None:
-        """Draw the same lines in other colours."""
-        self._source.data.update(self._colored(methods, styles))
-
-    @staticmethod
-    def _colored(methods: Iterable[str], styles: Mapping[str, Style]) -> dict[str, list[Any]]:
-        of = [styles[method] for method in methods]
-        return {"color": [color for color, _ in of], "dash": [dash or "solid" for _, dash in of]}
 
 
 class CurvePlot:
@@ -173,8 +165,6 @@ class CurvePlot:
         self._answers = self._plot.source("answers")
         self._answers.data = {"bin": [], "score": [], "color": []}
         self._plot.layers["answers"]["glyph"].fill_color = {"field": "color"}
-        self._drawn: dict[str, tuple[Array, Array]] = {}
-        self._answered: list[str] = []
         drawing = self._plot.figure
         drawing.x_range, drawing.y_range = Range1d(0, 1), Range1d(0, 1)
         drawing.min_border_left, drawing.min_border_right = 46, 14
@@ -200,8 +190,7 @@ class CurvePlot:
             bins.update(end=acquisition.n_bins, reset_end=acquisition.n_bins)
         self._metres.follow(acquisition)
         centres = plots.centres(acquisition.n_bins)
-        self._drawn = {method: (centres, curve) for method, curve in curves.items()}
-        self._lines.update(self._drawn, styles)
+        self._lines.update({method: (centres, curve) for method, curve in curves.items()}, styles)
         lowest = min((float(curve.min()) for curve in curves.values()), default=0.0)
         low = 1.05 * max(lowest, LOWEST_SCORE) - 0.02
         # One above the other, so that equal answers can be told apart.
@@ -210,22 +199,20 @@ class CurvePlot:
         vertical = plot.figure.y_range
         if (low, top) != (vertical.start, vertical.end):
             vertical.update(start=low, end=top, reset_start=low, reset_end=top)
-        self._answered = [method for method, at in answers.items() if np.isfinite(at)]
+        answered = [method for method, at in answers.items() if np.isfinite(at)]
         self._answers.data = {
-            "bin": np.array([answers[method] for method in self._answered], np.float32),
-            "score": np.array([height[method] for method in self._answered], np.float32),
-            "color": [styles[method][0] for method in self._answered],
+            "bin": np.array([answers[method] for method in answered], np.float32),
+            "score": np.array([height[method] for method in answered], np.float32),
+            "color": [styles[method][0] for method in answered],
         }
         x, y = plots.marker_line(truth_bin, top)
         plot.write("truth", bin=x, score=y)
         plot.show("truth", bool(np.isfinite(truth_bin)))
 
-    def paint(self, colors: Palette, styles: Mapping[str, Style]) -> None:
-        """Take on the colours of the mode."""
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode; those of the lines come with `update`."""
         paint_frame(self._plot.figure, colors)
         self._plot.layers["truth"]["glyph"].line_color = colors.truth
-        self._lines.paint(self._drawn, styles)
-        self._answers.data["color"] = [styles[method][0] for method in self._answered]
 
 
 class ReliabilityPlot:

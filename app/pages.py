@@ -14,6 +14,8 @@ from bokeh.models import CustomJS
 
 from app.store import Answer
 
+AS_HIGH_AS_ITS_PARTS = ":host { flex: none !important; height: auto !important; }"
+
 # While a page is being built, Bokeh may measure plots of it that have no layout yet, and fail.
 PATIENCE = """
 const view = Bokeh.Models.get("Figure").prototype.default_view.prototype;
@@ -125,7 +127,7 @@ class Pages:
 
 
 def _holder(margin: Any) -> pn.Column:
-    return pn.Column(visible=False, margin=margin)
+    return pn.Column(visible=False, stylesheets=[AS_HIGH_AS_ITS_PARTS], margin=margin)
 
 
 def _several(content: Any) -> Sequence[Any]:

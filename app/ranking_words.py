@@ -192,7 +192,7 @@ def caption(answer: Answer, row: int, col: int) -> str:
     range_m, sure = float(image.range_m[row, col]), float(image.confidence[row, col])
     off = ""
     if truth_m is not None and math.isfinite(truth_m[row, col]):
-        off = f" ({range_m - float(truth_m[row, col]):+.2f} m)"
+        off = f" ({range_m - float(truth_m[row, col]):+.2f})"
     return f"{range_m:,.2f} m{off}, {100 * sure:.0f} % sure"
 
 

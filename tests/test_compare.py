@@ -294,7 +294,7 @@ def test_all_methods_fit_in_the_table_and_the_first_six_have_pictures(stage):
     assert stage.page._status.text == f"{len(ESTIMATORS)} methods compared"
     assert len(stage.page._pictures) == MOST_PICTURES
     assert f"first {MOST_PICTURES}" in stage.page._remarks.text
-    assert len(stage.page._curves._drawn) == len(ESTIMATORS)
+    assert len(stage.page._curves._lines.source.data["title"]) == len(ESTIMATORS)
 
 
 def test_no_method_at_all_is_asked_for_kindly(stage):
@@ -337,6 +337,7 @@ def test_the_hidden_page_is_not_drawn_and_catches_up(stage):
 def open_compare(page):
     page.get_by_role("button", name="Compare", exact=True).click()
     expect(page.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible(timeout=30_000)
+    expect(page.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
     page.wait_for_function("Bokeh.documents[0].is_idle")
 
 
