@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from core.acquisition import Acquisition, Floats, Pulse
-from core.blocks import LANES, to_blocks
+from core.blocks import LANES, lane_rows, to_blocks
 from core.capture import Capture, once_per_capture
 from core.parallel import COMPILED, PARALLEL, entering
 
@@ -181,6 +181,8 @@ def _backgrounds(
     """
     scatter = float(total.var())
     kept = max(0.0, 1 - unrelated / scatter) if scatter > 0 else 0.0
+    if kept < 3 * math.sqrt(2 / total.size):  # a variance is known no better than that
+        kept = 0.0
     left = total - levels[:, np.newaxis, np.newaxis]
     everywhere = total.mean() - mean_signal
     # Half a count more than nothing: what was never seen may still be there.
@@ -259,16 +261,19 @@ def posterior_of(capture: Capture) -> Posterior:
     n_blocks, n_bins, _ = prepared.counts.shape
     near = np.empty((n_blocks, LANES, n_bins), np.float32)
     surface = np.empty((n_blocks, LANES))
-    bins = np.arange(n_bins)
-    low, high = np.maximum(bins - TOLERANCE_BINS, 0), np.minimum(bins + TOLERANCE_BINS, n_bins)
     for some, density, top in _densities(prepared):
-        until = np.pad(np.cumsum(density, axis=1), ((0, 0), (1, 0), (0, 0)))
+        # What lies before each delay, from so many bins before the gate to so many behind it.
+        before = np.zeros((len(top), n_bins + 2 * TOLERANCE_BINS + 1, LANES), np.float32)
+        behind = TOLERANCE_BINS + n_bins
+        np.cumsum(density, axis=1, out=before[:, TOLERANCE_BINS + 1 : behind + 1])
+        everything = before[:, behind]
+        before[:, behind + 1 :] = everything[:, np.newaxis]
         # In units of the larger of the two, so that neither overflows.
         unit = np.maximum(top, prepared.log_share[0])
-        seen = np.exp(top - unit) * until[:, -1] / n_bins
+        seen = np.exp(top - unit) * everything / n_bins
         surface[some] = seen / (seen + np.exp(prepared.log_share[0] - unit))
-        mass = until[:, high] - until[:, low]
-        mass *= (surface[some] / until[:, -1])[:, np.newaxis].astype(np.float32)
+        mass = before[:, 2 * TOLERANCE_BINS : -1] - before[:, :n_bins]
+        mass *= (surface[some] / everything)[:, np.newaxis].astype(np.float32)
         near[some] = mass.transpose(0, 2, 1)
     pixels = slice(capture.shape[0] * capture.shape[1])
     return Posterior(
@@ -427,11 +432,14 @@ def _lanes(image: Floats) -> Floats:
 
 def _level_evidence(prepared: _Prepared) -> Floats:
     """Log likelihood of each level over that of no echo, all delays alike; (pixel, level)."""
-    log = np.concatenate([log for _, log in _log_likelihoods(prepared)])
-    top = log.max(axis=2)
-    mean = np.exp(log - top[:, :, np.newaxis]).mean(axis=2)
-    evidence = top + np.log(mean, dtype=float)
-    return np.asarray(evidence.transpose(0, 2, 1).reshape(-1, log.shape[1])[: prepared.n_pixels])
+    n_levels, n_blocks, _ = prepared.signal.shape
+    evidence = np.empty((n_blocks, LANES, n_levels))
+    for some, log in _log_likelihoods(prepared):
+        top = log.max(axis=2)
+        np.subtract(log, top[:, :, np.newaxis], out=log)
+        mean = np.exp(log, out=log).mean(axis=2)
+        evidence[some] = (top + np.log(mean)).transpose(0, 2, 1)
+    return evidence.reshape(-1, n_levels)[: prepared.n_pixels]
 
 
 def _level_densities(prepared: _Prepared) -> NDArray[np.float32]:
@@ -510,9 +518,14 @@ def _fill_level(b, level, prepared, fired, reach, gain, ratio):  # type: ignore[
     """T(d) of one level into `ratio`, (delay, LANES)."""
     n_bins = fired.shape[0]
     n_steps, n_taps = prepared.echo.shape
+    previous_signal, previous_background = 0.0, 0.0
     for i in range(LANES):
         signal = prepared.signal[level, b, i]
         background = prepared.background[level, b, i] / n_bins
+        if i > 0 and signal == previous_signal and background == previous_background:
+            gain[:, :, i] = gain[:, :, i - 1]  # logarithms are what costs, and neighbours are alike
+            continue
+        previous_signal, previous_background = signal, background
         bare = -math.expm1(-background)
         for step in range(n_steps):
             for tap in range(n_taps):
@@ -552,9 +565,10 @@ def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
     n_levels, n_delays, _ = log.shape
     n_bins = prepared.counts.shape[1]
     n_steps, n_taps = prepared.echo.shape
-    fired, unfired = np.empty((2, n_bins, LANES), np.float32)
-    reach = np.empty((n_delays, LANES), np.float32)
-    gain = np.empty((n_steps, n_taps, LANES), np.float32)
+    # On cache lines' boundaries: vectors that straddle them cost twice.
+    fired, unfired = lane_rows(n_bins).reshape(-1, LANES), lane_rows(n_bins).reshape(-1, LANES)
+    reach, ratio = lane_rows(n_delays).reshape(-1, LANES), lane_rows(n_delays).reshape(-1, LANES)
+    gain = lane_rows(n_steps * n_taps).reshape(n_steps, n_taps, LANES)
     all_fired, all_unfired, flat = np.zeros((3, LANES))
     _fill_reach(b, prepared, fired, unfired, reach)
     for k in range(n_bins):
@@ -563,11 +577,11 @@ def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
             all_unfired[i] += unfired[k, i]
     log[0] = 0.0
     for level in range(1, n_levels):
-        _fill_level(b, level, prepared, fired, reach, gain, log[level])
+        _fill_level(b, level, prepared, fired, reach, gain, ratio)
         _flat_likelihood(b, level, prepared, all_fired, all_unfired, flat)
         for d in range(n_delays):
             for i in range(LANES):
-                log[level, d, i] += np.float32(flat[i])
+                log[level, d, i] = ratio[d, i] + np.float32(flat[i])
 
 
 @njit(**PARALLEL)
