@@ -15,7 +15,8 @@ test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q core/tests --cov --cov-report=
-	$(BIN)/python -m pytest --cov --cov-append --cov-fail-under=95
+	$(BIN)/python -m pytest core/tests --cov --cov-append --cov-fail-under=95
+	$(BIN)/python -m pytest tests
 
 bench: $(VENV)/.test ## slider to changed pixels, through a real browser
 	$(BIN)/python -m tests.latency

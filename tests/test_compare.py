@@ -457,12 +457,12 @@ def test_the_comparison_can_be_stopped(page):
     open_compare(here)
     for box in here.get_by_role("checkbox").all():
         box.check()
-    expect(here.get_by_text(f"{len(ESTIMATORS)} methods compared")).to_be_visible(timeout=30_000)
+    expect(here.get_by_text(f"{len(ESTIMATORS)} methods compared")).to_be_visible(timeout=90_000)
     here.get_by_role("combobox", name=re.compile("^Scene or capture")).click()
     here.get_by_role("menuitem", name="Car at 50 m, 256 × 256", exact=True).click()
     here.get_by_role("button", name="Cancel", exact=True).click()
     expect(here.get_by_text(re.compile(f"^Stopped: .* of {len(ESTIMATORS)} done"))).to_be_visible(
-        timeout=20_000
+        timeout=90_000
     )
     here.get_by_role("button", name="Go on", exact=True).click()
-    expect(here.get_by_text(f"{len(ESTIMATORS)} methods compared")).to_be_visible(timeout=60_000)
+    expect(here.get_by_text(f"{len(ESTIMATORS)} methods compared")).to_be_visible(timeout=90_000)
