@@ -336,7 +336,7 @@ def test_the_hidden_page_is_not_drawn_and_catches_up(stage):
 
 def open_compare(page):
     page.get_by_role("button", name="Compare", exact=True).click()
-    expect(page.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible(timeout=30_000)
+    expect(page.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible(timeout=90_000)
     expect(page.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
     page.wait_for_function("Bokeh.documents[0].is_idle")
 
