@@ -32,7 +32,7 @@ table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabul
 th, td {{ padding: 3px 10px; text-align: right; border-bottom: 1px solid #d9dee5;
   white-space: nowrap; }}
 th {{ position: sticky; top: 0; background: #f2f5f8; }}
-td.word, th.word {{ text-align: left; white-space: normal; }}
+td.word {{ text-align: left; white-space: normal; min-width: 9em; }}
 </style></head><body>
 <h1>{title}</h1>
 {body}
