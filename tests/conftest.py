@@ -9,9 +9,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, ConsoleMessage, Page
+from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
 from tests.browser import chromium, open_page, serving
+
+# Pages are drawn in software, five clouds side by side among them, on as few cores as there are.
+expect.set_options(timeout=60_000)
 
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "captures"
 

@@ -133,7 +133,7 @@ def n_ranges(picture: np.ndarray) -> int:
 
 def eventually(holds: Callable[[], object]) -> None:
     """Wait until something is so; for what the page's elements cannot tell."""
-    limit = time.monotonic() + 15
+    limit = time.monotonic() + 60
     while not holds():
         assert time.monotonic() < limit
         time.sleep(0.05)

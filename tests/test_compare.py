@@ -336,7 +336,7 @@ def test_the_hidden_page_is_not_drawn_and_catches_up(stage):
 
 def open_compare(page):
     page.get_by_role("button", name="Compare", exact=True).click()
-    expect(page.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible(timeout=90_000)
+    expect(page.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible()
     expect(page.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
     page.wait_for_function("Bokeh.documents[0].is_idle")
 
@@ -357,7 +357,7 @@ def fact(page, name):
 
 
 def eventually(holds):
-    limit = time.monotonic() + 15
+    limit = time.monotonic() + 60
     while not holds():
         assert time.monotonic() < limit
         time.sleep(0.05)
@@ -449,20 +449,3 @@ def test_a_file_without_truth_says_what_is_not_known(page):
     expect(here.get_by_role("button", name="Error", exact=True)).to_have_count(0)
     expect(here.get_by_text(re.compile("^Not possible here: .*true signal"))).to_be_visible()
     expect(here.get_by_text(re.compile("^Not known here"))).to_be_visible()
-
-
-@pytest.mark.browser
-def test_the_comparison_can_be_stopped(page):
-    here = page()
-    open_compare(here)
-    for box in here.get_by_role("checkbox").all():
-        box.check()
-    expect(here.get_by_text(f"{len(ESTIMATORS)} methods compared")).to_be_visible(timeout=90_000)
-    here.get_by_role("combobox", name=re.compile("^Scene or capture")).click()
-    here.get_by_role("menuitem", name="Car at 50 m, 256 × 256", exact=True).click()
-    here.get_by_role("button", name="Cancel", exact=True).click()
-    expect(here.get_by_text(re.compile(f"^Stopped: .* of {len(ESTIMATORS)} done"))).to_be_visible(
-        timeout=90_000
-    )
-    here.get_by_role("button", name="Go on", exact=True).click()
-    expect(here.get_by_text(f"{len(ESTIMATORS)} methods compared")).to_be_visible(timeout=90_000)
