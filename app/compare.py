@@ -52,6 +52,7 @@ GRID = """
 :host {{ display: grid !important; gap: 8px; width: 100%;
   grid-template-columns: repeat({columns}, minmax(0, 1fr)); }}
 @media (max-width: 900px) {{ :host {{ grid-template-columns: repeat({few}, minmax(0, 1fr)); }} }}
+@media (max-width: 500px) {{ :host {{ grid-template-columns: repeat({fewest}, minmax(0, 1fr)); }} }}
 .scroll-button {{ display: none; }}
 """
 CLOUDS_IN_A_ROW = 3
@@ -64,7 +65,8 @@ BELOW = """
 }
 """
 HEAD = """
-:host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 4px 12px; }
+:host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 4px 12px;
+  min-width: 0 !important; }
 """
 
 
@@ -388,7 +390,9 @@ class Compare:
         with pn.io.hold(self._session.page):
             clouds = self._kind.value == CLOUDS
             columns = max(min(len(methods), CLOUDS_IN_A_ROW if clouds else MOST_PICTURES), 1)
-            self._grid.stylesheets = [GRID.format(columns=columns, few=1 if clouds else 3)]
+            self._grid.stylesheets = [
+                GRID.format(columns=columns, few=1 if clouds else 3, fewest=1 if clouds else 2)
+            ]
             least = self._viewing.least_confidence
             _, look = image_of(self._session.answer, KINDS[self._kind.value], least)
             self._scale.update(look)

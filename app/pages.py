@@ -14,7 +14,10 @@ from bokeh.models import CustomJS
 
 from app.store import Answer
 
-AS_HIGH_AS_ITS_PARTS = ":host { flex: none !important; height: auto !important; }"
+# As high as its parts, and not as wide as all of them side by side: that is more than a phone.
+HOLDER = """
+:host { flex: none !important; height: auto !important; min-width: 0 !important; }
+"""
 
 # While a page is being built, Bokeh may measure plots of it that have no layout yet, and fail.
 PATIENCE = """
@@ -127,7 +130,7 @@ class Pages:
 
 
 def _holder(margin: Any) -> pn.Column:
-    return pn.Column(visible=False, stylesheets=[AS_HIGH_AS_ITS_PARTS], margin=margin)
+    return pn.Column(visible=False, stylesheets=[HOLDER], margin=margin)
 
 
 def _several(content: Any) -> Sequence[Any]:

@@ -33,7 +33,11 @@ TABLE_2_METHODS = sorted(paper.TABLE_2_METHODS, key=lambda method: method.estima
 BOARD = """
 :host { display: grid !important; gap: 14px; align-items: start;
   grid-template-columns: 270px minmax(0, 1fr); }
-@media (max-width: 900px) { :host { display: flex !important; flex-direction: column; } }
+@media (max-width: 900px) {
+  :host { display: flex !important; flex: none !important; flex-direction: column;
+    height: auto !important; }
+  .bk-panel-models-layout-Column { flex: none !important; height: auto !important; width: 100%; }
+}
 """
 STACK = """
 :host { display: flex !important; flex-direction: column; gap: 8px;
