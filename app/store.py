@@ -27,6 +27,7 @@ from core import (
     trigger_probability,
 )
 from core.checks import require
+from core.posterior import posterior_of
 
 MOST_PIXELS = 2**20
 
@@ -111,6 +112,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
     else:
         started = perf_counter()
         capture = request.source.load(request.light, request.reading)
+        posterior_of(capture)  # what every answer's confidence rests on, whatever the method
         capture_s = perf_counter() - started
     return Answer(request, run(capture, "tracking", request.tracking), capture_s)
 

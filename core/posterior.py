@@ -10,11 +10,11 @@ which is exact for the trigger probabilities of Eq. 1. Where the number of pulse
 where a pulse may fire more than once, counts are taken for Poisson: ``ln(1 + s_k / b)`` and ``-
 s_k``, with photons per pixel instead of per pulse.
 
-Neither ``S`` nor ``b`` is told. How often which signal occurs in the capture is estimated from all
-of its pixels (`light_of`: the nonparametric maximum likelihood of a mixing distribution, Kiefer &
-Wolfowitz 1956, on a grid of levels, "no echo" being one of them), and each pixel's answer is then
-the average over the levels: an empirical Bayes posterior, all delays within the gate being equally
-likely beforehand. Its mass around an answer is that answer's probability of being right, whichever
+Neither ``S`` nor ``b`` is told. How often which signal occurs in the capture is estimated from a
+sample of its pixels (`light_of`: the nonparametric maximum likelihood of a mixing distribution,
+Kiefer & Wolfowitz 1956, on a grid of levels, "no echo" being one of them), and so is how often
+which delay occurs. Each pixel's answer is then the average over the levels: an empirical Bayes
+posterior. Its mass around an answer is that answer's probability of being right, whichever
 estimator gave it.
 """
 
@@ -384,8 +384,8 @@ def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
 class _Prepared(NamedTuple):
     """A cube and its light, as the kernels take them."""
 
-    counts: NDArray[np.uint32]
-    """Shape (block, bin, LANES); of one type, as kernels take a quarter of a minute to compile."""
+    counts: NDArray[np.unsignedinteger]
+    """Shape (block, bin, LANES)."""
     signal: Floats
     """Shape (level, block, LANES)."""
     background: Floats
@@ -411,7 +411,7 @@ def _prepare(
     blocks = capture.blocks if cube is capture.cube else to_blocks(cube)
     log_share = np.log(np.maximum(light.share, np.finfo(float).tiny))
     return _Prepared(
-        blocks.counts.astype(np.uint32, copy=False),
+        blocks.counts,
         _lanes(light.signal),
         _lanes(light.background),
         log_share,

@@ -10,6 +10,16 @@ from numpy.typing import NDArray
 from core.acquisition import Floats
 
 
+def pooled_at(
+    cube: NDArray[np.unsignedinteger], row: int, col: int, reach: int
+) -> NDArray[np.uint64]:
+    """What `pooled` gives one pixel, shape (bin,)."""
+    steps = np.arange(reach) - reach // 2
+    rows = np.clip(row + steps, 0, cube.shape[0] - 1)
+    cols = np.clip(col + steps, 0, cube.shape[1] - 1)
+    return np.asarray(cube[np.ix_(rows, cols)].sum(axis=(0, 1), dtype=np.uint64))
+
+
 def pooled(cube: NDArray[np.unsignedinteger], reach: int) -> NDArray[np.unsignedinteger]:
     """Each pixel's counts added to those of its neighbours.
 

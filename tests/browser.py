@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -15,7 +16,7 @@ from tempfile import TemporaryFile
 from typing import IO
 from urllib.request import urlopen
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, sync_playwright
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -82,6 +83,20 @@ def open_page(
     page.locator(".stage[data-camera]").wait_for()
     page.wait_for_function("Bokeh.documents[0].is_idle")
     return page
+
+
+def eventually(holds: Callable[[], object], limit_s: float = 60.0) -> None:
+    """Wait until something is so; for what the page's elements cannot tell."""
+    until = time.monotonic() + limit_s
+    while not holds():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def fact(page: Page, name: str) -> Locator:
+    """The value of a figure or of a pixel's number on the page that is shown."""
+    term = page.locator("dt").filter(has_text=re.compile(f"^{re.escape(name)}$"))
+    return page.locator("dl div", has=term).locator("dd").filter(visible=True)
 
 
 def _free_port() -> int:

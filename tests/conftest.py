@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,12 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
+from core.tests.captures import real_capture_path
 from tests.browser import chromium, open_page, serving
 
 # Pages are drawn in software, five clouds side by side among them, on as few cores as there are.
 expect.set_options(timeout=60_000)
 
-CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "captures"
 
 OWN_SCHEMES = ("data", "blob")
 
@@ -87,13 +86,5 @@ def page(open_watched: Callable[..., Page], troubles: list[str]) -> Iterator[Cal
 
 @pytest.fixture
 def real_capture() -> Callable[[str], Path]:
-    """Path of a published capture; these are too large, and not ours, to keep in the project."""
-
-    def find(name: str) -> Path:
-        path = CAPTURES / name
-        if not path.exists():
-            reason = f"{path} is absent: the published captures are kept beside the checkout"
-            (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
-        return path
-
-    return find
+    """Path of a published capture."""
+    return real_capture_path

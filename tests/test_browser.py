@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections import Counter
 from collections.abc import Callable
 from io import BytesIO
@@ -21,7 +20,7 @@ from app.store import built_in_sources
 from app.theme import DARK, LIGHT, RANGE_COLORS, WRONG_COLOR
 from core import PRESETS, TrackingParameters
 from core.readers.npz import FORMAT
-from tests.browser import serving
+from tests.browser import eventually, fact, serving
 
 pytestmark = pytest.mark.browser
 
@@ -29,12 +28,6 @@ NEED_TRUTH = ("RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error")
 
 
 # -- parts of the page -----------------------------------------------------------------------------
-
-
-def fact(page: Page, name: str) -> Locator:
-    """The value of a figure or of a pixel's number."""
-    term = page.locator("dt").filter(has_text=re.compile(f"^{re.escape(name)}$"))
-    return page.locator("dl div", has=term).locator("dd")
 
 
 def slider(page: Page, name: str) -> Locator:
@@ -129,14 +122,6 @@ def about(picture: np.ndarray, color: str) -> int:
 def n_ranges(picture: np.ndarray) -> int:
     """How many colours of the scale of ranges occur."""
     return len(colors(picture).keys() & set(RANGE_COLORS))
-
-
-def eventually(holds: Callable[[], object]) -> None:
-    """Wait until something is so; for what the page's elements cannot tell."""
-    limit = time.monotonic() + 60
-    while not holds():
-        assert time.monotonic() < limit
-        time.sleep(0.05)
 
 
 def changed(page: Page, before: dict[str, np.ndarray], *names: str) -> Callable[[], bool]:

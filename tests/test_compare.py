@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from io import BytesIO
 from queue import SimpleQueue
 
@@ -22,6 +21,7 @@ from app.state import Light, Reading
 from app.store import Request, built_in_sources, compute
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
+from tests.browser import eventually, fact
 
 # -- what is computed ------------------------------------------------------------------------------
 
@@ -351,18 +351,6 @@ def colors_of(part):
     return {"#{:02x}{:02x}{:02x}".format(*color) for color in np.unique(picture, axis=0).tolist()}
 
 
-def fact(page, name):
-    term = page.locator("dt").filter(has_text=re.compile(f"^{re.escape(name)}$"))
-    return page.locator("dl div", has=term).locator("dd").filter(visible=True)
-
-
-def eventually(holds):
-    limit = time.monotonic() + 60
-    while not holds():
-        assert time.monotonic() < limit
-        time.sleep(0.05)
-
-
 def first_row(page):
     return page.locator("tbody tr").first.locator("th")
 
@@ -449,3 +437,33 @@ def test_a_file_without_truth_says_what_is_not_known(page):
     expect(here.get_by_role("button", name="Error", exact=True)).to_have_count(0)
     expect(here.get_by_text(re.compile("^Not possible here: .*true signal"))).to_be_visible()
     expect(here.get_by_text(re.compile("^Not known here"))).to_be_visible()
+
+
+@pytest.mark.browser
+def test_the_comparison_can_be_stopped(page):
+    here = page()
+    open_compare(here)
+    here.get_by_role("checkbox", name=re.compile("^Unmixing")).check()
+    expect(here.get_by_text("6 methods compared")).to_be_visible()
+    here.get_by_role("combobox", name=re.compile("^Scene or capture")).click()
+    # Large enough to be under way still when the button is pressed.
+    here.get_by_role("menuitem", name="Car at 50 m, 256 × 256", exact=True).click()
+    here.get_by_role("button", name="Cancel", exact=True).click()
+    expect(here.get_by_text(re.compile("^Stopped: .* of 6 done"))).to_be_visible()
+    here.get_by_role("button", name="Go on", exact=True).click()
+    expect(here.get_by_text("6 methods compared")).to_be_visible()
+
+
+@pytest.mark.browser
+def test_pages_fit_a_phone(page):
+    here = page(width=390, height=844)
+    open_compare(here)
+    for picture in pictures(here).locator(".bk-Figure").all():
+        box = picture.bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 390
+    here.get_by_role("button", name="Paper", exact=True).click()
+    figure = here.locator(".bk-Figure").filter(has_text="background alone")
+    expect(figure).to_be_visible()
+    last = here.get_by_role("slider", name="SBR", exact=True).bounding_box()
+    assert figure.bounding_box()["y"] >= last["y"] + last["height"]

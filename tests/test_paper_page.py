@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -25,16 +24,9 @@ from app.theme import DARK, LIGHT
 from core import PRESETS, Flux
 from core.experiments import items, paper
 from core.experiments.trials import Condition, trials
+from tests.browser import eventually
 
 SOON_MS = 20_000
-
-
-def until(condition: Callable[[], object]) -> None:
-    """Wait for the worker's thread."""
-    limit = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.01)
 
 
 # -- work in steps ---------------------------------------------------------------------------------
@@ -63,7 +55,7 @@ def test_steps_are_done_one_after_the_other():
     told = Told()
     told.gate.release(3)
     told.work.start(told.steps)
-    until(lambda: not told.work.is_running)
+    eventually(lambda: not told.work.is_running)
     assert told.drawn == [0, 1, 2]
     assert (told.work.done, told.work.of) == (3, 3)
 
@@ -72,7 +64,7 @@ def test_cancelled_work_draws_no_more_and_begins_no_step():
     told = Told()
     told.gate.release(1)
     told.work.start(told.steps)
-    until(lambda: told.begun == 2)
+    eventually(lambda: told.begun == 2)
     told.work.cancel()
     told.gate.release(2)
     time.sleep(0.1)
@@ -84,21 +76,21 @@ def test_paused_work_goes_on_where_it_stopped():
     told.work.start(told.steps)
     told.work.pause(True)
     told.gate.release(3)
-    until(lambda: told.drawn == [0])
+    eventually(lambda: told.drawn == [0])
     time.sleep(0.1)
     assert told.begun == 1
     told.work.pause(False)
-    until(lambda: told.drawn == [0, 1, 2])
+    eventually(lambda: told.drawn == [0, 1, 2])
     assert told.begun == 3
 
 
 def test_another_start_forgets_the_first():
     told = Told()
     told.work.start(told.steps)
-    until(lambda: told.begun == 1)
+    eventually(lambda: told.begun == 1)
     told.work.start(told.steps[1:])
     told.gate.release(3)
-    until(lambda: not told.work.is_running)
+    eventually(lambda: not told.work.is_running)
     assert told.drawn == [1, 2]
 
 
@@ -106,7 +98,7 @@ def test_a_failure_ends_the_work_and_is_told():
     told = Told(fails_at=1)
     told.gate.release(3)
     told.work.start(told.steps)
-    until(lambda: told.failures)
+    eventually(lambda: told.failures)
     assert (told.drawn, told.begun, told.work.is_running) == ([0], 2, False)
 
 
@@ -334,7 +326,7 @@ def test_a_table_over_repetitions_is_what_core_computes(few):
     view = section.view
     assert shown_table(view)[0] == paper_words.NEEDS_TWO
     view.show(True)
-    until(lambda: "3 repetitions" in shown_table(view)[0])
+    eventually(lambda: "3 repetitions" in shown_table(view)[0])
     condition = Condition("car", 0.05)
     results = trials({condition: paper.COMPARED}, range(3))
     expected = table_of(paper.table_3(results, 0.05))[1]
@@ -346,14 +338,14 @@ def test_a_table_over_repetitions_is_what_core_computes(few):
 def test_a_table_stands_still_while_it_is_hidden(few):
     view = few(100).view
     view.show(True)
-    until(lambda: shown_table(view)[1])
+    eventually(lambda: shown_table(view)[1])
     view.show(False)
     time.sleep(0.3)
     before = shown_table(view)[0]
     time.sleep(0.3)
     assert shown_table(view)[0] == before
     view.show(True)
-    until(lambda: shown_table(view)[0] != before)
+    eventually(lambda: shown_table(view)[0] != before)
     *_, buttons, _, sentence = view.aside
     buttons[1].clicks += 1  # Cancel
     assert sentence.text.startswith("Stopped after")
@@ -363,7 +355,7 @@ def test_range_images_come_on_the_first_visit(session):
     section = RangeImages(session)
     view = section.view
     view.show(True)
-    until(lambda: paper_words.OUTSIDE_NOTE in view.main[-1].text)  # written last
+    eventually(lambda: paper_words.OUTSIDE_NOTE in view.main[-1].text)  # written last
     titles = [each.title.text.split(":")[0] for each in section._gallery.figures]
     assert titles == ["truth", *(f"SBR {sbr:g}" for sbr in paper.NEAR)]
 
@@ -412,8 +404,8 @@ def test_the_slider_of_figure_5_moves_the_curves(paper_page):
     slider(paper_page, "Echo's bin").focus()
     for _ in range(20):
         paper_page.keyboard.press("ArrowRight")
-    until(lambda: "Both scales, echo at bin 70, SBR 0.08" in titles(paper_page))
-    until(lambda: pixel.screenshot() != before[0] and curve.screenshot() != before[1])
+    eventually(lambda: "Both scales, echo at bin 70, SBR 0.08" in titles(paper_page))
+    eventually(lambda: pixel.screenshot() != before[0] and curve.screenshot() != before[1])
 
 
 @pytest.mark.browser
@@ -441,7 +433,7 @@ def test_the_page_is_dark_where_the_app_is(paper_page):
     paper_page.get_by_role("button", name="Toggle theme").click()
     go(paper_page, "Figure 6")
     expect(figure(paper_page, "weight cubic")).to_be_visible(timeout=SOON_MS)
-    until(lambda: sum(text.startswith("Figure") for text in titles(paper_page)) == 3)
+    eventually(lambda: sum(text.startswith("Figure") for text in titles(paper_page)) == 3)
     colors = {color for text, color in titles(paper_page).items() if text.startswith("Figure")}
     assert colors == {DARK.text}
 
@@ -454,4 +446,4 @@ def test_range_images_are_compared_at_a_pixel(paper_page):
     row = paper_page.get_by_role("textbox", name="Row", exact=True)
     row.fill("0")
     row.press("Enter")
-    until(lambda: "SBR 0.03: no target" in titles(paper_page))
+    eventually(lambda: "SBR 0.03: no target" in titles(paper_page))

@@ -15,7 +15,7 @@ from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
 from core.parameters import Number
 from core.posterior import Conditions, Light
-from core.spatial import pooled
+from core.spatial import pooled, pooled_at
 from core.trigger import rate_per_bin, trigger_probability
 
 
@@ -140,7 +140,7 @@ class Estimator:
     def curves(self, capture: Capture, row: int, col: int, parameters: Any) -> Floats:
         """The score of each bin for one pixel, shape (bin,)."""
         light, reach = self.light(capture), self.reach(parameters)
-        around = pooled(capture.cube, reach)[row, col] if reach > 1 else capture.cube[row, col]
+        around = pooled_at(capture.cube, row, col, reach)
         given = conditions_of(capture, light, reach)
         here = np.s_[row : row + 1, col : col + 1]
         conditions = given._replace(signal=given.signal[here], background=given.background[here])

@@ -26,8 +26,8 @@ from core.capture import Capture, CaptureError
 from core.export import save_capture
 from core.readers import MAX_CUBE_BYTES, READERS, guards, read_capture
 from core.readers.npz import FORMAT
+from core.tests.captures import real_capture_path
 
-CAPTURES = Path(__file__).resolve().parents[3] / "shared" / "captures"
 Builder = Callable[[], bytes]
 
 
@@ -124,16 +124,8 @@ def write(tmp_path: Path) -> Callable[[str, bytes], Path]:
 
 @pytest.fixture
 def real_capture() -> Callable[[str], Path]:
-    """Path of a published capture; these are too large, and not ours, to keep in the project."""
-
-    def find(name: str) -> Path:
-        path = CAPTURES / name
-        if not path.exists():
-            reason = f"{path} is absent: the published captures are kept beside the checkout"
-            (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
-        return path
-
-    return find
+    """Path of a published capture."""
+    return real_capture_path
 
 
 def test_every_reader_is_under_the_contract() -> None:

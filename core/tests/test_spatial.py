@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.spatial import box_sum, neighbours, pooled, weighted_median
+from core.spatial import box_sum, neighbours, pooled, pooled_at, weighted_median
 
 RNG = np.random.default_rng(0)
 CUBE = RNG.integers(0, 200, (5, 7, 3))
@@ -46,6 +46,11 @@ def test_pooled_counts_are_the_explicit_sum_however_narrow(dtype: type) -> None:
     cube = np.full((4, 4, 2), np.iinfo(dtype).max, dtype)
     cube[1, 2] = [0, 7]
     found = pooled(cube, 3)
+    rows, cols, _ = cube.shape
+    for reach in (1, 3, 5):
+        whole = pooled(cube, reach)
+        for row, col in ((0, 0), (rows - 1, 0), (rows // 2, cols // 2)):
+            np.testing.assert_array_equal(pooled_at(cube, row, col, reach), whole[row, col])
     for row in range(4):
         for col in range(4):
             np.testing.assert_array_equal(
