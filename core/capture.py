@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
-from typing import TypeVar
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,11 @@ from core.blocks import Blocks, to_blocks
 from core.checks import require
 
 COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
+
+Detection = Literal["first", "all"]
+"""What a pulse leaves in a histogram: its first photon alone, as in a Geiger-mode pixel that fires
+once and is blind until the next pulse; or all its photons, as in photon counting (TCSPC).
+"""
 
 
 class CaptureError(ValueError):
@@ -42,11 +47,14 @@ class Capture:
         True background photons per pulse over the gate, where known.
     source : str
         Where it came from and, for a file, what was guessed.
+    detection : str
+        ``"first"`` where a pulse fires a pixel at most once, so that what comes first hides what
+        comes later (pile-up); ``"all"`` where every photon counts.
 
     Raises
     ------
     ValueError
-        If shapes or types do not fit each other.
+        If shapes or types do not fit each other, or first photons outnumber the pulses.
     """
 
     cube: NDArray[np.unsignedinteger]
@@ -56,6 +64,7 @@ class Capture:
     signal: Floats | None = None
     background: float | None = None
     source: str = ""
+    detection: Detection = "first"
 
     def __post_init__(self) -> None:
         cube = self.cube
@@ -82,7 +91,15 @@ class Capture:
         if self.background is not None:
             finite = 0 <= self.background < np.inf
             require("background", self.background, finite, "finite photons, 0 or more")
+        kinds = get_args(Detection)
+        require("detection", self.detection, self.detection in kinds, " or ".join(map(repr, kinds)))
         cube.setflags(write=False)
+        if self.armed_pulses is not None:
+            most = int(self.counts.max())
+            once = "no more first photons than pulses in a pixel, or 'all' for its detection"
+            require(
+                f"n_pulses = {self.armed_pulses}, counts", most, most <= self.armed_pulses, once
+            )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -101,9 +118,8 @@ class Capture:
 
     @property
     def armed_pulses(self) -> int | None:
-        """Pulses sent, if these are first photons; None where pulses are unknown or fire twice."""
-        n_pulses = self.acquisition.n_pulses
-        return n_pulses if n_pulses is not None and self.counts.max() <= n_pulses else None
+        """Pulses sent, where these are first photons; None where pulses are not known, too."""
+        return self.acquisition.n_pulses if self.detection == "first" else None
 
     @property
     def echo_bins(self) -> int:

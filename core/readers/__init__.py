@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from core.acquisition import Pulse
-from core.capture import Capture, CaptureError
+from core.capture import Capture, CaptureError, Detection
 from core.checks import require
 from core.readers import matlab, npy, npz
 from core.readers.guards import MAX_CUBE_BYTES
@@ -36,6 +36,12 @@ def read_capture(
     variable: str | None = None,
     pulse: Pulse | None = None,
     pixel_angle_rad: float | None = None,
+    detection: Detection | None = None,
+    axes: str | None = None,
+    shape: tuple[int, int] | None = None,
+    stop_s: float | None = None,
+    no_trigger: int | None = None,
+    first_detections: int | None = None,
 ) -> Capture:
     """Read a capture from a file; its suffix tells the format.
 
@@ -63,6 +69,23 @@ def read_capture(
         Shape of an echo.
     pixel_angle_rad : float, optional
         Angle between neighbouring pixels in radians.
+    detection : str, optional
+        ``"first"`` or ``"all"``, see `Capture`. Guessed to be first photons where the number of
+        pulses is known and no pixel has more photons.
+    axes : str, optional
+        Names of the file's axes in its own order, such as ``"bin row col"`` or, for raw frames,
+        ``"pulse col row"``, or for lists of photons ``"col row"``.
+    shape : tuple of int, optional
+        Rows and columns of a file that lists its pixels one after the other.
+    stop_s : float, optional
+        For common-stop instruments: times count backwards from this time after the pulse, often
+        the laser's period.
+    no_trigger : int, optional
+        For raw frames (pulse, row, col) of trigger bins: what stands where nothing fired. Tells a
+        ``.npy`` file's array to be such frames.
+    first_detections : int, optional
+        Keep so many detections of each pixel, in the order of the file; only for a file that lists
+        photons.
 
     Returns
     -------
@@ -88,6 +111,12 @@ def read_capture(
             variable=variable,
             pulse=pulse,
             pixel_angle_rad=pixel_angle_rad,
+            detection=detection,
+            axes=axes,
+            shape=shape,
+            stop_s=stop_s,
+            no_trigger=no_trigger,
+            first_detections=first_detections,
         )
         return READERS[suffix](path, request)
     except ValueError as error:

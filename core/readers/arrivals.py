@@ -13,6 +13,9 @@ unit here.
 The gate. From the first photon, rounded down to a multiple of the bin width, to the last.
 
 The pulse. A Gaussian of one bin width. The number of pulses stays unknown.
+
+A common-stop instrument's times count backwards from ``stop_s``; a time in whole units stands for
+all of its unit, so the last one before the stop becomes the first after the pulse.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
 from core.checks import require
-from core.readers.dense import count_dtype
+from core.readers.dense import count_dtype, guess_detection
 from core.readers.guards import require_fits
 from core.readers.request import Request
 from core.readers.wording import guesses, sentence, time_text
@@ -68,12 +71,21 @@ def arrivals_capture(
         If a time is no time, nothing sensible can be guessed, or no photon lies in the gate.
     """
     _require_times(times, pixel, shape, name)
+    request.refuse(["shape", "no_trigger"], "lists of photons lie in pixels already")
+    if request.first_detections is not None:
+        kept = _rank(pixel) < request.first_detections
+        times, pixel = times[kept], pixel[kept]
+    if request.order(("row", "col")) == (1, 0):
+        row, col = np.divmod(pixel, shape[1])
+        pixel, shape = col * shape[0] + row, (shape[1], shape[0])
     times = times.astype(np.float64)
     whole = bool(np.all(times == np.floor(times)))
     unit_s = request.time_unit_s or guess_time_unit(times, whole, name)
     tick_s = unit_s if whole else 1e-12
     ticks = times if whole else _snapped(times * (unit_s / tick_s))
     _require_countable(float(ticks.max()), tick_s, name)
+    if request.stop_s is not None:
+        ticks = _from_stop(ticks, float(_snapped(request.stop_s / tick_s)), whole, tick_s)
 
     per_bin, opening, n_bins = _gate(ticks, tick_s, request)
     bins = np.floor((ticks - opening) / per_bin)
@@ -88,8 +100,10 @@ def arrivals_capture(
     )
     cube = _cube(bins[inside].astype(np.int64), pixel[inside], shape, n_bins, name)
     pulse = request.pulse or Pulse.gaussian(acquisition.bin_width_s)
-    guessed = guesses(request, acquisition, pulse, unit_s)
-    return Capture(cube, acquisition, pulse, source=sentence(origin, guessed, _dropped(inside)))
+    detection = request.detection or guess_detection(cube, request.n_pulses)
+    guessed = guesses(request, acquisition, pulse, detection, unit_s)
+    source = sentence(origin, guessed, _dropped(inside))
+    return Capture(cube, acquisition, pulse, source=source, detection=detection)
 
 
 def guess_time_unit(times: Floats, whole: bool, name: str) -> float:
@@ -143,6 +157,23 @@ def _gate(ticks: Floats, tick_s: float, request: Request) -> tuple[float, float,
     )
     opening = _opening(first, per_bin, delay)
     return per_bin, opening, request.n_bins or max(1, floor((last - opening) / per_bin) + 1)
+
+
+def _rank(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many photons of the same pixel come before each, in the order of the file."""
+    order = np.argsort(pixel, kind="stable")
+    _, begin, n_photons = np.unique(pixel[order], return_index=True, return_counts=True)
+    rank = np.empty(pixel.size, np.int64)
+    rank[order] = np.arange(pixel.size) - np.repeat(begin, n_photons)
+    return rank
+
+
+def _from_stop(ticks: Floats, stop: float, whole: bool, tick_s: float) -> Floats:
+    """Times after the pulse, in ticks, from times before a stop that comes `stop` after it."""
+    after = stop - ticks - (1.0 if whole else 0.0)
+    least = f"the stop's time after the pulse, at least the largest time, {ticks.max() * tick_s} s"
+    require("stop_s", stop * tick_s, bool(after.min() >= 0), least)
+    return np.asarray(after)
 
 
 def _opening(first: float, per_bin: float, delay: float | None) -> float:

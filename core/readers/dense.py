@@ -1,11 +1,13 @@
 """A histogram cube of any number type, and what is guessed where only the cube is known.
 
-Unless told otherwise, bins are 1 ns wide, the gate opens with the pulse, and an echo is a Gaussian
-of one bin.
+Unless told otherwise, the axes are (row, col, bin), bins are 1 ns wide, the gate opens with the
+pulse, and an echo is a Gaussian of one bin. A common-stop instrument's bins (``stop_s``) are turned
+round.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Pulse
-from core.capture import Capture
+from core.capture import Capture, Detection
 from core.checks import require
 from core.readers.guards import require_fits
 from core.readers.request import Request
 from core.readers.wording import guesses, sentence
+
+AXES = ("row", "col", "bin")
 
 _LARGEST_COUNT = 2**32 - 1
 
@@ -54,11 +58,34 @@ def count_dtype(highest: float) -> np.dtype[np.unsignedinteger]:
     return np.dtype(np.uint16 if highest < 2**16 else np.uint32)
 
 
+def cube_capture(
+    cube: NDArray[Any], name: str, origin: str, request: Request, axes: str | None = None
+) -> Capture:
+    """A capture from an array of counts, its axes in the order that is told or in the usual one.
+
+    Parameters
+    ----------
+    cube : ndarray of three axes
+    name, origin : str
+        What to call the array in a refusal, and the capture in its source.
+    axes : str, optional
+        The order of the file's own axes, where it tells.
+    """
+    request = replace(request, axes=request.axes or axes)
+    order = request.order(AXES)
+    if order is not None:
+        require_cube(cube, name)
+        cube = cube.transpose(order)
+    guessed = [] if order else [f"axes ({', '.join(AXES)})"]
+    return dense_capture(whole_counts(cube, name), origin, request, also_guessed=guessed)
+
+
 def dense_capture(
     counts: NDArray[np.unsignedinteger],
     origin: str,
     request: Request,
     guessed_pulse: Pulse | None = None,
+    also_guessed: Sequence[str] = (),
 ) -> Capture:
     """A capture from a histogram cube and what is known of it.
 
@@ -69,17 +96,34 @@ def dense_capture(
         What to call the capture in its source.
     guessed_pulse : Pulse, optional
         Taken where none is given, in place of a Gaussian of one bin.
+    also_guessed : sequence of str
+        What was guessed before.
     """
-    unit, asked, n_bins = request.time_unit_s, request.n_bins, counts.shape[2]
-    require("time_unit_s", unit, unit is None, "None: a histogram cube takes bin_width_s alone")
+    asked, n_bins = request.n_bins, counts.shape[2]
+    request.refuse(["time_unit_s"], "a histogram cube takes bin_width_s alone")
+    request.refuse(["first_detections"], "a histogram cube keeps no order of its photons")
+    request.refuse(["shape", "no_trigger"], "a histogram cube tells its pixels")
     require("n_bins", asked, asked in (None, n_bins), f"{n_bins}, the cube's last axis, or None")
+    bin_width_s = 1e-9 if request.bin_width_s is None else request.bin_width_s
+    opens_s = 0.0
+    if request.stop_s is not None:
+        counts, opens_s = counts[:, :, ::-1].copy(), request.stop_s - n_bins * bin_width_s
     acquisition = Acquisition(
         n_bins=n_bins,
-        bin_width_s=1e-9 if request.bin_width_s is None else request.bin_width_s,
-        gate_delay_s=0.0 if request.gate_delay_s is None else request.gate_delay_s,
+        bin_width_s=bin_width_s,
+        gate_delay_s=opens_s if request.gate_delay_s is None else request.gate_delay_s,
         n_pulses=request.n_pulses,
         pixel_angle_rad=request.pixel_angle_rad,
     )
     pulse = request.pulse or guessed_pulse or Pulse.gaussian(acquisition.bin_width_s)
-    guessed = guesses(replace(request, n_bins=n_bins), acquisition, pulse)
-    return Capture(counts, acquisition, pulse, source=sentence(origin, guessed))
+    detection = request.detection or guess_detection(counts, request.n_pulses)
+    guessed = guesses(replace(request, n_bins=n_bins), acquisition, pulse, detection)
+    source = sentence(origin, [*also_guessed, *guessed])
+    return Capture(counts, acquisition, pulse, source=source, detection=detection)
+
+
+def guess_detection(cube: NDArray[np.unsignedinteger], n_pulses: int | None) -> Detection:
+    """First photons where pulses are known and no pixel of a cube has more photons."""
+    if n_pulses is None:
+        return "all"
+    return "first" if cube.sum(axis=2, dtype=np.int64).max() <= n_pulses else "all"

@@ -24,7 +24,7 @@ from scipy.io import loadmat, whosmat
 from core.capture import Capture
 from core.checks import require
 from core.readers.arrivals import arrivals_capture
-from core.readers.dense import dense_capture, whole_counts
+from core.readers.dense import cube_capture
 from core.readers.guards import decoding, require_fits
 from core.readers.request import Request
 
@@ -65,7 +65,7 @@ def read(path: Path, request: Request) -> Capture:
     array = _load(variable, data[:_HEADER_BYTES], order)
     origin = f"{path.name}, variable {variable.name}"
     if variable.kind != "cell":
-        return dense_capture(whole_counts(array, variable.name), origin, request)
+        return cube_capture(array, variable.name, origin, request)
     times, pixel = _flat(array, variable.name)
     shape = (array.shape[0], array.shape[1])
     return arrivals_capture(times, pixel, shape, variable.name, origin, request)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.readers.dense import dense_capture, whole_counts
+from core.readers.dense import cube_capture
 from core.readers.guards import decoding, require_fits
 from core.readers.request import Request
 
@@ -22,7 +22,7 @@ def read(path: Path, request: Request) -> Capture:
     require("variable", request.variable, request.variable is None, "None: .npy holds one array")
     with path.open("rb") as file:
         cube = read_array(file, path.stat().st_size, "the array")
-    return dense_capture(whole_counts(cube, "the array"), path.name, request)
+    return cube_capture(cube, "the array", path.name, request)
 
 
 def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:

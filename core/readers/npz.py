@@ -15,6 +15,7 @@ field               shape           meaning
 ``truth_range_m``   (row, col)      true range in metres, NaN without a target; may be absent
 ``signal``          (row, col)      true signal photons per pulse; may be absent
 ``background``      scalar          true background photons per pulse and gate; may be absent
+``detection``       text            ``"first"`` or ``"all"``, see `core.capture.Detection`
 ``source``          text            where the capture came from; may be absent
 ==================  ==============  ==========================================================
 
@@ -39,7 +40,7 @@ from numpy.typing import NDArray
 from core.acquisition import Floats, Pulse
 from core.capture import COUNT_TYPES, Capture
 from core.checks import require
-from core.readers.dense import dense_capture, require_cube, whole_counts
+from core.readers.dense import AXES, cube_capture, dense_capture, require_cube, whole_counts
 from core.readers.guards import decoding, require_fits
 from core.readers.npy import read_array, read_header
 from core.readers.request import Request
@@ -49,7 +50,7 @@ FORMAT = "firstphoton-capture-1"
 _TIMING = ("bin_width_s", "gate_delay_s", "pixel_angle_rad")
 _PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 _TRUTH = ("truth_range_m", "signal", "background")
-_FIELDS = ("format", "n_pulses", "source", *_TIMING, *_PULSE, *_TRUTH)
+_FIELDS = ("format", "n_pulses", "detection", "source", *_TIMING, *_PULSE, *_TRUTH)
 
 
 def fields(capture: Capture) -> dict[str, NDArray[Any]]:
@@ -68,6 +69,7 @@ def fields(capture: Capture) -> dict[str, NDArray[Any]]:
         "truth_range_m": capture.truth_range_m,
         "signal": capture.signal,
         "background": capture.background,
+        "detection": capture.detection,
         "source": capture.source or None,
     }
     return {name: np.asarray(value) for name, value in kept.items() if value is not None}
@@ -83,7 +85,7 @@ def read(path: Path, request: Request) -> Capture:
         cube = _array(archive, name)
         origin = f"{path.name}, variable {name}"
         if name != "cube":
-            return dense_capture(whole_counts(cube, name), origin, request)
+            return cube_capture(cube, name, origin, request)
         stored = {field: _array(archive, field) for field in names if field in _FIELDS}
     return _own(cube, stored, origin, request)
 
@@ -94,8 +96,13 @@ def _own(
     """A capture from the fields of our layout."""
     version = _text(stored, "format", FORMAT)
     require("format", version, version == FORMAT, FORMAT)
+    require("axes", request.axes, request.order(AXES) in (None, (0, 1, 2)), repr(" ".join(AXES)))
     known: dict[str, Any] = {name: _number(stored, name) for name in _TIMING}
-    known |= {"n_pulses": _n_pulses(stored), "pulse": _pulse(stored)}
+    known |= {
+        "n_pulses": _n_pulses(stored),
+        "pulse": _pulse(stored),
+        "detection": _text(stored, "detection", "") or None,
+    }
     request = replace(
         request,
         **{name: value for name, value in known.items() if getattr(request, name) is None},

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
 from core.acquisition import Pulse
+from core.capture import Detection
 from core.checks import require
 
 
@@ -30,16 +34,66 @@ class Request:
     variable: str | None = None
     pulse: Pulse | None = None
     pixel_angle_rad: float | None = None
+    detection: Detection | None = None
+    axes: str | None = None
+    shape: tuple[int, int] | None = None
+    stop_s: float | None = None
+    no_trigger: int | None = None
+    first_detections: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("time_unit_s", "bin_width_s"):
             value = getattr(self, name)
             require(name, value, value is None or 0 < value < np.inf, "positive, in seconds")
-        for name in ("n_bins", "n_pulses"):
+        for name in ("n_bins", "n_pulses", "first_detections"):
             value = getattr(self, name)
             whole = isinstance(value, int | np.integer) and value >= 1
             require(name, value, value is None or bool(whole), "a whole number, at least 1")
-        delay = self.gate_delay_s
-        require("gate_delay_s", delay, delay is None or bool(np.isfinite(delay)), "finite, seconds")
+        for name in ("gate_delay_s", "stop_s"):
+            value = getattr(self, name)
+            require(name, value, value is None or bool(np.isfinite(value)), "finite, in seconds")
         angle = self.pixel_angle_rad
         require("pixel_angle_rad", angle, angle is None or 0 < angle < 1, "between 0 and 1 radian")
+        kinds = get_args(Detection)
+        kind = self.detection
+        require("detection", kind, kind is None or kind in kinds, " or ".join(map(repr, kinds)))
+        value = self.no_trigger
+        whole = isinstance(value, int | np.integer)
+        require("no_trigger", value, value is None or whole, "a whole number")
+        shape = self.shape
+        pair = (
+            isinstance(shape, tuple)
+            and len(shape) == 2
+            and all(isinstance(size, int | np.integer) and size >= 1 for size in shape)
+        )
+        require("shape", shape, shape is None or pair, "rows and columns, each at least 1")
+
+    def order(self, canonical: tuple[str, ...]) -> tuple[int, ...] | None:
+        """Where each of the axes that a reader wants lies in the file, as `numpy.transpose` takes.
+
+        Parameters
+        ----------
+        canonical : tuple of str
+            Names of the axes as the reader wants them, such as ``("row", "col", "bin")``.
+
+        Returns
+        -------
+        tuple of int or None
+            None where `axes` is not told.
+
+        Raises
+        ------
+        ValueError
+            If `axes` names others, or not each of them once.
+        """
+        if self.axes is None:
+            return None
+        named = re.split(r"[\s,]+", self.axes.strip())
+        fits = sorted(named) == sorted(canonical)
+        require("axes", self.axes, fits, f"{' '.join(canonical)!r} in the order of the file")
+        return tuple(named.index(name) for name in canonical)
+
+    def refuse(self, names: Iterable[str], why: str) -> None:
+        """Raise ``ValueError`` if one of the fields is told, for which a file has no use."""
+        for name in names:
+            require(name, getattr(self, name), getattr(self, name) is None, f"None: {why}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from core.acquisition import Acquisition, Pulse
+from core.capture import Detection
 from core.readers.request import Request
 
 
@@ -18,7 +19,11 @@ def time_text(time_s: float) -> str:
 
 
 def guesses(
-    request: Request, acquisition: Acquisition, pulse: Pulse, time_unit_s: float | None = None
+    request: Request,
+    acquisition: Acquisition,
+    pulse: Pulse,
+    detection: Detection,
+    time_unit_s: float | None = None,
 ) -> list[str]:
     """What `request` left open, and the value taken for it.
 
@@ -41,6 +46,8 @@ def guesses(
     if request.pulse is None:
         shape = "Gaussian" if pulse.shape == "gaussian" else pulse.shape
         found.append(f"pulse {shape} of {time_text(pulse.tau_s)}")
+    if request.detection is None:
+        found.append("first photons only" if detection == "first" else "all photons of a pulse")
     return found
 
 

@@ -69,11 +69,18 @@ def test_blocks_are_laid_out_once() -> None:
     assert capture.blocks.n_pixels == 6
 
 
-@pytest.mark.parametrize(("n_pulses", "armed"), [(None, None), (7, None), (8, 8), (1000, 1000)])
-def test_pulses_count_as_armed_while_none_fires_twice(
-    n_pulses: int | None, armed: int | None
-) -> None:
-    assert capture_of(np.full((2, 3, 4), 2), n_pulses).armed_pulses == armed
+@pytest.mark.parametrize("n_pulses", [None, 8, 1000])
+def test_pulses_are_armed_for_first_photons_alone(n_pulses: int | None) -> None:
+    first = capture_of(np.full((2, 3, 4), 2), n_pulses)
+    assert first.armed_pulses == n_pulses
+    assert replace(first, detection="all").armed_pulses is None
+
+
+def test_first_photons_do_not_outnumber_the_pulses() -> None:
+    with pytest.raises(ValueError, match=r"n_pulses = 7, counts = 8 .*'all' for its detection"):
+        capture_of(np.full((2, 3, 4), 2), 7)
+    with pytest.raises(ValueError, match=r"detection = 'some' .*'first' or 'all'"):
+        replace(capture_of(np.ones((2, 3, 4))), detection="some")
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,7 @@ def cell_bytes(values: list[Any]) -> bytes:
 
 OWN_FIELDS = {
     "format": FORMAT,
+    "detection": "first",
     "cube": CUBE,
     "bin_width_s": 1e-9,
     "gate_delay_s": 1e-6,
@@ -137,6 +138,7 @@ def test_contract_nothing_to_guess(kind: str, write: Callable[[str, bytes], Path
     name, build = FORMATS[kind]
     told: dict[str, Any] = {"time_unit_s": 1e-12} if "cells" in kind else {}
     told |= {"bin_width_s": 1e-9, "gate_delay_s": 1e-6, "n_bins": 100, "n_pulses": 500}
+    told |= {"detection": "first", "axes": "row col" if "cells" in kind else "row col bin"}
     pulse = Pulse.gaussian(2e-9)
     capture = read_capture(write(name, build()), **told, pulse=pulse, pixel_angle_rad=1e-3)
     np.testing.assert_array_equal(capture.cube, CUBE)
@@ -144,6 +146,7 @@ def test_contract_nothing_to_guess(kind: str, write: Callable[[str, bytes], Path
     assert capture.cube.flags.c_contiguous and not capture.cube.flags.writeable
     assert capture.acquisition == ACQUISITION
     assert capture.pulse == pulse
+    assert capture.detection == "first"
     assert capture.source.startswith(name) and "guessed" not in capture.source
 
 
@@ -170,6 +173,12 @@ def test_contract_arguments_that_do_not_fit(kind: str, write: Callable[[str, byt
         {"n_pulses": -1},
         {"pixel_angle_rad": 2.0},
         {"time_unit_s": -1.0},
+        {"stop_s": np.inf},
+        {"detection": "some"},
+        {"axes": "row col row"},
+        {"first_detections": 0},
+        {"no_trigger": 0},
+        {"shape": (3, 4)},
     ]
     if "cells" not in kind:
         refused += [{"n_bins": 99}, {"time_unit_s": 1e-12}]
@@ -194,7 +203,7 @@ def test_own_layout_says_what_it_lacks(write: Callable[[str, bytes], Path]) -> N
     capture = read_capture(path, gate_delay_s=2e-7)
     assert capture.acquisition.n_pulses is None
     assert capture.pulse == Pulse()
-    assert capture.source == "a wall; guessed: pulse gamma of 1 ns"
+    assert capture.source == "a wall; guessed: pulse gamma of 1 ns, all photons of a pulse"
 
 
 def test_variable_chooses(write: Callable[[str, bytes], Path]) -> None:
@@ -325,6 +334,51 @@ def test_photons_outside_a_given_gate_are_dropped(write: Callable[[str, bytes], 
     assert "dropped: 3 of 5 photons, outside the gate" in capture.source
     with pytest.raises(CaptureError, match=r"200 ns to 300 ns.* gate_delay_s"):
         read_capture(path, gate_delay_s=1e-6)
+
+
+def test_axes_are_turned_as_told(write: Callable[[str, bytes], Path]) -> None:
+    turned = read_capture(write("t.npy", npy_bytes(CUBE.transpose(2, 1, 0))), axes="bin, col row")
+    np.testing.assert_array_equal(turned.cube, CUBE)
+    told = {"bin_width_s": 1e-9, "gate_delay_s": 1e-6, "n_bins": 100}
+    cells = arrival_cells(CUBE.transpose(1, 0, 2))
+    turned = read_capture(write("t.mat", mat_bytes(Ts=cells)), axes="col row", **told)
+    np.testing.assert_array_equal(turned.cube, CUBE)
+    guessed = read_capture(write("g.npy", npy_bytes(CUBE)))
+    assert "guessed: axes (row, col, bin), bin width 1 ns" in guessed.source
+
+
+def test_common_stop_counts_backwards(write: Callable[[str, bytes], Path]) -> None:
+    """Recorded is the time left to a stop 1.1 µs after the pulse."""
+    forwards = read_capture(write("f.npy", npy_bytes(CUBE)), gate_delay_s=1e-6)
+    backwards = read_capture(write("b.npy", npy_bytes(CUBE[:, :, ::-1])), stop_s=1.1e-6)
+    np.testing.assert_array_equal(backwards.cube, forwards.cube)
+    assert backwards.acquisition.gate_delay_s == pytest.approx(1e-6, rel=1e-12)
+    cells = arrival_cells(CUBE)
+    for cell in np.ndindex(cells.shape):
+        cells[cell] = 1_100_000 - 1 - cells[cell]
+    told = {"time_unit_s": 1e-12, "bin_width_s": 1e-9, "n_bins": 100, "gate_delay_s": 1e-6}
+    times = read_capture(write("t.mat", mat_bytes(Ts=cells)), stop_s=1.1e-6, **told)
+    np.testing.assert_array_equal(times.cube, forwards.cube)
+    with pytest.raises(CaptureError, match=r"stop_s = 5e-08 .*at least the largest time"):
+        read_capture(write("t.mat", mat_bytes(Ts=cells)), stop_s=5e-8, **told)
+
+
+def test_first_detections_are_those_first_in_the_file(write: Callable[[str, bytes], Path]) -> None:
+    cells = cells_of([[5, 3, 9, 3], [], [7]], (1, 3))
+    capture = read_capture(write("f.mat", mat_bytes(Ts=cells)), first_detections=2, n_bins=10)
+    np.testing.assert_array_equal(capture.counts, [[2, 0, 1]])
+    assert set(np.flatnonzero(capture.cube[0, 0])) == {0, 2}  # the gate opens at 3
+
+
+def test_first_photons_are_guessed_where_pulses_allow(write: Callable[[str, bytes], Path]) -> None:
+    path = write("d.npy", npy_bytes(CUBE))
+    most = int(CUBE.sum(axis=2).max())
+    assert read_capture(path).detection == "all"
+    assert read_capture(path, n_pulses=most).detection == "first"
+    assert read_capture(path, n_pulses=most - 1).detection == "all"
+    assert "first photons only" in read_capture(path, n_pulses=most).source
+    with pytest.raises(CaptureError, match=f"counts = {most} "):
+        read_capture(path, n_pulses=most - 1, detection="first")
 
 
 def test_row_vectors_scalars_and_empty_cells(write: Callable[[str, bytes], Path]) -> None:
@@ -664,7 +718,7 @@ def test_building_at_21_km(real_capture: Callable[[str], Path]) -> None:
     assert capture.acquisition.n_pulses is None
     assert capture.source == (
         "21km_K11_night.mat, variable Ts_gated; guessed: time unit 1 ps, bin width 1 ns, "
-        "gate 4430-4630 ns, pulse Gaussian of 1 ns"
+        "gate 4430-4630 ns, pulse Gaussian of 1 ns, all photons of a pulse"
     )
 
 
@@ -710,6 +764,8 @@ def captures(draw: st.DrawFn) -> Capture:
     images = st.none() | hnp.arrays(np.float64, cube.shape[:2])
     photons = st.none() | hnp.arrays(np.float64, cube.shape[:2], elements=st.floats(0, 1e6))
     acquisition = draw(acquisitions)
+    n_pulses = acquisition.n_pulses
+    fits = n_pulses is None or cube.sum(axis=2, dtype=np.int64).max() <= n_pulses
     return Capture(
         cube,
         Acquisition(
@@ -724,6 +780,7 @@ def captures(draw: st.DrawFn) -> Capture:
         signal=draw(photons),
         background=draw(st.none() | st.floats(0, 1e6)),
         source=draw(st.text(st.characters(exclude_characters="\0", codec="utf-8"))),
+        detection=draw(st.sampled_from(["first", "all"] if fits else ["all"])),
     )
 
 
@@ -738,7 +795,7 @@ def test_round_trip(capture: Capture) -> None:
     np.testing.assert_array_equal(read.cube, capture.cube)
     assert read.acquisition == capture.acquisition
     assert read.pulse == capture.pulse
-    assert read.background == capture.background
+    assert (read.background, read.detection) == (capture.background, capture.detection)
     for image in ("truth_range_m", "signal"):
         kept, given_ = getattr(read, image), getattr(capture, image)
         assert (kept is None) == (given_ is None)
