@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, wraps
-from typing import Literal, TypeVar, get_args
+from functools import cached_property, update_wrapper
+from typing import Generic, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,15 +131,21 @@ class Capture:
 Found = TypeVar("Found")
 
 
-def once_per_capture(find: Callable[[Capture], Found]) -> Callable[[Capture], Found]:
-    """Keep what a function finds in a capture for as long as the capture lives."""
+class once_per_capture(Generic[Found]):
+    """Decorator: keep what a function finds in a capture for as long as the capture lives."""
 
-    @wraps(find)
-    def kept(capture: Capture) -> Found:
+    def __init__(self, find: Callable[[Capture], Found]) -> None:
+        update_wrapper(self, find)
+        self._find, self._name = find, find.__qualname__
+
+    def __call__(self, capture: Capture) -> Found:
+        """What is kept, or found now."""
         known = capture.__dict__  # where cached_property keeps its values, too
-        if find.__qualname__ not in known:
-            known[find.__qualname__] = find(capture)
-        found: Found = known[find.__qualname__]
+        if self._name not in known:
+            known[self._name] = self._find(capture)
+        found: Found = known[self._name]
         return found
 
-    return kept
+    def tell(self, capture: Capture, found: Found) -> None:
+        """Say what is to be found in a capture, such as what the image it is part of tells."""
+        capture.__dict__[self._name] = found

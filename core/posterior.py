@@ -68,12 +68,15 @@ class Light:
         Share of the pixels at each level; sums to 1.
     depth : ndarray, shape (bin,)
         How much more often than in others a surface's delay falls in each bin; 1 on average.
+    image_contrast : float, optional
+        `contrast` of the image that these pixels are a part of; None where they are all of it.
     """
 
     signal: Floats
     background: Floats
     share: Floats
     depth: Floats
+    image_contrast: float | None = None
 
     @property
     def typical_signal(self) -> Floats:
@@ -87,6 +90,13 @@ class Light:
         """Mean background, shape (row, col)."""
         return np.asarray(np.tensordot(self.share, self.background, axes=1))
 
+    @property
+    def contrast(self) -> float:
+        """Signal over background, both on average over the image."""
+        if self.image_contrast is not None:
+            return self.image_contrast
+        return float(self.typical_signal.mean() / self.typical_background.mean())
+
     def of_pixels(self, pixels: NDArray[np.intp]) -> Light:
         """The light of some pixels, given as flat indices of shape (row, col)."""
         flat = (len(self.share), -1)
@@ -95,6 +105,37 @@ class Light:
             self.background.reshape(flat)[:, pixels],
             self.share,
             self.depth,
+            self.contrast,
+        )
+
+
+class Lighting(NamedTuple):
+    """What the pixels of an image have in common; with its counts it gives each one's `Light`."""
+
+    levels: Floats
+    """Signal photons per pulse, shape (level,)."""
+    share: Floats
+    """`Light.share`."""
+    depth: Floats
+    """`Light.depth`."""
+    background: Floats
+    """Mean background over the image, per level where the signals are not known yet."""
+    trust: float
+    """Share of a background's deviation from the mean that is no chance."""
+    contrast: float | None = None
+    """`Light.contrast` of the image."""
+
+    def light(self, total: Floats, least_background: float) -> Light:
+        """The light of pixels of which the total rates are known, shape (row, col)."""
+        left = total - self.levels[:, np.newaxis, np.newaxis]
+        background = self.background + self.trust * (left - self.background)
+        signal = np.broadcast_to(self.levels[:, np.newaxis, np.newaxis], background.shape)
+        return Light(
+            signal,
+            np.maximum(background, least_background),
+            self.share,
+            self.depth,
+            self.contrast,
         )
 
 
@@ -121,28 +162,37 @@ _RARE = 1e-3  # levels with a smaller share are left out
 
 @once_per_capture
 def light_of(capture: Capture) -> Light:
-    """Signal levels, their shares, and each pixel's background, as the capture itself tells.
+    """Signal levels, their shares, and each pixel's background, as the capture itself tells."""
+    return lighting_of(capture).light(_totals(capture)[0], _least_background(capture))
+
+
+@once_per_capture
+def lighting_of(capture: Capture) -> Lighting:
+    """What a capture tells of the light that all its pixels see.
 
     The total of a pixel's rates (Coates 1968) is signal and background together. What a level of
     signal leaves of it is background, drawn towards the image's mean background as far as its
     scatter is what chance alone makes (James & Stein 1961, the chance being Greenwood's 1926
     variance): where all pixels see the same background, all are given the same.
+
+    A part of an image too large for memory is told that of a sample of the image,
+    ``lighting_of.tell(part, lighting)``.
     """
     total, chance = _totals(capture)
     flat = capture.cube.reshape(total.size, -1)
     # At random: a regular step could miss what stands in columns.
     pixels = np.sort(np.random.default_rng(0).permutation(total.size)[:_SAMPLE])[np.newaxis]
+    sample, least = total.ravel()[pixels], _least_background(capture)
     levels = _levels(flat[pixels[0]], capture)
-    alike = np.ones(flat.shape[1])
-    # Mean and variance of the signal over pixels: while nothing is known, each level is everyone's.
-    mean, variance = levels[:, np.newaxis, np.newaxis], 0.0
-
-    def light(pixels: NDArray[np.intp], share: Floats, depth: Floats) -> Light:
-        background = _backgrounds(levels, total, chance + variance, mean, capture)
-        signal = np.broadcast_to(levels[:, np.newaxis, np.newaxis], background.shape)
-        return Light(signal, background, share, depth).of_pixels(pixels)
-
-    lit = light(pixels, np.full(levels.size, 1 / levels.size), alike)
+    # While nothing is known, each level is everyone's signal.
+    guess = Lighting(
+        levels,
+        share=np.full(levels.size, 1 / levels.size),
+        depth=np.ones(flat.shape[1]),
+        background=total.mean() - levels[:, np.newaxis, np.newaxis],
+        trust=_trust(total, chance),
+    )
+    lit = guess.light(sample, least)
     share = _shares(_level_evidence(_prepare(capture, flat[pixels], lit, 1)))
     mean = np.asarray(share @ levels)
     variance = float(share @ (levels - mean) ** 2)
@@ -150,10 +200,21 @@ def light_of(capture: Capture) -> Light:
     kept[0] = True
     if not kept[1:].any():  # an echo so rare that the sample missed it
         kept[-1], share[-1] = True, _RARE
-    levels, share = levels[kept], share[kept] / share[kept].sum()
-    prepared = _prepare(capture, flat[pixels], light(pixels, share, alike), 1)
-    share, depth = _shares_and_depths(_level_densities(prepared), share)
-    return light(np.arange(total.size).reshape(total.shape), share, depth)
+    found = guess._replace(
+        levels=levels[kept],
+        share=share[kept] / share[kept].sum(),
+        background=total.mean() - mean,
+        trust=_trust(total, chance + variance),
+    )
+    prepared = _prepare(capture, flat[pixels], found.light(sample, least), 1)
+    share, depth = _shares_and_depths(_level_densities(prepared), found.share)
+    found = found._replace(share=share, depth=depth)
+    return found._replace(contrast=found.light(total, least).contrast)
+
+
+def _least_background(capture: Capture) -> float:
+    """Half a count more than nothing: what was never seen may still be there."""
+    return 0.5 / (capture.armed_pulses or 1)
 
 
 def _totals(capture: Capture) -> tuple[Floats, float]:
@@ -171,23 +232,11 @@ def _totals(capture: Capture) -> tuple[Floats, float]:
     return np.log(n_pulses / unfired) - variance / 2, float(variance.mean())
 
 
-def _backgrounds(
-    levels: Floats, total: Floats, unrelated: float, mean_signal: Floats, capture: Capture
-) -> Floats:
-    """Background of each pixel were its signal of each level, shape (level, row, col).
-
-    `unrelated` is the variance of the totals that no difference in background makes; `mean_signal`
-    is the mean of the pixels' signals, or what it would be for each level.
-    """
+def _trust(total: Floats, unrelated: float) -> float:
+    """Share of the totals' variance that is no chance, `unrelated` being the variance by chance."""
     scatter = float(total.var())
-    kept = max(0.0, 1 - unrelated / scatter) if scatter > 0 else 0.0
-    if kept < 3 * math.sqrt(2 / total.size):  # a variance is known no better than that
-        kept = 0.0
-    left = total - levels[:, np.newaxis, np.newaxis]
-    everywhere = total.mean() - mean_signal
-    # Half a count more than nothing: what was never seen may still be there.
-    least = 0.5 / (capture.armed_pulses or 1)
-    return np.asarray(np.maximum(everywhere + kept * (left - everywhere), least))
+    trust = max(0.0, 1 - unrelated / scatter) if scatter > 0 else 0.0
+    return trust if trust >= 3 * math.sqrt(2 / total.size) else 0.0  # it is known no better
 
 
 def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture) -> Floats:

@@ -312,6 +312,7 @@ def test_a_click_on_a_point_of_the_cloud_chooses_its_pixel(car_page):
 
 
 def test_the_camera_stays_while_a_slider_moves_and_goes_home_by_key(car_page):
+    stage(car_page).press("0")  # the page may have been given its size just now
     home = stage(car_page).get_attribute("data-camera")
     stage(car_page).press("ArrowLeft")
     stage(car_page).press("+")

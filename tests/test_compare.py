@@ -457,7 +457,8 @@ def test_the_comparison_can_be_stopped(page):
 @pytest.mark.browser
 def test_pages_fit_a_phone(page):
     here = page(width=390, height=844)
-    open_compare(here)
+    here.get_by_role("button", name="Compare", exact=True).click()
+    expect(here.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible()
     for picture in pictures(here).locator(".bk-Figure").all():
         box = picture.bounding_box()
         assert box["x"] >= 0

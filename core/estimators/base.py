@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,15 @@ NULL_SIDE = 256
 """Rows and columns of the echo-free image on which a detection threshold is found."""
 
 
+class Calibration(NamedTuple):
+    """What an estimator knows of all pixels of an image before it ranges one of them."""
+
+    lag_bins: float
+    """`Estimator.lag_bins`."""
+    least_score: float | None
+    """`Estimator.threshold`; None where every pixel is answered."""
+
+
 @dataclass(frozen=True)
 class Estimator:
     """One entry of the registry.
@@ -83,6 +92,9 @@ class Estimator:
         Where the original was not available: from what the method was reconstructed.
     null_side : int
         Rows and columns of the echo-free image on which a detection threshold is found.
+    whole_image : bool
+        Whether a pixel's answer depends on pixels beyond its `reach`, so that no part of an image
+        can be ranged without the rest.
     """
 
     title: str
@@ -95,6 +107,7 @@ class Estimator:
     light: Callable[[Capture], Light] = posterior.light_of
     reconstructed: str = ""
     null_side: int = NULL_SIDE
+    whole_image: bool = False
 
     def __call__(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
@@ -115,7 +128,23 @@ class Estimator:
         ValueError
             If `false_alarm` is not within the bounds of `FALSE_ALARM`.
         """
-        bins, score = self.delays(capture, parameters, false_alarm)
+        return self.ranged(capture, parameters, self.calibration(capture, parameters, false_alarm))
+
+    def calibration(
+        self, capture: Capture, parameters: Any, false_alarm: float | None = None
+    ) -> Calibration:
+        """What is to be known of a capture, or of a sample of it, before it is ranged."""
+        if false_alarm is not None:
+            FALSE_ALARM.check("false_alarm", false_alarm)
+        least = None
+        if false_alarm is not None and false_alarm < 1:
+            least = self.threshold(capture, parameters, false_alarm)
+        lag = 0.0 if self.finds_delay else self.lag_bins(capture, parameters)
+        return Calibration(lag, least)
+
+    def ranged(self, capture: Capture, parameters: Any, calibration: Calibration) -> RangeImage:
+        """Range every pixel of a capture, or of a part of one."""
+        bins, score = self._delays(capture, parameters, calibration)
         return RangeImage(
             range_m=capture.acquisition.bin_to_range_m(bins),
             bin=bins,
@@ -128,14 +157,16 @@ class Estimator:
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
     ) -> tuple[Floats, Floats]:
         """`RangeImage.bin` and `RangeImage.score` alone: the estimator without what it is worth."""
-        if false_alarm is not None:
-            FALSE_ALARM.check("false_alarm", false_alarm)
+        return self._delays(capture, parameters, self.calibration(capture, parameters, false_alarm))
+
+    def _delays(
+        self, capture: Capture, parameters: Any, calibration: Calibration
+    ) -> tuple[Floats, Floats]:
         position, score = self._best(capture, self.light(capture), parameters)
-        if false_alarm is not None and false_alarm < 1:
-            least = self.threshold(capture, parameters, false_alarm)
-            position = np.where(score > least, position, np.nan)
-        lag = 0.0 if self.finds_delay else self.lag_bins(capture, parameters)
-        return np.clip(position - lag, 0.0, capture.acquisition.n_bins), score
+        if calibration.least_score is not None:
+            position = np.where(score > calibration.least_score, position, np.nan)
+        delay = np.clip(position - calibration.lag_bins, 0.0, capture.acquisition.n_bins)
+        return delay, score
 
     def curves(self, capture: Capture, row: int, col: int, parameters: Any) -> Floats:
         """The score of each bin for one pixel, shape (bin,)."""
@@ -154,7 +185,8 @@ class Estimator:
         """
         whole = tuple(_whole(self.null_side, size) for size in capture.shape)
         some = np.s_[: whole[0], : whole[1]]
-        null = Capture(_null_cube(capture)[some].copy(), capture.acquisition, capture.pulse)
+        cube = _null_cube(capture)[some].copy()
+        null = Capture(cube, capture.acquisition, capture.pulse, detection=capture.detection)
         light = self.light(capture).of_pixels(_null_pixels(capture)[some])
         _, score = self._best(null, light, parameters)
         return float(np.quantile(score, 1 - false_alarm))
@@ -223,7 +255,7 @@ def conditions_of(capture: Capture, light: Light, reach: int = 1) -> Conditions:
         n_pulses * reach * reach if n_pulses else None,
         signal * more,
         background * more,
-        float(signal.mean() / background.mean()),
+        light.contrast,
     )
 
 

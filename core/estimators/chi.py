@@ -187,4 +187,5 @@ ESTIMATOR = Estimator(
     _locate,
     reach=lambda _: 3,
     reconstructed="the abstract of Chi et al. (2025)",
+    whole_image=True,
 )

@@ -337,4 +337,5 @@ ESTIMATOR = Estimator(
     finds_delay=True,
     reconstructed="public descriptions of IEEE Transactions on Computational Imaging 3, 445 (2017)",
     null_side=64,
+    whole_image=True,
 )

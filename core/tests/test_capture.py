@@ -58,7 +58,7 @@ def test_the_cube_is_read_only() -> None:
 
 
 def test_counts_do_not_wrap() -> None:
-    capture = capture_of(np.full((2, 3, 400), 255), dtype=np.uint8)
+    capture = capture_of(np.full((2, 3, 400), 255), None, np.uint8)
     assert capture.shape == (2, 3)
     np.testing.assert_array_equal(capture.counts, np.full((2, 3), 400 * 255))
 

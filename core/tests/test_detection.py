@@ -16,6 +16,7 @@ from scipy import stats
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS, FALSE_ALARM, base, estimate
+from core.readers.dense import guess_detection
 from core.scene import Scene
 from core.simulate import simulate
 
@@ -198,7 +199,8 @@ def test_a_pixel_that_saw_nothing_is_no_detection(unseen: Capture, method: str) 
 def told(cube: np.ndarray, n_pulses: int | None = 1000) -> Capture:
     """Counts, and a light for the oracle to be told."""
     light: dict[str, Any] = {"signal": np.full(cube.shape[:2], 0.1), "background": 1.7}
-    return Capture(cube, Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses), **light)
+    setting = Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses)
+    return Capture(cube, setting, detection=guess_detection(cube, n_pulses), **light)
 
 
 CAPTURES = {

@@ -17,6 +17,7 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
 from core.posterior import light_of
+from core.readers.dense import guess_detection
 from core.scene import Scene, uniform
 from core.simulate import simulate
 from core.tracking import PRESETS, TrackingParameters
@@ -69,6 +70,7 @@ def capture_of(cube: Any, n_pulses: int | None = 1000, dtype: type = np.uint16) 
         Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses),
         signal=np.full(cube.shape[:2], 0.1041),
         background=1.735,
+        detection=guess_detection(cube, n_pulses),
     )
 
 
@@ -187,7 +189,7 @@ def lone_echo(onset_bin: float = 40.3, n_pulses: int = 1000, **acquisition: Any)
 def test_a_later_echo_gives_a_later_answer(method: str, later: int) -> None:
     capture = lone_echo()
     shifted = replace(capture, cube=np.roll(capture.cube, later, axis=2))
-    shifted.__dict__["light_of"] = light_of(capture)  # the light decides on the lag
+    light_of.tell(shifted, light_of(capture))  # the light decides on the lag
     near, far = estimate(capture, method), estimate(shifted, method)
     assert near.valid.all()
     # Rounding, once of bins near a hundred in float64 and once of densities in float32.

@@ -18,6 +18,7 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import estimate
 from core.posterior import Conditions, Light, Posterior, light_of, most_likely, near, posterior_of
+from core.readers.dense import guess_detection
 from core.scene import Scene
 from core.simulate import simulate
 from core.trigger import coates_rate, rate_per_bin, trigger_probability
@@ -77,7 +78,8 @@ def capture_of(cube: Any, n_pulses: int | None = 1000, pulse: Pulse = Pulse()) -
     cube = np.asarray(cube)
     if cube.dtype.kind != "u":
         cube = cube.astype(np.uint16)
-    return Capture(cube, Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses), pulse)
+    setting = Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses)
+    return Capture(cube, setting, pulse, detection=guess_detection(cube, n_pulses))
 
 
 # --- The twin: one pixel, one level, one delay at a time, in float64. ---
