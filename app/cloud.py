@@ -1,8 +1,6 @@
 """The 3D cloud: a range image as a PyVista mesh, as a file, and as points in the browser.
 
-Coordinates are right-handed, in metres, with the sensor at the origin: x to the right of the
-image, y away from the sensor along the optical axis, z up. Distances are thus positive and the
-cloud stands upright in programs that take z as up.
+Its coordinates are those of `core.cloud`.
 
 The mesh never becomes a picture on the server, where OpenGL may be missing: its points and colours
 go to the browser, which draws them with the vtk.js that Panel bundles.
@@ -11,8 +9,8 @@ go to the browser, which draws them with the vtk.js that Panel bundles.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -22,35 +20,10 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 from app.theme import WRONG_COLOR, palette
+from core.cloud import points_m
+from core.export import write_ply
 
 Floats = NDArray[np.float64]
-
-PLY_TYPES = {"b": "char", "u": "uchar", "i": "int", "f": "float"}
-
-
-def sight_lines(shape: tuple[int, int], pixel_angle_rad: float) -> Floats:
-    """Direction in which each pixel looks, by the pinhole model with square pixels.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Rows and columns of the image; row 0 is the top.
-    pixel_angle_rad : float
-        Angle between the lines of sight of neighbouring pixels at the centre of the image.
-
-    Returns
-    -------
-    ndarray, shape (row, col, 3)
-        Unit vectors; the centre of the image looks along y.
-    """
-    rows, cols = shape
-    step = np.tan(pixel_angle_rad)
-    right = (np.arange(cols) - (cols - 1) / 2) * step
-    up = ((rows - 1) / 2 - np.arange(rows)) * step
-    lines = np.ones((rows, cols, 3))
-    lines[..., 0] = right
-    lines[..., 2] = up[:, np.newaxis]
-    return np.asarray(lines / np.linalg.norm(lines, axis=-1, keepdims=True))
 
 
 def point_cloud(range_m: ArrayLike, pixel_angle_rad: float, **images: ArrayLike) -> pv.PolyData:
@@ -75,17 +48,15 @@ def point_cloud(range_m: ArrayLike, pixel_angle_rad: float, **images: ArrayLike)
     Raises
     ------
     ValueError
-        If an image has another size than ``range_m``.
+        If ``range_m`` is no image, an image has another size than ``range_m``, or the angle is not
+        between 0 and π/2.
     """
     ranges = np.asarray(range_m, float)
-    if ranges.ndim != 2:
-        raise ValueError(f"range_m has shape {ranges.shape}: give an image (row, col).")
-    row, col = np.nonzero(np.isfinite(ranges))
-    lines = sight_lines(ranges.shape, pixel_angle_rad)
-    cloud = pv.PolyData(ranges[row, col, np.newaxis] * lines[row, col])
+    xyz_m, row, col = points_m(ranges, pixel_angle_rad)
+    cloud = pv.PolyData(xyz_m)
     cloud["range_m"] = ranges[row, col]
-    cloud["row"] = row.astype(np.int32)
-    cloud["col"] = col.astype(np.int32)
+    cloud["row"] = row
+    cloud["col"] = col
     for name, image in images.items():
         values = np.asarray(image)
         if values.shape[:2] != ranges.shape:
@@ -161,57 +132,25 @@ def _dense_ranges(ranges: Floats) -> tuple[float, float]:
     return float(edges[dense[0]]), float(edges[dense[-1] + 1])
 
 
-def export_bytes(cloud: pv.PolyData, suffix: str) -> bytes:
-    """Content of a binary file that holds the cloud.
+def ply_bytes(cloud: pv.PolyData) -> bytes:
+    """Content of a PLY file that holds the cloud.
 
     Parameters
     ----------
     cloud : pyvista.PolyData
-        From `point_cloud`.
-    suffix : str
-        ``.vtp`` keeps every array in its own type. ``.ply`` keeps every array of one component,
-        as float, int or char, and ``rgb`` as red, green and blue.
-
-    Raises
-    ------
-    ValueError
-        If the suffix is another one.
+        From `point_cloud`; point data of one component are kept in their own types, ``rgb`` as
+        red, green and blue.
     """
-    if suffix == ".ply":
-        return _ply_bytes(cloud)
-    if suffix != ".vtp":
-        raise ValueError(f"suffix {suffix!r} is not accepted: give '.ply' or '.vtp'.")
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "cloud.vtp"
-        cloud.save(path)
-        return path.read_bytes()
-
-
-def _ply_bytes(cloud: pv.PolyData) -> bytes:
-    """Write the PLY by hand: VTK's writer drops all point data but colours."""
-    columns = dict(zip("xyz", np.asarray(cloud.points, "<f4").T, strict=True))
+    columns: dict[str, NDArray[Any]] = {}
     for name in cloud.point_data:
         values = np.asarray(cloud[name])
         if name == "rgb":
-            columns |= dict(zip(("red", "green", "blue"), values.astype("u1").T, strict=True))
+            columns |= dict(zip(("red", "green", "blue"), values.T, strict=True))
         elif values.ndim == 1:
-            columns[name] = _ply_column(values)
-    table = np.empty(cloud.n_points, [(name, values.dtype) for name, values in columns.items()])
-    for name, values in columns.items():
-        table[name] = values
-    properties = [f"property {PLY_TYPES[v.dtype.kind]} {name}" for name, v in columns.items()]
-    header = ["ply", "format binary_little_endian 1.0", "comment x right, y away, z up, in metres"]
-    header += [f"element vertex {cloud.n_points}", *properties, "end_header", ""]
-    return "\n".join(header).encode("ascii") + table.tobytes()
-
-
-def _ply_column(values: NDArray[Any]) -> NDArray[Any]:
-    """Give the values in the nearest type that every PLY reader knows."""
-    if values.dtype.kind == "f":
-        return values.astype("<f4")
-    if values.dtype.itemsize == 1:
-        return values.view("u1") if values.dtype.kind == "b" else values
-    return values.astype("<i4")
+            columns[name] = values
+    file = BytesIO()
+    write_ply(np.asarray(cloud.points), columns, file)
+    return file.getvalue()
 
 
 class PointCloud(pn.custom.JSComponent):

@@ -14,7 +14,7 @@ import panel as pn
 import param
 
 from app import words
-from app.cloud import PointCloud, export_bytes
+from app.cloud import PointCloud, ply_bytes
 from app.controls import Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
@@ -241,7 +241,7 @@ class Session:
 
     def cloud_file(self) -> BytesIO:
         """The cloud as it is shown, as a PLY file."""
-        return BytesIO(export_bytes(self._cloud, ".ply"))
+        return BytesIO(ply_bytes(self._cloud))
 
     def scene_id(self) -> str:
         """Changes when the camera should start anew."""

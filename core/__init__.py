@@ -4,7 +4,7 @@ from core import limits, metrics
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
-from core.export import save_capture
+from core.export import save_capture, save_image, save_pixel
 from core.pipeline import Run, run
 from core.readers import read_capture
 from core.scene import Scene, scenes
@@ -43,6 +43,8 @@ __all__ = [
     "read_capture",
     "run",
     "save_capture",
+    "save_image",
+    "save_pixel",
     "scenes",
     "simulate",
     "tracking_signals",

@@ -1,16 +1,45 @@
-"""Captures to files, in the layout of `core.readers.npz`."""
+"""Captures and answers to files that other software opens: one family of formats a module.
+
+A new format is a module with a ``write(product, file)`` and a line in `WRITERS`. Captures are
+written in the layout of `core.readers.npz`.
+"""
 
 from __future__ import annotations
 
 import os
-import secrets
+from collections.abc import Callable
+from numbers import Integral
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from core.capture import Capture
 from core.checks import require
-from core.readers import npz
+from core.estimators import RangeImage
+from core.export import las, netcdf, npz, pcd, picture, ply, table, tiff
+from core.export.ply import write_ply
+from core.export.product import Product
+from core.export.whole import whole_file
+from core.readers.npz import fields
+from core.tracking import TrackingParameters
+
+__all__ = ["WRITERS", "save_capture", "save_image", "save_pixel", "write_ply"]
+
+WRITERS: dict[str, Callable[[Product, BinaryIO], None]] = {
+    ".npz": npz.write,
+    ".csv": table.write,
+    ".tif": tiff.write,
+    ".tiff": tiff.write,
+    ".nc": netcdf.write,
+    ".h5": netcdf.write,
+    ".ply": ply.write,
+    ".las": las.write,
+    ".laz": las.write_compressed,
+    ".pcd": pcd.write,
+    ".png": picture.write_png,
+    ".svg": picture.write_svg,
+}
 
 
 def save_capture(
@@ -37,14 +66,113 @@ def save_capture(
     """
     path = Path(path)
     require("path", str(path), path.suffix.lower() == ".npz", "a name ending in .npz")
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists: give another name, or overwrite=True to replace it.")
-    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
-    try:
-        with unfinished.open("xb") as file:
-            np.savez_compressed(file, allow_pickle=False, **npz.fields(capture))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with whole_file(path, overwrite=overwrite) as file:
+        np.savez_compressed(file, allow_pickle=False, **fields(capture))
+
+
+def save_image(
+    capture: Capture,
+    image: RangeImage,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    pixel_angle_rad: float | None = None,
+    title: str = "",
+) -> None:
+    """Write a range image, whole or not at all; the suffix tells the format.
+
+    ==================  ===========================================================================
+    suffix              what is written
+    ==================  ===========================================================================
+    ``.npz``            NumPy: every array as it is, the acquisition, the source
+    ``.nc``, ``.h5``    netCDF-4, which is HDF5: the same, with units
+    ``.csv``            one line a pixel
+    ``.tif``, ``.tiff`` three pages of 32-bit floats: ``range_m``, ``confidence``, ``counts``
+    ``.ply``, ``.pcd``  point cloud; coordinates as 32-bit floats
+    ``.las``, ``.laz``  point cloud, LAS 1.4; coordinates in steps of a thousandth of a bin or less
+    ``.png``, ``.svg``  picture of the range image
+    ==================  ===========================================================================
+
+    Where there is no answer an image holds NaN, a line of text nothing, and a cloud no point. The
+    modules of `core.export` describe the formats, `core.cloud` the coordinates.
+
+    Parameters
+    ----------
+    capture : Capture
+        What was ranged.
+    image : RangeImage
+        The answer, of the capture's shape.
+    path : path-like
+        A name ending in one of the suffixes of `WRITERS`.
+    overwrite : bool
+        Replace a file of that name.
+    pixel_angle_rad : float, optional
+        Angle between the lines of sight of neighbouring pixels, in radians; the capture's own where
+        None. Clouds need it.
+    title : str
+        Above a picture; its default says what is seen.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is unknown, image and capture differ in shape, the angle is not between 0 and
+        π/2, or a cloud is asked for and nobody knows the angle.
+    FileExistsError
+        If the file exists and is not to be replaced.
+    OSError
+        If the folder cannot be written; an older file is then left as it was.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    require("suffix", path.suffix, suffix in WRITERS, "one of " + ", ".join(WRITERS))
+    if pixel_angle_rad is None:
+        pixel_angle_rad = capture.acquisition.pixel_angle_rad
+    product = Product(capture, image, pixel_angle_rad, title)
+    with whole_file(path, overwrite=overwrite) as file:
+        WRITERS[suffix](product, file)
+
+
+def save_pixel(
+    capture: Capture,
+    row: int,
+    col: int,
+    settings: TrackingParameters | None,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write what the tracking differentiators make of one pixel, one line a bin, as CSV.
+
+    The columns are ``bin``, ``time_s`` and ``range_m`` (where the bin begins), ``counts`` (whole
+    numbers), and the stages of `core.Signals` in counts: ``raw``, ``small``, ``large``,
+    ``residual``, ``enhanced``.
+
+    Parameters
+    ----------
+    capture : Capture
+    row, col : int
+        The pixel.
+    settings : TrackingParameters or None
+        The recommended preset where None.
+    path : path-like
+        A name ending in ``.csv``.
+    overwrite : bool
+        Replace a file of that name.
+
+    Raises
+    ------
+    ValueError
+        If the name has another ending, the pixel lies outside the image, or the weight "survival"
+        lacks the capture's pulses.
+    FileExistsError
+        If the file exists and is not to be replaced.
+    OSError
+        If the folder cannot be written; an older file is then left as it was.
+    """
+    path = Path(path)
+    require("path", str(path), path.suffix.lower() == ".csv", "a name ending in .csv")
+    for name, index, size in zip(("row", "col"), (row, col), capture.shape, strict=True):
+        inside = isinstance(index, Integral) and 0 <= index < size
+        require(name, index, inside, f"an integer from 0 to {size - 1}, within the image")
+    with whole_file(path, overwrite=overwrite) as file:
+        table.write_pixel(capture, row, col, settings or TrackingParameters(), file)

@@ -1,0 +1,125 @@
+"""What is known of a range image once it leaves the house: the same in every format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.capture import Capture
+from core.checks import require
+from core.cloud import Points, points_m
+from core.estimators import RangeImage
+
+
+class Plane(NamedTuple):
+    """One image of a product, shape (row, col), its unit (by UDUNITS) and its meaning."""
+
+    values: NDArray[Any]
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True, eq=False)
+class Product:
+    """A range image with all that a file may want to say of it.
+
+    Parameters
+    ----------
+    capture : Capture
+        What was ranged.
+    image : RangeImage
+        The answer, of the capture's shape.
+    pixel_angle_rad : float, optional
+        Angle between the lines of sight of neighbouring pixels, in radians.
+    title : str
+        For people; see `heading`.
+
+    Raises
+    ------
+    ValueError
+        If image and capture differ in shape, or the angle is not between 0 and π/2.
+    """
+
+    capture: Capture
+    image: RangeImage
+    pixel_angle_rad: float | None = None
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        shape, angle_rad = self.image.range_m.shape, self.pixel_angle_rad
+        fits = shape == self.capture.shape
+        require("image", f"shape {shape}", fits, f"shape {self.capture.shape}, the capture's")
+        possible = angle_rad is None or 0 < angle_rad < np.pi / 2
+        require("pixel_angle_rad", angle_rad, possible, "an angle between 0 and π/2 radians")
+
+    @property
+    def heading(self) -> str:
+        """The title, if there is one."""
+        return _plain(self.title) or "Range image"
+
+    @property
+    def planes(self) -> dict[str, Plane]:
+        """The images, by name."""
+        image = self.image
+        return {
+            "range_m": Plane(image.range_m, "m", "range of the surface, NaN without an answer"),
+            "confidence": Plane(
+                image.confidence, "1", "probability that the surface is within 3 bins of the answer"
+            ),
+            "counts": Plane(self.capture.counts, "1", "detections of the pixel"),
+            "bin": Plane(image.bin, "1", "delay of the echo in bins, from the opening of the gate"),
+            "score": Plane(image.score, "1", "score at the answer, of the estimator's own scale"),
+            "valid": Plane(image.valid, "1", "whether there is an answer"),
+        }
+
+    @property
+    def facts(self) -> dict[str, str | int | float]:
+        """Acquisition and source; `n_pulses` is 0 and no `pixel_angle_rad` where not known."""
+        acquisition = self.capture.acquisition
+        facts: dict[str, str | int | float] = {
+            "bin_width_s": float(acquisition.bin_width_s),
+            "gate_delay_s": float(acquisition.gate_delay_s),
+            "n_pulses": int(acquisition.n_pulses or 0),
+            "detection": self.capture.detection,
+            "source": _plain(self.capture.source),
+        }
+        if self.pixel_angle_rad is not None:
+            facts["pixel_angle_rad"] = float(self.pixel_angle_rad)
+        return facts
+
+    def points(self) -> Points:
+        """The answers in space.
+
+        Raises
+        ------
+        ValueError
+            If there are none, or the angle between pixels is not known.
+        """
+        answers = int(self.image.valid.sum())
+        require("answers", answers, answers > 0, "an image with answers: a cloud needs points")
+        angle_rad = self.pixel_angle_rad
+        if angle_rad is None:
+            raise ValueError(
+                "pixel_angle_rad = None is not accepted: give the angle between neighbouring "
+                "pixels in radians, which the capture does not know and a cloud needs."
+            )
+        return points_m(self.image.range_m, angle_rad)
+
+    def point_columns(self, points: Points) -> dict[str, NDArray[Any]]:
+        """What a cloud says of each point beside its coordinates; each of shape (point,)."""
+        here = points.row, points.col
+        return {
+            "range_m": self.image.range_m[here],
+            "counts": np.minimum(self.capture.counts[here], 2**32 - 1).astype(np.uint32),
+            "confidence": self.image.confidence[here].astype(np.float32),
+            "row": points.row,
+            "col": points.col,
+        }
+
+
+def _plain(text: str) -> str:
+    """Text on one line, of characters that every format can hold."""
+    return "".join(character if character.isprintable() else " " for character in text)

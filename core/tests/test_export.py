@@ -1,0 +1,641 @@
+"""One contract for every writer, each checked by a reader that is not ours; whole files or none."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import errno
+import io
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+from xml.etree import ElementTree
+
+import h5py
+import laspy
+import numpy as np
+import pytest
+import tifffile
+import trimesh
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+import core
+from core.acquisition import Acquisition
+from core.capture import Capture
+from core.cloud import sight_lines
+from core.estimators import RangeImage
+from core.export import WRITERS, save_capture, save_image, save_pixel
+from core.export.product import Product
+from core.tracking import TrackingParameters, tracking_signals
+
+Images = dict[str, np.ndarray]
+
+ROWS, COLS = 7, 9
+ANGLE = 1.5e-3
+TITLE = "A <wall> & a µ-hole, 5 $ the piece"
+SOURCE = "wall, Straße 5\n\0<&>"
+PLAIN_SOURCE = "wall, Straße 5  <&>"
+
+
+def capture_of(shape: tuple[int, int], angle_rad: float | None = ANGLE) -> Capture:
+    cube = np.random.default_rng(3).poisson(0.3, (*shape, 100)).astype(np.uint16)
+    return Capture(cube, Acquisition(100, 1e-9, 3e-7, 900, angle_rad), source=SOURCE)
+
+
+def image_of(capture: Capture, valid: np.ndarray) -> RangeImage:
+    """A slanted wall, ranged where `valid`."""
+    rng = np.random.default_rng(5)
+    bins = np.where(valid, 20 + np.arange(valid.size).reshape(valid.shape) / 3, np.nan)
+    return RangeImage(
+        range_m=capture.acquisition.bin_to_range_m(bins),
+        bin=bins,
+        score=rng.normal(size=valid.shape),
+        confidence=np.where(valid, rng.uniform(0.5, 1, valid.shape), 0.0),
+        valid=valid,
+    )
+
+
+CAPTURE = capture_of((ROWS, COLS))
+VALID = np.ones((ROWS, COLS), bool)
+VALID[0, 0] = VALID[3, 4] = VALID[6, 8] = False
+IMAGE = image_of(CAPTURE, VALID)
+NOTHING = image_of(CAPTURE, np.zeros((ROWS, COLS), bool))
+
+
+def images_of(image: RangeImage) -> Images:
+    """Everything that a writer may keep, as it was."""
+    kept = ("range_m", "confidence", "bin", "score", "valid")
+    return {"counts": CAPTURE.counts, **{name: getattr(image, name) for name in kept}}
+
+
+def at_pixels(row: Any, col: Any, columns: dict[str, Any]) -> Images:
+    """Images of what a cloud says of its points; NaN where it has none."""
+    images = {}
+    for name, values in columns.items():
+        images[name] = np.full((ROWS, COLS), np.nan)
+        images[name][np.asarray(row, int), np.asarray(col, int)] = np.asarray(values)
+    return images
+
+
+def read_npz(path: Path) -> Images:
+    with np.load(path, allow_pickle=False) as archive:
+        assert archive["format"] == "firstphoton-range-image-1"
+        return {name: archive[name] for name in archive if archive[name].ndim == 2}
+
+
+def read_csv(path: Path) -> Images:
+    assert path.read_bytes().count(b"\r\n") == path.read_bytes().count(b"\n") == 1 + ROWS * COLS
+    with path.open(newline="", encoding="utf-8") as file:
+        table = list(csv.DictReader(file, strict=True))
+    assert list(table[0]) == ["row", "col", "range_m", "confidence", "counts", "valid"]
+    pixels = [(int(line["row"]), int(line["col"])) for line in table]
+    assert pixels == list(np.ndindex(ROWS, COLS))
+    return {
+        name: np.array([float(line[name] or "nan") for line in table]).reshape(ROWS, COLS)
+        for name in ("range_m", "confidence", "counts", "valid")
+    }
+
+
+def read_tiff(path: Path) -> Images:
+    with tifffile.TiffFile(path) as file:
+        pages = {page.tags["PageName"].value: page.asarray() for page in file.pages}
+    with Image.open(path) as frames:  # another reader of the same
+        for index, page in enumerate(pages.values()):
+            frames.seek(index)
+            assert frames.mode == "F"
+            np.testing.assert_array_equal(np.asarray(frames), page)
+    return pages
+
+
+def read_hdf5(path: Path) -> Images:
+    with h5py.File(path) as file:
+        return {name: file[name][()] for name in file if file[name].ndim == 2}
+
+
+def read_ply(path: Path) -> Images:
+    with path.open("rb") as file:
+        raw = trimesh.exchange.ply.load_ply(file)["metadata"]["_ply_raw"]["vertex"]["data"]
+    return at_pixels(raw["row"], raw["col"], {name: raw[name] for name in raw.dtype.names})
+
+
+def read_las(path: Path) -> Images:
+    las = laspy.read(path)
+    names = ("x", "y", "z", "intensity", *las.point_format.extra_dimension_names)
+    return at_pixels(las["row"], las["col"], {name: las[name] for name in names})
+
+
+def read_pcd(path: Path) -> Images:
+    """By the format's description, which is short."""
+    header, _, data = path.read_bytes().partition(b"DATA binary\n")
+    known = dict(line.split(" ", 1) for line in header.decode("ascii").splitlines())
+    assert known["VERSION"] == "0.7"
+    assert set(known["COUNT"].split()) == {"1"}
+    kinds = [
+        f"<{kind.lower()}{size}"
+        for kind, size in zip(known["TYPE"].split(), known["SIZE"].split(), strict=True)
+    ]
+    table = np.frombuffer(data, list(zip(known["FIELDS"].split(), kinds, strict=True)))
+    assert int(known["POINTS"]) == int(known["WIDTH"]) == len(table)
+    return at_pixels(table["row"], table["col"], {name: table[name] for name in table.dtype.names})
+
+
+def read_png(path: Path) -> Images:
+    with Image.open(path) as picture:
+        picture.verify()
+        assert picture.format == "PNG"
+        assert min(picture.size) > 200
+    return {}
+
+
+def read_svg(path: Path) -> Images:
+    root = ElementTree.parse(path).getroot()
+    assert root.tag.endswith("svg")
+    return {}
+
+
+READERS: dict[str, Callable[[Path], Images]] = {
+    ".npz": read_npz,
+    ".csv": read_csv,
+    ".tif": read_tiff,
+    ".tiff": read_tiff,
+    ".nc": read_hdf5,
+    ".h5": read_hdf5,
+    ".ply": read_ply,
+    ".las": read_las,
+    ".laz": read_las,
+    ".pcd": read_pcd,
+    ".png": read_png,
+    ".svg": read_svg,
+}
+PICTURES = {".png", ".svg"}
+CLOUDS = {".ply", ".las", ".laz", ".pcd"}
+
+SINGLE = 6e-8
+"""Relative quantisation of a 32-bit float."""
+STEP_M = CAPTURE.acquisition.bin_length_m / 1000
+
+every_format = pytest.mark.parametrize("suffix", WRITERS)
+every_cloud = pytest.mark.parametrize("suffix", sorted(CLOUDS))
+
+
+def saved(folder: Path, suffix: str, image: RangeImage = IMAGE, **options: Any) -> Path:
+    path = folder / f"wall{suffix}"
+    save_image(CAPTURE, image, path, **options)
+    return path
+
+
+def test_every_writer_has_a_reader_that_is_not_ours() -> None:
+    assert set(WRITERS) == set(READERS)
+
+
+@every_format
+@pytest.mark.parametrize("image", [IMAGE, NOTHING], ids=["wall", "nothing"])
+def test_what_is_written_is_read(tmp_path: Path, suffix: str, image: RangeImage) -> None:
+    if image is NOTHING and suffix in CLOUDS:
+        with pytest.raises(ValueError, match=r"answers = 0 .*a cloud needs points"):
+            saved(tmp_path, suffix, image)
+        assert os.listdir(tmp_path) == []
+        return
+    found = READERS[suffix](saved(tmp_path, suffix, image, title=TITLE))
+    if suffix not in PICTURES:
+        assert {"range_m", "confidence", "counts"} <= set(found)
+    known = images_of(image)
+    for name in set(found) & set(known):
+        expected = np.where(image.valid, known[name], np.nan) if suffix in CLOUDS else known[name]
+        np.testing.assert_allclose(found[name], expected, rtol=SINGLE, err_msg=name)
+    if suffix not in {".tif", ".tiff"} | PICTURES:
+        np.testing.assert_array_equal(found["range_m"], image.range_m)
+    assert os.listdir(tmp_path) == [f"wall{suffix}"]
+
+
+@every_cloud
+@pytest.mark.parametrize("angle", [None, 0.02])
+def test_points_lie_on_their_lines_of_sight(
+    tmp_path: Path, suffix: str, angle: float | None
+) -> None:
+    found = READERS[suffix](saved(tmp_path, suffix, pixel_angle_rad=angle))
+    lines = sight_lines((ROWS, COLS), angle or ANGLE)
+    quantisation_m = STEP_M / 2 if suffix in {".las", ".laz"} else 0.0
+    for axis, name in enumerate("xyz"):
+        expected = lines[..., axis] * IMAGE.range_m
+        np.testing.assert_allclose(found[name], expected, rtol=SINGLE, atol=quantisation_m)
+
+
+@every_cloud
+def test_a_cloud_needs_the_angle_between_pixels(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"wall{suffix}"
+    blind = capture_of((ROWS, COLS), angle_rad=None)
+    with pytest.raises(ValueError, match="pixel_angle_rad = None is not accepted: give the angle"):
+        save_image(blind, IMAGE, path)
+    assert os.listdir(tmp_path) == []
+    save_image(blind, IMAGE, path, pixel_angle_rad=ANGLE)
+    np.testing.assert_array_equal(READERS[suffix](path)["range_m"], IMAGE.range_m)
+
+
+@pytest.mark.parametrize("suffix", sorted(set(WRITERS) - CLOUDS))
+def test_an_image_needs_no_angle(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"wall{suffix}"
+    save_image(capture_of((ROWS, COLS), angle_rad=None), IMAGE, path)
+    READERS[suffix](path)
+
+
+@every_format
+@pytest.mark.parametrize("shape", [(1, 1), (1, 150), (150, 1)])
+def test_any_shape_can_be_written(tmp_path: Path, suffix: str, shape: tuple[int, int]) -> None:
+    capture = capture_of(shape)
+    path = tmp_path / f"thin{suffix}"
+    save_image(capture, image_of(capture, np.ones(shape, bool)), path)
+    assert path.stat().st_size > 0
+
+
+@every_format
+def test_a_suffix_may_be_in_capitals(tmp_path: Path, suffix: str) -> None:
+    save_image(CAPTURE, IMAGE, tmp_path / f"WALL{suffix.upper()}")
+    assert os.listdir(tmp_path) == [f"WALL{suffix.upper()}"]
+
+
+def test_an_unknown_suffix_is_refused_and_the_known_are_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"suffix = '\.stl' is not accepted") as refusal:
+        save_image(CAPTURE, IMAGE, tmp_path / "wall.stl")
+    assert all(suffix in str(refusal.value) for suffix in WRITERS)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("angle", [0.0, -1e-3, 2.0, np.nan])
+def test_an_impossible_angle_is_refused(tmp_path: Path, angle: float) -> None:
+    with pytest.raises(ValueError, match=r"pixel_angle_rad = .* between 0 and π/2"):
+        save_image(CAPTURE, IMAGE, tmp_path / "wall.npz", pixel_angle_rad=angle)
+
+
+def test_an_image_of_another_capture_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"image = 'shape \(7, 9\)'.*shape \(2, 2\)"):
+        save_image(capture_of((2, 2)), IMAGE, tmp_path / "wall.npz")
+
+
+# Whole or not at all
+
+
+def fails_half_way(product: Product, file: BinaryIO) -> None:
+    file.write(b"half")
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@every_format
+def test_an_existing_file_is_kept_unless_told(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"wall{suffix}"
+    path.write_bytes(b"older")
+    with pytest.raises(FileExistsError, match=f"wall{suffix} exists: give another name, or over"):
+        save_image(CAPTURE, IMAGE, path)
+    assert path.read_bytes() == b"older"
+    save_image(CAPTURE, IMAGE, path, overwrite=True)
+    READERS[suffix](path)
+    assert os.listdir(tmp_path) == [path.name]
+
+
+@every_format
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"wall{suffix}"
+    path.write_bytes(b"older")
+    monkeypatch.setitem(WRITERS, suffix, fails_half_way)
+    with pytest.raises(OSError, match="No space"):
+        save_image(CAPTURE, IMAGE, path, overwrite=True)
+    assert path.read_bytes() == b"older"
+    assert os.listdir(tmp_path) == [path.name]
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(WRITERS, ".npz", fails_half_way)
+    with pytest.raises(OSError, match="No space"):
+        save_image(CAPTURE, IMAGE, tmp_path / "wall.npz")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_file_that_comes_meanwhile_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_links: bool
+) -> None:
+    path = tmp_path / "wall.csv"
+    monkeypatch.setattr(os, "fsync", lambda _: path.write_bytes(b"somebody else's"))
+    if not has_links:
+        monkeypatch.setattr(os, "link", no_links)
+    with pytest.raises(FileExistsError, match=r"wall\.csv exists: give another name"):
+        save_image(CAPTURE, IMAGE, path)
+    assert path.read_bytes() == b"somebody else's"
+    assert os.listdir(tmp_path) == ["wall.csv"]
+
+
+def no_links(*_: Any) -> None:
+    raise PermissionError(errno.EPERM, "Operation not permitted")
+
+
+def test_a_file_system_without_links_will_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "link", no_links)
+    READERS[".csv"](saved(tmp_path, ".csv"))
+    assert os.listdir(tmp_path) == ["wall.csv"]
+
+
+def test_a_name_claimed_in_vain_is_given_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "link", no_links)
+    monkeypatch.setattr(os, "replace", no_links)
+    with pytest.raises(PermissionError):
+        saved(tmp_path, ".csv")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_capture_is_not_written_over_what_comes_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "wall.npz"
+    monkeypatch.setattr(os, "fsync", lambda _: path.write_bytes(b"somebody else's"))
+    with pytest.raises(FileExistsError):
+        save_capture(CAPTURE, path)
+    assert path.read_bytes() == b"somebody else's"
+
+
+def test_a_missing_folder_passes_as_it_is(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        save_image(CAPTURE, IMAGE, tmp_path / "nowhere" / "wall.csv")
+
+
+# What the formats say of themselves
+
+FACTS = {
+    "bin_width_s": 1e-9,
+    "gate_delay_s": 3e-7,
+    "n_pulses": 900,
+    "detection": "first",
+    "pixel_angle_rad": ANGLE,
+    "source": PLAIN_SOURCE,
+}
+
+
+def test_npz_holds_the_acquisition(tmp_path: Path) -> None:
+    with np.load(saved(tmp_path, ".npz"), allow_pickle=False) as archive:
+        assert {name: archive[name].item() for name in FACTS} == FACTS
+        assert archive["valid"].dtype == bool
+    save_image(
+        Capture(CAPTURE.cube, Acquisition(100, n_pulses=None, pixel_angle_rad=None)),
+        IMAGE,
+        tmp_path / "unknown.npz",
+    )
+    with np.load(tmp_path / "unknown.npz", allow_pickle=False) as archive:
+        assert archive["n_pulses"] == 0
+        assert "pixel_angle_rad" not in archive
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".h5"])
+def test_netcdf_follows_the_conventions(tmp_path: Path, suffix: str) -> None:
+    with h5py.File(saved(tmp_path, suffix, title=TITLE)) as file:
+        attributes = dict(file.attrs)
+        units = {name: file[name].attrs["units"] for name in images_of(IMAGE)}
+        assert all(file[name].attrs["long_name"] for name in images_of(IMAGE))
+        dimensions = [scale[0].name for scale in file["range_m"].dims]
+        assert list(file["valid"].attrs["flag_values"]) == [0, 1]
+        assert file["valid"].attrs["flag_meanings"] == "no_answer answer"
+    assert attributes["Conventions"].startswith("CF-1.")
+    assert attributes["title"] == TITLE
+    assert {name: attributes[name] for name in FACTS} == FACTS
+    assert units == {name: "m" if name == "range_m" else "1" for name in units}
+    assert dimensions == ["/row", "/col"]
+
+
+def test_tiff_names_its_pages_and_units(tmp_path: Path) -> None:
+    with tifffile.TiffFile(saved(tmp_path, ".tif")) as file:
+        pages = [{tag.name: tag.value for tag in page.tags} for page in file.pages]
+        assert {page.dtype for page in file.pages} == {np.dtype(np.float32)}
+    assert [page["PageName"] for page in pages] == ["range_m", "confidence", "counts"]
+    described = [page["ImageDescription"].split(":")[0] for page in pages]
+    assert described == ["range_m [m]", "confidence [1]", "counts [1]"]
+    assert np.isnan(float(pages[0]["GDAL_NODATA"]))
+    items = ElementTree.fromstring(pages[0]["GDAL_METADATA"])
+    said = {item.attrib.get("role", item.attrib["name"]): item.text for item in items}
+    assert said == {
+        "description": "range_m",
+        "unittype": "m",
+        **{name: str(fact) for name, fact in FACTS.items()},
+    }
+
+
+@pytest.mark.parametrize(("suffix", "compressed"), [(".las", 0), (".laz", 0x80)])
+def test_las_is_of_version_1_4(tmp_path: Path, suffix: str, compressed: int) -> None:
+    path = saved(tmp_path, suffix)
+    header = path.read_bytes()[:375]
+    assert header[:4] == b"LASF"
+    assert header[24:26] == bytes([1, 4])
+    assert header[104] == 6 | compressed
+    assert struct.unpack_from("<H", header, 6)[0] & 16  # coordinates would be told as WKT
+    assert struct.unpack_from("<Q", header, 247)[0] == VALID.sum()
+    scales = struct.unpack_from("<3d", header, 131)
+    assert all(STEP_M / 10 < scale <= STEP_M for scale in scales)
+    las = laspy.read(path)
+    described = {
+        dimension.name: dimension.description for dimension in las.point_format.extra_dimensions
+    }
+    assert described["range_m"] == "range of the surface, m"
+    assert set(described) == {"range_m", "counts", "confidence", "row", "col"}
+    np.testing.assert_array_equal(las.intensity, CAPTURE.counts[VALID])
+    np.testing.assert_array_equal(np.asarray(las.return_number), 1)
+    np.testing.assert_array_equal(np.asarray(las.number_of_returns), 1)
+
+
+@pytest.mark.parametrize("bin_width_s", [1e-12, 1e-9, 1e-6])
+def test_las_coordinates_are_far_finer_than_a_bin_wherever_they_are(
+    tmp_path: Path, bin_width_s: float
+) -> None:
+    acquisition = Acquisition(100, bin_width_s, 1.4e-4, 900, 1e-5)  # 21 km away
+    capture = Capture(CAPTURE.cube, acquisition)
+    image = image_of(capture, VALID)
+    save_image(capture, image, tmp_path / "far.las")
+    las = laspy.read(tmp_path / "far.las")
+    expected = (sight_lines((ROWS, COLS), 1e-5) * image.range_m[..., np.newaxis])[VALID]
+    step_m = acquisition.bin_length_m / 1000
+    np.testing.assert_allclose(np.asarray(las.xyz), expected, rtol=0, atol=0.5 * step_m + 1e-11)
+
+
+def test_a_cloud_too_wide_for_fine_steps_gets_coarser_ones(tmp_path: Path) -> None:
+    capture = Capture(CAPTURE.cube, Acquisition(100, 1e-12, 3e-7, 900, 0.3))
+    image = image_of(capture, VALID)
+    image.range_m[2, 2] = 1e5
+    save_image(capture, image, tmp_path / "wide.las")
+    las = laspy.read(tmp_path / "wide.las")
+    expected = (sight_lines((ROWS, COLS), 0.3) * image.range_m[..., np.newaxis])[VALID]
+    np.testing.assert_allclose(np.asarray(las.xyz), expected, rtol=0, atol=0.5e-4)
+    assert set(las.header.scales) == {1e-4}
+
+
+def test_intensity_ends_at_16_bits(tmp_path: Path) -> None:
+    cube = np.full((ROWS, COLS, 100), 1000, np.uint16)
+    capture = Capture(cube, Acquisition(100, n_pulses=None))
+    save_image(capture, IMAGE, tmp_path / "bright.las")
+    las = laspy.read(tmp_path / "bright.las")
+    assert set(np.asarray(las.intensity)) == {65535}
+    assert set(np.asarray(las["counts"])) == {100_000}
+
+
+# Pictures
+
+
+def drawn_pixels(path: Path) -> np.ndarray:
+    """The range image within an SVG, RGBA of shape (row, col, 4), right way up."""
+    link = "{http://www.w3.org/1999/xlink}href"
+    for element in ElementTree.parse(path).iter("{http://www.w3.org/2000/svg}image"):
+        data = base64.b64decode(element.attrib[link].partition("base64,")[2])
+        with Image.open(io.BytesIO(data)) as picture:
+            pixels = np.asarray(picture.convert("RGBA"))
+        if pixels.shape[:2] == (ROWS, COLS):
+            return pixels if "scale(1 -1)" not in element.attrib["transform"] else pixels[::-1]
+    raise AssertionError("no range image")
+
+
+def test_svg_says_what_it_shows(tmp_path: Path) -> None:
+    path = saved(tmp_path, ".svg", title=TITLE)
+    text = " ".join(ElementTree.parse(path).getroot().itertext())
+    for label in ("Column (px)", "Row (px)", "Range (m)", TITLE):
+        assert label in text
+    assert "Date" not in path.read_text(encoding="utf-8")
+
+
+def test_svg_has_one_colour_for_each_range_and_none_without(tmp_path: Path) -> None:
+    sure = RangeImage(IMAGE.range_m, IMAGE.bin, IMAGE.score, VALID * 1.0, VALID)
+    pixels = drawn_pixels(saved(tmp_path, ".svg", sure))
+    assert {tuple(color) for color in pixels[~VALID]} == {(255, 255, 255, 255)}
+    colors = pixels[VALID].astype(int)
+    # Viridis grows brighter with range, which here grows along the rows.
+    brightness = colors[:, :3] @ [299, 587, 114]
+    assert np.all(np.diff(brightness) > 0)
+
+
+def test_answers_beyond_the_confident_ones_are_grey(tmp_path: Path) -> None:
+    range_m = IMAGE.range_m.copy()
+    range_m[1, 1], range_m[5, 5] = 1.0, 1e4
+    confidence = VALID * 0.99
+    confidence[1, 1] = confidence[5, 5] = 0.2
+    image = RangeImage(range_m, IMAGE.bin, IMAGE.score, confidence, VALID)
+    pixels = drawn_pixels(saved(tmp_path, ".svg", image))
+    np.testing.assert_array_equal(pixels[1, 1], pixels[5, 5])
+    grey = np.all(pixels == pixels[1, 1], axis=-1)
+    assert np.argwhere(grey).tolist() == [[1, 1], [5, 5]]
+
+
+def test_png_and_svg_show_the_same_colours(tmp_path: Path) -> None:
+    with Image.open(saved(tmp_path, ".png")) as picture:
+        colors = {color for _, color in picture.convert("RGBA").getcolors(2**24)}
+    assert {tuple(color) for color in drawn_pixels(saved(tmp_path, ".svg"))[VALID]} <= colors
+
+
+@pytest.mark.parametrize("suffix", sorted(PICTURES))
+def test_the_same_answer_gives_the_same_picture(tmp_path: Path, suffix: str) -> None:
+    first = saved(tmp_path, suffix, title=TITLE).read_bytes()
+    assert saved(tmp_path, suffix, title=TITLE, overwrite=True).read_bytes() == first
+
+
+# One pixel
+
+
+def test_a_pixels_signals_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "pixel.csv"
+    settings_ = TrackingParameters(l=0.01, weight="survival")
+    save_pixel(CAPTURE, 2, 5, settings_, path)
+    with path.open(newline="", encoding="utf-8") as file:
+        table = list(csv.DictReader(file, strict=True))
+    stages = ("raw", "small", "large", "residual", "enhanced")
+    assert list(table[0]) == ["bin", "time_s", "range_m", "counts", *stages]
+    columns = {name: np.array([float(line[name]) for line in table]) for name in table[0]}
+    bins = np.arange(100)
+    signals = tracking_signals(CAPTURE.cube[2, 5], settings_, 900)
+    for stage in stages:
+        np.testing.assert_array_equal(columns[stage], getattr(signals, stage))
+    np.testing.assert_array_equal(columns["bin"], bins)
+    np.testing.assert_array_equal(columns["counts"], CAPTURE.cube[2, 5])
+    np.testing.assert_array_equal(columns["range_m"], CAPTURE.acquisition.bin_to_range_m(bins))
+    np.testing.assert_allclose(columns["time_s"] * (299792458 / 2), columns["range_m"], rtol=1e-12)
+    assert all(line["counts"].isdigit() and line["bin"].isdigit() for line in table)
+
+
+def test_a_pixels_settings_are_the_recommended_where_none_are_given(tmp_path: Path) -> None:
+    save_pixel(CAPTURE, 0, 0, None, tmp_path / "a.csv")
+    save_pixel(CAPTURE, 0, 0, TrackingParameters(), tmp_path / "b.csv")
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    with pytest.raises(FileExistsError):
+        save_pixel(CAPTURE, 0, 0, None, tmp_path / "a.csv")
+    save_pixel(CAPTURE, 0, 1, None, tmp_path / "a.csv", overwrite=True)
+    assert (tmp_path / "a.csv").read_bytes() != (tmp_path / "b.csv").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("row", "col", "words"),
+    [
+        (-1, 0, "row = -1 .* from 0 to 6"),
+        (7, 0, "row = 7 .* from 0 to 6"),
+        (0, 9, "col = 9 .* from 0 to 8"),
+        (0, 1.5, "col = 1.5 .* an integer"),
+    ],
+)
+def test_a_pixel_outside_is_refused(tmp_path: Path, row: Any, col: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        save_pixel(CAPTURE, row, col, None, tmp_path / "pixel.csv")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_pixel_is_written_as_csv_alone(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"a name ending in \.csv"):
+        save_pixel(CAPTURE, 0, 0, None, tmp_path / "pixel.npz")
+
+
+# Any image at all
+
+
+@st.composite
+def answers(draw: st.DrawFn) -> tuple[Capture, RangeImage]:
+    shape = draw(hnp.array_shapes(min_dims=2, max_dims=2, max_side=4))
+    numbers = st.floats(0, 1e7, allow_subnormal=False)
+    range_m = draw(hnp.arrays(float, shape, elements=numbers | st.just(np.nan)))
+    shares = hnp.arrays(float, shape, elements=st.floats(0, 1, allow_subnormal=False))
+    cube = draw(hnp.arrays(np.uint32, (*shape, 3), elements=st.integers(0, 2**30)))
+    image = RangeImage(range_m, range_m / 3, -range_m, draw(shares), np.isfinite(range_m))
+    acquisition = Acquisition(3, n_pulses=None, pixel_angle_rad=draw(st.floats(1e-6, 0.5)))
+    return Capture(cube, acquisition, source=draw(st.text())), image
+
+
+@settings(max_examples=20)
+@given(answers())
+def test_any_answer_is_read_from_any_format_as_it_was(answer: tuple[Capture, RangeImage]) -> None:
+    capture, image = answer
+    assume(image.valid.any())
+    with tempfile.TemporaryDirectory() as folder:
+        paths = {suffix: Path(folder) / f"any{suffix}" for suffix in (".npz", ".nc", ".ply")}
+        for path in paths.values():
+            save_image(capture, image, path)
+        for images in (read_npz(paths[".npz"]), read_hdf5(paths[".nc"])):
+            np.testing.assert_array_equal(images["counts"], capture.counts)
+            for name in ("range_m", "bin", "score", "confidence", "valid"):
+                np.testing.assert_array_equal(images[name], getattr(image, name))
+        with paths[".ply"].open("rb") as file:
+            points = trimesh.exchange.ply.load_ply(file)["metadata"]["_ply_raw"]["vertex"]["data"]
+    assert len(points) == image.valid.sum()
+    np.testing.assert_array_equal(points["range_m"], image.range_m[image.valid])
+    np.testing.assert_array_equal(points["counts"], capture.counts[image.valid])
+    distance_m = np.sqrt(sum(points[axis].astype(float) ** 2 for axis in "xyz"))
+    np.testing.assert_allclose(distance_m, points["range_m"], rtol=4 * SINGLE, atol=1e-30)
+
+
+def test_the_libraries_of_the_formats_wait_until_they_are_needed() -> None:
+    heavy = {"laspy", "matplotlib", "trimesh", "pypcd4", "tifffile", "xarray"}
+    command = [sys.executable, "-c", "import sys, core.export; print(*sys.modules)"]
+    folder = Path(core.__file__).parent.parent
+    loaded = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
+    assert not heavy & {name.partition(".")[0] for name in loaded.split()}
