@@ -5,10 +5,12 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
 from core.export import save_capture, save_image, save_pixel
+from core.large import estimate_large
 from core.pipeline import Run, run
-from core.readers import read_capture
+from core.readers import open_capture, read_capture
 from core.scene import Scene, scenes
-from core.simulate import simulate
+from core.scene_files import SceneError, read_scene
+from core.simulate import first_photons, simulate
 from core.tracking import PRESETS, Signals, TrackingParameters, tracking_signals
 from core.trigger import (
     coates_rate,
@@ -31,16 +33,21 @@ __all__ = [
     "RangeImage",
     "Run",
     "Scene",
+    "SceneError",
     "Signals",
     "TrackingParameters",
     "coates_rate",
     "estimate",
+    "estimate_large",
     "first_difference",
+    "first_photons",
     "limits",
     "metrics",
     "no_trigger_probability",
+    "open_capture",
     "rate_per_bin",
     "read_capture",
+    "read_scene",
     "run",
     "save_capture",
     "save_image",

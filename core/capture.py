@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, update_wrapper
-from typing import Generic, Literal, TypeVar, get_args
+from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,30 @@ class Capture:
         """Whole bins that hold the middle four fifths of an echo, at least 1."""
         begin_s, end_s = self.pulse.span_s
         return max(1, math.ceil((end_s - begin_s) / self.acquisition.bin_width_s))
+
+
+class Seen(Protocol):
+    """What is known of a capture, though its cube may not be in memory; a `Capture` is one."""
+
+    @property
+    def counts(self) -> NDArray[Any]:
+        """Detections of each pixel, shape (row, col)."""
+
+    @property
+    def acquisition(self) -> Acquisition:
+        """How it was recorded."""
+
+    @property
+    def detection(self) -> Detection:
+        """First photons or all."""
+
+    @property
+    def source(self) -> str:
+        """Where it came from."""
+
+    @property
+    def armed_pulses(self) -> int | None:
+        """As `Capture.armed_pulses`."""
 
 
 Found = TypeVar("Found")

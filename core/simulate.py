@@ -12,6 +12,7 @@ scene and not the dice.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from numbers import Integral
 
 import numpy as np
@@ -65,8 +66,7 @@ def simulate(
     if n_pulses is None:
         raise ValueError("n_pulses = None is not accepted: give the number of pulses to simulate.")
     require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
-    whole = isinstance(seed, Integral)
-    require("seed", seed, whole and 0 <= seed < 2**63, "an integer from 0 to 2**63 - 1")
+    _require_seed(seed)
     shape = np.shape(scene.range_m)
     has_target = np.isfinite(scene.range_m)
     reflectivity = np.ones(shape) if scene.reflectivity is None else scene.reflectivity
@@ -88,6 +88,49 @@ def simulate(
         background=flux.background,
         source=f"simulated, seed {seed}",
     )
+
+
+def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
+    """What a first-photon detector would have recorded of the photons that a capture holds.
+
+    Photons fall on the pulses at random, each on any of them alike, and a pulse fires by the first
+    that falls on it. Taken in the order of their arrival, a photon fires with probability
+    ``armed / n_pulses``, armed being the pulses that have not fired: which ones these are does not
+    matter. For light whose photons are independent that is exact.
+
+    Parameters
+    ----------
+    capture : Capture
+        One that holds all photons.
+    n_pulses : int
+        Pulses on which its photons fall, at least 1.
+    seed : int
+        The same seed gives the same capture, for any number of threads.
+
+    Returns
+    -------
+    Capture
+        First photons, `n_pulses` sent for each pixel.
+
+    Raises
+    ------
+    ValueError
+        If the capture holds first photons already, or an argument is out of its range.
+    """
+    kind = capture.detection
+    require("detection", kind, kind == "all", "a capture of all photons, which still has others")
+    acquisition = replace(capture.acquisition, n_pulses=n_pulses)
+    _require_seed(seed)
+    cube = np.zeros_like(capture.cube)
+    with KERNEL_LOCK:
+        _fire_once(capture.cube, n_pulses, np.uint64(seed), cube)
+    source = f"{capture.source}; reduced to the first photons of {n_pulses} pulses, seed {seed}"
+    return replace(capture, cube=cube, acquisition=acquisition, detection="first", source=source)
+
+
+def _require_seed(seed: int) -> None:
+    whole = isinstance(seed, Integral)
+    require("seed", seed, whole and 0 <= seed < 2**63, "an integer from 0 to 2**63 - 1")
 
 
 def _triggered_by_each_edge(
@@ -126,6 +169,19 @@ def _splitmix64(state):  # type: ignore[no-untyped-def]
     return z ^ (z >> np.uint64(31))
 
 
+@njit(**COMPILED, inline="always")
+def _pixel_key(seed, pixel):  # type: ignore[no-untyped-def]
+    """Where the stream of random numbers of a pixel begins."""
+    return _splitmix64(_splitmix64(seed + np.uint64(1)) + np.uint64(pixel))
+
+
+@njit(**COMPILED, inline="always")
+def _uniform(key, draw):  # type: ignore[no-untyped-def]
+    """Number `draw` of a stream, uniform in [0, 1)."""
+    state = key + np.uint64(draw) * np.uint64(0x9E3779B97F4A7C15)
+    return np.float64(_splitmix64(state) >> np.uint64(11)) * 2.0**-53
+
+
 @njit(**COMPILED)
 def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
     """Add `n_pulses` first-photon draws to `counts`, whose last element stands for "no trigger".
@@ -144,8 +200,7 @@ def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignor
     while done < n_pulses:
         batch = min(uniform.size, n_pulses - done)
         for i in range(batch):
-            state = key + np.uint64(done + i) * np.uint64(0x9E3779B97F4A7C15)
-            uniform[i] = np.float64(_splitmix64(state) >> np.uint64(11)) * 2.0**-53
+            uniform[i] = _uniform(key, done + i)
         for i in range(batch):
             k = np.uint64(guide[np.uint64(uniform[i] * guide.size)])
             # One step without a jump settles nearly every draw; a mispredicted jump costs five.
@@ -165,7 +220,21 @@ def _draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-de
         guide = np.empty(256, np.uint32)
         uniform = np.empty(64)
         counts = np.zeros(n_bins + 1, np.int64)
-        key = _splitmix64(_splitmix64(seed + np.uint64(1)) + np.uint64(pixel))
-        _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts)
+        _draw_pixel(fired_by, n_pulses, _pixel_key(seed, pixel), guide, uniform, counts)
         for k in range(n_bins):
             cube[pixel, k] = counts[k]
+
+
+@njit(**PARALLEL)
+def _fire_once(photons, n_pulses, seed, fired):  # type: ignore[no-untyped-def]
+    rows, cols, n_bins = photons.shape
+    for row in prange(rows):
+        for col in range(cols):
+            key = _pixel_key(seed, row * cols + col)
+            armed, draw = n_pulses, 0
+            for k in range(n_bins):
+                for _ in range(photons[row, col, k]):
+                    if _uniform(key, draw) * n_pulses < armed:
+                        fired[row, col, k] += 1
+                        armed -= 1
+                    draw += 1

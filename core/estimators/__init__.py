@@ -22,7 +22,7 @@ from core.estimators import (
 )
 from core.estimators.base import FALSE_ALARM, Estimator, RangeImage
 
-__all__ = ["ESTIMATORS", "FALSE_ALARM", "Estimator", "RangeImage", "estimate"]
+__all__ = ["ESTIMATORS", "FALSE_ALARM", "Estimator", "RangeImage", "estimate", "settings_of"]
 
 ESTIMATORS: dict[str, Estimator] = {
     "tracking": tracking.ESTIMATOR,
@@ -73,14 +73,25 @@ def estimate(
         If the method is unknown, a parameter is unknown or out of its bounds, or the method needs
         what the capture does not know.
     """
+    settings = settings_of(method, settings, **parameters)
+    return ESTIMATORS[method](capture, settings, false_alarm)
+
+
+def settings_of(method: str, settings: Any = None, **parameters: Any) -> Any:
+    """A method's settings, from its own dataclass or from single fields, as `estimate` takes them.
+
+    Raises
+    ------
+    ValueError
+        If the method or a parameter is unknown, or one is out of its bounds.
+    """
     require("method", method, method in ESTIMATORS, " or ".join(map(repr, ESTIMATORS)))
-    estimator = ESTIMATORS[method]
+    kind = ESTIMATORS[method].parameters
     if settings is None:
-        known = estimator.parameters.__dataclass_fields__
+        known = kind.__dataclass_fields__
         for name, value in parameters.items():
             require(name, value, name in known, f"one of {list(known)}")
-        settings = estimator.parameters(**parameters)
-    else:
-        fits = isinstance(settings, estimator.parameters) and not parameters
-        require("settings", settings, fits, f"{estimator.parameters.__name__}, or single fields")
-    return estimator(capture, settings, false_alarm)
+        return kind(**parameters)
+    fits = isinstance(settings, kind) and not parameters
+    require("settings", settings, fits, f"{kind.__name__}, or single fields")
+    return settings

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core import posterior
 from core.acquisition import Floats
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, Seen, once_per_capture
 from core.parameters import Number
 from core.posterior import Conditions, Light
 from core.spatial import pooled, pooled_at
@@ -92,6 +92,9 @@ class Estimator:
         Where the original was not available: from what the method was reconstructed.
     null_side : int
         Rows and columns of the echo-free image on which a detection threshold is found.
+    undoes_pile_up : bool
+        Whether the estimator takes counts for first photons and undoes that early ones hide later
+        ones, where the number of pulses is known.
     whole_image : bool
         Whether a pixel's answer depends on pixels beyond its `reach`, so that no part of an image
         can be ranged without the rest.
@@ -107,6 +110,7 @@ class Estimator:
     light: Callable[[Capture], Light] = posterior.light_of
     reconstructed: str = ""
     null_side: int = NULL_SIDE
+    undoes_pile_up: bool = False
     whole_image: bool = False
 
     def __call__(
@@ -129,6 +133,14 @@ class Estimator:
             If `false_alarm` is not within the bounds of `FALSE_ALARM`.
         """
         return self.ranged(capture, parameters, self.calibration(capture, parameters, false_alarm))
+
+    def remark(self, capture: Seen) -> str:
+        """What the estimator leaves out for a capture; empty where nothing."""
+        if not self.undoes_pile_up or capture.armed_pulses is not None:
+            return ""
+        if capture.detection == "all":
+            return "no pile-up is undone: the capture holds all photons, none hides another"
+        return "no pile-up is undone: the number of pulses is not known"
 
     def calibration(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None

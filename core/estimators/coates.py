@@ -33,4 +33,6 @@ def _curve(histogram: Floats, conditions: Conditions, parameters: CoatesParamete
     return np.asarray(amplitude / spread)
 
 
-ESTIMATOR = Estimator("Coates correction, matched filter", CoatesParameters, _curve)
+ESTIMATOR = Estimator(
+    "Coates correction, matched filter", CoatesParameters, _curve, undoes_pile_up=True
+)

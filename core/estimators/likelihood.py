@@ -61,5 +61,10 @@ def curve(histogram: Floats, conditions: Conditions, parameters: LikelihoodParam
 
 
 ESTIMATOR = Estimator(
-    "Likelihood, light estimated", LikelihoodParameters, curve, locate, finds_delay=True
+    "Likelihood, light estimated",
+    LikelihoodParameters,
+    curve,
+    locate,
+    finds_delay=True,
+    undoes_pile_up=True,
 )

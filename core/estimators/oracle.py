@@ -44,4 +44,5 @@ ESTIMATOR = Estimator(
     locate,
     finds_delay=True,
     light=true_light,
+    undoes_pile_up=True,
 )

@@ -337,5 +337,6 @@ ESTIMATOR = Estimator(
     finds_delay=True,
     reconstructed="public descriptions of IEEE Transactions on Computational Imaging 3, 445 (2017)",
     null_side=64,
+    undoes_pile_up=True,
     whole_image=True,
 )

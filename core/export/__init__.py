@@ -1,7 +1,7 @@
 """Captures and answers to files that other software opens: one family of formats a module.
 
 A new format is a module with a ``write(product, file)`` and a line in `WRITERS`. Captures are
-written in the layout of `core.readers.npz`.
+written in the layouts of `core.readers.npz` and `core.readers.labelled`.
 """
 
 from __future__ import annotations
@@ -14,17 +14,26 @@ from typing import BinaryIO
 
 import numpy as np
 
-from core.capture import Capture
+from core.capture import Capture, Seen
 from core.checks import require
 from core.estimators import RangeImage
 from core.export import las, netcdf, npz, pcd, picture, ply, table, tiff
 from core.export.ply import write_ply
 from core.export.product import Product
-from core.export.whole import whole_file
+from core.export.whole import whole_file, whole_folder
+from core.readers.labelled import dataset
 from core.readers.npz import fields
 from core.tracking import TrackingParameters
 
-__all__ = ["WRITERS", "save_capture", "save_image", "save_pixel", "write_ply"]
+__all__ = [
+    "CAPTURE_SUFFIXES",
+    "FOLDER_WRITERS",
+    "WRITERS",
+    "save_capture",
+    "save_image",
+    "save_pixel",
+    "write_ply",
+]
 
 WRITERS: dict[str, Callable[[Product, BinaryIO], None]] = {
     ".npz": npz.write,
@@ -42,6 +51,12 @@ WRITERS: dict[str, Callable[[Product, BinaryIO], None]] = {
 }
 
 
+FOLDER_WRITERS: dict[str, Callable[[Product, Path], None]] = {".zarr": netcdf.write_zarr}
+"""Formats that are folders."""
+
+CAPTURE_SUFFIXES = (".npz", ".nc", ".h5", ".zarr")
+
+
 def save_capture(
     capture: Capture, path: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
@@ -51,7 +66,8 @@ def save_capture(
     ----------
     capture : Capture
     path : path-like
-        A name ending in ``.npz``.
+        A name ending in ``.npz``; ``.nc`` or ``.h5``, netCDF-4, which is HDF5; or ``.zarr``, which
+        is a folder.
     overwrite : bool
         Replace a file of that name.
 
@@ -65,13 +81,23 @@ def save_capture(
         If the folder cannot be written; an older file is then left as it was.
     """
     path = Path(path)
-    require("path", str(path), path.suffix.lower() == ".npz", "a name ending in .npz")
+    suffix = path.suffix.lower()
+    accepted = "one of " + ", ".join(CAPTURE_SUFFIXES)
+    require("suffix", path.suffix, suffix in CAPTURE_SUFFIXES, accepted)
+    if suffix == ".zarr":
+        with whole_folder(path, overwrite=overwrite) as folder:
+            dataset(capture).to_zarr(folder, consolidated=False)
+        return
     with whole_file(path, overwrite=overwrite) as file:
-        np.savez_compressed(file, allow_pickle=False, **fields(capture))
+        if suffix == ".npz":
+            np.savez_compressed(file, allow_pickle=False, **fields(capture))
+        else:
+            compressed = {"counts": {"compression": "gzip", "shuffle": True}}
+            file.write(dataset(capture).to_netcdf(engine="h5netcdf", encoding=compressed))
 
 
 def save_image(
-    capture: Capture,
+    capture: Seen,
     image: RangeImage,
     path: str | os.PathLike[str],
     *,
@@ -86,6 +112,7 @@ def save_image(
     ==================  ===========================================================================
     ``.npz``            NumPy: every array as it is, the acquisition, the source
     ``.nc``, ``.h5``    netCDF-4, which is HDF5: the same, with units
+    ``.zarr``           Zarr, a folder: the same
     ``.csv``            one line a pixel
     ``.tif``, ``.tiff`` three pages of 32-bit floats: ``range_m``, ``confidence``, ``counts``
     ``.ply``, ``.pcd``  point cloud; coordinates as 32-bit floats
@@ -99,7 +126,7 @@ def save_image(
     Parameters
     ----------
     capture : Capture
-        What was ranged.
+        What was ranged, or for one larger than memory what `core.large.as_image` tells of it.
     image : RangeImage
         The answer, of the capture's shape.
     path : path-like
@@ -124,10 +151,15 @@ def save_image(
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    require("suffix", path.suffix, suffix in WRITERS, "one of " + ", ".join(WRITERS))
+    known = [*WRITERS, *FOLDER_WRITERS]
+    require("suffix", path.suffix, suffix in known, "one of " + ", ".join(known))
     if pixel_angle_rad is None:
         pixel_angle_rad = capture.acquisition.pixel_angle_rad
     product = Product(capture, image, pixel_angle_rad, title)
+    if suffix in FOLDER_WRITERS:
+        with whole_folder(path, overwrite=overwrite) as folder:
+            FOLDER_WRITERS[suffix](product, folder)
+        return
     with whole_file(path, overwrite=overwrite) as file:
         WRITERS[suffix](product, file)
 

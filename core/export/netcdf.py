@@ -1,4 +1,4 @@
-"""netCDF-4 with the metadata of the CF conventions; such a file is an HDF5 file, too.
+"""netCDF-4 with the metadata of the CF conventions; such a file is an HDF5 file, too. And Zarr.
 
 Variables ``range_m``, ``confidence``, ``counts``, ``bin``, ``score``, ``valid`` (1 or 0) over the
 dimensions ``row`` and ``col``; acquisition and source are attributes of the file.
@@ -6,27 +6,39 @@ dimensions ``row`` and ``col``; acquisition and source are attributes of the fil
 
 from __future__ import annotations
 
-from typing import Any, BinaryIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.export.product import Plane, Product
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 _FLAGS = {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "no_answer answer"}
 
 
 def write(product: Product, file: BinaryIO) -> None:
     """Write a dataset."""
-    import xarray  # noqa: PLC0415 - only who writes netCDF waits for it
+    file.write(_dataset(product).to_netcdf(engine="h5netcdf"))
+
+
+def write_zarr(product: Product, folder: Path) -> None:
+    """Write a dataset into a folder, as Zarr."""
+    _dataset(product).to_zarr(folder, consolidated=False)
+
+
+def _dataset(product: Product) -> xr.Dataset:
+    import xarray as xr  # noqa: PLC0415 - only who writes netCDF waits for it
 
     variables = {
         name: (("row", "col"), _numbers(plane), _attributes(plane))
         for name, plane in product.planes.items()
     }
     about = {"Conventions": "CF-1.11", "title": product.heading}
-    dataset = xarray.Dataset(variables, attrs={**about, **product.facts})
-    file.write(dataset.to_netcdf(engine="h5netcdf"))
+    return xr.Dataset(variables, attrs={**about, **product.facts})
 
 
 def _numbers(plane: Plane) -> NDArray[Any]:

@@ -39,7 +39,7 @@ def _drawn(product: Product) -> Figure:
     import matplotlib  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    rows, cols = product.capture.shape
+    rows, cols = product.image.range_m.shape
     low_m, high_m = _limits_m(product)
     colors = matplotlib.colormaps["viridis"].with_extremes(
         bad=_WITHOUT_ANSWER, under=_OUTSIDE, over=_OUTSIDE

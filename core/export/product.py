@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.capture import Capture
+from core.capture import Seen
 from core.checks import require
 from core.cloud import Points, points_m
 from core.estimators import RangeImage
@@ -28,7 +28,7 @@ class Product:
 
     Parameters
     ----------
-    capture : Capture
+    capture : Seen
         What was ranged.
     image : RangeImage
         The answer, of the capture's shape.
@@ -43,15 +43,15 @@ class Product:
         If image and capture differ in shape, or the angle is not between 0 and π/2.
     """
 
-    capture: Capture
+    capture: Seen
     image: RangeImage
     pixel_angle_rad: float | None = None
     title: str = ""
 
     def __post_init__(self) -> None:
         shape, angle_rad = self.image.range_m.shape, self.pixel_angle_rad
-        fits = shape == self.capture.shape
-        require("image", f"shape {shape}", fits, f"shape {self.capture.shape}, the capture's")
+        known = self.capture.counts.shape
+        require("image", f"shape {shape}", shape == known, f"shape {known}, the capture's")
         possible = angle_rad is None or 0 < angle_rad < np.pi / 2
         require("pixel_angle_rad", angle_rad, possible, "an angle between 0 and π/2 radians")
 

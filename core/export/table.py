@@ -22,7 +22,7 @@ from core.tracking import TrackingParameters, tracking_signals
 def write(product: Product, file: BinaryIO) -> None:
     """Write row, col, range_m, confidence, counts and valid (1 or 0) of each pixel."""
     image = product.image
-    row, col = np.indices(product.capture.shape)
+    row, col = map(np.asarray, np.indices(image.range_m.shape))
     columns = {
         "row": row,
         "col": col,

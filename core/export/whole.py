@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -47,6 +48,37 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
             _take_free_name(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path, *, overwrite: bool) -> Iterator[Path]:
+    """A folder to be filled, which takes its name only once it is full; like `whole_file`.
+
+    Yields
+    ------
+    Path
+        Where to write.
+    """
+    if path.exists() and not overwrite:
+        raise _refusal(path)
+    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
+    older = path.with_name(f".{secrets.token_hex(8)}.older")
+    try:
+        yield unfinished
+        if overwrite and path.exists():
+            path.rename(older)
+        try:
+            unfinished.rename(path)  # fails where something full of that name came meanwhile
+        except OSError:
+            if older.exists():
+                older.rename(path)
+            raise
+    finally:
+        for rest in (unfinished, older):
+            if rest.is_dir():
+                shutil.rmtree(rest)
+            else:
+                rest.unlink(missing_ok=True)
 
 
 def _refusal(path: Path) -> FileExistsError:

@@ -6,22 +6,35 @@ A new format is a module with a ``read(path, request) -> Capture`` and a line in
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from core.acquisition import Pulse
 from core.capture import Capture, CaptureError, Detection
 from core.checks import require
-from core.readers import matlab, npy, npz
+from core.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820
 from core.readers.guards import MAX_CUBE_BYTES
 from core.readers.request import Request
 
-__all__ = ["MAX_CUBE_BYTES", "READERS", "read_capture"]
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["MAX_CUBE_BYTES", "READERS", "open_capture", "read_capture"]
 
 READERS: dict[str, Callable[[Path, Request], Capture]] = {
     ".npz": npz.read,
     ".npy": npy.read,
     ".mat": matlab.read,
+    ".h5": labelled.read,
+    ".hdf5": labelled.read,
+    ".nc": labelled.read,
+    ".zarr": labelled.read,
+    ".bin": gmapd.read,
+    ".ptu": ptu.read,
+    ".sdt": sdt.read,
+    ".json": tmf8820.read,
 }
 
 
@@ -46,13 +59,13 @@ def read_capture(
     """Read a capture from a file; its suffix tells the format.
 
     What is None comes from the file, or is guessed where the file does not say; ``.source`` of the
-    answer tells every guess. `core.readers.npz`, `npy` and `matlab` describe the formats,
+    answer tells every guess. The modules of `core.readers` describe the formats,
     `core.readers.arrivals` the rules for guessing.
 
     Parameters
     ----------
     path : path-like
-        An ``.npz``, ``.npy`` or ``.mat`` file.
+        A file with one of the suffixes in `READERS`, or a ``.zarr`` directory.
     time_unit_s : float, optional
         Unit of the arrival times in seconds; only for a file that holds such.
     bin_width_s : float, optional
@@ -81,8 +94,8 @@ def read_capture(
         For common-stop instruments: times count backwards from this time after the pulse, often
         the laser's period.
     no_trigger : int, optional
-        For raw frames (pulse, row, col) of trigger bins: what stands where nothing fired. Tells a
-        ``.npy`` file's array to be such frames.
+        For raw frames (pulse, row, col) of trigger bins: what stands where nothing fired. Tells the
+        array of a ``.npy`` or ``.npz`` file to be such frames.
     first_detections : int, optional
         Keep so many detections of each pixel, in the order of the file; only for a file that lists
         photons.
@@ -98,10 +111,7 @@ def read_capture(
         and the remedy.
     """
     path = Path(path)
-    try:
-        require("path", str(path), path.is_file(), "an existing file")
-        suffix = path.suffix.lower()
-        require("suffix", path.suffix, suffix in READERS, "one of " + ", ".join(READERS))
+    with _refusing(path):
         request = Request(
             time_unit_s=time_unit_s,
             bin_width_s=bin_width_s,
@@ -118,10 +128,59 @@ def read_capture(
             no_trigger=no_trigger,
             first_detections=first_detections,
         )
-        return READERS[suffix](path, request)
+        return READERS[_suffix(path)](path, request)
+
+
+def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
+    """Open a capture without reading its counts, as one larger than memory must be.
+
+    Parameters
+    ----------
+    path : path-like
+        As of `read_capture`. HDF5, netCDF-4 and Zarr are read as they are asked for, whatever their
+        size; other files are read at once.
+    **options
+        As of `read_capture`.
+
+    Returns
+    -------
+    DataArray, shape (row, col, bin)
+        Counts of type uint8, uint16 or uint32 with the attributes and coordinates of
+        `core.readers.labelled`, so that `core.readers.labelled.describe` has nothing left to guess:
+        its ``source`` tells what was guessed here. Where the number of pulses is known, all of it
+        is taken for first photons unless ``detection`` is told: nobody counted. A number that is no
+        count raises `CaptureError` when it is read.
+
+    Raises
+    ------
+    CaptureError
+        As `read_capture`.
+    """
+    path = Path(path)
+    with _refusing(path):
+        request = Request(**options)
+        if _suffix(path) in labelled.LAZY:
+            return labelled.open_counts(path, request)
+        return labelled.dataset(READERS[_suffix(path)](path, request))["counts"]
+
+
+def _suffix(path: Path) -> str:
+    """The suffix of a file that exists, in small letters, if it is known."""
+    suffix = path.suffix.lower()
+    there = path.is_file() or (suffix == ".zarr" and path.is_dir())
+    require("path", str(path), there, "an existing file")
+    require("suffix", path.suffix, suffix in READERS, "one of " + ", ".join(READERS))
+    return suffix
+
+
+@contextmanager
+def _refusing(path: Path) -> Iterator[None]:
+    """Turn whatever goes wrong with a file into the one type of error that is promised."""
+    try:
+        yield
     except ValueError as error:
         raise CaptureError(f"{path.name}: {error}") from error
-    except Exception as error:  # from a closed folder to memory too small: the promise is one type
+    except Exception as error:  # from a closed folder to memory too small
         raise CaptureError(
             f"{path.name}: cannot be read ({type(error).__name__}: {error}): "
             "give a whole file that may be opened and fits in memory."

@@ -12,7 +12,8 @@ unit here.
 
 The gate. From the first photon, rounded down to a multiple of the bin width, to the last.
 
-The pulse. A Gaussian of one bin width. The number of pulses stays unknown.
+The pulse. A Gaussian as wide as `core.readers.pulse_guess` finds the echoes, or of one bin width.
+The number of pulses stays unknown.
 
 A common-stop instrument's times count backwards from ``stop_s``; a time in whole units stands for
 all of its unit, so the last one before the stop becomes the first after the pulse.
@@ -26,11 +27,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.acquisition import Acquisition, Floats, Pulse
+from core.acquisition import Acquisition, Floats
 from core.capture import Capture
 from core.checks import require
 from core.readers.dense import count_dtype, guess_detection
 from core.readers.guards import require_fits
+from core.readers.pulse_guess import guessed_pulse
 from core.readers.request import Request
 from core.readers.wording import guesses, sentence, time_text
 
@@ -40,7 +42,7 @@ SECONDS_BELOW = 1e-3
 FEWEST_BINS_OF_1_NS = 100
 MOST_BINS = 1024
 
-_BYTES_A_PHOTON = 64  # of working memory: its time, pixel, bin and place, before and after sorting
+BYTES_A_PHOTON = 64  # of working memory: its time, pixel, bin and place, before and after sorting
 _LARGEST_TICK = 2**53  # beyond, a float skips whole numbers
 
 
@@ -99,7 +101,7 @@ def arrivals_capture(
         pixel_angle_rad=request.pixel_angle_rad,
     )
     cube = _cube(bins[inside].astype(np.int64), pixel[inside], shape, n_bins, name)
-    pulse = request.pulse or Pulse.gaussian(acquisition.bin_width_s)
+    pulse = request.pulse or guessed_pulse(cube, acquisition.bin_width_s)
     detection = request.detection or guess_detection(cube, request.n_pulses)
     guessed = guesses(request, acquisition, pulse, detection, unit_s)
     source = sentence(origin, guessed, _dropped(inside))
@@ -187,7 +189,7 @@ def _require_times(
     kind = times.dtype
     require(f"type of {name}", str(kind), kind.kind in "biuf", "real numbers")
     require(f"photons of {name}", times.size, times.size > 0, "at least one photon")
-    require_fits(f"{times.size:,} photons", times.size * _BYTES_A_PHOTON)
+    require_fits(f"{times.size:,} photons", times.size * BYTES_A_PHOTON)
     odd = np.flatnonzero(~((times >= 0) & (times < np.inf)))
     if odd.size:
         row, col = divmod(int(pixel[odd[0]]), shape[1])

@@ -1,8 +1,8 @@
 """A histogram cube of any number type, and what is guessed where only the cube is known.
 
 Unless told otherwise, the axes are (row, col, bin), bins are 1 ns wide, the gate opens with the
-pulse, and an echo is a Gaussian of one bin. A common-stop instrument's bins (``stop_s``) are turned
-round.
+pulse, and the echo is what `core.readers.pulse_guess` makes of the counts. A common-stop
+instrument's bins (``stop_s``) are turned round.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Pulse
-from core.capture import Capture, Detection
+from core.capture import COUNT_TYPES, Capture, Detection
 from core.checks import require
 from core.readers.guards import require_fits
+from core.readers.pulse_guess import guessed_pulse
 from core.readers.request import Request
 from core.readers.wording import guesses, sentence
 
@@ -26,8 +27,12 @@ AXES = ("row", "col", "bin")
 _LARGEST_COUNT = 2**32 - 1
 
 
-def whole_counts(cube: NDArray[Any], name: str) -> NDArray[np.unsignedinteger]:
-    """The cube as uint16, or uint32 where a count exceeds 65535; never a view of `cube`.
+def whole_counts(
+    cube: NDArray[Any], name: str, dtype: np.dtype[np.unsignedinteger] | None = None
+) -> NDArray[np.unsignedinteger]:
+    """The cube as `dtype`, never a view of it.
+
+    Without `dtype` as uint16, or uint32 where a count exceeds 65535.
 
     Raises
     ------
@@ -38,12 +43,20 @@ def whole_counts(cube: NDArray[Any], name: str) -> NDArray[np.unsignedinteger]:
     lowest, highest = cube.min().item(), cube.max().item()
     require(name, lowest, lowest >= 0, "counts, 0 or more")
     require(name, highest, highest <= _LARGEST_COUNT, f"counts up to {_LARGEST_COUNT:,}")
-    dtype = count_dtype(highest)
+    dtype = dtype or count_dtype(highest)
     require_fits(name, cube.size * dtype.itemsize)
     counts = np.array(cube, dtype, order="C")
     if cube.dtype.kind == "f" and not np.array_equal(counts, cube):
         require(name, cube[counts != cube][0].item(), False, "whole counts")
     return counts
+
+
+def stored_counts(cube: NDArray[Any], name: str) -> NDArray[np.unsignedinteger]:
+    """The cube in its own type where that is one for counts, as of `whole_counts` elsewhere."""
+    if cube.dtype.newbyteorder("=") not in COUNT_TYPES:
+        return whole_counts(cube, name)
+    require_cube(cube, name)
+    return np.ascontiguousarray(cube, cube.dtype.newbyteorder("="))
 
 
 def require_cube(cube: NDArray[Any], name: str) -> None:
@@ -59,7 +72,12 @@ def count_dtype(highest: float) -> np.dtype[np.unsignedinteger]:
 
 
 def cube_capture(
-    cube: NDArray[Any], name: str, origin: str, request: Request, axes: str | None = None
+    cube: NDArray[Any],
+    name: str,
+    origin: str,
+    request: Request,
+    axes: str | None = None,
+    guessed_bin_width_s: float | None = None,
 ) -> Capture:
     """A capture from an array of counts, its axes in the order that is told or in the usual one.
 
@@ -70,6 +88,8 @@ def cube_capture(
         What to call the array in a refusal, and the capture in its source.
     axes : str, optional
         The order of the file's own axes, where it tells.
+    guessed_bin_width_s : float, optional
+        Taken where none is told.
     """
     request = replace(request, axes=request.axes or axes)
     order = request.order(AXES)
@@ -77,15 +97,22 @@ def cube_capture(
         require_cube(cube, name)
         cube = cube.transpose(order)
     guessed = [] if order else [f"axes ({', '.join(AXES)})"]
-    return dense_capture(whole_counts(cube, name), origin, request, also_guessed=guessed)
+    return dense_capture(
+        whole_counts(cube, name),
+        origin,
+        request,
+        also_guessed=guessed,
+        guessed_bin_width_s=guessed_bin_width_s,
+    )
 
 
 def dense_capture(
     counts: NDArray[np.unsignedinteger],
     origin: str,
     request: Request,
-    guessed_pulse: Pulse | None = None,
+    assumed_pulse: Pulse | None = None,
     also_guessed: Sequence[str] = (),
+    guessed_bin_width_s: float | None = None,
 ) -> Capture:
     """A capture from a histogram cube and what is known of it.
 
@@ -94,17 +121,19 @@ def dense_capture(
     counts : ndarray, shape (row, col, bin)
     origin : str
         What to call the capture in its source.
-    guessed_pulse : Pulse, optional
-        Taken where none is given, in place of a Gaussian of one bin.
+    assumed_pulse : Pulse, optional
+        Taken where none is given, in place of one that the counts tell of.
     also_guessed : sequence of str
         What was guessed before.
+    guessed_bin_width_s : float, optional
+        Taken where none is given, in place of 1 ns.
     """
     asked, n_bins = request.n_bins, counts.shape[2]
     request.refuse(["time_unit_s"], "a histogram cube takes bin_width_s alone")
     request.refuse(["first_detections"], "a histogram cube keeps no order of its photons")
     request.refuse(["shape", "no_trigger"], "a histogram cube tells its pixels")
     require("n_bins", asked, asked in (None, n_bins), f"{n_bins}, the cube's last axis, or None")
-    bin_width_s = 1e-9 if request.bin_width_s is None else request.bin_width_s
+    bin_width_s = request.bin_width_s or guessed_bin_width_s or 1e-9
     opens_s = 0.0
     if request.stop_s is not None:
         counts, opens_s = counts[:, :, ::-1].copy(), request.stop_s - n_bins * bin_width_s
@@ -115,7 +144,7 @@ def dense_capture(
         n_pulses=request.n_pulses,
         pixel_angle_rad=request.pixel_angle_rad,
     )
-    pulse = request.pulse or guessed_pulse or Pulse.gaussian(acquisition.bin_width_s)
+    pulse = request.pulse or assumed_pulse or guessed_pulse(counts, acquisition.bin_width_s)
     detection = request.detection or guess_detection(counts, request.n_pulses)
     guessed = guesses(replace(request, n_bins=n_bins), acquisition, pulse, detection)
     source = sentence(origin, [*also_guessed, *guessed])

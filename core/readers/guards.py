@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from core.capture import CaptureError
 from core.checks import require
@@ -11,6 +22,10 @@ from core.checks import require
 # Largest cube, file, and decompressed part of a file. Checked before memory is asked for: a header
 # of a hundred bytes can claim any size.
 MAX_CUBE_BYTES = 2 * 1024**3
+
+# What a process may take that looks at a file for us; on Windows, the time alone is limited.
+MAX_CHILD_BYTES = 2 * 1024**3
+MAX_CHILD_SECONDS = 120
 
 
 def require_fits(name: str, n_bytes: int, remedy: str = "a smaller file") -> None:
@@ -32,3 +47,61 @@ def decoding(what: str) -> Iterator[None]:
         raise CaptureError(
             f"{what} cannot be read, the file is damaged ({reason}): copy or save it again."
         ) from error
+
+
+def isolated(script: Path, what: str, *arguments: str) -> tuple[Any, dict[str, NDArray[Any]]]:
+    """Run a script in a process of its own, which may crash, hang or swell in place of this one.
+
+    Parameters
+    ----------
+    script : Path
+        Limits itself to the bytes and seconds that are its first two arguments, and writes an
+        ``.npz`` to its standard output: ``_told``, a JSON text, and other arrays. In place of an
+        answer the text may have ``refused``, a sentence, or an ``error``.
+    what : str
+        What to call in a refusal that which it reads.
+    arguments : str
+        The script's others.
+
+    Returns
+    -------
+    told : object
+        What the JSON text says.
+    arrays : dict of ndarray
+
+    Raises
+    ------
+    ValueError
+        If the script refuses, takes more than it may, or ends otherwise.
+    """
+    limits = (str(MAX_CHILD_BYTES), str(MAX_CHILD_SECONDS))
+    command = [sys.executable, "-I", str(script), *limits, *arguments]
+    # Each thread of a linear algebra that nobody asked for would reserve memory of its own. And no
+    # plugin is loaded that a file may name.
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}
+    remedy = "a whole file: copy or save it again"
+    with tempfile.TemporaryFile() as answer:
+        try:
+            status = subprocess.run(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=answer,
+                stderr=subprocess.DEVNULL,
+                timeout=MAX_CHILD_SECONDS,
+                env=environment,
+                check=False,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            found = f"{what} = more than {MAX_CHILD_SECONDS} s to look at is not accepted: give"
+            raise CaptureError(f"{found} {remedy}.") from None
+        ending = signal.Signals(-status).name if status < 0 else f"status {status}"
+        require(what, f"its library ended by {ending}", status == 0, remedy)
+        answer.seek(0)
+        with decoding(what), np.load(answer, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+            told = json.loads(str(arrays.pop("_told")))
+    if "refused" in told:
+        raise CaptureError(told["refused"])
+    if "error" in told:
+        raise CaptureError(f"{what} cannot be read ({told['error']}): give {remedy}.")
+    return told, arrays

@@ -6,20 +6,33 @@ stands in the attributes of the counts, under the names and with the meaning of 
 
 Arrays of others open too. Their axes are known by the names below, or by ``axes``; bins by any
 coordinate along them whose ``units`` are a time's or metres, or whose name ends in such a unit.
+Where a file names no axes, as plain HDF5 does not, they are guessed to be (row, col, bin).
+
+Unsigned counts of 8, 16 or 32 bits keep their type. Others are checked when they are read, and are
+uint16 or uint32 in a capture, uint32 in an array that is opened but not read.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from core.acquisition import Acquisition, Floats, Pulse
-from core.capture import Capture, Detection
+from core.capture import COUNT_TYPES, Capture, CaptureError, Detection
 from core.checks import require
-from core.readers.dense import AXES
+from core.readers import hdf5, netcdf3, zarr
+from core.readers.dense import AXES, guess_detection, stored_counts, whole_counts
+from core.readers.guards import require_fits
+from core.readers.pulse_guess import guessed_pulse
 from core.readers.request import Request
+from core.readers.stored import Numbers, Stored, choose, whole
 from core.readers.wording import guesses, sentence
 
 if TYPE_CHECKING:
@@ -37,6 +50,20 @@ UNITS_S["m"] = UNITS_S["metre"] = UNITS_S["meter"] = 2 / speed_of_light
 """Seconds of the light's way there and back, for each unit of a coordinate along the bins."""
 
 
+LAZY = (".h5", ".hdf5", ".nc", ".zarr")
+"""Suffixes of what `open_counts` opens without reading it."""
+
+BLOCK_BYTES = 2**24
+"""About what a block of an array takes that is opened, not read."""
+
+_LONGEST = 2**20  # coordinate that is read
+_MOST_COORDINATES = 100
+_OF_ENCODING = (
+    *("_FillValue", "missing_value", "scale_factor", "add_offset", "coordinates"),
+    *("_ARRAY_DIMENSIONS", "_NCProperties"),
+)
+
+
 class Description(NamedTuple):
     """What is known of an array of counts without looking at them."""
 
@@ -46,35 +73,226 @@ class Description(NamedTuple):
     source: str
 
 
+@dataclass(frozen=True)
+class Counts:
+    """An array of a file as counts, checked as they are read.
+
+    Parameters
+    ----------
+    numbers : Numbers
+        With three axes.
+    name, file : str
+        What to call the array and the file in a refusal.
+    missing : float or None
+        What stands for a number that is not there.
+    """
+
+    numbers: Numbers
+    name: str
+    file: str
+    missing: float | None = None
+    ndim = len(AXES)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Size along each axis, in the order of the file."""
+        return self.numbers.shape
+
+    @property
+    def dtype(self) -> np.dtype[np.unsignedinteger]:
+        """The file's own where it is one for counts, uint32 elsewhere."""
+        stored = self.numbers.dtype.newbyteorder("=")
+        return stored if stored in COUNT_TYPES else np.dtype(np.uint32)
+
+    def __getitem__(self, key: tuple[int | slice, ...]) -> NDArray[np.unsignedinteger]:
+        """The counts at whole numbers and slices; raises `CaptureError` where one is none."""
+        boxes, within = zip(*map(_box, key, self.shape), strict=True)
+        try:
+            found = self.read(boxes)
+            if found.dtype != self.dtype and found.size:
+                found = whole_counts(found, self.name, self.dtype)
+        except ValueError as error:
+            raise CaptureError(f"{self.file}: {error}") from error
+        return found.astype(self.dtype, copy=False)[within]
+
+    def read(self, box: tuple[slice, ...]) -> NDArray[Any]:
+        """The numbers in a box of slices, none of them missing."""
+        found = self.numbers[box]
+        gaps = self.missing is not None and bool((found == self.missing).any())
+        require(f"_FillValue of {self.name}", self.missing, not gaps, "counts without gaps")
+        return found
+
+
+def _box(key: int | slice, size: int) -> tuple[slice, int | slice]:
+    """The slice of step 1 that an index along an axis lies in, and the index within it."""
+    if not isinstance(key, slice):
+        place = range(size)[key]
+        return slice(place, place + 1), 0
+    picked = range(*key.indices(size))
+    if not picked:
+        return slice(0, 0), slice(None)
+    low, high = sorted((picked[0], picked[-1]))
+    return slice(low, high + 1), slice(None, None, picked.step)
+
+
+class _File:
+    """The arrays of a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.arrays, self.groups = _arrays(path)
+
+    def origin(self, chosen: Stored) -> str:
+        """What to call a capture in its source."""
+        return f"{self.path.name}, variable {chosen.name}"
+
+    def counts(self, chosen: Stored) -> Counts:
+        """An array as counts."""
+        known = chosen.attributes
+        for name, plain in (("scale_factor", 1.0), ("add_offset", 0.0)):
+            value = _number(known, name)
+            require(f"{name} of {chosen.name}", value, value in (None, plain), "counts as they are")
+        require(f"axes of {chosen.name}", chosen.n_axes, chosen.n_axes == 3, "row, col and bin")
+        assert chosen.numbers is not None
+        missing = _number(known, "_FillValue")
+        return Counts(chosen.numbers, chosen.name, self.path.name, missing)
+
+    def labelled(self, chosen: Stored, data: Any, request: Request) -> xr.DataArray:
+        """Counts with the names, coordinates and attributes that the file gives them."""
+        import xarray as xr  # noqa: PLC0415
+
+        group, _, name = chosen.name.rpartition("/")
+        dims = _named_axes(chosen, request)
+        require(f"axes of {name}", dims, len({*dims}) == len(dims), "each name once")
+        along = [
+            one
+            for one in self.arrays
+            if one.name.rpartition("/")[0] == group
+            and one.numbers is not None
+            and one.n_axes == 1
+            and one.axes[0] in dims
+            and one.numbers.shape[0] == data.shape[dims.index(one.axes[0])] <= _LONGEST
+        ]
+        require("coordinates", len(along), len(along) <= _MOST_COORDINATES, "fewer")
+        beside = {
+            one.name.rpartition("/")[2]: (one.axes, whole(one.numbers), dict(one.attributes))
+            for one in along
+            if one.numbers is not None
+        }
+        inherited = dict(self.groups.get("", {})) | self.groups.get(group, {})
+        known = {
+            key: value
+            for key, value in (inherited | dict(chosen.attributes)).items()
+            if key not in _OF_ENCODING
+        }
+        coords = xr.Coordinates(beside, indexes={})
+        return xr.DataArray(data, coords=coords, dims=dims, name=name, attrs=known)
+
+    def image(self, chosen: Stored, name: str, request: Request) -> Floats | None:
+        """An array (row, col) beside the counts, None where there is none."""
+        prefix = chosen.name.removesuffix("counts")
+        dims = _named_axes(chosen, request)
+        places = _places(dims, request, chosen.name)
+        row, col = (dims[k] for k in places[:2])
+        for one in self.arrays:
+            if one.name == prefix + name and one.n_axes == 2 and one.numbers is not None:
+                values = whole(one.numbers).astype(float)
+                return values.T if one.axes == (col, row) else values
+        return None
+
+
+def read(path: Path, request: Request) -> Capture:
+    """Read counts and, from a file of our own layout, the truth beside them."""
+    file = _File(path)
+    chosen = choose(file.arrays, request)
+    every = (slice(None),) * len(AXES)
+    cube = stored_counts(file.counts(chosen).read(every), chosen.name)
+    counts = oriented(file.labelled(chosen, cube, request), request)
+    known = describe(counts, request, file.origin(chosen), _guessed(chosen, request))
+    ours = chosen.name.rpartition("/")[2] == "counts"
+    return Capture(
+        np.ascontiguousarray(counts.data),
+        known.acquisition,
+        known.pulse,
+        truth_range_m=file.image(chosen, "truth_range_m", request) if ours else None,
+        signal=file.image(chosen, "signal", request) if ours else None,
+        background=_number(counts.attrs, "background") if ours else None,
+        source=known.source,
+        detection=known.detection,
+    )
+
+
+def open_counts(path: Path, request: Request) -> xr.DataArray:
+    """Counts of which none is read before it is asked for; `describe` has nothing left to guess.
+
+    Parameters
+    ----------
+    path : Path
+        Of an HDF5 or netCDF file, or a Zarr directory.
+    request : Request
+
+    Returns
+    -------
+    DataArray, shape (row, col, bin)
+        A dask array in blocks of whole chunks, some `BLOCK_BYTES` large, all bins in one block. A
+        number that is no count raises `CaptureError` when its block is read.
+    """
+    import dask.array as da  # noqa: PLC0415
+
+    file = _File(path)
+    chosen = choose(file.arrays, request)
+    numbers = file.counts(chosen)
+    time_axis = _places(_named_axes(chosen, request), request, chosen.name)[2]
+    lazy = da.from_array(
+        numbers,
+        chunks=_blocks(numbers, time_axis),
+        name=False,  # a hash would have to read it all
+        meta=np.empty((0, 0, 0), numbers.dtype),
+    )
+    counts = oriented(file.labelled(chosen, lazy, request), request)
+    known = describe(counts, request, file.origin(chosen), _guessed(chosen, request))
+    return completed(counts, known)
+
+
+def _arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
+    if path.is_dir():
+        return zarr.arrays(path)
+    with path.open("rb") as file:
+        start = file.read(4)
+    return netcdf3.arrays(path) if start in netcdf3.SIGNATURES else hdf5.arrays(path)
+
+
+def _named_axes(chosen: Stored, request: Request) -> tuple[str, ...]:
+    """Names of an array's axes, where the file gives none those that are guessed."""
+    if _guessed(chosen, request):
+        return AXES
+    return tuple(name or f"axis_{k}" for k, name in enumerate(chosen.axes))
+
+
+def _guessed(chosen: Stored, request: Request) -> list[str]:
+    """The guess at the axes, where neither the file nor the request names any."""
+    nameless = chosen.n_axes == len(AXES) and not any(chosen.axes) and request.axes is None
+    return [f"axes ({', '.join(AXES)})"] if nameless else []
+
+
+def _blocks(counts: Counts, time_axis: int) -> tuple[int, ...]:
+    """Whole chunks together, all bins and as many pixels as some `BLOCK_BYTES` hold."""
+    block = list(counts.numbers.chunk)
+    block[time_axis] = counts.shape[time_axis]
+    for axis in reversed(range(len(block))):
+        n_bytes = prod(block) * counts.dtype.itemsize
+        block[axis] = min(counts.shape[axis], block[axis] * max(1, BLOCK_BYTES // n_bytes))
+    require_fits(f"a block of {counts.name} with all its bins", prod(block) * counts.dtype.itemsize)
+    return tuple(block)
+
+
 def dataset(capture: Capture) -> xr.Dataset:
     """A capture as an array ``counts``, with ``truth_range_m`` and ``signal`` where known."""
     import xarray as xr  # noqa: PLC0415 - half a second that reading a .npz should not pay
 
-    acquisition, pulse = capture.acquisition, capture.pulse
-    opens = np.arange(acquisition.n_bins)
-    time_s = acquisition.gate_delay_s + opens * acquisition.bin_width_s
-    known: dict[str, Any] = {
-        "long_name": "detections",
-        "bin_width_s": acquisition.bin_width_s,
-        "gate_delay_s": acquisition.gate_delay_s,
-        "n_pulses": acquisition.n_pulses,
-        "pixel_angle_rad": acquisition.pixel_angle_rad,
-        "pulse_shape": pulse.shape,
-        "pulse_tau_s": pulse.tau_s,
-        "pulse_samples": list(pulse.samples) or None,
-        "background": capture.background,
-        "detection": capture.detection,
-        "source": capture.source or None,
-    }
-    counts = xr.DataArray(
-        capture.cube,
-        dims=AXES,
-        coords={
-            "time_s": ("bin", time_s, {"units": "s", "long_name": "time after the pulse"}),
-            "range_m": ("bin", acquisition.bin_to_range_m(opens), {"units": "m"}),
-        },
-        attrs={name: value for name, value in known.items() if value is not None},
-    )
+    counts = xr.DataArray(capture.cube, dims=AXES, attrs={"long_name": "detections"})
+    if capture.background is not None:
+        counts.attrs["background"] = capture.background
     images = {
         name: (AXES[:2], image, {"units": unit})
         for name, image, unit in (
@@ -83,44 +301,101 @@ def dataset(capture: Capture) -> xr.Dataset:
         )
         if image is not None
     }
-    return xr.Dataset({"counts": counts, **images})
+    known = Description(capture.acquisition, capture.pulse, capture.detection, capture.source)
+    return xr.Dataset({"counts": completed(counts, known), **images})
+
+
+def completed(counts: xr.DataArray, known: Description) -> xr.DataArray:
+    """Counts (row, col, bin) whose attributes and coordinates tell all of a description."""
+    acquisition, pulse = known.acquisition, known.pulse
+    opens = np.arange(acquisition.n_bins)
+    time_s = acquisition.gate_delay_s + opens * acquisition.bin_width_s
+    told: dict[str, Any] = {
+        "bin_width_s": acquisition.bin_width_s,
+        "gate_delay_s": acquisition.gate_delay_s,
+        "n_pulses": acquisition.n_pulses,
+        "pixel_angle_rad": acquisition.pixel_angle_rad,
+        "pulse_shape": pulse.shape,
+        "pulse_tau_s": pulse.tau_s,
+        "pulse_samples": list(pulse.samples) or None,
+        "detection": known.detection,
+        "source": known.source or None,
+    }
+    others = {name: value for name, value in counts.attrs.items() if name not in told}
+    coordinates = {
+        "time_s": ("bin", time_s, {"units": "s", "long_name": "time after the pulse"}),
+        "range_m": ("bin", acquisition.bin_to_range_m(opens), {"units": "m"}),
+    }
+    labelled = counts.drop_vars([name for name in coordinates if name in counts.coords])
+    labelled = labelled.assign_coords(coordinates)
+    labelled.attrs = others | {name: value for name, value in told.items() if value is not None}
+    return labelled
 
 
 def oriented(counts: xr.DataArray, request: Request) -> xr.DataArray:
     """The array with its axes named and ordered (row, col, bin).
+
+    A common-stop instrument's bins (``stop_s``) are turned round.
 
     Raises
     ------
     ValueError
         If it has not three axes, or they are named otherwise and ``axes`` is not told.
     """
-    name = counts.name or "the array"
-    require(f"axes of {name}", counts.dims, counts.ndim == 3, "three: row, col and bin")
+    import xarray as xr  # noqa: PLC0415
+
+    dims = tuple(map(str, counts.dims))
+    found = [counts.dims[k] for k in _places(dims, request, str(counts.name or "the array"))]
+    # What lies along an axis keeps its own name where the axis gets another.
+    along = dict(zip(found, AXES, strict=True))
+    beside = {
+        name: (
+            [along.get(dim, dim) for dim in coordinate.dims],
+            coordinate.data,
+            _with_unit(str(name), coordinate.attrs),
+        )
+        for name, coordinate in counts.coords.items()
+    }
+    bare = counts.drop_vars(list(beside)).transpose(*found)
+    named = bare.rename({old: new for old, new in along.items() if old != new})
+    labelled = named.assign_coords(xr.Coordinates(beside, indexes={}))
+    return labelled if request.stop_s is None else labelled.isel(bin=slice(None, None, -1))
+
+
+def _places(dims: tuple[str, ...], request: Request, name: str) -> tuple[int, ...]:
+    """Where row, col and bin lie among the axes of an array."""
+    require(f"axes of {name}", dims, len(dims) == 3, "three: row, col and bin")
     order = request.order(AXES)
     if order is not None:
-        found = [counts.dims[place] for place in order]
-    else:
-        known = {alias: axis for axis, aliases in NAMES.items() for alias in aliases}
-        named = {known.get(str(dim).lower()): dim for dim in counts.dims}
-        told = "names row, col and bin, or as axes their order in the file"
-        require(f"axes of {name}", counts.dims, named.keys() == set(AXES), told)
-        found = [named[axis] for axis in AXES]
-    # Coordinates of an axis go by its old name; as variables of their own they keep it.
-    renamed = counts.transpose(*found).reset_index([d for d in found if d in counts.indexes])
-    return renamed.rename({old: new for old, new in zip(found, AXES, strict=True) if old != new})
+        return order
+    known = {alias: axis for axis, aliases in NAMES.items() for alias in aliases}
+    named = {known.get(dim.lower()): k for k, dim in enumerate(dims)}
+    told = "names row, col and bin, or as axes their order in the file"
+    require(f"axes of {name}", dims, named.keys() == set(AXES), told)
+    return tuple(named[axis] for axis in AXES)
 
 
-def describe(counts: xr.DataArray, request: Request, origin: str = "") -> Description:
+def _with_unit(name: str, known: Mapping[Any, Any]) -> dict[Any, Any]:
+    """The attributes of a coordinate, with the unit that its name ends in where they have none."""
+    unit = _unit_of(name)
+    return ({"units": unit} if unit in UNITS_S else {}) | dict(known)
+
+
+def describe(
+    counts: xr.DataArray, request: Request, origin: str = "", also_guessed: Sequence[str] = ()
+) -> Description:
     """What the request, the attributes and the coordinates tell of counts; the rest is guessed.
 
     Parameters
     ----------
     counts : DataArray, shape (row, col, bin)
-        As `oriented` gives them; none is looked at.
+        As `oriented` gives them; looked at only where they are in memory.
     request : Request
         Goes before what the array says.
     origin : str
         What to call the capture, where it does not say itself.
+    also_guessed : sequence of str
+        What was guessed before.
 
     Raises
     ------
@@ -129,17 +404,27 @@ def describe(counts: xr.DataArray, request: Request, origin: str = "") -> Descri
     """
     known = counts.attrs
     request.refuse(["time_unit_s", "first_detections"], "labelled counts know their bins")
-    request.refuse(["shape", "no_trigger", "stop_s"], "labelled counts know their axes")
+    request.refuse(["shape", "no_trigger"], "labelled counts know their axes")
     n_bins = counts.sizes["bin"]
     require("n_bins", request.n_bins, request.n_bins in (None, n_bins), f"{n_bins} or None")
-    timing = _timing(counts)
+    times = _times(counts)
+    known_times = str(times.name) if times is not None else None
+    require(
+        "stop_s",
+        request.stop_s,
+        None in (request.stop_s, known_times),
+        f"None: {known_times} tells",
+    )
+    timing = {} if times is None else _timing(times)
     told: dict[str, Any] = {
         name: _number(known, name) if getattr(request, name) is None else getattr(request, name)
         for name in ("bin_width_s", "gate_delay_s", "n_pulses", "pixel_angle_rad")
     }
-    told["bin_width_s"] = told["bin_width_s"] or timing.get("bin_width_s")
-    if told["gate_delay_s"] is None:
-        told["gate_delay_s"] = timing.get("gate_delay_s")
+    told |= {name: value for name, value in timing.items() if told[name] is None}
+    if request.stop_s is not None and request.gate_delay_s is None:
+        opens = told["gate_delay_s"]
+        require("stop_s", request.stop_s, opens is None, f"None: bins open {opens} s after a pulse")
+        told["gate_delay_s"] = request.stop_s - n_bins * (told["bin_width_s"] or 1e-9)
     if told["n_pulses"] is not None:
         whole = float(told["n_pulses"]).is_integer() and told["n_pulses"] >= 0
         require("n_pulses", told["n_pulses"], whole, "a whole number, 0 if not known")
@@ -154,31 +439,46 @@ def describe(counts: xr.DataArray, request: Request, origin: str = "") -> Descri
         n_pulses=complete.n_pulses,
         pixel_angle_rad=complete.pixel_angle_rad,
     )
+    in_memory = isinstance(counts.data, np.ndarray)
+    width_s = acquisition.bin_width_s
     if pulse is None:
-        pulse = Pulse.gaussian(acquisition.bin_width_s)
-    if detection is None:
+        pulse = guessed_pulse(counts.data, width_s) if in_memory else Pulse.gaussian(width_s)
+    if detection is None and in_memory:
+        detection = guess_detection(counts.data, acquisition.n_pulses)
+    elif detection is None:
         detection = "all" if acquisition.n_pulses is None else "first"
-    guessed = guesses(complete, acquisition, pulse, detection)
+    guessed = [*also_guessed, *guesses(complete, acquisition, pulse, detection)]
     return Description(
         acquisition, pulse, detection, sentence(str(known.get("source", origin)), guessed)
     )
 
 
-def _timing(counts: xr.DataArray) -> dict[str, float]:
-    """Bin width and gate delay, from the first coordinate along the bins that tells of time."""
+def _times(counts: xr.DataArray) -> xr.DataArray | None:
+    """The first coordinate along the bins that tells of time or range."""
+    coordinate: xr.DataArray
     for name, coordinate in counts.coords.items():
-        unit_s = UNITS_S.get(str(coordinate.attrs.get("units", str(name).rpartition("_")[2])))
-        if coordinate.dims != ("bin",) or unit_s is None or coordinate.dtype.kind not in "iuf":
-            continue
-        opens_s: Floats = np.asarray(coordinate, float) * unit_s
-        if opens_s.size < 2:
-            return {"gate_delay_s": float(opens_s[0])}
-        width_s = float(opens_s[-1] - opens_s[0]) / (opens_s.size - 1)
-        uneven = float(np.abs(np.diff(opens_s) - width_s).max())
-        even = width_s > 0 and uneven <= 1e-3 * width_s
-        require(f"steps of {name}", f"up to {uneven:g} s uneven", even, "bins of one width, rising")
-        return {"bin_width_s": width_s, "gate_delay_s": float(opens_s[0])}
-    return {}
+        along = coordinate.dims == ("bin",) and coordinate.dtype.kind in "iuf"
+        if along and str(coordinate.attrs.get("units", _unit_of(str(name)))) in UNITS_S:
+            return coordinate
+    return None
+
+
+def _timing(times: xr.DataArray) -> dict[str, float]:
+    """Bin width and gate delay, from the times or ranges at which bins open."""
+    unit_s = UNITS_S[str(times.attrs.get("units", _unit_of(str(times.name))))]
+    opens_s: Floats = np.asarray(times, float) * unit_s
+    if opens_s.size < 2:
+        return {"gate_delay_s": float(opens_s[0])}
+    width_s = float(opens_s[-1] - opens_s[0]) / (opens_s.size - 1)
+    uneven = float(np.abs(np.diff(opens_s) - width_s).max())
+    even = width_s > 0 and uneven <= 1e-3 * width_s
+    what = f"steps of {times.name}"
+    require(what, f"up to {uneven:g} s uneven", even, "bins of one width, rising")
+    return {"bin_width_s": width_s, "gate_delay_s": float(opens_s[0])}
+
+
+def _unit_of(name: str) -> str:
+    return name.rpartition("_")[2]
 
 
 def _pulse(known: dict[Any, Any]) -> Pulse | None:
@@ -191,7 +491,7 @@ def _pulse(known: dict[Any, Any]) -> Pulse | None:
     return Pulse(tau_s, shape=shape, samples=tuple(samples.astype(float).tolist()))  # type: ignore[arg-type]
 
 
-def _number(known: dict[Any, Any], name: str) -> float | None:
+def _number(known: Mapping[Any, Any], name: str) -> float | None:
     if name not in known:
         return None
     value = np.asarray(known[name])

@@ -1,93 +1,108 @@
-"""MATLAB v5 ``.mat`` (saved with ``-v6`` or ``-v7``).
+"""MATLAB ``.mat``: version 5 here (saved with ``-v6`` or ``-v7``), 7.3 in `core.readers.matlab73`.
 
 Either a cell array (row, col) holding each pixel's photon arrival times as a vector, or a cube
-(row, col, bin) of counts. Other variables may lie beside it, as long as only one fits.
+(row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts as in `core.readers.sparse`.
+Other variables may lie beside it, as long as only one fits; of these, a number named like
+``bin_width`` or ``resolution`` that can be seconds is taken for the bin width, as a guess.
 
-SciPy reads the numbers. It trusts the file, though: a type code out of its table, or a few hundred
-kilobytes of cells within cells, end the whole process. So the layout is checked before.
+SciPy reads the numbers, but those of sparse matrices, whose places it does not check. It trusts the
+file, though: a type code out of its table, or a few hundred kilobytes of cells within cells, end
+the whole process, and it takes as much memory as a size claims. So the layout is checked before.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections import Counter
 from io import BytesIO
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat, whosmat
+from scipy.io import loadmat
 
 from core.capture import Capture
 from core.checks import require
+from core.readers import hdf5, matlab73
 from core.readers.arrivals import arrivals_capture
 from core.readers.dense import cube_capture
 from core.readers.guards import decoding, require_fits
 from core.readers.request import Request
+from core.readers.sparse import Sparse, sparse_capture
+from core.readers.variables import Variable, bin_width, choose
 
-_NUMERIC = ("double", "single", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)))
 _HEADER_BYTES = 128
+_USER_BLOCK = 512  # what stands before the HDF5 of version 7.3
 _BYTES_A_CELL = 256  # of memory that one loaded cell takes
 
 # Codes of the format, as in "MAT-File Format", The MathWorks.
 _UINT32, _INT32, _MATRIX, _COMPRESSED = 6, 5, 14, 15
-_DATA_TYPES = (1, 2, 3, 4, 5, 6, 7, 9, 12, 13)  # whole numbers and floats
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8"}
+_NUMBERS |= {13: "u8"}
 _FIRST_NUMERIC_CLASS, _LAST_NUMERIC_CLASS = 6, 15
-_COMPLEX_FLAG = 0x0800
-
-
-class _Variable(NamedTuple):
-    name: str
-    shape: tuple[int, ...]
-    kind: str
-    element: memoryview  # tag and content, as in the file
-
-    def __str__(self) -> str:
-        return f"{self.name} ({self.kind}, {' x '.join(map(str, self.shape))})"
-
-    @property
-    def fits(self) -> bool:
-        is_cube = self.kind in _NUMERIC and len(self.shape) == 3
-        is_cell = self.kind == "cell" and len(self.shape) == 2
-        return (is_cube or is_cell) and min(self.shape) > 0
+_COMPLEX_FLAG, _LOGICAL_FLAG = 0x0800, 0x0200
+_CLASSES = {1: "cell", 2: "struct", 3: "object", 4: "char", 5: "sparse", 16: "function"}
+_CLASSES |= {6: "double", 7: "single", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16"}
+_CLASSES |= {12: "int32", 13: "uint32", 14: "int64", 15: "uint64"}
+_DIMENSIONS = 6  # where they begin, in words of 4 bytes, after the tag and the flags
+_BEGINNING_BYTES = 4096
 
 
 def read(path: Path, request: Request) -> Capture:
-    """Read a cell array of arrival times, or a cube."""
+    """Read a cell array of arrival times, a cube, or a sparse matrix."""
+    with path.open("rb") as file:
+        start = file.read(_USER_BLOCK + len(hdf5.SIGNATURE))
+    if hdf5.SIGNATURE in (start[: len(hdf5.SIGNATURE)], start[_USER_BLOCK:]):
+        return matlab73.read(path, request)
     require_fits("the file", path.stat().st_size)
     data = path.read_bytes()
-    _require_version_5(data)
-    order = "<" if data[126:128] == b"IM" else ">"
-    variable = _choose(_variables(data, order), request.variable)
-    array = _load(variable, data[:_HEADER_BYTES], order)
-    origin = f"{path.name}, variable {variable.name}"
-    if variable.kind != "cell":
-        return cube_capture(array, variable.name, origin, request)
-    times, pixel = _flat(array, variable.name)
-    shape = (array.shape[0], array.shape[1])
-    return arrivals_capture(times, pixel, shape, variable.name, origin, request)
-
-
-def _require_version_5(data: bytes) -> None:
-    hdf5 = b"\x89HDF\r\n\x1a\n"
-    if data.startswith((hdf5, b"MATLAB 7.3")) or data[512:520] == hdf5:
-        require("version", "7.3 (HDF5)", False, "a file saved with -v7: 7.3 is not read yet")
     # SciPy takes a zero in the first four bytes for version 4.
     known = data[124:128] in (b"\x00\x01IM", b"\x01\x00MI") and 0 not in data[:4]
-    require("version", data[124:128], known, "a MATLAB v5 file, saved with -v6 or -v7")
+    require("version", data[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
+    order = "<" if data[126:128] == b"IM" else ">"
+    variables = _variables(data, order)
+    variable = choose(variables, request.variable)
+    name, header = variable.name, data[:_HEADER_BYTES]
+    origin = f"{path.name}, variable {name}"
+    if variable.kind == "cell":
+        array = _load(variable, header, order)
+        times, pixel = _flat(array, name)
+        shape = (array.shape[0], array.shape[1])
+        return arrivals_capture(times, pixel, shape, name, origin, request)
+    widths = [_load(one, header, order) for one in variables if one.may_tell_bin_width]
+    width_s = bin_width(float(value.item()) for value in widths)
+    if variable.kind == "sparse":
+        return sparse_capture(_sparse(variable, order), name, origin, request, width_s)
+    array = _load(variable, header, order)
+    return cube_capture(array, name, origin, request, guessed_bin_width_s=width_s)
 
 
-def _variables(data: bytes, order: str) -> list[_Variable]:
-    elements = _elements(data, order)
-    with decoding("the list of variables"):
-        listed = whosmat(BytesIO(data))
-        return [
-            _Variable(name, tuple(int(n) for n in shape), kind, element)
-            for (name, shape, kind), element in zip(listed, elements, strict=True)
-        ]
+def _variables(data: bytes, order: str) -> list[Variable]:
+    found = []
+    for element in _elements(data, order):
+        with decoding("the list of variables"):
+            start = _beginning(element, order)
+            words = np.frombuffer(start, order + "u4", len(start) // 4)
+            require(
+                "kind of a variable", int(words[0]), words[0] == _MATRIX, f"{_MATRIX}, a matrix"
+            )
+            name_at = int(_after(words, np.array(_DIMENSIONS)))
+            shape = tuple(_numbers(start, words, _DIMENSIONS, order).tolist())
+            name = _numbers(start, words, name_at, order).tobytes().decode("latin-1")
+            kind = _CLASSES.get(int(words[4]) & 0xFF, "unknown")
+            if words[4] & _LOGICAL_FLAG and kind != "sparse":
+                kind = "logical"
+        found.append(Variable(name, shape, kind, element))
+    return found
+
+
+def _beginning(element: memoryview, order: str) -> bytes:
+    """As much of a variable's element as its description takes, decompressed if need be."""
+    if struct.unpack_from(order + "I", element)[0] != _COMPRESSED:
+        return bytes(element[:_BEGINNING_BYTES])
+    return zlib.decompressobj().decompress(element[8:], _BEGINNING_BYTES)
 
 
 def _elements(data: bytes, order: str) -> list[memoryview]:
@@ -104,22 +119,7 @@ def _elements(data: bytes, order: str) -> list[memoryview]:
     return parts
 
 
-def _choose(variables: list[_Variable], name: str | None) -> _Variable:
-    """The variable asked for, or the only one that fits."""
-    for known, times in Counter(variable.name for variable in variables).items():
-        require(f"variables named {known!r}", times, times == 1, "each name once")
-    fitting = {variable.name: variable for variable in variables if variable.fits}
-    listed = ", ".join(map(str, variables)) or "nothing"
-    remedy = f"a cell (row, col) of arrival times or a cube (row, col, bin); the file has {listed}"
-    if name is not None:
-        require("variable", name, name in fitting, f"the name of {remedy}")
-        return fitting[name]
-    found = ", ".join(fitting) or None
-    require("variable", found, len(fitting) == 1, f"as variable the name of {remedy}")
-    return next(iter(fitting.values()))
-
-
-def _load(variable: _Variable, header: bytes, order: str) -> NDArray[Any]:
+def _load(variable: Variable, header: bytes, order: str) -> NDArray[Any]:
     """The variable's array, alone, after its layout was checked."""
     name, n_elements = variable.name, prod(variable.shape)
     element = _inflated(variable, order)
@@ -142,14 +142,15 @@ def _load(variable: _Variable, header: bytes, order: str) -> NDArray[Any]:
     return array
 
 
-def _inflated(variable: _Variable, order: str) -> bytes | memoryview:
+def _inflated(variable: Variable, order: str) -> bytes | memoryview:
     """The variable's element, decompressed if need be, and no further than it claims to go."""
     tag = struct.Struct(order + "II")
-    if tag.unpack_from(variable.element)[0] != _COMPRESSED:
-        return variable.element
+    packed: memoryview = variable.content
+    if tag.unpack_from(packed)[0] != _COMPRESSED:
+        return packed
     with decoding(variable.name):
         inflater = zlib.decompressobj()
-        start = inflater.decompress(variable.element[8:], tag.size)
+        start = inflater.decompress(packed[8:], tag.size)
         size = tag.unpack(start)[1]
     require_fits(variable.name, size)
     with decoding(variable.name):
@@ -161,9 +162,38 @@ def _inflated(variable: _Variable, order: str) -> bytes | memoryview:
     return element
 
 
+def _sparse(variable: Variable, order: str) -> Sparse:
+    """A sparse matrix: after its name come the rows, the starts of the columns, the values."""
+    element = _inflated(variable, order)
+    words = np.frombuffer(element, order + "u4", len(element) // 4).astype(np.uint32, copy=False)
+    with decoding(variable.name):
+        place = _after(words, _after(words, np.array(_DIMENSIONS)))
+        parts = []
+        for _ in ("rows", "starts", "values"):
+            parts.append(_numbers(element, words, int(place), order))
+            place = _after(words, place)
+        is_real = not words[4] & _COMPLEX_FLAG
+    require(f"content of {variable.name}", "complex numbers", is_real, "real numbers")
+    rows, starts, values = parts
+    return Sparse(values, rows, starts, (variable.shape[0], variable.shape[1]))
+
+
+def _numbers(
+    element: bytes | memoryview, words: NDArray[np.uint32], place: int, order: str
+) -> NDArray[Any]:
+    """The numbers of the data element that starts at a word."""
+    small = int(words[place]) >> 16
+    size = small or int(words[place + 1])
+    dtype = np.dtype(order + _NUMBERS[int(words[place]) & 0xFFFF if small else int(words[place])])
+    begin = 4 * place + (4 if small else 8)
+    return np.frombuffer(element, dtype, size // dtype.itemsize, begin)
+
+
 def _cells(words: NDArray[np.uint32], n_cells: int) -> NDArray[np.int64]:
     """Where each filled cell starts, in words of 4 bytes."""
-    position = int(_after(words, _after(words, np.array(6))))  # beyond the dimensions and the name
+    position = int(
+        _after(words, _after(words, np.array(_DIMENSIONS)))
+    )  # beyond the dimensions and the name
     view = words.data
     starts = []
     for _ in range(n_cells):
@@ -178,17 +208,17 @@ def _plain(words: NDArray[np.uint32], starts: NDArray[np.int64]) -> NDArray[np.b
     """Whether a plain array of real numbers lies at each start, and ends where it says."""
     kind, size, flags_kind, flags_size, flags = (words[starts + k] for k in range(5))
     array_class = flags & 0xFF
-    data = _after(words, _after(words, starts + 6))
+    data = _after(words, _after(words, starts + _DIMENSIONS))
     data_kind = np.where(words[data] >> 16, words[data] & 0xFFFF, words[data])
     return np.asarray(
         (kind == _MATRIX)
         & (flags_kind == _UINT32)
         & (flags_size == 8)
-        & (words[starts + 6] == _INT32)
+        & (words[starts + _DIMENSIONS] == _INT32)
         & (array_class >= _FIRST_NUMERIC_CLASS)
         & (array_class <= _LAST_NUMERIC_CLASS)
         & (flags & _COMPLEX_FLAG == 0)
-        & np.isin(data_kind, _DATA_TYPES)
+        & np.isin(data_kind, [*_NUMBERS])
         & (_after(words, data) == starts + 2 + (size.astype(np.int64) + 7) // 8 * 2)
     )
 

@@ -1,10 +1,13 @@
-"""NumPy ``.npy``: one histogram cube (row, col, bin) of non-negative whole numbers."""
+"""NumPy ``.npy``: one histogram cube (row, col, bin) of non-negative whole numbers.
+
+Where ``no_trigger`` is told the array is raw frames (pulse, row, col), see `core.readers.frames`.
+"""
 
 from __future__ import annotations
 
 from math import prod
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -13,16 +16,45 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.checks import require
 from core.readers.dense import cube_capture
+from core.readers.frames import AXES, frames_capture, require_frames, stretches_of
 from core.readers.guards import decoding, require_fits
 from core.readers.request import Request
 
 
+class Header(NamedTuple):
+    """What an array's header says."""
+
+    shape: tuple[int, ...]
+    fortran_order: bool
+    dtype: np.dtype[Any]
+
+
 def read(path: Path, request: Request) -> Capture:
-    """Read a cube; everything else is given or guessed."""
+    """Read a cube, or frames; everything else is given or guessed."""
     require("variable", request.variable, request.variable is None, "None: .npy holds one array")
+    size = path.stat().st_size
     with path.open("rb") as file:
-        cube = read_array(file, path.stat().st_size, "the array")
+        if request.no_trigger is not None:
+            return frames_in(file, size, "the array", path.name, request)
+        cube = read_array(file, size, "the array")
     return cube_capture(cube, "the array", path.name, request)
+
+
+def frames_in(file: IO[bytes], size: int, name: str, origin: str, request: Request) -> Capture:
+    """A capture from an array of frames in a file of `size` bytes, counted as they are read.
+
+    Parameters are those of `read_array` and `core.readers.frames.frames_capture`; the request's
+    ``no_trigger`` tells what stands where nothing fired.
+    """
+    shape, fortran_order, dtype = read_header(file, name)
+    require_frames(shape, dtype, name)
+    _require_whole(file, size, shape, dtype, name)
+    stretches, counted = stretches_of(file, shape, dtype, request, fortran_order)
+    no_trigger = int(request.no_trigger or 0)
+    guessed = [f"axes ({', '.join(AXES)})"] if request.axes is None and name != "frames" else []
+    return frames_capture(
+        stretches, counted, no_trigger, name, origin, request, also_guessed=guessed
+    )
 
 
 def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
@@ -33,19 +65,25 @@ def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
     ValueError
         If the array holds objects (pickles are never read), does not fit in `size` or is too large.
     """
-    shape, dtype = read_header(file, name)
+    shape, _, dtype = read_header(file, name)
     what = f"type of {name}"
     require(what, str(dtype), dtype.kind in "biufU", "numbers or text; pickled objects are refused")
-    found, claimed = size - file.tell(), prod(shape) * dtype.itemsize
-    require_fits(name, claimed)
-    whole = f"a whole file: its header claims {claimed} ({dtype} of shape {shape})"
-    require(f"bytes of {name}", found, found == claimed, whole)
+    require_fits(name, prod(shape) * dtype.itemsize)
+    _require_whole(file, size, shape, dtype, name)
     file.seek(0)
     with decoding(name):
         return npy_format.read_array(file, allow_pickle=False)
 
 
-def read_header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _require_whole(
+    file: IO[bytes], size: int, shape: tuple[int, ...], dtype: np.dtype[Any], name: str
+) -> None:
+    found, claimed = size - file.tell(), prod(shape) * dtype.itemsize
+    whole = f"a whole file: its header claims {claimed} ({dtype} of shape {shape})"
+    require(f"bytes of {name}", found, found == claimed, whole)
+
+
+def read_header(file: IO[bytes], name: str) -> Header:
     """Shape and type of an array; leaves `file` at the first of its numbers."""
     with decoding(name):
         version = npy_format.read_magic(file)
@@ -53,5 +91,4 @@ def read_header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], np.dtype[A
             (1, 0): npy_format.read_array_header_1_0,
             (2, 0): npy_format.read_array_header_2_0,
         }
-        shape, _, dtype = readers[version](file)
-    return shape, dtype
+        return Header(*readers[version](file))

@@ -23,6 +23,10 @@ Text is an array of one unicode string. Where timing or pulse are absent they ar
 1 ns, a gate that opens with the pulse, and the default pulse. An archive of other names opens too
 if exactly one array has three axes, or if ``variable`` names one; its pulse is then guessed to be a
 Gaussian of one bin.
+
+In place of a cube there may be raw ``frames`` (pulse, row, col) of trigger bins with a whole number
+``no_trigger`` for where nothing fired, as in `core.readers.frames`; the other fields may stand
+beside them. Frames that are stored without compression may be larger than memory.
 """
 
 from __future__ import annotations
@@ -38,11 +42,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Floats, Pulse
-from core.capture import COUNT_TYPES, Capture
+from core.capture import Capture
 from core.checks import require
-from core.readers.dense import AXES, cube_capture, dense_capture, require_cube, whole_counts
+from core.readers.dense import AXES, cube_capture, dense_capture, stored_counts
 from core.readers.guards import decoding, require_fits
-from core.readers.npy import read_array, read_header
+from core.readers.npy import frames_in, read_array, read_header
 from core.readers.request import Request
 
 FORMAT = "firstphoton-capture-1"
@@ -50,7 +54,7 @@ FORMAT = "firstphoton-capture-1"
 _TIMING = ("bin_width_s", "gate_delay_s", "pixel_angle_rad")
 _PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 _TRUTH = ("truth_range_m", "signal", "background")
-_FIELDS = ("format", "n_pulses", "detection", "source", *_TIMING, *_PULSE, *_TRUTH)
+_FIELDS = ("format", "n_pulses", "detection", "source", "no_trigger", *_TIMING, *_PULSE, *_TRUTH)
 
 
 def fields(capture: Capture) -> dict[str, NDArray[Any]]:
@@ -76,52 +80,68 @@ def fields(capture: Capture) -> dict[str, NDArray[Any]]:
 
 
 def read(path: Path, request: Request) -> Capture:
-    """Read our own layout, or the one cube of an archive."""
+    """Read our own layout, the one cube of an archive, or raw frames."""
     with decoding("the archive"):
         archive = ZipFile(path)
     with archive:
         names = _names(archive)
-        name = _choose(archive, names, request.variable)
-        cube = _array(archive, name)
+        name = _choose(archive, names, request)
         origin = f"{path.name}, variable {name}"
-        if name != "cube":
-            return cube_capture(cube, name, origin, request)
         stored = {field: _array(archive, field) for field in names if field in _FIELDS}
-    return _own(cube, stored, origin, request)
+        if name == "frames" or (request.no_trigger is not None and name != "cube"):
+            return _frames(archive, name, stored, origin, request)
+        cube = _array(archive, name)
+    if name != "cube":
+        return cube_capture(cube, name, origin, request)
+    require("axes", request.axes, request.order(AXES) in (None, (0, 1, 2)), repr(" ".join(AXES)))
+    origin = _text(stored, "source", origin)
+    counts = stored_counts(cube, name)
+    return _with_truth(dense_capture(counts, origin, _known(stored, request), Pulse()), stored)
 
 
-def _own(
-    cube: NDArray[Any], stored: Mapping[str, NDArray[Any]], origin: str, request: Request
+def _frames(
+    archive: ZipFile,
+    name: str,
+    stored: Mapping[str, NDArray[Any]],
+    origin: str,
+    request: Request,
 ) -> Capture:
-    """A capture from the fields of our layout."""
+    """A capture from frames, which are counted as they are unpacked."""
+    no_trigger = request.no_trigger
+    if no_trigger is None:
+        no_trigger = _whole(_number(stored, "no_trigger"), "no_trigger", "what stands for none")
+    info = _info(archive, name, stored_at_any_size=True)
+    origin, known = _text(stored, "source", origin), _known(stored, request)
+    with decoding(name):
+        file = archive.open(info)
+    with file:
+        capture = frames_in(
+            file, info.file_size, name, origin, replace(known, no_trigger=no_trigger)
+        )
+    return _with_truth(capture, stored)
+
+
+def _known(stored: Mapping[str, NDArray[Any]], request: Request) -> Request:
+    """The request, completed by the fields of our layout."""
     version = _text(stored, "format", FORMAT)
     require("format", version, version == FORMAT, FORMAT)
-    require("axes", request.axes, request.order(AXES) in (None, (0, 1, 2)), repr(" ".join(AXES)))
     known: dict[str, Any] = {name: _number(stored, name) for name in _TIMING}
     known |= {
         "n_pulses": _n_pulses(stored),
         "pulse": _pulse(stored),
         "detection": _text(stored, "detection", "") or None,
     }
-    request = replace(
-        request,
-        **{name: value for name, value in known.items() if getattr(request, name) is None},
-    )
-    as_stored = cube.dtype.newbyteorder("=") in COUNT_TYPES
-    counts = _as_stored(cube) if as_stored else whole_counts(cube, "cube")
-    capture = dense_capture(counts, _text(stored, "source", origin), request, guessed_pulse=Pulse())
+    told = {name: value for name, value in known.items() if getattr(request, name) is None}
+    return replace(request, **told)
+
+
+def _with_truth(capture: Capture, stored: Mapping[str, NDArray[Any]]) -> Capture:
     return replace(
         capture,
         truth_range_m=_image(stored, "truth_range_m"),
         signal=_image(stored, "signal"),
         background=_number(stored, "background"),
     )
-
-
-def _as_stored(cube: NDArray[Any]) -> NDArray[np.unsignedinteger]:
-    """An unsigned cube in its own type, in the byte order and layout of this machine."""
-    require_cube(cube, "cube")
-    return np.ascontiguousarray(cube, cube.dtype.newbyteorder("="))
 
 
 def _pulse(stored: Mapping[str, NDArray[Any]]) -> Pulse | None:
@@ -137,9 +157,15 @@ def _pulse(stored: Mapping[str, NDArray[Any]]) -> Pulse | None:
 
 
 def _n_pulses(stored: Mapping[str, NDArray[Any]]) -> int | None:
-    value = _number(stored, "n_pulses") or 0.0
-    require("n_pulses", value, value >= 0 and value.is_integer(), "a whole number, 0 if not known")
-    return int(value) or None
+    value = _whole(_number(stored, "n_pulses") or 0.0, "n_pulses", "0 if not known")
+    require("n_pulses", value, value >= 0, "0 or more")
+    return value or None
+
+
+def _whole(value: float | None, name: str, meaning: str) -> int:
+    whole = value is not None and value.is_integer()
+    require(name, value, whole, f"a whole number, {meaning}")
+    return int(value or 0)
 
 
 def _number(stored: Mapping[str, NDArray[Any]], name: str) -> float | None:
@@ -178,16 +204,18 @@ def _names(archive: ZipFile) -> list[str]:
     return [name.removesuffix(".npy") for name in counted if name.endswith(".npy")]
 
 
-def _choose(archive: ZipFile, names: list[str], variable: str | None) -> str:
-    """Name of the cube: the one asked for, or ``cube``, or the only array with three axes."""
-    listed = ", ".join(names) or "none"
+def _choose(archive: ZipFile, names: list[str], request: Request) -> str:
+    """The array asked for, or ``cube``, or ``frames``, or the only array with three axes."""
+    listed, variable = ", ".join(names) or "none", request.variable
     if variable is not None:
         require(
             "variable", variable, variable in names, f"the name of an array; the file has {listed}"
         )
         return variable
-    if "cube" in names:
-        return "cube"
+    ours = ("cube", "frames") if request.no_trigger is None else ("frames",)
+    for name in ours:
+        if name in names:
+            return name
     cubes = [name for name in names if len(_header(archive, name)) == 3]
     remedy = f"as variable the name of a (row, col, bin) array; the file has {listed}"
     require("variable", ", ".join(cubes) or None, len(cubes) == 1, remedy)
@@ -197,7 +225,7 @@ def _choose(archive: ZipFile, names: list[str], variable: str | None) -> str:
 def _header(archive: ZipFile, name: str) -> tuple[int, ...]:
     info = _info(archive, name)
     with decoding(name), archive.open(info) as file:
-        return read_header(file, name)[0]
+        return read_header(file, name).shape
 
 
 def _array(archive: ZipFile, name: str) -> NDArray[Any]:
@@ -208,11 +236,15 @@ def _array(archive: ZipFile, name: str) -> NDArray[Any]:
         return read_array(file, info.file_size, name)
 
 
-def _info(archive: ZipFile, name: str) -> ZipInfo:
-    """The archive's entry for an array, once its size and compression proved harmless."""
+def _info(archive: ZipFile, name: str, stored_at_any_size: bool = False) -> ZipInfo:
+    """The archive's entry for an array, once its size and compression proved harmless.
+
+    What is stored as it is can be no larger than the archive; a few bytes may unpack to any size.
+    """
     info = archive.getinfo(f"{name}.npy")
-    require_fits(name, info.file_size)
     method = info.compress_type
+    if not (stored_at_any_size and method == ZIP_STORED):
+        require_fits(name, info.file_size)
     # LZMA's header sizes its own buffers, up to 4 GiB.
     plain = method in (ZIP_STORED, ZIP_DEFLATED)
     require(f"compression method of {name}", method, plain, "0 (stored) or 8 (deflated)")

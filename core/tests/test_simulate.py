@@ -13,7 +13,7 @@ from scipy import stats
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.scene import Scene
-from core.simulate import simulate
+from core.simulate import first_photons, simulate
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
 module = import_module("core.simulate")  # the package's attribute of that name is the function
@@ -239,3 +239,52 @@ def test_impossible_seeds_are_refused(seed: int) -> None:
 def test_an_unknown_number_of_pulses_is_refused() -> None:
     with pytest.raises(ValueError, match=r"n_pulses = None .*number of pulses to simulate"):
         simulate(wall(1), Acquisition(n_pulses=None), Flux())
+
+
+# -- first photons of what recorded all ------------------------------------------------------------
+
+
+def all_photons(n_pulses: int, pixels: int) -> Capture:
+    """Poisson counts of a pulse's photons over all pulses, each pixel alike."""
+    acquisition = Acquisition(n_bins=30, n_pulses=None)
+    rate = rate_per_bin(np.full(pixels, 12.3), np.full(pixels, 0.5), 2.0, Pulse(), acquisition)
+    counts = np.random.default_rng(0).poisson(rate * n_pulses).astype(np.uint16)
+    return Capture(counts[np.newaxis], acquisition, detection="all")
+
+
+def test_first_photons_have_the_distribution_of_simulated_ones() -> None:
+    n_pulses, pixels = 200, 20_000
+    counts = first_photons(all_photons(n_pulses, pixels), n_pulses, seed=1).cube[0].astype(float)
+    acquisition = Acquisition(n_bins=30)
+    rate = rate_per_bin(np.array([12.3]), np.array([0.5]), 2.0, Pulse(), acquisition)[0]
+    p = trigger_probability(rate)
+    spread = np.sqrt(n_pulses * p * (1 - p) / pixels)
+    most = stats.norm.isf(1e-6 / p.size)  # of so many bins, one in a million times
+    assert np.all(np.abs(counts.mean(axis=0) - n_pulses * p) < most * spread)
+    # Not the mean alone: multinomial counts scatter less in sum than each for itself.
+    fired = p.sum()
+    variance = counts.sum(axis=1).var()
+    expected = n_pulses * fired * (1 - fired)
+    assert abs(variance / expected - 1) < most * np.sqrt(2 / pixels)
+
+
+def test_first_photons_are_some_of_all() -> None:
+    photons = all_photons(50, 100)
+    first = first_photons(photons, 50)
+    assert np.all(first.cube <= photons.cube)
+    assert first.counts.max() <= first.armed_pulses == 50
+    np.testing.assert_array_equal(first.cube, first_photons(photons, 50).cube)
+    assert not np.array_equal(first.cube, first_photons(photons, 50, seed=1).cube)
+    assert "first photons of 50 pulses" in first.source
+    many = first_photons(photons, 10**9)
+    np.testing.assert_array_equal(many.cube, photons.cube)  # none shares a pulse
+
+
+def test_first_photons_are_not_reduced_again() -> None:
+    photons = all_photons(50, 4)
+    with pytest.raises(ValueError, match=r"detection = 'first' .*all photons"):
+        first_photons(first_photons(photons, 50), 50)
+    with pytest.raises(ValueError, match="n_pulses = 0"):
+        first_photons(photons, 0)
+    with pytest.raises(ValueError, match="seed = -1"):
+        first_photons(photons, 50, seed=-1)

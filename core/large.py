@@ -1,0 +1,233 @@
+"""Captures larger than memory: ranged part by part, on this machine's threads or on a cluster.
+
+What pixels have in common, the light (`core.posterior.Lighting`) and an estimator's calibration, is
+learned from a sample of the image before. A part is then ranged like any capture, so that the
+answer does not depend on how the image is cut, nor on who ranges which part.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Acquisition, Floats
+from core.capture import Capture, Detection
+from core.checks import require
+from core.estimators import ESTIMATORS, RangeImage, settings_of
+from core.estimators.base import Calibration
+from core.posterior import Lighting, lighting_of
+from core.readers.dense import AXES, whole_counts
+from core.readers.labelled import Description, describe
+from core.readers.request import Request
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+IMAGES = {
+    "range_m": ("range of the surface", "m"),
+    "bin": ("delay of the echo", "bins"),
+    "score": ("score of the answer", "1"),
+    "confidence": ("probability that the answer is right within 3 bins", "1"),
+    "counts": ("detections", "1"),
+}
+"""What is known of each pixel, its name in words and its unit."""
+
+SAMPLE_COUNTS = 2**25
+"""Largest sample of an image, in counts of bins: 64 MiB of uint16. A smaller image is its own."""
+
+_PATCH = 32  # rows and columns of a sample that stay together, for what looks at neighbours
+
+
+def estimate_large(
+    counts: xr.DataArray,
+    method: str,
+    settings: Any = None,
+    *,
+    false_alarm: float | None = None,
+    **parameters: Any,
+) -> xr.Dataset:
+    """Range every pixel of a labelled array, part by part.
+
+    Parameters
+    ----------
+    counts : DataArray, shape (row, col, bin)
+        As `core.open_capture` gives them, in Dask's chunks or in memory; chunks along ``bin`` are
+        joined.
+    method, settings, false_alarm, **parameters
+        As `core.estimate` takes them.
+
+    Returns
+    -------
+    Dataset
+        `IMAGES`, each of shape (row, col), NaN where there is no answer; its attributes tell of the
+        acquisition, of the detection and of the source. Nothing is ranged before
+        ``.compute()`` or a ``.to_…()``; a sample of the image is read at once. Dask ranges on
+        threads, or on the cluster of the `dask.distributed.Client` that is open.
+
+    Raises
+    ------
+    ValueError
+        As `core.estimate`; if the method needs the whole image for each of its pixels; or if the
+        array is not described as `core.readers.labelled` wants it.
+    """
+    import dask.array as da  # noqa: PLC0415 - half a second that others should not pay
+
+    settings = settings_of(method, settings, **parameters)
+    estimator = ESTIMATORS[method]
+    apart = [name for name, each in ESTIMATORS.items() if not each.whole_image]
+    told = " or ".join(map(repr, apart)) + ", which range a pixel without the whole image"
+    require("method", method, not estimator.whole_image, told)
+    require("axes", counts.dims, counts.dims == AXES, "row, col and bin")
+    description = describe(counts, Request())
+    array = da.asarray(counts.data).rechunk({2: -1})
+    common = learned(array, description, method, settings, false_alarm)
+    margin = estimator.reach(settings) // 2
+    around = {0: margin, 1: margin, 2: 0}
+    # Chunks of an edge may be narrower than the margin: Dask joins them.
+    parts = da.overlap.overlap(array, depth=around, boundary="none")
+    ranged = parts.map_blocks(
+        range_part,
+        description,
+        method,
+        settings,
+        *common,
+        dtype=float,
+        chunks=(*parts.chunks[:2], (len(IMAGES),)),
+        meta=np.empty((0, 0, 0)),
+    )
+    images = da.overlap.trim_internal(ranged, around, boundary="none")
+    return _dataset(images, description)
+
+
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """What is known of a capture of which not all counts are in memory."""
+
+    counts: NDArray[np.int64]
+    """Detections of each pixel, shape (row, col)."""
+    acquisition: Acquisition
+    detection: Detection
+    source: str
+
+    @property
+    def armed_pulses(self) -> int | None:
+        """As `Capture.armed_pulses`."""
+        return self.acquisition.n_pulses if self.detection == "first" else None
+
+
+def computed(parts: xr.Dataset, scheduler: str | None = None) -> xr.Dataset:
+    """Range all parts, with a bar on standard error.
+
+    Parameters
+    ----------
+    parts : Dataset
+        Of `estimate_large`.
+    scheduler : str, optional
+        Address of a Dask cluster, such as ``tcp://host:8786``; this machine's threads where None.
+
+    Raises
+    ------
+    OSError
+        If there is no cluster at the address.
+    """
+    from dask.diagnostics import ProgressBar  # noqa: PLC0415 - Dask is slow to come
+
+    with contextlib.redirect_stdout(sys.stderr):
+        if scheduler is None:
+            with ProgressBar():
+                return parts.compute()
+        from dask.distributed import Client, progress  # noqa: PLC0415
+
+        with Client(scheduler, timeout="10s") as client:
+            begun = client.persist(parts)
+            progress(begun, notebook=False)
+            done: xr.Dataset = begun.compute()
+            return done
+
+
+def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:
+    """What `core.export.save_image` takes, from a dataset of `estimate_large` that is computed."""
+    known = {name: ranged[name].to_numpy() for name in IMAGES}
+    counts = known.pop("counts").astype(np.int64)
+    about = ranged.attrs
+    acquisition = Acquisition(
+        about["n_bins"],
+        about["bin_width_s"],
+        about["gate_delay_s"],
+        about.get("n_pulses"),
+        about.get("pixel_angle_rad"),
+    )
+    valid = np.isfinite(known["range_m"])
+    return (
+        Overview(counts, acquisition, about["detection"], about["source"]),
+        RangeImage(**known, valid=valid),
+    )
+
+
+def learned(
+    array: Any, description: Description, method: str, settings: Any, false_alarm: float | None
+) -> tuple[Lighting, Calibration]:
+    """What a sample of a Dask array (row, col, bin) tells of all its pixels."""
+    sample = _capture(sample_of(array), description)
+    return lighting_of(sample), ESTIMATORS[method].calibration(sample, settings, false_alarm)
+
+
+def range_part(
+    cube: NDArray[Any],
+    description: Description,
+    method: str,
+    settings: Any,
+    lighting: Lighting,
+    calibration: Calibration,
+) -> Floats:
+    """Range a part of an image; shape (row, col, len(IMAGES))."""
+    part = _capture(cube, description)
+    lighting_of.tell(part, lighting)
+    image = ESTIMATORS[method].ranged(part, settings, calibration)
+    known = {name: getattr(image, name) for name in IMAGES if hasattr(image, name)}
+    return np.stack([known.get(name, part.counts) for name in IMAGES], axis=2).astype(float)
+
+
+def sample_of(array: Any) -> NDArray[Any]:
+    """Patches of a Dask array (row, col, bin) from all over the image; all of it if it is small.
+
+    Few chunks are read: as many as the sample has patches.
+    """
+    rows, cols, n_bins = array.shape
+    if rows * cols * n_bins <= SAMPLE_COUNTS:
+        return np.asarray(array)
+    high, wide = min(_PATCH, rows), min(_PATCH, cols)
+    n_patches = max(1, SAMPLE_COUNTS // (high * wide * n_bins))
+    rng = np.random.default_rng(0)
+    tops, lefts = rng.integers((rows - high + 1, cols - wide + 1), size=(n_patches, 2)).T
+    patches = [
+        array[top : top + high, left : left + wide] for top, left in zip(tops, lefts, strict=True)
+    ]
+    import dask  # noqa: PLC0415
+
+    return np.concatenate(dask.compute(*patches))
+
+
+def _capture(cube: NDArray[Any], description: Description) -> Capture:
+    acquisition, pulse, detection, source = description
+    counts = whole_counts(cube, "counts")
+    return Capture(counts, acquisition, pulse, source=source, detection=detection)
+
+
+def _dataset(images: Any, description: Description) -> xr.Dataset:
+    import xarray as xr  # noqa: PLC0415
+
+    acquisition, _, detection, source = description
+    about = {**vars(acquisition), "detection": detection, "source": source}
+    return xr.Dataset(
+        {
+            name: (AXES[:2], images[..., number], {"long_name": words, "units": unit})
+            for number, (name, (words, unit)) in enumerate(IMAGES.items())
+        },
+        attrs={name: value for name, value in about.items() if value is not None},
+    )

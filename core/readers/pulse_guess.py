@@ -1,0 +1,183 @@
+"""How wide an echo is, guessed from a capture alone.
+
+Two photons of the same echo lie within a pulse's width of each other, wherever the surface is; any
+other two may lie anywhere in the gate. So among the gaps between two photons of the same pixel
+there is a peak at zero, √2 as wide as the pulse, on a broad floor.
+
+The gaps are counted by the autocorrelation of each pixel's histogram (Fourier transforms, in
+blocks, over as many pixels as `_MOST_NUMBERS` allows, evenly spread), lag 0 less the pairs of each
+photon with itself. Every photon counts inversely to how many there are in its part of the gate over
+the whole image, a running median of the mean histogram over a quarter of the gate: else the decay
+of first photons under a strong background would bend the floor. What remains of it is a straight
+line. A peak of a Gaussian pulse on that line, blurred by the bins, is fitted by least squares:
+first the width whose peak stands out most, then, around it, the width that fits best.
+
+A width is told only if its peak is significant: fitted to each of 32 groups of pixels by itself,
+the mean number of pairs in the peak is 6 standard errors above zero, and its height is 2 % of the
+floor, less than which a line that does not quite follow the floor might leave. A pulse as wide as a
+tenth of the gate is out of reach, and so is, above a twentieth, that of a wall all at one range.
+Where a real pulse has a tail, the Gaussian is that of its core rather.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.ndimage import median_filter
+from scipy.special import ndtr
+
+from core.acquisition import Floats, Pulse
+
+_GROUPS = 32
+_MOST_NUMBERS = 2**24  # in all transforms together: a tenth of a second
+_NUMBERS_A_BLOCK = 2**20
+_FEWEST_BINS = 16
+_NARROWEST_BINS = 0.3  # standard deviation; below, nearly all of an echo lies in two bins
+_WIDEST_SHARE = 0.1  # of the gate; above, there is no floor left to see
+_MOST_WEIGHT = 20.0  # of a photon where there are few
+_STANDARD_ERRORS = 6.0
+_LOWEST_PEAK = 0.02
+
+
+def guessed_pulse(cube: NDArray[np.unsignedinteger], bin_width_s: float) -> Pulse:
+    """A Gaussian as wide as the capture tells, to two digits, or of one bin where it does not.
+
+    Parameters
+    ----------
+    cube : ndarray, shape (row, col, bin)
+        Counts.
+    bin_width_s : float
+        Width of one bin in seconds.
+
+    Returns
+    -------
+    Pulse
+    """
+    sigma_bins = guessed_sigma_bins(cube)
+    if sigma_bins is None:
+        return Pulse.gaussian(bin_width_s)
+    return Pulse.gaussian(float(f"{sigma_bins * bin_width_s:.1e}"))
+
+
+def guessed_sigma_bins(cube: NDArray[np.unsignedinteger]) -> float | None:
+    """Standard deviation of a Gaussian pulse in bins; None where it cannot be told.
+
+    Parameters
+    ----------
+    cube : ndarray, shape (row, col, bin)
+        Counts.
+
+    Returns
+    -------
+    float or None
+    """
+    n_bins = cube.shape[2]
+    if n_bins < _FEWEST_BINS or cube.shape[0] * cube.shape[1] < _GROUPS:
+        return None
+    pairs = pairs_by_lag(cube, 3 * n_bins // 4)
+    total = pairs.sum(axis=0)
+    steps = np.arange(0.0, np.log(_WIDEST_SHARE * n_bins / _NARROWEST_BINS), 0.1)
+    rough = _NARROWEST_BINS * np.exp(steps)
+    standing_out = [_fit(total, sigma, _window(sigma, n_bins)).significance for sigma in rough]
+    best = rough[np.argmax(standing_out)]
+    window = _window(best, n_bins)
+    fine = best * np.exp(np.linspace(-0.5, 0.5, 101))
+    fits = [_fit(total, sigma, window) for sigma in fine]
+    chosen = int(np.argmin([fit.misfit for fit in fits]))
+    sigma_bins, fit = float(fine[chosen]), fits[chosen]
+    in_peak = pairs[:, :window] @ fit.peak_weights
+    error = in_peak.std(ddof=1) / np.sqrt(_GROUPS)
+    stands_out = in_peak.mean() > _STANDARD_ERRORS * error and fit.contrast > _LOWEST_PEAK
+    return sigma_bins if stands_out and sigma_bins < _WIDEST_SHARE * n_bins else None
+
+
+def pairs_by_lag(cube: NDArray[np.unsignedinteger], n_lags: int) -> Floats:
+    """Pairs of photons of the same pixel by their gap in bins, in groups of pixels.
+
+    Parameters
+    ----------
+    cube : ndarray, shape (row, col, bin)
+        Counts.
+    n_lags : int
+        Gaps from 0 to one below this.
+
+    Returns
+    -------
+    ndarray, shape (group, lag)
+        Sums of the products of both photons' weights.
+    """
+    n_bins = cube.shape[2]
+    size = fft.next_fast_len(n_bins + n_lags, real=True)
+    histograms = cube.reshape(-1, n_bins)
+    stride = -(-histograms.shape[0] * size // _MOST_NUMBERS)
+    weight = _weights(histograms[::stride].mean(axis=0))
+    power = np.zeros((_GROUPS, size // 2 + 1))
+    with_themselves = np.zeros(_GROUPS)
+    pixels_at_once = max(1, _NUMBERS_A_BLOCK // size)
+    for group in range(_GROUPS):
+        members = histograms[group * stride :: _GROUPS * stride]
+        for first in range(0, members.shape[0], pixels_at_once):
+            some = members[first : first + pixels_at_once] * weight
+            spectrum = fft.rfft(some, size, axis=1)
+            for part in (spectrum.real, spectrum.imag):
+                power[group] += np.einsum("pf,pf->f", part, part)
+            with_themselves[group] += (some @ weight).sum(dtype=float)
+    pairs = fft.irfft(power, size, axis=1)[:, :n_lags]
+    pairs[:, 0] -= with_themselves
+    return np.asarray(pairs)
+
+
+def _weights(mean: Floats) -> NDArray[np.float32]:
+    """Weight of a photon in each bin that levels the mean histogram, but for narrow peaks."""
+    level = median_filter(mean, size=max(3, mean.size // 4), mode="nearest")
+    typical = max(float(mean.mean()), np.finfo(float).tiny)
+    return np.asarray(typical / np.maximum(level, typical / _MOST_WEIGHT), np.float32)
+
+
+class _Fit(NamedTuple):
+    significance: float
+    misfit: float
+    contrast: float
+    """Height of the peak as a share of the floor below it; infinite where there is no floor."""
+    peak_weights: Floats
+    """Of the pairs of each lag, in the number of pairs in the peak, shape (lag,)."""
+
+
+def _window(sigma_bins: float, n_bins: int) -> int:
+    """Lags that show both a peak and the floor around it."""
+    return int(min(np.ceil(12 * sigma_bins) + 12, 3 * n_bins // 4))
+
+
+def _fit(pairs: Floats, sigma_bins: float, n_lags: int) -> _Fit:
+    """Fit a peak and the line of its floor to the pairs of the first lags."""
+    found = pairs[:n_lags]
+    lag = np.arange(n_lags)
+    terms = np.stack([_peak(lag, sigma_bins), np.ones(n_lags), lag / n_lags])
+    # Weights of counts, but of no fewer than the mean: chance lows would pull the fit down.
+    weighted = terms / np.maximum(found, max(found.mean(), 1.0))
+    covariance = np.linalg.pinv(weighted @ terms.T)
+    solve = covariance @ weighted
+    amplitudes = solve @ found
+    misfit = float(weighted[1] @ (found - amplitudes @ terms) ** 2)
+    floor, height = float(amplitudes[1]), float(amplitudes[0] * terms[0, 0])
+    contrast = height / floor if floor > 0 else np.inf
+    return _Fit(float(amplitudes[0] / np.sqrt(covariance[0, 0])), misfit, contrast, solve[0])
+
+
+def _peak(lag: NDArray[np.int64], sigma_bins: float) -> Floats:
+    """Share of an echo's pairs with a gap of `lag` bins.
+
+    The gap of two photons is √2 as wide as the pulse; that both are rounded to bins blurs it by a
+    triangle two bins wide.
+    """
+    width = np.sqrt(2.0) * sigma_bins
+
+    def integrated_twice(gap: NDArray[np.floating]) -> Floats:
+        density = np.exp(-0.5 * (gap / width) ** 2) / np.sqrt(2 * np.pi)
+        return np.asarray(gap * ndtr(gap / width) + width * density)
+
+    below, at, above = (integrated_twice(lag + shift) for shift in (-1.0, 0.0, 1.0))
+    return np.asarray(below - 2 * at + above)

@@ -1,0 +1,165 @@
+"""Captures larger than memory: the answer is that of the whole image, however it is cut."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from core import large
+from core.acquisition import Acquisition, Flux
+from core.capture import Capture
+from core.estimators import ESTIMATORS, estimate
+from core.large import IMAGES, as_image, computed, estimate_large, sample_of
+from core.posterior import lighting_of
+from core.readers.labelled import dataset
+from core.scene import Scene, scenes
+from core.simulate import simulate
+
+APART = [name for name, each in ESTIMATORS.items() if not each.whole_image and name != "oracle"]
+
+
+def small_car() -> Capture:
+    """Some of the car, wider than high."""
+    scene = scenes["car"]()
+    return simulate(Scene(scene.range_m[20:45, 10:50]), scene.acquisition, Flux(sbr=0.1))
+
+
+CAPTURE = small_car()
+COUNTS = dataset(CAPTURE).counts
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("method", APART)
+@pytest.mark.parametrize(
+    ("chunks", "false_alarm"),
+    [({"row": 7, "col": 13}, 0.05), ({"row": 25, "col": 1, "bin": 30}, None)],
+    ids=["small chunks, some without answer", "chunks of a column"],
+)
+def test_parts_give_the_answer_of_the_whole(
+    method: str, chunks: dict[str, int], false_alarm: float | None
+) -> None:
+    whole = estimate(CAPTURE, method, false_alarm=false_alarm)
+    parts = estimate_large(COUNTS.chunk(chunks), method, false_alarm=false_alarm).compute()
+    for name in set(IMAGES) - {"counts"}:
+        np.testing.assert_array_equal(parts[name], getattr(whole, name), err_msg=name)
+    np.testing.assert_array_equal(parts["counts"], CAPTURE.counts)
+    assert parts["range_m"].attrs["units"] == "m"
+
+
+def test_settings_are_those_of_estimate() -> None:
+    whole = estimate(CAPTURE, "peak")
+    np.testing.assert_array_equal(estimate_large(COUNTS, "peak").range_m, whole.range_m)
+    with pytest.raises(ValueError, match="smoothing_bins = 1000"):
+        estimate_large(COUNTS, "cfar", smoothing_bins=1000.0)
+    with pytest.raises(ValueError, match="method = 'best'"):
+        estimate_large(COUNTS, "best")
+
+
+@pytest.mark.parametrize("method", [name for name in ESTIMATORS if ESTIMATORS[name].whole_image])
+def test_what_needs_the_whole_image_is_refused(method: str) -> None:
+    with pytest.raises(ValueError, match=rf"method = '{method}' .*'tracking' or .*whole image"):
+        estimate_large(COUNTS, method)
+
+
+def test_axes_must_be_named() -> None:
+    with pytest.raises(ValueError, match=r"axes = \('x', 'col', 'bin'\) .*row, col and bin"):
+        estimate_large(COUNTS.rename(row="x"), "peak")
+
+
+def test_nothing_is_ranged_before_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    ranged = large.range_part
+
+    def counted(*arguments: Any) -> Any:
+        asked.append(arguments)
+        return ranged(*arguments)
+
+    monkeypatch.setattr(large, "range_part", counted)
+    parts = estimate_large(COUNTS.chunk(row=5), "peak")
+    assert asked == []
+    parts.compute(scheduler="synchronous")
+    assert len(asked) == 5
+
+
+def test_a_large_image_is_learned_from_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    counts = rng.poisson(1.0, (200, 300, 8)).astype(np.uint16)
+    array = xr.DataArray(counts).chunk(50).data
+    np.testing.assert_array_equal(sample_of(array), counts)  # small: all of it
+    monkeypatch.setattr(large, "SAMPLE_COUNTS", 32 * 32 * 8 * 3)
+    sample = sample_of(array)
+    assert sample.shape == (3 * 32, 32, 8)
+    windows = {counts[r, c].tobytes() for r in range(200) for c in range(300)}
+    assert all(pixel.tobytes() in windows for pixel in sample.reshape(-1, 8))
+    np.testing.assert_array_equal(sample, sample_of(array))
+
+
+@pytest.mark.compiled
+def test_a_sample_tells_what_the_image_would(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answers of an image ranged by what a tenth of it tells: nearly all the same."""
+    scene = scenes["uniform"](128)
+    capture = simulate(scene, scene.acquisition, Flux(sbr=0.1))
+    whole = estimate(capture, "likelihood")
+    monkeypatch.setattr(large, "SAMPLE_COUNTS", capture.cube.size // 10)
+    parts = estimate_large(dataset(capture).counts.chunk(row=32), "likelihood").compute()
+    changed = np.abs(parts["bin"].to_numpy() - whole.bin) > 1
+    assert changed.mean() < 0.01
+    told = np.abs(parts["confidence"].to_numpy() - whole.confidence)[~changed]
+    assert np.quantile(told, 0.99) < 0.1
+
+
+def test_light_told_is_light_taken() -> None:
+    part = Capture(CAPTURE.cube[:5].copy(), CAPTURE.acquisition, CAPTURE.pulse)
+    own = lighting_of(part)
+    told = Capture(CAPTURE.cube[:5].copy(), CAPTURE.acquisition, CAPTURE.pulse)
+    lighting_of.tell(told, lighting_of(CAPTURE))
+    assert lighting_of(told) is lighting_of(CAPTURE)
+    assert not np.array_equal(own.depth, lighting_of(told).depth)
+
+
+def test_an_answer_in_parts_is_an_image_with_what_is_known(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    seen, image = as_image(computed(estimate_large(COUNTS.chunk(row=9), "peak")))
+    whole = estimate(CAPTURE, "peak")
+    np.testing.assert_array_equal(image.range_m, whole.range_m)
+    np.testing.assert_array_equal(image.valid, whole.valid)
+    np.testing.assert_array_equal(seen.counts, CAPTURE.counts)
+    assert seen.acquisition == CAPTURE.acquisition
+    assert (seen.detection, seen.source) == (CAPTURE.detection, CAPTURE.source)
+    assert seen.armed_pulses == CAPTURE.armed_pulses
+    printed = capsys.readouterr()
+    assert printed.out == "" and "100%" in printed.err
+
+
+def test_unknown_pulses_stay_unknown() -> None:
+    counts = dataset(Capture(CAPTURE.cube, Acquisition(100, n_pulses=None), detection="all"))
+    seen, _ = as_image(estimate_large(counts.counts, "peak").compute())
+    assert seen.acquisition.n_pulses is None and seen.armed_pulses is None
+
+
+@pytest.mark.compiled
+def test_a_cluster_gives_the_same_and_loses_nothing_with_a_worker(tmp_path: Path) -> None:
+    """The study of 8 GB, on a capture of 8 MB."""
+    from core.experiments import large as study  # noqa: PLC0415 - brings a cluster
+
+    path = tmp_path / "small.zarr"
+    study.generate(path, 256, 64, 64)
+    assert os.listdir(tmp_path) == ["small.zarr"]
+    shown: list[tuple[int, int]] = []
+    found = list(study.study(path, 2, 2 * 10**9, lambda *done: shown.append(done)))
+    assert [each.title for each in found] == [
+        "part after part, without Dask",
+        "1 worker",
+        "2 workers",
+        "2 workers, one killed",
+    ]
+    assert all(each.same for each in found)
+    # The first ran in this process, which holds other tests' captures, too.
+    assert all(0 < each.peak_bytes < 2e9 for each in found[1:])
+    assert all(done <= of for done, of in shown)

@@ -1,0 +1,296 @@
+"""MATLAB files: sparse matrices of both versions, and version 7.3."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from scipy.sparse import csc_array
+
+from core.capture import CaptureError
+from core.readers import guards, read_capture
+from core.tests.formats import list_of, matlab73
+from core.tests.labelled_files import Matlab73
+from core.tests.samples import CUBE, arrival_cells, cells_of, element, mat_bytes, mat_file, matrix
+
+SQUARE = np.random.default_rng(6).poisson(0.1, (8, 8, 64)).astype(np.uint16)
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[bytes], Path]:
+    def written(content: bytes) -> Path:
+        path = tmp_path / "a.mat"
+        path.write_bytes(content)
+        return path
+
+    return written
+
+
+WRITERS: dict[str, Callable[..., bytes]] = {"5": mat_bytes, "7.3": matlab73}
+
+
+@pytest.fixture(params=WRITERS)
+def save(request: pytest.FixtureRequest) -> Callable[..., bytes]:
+    return WRITERS[request.param]
+
+
+# -- sparse matrices -------------------------------------------------------------------------------
+
+
+def test_a_square_image_is_guessed(
+    save: Callable[..., bytes], write: Callable[[bytes], Path]
+) -> None:
+    path = write(save(spad=list_of(SQUARE), bin_size=80e-12, rates=np.ones((8, 8))))
+    capture = read_capture(path)
+    np.testing.assert_array_equal(capture.cube, SQUARE)
+    assert capture.acquisition.bin_width_s == pytest.approx(80e-12)
+    assert capture.source.startswith(
+        "a.mat, variable spad; guessed: shape 8 x 8, pixels column by column, bin width 80 ps"
+    )
+    told = read_capture(path, shape=(8, 8), axes="col row", bin_width_s=1e-10, n_pulses=100)
+    assert told.source.split("guessed: ")[1].startswith("gate")
+    assert told.acquisition.bin_width_s == 1e-10 and told.detection == "first"
+
+
+def test_shape_and_order_of_the_pixels(
+    save: Callable[..., bytes], write: Callable[[bytes], Path]
+) -> None:
+    by_row = csc_array(CUBE.reshape(12, 100).astype(float))
+    by_col = write(save(spad=list_of(CUBE)))
+    np.testing.assert_array_equal(read_capture(by_col, shape=(3, 4)).cube, CUBE)
+    path = write(save(spad=by_row))
+    capture = read_capture(path, shape=(3, 4), axes="row col")
+    np.testing.assert_array_equal(capture.cube, CUBE)
+    assert "column" not in capture.source
+    with pytest.raises(CaptureError, match=r"shape = None .*rows and columns of 12 pixels"):
+        read_capture(path)
+    with pytest.raises(CaptureError, match=r"shape = \(5, 2\) .*of 12 pixels"):
+        read_capture(path, shape=(5, 2))
+    with pytest.raises(CaptureError, match="axes = 'row col bin'"):
+        read_capture(path, shape=(3, 4), axes="row col bin")
+
+
+def test_common_stop(save: Callable[..., bytes], write: Callable[[bytes], Path]) -> None:
+    path = write(save(spad=list_of(SQUARE[:, :, ::-1])))
+    capture = read_capture(path, stop_s=1e-6)
+    np.testing.assert_array_equal(capture.cube, SQUARE)
+    assert capture.acquisition.gate_delay_s == pytest.approx(1e-6 - 64e-9)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"), [(-1.0, "= -1.0"), (0.5, "= 0.5"), (np.nan, "= nan")]
+)
+def test_no_counts(
+    value: float, message: str, save: Callable[..., bytes], write: Callable[[bytes], Path]
+) -> None:
+    odd = list_of(SQUARE)
+    odd.data[7] = value
+    with pytest.raises(CaptureError, match=f"a.mat: spad {message}.* whole counts"):
+        read_capture(write(save(spad=odd)))
+
+
+def sparse_5(
+    order: str = "<",
+    rows: Any = (0, 2, 1),
+    starts: Any = (0, 2, 3),
+    values: Any = (5.0, 6.0, 7.0),
+    shape: tuple[int, int] = (4, 2),
+    flags: int = 0,
+) -> bytes:
+    """A sparse matrix by hand: flags, shape, name, rows, starts of the columns, values."""
+    kind, nonzero = 5 | flags, len(values)
+    head = element(order, 6, struct.pack(order + "II", kind, nonzero))
+    head += element(order, 5, struct.pack(order + "ii", *shape)) + element(order, 1, b"spad")
+    parts = [struct.pack(f"{order}{len(one)}i", *one) for one in (rows, starts)]
+    body = b"".join(element(order, 5, part) for part in parts)
+    body += element(order, 9, struct.pack(f"{order}{len(values)}d", *values))
+    return mat_file(order, element(order, 14, head + body))
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_both_byte_orders(order: str, write: Callable[[bytes], Path]) -> None:
+    capture = read_capture(write(sparse_5(order)), axes="row col")
+    np.testing.assert_array_equal(capture.cube, [[[5, 0], [0, 7]], [[6, 0], [0, 0]]])
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ({"rows": (0, 9, 1)}, "rows of spad = 'out of order' .*below 4"),
+        ({"rows": (0, -1, 1)}, "rows of spad"),
+        ({"rows": (2, 0, 1)}, "rows of spad"),
+        ({"rows": (2, 2, 1)}, "rows of spad"),
+        ({"rows": (0, 2)}, "entries of spad = 3"),
+        ({"starts": (0, 2, 9)}, "entries of spad = 9"),
+        ({"starts": (0, 5, 3)}, "entries of spad"),
+        ({"starts": (1, 2, 3)}, "entries of spad"),
+        ({"starts": (0, 3)}, "columns of spad = 1"),
+        ({"values": (5.0, 6.0)}, "entries of spad = 3"),
+        ({"shape": (4, 10**9)}, "columns of spad"),
+        ({"shape": (2**30, 2)}, "bytes of the cube of spad"),
+        ({"flags": 0x0800}, "content of spad = 'complex"),
+    ],
+)
+def test_damaged_sparse_matrices(
+    made: dict[str, Any], message: str, write: Callable[[bytes], Path]
+) -> None:
+    with pytest.raises(CaptureError, match=message):
+        read_capture(write(sparse_5(**made)), axes="row col")
+
+
+def test_a_sparse_matrix_must_fit(
+    save: Callable[..., bytes], write: Callable[[bytes], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(save(spad=csc_array(([1.0], ([0], [0])), shape=(1024, 1024))))
+    monkeypatch.setattr(guards, "MAX_CUBE_BYTES", 2**20)
+    with pytest.raises(CaptureError, match="bytes of the cube of spad = 2097152 "):
+        read_capture(path)
+
+
+# -- the width of a bin that lies beside -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("beside", "width_s"),
+    [
+        ({"binWidth": 4e-12}, 4e-12),
+        ({"resolution": 4e-12, "bin_size": 4e-12}, 4e-12),
+        ({"resolution": 4e-12, "bin_size": 8e-12}, 1e-9),  # which?
+        ({"resolution": 4.0}, 1e-9),  # in picoseconds, perhaps
+        ({"resolution": np.nan}, 1e-9),
+        ({"width": 4e-12}, 1e-9),
+    ],
+)
+def test_bin_width_beside(
+    beside: dict[str, float],
+    width_s: float,
+    save: Callable[..., bytes],
+    write: Callable[[bytes], Path],
+) -> None:
+    capture = read_capture(write(save(counts=CUBE, **beside)))
+    assert capture.acquisition.bin_width_s == width_s
+    assert "guessed: axes (row, col, bin), bin width" in capture.source
+
+
+# -- version 7.3 -----------------------------------------------------------------------------------
+
+
+def test_cells_of_every_kind(write: Callable[[bytes], Path]) -> None:
+    """Rows, columns, numbers alone, and empty cells, which are stored as their size."""
+    cells = np.empty((2, 3), object)
+    cells[:] = [
+        [np.array([[10, 11]]), np.array([[]]), np.array([[12], [10]])],
+        [np.array(12), np.zeros((0, 0)), np.zeros((1, 0))],
+    ]
+    capture = read_capture(write(matlab73(Ts=cells)))
+    np.testing.assert_array_equal(capture.counts, [[2, 0, 2], [1, 0, 0]])
+    assert capture.cube[0, 2, 0] == capture.cube[0, 2, 2] == 1
+    limited = read_capture(write(matlab73(Ts=cells)), first_detections=1)
+    np.testing.assert_array_equal(limited.counts, [[1, 0, 1], [1, 0, 0]])
+    assert limited.cube[0, 2, -1] == 1  # the 12 came first
+
+
+def test_axes_are_turned(write: Callable[[bytes], Path]) -> None:
+    told = {"bin_width_s": 1e-9, "gate_delay_s": 1e-6, "n_bins": 100}
+    turned = matlab73(Ts=arrival_cells(CUBE.transpose(1, 0, 2)))
+    np.testing.assert_array_equal(read_capture(write(turned), axes="col row", **told).cube, CUBE)
+    turned = matlab73(counts=CUBE.transpose(2, 1, 0))
+    np.testing.assert_array_equal(read_capture(write(turned), axes="bin col row").cube, CUBE)
+
+
+def test_packed_cells_and_cubes(write: Callable[[bytes], Path]) -> None:
+    file = Matlab73()
+    file.cells("Ts", arrival_cells(CUBE), chunks=(1, 1), compression="gzip")
+    file.number("counts", CUBE, chunks=(50, 4, 3), compression="gzip", shuffle=True)
+    path = write(file.bytes())
+    with pytest.raises(CaptureError, match=r"variable = '.*Ts.*'"):
+        read_capture(path)
+    np.testing.assert_array_equal(read_capture(path, variable="counts").cube, CUBE)
+    capture = read_capture(path, variable="Ts", n_bins=100, gate_delay_s=1e-6)
+    np.testing.assert_array_equal(capture.cube, CUBE)
+
+
+def test_other_variables_do_not_fit(write: Callable[[bytes], Path]) -> None:
+    file = Matlab73()
+    file.text("note", "hello")
+    file.number("empty", np.zeros((0, 3, 4)))
+    file.number("depth", np.ones((3, 3)))
+    path = write(file.bytes())
+    listed = r"depth \(double, 3 x 3\), empty .*not numbers.*, note .*not numbers"
+    with pytest.raises(CaptureError, match=f"variable = None .*{listed}"):
+        read_capture(path)
+
+
+def cell_with(change: Callable[[Matlab73, h5py.Dataset], Any]) -> bytes:
+    """A row of three cells, of which the second was changed."""
+    file = Matlab73()
+    array = file.cells("Ts", cells_of([[5], [6], [7]], (1, 3)))
+    change(file, array)
+    return file.bytes()
+
+
+def refers(name: str) -> Callable[[Matlab73, h5py.Dataset], Any]:
+    def change(_: Matlab73, array: h5py.Dataset) -> None:
+        references = array[()]
+        references[1, 0] = array.file[name].ref
+        array[...] = references
+
+    return change
+
+
+def text(_: Matlab73, array: h5py.Dataset) -> None:
+    array.file["#refs#/c1"].attrs["MATLAB_int_decode"] = np.int32(2)
+
+
+def square(file: Matlab73, array: h5py.Dataset) -> None:
+    file.number("#refs#/square", np.ones((2, 3)))
+    refers("#refs#/square")(file, array)
+
+
+def outside(file: Matlab73, array: h5py.Dataset) -> None:
+    array.file.create_dataset("#refs#/out", (1, 4), "u2", external=[("/etc/passwd", 0, 8)])
+    refers("#refs#/out")(file, array)
+
+
+def nowhere(_: Matlab73, array: h5py.Dataset) -> None:
+    references = array[()]
+    references[1, 0] = h5py.Reference()
+    array[...] = references
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (refers("Ts"), r"Ts in pixel \(0, 1\) = no numbers"),
+        (refers("#refs#"), r"Ts in pixel \(0, 1\) = no array"),
+        (text, r"Ts in pixel \(0, 1\) = text"),
+        (square, r"Ts in pixel \(0, 1\) = array of shape \(2, 3\) .*give a vector"),
+        (outside, r"Ts in pixel \(0, 1\) = an array kept in other files"),
+        (nowhere, "Ts"),
+    ],
+)
+def test_cells_refused(
+    change: Callable[[Matlab73, h5py.Dataset], Any], message: str, write: Callable[[bytes], Path]
+) -> None:
+    with pytest.raises(CaptureError, match=message) as caught:
+        read_capture(write(cell_with(change)))
+    assert str(caught.value).startswith("a.mat: ")
+
+
+def test_cells_must_fit(write: Callable[[bytes], Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(matlab73(Ts=cells_of([np.ones(900), np.ones(900)], (1, 2))))
+    monkeypatch.setattr(guards, "MAX_CUBE_BYTES", 64 * 1000)
+    with pytest.raises(CaptureError, match=r"Ts in pixel \(0, 1\) = 900 photons, too many"):
+        read_capture(path)
+
+
+def test_version_5_helpers_agree_with_scipy(write: Callable[[bytes], Path]) -> None:
+    """The layout written here by hand is SciPy's."""
+    body = element("<", 9, CUBE.astype(float).tobytes("F"))
+    path = write(mat_file("<", matrix("<", 6, CUBE.shape, b"counts", body)))
+    np.testing.assert_array_equal(read_capture(path).cube, CUBE)

@@ -1,0 +1,486 @@
+"""What instruments write: what a file tells, what it cannot, and what must be refused."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from core.acquisition import Pulse
+from core.capture import CaptureError
+from core.estimators import estimate
+from core.readers import guards, read_capture
+from core.tests.captures import real_capture_path
+from core.tests.instruments import (
+    COMPRESSED,
+    FCS,
+    IMAGE,
+    UINT32,
+    ptu_bytes,
+    ptu_with,
+    sdt_bytes,
+    split,
+    tmf8820_bytes,
+    tmf8820_records,
+    zipped,
+)
+from core.tests.samples import CUBE
+
+Write = Callable[[str, bytes], Path]
+PTU = ptu_bytes(CUBE)
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    def written(name: str, content: bytes) -> Path:
+        path = tmp_path / name
+        path.write_bytes(content)
+        return path
+
+    return written
+
+
+# -- PicoQuant ----------------------------------------------------------------------------------
+
+
+def test_ptu_tells_its_bins_and_counts_all_photons(write: Write) -> None:
+    capture = read_capture(write("a.ptu", ptu_bytes(CUBE, 12.5e-9, 16e-12)), n_pulses=10**6)
+    assert capture.acquisition.bin_width_s == 16e-12
+    assert capture.acquisition.gate_delay_s == 0
+    assert capture.acquisition.n_bins == 782  # 781.25 to a period: the last one begins within
+    np.testing.assert_array_equal(capture.cube[:, :, :100], CUBE)
+    assert capture.detection == "all"
+    assert capture.source == "a.ptu; guessed: gate 0-12.512 ns, pulse Gaussian of 16 ps"
+
+
+def test_ptu_sums_frames_and_channels_or_takes_one(write: Write) -> None:
+    parts = split(CUBE)
+    path = write("a.ptu", ptu_bytes(parts))
+    assert read_capture(path).source.startswith("a.ptu, 2 frames and 2 channels summed; ")
+    for channel in (0, 1):
+        capture = read_capture(path, variable=f"channel {channel}")
+        np.testing.assert_array_equal(capture.cube, parts.sum(axis=0)[:, :, channel])
+        assert capture.source.startswith(f"a.ptu, channel {channel}, 2 frames summed; ")
+    with pytest.raises(CaptureError, match=r"variable = 'channel 2' .*channel 0, channel 1"):
+        read_capture(path, variable="channel 2")
+
+
+def test_ptu_keeps_to_one_period(write: Write) -> None:
+    """Photons that a file holds later than that belong to no bin."""
+    capture = read_capture(write("a.ptu", ptu_bytes(CUBE, period_s=40e-9)))
+    np.testing.assert_array_equal(capture.cube, CUBE[:, :, :40])
+
+
+def test_ptu_of_reverse_start_stop(write: Write) -> None:
+    path = write("a.ptu", ptu_bytes(CUBE[:, :, ::-1]))
+    capture = read_capture(path, stop_s=100e-9)
+    np.testing.assert_array_equal(capture.cube, CUBE)
+    assert capture.acquisition.gate_delay_s == pytest.approx(0, abs=1e-18)
+
+
+# -- Becker & Hickl -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [IMAGE, IMAGE | UINT32, IMAGE | COMPRESSED])
+def test_sdt_tells_its_bins_and_counts_all_photons(kind: int, write: Write) -> None:
+    path = write("a.sdt", sdt_bytes(CUBE, kind=kind, range_s=12.5e-9))
+    capture = read_capture(path, n_pulses=10**6)
+    assert capture.acquisition.bin_width_s == 125e-12  # the file holds numbers of 4 bytes
+    assert capture.detection == "all"
+    assert capture.source == "a.sdt, block 0; guessed: gate 0-12.5 ns, pulse Gaussian of 125 ps"
+
+
+def test_sdt_blocks_are_chosen_by_name(write: Write) -> None:
+    path = write("a.sdt", sdt_bytes(CUBE, 2 * CUBE))
+    with pytest.raises(CaptureError, match=r"variable = 'block 0, block 1'.*block 1 \(an image\)"):
+        read_capture(path)
+    np.testing.assert_array_equal(read_capture(path, variable="block 1").cube, 2 * CUBE)
+
+
+def test_sdt_of_curves_is_one_row(write: Write) -> None:
+    content = sdt_bytes(CUBE, kind=0x01, of_measurement={"scan_x": 0, "scan_y": 0})
+    capture = read_capture(write("a.sdt", content))
+    np.testing.assert_array_equal(capture.cube, CUBE.reshape(1, 12, 100))
+
+
+def test_sdt_sums_routing_channels(write: Write) -> None:
+    both = np.concatenate([CUBE, 2 * CUBE])
+    fields = {"scan_y": 3, "scan_x": 4, "scan_rx": 2}
+    capture = read_capture(write("a.sdt", sdt_bytes(both, of_measurement=fields)))
+    np.testing.assert_array_equal(capture.cube, 3 * CUBE)
+
+
+def test_sdt_without_times_needs_a_bin_width(write: Write) -> None:
+    path = write("a.sdt", sdt_bytes(CUBE, range_s=0.0))
+    with pytest.raises(CaptureError, match=r"bin width of block 0 = 0\.0 .*bin_width_s"):
+        read_capture(path)
+    assert read_capture(path, bin_width_s=1e-9).acquisition.bin_width_s == 1e-9
+
+
+# -- TMF8820 ------------------------------------------------------------------------------------
+
+
+def records_with(**fields: Any) -> bytes:
+    records = tmf8820_records(CUBE)
+    records[1] |= fields
+    return json.dumps(records).encode()
+
+
+def test_tmf8820_pulse_and_truth(write: Write) -> None:
+    records = tmf8820_records(CUBE)
+    reference = [0, 3, 0, 10, 1000, 500, 20, 1]
+    for k, record in enumerate(records):
+        record["reference_hist"] = reference
+        record["dist_to_plane"] = [0.1, None, 0.3][k]
+    capture = read_capture(write("a.json", json.dumps(records).encode()), n_pulses=10**6)
+    assert capture.pulse == Pulse.measured(3 * np.array(reference[3:]), 91e-12)
+    # An echo from 0 m has its peak in the second sample, 1.1 ns after the first bin begins.
+    assert capture.acquisition.gate_delay_s == pytest.approx(1.5 * 91e-12 - 1.1e-9)
+    np.testing.assert_array_equal(
+        capture.truth_range_m, np.repeat([[0.1], [np.nan], [0.3]], 4, axis=1)
+    )
+    assert capture.detection == "all"
+    assert capture.source == (
+        "a.json; guessed: bin width 91 ps, zero range 963.5 ps after the first bin"
+    )
+
+
+def test_tmf8820_record_is_a_square(write: Write) -> None:
+    path = write("a.json", tmf8820_bytes(CUBE))
+    capture = read_capture(path, variable="record 2")
+    np.testing.assert_array_equal(capture.cube, CUBE[2].reshape(2, 2, 100))
+    assert capture.source.startswith("a.json, record 2; ")
+    row = read_capture(write("b.json", tmf8820_bytes(CUBE[:, :3])), variable="record 0")
+    np.testing.assert_array_equal(row.cube, CUBE[:1, :3])
+    for name in ("record 3", "record -1", "record", "zone 1", "record 0 1"):
+        with pytest.raises(CaptureError, match=r"variable = .*'record 0' to 'record 2'"):
+            read_capture(path, variable=name)
+
+
+@pytest.mark.parametrize("pulse", [Pulse(1e-10), Pulse.gaussian(1e-10)])
+def test_tmf8820_zero_range_follows_a_told_pulse(pulse: Pulse, write: Write) -> None:
+    capture = read_capture(write("a.json", tmf8820_bytes(CUBE)), pulse=pulse)
+    peak_s = pulse.tau_s if pulse.shape == "gamma" else 0.0
+    assert capture.acquisition.gate_delay_s == pytest.approx(peak_s - 1.1e-9)
+
+
+@pytest.mark.parametrize("method", ["peak", "matched_filter", "likelihood"])
+def test_tmf8820_ranges_of_a_real_sensor(method: str) -> None:
+    """A plane at 5 to 400 mm: the middle zone within a bin, 13.6 mm, from where crosstalk ends."""
+    capture = read_capture(real_capture_path("tmf8820_distance_data.json"))
+    assert capture.cube.shape == (159, 9, 128) and capture.cube.dtype == np.uint32
+    assert capture.truth_range_m is not None
+    error_m = (estimate(capture, method).range_m - capture.truth_range_m)[:, 4]
+    seen = capture.truth_range_m[:, 4] > 0.04
+    assert 0.004 < np.median(error_m[seen]) < 0.008
+    assert np.all(np.abs(error_m[seen]) < 0.0182)
+    assert error_m[seen].std() < 0.0048
+
+
+# -- what must be refused -----------------------------------------------------------------------
+
+
+def bomb_sdt(n_bytes: int, claims: int | None = None, length: int | None = None) -> bytes:
+    """A block that unpacks to zeros; its archive and its header may claim other sizes."""
+    packed = zipped(bytes(n_bytes), claims=claims)
+    told = n_bytes if claims is None else claims
+    content = sdt_bytes(CUBE, kind=IMAGE | COMPRESSED)
+    begin = content.index(b"PK\x03\x04")
+    plain = bytearray(content[:begin] + packed)
+    plain[begin - 4 : begin] = (told if length is None else length).to_bytes(4, "little")
+    plain[begin - 16 : begin - 12] = (begin + len(packed)).to_bytes(4, "little")
+    return bytes(plain)
+
+
+def nested(depth: int) -> bytes:
+    return b"[" * depth + b"]" * depth
+
+
+REFUSED: dict[str, tuple[str, Callable[[], bytes], str]] = {
+    # PicoQuant
+    "empty ptu": ("a.ptu", lambda: b"", "damaged"),
+    "wrong magic in ptu": ("a.ptu", lambda: bytes(500), "damaged.*magic"),
+    "truncated ptu": ("a.ptu", lambda: PTU[:-40], "TTResult_NumberOfRecords = 115 .*it holds 105"),
+    "ptu truncated in its header": ("a.ptu", lambda: PTU[:500], "header.*damaged"),
+    "ptu of huge image": (
+        "a.ptu",
+        lambda: ptu_with(ptu_with(PTU, "ImgHdr_PixX", 2**16), "ImgHdr_PixY", 2**16),
+        "bytes of the image = 1717986918400 .*2,147,483,648",
+    ),
+    "ptu of pixels beyond counting": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "ImgHdr_PixX", 2**62),
+        "ImgHdr_PixX = 4611686018427387904 .*65,536",
+    ),
+    "ptu of negative pixels": ("a.ptu", lambda: ptu_with(PTU, "ImgHdr_PixY", -3), "PixY = -3"),
+    "ptu of more records than bytes": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "TTResult_NumberOfRecords", 2**60),
+        "TTResult_NumberOfRecords = 1152921504606846976 ",
+    ),
+    "ptu of no records": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "TTResult_NumberOfRecords", -1),
+        "TTResult_NumberOfRecords = -1",
+    ),
+    "ptu of a marker beyond memory": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "ImgHdr_LineStop", 2**40),
+        "ImgHdr_LineStop = 1099511627776 .*1 to 8",
+    ),
+    "ptu of no width": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "MeasDesc_Resolution", np.nan),
+        "MeasDesc_Resolution = nan",
+    ),
+    "ptu of negative width": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "MeasDesc_Resolution", -1e-9),
+        "MeasDesc_Resolution = -1e-09",
+    ),
+    "ptu of an endless period": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "MeasDesc_GlobalResolution", 1e300),
+        "MeasDesc_GlobalResolution / MeasDesc_Resolution = 1e\\+309|inf",
+    ),
+    "ptu of T2 records": ("a.ptu", lambda: ptu_with(PTU, "Measurement_Mode", 2), "Mode = 2 .*T3"),
+    "ptu of a point": ("a.ptu", lambda: ptu_with(PTU, "Measurement_SubMode", 1), "SubMode = 1"),
+    "ptu of a swinging mirror": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "ImgHdr_SinCorrection", 80),
+        "ImgHdr_SinCorrection = 80 ",
+    ),
+    "ptu of unknown records": (
+        "a.ptu",
+        lambda: ptu_with(PTU, "TTResultFormat_TTTRRecType", 7),
+        "records cannot be read",
+    ),
+    # Becker & Hickl
+    "empty sdt": ("a.sdt", lambda: b"", "header.*damaged"),
+    "wrong magic in sdt": ("a.sdt", lambda: bytes(500), "no_of_data_blocks = 0"),
+    "sdt of invalid header": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, changes={"chksum": 0, "header_valid": 0x1111}),
+        "blocks cannot be read.*invalid SDT file header",
+    ),
+    "truncated sdt": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE)[:-10],
+        "bytes of block 0 = 2390 .*2,400",
+    ),
+    "truncated compressed sdt": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, kind=IMAGE | COMPRESSED)[:-10],
+        "block 0 cannot be read.*zip",
+    ),
+    "sdt of more blocks than bytes": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, changes={"no_of_data_blocks": 0x7FFF, "reserved1": 2**31}),
+        "no_of_data_blocks = 2147483648",
+    ),
+    "sdt of blocks in a circle": (
+        "a.sdt",
+        lambda: sdt_bytes(
+            CUBE, changes={"no_of_data_blocks": 30}, of_blocks={"next_block_offs": 200}
+        ),
+        "offset of a block = 200 .*forwards",
+    ),
+    "sdt of a huge block": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, of_blocks={"block_length": 2**32 - 2}),
+        "bytes of all blocks = 4294967294",
+    ),
+    "sdt that claims more than it holds": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, of_blocks={"block_length": 2**30}),
+        "bytes of block 0 = 2400 .*1,073,741,824",
+    ),
+    "sdt that unpacks to more than it claims": (
+        "a.sdt",
+        lambda: bomb_sdt(2**24, claims=2400),
+        "bytes of block 0, unpacked, = 2401 ",
+    ),
+    "sdt that unpacks to less than it needs": (
+        "a.sdt",
+        lambda: bomb_sdt(100, length=2400),
+        "bytes of block 0 = 100 .*2,400",
+    ),
+    "sdt that claims to unpack to gigabytes": (
+        "a.sdt",
+        lambda: bomb_sdt(100, claims=2**32 - 2, length=2400),
+        "bytes of block 0 = 4294967294 .*2,147,483,648",
+    ),
+    "sdt by lzma": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, kind=IMAGE | COMPRESSED).replace(
+            zipped(CUBE.tobytes()), zipped(CUBE.tobytes(), zipfile.ZIP_LZMA)
+        ),
+        "compression method of block 0 = 14|block 0 cannot be read",
+    ),
+    "sdt of correlations": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, kind=FCS | 0x01),
+        "variable = None .*file has none",
+    ),
+    "sdt of no image": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, of_measurement={"adc_re": 7}),
+        r"shape of block 0 = \(1200,\)",
+    ),
+    "sdt of no measurement": (
+        "a.sdt",
+        lambda: sdt_bytes(CUBE, of_blocks={"meas_desc_block_no": 5}),
+        "blocks cannot be read.*IndexError",
+    ),
+    # TMF8820
+    "empty json": ("a.json", lambda: b"", "list of records.*damaged"),
+    "no json": ("a.json", lambda: b"\x89PNG\r\n", "list of records.*damaged"),
+    "truncated json": ("a.json", lambda: records_with()[:-10], "list of records.*damaged"),
+    "json of something else": ("a.json", lambda: b'{"hists": []}', "the file = 'dict'"),
+    "json of no records": ("a.json", lambda: b"[]", "records = 0"),
+    "json of other records": ("a.json", lambda: b'[{"hist": 1}]', "record 0 = 'dict'.*hists"),
+    "json of numbers": ("a.json", lambda: b"[1, 2]", "record 0 = 'int'"),
+    "nested json": ("a.json", lambda: nested(100_000), "depth of the records = 100000"),
+    "nested deep in json": (
+        "a.json",
+        lambda: b'[{"hists": ' + nested(20_000) + b"}]",
+        "depth of the records = 20002",
+    ),
+    "nan in json": (
+        "a.json",
+        lambda: records_with(dist_to_plane=np.nan),
+        "NaN is no number",
+    ),
+    "infinity in json": (
+        "a.json",
+        lambda: records_with().replace(b"3", b"Infinity", 1),
+        "Infinity is no number",
+    ),
+    "a count beyond floats": (
+        "a.json",
+        lambda: records_with().replace(b"3", b"1e999", 1),
+        "hists = inf",
+    ),
+    "a count of too many digits": (
+        "a.json",
+        lambda: records_with().replace(b"3", b"3" * 5000, 1),
+        "list of records.*digits",
+    ),
+    "a count beyond integers": (
+        "a.json",
+        lambda: records_with().replace(b"3", b"3" * 30, 1),
+        "hists of record 0 = 'object array",
+    ),
+    "negative count": ("a.json", lambda: records_with().replace(b"3", b"-3", 1), "hists = -3"),
+    "no whole count": ("a.json", lambda: records_with().replace(b"3", b"3.5", 1), "hists = 3.5"),
+    "text for a count": ("a.json", lambda: records_with().replace(b"3", b'"3"', 1), "hists of.* 0"),
+    "null for a count": (
+        "a.json",
+        lambda: records_with().replace(b"3", b"null", 1),
+        "hists of record 0 = 'object array",
+    ),
+    "ragged bins": (
+        "a.json",
+        lambda: records_with(hists=[[1, 2], [1]]),
+        "hists of record 1 cannot be read",
+    ),
+    "fewer zones": (
+        "a.json",
+        lambda: records_with(hists=[[0] * 100] * 3),
+        r"shape of hists of record 1 = \(3, 100\) .*\(4, 100\)",
+    ),
+    "no zones": ("a.json", lambda: records_with(hists=[]), "hists of record 1"),
+    "one zone": ("a.json", lambda: records_with(hists=[1, 2]), r"hists of record 1 .*\(2,\)"),
+    "hists of text": ("a.json", lambda: records_with(hists="some"), "hists of record 1 = '<U4"),
+    "hists of an object": ("a.json", lambda: records_with(hists={}), "hists of record 1 = 'object"),
+    "one reference": (
+        "a.json",
+        lambda: records_with(reference_hist=[1, 2]),
+        "reference_hist of record 0 = 'object",
+    ),
+    "negative distance": (
+        "a.json",
+        lambda: records_with(dist_to_plane=-0.1),
+        "dist_to_plane of record 1 = -0.1",
+    ),
+    "distance of text": (
+        "a.json",
+        lambda: records_with(dist_to_plane="far"),
+        "dist_to_plane of record 1 = 'far'",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered in:RuntimeWarning")
+@pytest.mark.parametrize("what", REFUSED)
+def test_refused(what: str, write: Write) -> None:
+    name, build, message = REFUSED[what]
+    path = write(name, build())
+    with pytest.raises(CaptureError):
+        read_capture(path)  # the first call of a format loads its library
+    tracemalloc.start()
+    try:
+        with pytest.raises(CaptureError, match=message) as caught:
+            read_capture(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert str(caught.value).startswith(f"{name}: ")
+    assert peak < 2**20 + 10 * path.stat().st_size
+
+
+def test_references_must_be_counts(write: Write) -> None:
+    for reference, message in {
+        (0, 0, 0): "reference_hist = 0.0 .*not all 0",
+        (1, -1, 0): "reference_hist of record 0 = -1",
+        (1, 2, "x"): "reference_hist of record 0",
+    }.items():
+        records = tmf8820_records(CUBE)
+        for record in records:
+            record["reference_hist"] = list(reference)
+        with pytest.raises(CaptureError, match=message):
+            read_capture(write("a.json", json.dumps(records).encode()))
+
+
+def test_what_unpacks_beyond_the_limit_is_refused(
+    write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guards, "MAX_CUBE_BYTES", 2**20)
+    for name, content in {
+        "bomb.sdt": sdt_bytes(np.zeros((64, 64, 256)), kind=IMAGE | COMPRESSED),
+        "wide.ptu": ptu_bytes(np.ones((64, 64, 1)), period_s=200e-9),
+        "many.json": json.dumps(tmf8820_records(np.zeros((2, 10, 1000), int))).encode(),
+    }.items():
+        with pytest.raises(CaptureError, match=r"bytes of .* at most 1,048,576 bytes are read"):
+            read_capture(write(name, content))
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=6,
+)
+counts = st.lists(st.lists(st.integers(-1, 9) | values, max_size=4), max_size=4)
+fields = st.fixed_dictionaries(
+    {"hists": counts | values},
+    optional={"reference_hist": st.lists(st.integers(0, 9)) | values, "dist_to_plane": values},
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(fields | values, max_size=3) | values)
+def test_any_json_is_read_or_refused(tmp_path_factory: Any, records: Any) -> None:
+    path = tmp_path_factory.mktemp("json") / "any.json"
+    path.write_text(json.dumps(records))
+    try:
+        assert read_capture(path).cube.ndim == 3
+    except CaptureError as error:
+        assert str(error).startswith("any.json: ")

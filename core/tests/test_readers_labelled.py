@@ -1,0 +1,730 @@
+"""HDF5, netCDF and Zarr: whole or in parts, from others or our own; and what must be refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import sys
+import tracemalloc
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numcodecs
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+
+from core.acquisition import Acquisition, Pulse
+from core.capture import Capture, CaptureError
+from core.readers import chunks, guards, open_capture, read_capture
+from core.readers.labelled import dataset, describe, oriented
+from core.readers.lzf import decompress
+from core.readers.request import Request
+from core.readers.stored import Stored, choose
+from core.tests.formats import Content, bare, put
+from core.tests.labelled_files import hdf5_bytes, netcdf_bytes, zarr_files
+from core.tests.samples import ACQUISITION, CUBE, npy_bytes
+
+CAPTURE = Capture(
+    CUBE.astype(np.uint8),
+    ACQUISITION,
+    Pulse.measured([1, 2, 1], 1e-9),
+    truth_range_m=np.arange(12.0).reshape(3, 4),
+    signal=np.full((3, 4), 0.5),
+    background=1.5,
+    source="a wall",
+)
+
+OWN: dict[str, Callable[[], Content]] = {
+    "c.nc": lambda: netcdf_bytes(dataset(CAPTURE)),
+    "c.h5": lambda: netcdf_bytes(dataset(CAPTURE), zlib=True, chunksizes=(2, 3, 64)),
+    "two.zarr": lambda: zarr_files(dataset(CAPTURE), 2),
+    "three.zarr": lambda: zarr_files(dataset(CAPTURE), 3, chunks=(2, 3, 64)),
+}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_our_own_layout_keeps_everything(name: str, tmp_path: Path) -> None:
+    path = put(tmp_path / name, OWN[name]())
+    read = read_capture(path)
+    assert read.cube.dtype == np.uint8
+    np.testing.assert_array_equal(read.cube, CAPTURE.cube)
+    for field in ("acquisition", "pulse", "background", "source", "detection"):
+        assert getattr(read, field) == getattr(CAPTURE, field), field
+    np.testing.assert_array_equal(read.truth_range_m, CAPTURE.truth_range_m)
+    np.testing.assert_array_equal(read.signal, CAPTURE.signal)
+    opened = open_capture(path)
+    assert describe(opened, Request()) == (ACQUISITION, CAPTURE.pulse, "first", "a wall")
+    assert opened.attrs["background"] == 1.5
+    again = read_capture(put(tmp_path / "again.nc", netcdf_bytes(opened.to_dataset())))
+    np.testing.assert_array_equal(again.cube, CAPTURE.cube)
+    assert again.acquisition == ACQUISITION
+
+
+# -- arrays of others ------------------------------------------------------------------------------
+
+
+def test_axes_and_times_are_known_by_their_names(tmp_path: Path) -> None:
+    times = ("time", 250.0 + 0.5 * np.arange(100), {"units": "ns"})
+    array = xr.Dataset(
+        {"hist": (("time", "x", "y"), CUBE.T)}, {"time": times, "y": ("y", [1.0, 2.0, 3.0])}
+    )
+    content = array.to_netcdf(engine="h5netcdf")
+    files: dict[str, Content] = {"t.nc": bytes(content)}
+    array.to_zarr(tmp_path / "t.zarr", consolidated=True, zarr_format=2)
+    for name in ("t.nc", "t.zarr"):
+        path = put(tmp_path / name, files[name]) if name in files else tmp_path / name
+        capture = read_capture(path)
+        np.testing.assert_array_equal(capture.cube, CUBE)
+        assert capture.acquisition.bin_width_s == pytest.approx(0.5e-9)
+        assert capture.acquisition.gate_delay_s == pytest.approx(250e-9)
+        assert capture.source == (
+            f"{name}, variable hist; guessed: pulse Gaussian of 500 ps, all photons of a pulse"
+        )
+        opened = open_capture(path, n_pulses=500)
+        assert opened.dims == ("row", "col", "bin") and opened.dtype == np.uint16
+        assert opened.chunks is not None and opened.chunks[2] == (100,)
+        np.testing.assert_array_equal(opened, CUBE)
+        found = describe(opened, Request())
+        assert found.acquisition == Acquisition(100, *_timing(capture), 500, None)
+        assert found.source.endswith("guessed: pulse Gaussian of 500 ps, first photons only")
+
+
+def _timing(capture: Capture) -> tuple[float, float]:
+    return capture.acquisition.bin_width_s, capture.acquisition.gate_delay_s
+
+
+def test_ranges_tell_times(tmp_path: Path) -> None:
+    ranges = ("bin", 30.0 + 0.15 * np.arange(100))
+    array = xr.Dataset({"counts": (("row", "col", "bin"), CUBE)}, {"range_m": ranges})
+    capture = read_capture(put(tmp_path / "r.nc", netcdf_bytes(array)))
+    assert capture.acquisition.bin_width_s == pytest.approx(0.3 / speed_of_light)
+    assert capture.acquisition.gate_delay_s == pytest.approx(60 / speed_of_light)
+
+
+def test_plain_hdf5_guesses_its_axes(tmp_path: Path) -> None:
+    known = {"bin_width_s": 2e-9, "n_pulses": 500}
+    kept = {"data": CUBE.transpose(2, 0, 1), "attributes": known}
+    path = put(tmp_path / "p.h5", hdf5_bytes(**{"raw/hist": kept, "depth": np.ones((3, 4))}))
+    capture = read_capture(path, axes="bin row col")
+    np.testing.assert_array_equal(capture.cube, CUBE)
+    assert capture.acquisition == Acquisition(100, 2e-9, 0.0, 500, None)
+    assert "axes" not in capture.source and capture.detection == "first"
+    np.testing.assert_array_equal(open_capture(path, axes="bin row col"), CUBE)
+    guessed = read_capture(path, n_pulses=1)
+    assert guessed.cube.shape == (100, 3, 4)
+    assert "guessed: axes (row, col, bin), gate" in guessed.source
+    assert guessed.detection == "all"  # some pixels have more than 1
+
+
+def test_common_stop_counts_backwards(tmp_path: Path) -> None:
+    path = put(tmp_path / "b.h5", hdf5_bytes(counts=CUBE[:, :, ::-1]))
+    told = {"stop_s": 1.1e-6, "bin_width_s": 1e-9}
+    capture, opened = read_capture(path, **told), open_capture(path, **told)
+    for counts, acquisition in (
+        (capture.cube, capture.acquisition),
+        (opened.values, describe(opened, Request()).acquisition),
+    ):
+        np.testing.assert_array_equal(counts, CUBE)
+        assert acquisition.gate_delay_s == pytest.approx(1e-6, rel=1e-12)
+    path = put(tmp_path / "t.nc", netcdf_bytes(dataset(CAPTURE)))
+    with pytest.raises(CaptureError, match=r"stop_s = 1.1e-06 .*None: time_s tells"):
+        read_capture(path, **told)
+
+
+def test_variable_chooses(tmp_path: Path) -> None:
+    path = put(tmp_path / "two.h5", hdf5_bytes(**{"a/night": CUBE, "day": 2 * CUBE}))
+    with pytest.raises(CaptureError, match=r"variable = 'day, a/night'.*day \(3 x 4 x 100\)"):
+        read_capture(path)
+    np.testing.assert_array_equal(read_capture(path, variable="a/night").cube, CUBE)
+
+
+def test_what_was_never_written_is_its_fill(tmp_path: Path) -> None:
+    file = io.BytesIO()
+    with h5py.File(file, "w") as target:
+        target.create_dataset("all", CUBE.shape, "u2", fillvalue=3)
+        some = target.create_dataset("some", CUBE.shape, "u2", chunks=(2, 2, 50), fillvalue=3)
+        some[0, 0, 0] = 9
+        target.create_dataset("compact", data=CUBE[:1, :2, :50])
+    path = put(tmp_path / "f.h5", file.getvalue())
+    assert np.all(read_capture(path, variable="all").cube == 3)
+    cube = read_capture(path, variable="some").cube
+    assert cube[0, 0, 0] == 9 and cube.sum() == 9 + 3 * (cube.size - 1)
+    np.testing.assert_array_equal(read_capture(path, variable="compact").cube, CUBE[:1, :2, :50])
+
+
+def test_compact_arrays(tmp_path: Path) -> None:
+    file = io.BytesIO()
+    with h5py.File(file, "w") as target:
+        kept = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        kept.set_layout(h5py.h5d.COMPACT)
+        space = h5py.h5s.create_simple(CUBE.shape)
+        array = h5py.h5d.create(target.id, b"c", h5py.h5t.STD_U16BE, space, dcpl=kept)
+        array.write(h5py.h5s.ALL, h5py.h5s.ALL, CUBE)
+    capture = read_capture(put(tmp_path / "c.h5", file.getvalue()))
+    np.testing.assert_array_equal(capture.cube, CUBE)
+
+
+# -- nothing is read before it is asked for --------------------------------------------------------
+
+
+class Reads:
+    """How many bytes of arrays were read from files."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.n_bytes = 0
+        fetch, box = chunks.read_stretch, chunks.Contiguous.__getitem__
+
+        def read_stretch(path: Path, offset: int, n_bytes: int) -> bytes:
+            self.n_bytes += n_bytes
+            return fetch(path, offset, n_bytes)
+
+        def read_box(array: chunks.Contiguous, key: tuple[slice, ...]) -> NDArray[Any]:
+            found = box(array, key)
+            self.n_bytes += found.nbytes
+            return found
+
+        monkeypatch.setattr(chunks, "read_stretch", read_stretch)
+        monkeypatch.setattr("core.readers.zarr.read_stretch", read_stretch)
+        monkeypatch.setattr(chunks.Contiguous, "__getitem__", read_box)
+
+
+LARGE = np.random.default_rng(5).poisson(0.05, (64, 48, 200)).astype(np.uint16)
+
+
+def large() -> Any:
+    return xr.Dataset({"counts": (("row", "col", "bin"), LARGE)})
+
+
+LAZY: dict[str, Callable[[], Content]] = {
+    "contiguous.h5": lambda: hdf5_bytes(counts=LARGE),
+    "chunked.h5": lambda: hdf5_bytes(
+        counts={"data": LARGE, "chunks": (8, 8, 50), "compression": "gzip"}
+    ),
+    "netcdf.nc": lambda: netcdf_bytes(large(), chunksizes=(8, 8, 200)),
+    "two.zarr": lambda: zarr_files(large(), 2, chunks=(8, 8, 200)),
+    "three.zarr": lambda: zarr_files(large(), 3, chunks=(8, 8, 50)),
+}
+
+
+@pytest.mark.parametrize("name", LAZY)
+def test_opening_reads_nothing(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guards, "MAX_CUBE_BYTES", LARGE.nbytes // 4)
+    monkeypatch.setattr("core.readers.labelled.BLOCK_BYTES", LARGE.nbytes // 16)
+    path = put(tmp_path / name, LAZY[name]())
+    with pytest.raises(CaptureError, match=r"bytes of .*counts.* are read"):
+        read_capture(path)
+    open_capture(put(tmp_path / "first.h5", hdf5_bytes(counts=CUBE)))  # what it imports
+    reads = Reads(monkeypatch)
+    tracemalloc.start()
+    try:
+        opened = open_capture(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert reads.n_bytes == 0
+    assert peak < LARGE.nbytes // 4
+    assert opened.shape == LARGE.shape and opened.chunks is not None
+    assert len(opened.chunks[0]) > 1 and opened.chunks[2] == (200,)
+    np.testing.assert_array_equal(opened[5, 7], LARGE[5, 7])
+    assert 0 < reads.n_bytes <= LARGE.nbytes // 8
+    for box in np.s_[::-1, 3, ::-7], np.s_[-1, 40:2:-3, 5:5], np.s_[60:, ::9, [1, 5, 2]]:
+        np.testing.assert_array_equal(opened[box], LARGE[box])
+    np.testing.assert_array_equal(opened.sum("bin"), LARGE.sum(axis=2))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(opened))[60:], LARGE[60:])
+
+
+def test_bins_first_are_read_whole_along_the_bins(tmp_path: Path) -> None:
+    path = put(tmp_path / "b.h5", hdf5_bytes(counts=LARGE.transpose(2, 0, 1)))
+    opened = open_capture(path, axes="bin row col")
+    np.testing.assert_array_equal(opened[3:5, 6:9], LARGE[3:5, 6:9])
+
+
+def test_counts_are_checked_when_they_are_read(tmp_path: Path) -> None:
+    for value, message in ((-1, "= -1.* 0 or more"), (0.5, "whole counts"), (np.nan, "nan")):
+        odd = CUBE.astype(float)
+        odd[2, 1, 5] = value
+        path = put(tmp_path / "o.h5", hdf5_bytes(counts={"data": odd, "chunks": (1, 4, 100)}))
+        opened = open_capture(path)
+        assert opened.dtype == np.uint32
+        with pytest.raises(CaptureError, match=message) as caught:
+            opened.compute(scheduler="synchronous")
+        assert str(caught.value).startswith("o.h5: ")
+        with pytest.raises(CaptureError, match=message):
+            read_capture(path)
+
+
+def test_other_files_are_opened_by_reading_them(tmp_path: Path) -> None:
+    opened = open_capture(put(tmp_path / "c.npy", npy_bytes(CUBE)), bin_width_s=2e-9)
+    np.testing.assert_array_equal(opened, CUBE)
+    assert describe(opened, Request()).acquisition.bin_width_s == 2e-9
+    assert opened.attrs["source"].startswith("c.npy; guessed: axes")
+    with pytest.raises(CaptureError, match=r"c.npy: n_bins = 99"):
+        open_capture(tmp_path / "c.npy", n_bins=99)
+    with pytest.raises(CaptureError, match="colour"):
+        open_capture(tmp_path / "c.npy", colour="red")
+    with pytest.raises(CaptureError, match="an existing file"):
+        open_capture(tmp_path / "absent.zarr")
+
+
+def test_any_labelled_array_is_described() -> None:
+    array = xr.DataArray(CUBE, dims=("y", "x", "t"), coords={"t": 5.0 + np.arange(100)})
+    array.t.attrs["units"] = "ns"
+    known = describe(oriented(array, Request()), Request(), "mine")
+    assert known.acquisition.gate_delay_s == pytest.approx(5e-9)
+    assert known.source == "mine; guessed: pulse Gaussian of 1 ns, all photons of a pulse"
+
+
+# -- filters and codecs ----------------------------------------------------------------------------
+
+CODECS: dict[str, tuple[int, dict[str, Any]]] = {
+    "none, 2": (2, {"compressors": None}),
+    "zlib": (2, {"compressors": numcodecs.Zlib()}),
+    "gzip": (2, {"compressors": numcodecs.GZip()}),
+    "zstd, 2": (2, {"compressors": numcodecs.Zstd(checksum=True)}),
+    **{
+        f"blosc {name} {shuffle}": (2, {"compressors": numcodecs.Blosc(name, shuffle=shuffle)})
+        for name in ("lz4", "lz4hc", "blosclz", "zlib", "zstd")
+        for shuffle in (0, 1, 2)
+    },
+    "shuffle": (2, {"compressors": numcodecs.Zlib(), "filters": [numcodecs.Shuffle(2)]}),
+    "fletcher32": (2, {"compressors": numcodecs.Zlib(), "filters": [numcodecs.Fletcher32()]}),
+    "none, 3": (3, {"compressors": None}),
+    "gzip, 3": (3, {"compressors": "gzip"}),
+    "crc32c": (3, {"compressors": "crc32c"}),
+    "blosc, 3": (3, {"compressors": "blosc"}),
+    "transposed": (3, {"filters": "transpose"}),
+    "big-endian": (3, {"serializer": "big"}),
+}
+
+
+@pytest.mark.parametrize("what", CODECS)
+def test_codecs(what: str, tmp_path: Path) -> None:
+    from zarr import codecs  # noqa: PLC0415
+
+    of_3 = {
+        "gzip": codecs.GzipCodec(),
+        "crc32c": [codecs.GzipCodec(), codecs.Crc32cCodec()],
+        "blosc": codecs.BloscCodec(),
+        "transpose": [codecs.TransposeCodec(order=(2, 0, 1))],
+        "big": codecs.BytesCodec(endian="big"),
+    }
+    version, told = CODECS[what]
+    encoding = {k: of_3.get(v, v) if isinstance(v, str) else v for k, v in told.items()}
+    path = put(tmp_path / "c.zarr", zarr_files(bare(), version, chunks=(2, 3, 64), **encoding))
+    np.testing.assert_array_equal(read_capture(path).cube, CUBE)
+
+
+def test_every_order_and_key_of_zarr_2(tmp_path: Path) -> None:
+    import zarr  # noqa: PLC0415
+
+    for order in "CF":
+        for separator in "./":
+            path = tmp_path / f"{order}{separator == '.'}.zarr"
+            array = zarr.create_array(
+                path,
+                name="data",
+                shape=CUBE.shape,
+                dtype=">u2",
+                chunks=(2, 3, 64),
+                order=order,
+                zarr_format=2,
+                chunk_key_encoding={"name": "v2", "separator": separator},
+                fill_value=7,
+            )
+            array[:, :3] = CUBE[:, :3]
+            capture = read_capture(path)
+            np.testing.assert_array_equal(capture.cube[:, :3], CUBE[:, :3])
+            assert np.all(capture.cube[:, 3] == 7)
+            assert capture.source.startswith(f"{path.name}, variable data; guessed: axes")
+
+
+def test_an_array_alone_is_a_zarr_directory(tmp_path: Path) -> None:
+    import zarr  # noqa: PLC0415
+
+    zarr.create_array(tmp_path / "a.zarr", data=CUBE, chunks=(2, 3, 64))
+    np.testing.assert_array_equal(read_capture(tmp_path / "a.zarr").cube, CUBE)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lzf_is_h5py_s(seed: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    cube = rng.poisson(10.0**-seed, (8, 8, 900)).astype(np.uint16)
+    kept = {"data": cube, "compression": "lzf", "shuffle": bool(seed % 2)}
+    path = put(tmp_path / "l.h5", hdf5_bytes(counts=kept))
+    np.testing.assert_array_equal(read_capture(path).cube, cube)
+
+
+def test_lzf_never_leaves_its_buffers() -> None:
+    assert decompress(b"\x02abc", 3) == b"abc"
+    assert decompress(b"\x00a\xe0\x05\x00", 100) == b"a" * 15
+    # Cut short, longer than told, and copied from before the beginning.
+    for packed in (b"\x05ab", b"\x02abc", b"\xe0", b"\xe0\x05", b"\x20", b"\x00a\x20\x05"):
+        with pytest.raises(ValueError, match="LZF"):
+            decompress(packed, 2)
+    rng = np.random.default_rng(0)
+    for _ in range(2000):
+        packed = rng.integers(256, size=rng.integers(40), dtype=np.uint8).tobytes()
+        try:
+            assert len(decompress(packed, 50)) <= 50
+        except ValueError:
+            continue
+
+
+# -- what must be refused --------------------------------------------------------------------------
+
+
+def written(build: Callable[[h5py.File], Any]) -> Callable[[], bytes]:
+    """A file that a function fills."""
+
+    def content() -> bytes:
+        file = io.BytesIO()
+        with h5py.File(file, "w") as target:
+            build(target)
+        return file.getvalue()
+
+    return content
+
+
+def virtual(file: h5py.File) -> None:
+    layout = h5py.VirtualLayout(CUBE.shape, "u2")
+    layout[:] = h5py.VirtualSource("/etc/secret.h5", "counts", CUBE.shape)
+    file.create_virtual_dataset("counts", layout)
+
+
+def external(file: h5py.File) -> None:
+    file.create_dataset("counts", CUBE.shape, "u2", external=[("/etc/passwd", 0, 2400)])
+
+
+def linked(file: h5py.File) -> None:
+    file["counts"] = h5py.ExternalLink("/etc/secret.h5", "/counts")
+
+
+def soft(file: h5py.File) -> None:
+    file["counts"] = h5py.SoftLink("/other")
+
+
+def compound(file: h5py.File) -> None:
+    file["counts"] = np.zeros((3, 4, 5), [("a", "u2"), ("b", "u2")])
+
+
+def ragged(file: h5py.File) -> None:
+    file.create_dataset("counts", (3, 4, 5), h5py.vlen_dtype("u2"))
+
+
+def texts(file: h5py.File) -> None:
+    file.create_dataset("counts", (3, 4, 5), h5py.string_dtype())
+
+
+def narrow(file: h5py.File) -> None:
+    kind = h5py.h5t.STD_U16LE.copy()
+    kind.set_precision(12)
+    space = h5py.h5s.create_simple((3, 4, 5))
+    h5py.h5d.create(file.id, b"counts", kind, space)
+
+
+def scaled(file: h5py.File) -> None:
+    file.create_dataset("counts", data=CUBE, chunks=(3, 4, 100), scaleoffset=0)
+
+
+def huge_chunk(file: h5py.File) -> None:
+    shape = (1500, 1000, 1000)
+    file.create_dataset("counts", shape, "u2", chunks=shape, compression="gzip")
+
+
+def many_chunks(file: h5py.File) -> None:
+    file.create_dataset("counts", (10**5, 10**5, 10**5), "u1", chunks=(1, 1, 1))
+
+
+def bomb(file: h5py.File) -> None:
+    """A chunk that unpacks to a thousand times what it may hold."""
+    array = file.create_dataset("counts", (3, 4, 100), "u2", chunks=(3, 4, 100), compression=1)
+    array.id.write_direct_chunk((0, 0, 0), zlib.compress(bytes(2_400_000)))
+
+
+def bomb_of_checksums(file: h5py.File) -> None:
+    array = file.create_dataset("counts", (3, 4, 100), "u2", chunks=(3, 4, 100), fletcher32=True)
+    array.id.write_direct_chunk((0, 0, 0), CUBE.tobytes() + b"\1\2\3\4")
+
+
+def gaps(file: h5py.File) -> None:
+    file["counts"] = CUBE
+    file["counts"].attrs["_FillValue"] = np.uint16(3)
+
+
+def packed(file: h5py.File) -> None:
+    file["counts"] = CUBE
+    file["counts"].attrs["scale_factor"] = 0.5
+
+
+def known(**attributes: Any) -> Callable[[], bytes]:
+    return lambda: hdf5_bytes(counts={"data": CUBE, "attributes": attributes})
+
+
+def uneven(file: h5py.File) -> None:
+    file["counts"] = CUBE
+    file["time_s"] = np.arange(100.0) ** 2
+    file["time_s"].make_scale()
+    file["counts"].dims[2].attach_scale(file["time_s"])
+    for axis, name in enumerate(("row", "col")):
+        file["counts"].dims[axis].label = name
+
+
+HDF5_REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
+    "empty": (lambda: b"", "file cannot be read"),
+    "no HDF5": (lambda: bytes(5000), "file cannot be read"),
+    "truncated": (lambda: hdf5_bytes(counts=CUBE)[:-100], "file cannot be read"),
+    "no arrays": (hdf5_bytes, "variable = None .*has nothing"),
+    "flat": (lambda: hdf5_bytes(counts=CUBE[0]), "axes of counts = 2"),
+    "no pixels": (lambda: hdf5_bytes(counts=CUBE[:0]), r"counts = .*\(0, 4, 100\)"),
+    "complex": (lambda: hdf5_bytes(counts=CUBE * 1j), "counts = 'no numbers'"),
+    "booleans": (lambda: hdf5_bytes(counts=CUBE > 0), "counts = 'no numbers'"),
+    "virtual": (written(virtual), "counts = 'a virtual array'"),
+    "kept in another file": (written(external), "counts = 'an array kept in other files'"),
+    "linked to another file": (written(linked), "counts = 'an external link'"),
+    "linked softly": (written(soft), "counts = 'a soft link'"),
+    "compound": (written(compound), "counts = 'no numbers'"),
+    "ragged": (written(ragged), "counts = 'no numbers'"),
+    "text": (written(texts), "counts = 'no numbers'"),
+    "numbers of 12 bits": (written(narrow), "counts = 'numbers of an unusual layout"),
+    "an unknown filter": (written(scaled), "counts = 'packed by the filter scaleoffset'"),
+    "a huge chunk": (written(huge_chunk), "a chunk of counts = 3000000000 "),
+    "too many chunks": (written(many_chunks), "chunks of counts = 1000000000000000 "),
+    "a bomb": (written(bomb), r"chunk \(0, 0, 0\) of counts .*more than 2,416"),
+    "a wrong checksum": (written(bomb_of_checksums), r"chunk \(0, 0, 0\) of counts .*checksum"),
+    "gaps": (written(gaps), "_FillValue of counts = 3.0 .*without gaps"),
+    "scaled": (written(packed), "scale_factor of counts = 0.5"),
+    "uneven bins": (written(uneven), "steps of time_s"),
+    "no bin width": (known(bin_width_s=0.0), "bin_width_s = 0.0"),
+    "two bin widths": (known(bin_width_s=[1.0, 2.0]), "bin_width_s = .*one number"),
+    "half a pulse": (known(n_pulses=0.5), "n_pulses = 0.5"),
+    "a pulse of text": (known(pulse_tau_s="long"), "pulse_tau_s = 'long'"),
+    "unknown detection": (known(detection="some"), "detection = 'some'"),
+}
+
+
+@pytest.mark.parametrize("what", HDF5_REFUSED)
+def test_hdf5_refused(what: str, tmp_path: Path) -> None:
+    build, message = HDF5_REFUSED[what]
+    path = put(tmp_path / "a.h5", build())
+    _refused(path, message)
+
+
+def _refused(path: Path, message: str) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(CaptureError, match=message) as caught:
+            read_capture(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert str(caught.value).startswith(f"{path.name}: ")
+    assert peak < 2**22
+
+
+def test_external_data_is_never_touched(tmp_path: Path) -> None:
+    """A pipe that nobody writes to would keep whoever opens it waiting for ever."""
+    pipe = tmp_path / "pipe.h5"
+    os.mkfifo(pipe)
+
+    def links(file: h5py.File) -> None:
+        file["link"] = h5py.ExternalLink(str(pipe), "/counts")
+        layout = h5py.VirtualLayout(CUBE.shape, "u2", maxshape=(None, 4, 100))
+        source = h5py.VirtualSource(str(pipe), "c", (3, 4, 100), maxshape=(None, 4, 100))
+        layout[: h5py.h5s.UNLIMITED, :, :] = source[: h5py.h5s.UNLIMITED, :, :]
+        file.create_virtual_dataset("virtual", layout)
+        file.create_dataset("outside", CUBE.shape, "u2", external=[(str(pipe), 0, 2400)])
+        file["counts"] = CUBE
+
+    path = put(tmp_path / "a.h5", written(links)())
+    np.testing.assert_array_equal(read_capture(path).cube, CUBE)
+    for name in ("link", "virtual", "outside"):
+        with pytest.raises(CaptureError, match=f"variable {name} = "):
+            read_capture(path, variable=name)
+
+
+def test_what_repeats_or_swells_is_refused(tmp_path: Path) -> None:
+    twice = [Stored("counts"), Stored("counts")]
+    with pytest.raises(ValueError, match="arrays named 'counts' = 2"):
+        choose(twice, Request())
+
+    def told(file: h5py.File) -> None:
+        for k in range(600):
+            file.create_group(f"g{k}").attrs["long"] = np.full(4000, 1e-300)
+
+    def many(file: h5py.File) -> None:
+        for k in range(10_001):
+            file[f"{k}"] = h5py.SoftLink("/nowhere")
+
+    along = {f"c{k}": ("bin", np.arange(100.0)) for k in range(101)}
+    for content, message in (
+        (netcdf_bytes(bare().assign_coords(along)), "coordinates = 101"),
+        (written(many)(), "arrays of the file = more than 10,000"),
+        (written(told)(), "attributes = too many"),
+    ):
+        _refused(put(tmp_path / "r.h5", content), message)
+
+
+def files_3() -> dict[str, bytes]:
+    return zarr_files(bare(), 3, chunks=(2, 3, 64))
+
+
+def files_2() -> dict[str, bytes]:
+    return zarr_files(bare(), 2, chunks=(2, 3, 64))
+
+
+def edited(files: dict[str, bytes], name: str, **changes: Any) -> dict[str, bytes]:
+    return {**files, name: json.dumps({**json.loads(files[name]), **changes}).encode()}
+
+
+def in_2(**changes: Any) -> Callable[[], Mapping[str, bytes]]:
+    return lambda: edited(files_2(), "counts/.zarray", **changes)
+
+
+def in_3(**changes: Any) -> Callable[[], Mapping[str, bytes]]:
+    return lambda: edited(files_3(), "counts/zarr.json", **changes)
+
+
+def codec_3(**codec: Any) -> Callable[[], Mapping[str, bytes]]:
+    plain = {"name": "bytes", "configuration": {"endian": "little"}}
+    return in_3(codecs=[plain, codec])
+
+
+def first_chunk(data: bytes, **changes: Any) -> Callable[[], Mapping[str, bytes]]:
+    return lambda: {**edited(files_2(), "counts/.zarray", **changes), "counts/0.0.0": data}
+
+
+SIZE = 2 * 3 * 64 * 2
+ZLIB, BLOSC, ZSTD = (
+    {"id": "zlib", "level": 1},
+    {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1, "blocksize": 0},
+    {"id": "zstd", "level": 1},
+)
+BLOSC_CHUNK = numcodecs.Blosc().encode(bytes(SIZE))
+
+ZARR_REFUSED: dict[str, tuple[Callable[[], Mapping[str, bytes]], str]] = {
+    "no arrays": (lambda: {"zarr.json": b'{"zarr_format": 3, "node_type": "group"}'}, "arrays = 0"),
+    "nothing of Zarr": (lambda: {"a.txt": b"a"}, "arrays = 0"),
+    "no JSON": (lambda: files_3() | {"counts/zarr.json": b"{"}, "zarr.json cannot be read"),
+    "deep JSON": (
+        lambda: files_3() | {"counts/zarr.json": b"[" * 100_000},
+        "zarr.json cannot be read",
+    ),
+    "a list": (lambda: files_3() | {"counts/zarr.json": b"[]"}, "zarr.json cannot be read"),
+    "two versions": (lambda: files_3() | {"counts/.zarray": b"{}"}, "versions 2 and 3"),
+    "another version": (in_3(zarr_format=4), "zarr_format = 4"),
+    "pickled objects": (
+        in_2(dtype="|O", filters=[{"id": "pickle", "protocol": 5}]),
+        "dtype = '|O'",
+    ),
+    "a pickling filter": (in_2(filters=[{"id": "pickle", "protocol": 5}]), "codec = 'pickle'"),
+    "structured": (in_2(dtype=[["a", "<u2"]]), "dtype = "),
+    "complex": (in_2(dtype="<c16"), "dtype = '<c16'"),
+    "text": (in_3(data_type="string"), "data_type = 'string'"),
+    "an unknown codec": (codec_3(name="numcodecs.lzma"), "codec = 'numcodecs.lzma'"),
+    "shards": (codec_3(name="sharding_indexed"), "codec = 'sharding_indexed'"),
+    "a wild grid": (in_3(chunk_grid={"name": "rectilinear"}), "chunk_grid = 'rectilinear'"),
+    "a key that leaves": (
+        in_3(chunk_key_encoding={"name": "v2", "configuration": {"separator": "/../"}}),
+        "separator = '/../'",
+    ),
+    "a separator that leaves": (in_2(dimension_separator="../"), "dimension_separator = '../'"),
+    "transformers": (in_3(storage_transformers=[{"name": "x"}]), "storage_transformers"),
+    "a shape of text": (in_2(shape="large"), "sizes = 'large'"),
+    "a negative shape": (in_2(shape=[-3, 4, 100]), r"sizes = \[-3, 4, 100\]"),
+    "a shape of fractions": (in_2(shape=[3.5, 4, 100]), r"sizes = \[3.5"),
+    "no chunks": (in_2(chunks=[0, 3, 64]), r"sizes = \[0"),
+    "chunks of other axes": (in_2(chunks=[3, 64]), "chunk of counts"),
+    "a huge chunk": (in_2(chunks=[10**4] * 3), "a chunk of counts = 2000000000000"),
+    "a huge array": (in_2(shape=[10**5] * 3, chunks=[1000] * 3), "bytes of counts = 2000"),
+    "too many chunks": (in_2(shape=[10**5] * 3), "chunks of counts = "),
+    "a wild order": (in_2(order="X"), "order = 'X'"),
+    "a wild fill": (in_2(fill_value="nothing"), "fill_value = 'nothing'"),
+    "an element of nothing": (in_2(filters=[{"id": "shuffle", "elementsize": 0}]), "sizes = .0"),
+    "a short chunk": (first_chunk(b"", compressor=None), "damaged.*bytes = 0"),
+    "a long chunk": (first_chunk(bytes(SIZE + 1), compressor=None), f"bytes = {SIZE + 1}"),
+    "a bomb": (
+        first_chunk(zlib.compress(bytes(2**24)), compressor=ZLIB),
+        r"chunk \(0, 0, 0\) of counts .*more than",
+    ),
+    "cut short": (first_chunk(zlib.compress(bytes(SIZE))[:-3], compressor=ZLIB), "cut short"),
+    "a bomb of zstd": (
+        first_chunk(numcodecs.Zstd().encode(bytes(2**24)), compressor=ZSTD),
+        "bytes unpacked = 16777216",
+    ),
+    "no zstd": (first_chunk(bytes(100), compressor=ZSTD), "a zstd frame"),
+    "a bomb of blosc": (
+        first_chunk(numcodecs.Blosc().encode(bytes(2**24)), compressor=BLOSC),
+        "bytes unpacked = 16777216",
+    ),
+    "blosc cut short": (first_chunk(BLOSC_CHUNK[:-2], compressor=BLOSC), "bytes of a blosc chunk"),
+    "a checksum that fails": (
+        lambda: {**codec_3(name="crc32c")(), "counts/c/0/0/0": bytes(SIZE + 4)},
+        "checksum of a chunk",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ZARR_REFUSED)
+def test_zarr_refused(what: str, tmp_path: Path) -> None:
+    build, message = ZARR_REFUSED[what]
+    path = tmp_path / "a.zarr"
+    path.mkdir()
+    _refused(put(path, build()), message)
+
+
+def test_zarr_holds_no_links_and_no_pipes(tmp_path: Path) -> None:
+    secret = put(tmp_path / "secret", bytes(SIZE))
+    for k, make in enumerate((lambda path: path.symlink_to(secret), os.mkfifo)):
+        path = put(tmp_path / f"{k}.zarr", files_2())
+        chunk = path / "counts" / "0.0.0"
+        chunk.unlink()
+        make(chunk)
+        _refused(path, r"a file of the directory = 'counts/0.0.0' .*no links")
+    path = put(tmp_path / "d.zarr", files_2())
+    (path / "more").symlink_to(tmp_path, target_is_directory=True)
+    _refused(path, "a file of the directory = 'more'")
+
+
+# -- a process of its own --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("does", "message"),
+    [
+        ("import os; os.abort()", "its library ended by SIGABRT"),
+        ("import time; time.sleep(60)", "more than 1 s to look at"),
+        ("while True: pass", "more than 1 s to look at"),
+        ("import sys; sys.exit(3)", "its library ended by status 3"),
+        ("print('no archive')", "damaged"),
+    ],
+)
+def test_what_becomes_of_a_process(
+    does: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guards, "MAX_CHILD_SECONDS", 1)
+    script = tmp_path / "script.py"
+    script.write_text(does)
+    with pytest.raises(ValueError, match=f"the file .*{message}"):
+        guards.isolated(script, "the file")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sets a process no such limits")
+def test_a_process_has_so_much_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guards, "MAX_CHILD_BYTES", 2**29)
+    file = io.BytesIO()
+    with h5py.File(file, "w", userblock_size=512) as target:
+        big = target.create_dataset("#refs#/a", (1, 2**28), "f8", chunks=(1, 2**28), compression=1)
+        big.id.write_direct_chunk((0, 0), zlib.compress(bytes(1000)))
+        target.create_dataset("Ts", data=[[big.ref]], dtype=h5py.ref_dtype)
+        target["Ts"].attrs["MATLAB_class"] = np.bytes_("cell")
+    monkeypatch.setattr(guards, "MAX_CUBE_BYTES", 2**36)
+    with pytest.raises(CaptureError, match="more memory than it may have"):
+        read_capture(put(tmp_path / "m.mat", file.getvalue()))
