@@ -5,7 +5,7 @@ PORT ?= 5006
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: app test bench paper table2 uniform calibration clean
+.PHONY: app test bench paper table2 uniform calibration field large fuzz clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
@@ -32,6 +32,15 @@ uniform: $(VENV)/.app ## every method on depths uniform over the gate
 
 calibration: $(VENV)/.app ## is a confidence of 0.9 right nine times in ten?
 	$(BIN)/python -m core calibration
+
+field: $(VENV)/.app ## published captures with a truth, in the folder CAPTURES=path
+	$(BIN)/python -m core field "$(CAPTURES)"
+
+large: $(VENV)/.app ## a generated capture of 8 GB on a small cluster of bounded memory
+	$(BIN)/python -m core large
+
+fuzz: $(VENV)/.test ## 20,000 damaged files: each is read or refused, nothing else happens
+	$(BIN)/python -m core.tests.fuzz
 
 # Stamps: made again when what they depend on has changed.
 $(VENV)/.app: pyproject.toml constraints.txt

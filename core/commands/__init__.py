@@ -1,0 +1,44 @@
+"""The headless command line, ``python -m core <command> --help``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from core.commands import captures, studies
+
+ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
+"""Exit codes: done; the machine failed (a full disk, say); bad input; Ctrl-C."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m core",
+        description="First-photon lidar without a screen: capture files in, ranges out.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    captures.add(commands)
+    studies.add(commands)
+    chosen = parser.parse_args(arguments)
+    try:
+        chosen.work(chosen)
+        sys.stdout.flush()
+    except (ValueError, FileExistsError) as error:
+        return _said(REFUSED, error)
+    except BrokenPipeError:  # whoever read us has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except OSError as error:
+        return _said(FAILED, error)
+    except MemoryError as error:
+        return _said(FAILED, f"memory is too small: {error}")
+    except KeyboardInterrupt:
+        return _said(INTERRUPTED, "Interrupted.")
+    return ACCEPTED
+
+
+def _said(code: int, why: object) -> int:
+    print(f"\n{why}", file=sys.stderr)
+    return code

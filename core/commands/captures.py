@@ -1,0 +1,330 @@
+"""Commands for captures: look at one, range it, simulate one, write it in another layout."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from core.acquisition import Flux
+from core.capture import Capture, Seen
+from core.checks import require
+from core.commands.options import add_reading, reading, show, whole_from_to
+from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage
+from core.export import (
+    CAPTURE_SUFFIXES,
+    FOLDER_WRITERS,
+    WRITERS,
+    save_capture,
+    save_image,
+    save_pixel,
+)
+from core.parameters import Number, spec_of
+from core.pipeline import run
+from core.readers import open_capture, read_capture
+from core.readers.guards import MAX_CUBE_BYTES
+from core.readers.labelled import LAZY, describe
+from core.readers.request import Request
+from core.scene import Scene, scenes
+from core.scene_files import read_scene
+from core.simulate import simulate
+from core.tracking import PRESETS
+
+_CONFIDENT = 0.9
+
+
+def add(commands: Any) -> None:
+    """Add these commands to a parser's."""
+    for each in (_add_info, _add_estimate, _add_simulate, _add_export):
+        each(commands)
+
+
+# -- info ------------------------------------------------------------------------------------------
+
+
+def _add_info(commands: Any) -> None:
+    command = commands.add_parser(
+        "info", help="what a capture file holds, and what would be guessed of it"
+    )
+    command.add_argument("capture", type=Path)
+    _add_json(command)
+    add_reading(command)
+    command.set_defaults(work=_info)
+
+
+def _info(chosen: argparse.Namespace) -> None:
+    counts = open_capture(chosen.capture, **reading(chosen))
+    acquisition, pulse, detection, source = describe(counts, Request())
+    rows, cols, n_bins = counts.shape
+    begin_m, end_m = acquisition.bin_to_range_m([0, n_bins])
+    facts: dict[str, Any] = {
+        "source": source,
+        "rows": rows,
+        "cols": cols,
+        "bins": n_bins,
+        "bin_width_s": acquisition.bin_width_s,
+        "gate_delay_s": acquisition.gate_delay_s,
+        "range_from_m": float(begin_m),
+        "range_to_m": float(end_m),
+        "pulse": pulse.shape,
+        "pulse_tau_s": pulse.tau_s,
+        "n_pulses": acquisition.n_pulses,
+        "pixel_angle_rad": acquisition.pixel_angle_rad,
+        "detection": detection,
+        "bytes": counts.nbytes,
+    }
+    if counts.nbytes <= MAX_CUBE_BYTES:
+        photons = counts.sum("bin", dtype=np.int64).to_numpy()
+        facts |= {
+            "photons": int(photons.sum()),
+            "photons_per_pixel": float(photons.mean()),
+            "photons_in_one_pixel_at_most": int(photons.max()),
+            "share_of_pixels_empty": float((photons == 0).mean()),
+        }
+    show(facts, chosen.json)
+
+
+# -- estimate --------------------------------------------------------------------------------------
+
+
+def _add_estimate(commands: Any) -> None:
+    command = commands.add_parser("estimate", help="range a scene or a capture by one method")
+    methods = command.add_subparsers(dest="method", required=True)
+    for name, estimator in ESTIMATORS.items():
+        method = methods.add_parser(name, help=estimator.title, description=estimator.title)
+        seen = method.add_mutually_exclusive_group()
+        seen.add_argument("--capture", type=Path, help="a file that `info` can read")
+        seen.add_argument("--scene", choices=scenes, default="car", help="to simulate (car)")
+        _add_light(method)
+        method.add_argument(
+            "--false-alarm",
+            type=float,
+            help=f"share of pixels without an echo that may be answered, "
+            f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; all are where not given",
+        )
+        _add_out(method, "the answer", (*WRITERS, *FOLDER_WRITERS))
+        method.add_argument(
+            "--scheduler", help="address of a Dask cluster to range on, such as tcp://host:8786"
+        )
+        _add_json(method)
+        for each in fields(estimator.parameters):
+            spec = spec_of(each)
+            method.add_argument(
+                f"--{each.name.replace('_', '-')}",
+                dest=f"setting_{each.name}",
+                type=_kind(spec),
+                default=each.default,
+                help=f"{each.metadata['help']} ({each.default})".replace("%", "%%"),
+            )
+        add_reading(method)
+        method.set_defaults(work=_estimate)
+
+
+def _kind(spec: Any) -> Callable[[str], Any]:
+    if not isinstance(spec, Number):
+        return str
+    return int if spec.whole else float
+
+
+def _settings(chosen: argparse.Namespace) -> Any:
+    prefix = "setting_"
+    told = {k.removeprefix(prefix): v for k, v in vars(chosen).items() if k.startswith(prefix)}
+    return ESTIMATORS[chosen.method].parameters(**told)
+
+
+def _estimate(chosen: argparse.Namespace) -> None:
+    _require_free(chosen)
+    settings = _settings(chosen)
+    if chosen.scheduler or _exceeds_memory(chosen):
+        seen, image, facts = _ranged_in_parts(chosen, settings)
+    else:
+        seen, image, facts = _ranged_at_once(chosen, settings)
+    for path in chosen.out:
+        save_image(seen, image, path, overwrite=chosen.overwrite)
+    known = {
+        "source": seen.source,
+        "remark": ESTIMATORS[chosen.method].remark(seen),
+        "settings": str(settings),
+        "pixels": image.valid.size,
+        "pixels_answered": int(image.valid.sum()),
+        "of_them_confident": int((image.confidence >= _CONFIDENT).sum()),
+        **facts,
+        "written": ", ".join(map(str, chosen.out)),
+    }
+    show({name: value for name, value in known.items() if value != ""}, chosen.json)
+
+
+def _exceeds_memory(chosen: argparse.Namespace) -> bool:
+    if chosen.capture is None or chosen.capture.suffix.lower() not in LAZY:
+        return False
+    return bool(open_capture(chosen.capture, **reading(chosen)).nbytes > MAX_CUBE_BYTES)
+
+
+def _ranged_at_once(
+    chosen: argparse.Namespace, settings: Any
+) -> tuple[Seen, RangeImage, dict[str, Any]]:
+    capture = _capture(chosen)
+    print(capture.source, file=sys.stderr)  # with the guesses, before anything rests on them
+    found = run(capture, chosen.method, settings, chosen.false_alarm)
+    seconds = {"light_s": found.light_s, "estimate_s": found.estimate_s}
+    return capture, found.image, found.figures | seconds
+
+
+def _ranged_in_parts(
+    chosen: argparse.Namespace, settings: Any
+) -> tuple[Seen, RangeImage, dict[str, Any]]:
+    from core import large  # noqa: PLC0415 - brings Dask, for which small captures need not wait
+
+    if chosen.capture is None:
+        raise ValueError("scheduler takes a --capture: a scene is simulated and ranged here.")
+    counts = open_capture(chosen.capture, **reading(chosen))
+    print(counts.attrs.get("source", ""), file=sys.stderr)
+    started = perf_counter()
+    parts = large.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)
+    seen, image = large.as_image(large.computed(parts, chosen.scheduler))
+    return seen, image, {"seconds": perf_counter() - started}
+
+
+# -- simulate and export ---------------------------------------------------------------------------
+
+
+def _add_simulate(commands: Any) -> None:
+    command = commands.add_parser("simulate", help="a capture of a scene, built-in or from a file")
+    command.add_argument(
+        "--scene",
+        default="car",
+        help=f"{', '.join(scenes)}, or a file: a mesh or a depth map (car)",
+    )
+    command.add_argument("--size", type=whole_from_to(8, 4096), help="rows and columns")
+    command.add_argument("--pulses", type=whole_from_to(1, 2**32 - 1), help="the scene's own")
+    group = command.add_argument_group("how a file's scene is seen; what is not told is guessed")
+    group.add_argument("--unit", dest="unit_m", type=float, help="of the file, in metres")
+    group.add_argument(
+        "--distance",
+        dest="distance_m",
+        type=float,
+        help="to the nearest point of a mesh, in metres",
+    )
+    group.add_argument(
+        "--pixel-angle",
+        dest="pixel_angle_rad",
+        type=float,
+        help="between neighbouring pixels, in radians",
+    )
+    _add_light(command)
+    _add_out(command, "the capture", CAPTURE_SUFFIXES, required=True)
+    _add_json(command)
+    command.set_defaults(work=_simulate)
+
+
+def _simulate(chosen: argparse.Namespace) -> None:
+    _require_free(chosen)
+    scene = _scene(chosen)
+    acquisition = scene.acquisition
+    if chosen.pulses is not None:
+        acquisition = replace(acquisition, n_pulses=chosen.pulses)
+    capture = simulate(scene, acquisition, Flux(chosen.ppp, chosen.sbr), seed=chosen.seed)
+    _save_captures(capture, chosen)
+
+
+def _scene(chosen: argparse.Namespace) -> Scene:
+    size = chosen.size
+    seen = {name: getattr(chosen, name) for name in ("unit_m", "distance_m", "pixel_angle_rad")}
+    if chosen.scene not in scenes:
+        return read_scene(chosen.scene, size=None if size is None else (size, size), **seen)
+    for name, value in seen.items():
+        require(name, value, value is None, "None: a built-in scene has a view of its own")
+    return scenes[chosen.scene](**({} if size is None else {"size": size}))
+
+
+def _add_export(commands: Any) -> None:
+    command = commands.add_parser(
+        "export", help="write a capture in another layout, or a pixel's signals as CSV"
+    )
+    command.add_argument("capture", type=Path)
+    suffixes = ", ".join(CAPTURE_SUFFIXES)
+    command.add_argument("out", type=Path, nargs="+", help=f"{suffixes}; .csv with --pixel")
+    command.add_argument(
+        "--pixel", type=int, nargs=2, metavar=("ROW", "COL"), help="whose signals are written"
+    )
+    command.add_argument(
+        "--preset", choices=PRESETS, default="recommended", help="of these signals (recommended)"
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace files")
+    _add_json(command)
+    add_reading(command)
+    command.set_defaults(work=_export, suffixes=(*CAPTURE_SUFFIXES, ".csv"))
+
+
+def _export(chosen: argparse.Namespace) -> None:
+    _require_free(chosen)
+    capture = read_capture(chosen.capture, **reading(chosen))
+    if chosen.pixel is None:
+        _save_captures(capture, chosen)
+        return
+    row, col = chosen.pixel
+    for path in chosen.out:
+        settings = PRESETS[chosen.preset]
+        save_pixel(capture, row, col, settings, path, overwrite=chosen.overwrite)
+    show({"source": capture.source, "written": ", ".join(map(str, chosen.out))}, chosen.json)
+
+
+def _save_captures(capture: Capture, chosen: argparse.Namespace) -> None:
+    for path in chosen.out:
+        save_capture(capture, path, overwrite=chosen.overwrite)
+    photons = int(capture.counts.sum())
+    written = ", ".join(map(str, chosen.out))
+    show({"source": capture.source, "photons": photons, "written": written}, chosen.json)
+
+
+# -- what they share -------------------------------------------------------------------------------
+
+
+def _add_light(command: Any) -> None:
+    group = command.add_argument_group("how a scene is lit")
+    group.add_argument("--sbr", type=float, default=0.06, help="signal over background (0.06)")
+    group.add_argument(
+        "--ppp", type=float, default=Flux().signal, help=f"signal per pulse ({Flux().signal})"
+    )
+    group.add_argument("--seed", type=int, default=0, help="of the simulation (0)")
+
+
+def _add_out(command: Any, what: str, suffixes: Sequence[str], required: bool = False) -> None:
+    command.add_argument(
+        "--out",
+        type=Path,
+        action="append",
+        default=[],
+        required=required,
+        help=f"a file for {what}, its suffix tells the format: {', '.join(suffixes)}; repeatable",
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace files")
+    command.set_defaults(suffixes=suffixes)
+
+
+def _add_json(command: Any) -> None:
+    command.add_argument("--json", action="store_true", help="one JSON object instead of lines")
+
+
+def _require_free(chosen: argparse.Namespace) -> None:
+    """Refuse what cannot be written before anything is computed."""
+    for path in chosen.out:
+        known = path.suffix.lower() in chosen.suffixes
+        require("suffix", path.suffix, known, "one of " + ", ".join(chosen.suffixes))
+        if path.exists() and not chosen.overwrite:
+            raise FileExistsError(f"{path} exists: give another name, or --overwrite.")
+        if not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"{path.parent} is no folder: make it first.")
+
+
+def _capture(chosen: argparse.Namespace) -> Capture:
+    if chosen.capture:
+        return read_capture(chosen.capture, **reading(chosen))
+    scene = scenes[chosen.scene]()
+    return simulate(scene, scene.acquisition, Flux(chosen.ppp, chosen.sbr), seed=chosen.seed)

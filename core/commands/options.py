@@ -1,0 +1,125 @@
+"""What several commands take and show alike."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from core.acquisition import Pulse
+
+_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15}
+
+
+def seconds(text: str) -> float:
+    """A time such as ``64ps``, ``4.43 us`` or, in seconds, ``1e-9``."""
+    number, unit = re.fullmatch(r"\s*(.*?)\s*([a-zµ]*)\s*", text).groups()  # type: ignore[union-attr]
+    try:
+        return float(number) * _UNITS_S[unit or "s"]
+    except (KeyError, ValueError):
+        known = ", ".join(_UNITS_S)
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not accepted: give a time such as 64ps or 1e-9; units are {known}."
+        ) from None
+
+
+def whole_from_to(least: int, most: int) -> Callable[[str], int]:
+    """A whole number within bounds."""
+
+    def whole(text: str) -> int:
+        if not (text.isdigit() and least <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text} is not accepted: give {least} to {most}.")
+        return int(text)
+
+    return whole
+
+
+READING: dict[str, dict[str, Any]] = {
+    "time-unit": {"type": seconds, "dest": "time_unit_s", "help": "of arrival times, such as 8ps"},
+    "bin-width": {"type": seconds, "dest": "bin_width_s", "help": "such as 64ps"},
+    "gate-delay": {
+        "type": seconds,
+        "dest": "gate_delay_s",
+        "help": "from the pulse to the first bin, such as 280ns",
+    },
+    "bins": {"type": int, "dest": "n_bins", "help": "in the gate"},
+    "pulses": {"type": int, "dest": "n_pulses", "help": "sent for each pixel"},
+    "variable": {"help": "name of the array, where the file holds several"},
+    "pulse-sigma": {
+        "type": seconds,
+        "dest": "pulse",
+        "help": "standard deviation of an echo, taken for a Gaussian",
+    },
+    "pixel-angle": {
+        "type": float,
+        "dest": "pixel_angle_rad",
+        "help": "between neighbouring pixels, in radians",
+    },
+    "detection": {"choices": ("first", "all"), "help": "photons of a pulse that are recorded"},
+    "axes": {"help": "the file's order, such as 'bin row col'"},
+    "shape": {
+        "type": int,
+        "nargs": 2,
+        "metavar": ("ROWS", "COLS"),
+        "help": "of a file that lists its pixels",
+    },
+    "stop": {
+        "type": seconds,
+        "dest": "stop_s",
+        "help": "common stop: times count backwards from this time after the pulse",
+    },
+    "no-trigger": {"type": int, "help": "raw frames: what stands where nothing fired"},
+    "first-detections": {"type": int, "help": "keep so many of each pixel"},
+}
+"""How a file is to be read, as `core.read_capture` takes it; guessed where not told."""
+
+
+def add_reading(command: Any) -> None:
+    """Add the options that tell how a file is to be read."""
+    group = command.add_argument_group("how to read the file; what is not told is guessed")
+    for name, kind in READING.items():
+        group.add_argument(f"--{name}", **kind)
+
+
+def reading(chosen: argparse.Namespace) -> dict[str, Any]:
+    """The arguments of `core.read_capture`."""
+    names = [kind.get("dest", name.replace("-", "_")) for name, kind in READING.items()]
+    told = {name: getattr(chosen, name) for name in names}
+    if told["pulse"] is not None:
+        told["pulse"] = Pulse.gaussian(told["pulse"])
+    if told["shape"] is not None:
+        told["shape"] = tuple(told["shape"])
+    return told
+
+
+def show_progress(done: int, of: int) -> None:
+    """A bar on standard error."""
+    bar = "#" * (40 * done // max(of, 1))
+    print(f"\r[{bar:<40}] {done} of {of} pieces", end="", file=sys.stderr, flush=True)
+
+
+def show(facts: Mapping[str, Any], as_json: bool) -> None:
+    """Print facts, one a line or as one JSON object; what is no number there is null."""
+    if as_json:
+        print(
+            json.dumps({name: _plain(value) for name, value in facts.items()}, ensure_ascii=False)
+        )
+        return
+    width = max(map(len, facts))
+    for name, value in facts.items():
+        text = f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
+        print(f"{name:<{width}}  {text}")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,236 @@
+"""The command line, as a shell meets it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from core.acquisition import Acquisition, Flux
+from core.commands import main
+from core.commands.options import seconds
+from core.estimators import estimate
+from core.export import CAPTURE_SUFFIXES, save_capture
+from core.large import IMAGES
+from core.readers import read_capture
+from core.scene import scenes
+from core.simulate import simulate
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def ran(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Exit code and what was printed."""
+    code = main([str(each) for each in arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+def facts(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    """What a command that succeeds says as JSON."""
+    code, out, err = ran(capsys, *arguments, "--json")
+    assert code == 0, err
+    known: dict[str, Any] = json.loads(out)
+    return known
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    """A file of counts that tells nothing of itself: 4 x 5 pixels, 30 bins, bins first."""
+    counts = np.random.default_rng(0).poisson(0.3, (30, 4, 5)).astype(np.uint16)
+    path = tmp_path / "counts.npy"
+    np.save(path, counts)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "expected_s"),
+    [("64ps", 64e-12), ("4.43 us", 4.43e-6), ("1e-9", 1e-9), ("0.5ns", 5e-10), ("2µs", 2e-6)],
+)
+def test_times_carry_units(text: str, expected_s: float) -> None:
+    assert seconds(text) == pytest.approx(expected_s, rel=1e-12)
+
+
+@pytest.mark.parametrize("text", ["", "ps", "64 pc", "1e-9 s s", "one ns", "64Ps"])
+def test_times_that_are_none_are_refused(
+    text: str, frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["info", str(frames), "--bin-width", text])
+    assert ended.value.code == 2
+    assert "give a time such as 64ps" in capsys.readouterr().err
+
+
+def test_info_tells_what_is_known_and_guessed(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = facts(capsys, "info", frames, "--axes", "bin row col", "--bin-width", "500ps")
+    counts = np.load(frames)
+    assert (told["rows"], told["cols"], told["bins"]) == (4, 5, 30)
+    assert told["bin_width_s"] == 5e-10
+    assert told["photons"] == counts.sum()
+    assert told["n_pulses"] is None
+    assert told["detection"] == "all"
+    assert "guessed: gate 0-15 ns, pulse Gaussian of 500 ps" in told["source"]
+    code, out, _ = ran(capsys, "info", frames)
+    assert code == 0
+    assert "guessed: axes (row, col, bin), bin width 1 ns" in out
+
+
+@pytest.mark.parametrize("suffix", CAPTURE_SUFFIXES)
+def test_a_simulated_capture_is_written_and_read(
+    suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"car{suffix}"
+    arguments = ("simulate", "--scene", "staircase", "--size", 8, "--sbr", 0.5, "--pulses", 50)
+    told = facts(capsys, *arguments, "--seed", 3, "--out", path)
+    scene = scenes["staircase"](8)
+    expected = simulate(
+        scene, Acquisition(n_pulses=50, pixel_angle_rad=0.016), Flux(sbr=0.5), seed=3
+    )
+    found = read_capture(path)
+    np.testing.assert_array_equal(found.cube, expected.cube)
+    assert found.acquisition == expected.acquisition
+    assert (found.pulse, found.detection) == (expected.pulse, expected.detection)
+    np.testing.assert_allclose(found.truth_range_m, expected.truth_range_m)
+    assert found.source == expected.source == told["source"]
+    assert told["photons"] == expected.counts.sum()
+    code, _, err = ran(capsys, *arguments, "--out", path)
+    assert code == 2
+    assert "exists: give another name, or --overwrite" in err
+    assert ran(capsys, *arguments, "--out", path, "--overwrite")[0] == 0
+    assert not np.array_equal(read_capture(path).cube, expected.cube)  # another seed
+
+
+@pytest.mark.compiled
+def test_estimate_writes_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = scenes["car"]()
+    capture = simulate(scene, scene.acquisition, Flux(sbr=0.2), seed=1)
+    path, tif, las = tmp_path / "car.npz", tmp_path / "car.tif", tmp_path / "car.las"
+    save_capture(capture, path)
+    arguments = ("--capture", path, "--false-alarm", 0.01, "--out", tif, "--out", las)
+    told = facts(capsys, "estimate", "cfar", *arguments, "--guard-bins", 4)
+    image = estimate(capture, "cfar", false_alarm=0.01, guard_bins=4)
+    assert told["pixels_answered"] == image.valid.sum()
+    assert told["rd_3_bins"] > 0.9
+    assert "guard_bins=4" in told["settings"]
+    np.testing.assert_allclose(tifffile.imread(tif)[0], image.range_m, rtol=1e-6)
+    assert las.stat().st_size > 20 * image.valid.sum()
+
+
+def test_estimate_says_where_pile_up_is_not_undone(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reading = ("--capture", frames, "--axes", "bin row col")
+    told = facts(capsys, "estimate", "coates", *reading)
+    assert "no pile-up is undone: the capture holds all photons" in told["remark"]
+    told = facts(capsys, "estimate", "coates", *reading, "--detection", "first")
+    assert "number of pulses is not known" in told["remark"]
+    assert "remark" not in facts(capsys, "estimate", "coates", *reading, "--pulses", 500)
+    assert "remark" not in facts(capsys, "estimate", "peak", *reading)
+
+
+@pytest.mark.compiled
+def test_what_exceeds_memory_is_ranged_in_parts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = scenes["car"]()
+    capture = simulate(scene, scene.acquisition, Flux(sbr=0.2))
+    path = tmp_path / "car.zarr"
+    save_capture(capture, path)
+    whole = facts(capsys, "estimate", "tracking", "--capture", path, "--out", tmp_path / "w.npz")
+    monkeypatch.setattr("core.commands.captures.MAX_CUBE_BYTES", 1000)
+    parts = facts(capsys, "estimate", "tracking", "--capture", path, "--out", tmp_path / "p.npz")
+    assert parts["pixels_answered"] == whole["pixels_answered"]
+    assert "rd_3_bins" in whole and "rd_3_bins" not in parts  # ranged without its truth
+    assert "photons" not in facts(capsys, "info", path)
+    with np.load(tmp_path / "w.npz") as one, np.load(tmp_path / "p.npz") as other:
+        for name in IMAGES:
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_a_pixel_is_exported(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = frames.with_name("pixel.csv")
+    reading = ("--axes", "bin row col")
+    assert ran(capsys, "export", frames, out, "--pixel", 1, 2, *reading)[0] == 0
+    lines = out.read_text().splitlines()
+    assert lines[0].split(",")[:4] == ["bin", "time_s", "range_m", "counts"]
+    assert [int(line.split(",")[3]) for line in lines[1:]] == np.load(frames)[:, 1, 2].tolist()
+    code, _, err = ran(
+        capsys, "export", frames, frames.with_name("a.npz"), "--pixel", 9, 9, *reading
+    )
+    assert code == 2 and ".csv" in err
+
+
+def test_a_capture_is_exported_in_another_layout(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outs = [frames.with_name("a.nc"), frames.with_name("a.npz")]
+    assert ran(capsys, "export", frames, *outs, "--axes", "bin row col")[0] == 0
+    for out in outs:
+        np.testing.assert_array_equal(read_capture(out).cube, np.load(frames).transpose(1, 2, 0))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("info", "absent.npz"), 2, "absent.npz: path = "),
+        (("info", "{frames}", "--axes", "a b c"), 2, "axes = 'a b c'"),
+        (("estimate", "peak", "--capture", "{frames}", "--out", "a.doc"), 2, "suffix = '.doc'"),
+        (("estimate", "peak", "--out", "nowhere/a.npz"), 1, "nowhere is no folder"),
+        (("estimate", "cfar", "--guard-bins", "-1"), 2, "guard_bins = -1"),
+        (("estimate", "peak", "--scheduler", "tcp://a:1"), 2, "takes a --capture"),
+        (("export", "{frames}", "{frames}"), 2, "suffix = '.npy'"),
+        (("simulate", "--scene", "absent.stl", "--out", "a.npz"), 2, "absent.stl"),
+        (("simulate", "--sbr", "0", "--out", "a.npz"), 2, "sbr = 0"),
+        (("field", "nowhere"), 2, "data_face.mat"),
+    ],
+)
+def test_what_goes_wrong_is_said_in_a_line(
+    arguments: tuple[str, ...],
+    code: int,
+    message: str,
+    frames: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(frames.parent)
+    found, out, err = ran(capsys, *(each.format(frames=frames) for each in arguments))
+    assert (found, out) == (code, "")
+    assert message in err.strip().splitlines()[-1]
+    assert "Traceback" not in err
+    assert [path.name for path in frames.parent.iterdir()] == ["counts.npy"]
+
+
+def test_a_machine_that_fails_is_no_bad_input(
+    frames: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("core.commands.captures.save_capture", full)
+    code, _, err = ran(capsys, "export", frames, frames.with_name("a.npz"))
+    assert code == 1 and "No space left" in err
+
+
+def test_an_interrupt_is_told_as_shells_do(
+    frames: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("core.commands.captures.open_capture", stopped)
+    code, _, err = ran(capsys, "info", frames)
+    assert code == 130 and "Interrupted" in err
+
+
+def test_a_pipe_that_closes_early_is_no_error(frames: Path) -> None:
+    command = f"{sys.executable} -m core info {frames} | head -c 1"
+    done = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
