@@ -38,6 +38,12 @@ READING_LABELS = {
     "n_pulses": "Pulses sent",
     "pulse": "Echo's standard deviation (s)",
     "variable": "Variable",
+    "detection": "Photons of a pulse (first, all)",
+    "axes": "Axes (such as bin row col)",
+    "stop_s": "Common stop after (s)",
+    "shape": "Rows x columns",
+    "first_detections": "First detections only",
+    "no_trigger": "Frames: no trigger is",
 }
 THEME = {
     mode: {

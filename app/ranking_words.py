@@ -214,6 +214,9 @@ def problem(error: Exception) -> str:
 def remarks(capture: Capture, answered: int, pictured: int) -> str:
     """What is to be said besides the pictures; empty for nothing."""
     told = [AGREEMENT_ONLY] if capture.truth_range_m is None else []
+    told += sorted(
+        {f"{each.remark(capture).capitalize()}." for each in ESTIMATORS.values()} - {"."}
+    )
     if pictured < answered:
         told.append(f"Pictures of the first {pictured}; curves and table have all {answered}.")
     return " ".join(told)

@@ -76,12 +76,23 @@ def _gaussian(text: str) -> Pulse:
     return Pulse.gaussian(float(text))
 
 
-_CONVERT: dict[str, Callable[[str], Any]] = {
-    "variable": str,
-    "n_bins": int,
-    "n_pulses": int,
-    "pulse": _gaussian,
+def _shape(text: str) -> tuple[int, int]:
+    rows, cols = text.replace("×", " ").replace("x", " ").split()
+    return int(rows), int(cols)
+
+
+_CONVERT: dict[str, tuple[Callable[[str], Any], str]] = {
+    "variable": (str, "a name"),
+    "detection": (str, "first or all"),
+    "axes": (str, "names"),
+    "n_bins": (int, "a whole number"),
+    "n_pulses": (int, "a whole number"),
+    "no_trigger": (int, "a whole number"),
+    "first_detections": (int, "a whole number"),
+    "shape": (_shape, "rows and columns such as 64 x 64"),
+    "pulse": (_gaussian, "a number such as 1e-9"),
 }
+_NUMBER: tuple[Callable[[str], Any], str] = (float, "a number such as 1e-9")
 
 
 class Reading(Request):
@@ -98,11 +109,10 @@ class Reading(Request):
         """
         values: dict[str, Any] = {}
         for name, text in typed.items():
-            convert = _CONVERT.get(name, float)
+            convert, kind = _CONVERT.get(name, _NUMBER)
             try:
                 values[name] = convert(text.strip()) if text.strip() else None
             except ValueError:
-                kind = "a whole number" if convert is int else "a number such as 1e-9"
                 require(name, text, False, f"{kind}, or nothing to let the reader guess")
         return cls(**values)
 
@@ -111,6 +121,8 @@ class Reading(Request):
         value = getattr(self, name)
         if isinstance(value, Pulse):
             value = value.tau_s
+        if isinstance(value, tuple):
+            value = " x ".join(map(str, value))
         return "" if value is None else str(value)
 
 

@@ -109,8 +109,12 @@ def test_typed_text_tells_how_to_read_a_file():
         "n_bins": "200",
         "n_pulses": "  ",
         "variable": " Ts ",
+        "axes": "col row",
+        "shape": "32 x 64",
     }
-    assert Reading.from_text(typed) == Reading(None, 1e-9, 0.0, 200, None, "Ts")
+    read = Reading.from_text(typed)
+    assert read == Reading(None, 1e-9, 0.0, 200, None, "Ts", axes="col row", shape=(32, 64))
+    assert read.as_text("shape") == "32 x 64"
     assert Reading.from_text(dict.fromkeys(typed, "")) == Reading()
 
 
@@ -120,6 +124,8 @@ def test_typed_text_tells_how_to_read_a_file():
         ("n_bins", "2.5", "a whole number"),
         ("n_pulses", "many", "a whole number"),
         ("bin_width_s", "1 ns", "a number such as 1e-9"),
+        ("shape", "64", "rows and columns such as 64 x 64"),
+        ("detection", "some", "'first' or 'all'"),
     ],
 )
 def test_text_that_is_no_number_is_refused_with_a_remedy(name, text, remedy):
