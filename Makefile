@@ -14,9 +14,9 @@ test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q core/tests --cov --cov-report=
-	$(BIN)/python -m pytest core/tests --cov --cov-append --cov-fail-under=95
-	$(BIN)/python -m pytest tests
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -n auto core/tests --cov --cov-report=
+	$(BIN)/python -m pytest -n auto core/tests --cov --cov-append --cov-fail-under=95
+	$(BIN)/python -m pytest -n auto tests
 
 bench: $(VENV)/.test ## slider to changed pixels, through a real browser
 	$(BIN)/python -m tests.latency

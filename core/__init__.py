@@ -5,7 +5,7 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
 from core.export import save_capture, save_image, save_pixel
-from core.large import estimate_large
+from core.large import as_image, estimate_large
 from core.pipeline import Run, run
 from core.readers import open_capture, read_capture
 from core.scene import Scene, scenes
@@ -36,6 +36,7 @@ __all__ = [
     "SceneError",
     "Signals",
     "TrackingParameters",
+    "as_image",
     "coates_rate",
     "estimate",
     "estimate_large",

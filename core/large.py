@@ -24,6 +24,7 @@ from core.posterior import Lighting, lighting_of
 from core.readers.dense import AXES, whole_counts
 from core.readers.labelled import Description, describe
 from core.readers.request import Request
+from core.readers.sample import sample_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -37,10 +38,7 @@ IMAGES = {
 }
 """What is known of each pixel, its name in words and its unit."""
 
-SAMPLE_COUNTS = 2**25
-"""Largest sample of an image, in counts of bins: 64 MiB of uint16. A smaller image is its own."""
-
-_PATCH = 32  # rows and columns of a sample that stay together, for what looks at neighbours
+_PATIENCE_S = 10.0  # for a cluster to answer
 
 
 def estimate_large(
@@ -132,8 +130,10 @@ def computed(parts: xr.Dataset, scheduler: str | None = None) -> xr.Dataset:
 
     Raises
     ------
+    ValueError
+        If that is no address.
     OSError
-        If there is no cluster at the address.
+        If there is no cluster at the address, or it has no workers.
     """
     from dask.diagnostics import ProgressBar  # noqa: PLC0415 - Dask is slow to come
 
@@ -141,13 +141,24 @@ def computed(parts: xr.Dataset, scheduler: str | None = None) -> xr.Dataset:
         if scheduler is None:
             with ProgressBar():
                 return parts.compute()
-        from dask.distributed import Client, progress  # noqa: PLC0415
+        from dask.distributed import progress  # noqa: PLC0415
 
-        with Client(scheduler, timeout="10s") as client:
+        with _client(scheduler) as client:
+            client.wait_for_workers(1, timeout=_PATIENCE_S)
             begun = client.persist(parts)
             progress(begun, notebook=False)
             done: xr.Dataset = begun.compute()
             return done
+
+
+def _client(scheduler: str) -> Any:
+    from dask.distributed import Client  # noqa: PLC0415
+
+    try:
+        return Client(scheduler, timeout=_PATIENCE_S)
+    except ValueError as error:
+        accepted = "the address of a cluster, such as tcp://host:8786"
+        raise ValueError(f"scheduler = {scheduler!r} is not accepted: give {accepted}.") from error
 
 
 def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:
@@ -191,26 +202,6 @@ def range_part(
     image = ESTIMATORS[method].ranged(part, settings, calibration)
     known = {name: getattr(image, name) for name in IMAGES if hasattr(image, name)}
     return np.stack([known.get(name, part.counts) for name in IMAGES], axis=2).astype(float)
-
-
-def sample_of(array: Any) -> NDArray[Any]:
-    """Patches of a Dask array (row, col, bin) from all over the image; all of it if it is small.
-
-    Few chunks are read: as many as the sample has patches.
-    """
-    rows, cols, n_bins = array.shape
-    if rows * cols * n_bins <= SAMPLE_COUNTS:
-        return np.asarray(array)
-    high, wide = min(_PATCH, rows), min(_PATCH, cols)
-    n_patches = max(1, SAMPLE_COUNTS // (high * wide * n_bins))
-    rng = np.random.default_rng(0)
-    tops, lefts = rng.integers((rows - high + 1, cols - wide + 1), size=(n_patches, 2)).T
-    patches = [
-        array[top : top + high, left : left + wide] for top, left in zip(tops, lefts, strict=True)
-    ]
-    import dask  # noqa: PLC0415
-
-    return np.concatenate(dask.compute(*patches))
 
 
 def _capture(cube: NDArray[Any], description: Description) -> Capture:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from numbers import Integral
+from typing import TypeVar
 
 import numpy as np
 from numba import njit, prange
@@ -24,6 +25,8 @@ from core.capture import Capture
 from core.checks import require
 from core.parallel import COMPILED, KERNEL_LOCK, PARALLEL
 from core.scene import Scene
+
+_Light = TypeVar("_Light", float, Floats)
 
 # Beyond this many pulses numpy's multinomial is faster: its time does not grow with them.
 PULSES_DRAWN_ONE_BY_ONE = 8192
@@ -110,7 +113,8 @@ def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
     Returns
     -------
     Capture
-        First photons, `n_pulses` sent for each pixel.
+        First photons, `n_pulses` sent for each pixel; the light is known only where that of a pulse
+        of the capture's own was.
 
     Raises
     ------
@@ -119,13 +123,28 @@ def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
     """
     kind = capture.detection
     require("detection", kind, kind == "all", "a capture of all photons, which still has others")
-    acquisition = replace(capture.acquisition, n_pulses=n_pulses)
+    whole = isinstance(n_pulses, Integral)
+    require("n_pulses", n_pulses, whole and 1 <= n_pulses < 2**32, "an integer, 1 to 2**32 - 1")
     _require_seed(seed)
+    before = capture.acquisition.n_pulses
+    share = None if before is None else before / n_pulses  # of the old pulses on each new one
     cube = np.zeros_like(capture.cube)
     with KERNEL_LOCK:
         _fire_once(capture.cube, n_pulses, np.uint64(seed), cube)
     source = f"{capture.source}; reduced to the first photons of {n_pulses} pulses, seed {seed}"
-    return replace(capture, cube=cube, acquisition=acquisition, detection="first", source=source)
+    return replace(
+        capture,
+        cube=cube,
+        acquisition=replace(capture.acquisition, n_pulses=n_pulses),
+        signal=_times(capture.signal, share),
+        background=_times(capture.background, share),
+        detection="first",
+        source=source,
+    )
+
+
+def _times(light: _Light | None, share: float | None) -> _Light | None:
+    return None if light is None or share is None else light * share
 
 
 def _require_seed(seed: int) -> None:

@@ -7,6 +7,7 @@ import os
 import sys
 
 from core.commands import captures, studies
+from core.commands.options import as_options
 
 ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done; the machine failed (a full disk, say); bad input; Ctrl-C."""
@@ -26,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
         chosen.work(chosen)
         sys.stdout.flush()
     except (ValueError, FileExistsError) as error:
-        return _said(REFUSED, error)
+        return _said(FAILED if _is_the_machines(error) else REFUSED, as_options(str(error)))
     except BrokenPipeError:  # whoever read us has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
@@ -37,6 +38,14 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _said(INTERRUPTED, "Interrupted.")
     return ACCEPTED
+
+
+def _is_the_machines(error: BaseException | None) -> bool:
+    """Whether a file was refused because the machine failed."""
+    if error is None:
+        return False
+    failed = isinstance(error, OSError | MemoryError) and not isinstance(error, FileExistsError)
+    return failed or _is_the_machines(error.__cause__)
 
 
 def _said(code: int, why: object) -> int:

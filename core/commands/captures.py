@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from time import perf_counter
@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from core.acquisition import Flux
+from core.acquisition import Acquisition, Flux
 from core.capture import Capture, Seen
 from core.checks import require
-from core.commands.options import add_reading, reading, show, whole_from_to
+from core.commands.options import READING_NAMES, add_reading, reading, show, whole_from_to
 from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage
 from core.export import (
     CAPTURE_SUFFIXES,
+    CLOUD_SUFFIXES,
     FOLDER_WRITERS,
     WRITERS,
     save_capture,
@@ -27,7 +28,7 @@ from core.export import (
 )
 from core.parameters import Number, spec_of
 from core.pipeline import run
-from core.readers import open_capture, read_capture
+from core.readers import READERS, open_capture, read_capture
 from core.readers.guards import MAX_CUBE_BYTES
 from core.readers.labelled import LAZY, describe
 from core.readers.request import Request
@@ -37,6 +38,8 @@ from core.simulate import simulate
 from core.tracking import PRESETS
 
 _CONFIDENT = 0.9
+_LIGHT = ("sbr", "ppp", "seed")
+_VIEW = ("unit_m", "distance_m", "pixel_angle_rad")
 
 
 def add(commands: Any) -> None:
@@ -52,7 +55,7 @@ def _add_info(commands: Any) -> None:
     command = commands.add_parser(
         "info", help="what a capture file holds, and what would be guessed of it"
     )
-    command.add_argument("capture", type=Path)
+    command.add_argument("capture", type=Path, help=f"a file: {', '.join(READERS)}")
     _add_json(command)
     add_reading(command)
     command.set_defaults(work=_info)
@@ -120,6 +123,7 @@ def _add_estimate(commands: Any) -> None:
                 dest=f"setting_{each.name}",
                 type=_kind(spec),
                 default=each.default,
+                metavar=each.name.upper(),
                 help=f"{each.metadata['help']} ({each.default})".replace("%", "%%"),
             )
         add_reading(method)
@@ -153,7 +157,8 @@ def _estimate(chosen: argparse.Namespace) -> None:
         "settings": str(settings),
         "pixels": image.valid.size,
         "pixels_answered": int(image.valid.sum()),
-        "of_them_confident": int((image.confidence >= _CONFIDENT).sum()),
+        f"of_them_at_confidence_{_CONFIDENT}": int((image.confidence >= _CONFIDENT).sum()),
+        "median_range_m": float(np.median(image.range_m[image.valid])) if image.valid.any() else "",
         **facts,
         "written": ", ".join(map(str, chosen.out)),
     }
@@ -171,9 +176,15 @@ def _ranged_at_once(
 ) -> tuple[Seen, RangeImage, dict[str, Any]]:
     capture = _capture(chosen)
     print(capture.source, file=sys.stderr)  # with the guesses, before anything rests on them
+    _require_angle(chosen, capture.acquisition)
     found = run(capture, chosen.method, settings, chosen.false_alarm)
-    seconds = {"light_s": found.light_s, "estimate_s": found.estimate_s}
-    return capture, found.image, found.figures | seconds
+    facts: dict[str, Any] = found.figures | {
+        "light_s": found.light_s,
+        "estimate_s": found.estimate_s,
+    }
+    if capture.truth_range_m is not None:
+        facts["pixels_with_a_target"] = int(np.isfinite(capture.truth_range_m).sum())
+    return capture, found.image, facts
 
 
 def _ranged_in_parts(
@@ -185,6 +196,7 @@ def _ranged_in_parts(
         raise ValueError("scheduler takes a --capture: a scene is simulated and ranged here.")
     counts = open_capture(chosen.capture, **reading(chosen))
     print(counts.attrs.get("source", ""), file=sys.stderr)
+    _require_angle(chosen, describe(counts, Request()).acquisition)
     started = perf_counter()
     parts = large.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)
     seen, image = large.as_image(large.computed(parts, chosen.scheduler))
@@ -229,17 +241,21 @@ def _simulate(chosen: argparse.Namespace) -> None:
     acquisition = scene.acquisition
     if chosen.pulses is not None:
         acquisition = replace(acquisition, n_pulses=chosen.pulses)
-    capture = simulate(scene, acquisition, Flux(chosen.ppp, chosen.sbr), seed=chosen.seed)
-    _save_captures(capture, chosen)
+    capture = _simulated(scene, acquisition, chosen)
+    told = {"unit": chosen.unit_m, "distance": chosen.distance_m, "SBR": chosen.sbr}
+    seen = [f"{name} {value:g}" for name, value in told.items() if value is not None]
+    source = ", ".join((chosen.scene, capture.source, *seen))
+    _save_captures(replace(capture, source=source), chosen)
 
 
 def _scene(chosen: argparse.Namespace) -> Scene:
     size = chosen.size
-    seen = {name: getattr(chosen, name) for name in ("unit_m", "distance_m", "pixel_angle_rad")}
     if chosen.scene not in scenes:
+        known = " or ".join(scenes)
+        require("scene", chosen.scene, Path(chosen.scene).suffix != "", f"{known}, or a file")
+        seen = {name: getattr(chosen, name) for name in _VIEW}
         return read_scene(chosen.scene, size=None if size is None else (size, size), **seen)
-    for name, value in seen.items():
-        require(name, value, value is None, "None: a built-in scene has a view of its own")
+    _require_none(vars(chosen), _VIEW, "a built-in scene has a view of its own")
     return scenes[chosen.scene](**({} if size is None else {"size": size}))
 
 
@@ -247,7 +263,7 @@ def _add_export(commands: Any) -> None:
     command = commands.add_parser(
         "export", help="write a capture in another layout, or a pixel's signals as CSV"
     )
-    command.add_argument("capture", type=Path)
+    command.add_argument("capture", type=Path, help="a file that `info` can read")
     suffixes = ", ".join(CAPTURE_SUFFIXES)
     command.add_argument("out", type=Path, nargs="+", help=f"{suffixes}; .csv with --pixel")
     command.add_argument(
@@ -288,11 +304,10 @@ def _save_captures(capture: Capture, chosen: argparse.Namespace) -> None:
 
 def _add_light(command: Any) -> None:
     group = command.add_argument_group("how a scene is lit")
-    group.add_argument("--sbr", type=float, default=0.06, help="signal over background (0.06)")
-    group.add_argument(
-        "--ppp", type=float, default=Flux().signal, help=f"signal per pulse ({Flux().signal})"
-    )
-    group.add_argument("--seed", type=int, default=0, help="of the simulation (0)")
+    usual = Flux()
+    group.add_argument("--sbr", type=float, help=f"signal over background ({usual.sbr})")
+    group.add_argument("--ppp", type=float, help=f"signal photons per pulse ({usual.signal})")
+    group.add_argument("--seed", type=int, help="of the simulation (0)")
 
 
 def _add_out(command: Any, what: str, suffixes: Sequence[str], required: bool = False) -> None:
@@ -312,6 +327,13 @@ def _add_json(command: Any) -> None:
     command.add_argument("--json", action="store_true", help="one JSON object instead of lines")
 
 
+def _require_angle(chosen: argparse.Namespace, acquisition: Acquisition) -> None:
+    """Refuse a cloud of pixels that look nobody knows where before they are ranged."""
+    clouds = [str(path) for path in chosen.out if path.suffix.lower() in CLOUD_SUFFIXES]
+    known = acquisition.pixel_angle_rad is not None
+    require("pixel_angle_rad", None, known or not clouds, f"it, which {', '.join(clouds)} needs")
+
+
 def _require_free(chosen: argparse.Namespace) -> None:
     """Refuse what cannot be written before anything is computed."""
     for path in chosen.out:
@@ -325,6 +347,22 @@ def _require_free(chosen: argparse.Namespace) -> None:
 
 def _capture(chosen: argparse.Namespace) -> Capture:
     if chosen.capture:
+        _require_none(vars(chosen), _LIGHT, "a capture is lit already")
         return read_capture(chosen.capture, **reading(chosen))
+    _require_none(reading(chosen), READING_NAMES, "a scene is not read from a file")
     scene = scenes[chosen.scene]()
-    return simulate(scene, scene.acquisition, Flux(chosen.ppp, chosen.sbr), seed=chosen.seed)
+    return _simulated(scene, scene.acquisition, chosen)
+
+
+def _simulated(scene: Scene, acquisition: Acquisition, chosen: argparse.Namespace) -> Capture:
+    usual = Flux()
+    flux = Flux(
+        usual.signal if chosen.ppp is None else chosen.ppp,
+        usual.sbr if chosen.sbr is None else chosen.sbr,
+    )
+    return simulate(scene, acquisition, flux, seed=chosen.seed or 0)
+
+
+def _require_none(told: Mapping[str, Any], names: Sequence[str], why: str) -> None:
+    for name in names:
+        require(name, told[name], told[name] is None, f"None: {why}")

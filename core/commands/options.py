@@ -14,19 +14,25 @@ import numpy as np
 
 from core.acquisition import Pulse
 
+_MOST_WITHOUT_UNIT_S = 1e-3
 _UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15}
 
 
 def seconds(text: str) -> float:
-    """A time such as ``64ps``, ``4.43 us`` or, in seconds, ``1e-9``."""
-    number, unit = re.fullmatch(r"\s*(.*?)\s*([a-zµ]*)\s*", text).groups()  # type: ignore[union-attr]
+    """A time such as ``64ps``, ``4.43 us`` or, in seconds and below a millisecond, ``1e-9``."""
+    parts = re.fullmatch(r"([-+.\deE]+) *([a-zµ]*)", text.strip())
     try:
-        return float(number) * _UNITS_S[unit or "s"]
+        number, unit = parts.groups() if parts else ("", "")
+        time_s = float(number) * _UNITS_S[unit or "s"]
+        # A forgotten unit would make nanoseconds of light years.
+        if not unit and abs(time_s) > _MOST_WITHOUT_UNIT_S:
+            raise ValueError
     except (KeyError, ValueError):
         known = ", ".join(_UNITS_S)
         raise argparse.ArgumentTypeError(
             f"{text!r} is not accepted: give a time such as 64ps or 1e-9; units are {known}."
         ) from None
+    return time_s
 
 
 def whole_from_to(least: int, most: int) -> Callable[[str], int]:
@@ -46,7 +52,7 @@ READING: dict[str, dict[str, Any]] = {
     "gate-delay": {
         "type": seconds,
         "dest": "gate_delay_s",
-        "help": "from the pulse to the first bin, such as 280ns",
+        "help": "from the pulse to the first bin, such as 280ns or, before it, =-5ns",
     },
     "bins": {"type": int, "dest": "n_bins", "help": "in the gate"},
     "pulses": {"type": int, "dest": "n_pulses", "help": "sent for each pixel"},
@@ -80,6 +86,10 @@ READING: dict[str, dict[str, Any]] = {
 """How a file is to be read, as `core.read_capture` takes it; guessed where not told."""
 
 
+READING_NAMES = [kind.get("dest", name.replace("-", "_")) for name, kind in READING.items()]
+"""Names of these arguments, in the same order."""
+
+
 def add_reading(command: Any) -> None:
     """Add the options that tell how a file is to be read."""
     group = command.add_argument_group("how to read the file; what is not told is guessed")
@@ -89,13 +99,20 @@ def add_reading(command: Any) -> None:
 
 def reading(chosen: argparse.Namespace) -> dict[str, Any]:
     """The arguments of `core.read_capture`."""
-    names = [kind.get("dest", name.replace("-", "_")) for name, kind in READING.items()]
-    told = {name: getattr(chosen, name) for name in names}
+    told = {name: getattr(chosen, name) for name in READING_NAMES}
     if told["pulse"] is not None:
         told["pulse"] = Pulse.gaussian(told["pulse"])
     if told["shape"] is not None:
         told["shape"] = tuple(told["shape"])
     return told
+
+
+def as_options(message: str) -> str:
+    """A message of `core` in the words of the command line."""
+    for name, argument in zip(READING, READING_NAMES, strict=True):
+        if "_" in argument:
+            message = re.sub(rf"\b{argument}\b", f"--{name}", message)
+    return message
 
 
 def show_progress(done: int, of: int) -> None:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from core.acquisition import Acquisition, Flux
 from core.estimators import settings_of
 from core.experiments.items import Table
+from core.export.whole import whole_folder
 from core.large import IMAGES, estimate_large, learned, range_part
 from core.readers import open_capture
 from core.readers.dense import AXES
@@ -77,9 +78,8 @@ def generate(path: Path, rows: int, n_bins: int, chunk: int) -> None:
     pixel = simulate(Scene(scene.range_m[:1, :1]), acquisition, FLUX)
     like = dataset(replace(pixel, source="the built-in building, simulated")).counts
     whole = xr.Dataset({"counts": (AXES, counts, like.attrs)}, coords=like.coords)
-    unfinished = path.with_name(f"{path.name}.part")
-    whole.to_zarr(unfinished, mode="w", consolidated=False)
-    unfinished.rename(path)
+    with whole_folder(path, overwrite=False) as folder:
+        whole.to_zarr(folder, consolidated=False)
 
 
 def _simulated(
@@ -119,9 +119,13 @@ def study(path: Path, workers: int, memory_bytes: int, progress: Progress) -> It
         return Pass(title, seconds, n_pixels / seconds, peak, same)
 
     def on_cluster(workers: int, killed: bool = False) -> tuple[NDArray[Any], int]:
-        with _cluster(workers, memory_bytes // workers, progress, killed) as memory:
+        with _cluster(workers, memory_bytes // workers, progress, killed) as watched:
+            before = set(watched.pids())
             ranged = estimate_large(open_capture(path), METHOD).compute()
-        return np.stack([ranged[name].to_numpy() for name in IMAGES], axis=2), memory.peak_bytes
+            lost = before - set(watched.pids())
+        if bool(lost) != killed:
+            raise ValueError(f"workers lost = {len(lost)} is not accepted: give more memory.")
+        return np.stack([ranged[name].to_numpy() for name in IMAGES], axis=2), watched.peak_bytes
 
     yield told("part after part, without Dask", lambda: _one_by_one(path, progress))
     yield told("1 worker", lambda: on_cluster(1))
@@ -148,7 +152,7 @@ class _Memory:
 
     def __init__(self, pids: Callable[[], list[int]]) -> None:
         self.peak_bytes = 0
-        self._pids, self._over = pids, threading.Event()
+        self.pids, self._over = pids, threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> _Memory:
@@ -161,7 +165,7 @@ class _Memory:
 
     def _watch(self) -> None:
         while not self._over.wait(0.1):
-            self.peak_bytes = max(self.peak_bytes, sum(map(_resident_bytes, self._pids())))
+            self.peak_bytes = max(self.peak_bytes, sum(map(_resident_bytes, self.pids())))
 
 
 def _resident_bytes(pid: int) -> int:

@@ -27,6 +27,7 @@ from core.tracking import TrackingParameters
 
 __all__ = [
     "CAPTURE_SUFFIXES",
+    "CLOUD_SUFFIXES",
     "FOLDER_WRITERS",
     "WRITERS",
     "save_capture",
@@ -53,6 +54,8 @@ WRITERS: dict[str, Callable[[Product, BinaryIO], None]] = {
 
 FOLDER_WRITERS: dict[str, Callable[[Product, Path], None]] = {".zarr": netcdf.write_zarr}
 """Formats that are folders."""
+
+CLOUD_SUFFIXES = (".ply", ".las", ".laz", ".pcd")
 
 CAPTURE_SUFFIXES = (".npz", ".nc", ".h5", ".zarr")
 

@@ -69,16 +69,30 @@ def whole_folder(path: Path, *, overwrite: bool) -> Iterator[Path]:
             path.rename(older)
         try:
             unfinished.rename(path)  # fails where something full of that name came meanwhile
-        except OSError:
-            if older.exists():
-                older.rename(path)
+        except BaseException as error:
+            _put_back(older, path, error)
             raise
+        _remove(older)
     finally:
-        for rest in (unfinished, older):
-            if rest.is_dir():
-                shutil.rmtree(rest)
-            else:
-                rest.unlink(missing_ok=True)
+        _remove(unfinished)
+
+
+def _put_back(older: Path, path: Path, error: BaseException) -> None:
+    """Give what was to be replaced its name again, or say where it is now."""
+    if not os.path.lexists(older):
+        return
+    if os.path.lexists(path):
+        error.add_note(f"What was {path} is now {older}.")
+    else:
+        older.rename(path)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, a link or a folder, if there is one."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _refusal(path: Path) -> FileExistsError:

@@ -6,14 +6,13 @@ A new format is a module with a ``read(path, request) -> Capture`` and a line in
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from core.acquisition import Pulse
 from core.capture import Capture, CaptureError, Detection
-from core.checks import require
+from core.checks import refusing, require
 from core.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820
 from core.readers.guards import MAX_CUBE_BYTES
 from core.readers.request import Request
@@ -111,7 +110,7 @@ def read_capture(
         and the remedy.
     """
     path = Path(path)
-    with _refusing(path):
+    with refusing(path, CaptureError):
         request = Request(
             time_unit_s=time_unit_s,
             bin_width_s=bin_width_s,
@@ -157,7 +156,10 @@ def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
         As `read_capture`.
     """
     path = Path(path)
-    with _refusing(path):
+    unknown = sorted(options.keys() - Request.__dataclass_fields__.keys())
+    if unknown:
+        raise TypeError(f"open_capture() got unexpected arguments: {', '.join(unknown)}")
+    with refusing(path, CaptureError):
         request = Request(**options)
         if _suffix(path) in labelled.LAZY:
             return labelled.open_counts(path, request)
@@ -171,17 +173,3 @@ def _suffix(path: Path) -> str:
     require("path", str(path), there, "an existing file")
     require("suffix", path.suffix, suffix in READERS, "one of " + ", ".join(READERS))
     return suffix
-
-
-@contextmanager
-def _refusing(path: Path) -> Iterator[None]:
-    """Turn whatever goes wrong with a file into the one type of error that is promised."""
-    try:
-        yield
-    except ValueError as error:
-        raise CaptureError(f"{path.name}: {error}") from error
-    except Exception as error:  # from a closed folder to memory too small
-        raise CaptureError(
-            f"{path.name}: cannot be read ({type(error).__name__}: {error}): "
-            "give a whole file that may be opened and fits in memory."
-        ) from error

@@ -1,8 +1,12 @@
 """Arrays in chunks, compressed or not, read from where they lie: HDF5's and Zarr's data alike.
 
 The bytes of a chunk are decoded here, never by the libraries that write them: each of them unpacks
-as far as the file says, and some read past the end of what they were given. Here a chunk never
-takes more memory than the array's shape allows, and only the filters of `FILTERS` are known.
+as far as the file says, and some read past the end of what they were given. Here a chunk unpacks to
+no more than its shape says, and only the filters of `FILTERS` are known.
+
+A box takes its own bytes, and while it is read those of one chunk up to four times: as it is
+packed, and before, within and after a filter. A chunk may be twice as large as its array, or
+16 MiB; box, chunk and what is packed may be `core.readers.guards.MAX_CUBE_BYTES` each.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ from core.readers.guards import decoding, require_fits
 _CHECKSUM_BYTES = 4
 _ROOM_FOR_CHECKSUMS = 4 * _CHECKSUM_BYTES  # packed along with the numbers
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_SMALL_CHUNK = 2**24  # bytes, however few of them an array fills
 _MOST_CHUNKS = 2**24  # of one array; a table of them takes half a gigabyte
 
 
@@ -91,7 +96,7 @@ def _shuffled(data: bytes, _: int, element_bytes: int) -> bytes:
     elements = np.empty((whole // element_bytes, element_bytes), np.uint8)
     for k, plane in enumerate(np.frombuffer(data, np.uint8, whole).reshape(element_bytes, -1)):
         elements[:, k] = plane
-    return elements.tobytes() + data[whole:]
+    return b"".join((elements.data, data[whole:]))
 
 
 def _lzf(data: bytes, most: int, _: int) -> bytes:
@@ -127,6 +132,14 @@ FILTERS: Mapping[str, Callable[[bytes, int, int], bytes]] = {
 """Ways back from packed bytes. Each takes the bytes, how many may come out, an element's size."""
 
 
+def _holds(dtype: np.dtype[Any], number: float) -> bool:
+    """Whether a type has a number, but for the rounding of floats."""
+    if dtype.kind == "f":  # a whole number of JSON may be beyond all floats
+        return not float(np.finfo(dtype).max) < abs(number) < np.inf
+    low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
+    return low <= number <= high and number == int(number)
+
+
 @dataclass(frozen=True)
 class Chunked:
     """An array in a file, of which nothing is read before it is asked for.
@@ -150,7 +163,7 @@ class Chunked:
     Raises
     ------
     ValueError
-        If a chunk is larger than `core.readers.guards.MAX_CUBE_BYTES`, or there are too many.
+        If a chunk is too large, or there are too many, or the type does not hold the fill.
     """
 
     name: str
@@ -165,9 +178,15 @@ class Chunked:
         fits = len(self.chunk) == len(self.shape) and min((*self.chunk, *self.shape), default=0) > 0
         whole = f"as many axes as {self.shape}, none of them 0"
         require(f"chunk of {self.name}", self.chunk, fits, whole)
-        require_fits(f"a chunk of {self.name}", prod(self.chunk) * self.dtype.itemsize)
+        n_bytes, in_all = (prod(n) * self.dtype.itemsize for n in (self.chunk, self.shape))
+        require_fits(f"a chunk of {self.name}", n_bytes)
+        most = max(2 * in_all, _SMALL_CHUNK)
+        what = f"bytes of a chunk of {self.name}"
+        require(what, n_bytes, n_bytes <= most, f"up to {most:,}, as its array has {in_all:,}")
         n_chunks = prod(self.grid)
         require(f"chunks of {self.name}", n_chunks, n_chunks <= _MOST_CHUNKS, "larger chunks")
+        held = f"a number that {self.dtype} holds"
+        require(f"fill_value of {self.name}", self.fill, _holds(self.dtype, self.fill), held)
 
     @property
     def grid(self) -> tuple[int, ...]:

@@ -24,7 +24,11 @@ from core.readers.wording import guesses, sentence
 
 AXES = ("row", "col", "bin")
 
+PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
+"""Fields of our own layouts that tell a pulse together."""
+
 _LARGEST_COUNT = 2**32 - 1
+_MOST_SAMPLES = 2**20
 
 
 def whole_counts(
@@ -64,6 +68,31 @@ def require_cube(cube: NDArray[Any], name: str) -> None:
     fits = cube.ndim == 3 and cube.size > 0 and cube.dtype.kind in "biuf"
     wanted = "real numbers of shape (row, col, bin), none of them 0"
     require(name, f"{cube.dtype} array of shape {cube.shape}", fits, wanted)
+
+
+def require_sums(shape: tuple[int, ...]) -> None:
+    """Raise ``ValueError`` if the sums of a cube's pixels, of 8 bytes each, would not fit."""
+    require_fits("the sums of all pixels", 8 * shape[0] * shape[1])
+
+
+def require_image(name: str, found: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    """Raise ``ValueError`` unless an image has the cube's rows and columns."""
+    require(name, f"shape {found}", found == shape, f"shape {shape}, that of the cube")
+
+
+def stored_pulse(tau_s: float | None, shape: str, samples: NDArray[Any]) -> Pulse:
+    """The pulse that a file of our own layouts tells.
+
+    Raises
+    ------
+    ValueError
+        If there is no time beside the shape, or it is no pulse.
+    """
+    if tau_s is None:
+        raise ValueError("pulse_tau_s = None is not accepted: give a time beside the shape.")
+    fits = samples.size <= _MOST_SAMPLES
+    require("pulse_samples", f"{samples.size:,} of them", fits, f"up to {_MOST_SAMPLES:,}")
+    return Pulse(tau_s, shape=shape, samples=tuple(samples.astype(float).ravel().tolist()))  # type: ignore[arg-type]
 
 
 def count_dtype(highest: float) -> np.dtype[np.unsignedinteger]:
@@ -129,6 +158,7 @@ def dense_capture(
         Taken where none is given, in place of 1 ns.
     """
     asked, n_bins = request.n_bins, counts.shape[2]
+    require_sums(counts.shape)
     request.refuse(["time_unit_s"], "a histogram cube takes bin_width_s alone")
     request.refuse(["first_detections"], "a histogram cube keeps no order of its photons")
     request.refuse(["shape", "no_trigger"], "a histogram cube tells its pixels")

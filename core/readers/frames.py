@@ -38,7 +38,7 @@ def frames_capture(
     name: str,
     origin: str,
     request: Request,
-    first_bin: int = 0,
+    first_bin: int | None = None,
     bin_width_s: float | None = None,
     also_guessed: Sequence[str] = (),
 ) -> Capture:
@@ -54,8 +54,8 @@ def frames_capture(
         What stands where nothing fired.
     name, origin : str
         What to call the frames in a refusal, and the capture in its source.
-    first_bin : int
-        The number that stands for the first bin.
+    first_bin : int, optional
+        The number that stands for the first bin; 0 where not told, but 1 where 0 stands for none.
     bin_width_s : float, optional
         The camera's, taken where none is told.
     also_guessed : sequence of str
@@ -76,7 +76,9 @@ def frames_capture(
     require(
         "n_pulses", asked, asked in (None, n_pulses), f"{n_pulses}, one for each frame, or None"
     )
-    cube = count_triggers(stretches, shape, no_trigger, name, request.n_bins, first_bin)
+    if first_bin is None and no_trigger == 0:
+        first_bin, also_guessed = 1, [*also_guessed, "1 stands for the first bin"]
+    cube = count_triggers(stretches, shape, no_trigger, name, request.n_bins, first_bin or 0)
     told = replace(
         request, n_pulses=n_pulses, no_trigger=None, detection=request.detection or "first"
     )

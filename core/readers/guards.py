@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,16 @@ from numpy.typing import NDArray
 from core.capture import CaptureError
 from core.checks import require
 
-# Largest cube, file, and decompressed part of a file. Checked before memory is asked for: a header
-# of a hundred bytes can claim any size.
+# Largest cube, file, and decompressed part of a file, each by itself: to read one takes a few times
+# as much, which is in memory beside it. Checked before memory is asked for: a header of a hundred
+# bytes can claim any size.
 MAX_CUBE_BYTES = 2 * 1024**3
 
 # What a process may take that looks at a file for us; on Windows, the time alone is limited.
 MAX_CHILD_BYTES = 2 * 1024**3
 MAX_CHILD_SECONDS = 120
+
+_LAST_BYTES = 2**12  # of what a process complained of
 
 
 def require_fits(name: str, n_bytes: int, remedy: str = "a smaller file") -> None:
@@ -75,18 +78,20 @@ def isolated(script: Path, what: str, *arguments: str) -> tuple[Any, dict[str, N
         If the script refuses, takes more than it may, or ends otherwise.
     """
     limits = (str(MAX_CHILD_BYTES), str(MAX_CHILD_SECONDS))
-    command = [sys.executable, "-I", str(script), *limits, *arguments]
+    # Without the script's own folder, whose modules are named like others.
+    command = [sys.executable, "-P", str(script), *limits, *arguments]
     # Each thread of a linear algebra that nobody asked for would reserve memory of its own. And no
-    # plugin is loaded that a file may name.
+    # plugin is loaded that a file may name. What is installed here is so there.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
     remedy = "a whole file: copy or save it again"
-    with tempfile.TemporaryFile() as answer:
+    with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as complaints:
         try:
             status = subprocess.run(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=answer,
-                stderr=subprocess.DEVNULL,
+                stderr=complaints,
                 timeout=MAX_CHILD_SECONDS,
                 env=environment,
                 check=False,
@@ -94,6 +99,8 @@ def isolated(script: Path, what: str, *arguments: str) -> tuple[Any, dict[str, N
         except subprocess.TimeoutExpired:
             found = f"{what} = more than {MAX_CHILD_SECONDS} s to look at is not accepted: give"
             raise CaptureError(f"{found} {remedy}.") from None
+        if status == 1:
+            _require_installed(what, complaints)
         ending = signal.Signals(-status).name if status < 0 else f"status {status}"
         require(what, f"its library ended by {ending}", status == 0, remedy)
         answer.seek(0)
@@ -105,3 +112,11 @@ def isolated(script: Path, what: str, *arguments: str) -> tuple[Any, dict[str, N
     if "error" in told:
         raise CaptureError(f"{what} cannot be read ({told['error']}): give {remedy}.")
     return told, arrays
+
+
+def _require_installed(what: str, complaints: IO[bytes]) -> None:
+    """Raise `CaptureError` if Python ended because it did not find what a script imports."""
+    complaints.seek(max(0, complaints.seek(0, os.SEEK_END) - _LAST_BYTES))
+    last = complaints.read().decode(errors="replace").strip().rpartition("\n")[2]
+    if last.startswith(("ImportError", "ModuleNotFoundError")):
+        raise CaptureError(f"{what} cannot be read without its library ({last}): install it.")

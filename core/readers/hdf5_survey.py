@@ -28,7 +28,7 @@ FILTERS |= {h5z.FILTER_FLETCHER32: "fletcher32", h5z.FILTER_LZF: "lzf"}
 MOST_LINKS = 10_000
 MOST_DEPTH = 10
 MOST_CHUNKS = 2**20  # of all arrays
-MOST_IN_ATTRIBUTE = 2**16
+MOST_IN_ATTRIBUTE = 2**20
 MOST_TOLD = 2**24  # letters
 
 
@@ -231,23 +231,28 @@ def _name(array: h5d.DatasetID) -> str:
 
 
 def _attributes(place: Any) -> dict[str, Any]:
-    """Attributes that are numbers or text; others are left out."""
+    """Attributes that are numbers or text; others are left out.
+
+    One that is too long is a text that says so, which is refused where numbers are wanted.
+    """
     told: dict[str, Any] = {}
     for k in range(h5a.get_num_attrs(place)):
         attribute = h5a.open(place, index=k)
         kind = attribute.get_type().get_class()
         if kind not in (h5t.INTEGER, h5t.FLOAT, h5t.STRING):
             continue
-        if attribute.get_space().get_simple_extent_npoints() > MOST_IN_ATTRIBUTE:
-            continue
         name = attribute.name.decode("utf-8", "replace")
+        length = attribute.get_space().get_simple_extent_npoints()
+        if length > MOST_IN_ATTRIBUTE:
+            told[name] = f"{length:,} values, more than {MOST_IN_ATTRIBUTE:,}"
+            continue
         manager = h5py.AttributeManager(_Owner(place))
         value = manager.get(name)
         if isinstance(value, bytes):
             value = value.decode("utf-8", "replace")
         if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "iuf":
             told[name] = value.item() if value.size == 1 else value.ravel().tolist()
-        elif isinstance(value, str) and len(value) <= MOST_IN_ATTRIBUTE:
+        elif isinstance(value, str):
             told[name] = value
     return told
 

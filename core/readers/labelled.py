@@ -15,7 +15,7 @@ uint16 or uint32 in a capture, uint32 in an array that is opened but not read.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,10 +28,20 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import COUNT_TYPES, Capture, CaptureError, Detection
 from core.checks import require
 from core.readers import hdf5, netcdf3, zarr
-from core.readers.dense import AXES, guess_detection, stored_counts, whole_counts
+from core.readers.dense import (
+    AXES,
+    PULSE,
+    guess_detection,
+    require_image,
+    require_sums,
+    stored_counts,
+    stored_pulse,
+    whole_counts,
+)
 from core.readers.guards import require_fits
 from core.readers.pulse_guess import guessed_pulse
 from core.readers.request import Request
+from core.readers.sample import sample_of
 from core.readers.stored import Numbers, Stored, choose, whole
 from core.readers.wording import guesses, sentence
 
@@ -45,8 +55,11 @@ NAMES = {
 }
 """Names by which each axis is known, in small letters."""
 
+_SECONDS = {"": "s", "milli": "ms", "micro": "us", "nano": "ns", "pico": "ps"}
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12}
-UNITS_S["m"] = UNITS_S["metre"] = UNITS_S["meter"] = 2 / speed_of_light
+UNITS_S |= {f"{name}second{s}": UNITS_S[unit] for s in ("", "s") for name, unit in _SECONDS.items()}
+UNITS_S |= dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 2 / speed_of_light)
+UNITS_S["km"] = 1e3 * UNITS_S["m"]
 """Seconds of the light's way there and back, for each unit of a coordinate along the bins."""
 
 
@@ -58,9 +71,10 @@ BLOCK_BYTES = 2**24
 
 _LONGEST = 2**20  # coordinate that is read
 _MOST_COORDINATES = 100
+_MISSING = ("_FillValue", "missing_value")
 _OF_ENCODING = (
-    *("_FillValue", "missing_value", "scale_factor", "add_offset", "coordinates"),
-    *("_ARRAY_DIMENSIONS", "_NCProperties"),
+    *_MISSING,
+    *("scale_factor", "add_offset", "coordinates", "_ARRAY_DIMENSIONS", "_NCProperties"),
 )
 
 
@@ -83,14 +97,14 @@ class Counts:
         With three axes.
     name, file : str
         What to call the array and the file in a refusal.
-    missing : float or None
-        What stands for a number that is not there.
+    missing : dict
+        What stands for a number that is not there, by the name of the attribute that says so.
     """
 
     numbers: Numbers
     name: str
     file: str
-    missing: float | None = None
+    missing: Mapping[str, float] = field(default_factory=dict)
     ndim = len(AXES)
 
     @property
@@ -118,8 +132,9 @@ class Counts:
     def read(self, box: tuple[slice, ...]) -> NDArray[Any]:
         """The numbers in a box of slices, none of them missing."""
         found = self.numbers[box]
-        gaps = self.missing is not None and bool((found == self.missing).any())
-        require(f"_FillValue of {self.name}", self.missing, not gaps, "counts without gaps")
+        for attribute, value in self.missing.items():
+            gaps = bool((found == value).any())
+            require(f"{attribute} of {self.name}", value, not gaps, "counts without gaps")
         return found
 
 
@@ -154,7 +169,8 @@ class _File:
             require(f"{name} of {chosen.name}", value, value in (None, plain), "counts as they are")
         require(f"axes of {chosen.name}", chosen.n_axes, chosen.n_axes == 3, "row, col and bin")
         assert chosen.numbers is not None
-        missing = _number(known, "_FillValue")
+        told = {name: _number(known, name) for name in _MISSING}
+        missing = {name: value for name, value in told.items() if value is not None}
         return Counts(chosen.numbers, chosen.name, self.path.name, missing)
 
     def labelled(self, chosen: Stored, data: Any, request: Request) -> xr.DataArray:
@@ -194,10 +210,15 @@ class _File:
         dims = _named_axes(chosen, request)
         places = _places(dims, request, chosen.name)
         row, col = (dims[k] for k in places[:2])
+        assert chosen.numbers is not None
+        shape = tuple(chosen.numbers.shape[k] for k in places[:2])
         for one in self.arrays:
             if one.name == prefix + name and one.n_axes == 2 and one.numbers is not None:
-                values = whole(one.numbers).astype(float)
-                return values.T if one.axes == (col, row) else values
+                turned = one.axes == (col, row)
+                found = one.numbers.shape[::-1] if turned else one.numbers.shape
+                require_image(name, found, shape)
+                values = whole(one.numbers).astype(float, copy=False)
+                return values.T if turned else values
         return None
 
 
@@ -208,6 +229,7 @@ def read(path: Path, request: Request) -> Capture:
     every = (slice(None),) * len(AXES)
     cube = stored_counts(file.counts(chosen).read(every), chosen.name)
     counts = oriented(file.labelled(chosen, cube, request), request)
+    require_sums(counts.shape)
     known = describe(counts, request, file.origin(chosen), _guessed(chosen, request))
     ours = chosen.name.rpartition("/")[2] == "counts"
     return Capture(
@@ -370,7 +392,7 @@ def _places(dims: tuple[str, ...], request: Request, name: str) -> tuple[int, ..
         return order
     known = {alias: axis for axis, aliases in NAMES.items() for alias in aliases}
     named = {known.get(dim.lower()): k for k, dim in enumerate(dims)}
-    told = "names row, col and bin, or as axes their order in the file"
+    told = "names row, col and bin, or axes, such as 'row col bin', in the order of the file"
     require(f"axes of {name}", dims, named.keys() == set(AXES), told)
     return tuple(named[axis] for axis in AXES)
 
@@ -389,7 +411,7 @@ def describe(
     Parameters
     ----------
     counts : DataArray, shape (row, col, bin)
-        As `oriented` gives them; looked at only where they are in memory.
+        As `oriented` gives them; a sample is looked at where pulse or detection must be guessed.
     request : Request
         Goes before what the array says.
     origin : str
@@ -407,7 +429,10 @@ def describe(
     request.refuse(["shape", "no_trigger"], "labelled counts know their axes")
     n_bins = counts.sizes["bin"]
     require("n_bins", request.n_bins, request.n_bins in (None, n_bins), f"{n_bins} or None")
-    times = _times(counts)
+    times, left_out = _times(counts)
+    if times is not None and "bin_width_s" not in known and counts.sizes["bin"] > 1:
+        also_guessed = [*also_guessed, f"{times.name} is when a bin opens"]
+    also_guessed = [*also_guessed, *left_out]
     known_times = str(times.name) if times is not None else None
     require(
         "stop_s",
@@ -439,28 +464,29 @@ def describe(
         n_pulses=complete.n_pulses,
         pixel_angle_rad=complete.pixel_angle_rad,
     )
-    in_memory = isinstance(counts.data, np.ndarray)
-    width_s = acquisition.bin_width_s
-    if pulse is None:
-        pulse = guessed_pulse(counts.data, width_s) if in_memory else Pulse.gaussian(width_s)
-    if detection is None and in_memory:
-        detection = guess_detection(counts.data, acquisition.n_pulses)
-    elif detection is None:
-        detection = "all" if acquisition.n_pulses is None else "first"
+    if pulse is None or detection is None:
+        sample = sample_of(counts.data)  # in memory or not: both ways in make the same guess
+        pulse = pulse or guessed_pulse(sample, acquisition.bin_width_s)
+        detection = detection or guess_detection(sample, acquisition.n_pulses)
     guessed = [*also_guessed, *guesses(complete, acquisition, pulse, detection)]
     return Description(
         acquisition, pulse, detection, sentence(str(known.get("source", origin)), guessed)
     )
 
 
-def _times(counts: xr.DataArray) -> xr.DataArray | None:
-    """The first coordinate along the bins that tells of time or range."""
+def _times(counts: xr.DataArray) -> tuple[xr.DataArray | None, list[str]]:
+    """The first coordinate along the bins that tells of time or range; what is left out if none."""
     coordinate: xr.DataArray
+    left_out = []
     for name, coordinate in counts.coords.items():
-        along = coordinate.dims == ("bin",) and coordinate.dtype.kind in "iuf"
-        if along and str(coordinate.attrs.get("units", _unit_of(str(name)))) in UNITS_S:
-            return coordinate
-    return None
+        if coordinate.dims != ("bin",) or coordinate.dtype.kind not in "iuf":
+            continue
+        unit = str(coordinate.attrs.get("units", _unit_of(str(name))))
+        if unit in UNITS_S:
+            return coordinate, []
+        told = f"of unit {unit!r}" if "units" in coordinate.attrs else "without a unit"
+        left_out.append(f"{name}, {told}, left out")
+    return None, left_out
 
 
 def _timing(times: xr.DataArray) -> dict[str, float]:
@@ -482,13 +508,14 @@ def _unit_of(name: str) -> str:
 
 
 def _pulse(known: dict[Any, Any]) -> Pulse | None:
-    if "pulse_tau_s" not in known:
+    if not any(name in known for name in PULSE):
         return None
-    samples = np.atleast_1d(np.asarray(known.get("pulse_samples", ())))
-    require("pulse_samples", f"{samples.dtype}", samples.dtype.kind in "biuf", "real numbers")
-    tau_s = _number(known, "pulse_tau_s")
-    shape: Any = str(known.get("pulse_shape", "gamma"))
-    return Pulse(tau_s, shape=shape, samples=tuple(samples.astype(float).tolist()))  # type: ignore[arg-type]
+    told = known.get("pulse_samples", ())
+    samples = np.asarray(told)
+    require("pulse_samples", told, samples.dtype.kind in "biuf", "real numbers")
+    return stored_pulse(
+        _number(known, "pulse_tau_s"), str(known.get("pulse_shape", "gamma")), samples
+    )
 
 
 def _number(known: Mapping[Any, Any], name: str) -> float | None:

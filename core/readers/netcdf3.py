@@ -19,24 +19,33 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     """All arrays of a file, and its attributes under the name ``""``."""
     from scipy.io import netcdf_file  # noqa: PLC0415 - not for every file
 
-    found, n_bytes = [], 0
     # Mapped: SciPy would read every variable at once, and any number of them may share their bytes.
-    with decoding("the file"), netcdf_file(path, mmap=True) as file:
-        groups = {"": _plain(file._attributes)}
-        for name in list(file.variables):
-            variable = file.variables.pop(name)
-            values, known = variable.data, _plain(variable._attributes)
-            useful = 1 <= values.ndim <= _LARGEST and values.dtype.kind in "iuf" and values.size
-            if not useful:
-                found.append(Stored(name, attributes=known, refused="no numbers with 1 to 3 axes"))
-            else:
-                n_bytes += values.nbytes
-                require_fits("all variables", n_bytes)
-                whole = Whole(values.tobytes())
-                numbers = Chunked(name, values.shape, values.dtype, values.shape, whole)
-                found.append(Stored(name, numbers, tuple(variable.dimensions), known))
-            del variable, values
-    return found, groups
+    with decoding("the file"):
+        file = netcdf_file(path, mmap=True)
+    with file:
+        with decoding("the file"):
+            n_bytes = sum(one.data.nbytes for one in file.variables.values() if _is_useful(one))
+        require_fits("all variables", n_bytes)
+        with decoding("the file"):
+            names = list(file.variables)
+            # None is left, or the map could not be closed.
+            found = [_stored(name, file.variables.pop(name)) for name in names]
+            return found, {"": _plain(file._attributes)}
+
+
+def _is_useful(variable: Any) -> bool:
+    values = variable.data
+    return bool(1 <= values.ndim <= _LARGEST and values.dtype.kind in "iuf" and values.size)
+
+
+def _stored(name: str, variable: Any) -> Stored:
+    """A copy of a variable."""
+    values, known = variable.data, _plain(variable._attributes)
+    if not _is_useful(variable):
+        return Stored(name, attributes=known, refused="no numbers with 1 to 3 axes")
+    whole = Whole(values.tobytes())
+    numbers = Chunked(name, values.shape, values.dtype, values.shape, whole)
+    return Stored(name, numbers, tuple(variable.dimensions), known)
 
 
 def _plain(known: Any) -> dict[str, Any]:

@@ -44,17 +44,26 @@ from numpy.typing import NDArray
 from core.acquisition import Floats, Pulse
 from core.capture import Capture
 from core.checks import require
-from core.readers.dense import AXES, cube_capture, dense_capture, stored_counts
+from core.readers.dense import (
+    AXES,
+    PULSE,
+    cube_capture,
+    dense_capture,
+    require_image,
+    stored_counts,
+    stored_pulse,
+)
 from core.readers.guards import decoding, require_fits
-from core.readers.npy import frames_in, read_array, read_header
+from core.readers.npy import Header, frames_in, read_array, read_header
 from core.readers.request import Request
 
 FORMAT = "firstphoton-capture-1"
 
 _TIMING = ("bin_width_s", "gate_delay_s", "pixel_angle_rad")
-_PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
-_TRUTH = ("truth_range_m", "signal", "background")
-_FIELDS = ("format", "n_pulses", "detection", "source", "no_trigger", *_TIMING, *_PULSE, *_TRUTH)
+_OTHERS = ("format", "n_pulses", "detection", "source", "no_trigger", "background")
+_FIELDS = (*_TIMING, *PULSE, *_OTHERS)
+_MOST_BYTES = 2**16  # of a field that is one number or one text
+_MOST_BYTES_OF_SAMPLES = 2**23 + 2**12
 
 
 def fields(capture: Capture) -> dict[str, NDArray[Any]]:
@@ -87,16 +96,18 @@ def read(path: Path, request: Request) -> Capture:
         names = _names(archive)
         name = _choose(archive, names, request)
         origin = f"{path.name}, variable {name}"
-        stored = {field: _array(archive, field) for field in names if field in _FIELDS}
+        stored = {field: _field(archive, field) for field in names if field in _FIELDS}
         if name == "frames" or (request.no_trigger is not None and name != "cube"):
             return _frames(archive, name, stored, origin, request)
         cube = _array(archive, name)
-    if name != "cube":
-        return cube_capture(cube, name, origin, request)
-    require("axes", request.axes, request.order(AXES) in (None, (0, 1, 2)), repr(" ".join(AXES)))
-    origin = _text(stored, "source", origin)
-    counts = stored_counts(cube, name)
-    return _with_truth(dense_capture(counts, origin, _known(stored, request), Pulse()), stored)
+        if name != "cube":
+            return cube_capture(cube, name, origin, request)
+        as_told = request.order(AXES) in (None, (0, 1, 2))
+        require("axes", request.axes, as_told, repr(" ".join(AXES)))
+        origin = _text(stored, "source", origin)
+        counts = stored_counts(cube, name)
+        capture = dense_capture(counts, origin, _known(stored, request), Pulse())
+        return _with_truth(capture, archive, stored)
 
 
 def _frames(
@@ -118,13 +129,15 @@ def _frames(
         capture = frames_in(
             file, info.file_size, name, origin, replace(known, no_trigger=no_trigger)
         )
-    return _with_truth(capture, stored)
+    return _with_truth(capture, archive, stored)
 
 
 def _known(stored: Mapping[str, NDArray[Any]], request: Request) -> Request:
     """The request, completed by the fields of our layout."""
     version = _text(stored, "format", FORMAT)
     require("format", version, version == FORMAT, FORMAT)
+    if "gate_delay_s" in stored:
+        request.refuse(["stop_s"], "the file's own gate_delay_s tells")
     known: dict[str, Any] = {name: _number(stored, name) for name in _TIMING}
     known |= {
         "n_pulses": _n_pulses(stored),
@@ -135,25 +148,22 @@ def _known(stored: Mapping[str, NDArray[Any]], request: Request) -> Request:
     return replace(request, **told)
 
 
-def _with_truth(capture: Capture, stored: Mapping[str, NDArray[Any]]) -> Capture:
+def _with_truth(capture: Capture, archive: ZipFile, stored: Mapping[str, NDArray[Any]]) -> Capture:
     return replace(
         capture,
-        truth_range_m=_image(stored, "truth_range_m"),
-        signal=_image(stored, "signal"),
+        truth_range_m=_image(archive, "truth_range_m", capture.shape),
+        signal=_image(archive, "signal", capture.shape),
         background=_number(stored, "background"),
     )
 
 
 def _pulse(stored: Mapping[str, NDArray[Any]]) -> Pulse | None:
-    if not any(name in stored for name in _PULSE):
+    if not any(name in stored for name in PULSE):
         return None
-    tau_s = _number(stored, "pulse_tau_s")
-    if tau_s is None:
-        raise ValueError("pulse_tau_s = None is not accepted: give a time beside the shape.")
     samples = stored.get("pulse_samples", np.empty(0))
-    _require_reals("pulse_samples", samples)
+    _require_reals("pulse_samples", samples.dtype)
     shape = _text(stored, "pulse_shape", "gamma")
-    return Pulse(tau_s, shape=shape, samples=tuple(samples.astype(float).ravel().tolist()))  # type: ignore[arg-type]
+    return stored_pulse(_number(stored, "pulse_tau_s"), shape, samples)
 
 
 def _n_pulses(stored: Mapping[str, NDArray[Any]]) -> int | None:
@@ -171,7 +181,7 @@ def _whole(value: float | None, name: str, meaning: str) -> int:
 def _number(stored: Mapping[str, NDArray[Any]], name: str) -> float | None:
     if name not in stored:
         return None
-    _require_reals(name, stored[name])
+    _require_reals(name, stored[name].dtype)
     require(name, f"array of shape {stored[name].shape}", stored[name].size == 1, "one number")
     return float(stored[name].item())
 
@@ -185,15 +195,18 @@ def _text(stored: Mapping[str, NDArray[Any]], name: str, default: str) -> str:
     return str(text.item())
 
 
-def _image(stored: Mapping[str, NDArray[Any]], name: str) -> Floats | None:
-    if name not in stored:
+def _image(archive: ZipFile, name: str, shape: tuple[int, int]) -> Floats | None:
+    """An image beside the counts, of which only the header is read unless it fits them."""
+    if f"{name}.npy" not in archive.namelist():
         return None
-    _require_reals(name, stored[name])
-    return np.asarray(stored[name], np.float64)
+    header = _header(archive, name)
+    _require_reals(name, header.dtype)
+    require_image(name, header.shape, shape)
+    return np.asarray(_array(archive, name), np.float64)
 
 
-def _require_reals(name: str, array: NDArray[Any]) -> None:
-    require(name, f"array of {array.dtype}", array.dtype.kind in "biuf", "real numbers")
+def _require_reals(name: str, dtype: np.dtype[Any]) -> None:
+    require(name, f"array of {dtype}", dtype.kind in "biuf", "real numbers")
 
 
 def _names(archive: ZipFile) -> list[str]:
@@ -216,16 +229,24 @@ def _choose(archive: ZipFile, names: list[str], request: Request) -> str:
     for name in ours:
         if name in names:
             return name
-    cubes = [name for name in names if len(_header(archive, name)) == 3]
+    cubes = [name for name in names if len(_header(archive, name).shape) == 3]
     remedy = f"as variable the name of a (row, col, bin) array; the file has {listed}"
     require("variable", ", ".join(cubes) or None, len(cubes) == 1, remedy)
     return cubes[0]
 
 
-def _header(archive: ZipFile, name: str) -> tuple[int, ...]:
+def _header(archive: ZipFile, name: str) -> Header:
     info = _info(archive, name)
     with decoding(name), archive.open(info) as file:
-        return read_header(file, name).shape
+        return read_header(file, name)
+
+
+def _field(archive: ZipFile, name: str) -> NDArray[Any]:
+    """A number, a text, or the samples of a pulse; together they take little."""
+    n_bytes = archive.getinfo(f"{name}.npy").file_size
+    most = _MOST_BYTES_OF_SAMPLES if name == "pulse_samples" else _MOST_BYTES
+    require(f"bytes of {name}", n_bytes, n_bytes <= most, f"up to {most:,}")
+    return _array(archive, name)
 
 
 def _array(archive: ZipFile, name: str) -> NDArray[Any]:

@@ -16,6 +16,7 @@ A width is told only if its peak is significant: fitted to each of 32 groups of 
 the mean number of pairs in the peak is 6 standard errors above zero, and its height is 2 % of the
 floor, less than which a line that does not quite follow the floor might leave. A pulse as wide as a
 tenth of the gate is out of reach, and so is, above a twentieth, that of a wall all at one range.
+Nothing is told of fewer than 16 bins or 32 pixels, nor of more than 65,536 bins.
 Where a real pulse has a tail, the Gaussian is that of its core rather.
 """
 
@@ -35,6 +36,7 @@ _GROUPS = 32
 _MOST_NUMBERS = 2**24  # in all transforms together: a tenth of a second
 _NUMBERS_A_BLOCK = 2**20
 _FEWEST_BINS = 16
+_MOST_BINS = 2**16  # above, even one pixel of each group would take long
 _NARROWEST_BINS = 0.3  # standard deviation; below, nearly all of an echo lies in two bins
 _WIDEST_SHARE = 0.1  # of the gate; above, there is no floor left to see
 _MOST_WEIGHT = 20.0  # of a photon where there are few
@@ -75,7 +77,7 @@ def guessed_sigma_bins(cube: NDArray[np.unsignedinteger]) -> float | None:
     float or None
     """
     n_bins = cube.shape[2]
-    if n_bins < _FEWEST_BINS or cube.shape[0] * cube.shape[1] < _GROUPS:
+    if not _FEWEST_BINS <= n_bins <= _MOST_BINS or cube.shape[0] * cube.shape[1] < _GROUPS:
         return None
     pairs = pairs_by_lag(cube, 3 * n_bins // 4)
     total = pairs.sum(axis=0)

@@ -106,14 +106,16 @@ def _require_harmless(data: bytes, headers: list[np.void]) -> None:
 
 
 def _require_inflates(packed: bytes, length: int, name: str) -> None:
-    """Raise ``ValueError`` unless an archive's first file unpacks to what it claims, and enough.
+    """Raise ``ValueError`` unless an archive's one file unpacks to what it claims, and enough.
 
     What its directory claims is not what it unpacks to: `zipfile` stops at the claim only after all
-    was unpacked.
+    was unpacked. And of two files of one name, it would read the last.
     """
+    with decoding(name), ZipFile(BytesIO(packed)) as archive:
+        files = archive.filelist
+    require(f"files packed in {name}", len(files), len(files) == 1, "one: save the file again")
+    info = files[0]
     with decoding(name):
-        with ZipFile(BytesIO(packed)) as archive:
-            info = archive.filelist[0]
         lengths = struct.unpack_from("<HH", packed, info.header_offset + 26)  # name, extra field
         begin = info.header_offset + 30 + sum(lengths)
     plain = info.compress_type in (ZIP_STORED, ZIP_DEFLATED)

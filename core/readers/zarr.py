@@ -8,6 +8,7 @@ with a symbolic link anywhere in it is refused. Consolidated metadata is not nee
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import re
@@ -96,6 +97,7 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
         title = name or path.name
         try:
             numbers, axes = describe(title, folder, about), about.get("dimension_names")
+            known = known | _missing(about, known, numbers)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             found.append(
                 Stored(title, attributes=known, refused=f"{type(error).__name__}: {error}")
@@ -183,6 +185,23 @@ def _array_3(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
         _fill(about.get("fill_value")),
         order=order,
     )
+
+
+def _missing(
+    about: Mapping[str, Any], known: Mapping[str, Any], numbers: Chunked
+) -> dict[str, float]:
+    """What stands for a missing number, where xarray keeps it in a way of its own.
+
+    In version 2 that is the fill itself, of which 0 is only what was never written. In version 3 it
+    is an attribute, that of floats as the base64 of a double.
+    """
+    if about["zarr_format"] == 2:
+        return {"_FillValue": numbers.fill} if about.get("fill_value") else {}
+    value = known.get("_FillValue")
+    if not isinstance(value, str):
+        return {}
+    (number,) = np.frombuffer(base64.b64decode(value, validate=True), "<f8").tolist()
+    return {"_FillValue": number}
 
 
 def _filter(name: Any, told: Mapping[str, Any], dtype: np.dtype[Any]) -> Filter:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from core.acquisition import Acquisition, Floats
-from core.checks import require
+from core.checks import refusing, require
 from core.scene import Scene
 from core.scene_files import depth, mesh
 
@@ -83,7 +83,7 @@ def read_scene(
     """
     path = Path(path)
     view = mesh.View(size, pixel_angle_rad, distance_m, position_m, direction)
-    try:
+    with refusing(path, SceneError):
         require("path", str(path), path.is_file(), "an existing file")
         accepted = pixel_angle_rad is None or 0 < pixel_angle_rad < 1
         require("pixel_angle_rad", pixel_angle_rad, accepted, "between 0 and 1 radian")
@@ -98,13 +98,6 @@ def read_scene(
                 require(name, value, value is None, "None: a depth map has a view of its own")
             range_m = depth.read(path, unit_m)
         return Scene(range_m, acquisition=suitable_acquisition(range_m, pixel_angle_rad))
-    except ValueError as error:
-        raise SceneError(f"{path.name}: {error}") from error
-    except Exception as error:  # from a closed folder to memory too small: the promise is one type
-        raise SceneError(
-            f"{path.name}: cannot be read ({type(error).__name__}: {error}): "
-            "give a whole file that may be opened and fits in memory."
-        ) from error
 
 
 def suitable_acquisition(range_m: Floats, pixel_angle_rad: float | None) -> Acquisition:

@@ -138,7 +138,12 @@ FRAMES: dict[str, Any] = {
 }
 
 FORMATS: dict[str, Format] = {
-    "own layout": Format("capture.npz", lambda: npz_bytes(**OWN_FIELDS), guesses=()),
+    "own layout": Format(
+        "capture.npz",
+        lambda: npz_bytes(**OWN_FIELDS),
+        guesses=(),
+        refuses=(*CUBES_REFUSE, {"stop_s": 1e-6}),
+    ),
     "npz with a bare cube": Format("c.npz", lambda: npz_bytes(cube=CUBE.astype(np.int64))),
     "npz of other names": Format(
         "c.npz", lambda: npz_bytes(counts=CUBE, depth=np.ones((3, 4))), refuses=ARRAYS_REFUSE

@@ -9,6 +9,7 @@ the command ends with 1.
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import resource
 import shutil
@@ -18,8 +19,10 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Timer
 from typing import Any
 
 from core.commands.options import show_progress
@@ -27,9 +30,11 @@ from core.experiments.items import as_markdown
 from core.tests.formats import FORMATS, damaged, put
 
 LARGEST_CUBE_BYTES = 2**26
-"""The readers' limit while they are tried, and how far memory may grow beyond what it was."""
+"""The readers' limit while they are tried."""
 
-HEADROOM_BYTES = 16 * LARGEST_CUBE_BYTES
+HEADROOM_BYTES = 6 * LARGEST_CUBE_BYTES
+"""By how much memory may grow: a cube, what it was made of, and what libraries keep for later."""
+
 SECONDS_A_FILE = 20.0
 _BATCH = 2000
 
@@ -61,7 +66,7 @@ def fuzz(n_files: int, seed: int, kept: Path) -> Counter[tuple[str, str]]:
                 if not isinstance(contents[name], bytes):
                     path.mkdir()
                 paths.append((name, put(path, damaged(contents[name], rng))))
-            for (name, path), outcome in zip(paths, _outcomes(paths), strict=True):
+            for name, path, outcome in _all_outcomes(paths):
                 outcomes[name, outcome] += 1
                 if outcome not in (READ, REFUSED):
                     kept.mkdir(parents=True, exist_ok=True)
@@ -74,6 +79,17 @@ def fuzz(n_files: int, seed: int, kept: Path) -> Counter[tuple[str, str]]:
 def _forever(names: Any) -> Iterator[str]:
     while True:
         yield from names
+
+
+def _all_outcomes(paths: list[tuple[str, Path]]) -> Iterator[tuple[str, Path, str]]:
+    """Each file with how it ended, as many files at a time as there are cores."""
+    cores = os.cpu_count() or 1
+    shares = [paths[k::cores] for k in range(cores)]
+    with ThreadPoolExecutor(cores) as pool:
+        for share, found in zip(
+            shares, pool.map(lambda share: list(_outcomes(share)), shares), strict=True
+        ):
+            yield from ((*path, outcome) for path, outcome in zip(share, found, strict=True))
 
 
 def _outcomes(paths: list[tuple[str, Path]]) -> Iterator[str]:
@@ -89,6 +105,7 @@ def _outcomes(paths: list[tuple[str, Path]]) -> Iterator[str]:
         ) as reader:
             assert reader.stdin is not None and reader.stdout is not None
             try:
+                reader.stdout.readline()  # it is ready
                 for name, path in paths[done:]:
                     reader.stdin.write(f"{name}\t{path}\n")
                     reader.stdin.flush()
@@ -115,8 +132,6 @@ class _Watchdog:
     """Kills a process that takes too long."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
-        from threading import Timer  # noqa: PLC0415
-
         self._barked = False
         self._process = process
         self._timer = Timer(SECONDS_A_FILE, self._bark)
@@ -147,17 +162,24 @@ def _read_what_is_asked() -> None:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + HEADROOM_BYTES,) * 2)
     warnings.simplefilter("ignore")
+    print("ready", flush=True)
     for line in sys.stdin:
         name, path = line.rstrip("\n").split("\t")
         try:
             read_capture(path, **FORMATS[name].needs)
             outcome = READ
         except CaptureError as error:
-            beyond = isinstance(error.__cause__, MemoryError)
-            outcome = "memory beyond the limit" if beyond else REFUSED
+            outcome = "memory beyond the limit" if _is_of_memory(error) else REFUSED
         except BaseException as error:
             outcome = f"{type(error).__name__}"
         print(outcome, flush=True)
+
+
+def _is_of_memory(error: BaseException | None) -> bool:
+    """Whether memory was too small, wherever in the chain of causes that is said."""
+    if error is None:
+        return False
+    return "MemoryError" in f"{type(error)} {error}" or _is_of_memory(error.__cause__)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -18,9 +18,11 @@ from core.commands.options import seconds
 from core.estimators import estimate
 from core.export import CAPTURE_SUFFIXES, save_capture
 from core.large import IMAGES
-from core.readers import read_capture
+from core.readers import READERS, read_capture
 from core.scene import scenes
 from core.simulate import simulate
+
+pytestmark = pytest.mark.files
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -57,7 +59,7 @@ def test_times_carry_units(text: str, expected_s: float) -> None:
     assert seconds(text) == pytest.approx(expected_s, rel=1e-12)
 
 
-@pytest.mark.parametrize("text", ["", "ps", "64 pc", "1e-9 s s", "one ns", "64Ps"])
+@pytest.mark.parametrize("text", ["", "ps", "64 pc", "1e-9 s s", "one ns", "64Ps", "64", "1\n2"])
 def test_times_that_are_none_are_refused(
     text: str, frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,7 +101,7 @@ def test_a_simulated_capture_is_written_and_read(
     assert found.acquisition == expected.acquisition
     assert (found.pulse, found.detection) == (expected.pulse, expected.detection)
     np.testing.assert_allclose(found.truth_range_m, expected.truth_range_m)
-    assert found.source == expected.source == told["source"]
+    assert found.source == told["source"] == f"staircase, {expected.source}, SBR 0.5"
     assert told["photons"] == expected.counts.sum()
     code, _, err = ran(capsys, *arguments, "--out", path)
     assert code == 2
@@ -189,6 +191,20 @@ def test_a_capture_is_exported_in_another_layout(
         (("export", "{frames}", "{frames}"), 2, "suffix = '.npy'"),
         (("simulate", "--scene", "absent.stl", "--out", "a.npz"), 2, "absent.stl"),
         (("simulate", "--sbr", "0", "--out", "a.npz"), 2, "sbr = 0"),
+        (("simulate", "--scene", "cars", "--out", "a.npz"), 2, "car or building or"),
+        (("simulate", "--distance", "3", "--out", "a.npz"), 2, "a view of its own"),
+        (("estimate", "peak", "--pulses", "7"), 2, "a scene is not read from a file"),
+        (("estimate", "peak", "--capture", "{frames}", "--sbr", "1"), 2, "lit already"),
+        (
+            ("estimate", "peak", "--capture", "{frames}", "--out", "a.las"),
+            2,
+            "--pixel-angle = None",
+        ),
+        (
+            ("info", "{frames}", "--gate-delay=5ns", "--first-detections", "3"),
+            2,
+            "--first-detections",
+        ),
         (("field", "nowhere"), 2, "data_face.mat"),
     ],
 )
@@ -217,6 +233,17 @@ def test_a_machine_that_fails_is_no_bad_input(
     monkeypatch.setattr("core.commands.captures.save_capture", full)
     code, _, err = ran(capsys, "export", frames, frames.with_name("a.npz"))
     assert code == 1 and "No space left" in err
+
+
+def test_a_file_that_the_machine_cannot_read_is_no_bad_input(
+    frames: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: Any, **__: Any) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setitem(READERS, ".npy", broken)
+    code, _, err = ran(capsys, "info", frames)
+    assert code == 1 and "counts.npy" in err and "Input/output error" in err
 
 
 def test_an_interrupt_is_told_as_shells_do(

@@ -36,6 +36,8 @@ from core.export import WRITERS, save_capture, save_image, save_pixel
 from core.export.product import Product
 from core.tracking import TrackingParameters, tracking_signals
 
+pytestmark = pytest.mark.files
+
 Images = dict[str, np.ndarray]
 
 ROWS, COLS = 7, 9
@@ -318,6 +320,58 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(OSError, match="No space"):
         save_image(CAPTURE, IMAGE, tmp_path / "wall.npz")
     assert os.listdir(tmp_path) == []
+
+
+def stopped(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("as_link", [False, True])
+def test_an_older_folder_is_replaced_or_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, as_link: bool
+) -> None:
+    path = tmp_path / "wall.zarr"
+    kept = tmp_path / "elsewhere" if as_link else path
+    kept.mkdir()
+    (kept / "older").write_text("older")
+    if as_link:
+        path.symlink_to(kept)
+    with pytest.raises(FileExistsError):
+        save_image(CAPTURE, IMAGE, path)
+    with monkeypatch.context() as patched:
+        rename = Path.rename
+        patched.setattr(
+            Path, "rename", lambda a, b: stopped() if a.suffix == ".part" else rename(a, b)
+        )
+        with pytest.raises(KeyboardInterrupt):
+            save_image(CAPTURE, IMAGE, path, overwrite=True)
+    assert (path / "older").read_text() == "older"
+    save_image(CAPTURE, IMAGE, path, overwrite=True)
+    assert not (path / "older").exists()
+    assert sorted(os.listdir(tmp_path)) == sorted({path.name, kept.name})
+
+
+def test_a_folder_that_comes_meanwhile_is_kept_and_so_is_the_older(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "wall.zarr"
+    path.mkdir()
+    (path / "older").write_text("older")
+    rename = Path.rename
+
+    def with_another(source: Path, target: Path) -> Path:
+        if source.suffix == ".part":
+            target.mkdir()
+            (target / "somebody's").write_text("else")
+        return rename(source, target)
+
+    monkeypatch.setattr(Path, "rename", with_another)
+    with pytest.raises(OSError, match="not empty") as caught:
+        save_image(CAPTURE, IMAGE, path, overwrite=True)
+    assert (path / "somebody's").exists()
+    (older,) = (each for each in tmp_path.iterdir() if each.suffix == ".older")
+    assert (older / "older").read_text() == "older"
+    assert str(older) in caught.value.__notes__[0]
 
 
 @pytest.mark.parametrize("has_links", [True, False])

@@ -17,17 +17,9 @@ from core.readers import frames, guards, read_capture
 from core.readers.chunks import boxes
 from core.tests.samples import CAMERA_CUBE, CUBE, frames_of, gmapd_bytes, npy_bytes, npz_bytes
 
+pytestmark = pytest.mark.files
+
 FRAMES = frames_of(CUBE, 500, -1).astype(np.int16)
-
-
-@pytest.fixture
-def write(tmp_path: Path) -> Callable[[str, bytes], Path]:
-    def written(name: str, content: bytes) -> Path:
-        path = tmp_path / name
-        path.write_bytes(content)
-        return path
-
-    return written
 
 
 def stored_npz(**arrays: Any) -> bytes:

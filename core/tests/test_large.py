@@ -11,14 +11,18 @@ import pytest
 import xarray as xr
 
 from core import large
-from core.acquisition import Acquisition, Flux
+from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
-from core.large import IMAGES, as_image, computed, estimate_large, sample_of
+from core.large import IMAGES, as_image, computed, estimate_large
 from core.posterior import lighting_of
-from core.readers.labelled import dataset
+from core.readers import open_capture, read_capture, sample
+from core.readers.labelled import dataset, describe
+from core.readers.request import Request
 from core.scene import Scene, scenes
 from core.simulate import simulate
+
+pytestmark = pytest.mark.compiled
 
 APART = [name for name, each in ESTIMATORS.items() if not each.whole_image and name != "oracle"]
 
@@ -33,7 +37,6 @@ CAPTURE = small_car()
 COUNTS = dataset(CAPTURE).counts
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize("method", APART)
 @pytest.mark.parametrize(
     ("chunks", "false_alarm"),
@@ -90,27 +93,47 @@ def test_a_large_image_is_learned_from_patches(monkeypatch: pytest.MonkeyPatch) 
     rng = np.random.default_rng(0)
     counts = rng.poisson(1.0, (200, 300, 8)).astype(np.uint16)
     array = xr.DataArray(counts).chunk(50).data
-    np.testing.assert_array_equal(sample_of(array), counts)  # small: all of it
-    monkeypatch.setattr(large, "SAMPLE_COUNTS", 32 * 32 * 8 * 3)
-    sample = sample_of(array)
-    assert sample.shape == (3 * 32, 32, 8)
+    np.testing.assert_array_equal(sample.sample_of(array), counts)  # small: all of it
+    monkeypatch.setattr(sample, "SAMPLE_COUNTS", 32 * 32 * 8 * 3)
+    some = sample.sample_of(array)
+    assert some.shape == (3 * 32, 32, 8)
     windows = {counts[r, c].tobytes() for r in range(200) for c in range(300)}
-    assert all(pixel.tobytes() in windows for pixel in sample.reshape(-1, 8))
-    np.testing.assert_array_equal(sample, sample_of(array))
+    assert all(pixel.tobytes() in windows for pixel in some.reshape(-1, 8))
+    np.testing.assert_array_equal(some, sample.sample_of(array))
 
 
-@pytest.mark.compiled
 def test_a_sample_tells_what_the_image_would(monkeypatch: pytest.MonkeyPatch) -> None:
     """Answers of an image ranged by what a tenth of it tells: nearly all the same."""
     scene = scenes["uniform"](128)
     capture = simulate(scene, scene.acquisition, Flux(sbr=0.1))
     whole = estimate(capture, "likelihood")
-    monkeypatch.setattr(large, "SAMPLE_COUNTS", capture.cube.size // 10)
+    monkeypatch.setattr(sample, "SAMPLE_COUNTS", capture.cube.size // 10)
     parts = estimate_large(dataset(capture).counts.chunk(row=32), "likelihood").compute()
     changed = np.abs(parts["bin"].to_numpy() - whole.bin) > 1
     assert changed.mean() < 0.01
     told = np.abs(parts["confidence"].to_numpy() - whole.confidence)[~changed]
     assert np.quantile(told, 0.99) < 0.1
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".zarr", ".h5"])
+def test_what_is_guessed_does_not_depend_on_the_way_in(tmp_path: Path, suffix: str) -> None:
+    scene = scenes["uniform"](32)
+    known = simulate(scene, scene.acquisition, Flux(signal=0.5, sbr=1.0), Pulse.gaussian(3e-9))
+    path = tmp_path / f"bare{suffix}"
+    counts = dataset(known).counts.drop_attrs().drop_vars(["time_s", "range_m"])
+    counts = counts.assign_attrs(n_pulses=int(known.counts.max()) - 1)
+    named = counts.to_dataset(name="counts")
+    if suffix == ".zarr":
+        named.to_zarr(path, consolidated=False)
+    else:
+        named.to_netcdf(path, engine="h5netcdf")
+    read, opened = read_capture(path), open_capture(path)
+    acquisition, pulse, detection, source = describe(opened, Request())
+    assert (acquisition, pulse) == (read.acquisition, read.pulse)
+    assert (detection, source) == (read.detection, read.source) and detection == "all"
+    assert pulse.tau_s == pytest.approx(3e-9, rel=0.2)
+    whole, parts = estimate(read, "likelihood"), estimate_large(opened, "likelihood").compute()
+    np.testing.assert_array_equal(parts["range_m"], whole.range_m)
 
 
 def test_light_told_is_light_taken() -> None:
@@ -143,7 +166,6 @@ def test_unknown_pulses_stay_unknown() -> None:
     assert seen.acquisition.n_pulses is None and seen.armed_pulses is None
 
 
-@pytest.mark.compiled
 def test_a_cluster_gives_the_same_and_loses_nothing_with_a_worker(tmp_path: Path) -> None:
     """The study of 8 GB, on a capture of 8 MB."""
     from core.experiments import large as study  # noqa: PLC0415 - brings a cluster
@@ -162,4 +184,4 @@ def test_a_cluster_gives_the_same_and_loses_nothing_with_a_worker(tmp_path: Path
     assert all(each.same for each in found)
     # The first ran in this process, which holds other tests' captures, too.
     assert all(0 < each.peak_bytes < 2e9 for each in found[1:])
-    assert all(done <= of for done, of in shown)
+    assert max(done for done, _ in shown) > 10

@@ -18,6 +18,8 @@ from core.tests.formats import list_of, matlab73
 from core.tests.labelled_files import Matlab73
 from core.tests.samples import CUBE, arrival_cells, cells_of, element, mat_bytes, mat_file, matrix
 
+pytestmark = pytest.mark.files
+
 SQUARE = np.random.default_rng(6).poisson(0.1, (8, 8, 64)).astype(np.uint16)
 
 

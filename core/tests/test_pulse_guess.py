@@ -105,6 +105,10 @@ def test_nothing_is_told_of_background_alone(mean: float) -> None:
     assert guessed_sigma_bins(rng.poisson(mean, (1, 31, 100)).astype(np.uint32)) is None
 
 
+def test_nothing_is_told_of_very_many_bins() -> None:
+    assert guessed_sigma_bins(np.zeros((32, 1, 2**16 + 1), np.uint8)) is None
+
+
 def test_one_bin_where_it_cannot_be_told() -> None:
     cube = np.zeros((9, 9, 50), np.uint16)
     assert guessed_pulse(cube, 64e-12) == Pulse.gaussian(64e-12)

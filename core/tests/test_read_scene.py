@@ -11,6 +11,7 @@ import struct
 import tracemalloc
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +26,15 @@ from core.cloud import points_m, sight_lines
 from core.readers import guards
 from core.scene_files import SceneError, read_scene, suitable_acquisition
 from core.simulate import simulate
+from core.tests.refusing import assert_refused
 from core.tests.samples import mutated
+
+pytestmark = pytest.mark.files
 
 Write = Callable[[str, bytes], Path]
 
 BOX = trimesh.creation.box((2.0, 1.0, 1.5))  # right, away, up, around the origin
 MESHES = ("ply", "stl", "obj", "glb")
-
-
-@pytest.fixture
-def write(tmp_path: Path) -> Write:
-    def written(name: str, content: bytes) -> Path:
-        path = tmp_path / name
-        path.write_bytes(content)
-        return path
-
-    return written
 
 
 def mesh_bytes(kind: str, mesh: Any = BOX) -> bytes:
@@ -496,17 +490,8 @@ REFUSED: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str]] = {
 def test_refused(what: str, write: Write) -> None:
     name, build, told, message = REFUSED[what]
     path = write(name, build())
-    with pytest.raises(SceneError):
-        read_scene(path, **told)  # the first call of a format loads its library
-    tracemalloc.start()
-    try:
-        with pytest.raises(SceneError, match=message) as caught:
-            read_scene(path, **told)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert str(caught.value).startswith(f"{name}: ")
-    assert peak < 2**20 + 30 * path.stat().st_size
+    most_bytes = 2**20 + 30 * path.stat().st_size
+    assert_refused(partial(read_scene, **told), path, message, SceneError, most_bytes)
 
 
 def test_no_file(tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
 from core.export import save_capture
 from core.readers import MAX_CUBE_BYTES, READERS, guards, read_capture
-from core.tests.captures import real_capture_path
 from core.tests.formats import FORMATS, Format, damaged, put
+from core.tests.refusing import assert_refused
 from core.tests.samples import (
     ACQUISITION,
     CELL,
@@ -45,28 +45,14 @@ from core.tests.samples import (
     photon_cell,
 )
 
+pytestmark = pytest.mark.files
+
 Builder = Callable[[], bytes]
 
 
 def cell_bytes(values: list[Any]) -> bytes:
     """A file with one row of cells, one photon each."""
     return mat_bytes(Ts=cells_of([[value] for value in values], (1, len(values))))
-
-
-@pytest.fixture
-def write(tmp_path: Path) -> Callable[[str, bytes], Path]:
-    def written(name: str, content: bytes) -> Path:
-        path = tmp_path / name
-        path.write_bytes(content)
-        return path
-
-    return written
-
-
-@pytest.fixture
-def real_capture() -> Callable[[str], Path]:
-    """Path of a published capture."""
-    return real_capture_path
 
 
 def test_every_reader_is_under_the_contract() -> None:
@@ -491,6 +477,17 @@ REFUSED: dict[str, tuple[str, Builder, str]] = {
         own(truth_range_m=np.ones((4, 3))),
         r"truth_range_m .*\(4, 3\)",
     ),
+    "truth of many pixels": (
+        "a.npz",
+        own(truth_range_m=np.zeros((2000, 2000), np.uint8)),
+        r"truth_range_m .*\(2000, 2000\)",
+    ),
+    "a pulse of many bytes": (
+        "a.npz",
+        own(pulse_samples=np.zeros(2**21)),
+        r"bytes of pulse_samples = 16777\d+ ",
+    ),
+    "a long text": ("a.npz", own(source="a" * 2**20), r"bytes of source = 4194\d+ .*65,536"),
     "truth pickled": ("a.npz", own(truth_range_m=PICKLED), "truth_range_m.*object"),
     "background of text": ("a.npz", own(background="low"), "background"),
     "no arrival time": ("a.mat", cells_with([np.nan]), r"Ts in pixel \(1, 0\) = nan"),
@@ -553,15 +550,13 @@ REFUSED: dict[str, tuple[str, Builder, str]] = {
 def test_refused(what: str, write: Callable[[str, bytes], Path]) -> None:
     name, build, message = REFUSED[what]
     path = write(name, build())
-    tracemalloc.start()
-    try:
-        with pytest.raises(CaptureError, match=message) as caught:
-            read_capture(path)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert str(caught.value).startswith(f"{name}: ")
-    assert peak < 2**20 + 10 * path.stat().st_size
+    assert_refused(read_capture, path, message, CaptureError, 2**20 + 10 * path.stat().st_size)
+
+
+def test_a_pulse_of_too_many_samples(write: Callable[[str, bytes], Path]) -> None:
+    content = own(pulse_samples=np.ones(2**20 + 1, np.uint8))()
+    with pytest.raises(CaptureError, match="pulse_samples = '1,048,577 of them'"):
+        read_capture(write("a.npz", content))
 
 
 def test_no_file(tmp_path: Path) -> None:
@@ -579,6 +574,7 @@ def test_what_unpacks_beyond_the_limit_is_refused(
     bomb = np.zeros((1, 1, 2**22), np.uint8)
     for name, content in {
         "bomb.npz": bomb_npz(2**22),
+        "pixels.npz": npz_bytes(cube=np.zeros((512, 512, 1), np.uint8)),  # and their sums of int64
         "bomb.npy": npy_bytes(bomb),
         "bomb.mat": mat_bytes(True, cube=bomb),
         "cells.mat": mat_bytes(True, Ts=cells_of([np.ones(2**22, np.uint8)], (1, 1))),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib import import_module
 
 import numba
@@ -253,7 +254,7 @@ def all_photons(n_pulses: int, pixels: int) -> Capture:
 
 
 def test_first_photons_have_the_distribution_of_simulated_ones() -> None:
-    n_pulses, pixels = 200, 20_000
+    n_pulses, pixels = 200, DRAWS // 100
     counts = first_photons(all_photons(n_pulses, pixels), n_pulses, seed=1).cube[0].astype(float)
     acquisition = Acquisition(n_bins=30)
     rate = rate_per_bin(np.array([12.3]), np.array([0.5]), 2.0, Pulse(), acquisition)[0]
@@ -276,6 +277,16 @@ def test_first_photons_are_some_of_all() -> None:
     np.testing.assert_array_equal(first.cube, first_photons(photons, 50).cube)
     assert not np.array_equal(first.cube, first_photons(photons, 50, seed=1).cube)
     assert "first photons of 50 pulses" in first.source
+    assert first.signal is None
+    lit = replace(
+        photons,
+        acquisition=replace(photons.acquisition, n_pulses=500),
+        signal=np.full(photons.shape, 0.1),
+        background=0.2,
+    )
+    first = first_photons(lit, 50)  # as many photons on a tenth of the pulses
+    np.testing.assert_allclose(first.signal, 1.0)
+    assert first.background == pytest.approx(2.0)
     many = first_photons(photons, 10**9)
     np.testing.assert_array_equal(many.cube, photons.cube)  # none shares a pulse
 
