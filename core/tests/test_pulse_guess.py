@@ -18,6 +18,8 @@ from core.scene import Scene, scenes
 from core.simulate import simulate
 from core.tests.captures import real_capture_path
 
+pytestmark = pytest.mark.compiled
+
 Cube = np.ndarray
 SEEDS = range(6)
 
