@@ -1,0 +1,56 @@
+"""The study on published captures: what it reads of them, and that its figures are sane."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.acquisition import Acquisition
+from core.capture import Capture
+from core.experiments import field
+
+pytestmark = pytest.mark.compiled
+
+
+@pytest.fixture
+def folder(real_capture: Callable[[str], Path]) -> Path:
+    """Where the published captures lie."""
+    for name in (field.FACE_TRUTH, field.TMF8820):
+        real_capture(name)
+    return real_capture(field.FACE).parent
+
+
+def test_the_truth_has_a_face_before_a_wall(folder: Path) -> None:
+    truth = field.face_truth(folder)
+    assert truth.range_m.shape == (340, 340)
+    assert not (truth.is_face & truth.is_wall).any()
+    assert truth.range_m[truth.is_face].max() < truth.range_m[truth.is_wall].min()
+
+
+def test_the_wall_returns_a_pulse_that_rises_fast_and_decays(folder: Path) -> None:
+    pulse = field.wall_pulse(folder, field.face_truth(folder))
+    begin_s, end_s = pulse.span_s
+    assert 0.2e-9 < end_s - begin_s < 1e-9
+    samples = np.array(pulse.samples)
+    assert samples.argmax() < len(samples) / 3
+
+
+def test_the_distances_of_a_sensor_are_those_of_the_plane(folder: Path) -> None:
+    table = field.tmf8820_table(folder)
+    assert tuple(row[0] for row in table.rows) == field.METHODS
+    for method, median_mm, half_mm, answered in table.rows:
+        assert abs(float(median_mm)) < 13.6, method  # a bin of 91 ps
+        assert float(half_mm) < 13.6, method
+        assert float(answered) > 0.95, method
+
+
+def test_background_is_added_as_told() -> None:
+    cube = np.zeros((40, 40, 50), np.uint16)
+    cube[..., 20] = 5
+    capture = Capture(cube, Acquisition(50, n_pulses=None), detection="all")
+    added = field.with_background(capture, 0.25).counts - capture.counts
+    expected = 5 / 0.25
+    assert abs(added.mean() - expected) < 5 * np.sqrt(expected / added.size)
