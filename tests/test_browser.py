@@ -85,6 +85,8 @@ def enter(page: Page, name: str, text: str) -> None:
 def upload(page: Page, name: str, content: bytes) -> None:
     file = {"name": name, "mimeType": "application/octet-stream", "buffer": content}
     page.locator("input[type=file]").set_input_files(file)
+    # The button is made anew when it first bears a name: a file chosen in the old one is lost.
+    expect(page.get_by_role("button", name=name, exact=True)).to_be_visible()
 
 
 # -- what a user sees ------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from core.acquisition import Acquisition, Flux
+from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, Seen
 from core.checks import require
 from core.commands.options import READING_NAMES, add_reading, reading, show, whole_from_to
@@ -168,7 +168,9 @@ def _estimate(chosen: argparse.Namespace) -> None:
 def _exceeds_memory(chosen: argparse.Namespace) -> bool:
     if chosen.capture is None or chosen.capture.suffix.lower() not in LAZY:
         return False
-    return bool(open_capture(chosen.capture, **reading(chosen)).nbytes > MAX_CUBE_BYTES)
+    # With nothing left to guess, nothing is read.
+    told = reading(chosen) | {"pulse": Pulse(), "detection": "all"}
+    return bool(open_capture(chosen.capture, **told).nbytes > MAX_CUBE_BYTES)
 
 
 def _ranged_at_once(

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from core.acquisition import Pulse
+from core.readers.wording import UNITS_S
 
 _MOST_WITHOUT_UNIT_S = 1e-3
-_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15}
 
 
 def seconds(text: str) -> float:
@@ -23,12 +23,12 @@ def seconds(text: str) -> float:
     parts = re.fullmatch(r"([-+.\deE]+) *([a-zµ]*)", text.strip())
     try:
         number, unit = parts.groups() if parts else ("", "")
-        time_s = float(number) * _UNITS_S[unit or "s"]
+        time_s = float(number) * UNITS_S[unit or "s"]
         # A forgotten unit would make nanoseconds of light years.
         if not unit and abs(time_s) > _MOST_WITHOUT_UNIT_S:
             raise ValueError
     except (KeyError, ValueError):
-        known = ", ".join(_UNITS_S)
+        known = ", ".join(UNITS_S)
         raise argparse.ArgumentTypeError(
             f"{text!r} is not accepted: give a time such as 64ps or 1e-9; units are {known}."
         ) from None

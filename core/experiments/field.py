@@ -25,11 +25,11 @@ from core.estimators import ESTIMATORS, estimate
 from core.experiments.items import Table
 from core.posterior import posterior_of
 from core.readers import read_capture
+from core.readers.arrivals import NATIVE_BIN_S
 
 FACE, FACE_TRUTH = "data_face.mat", "data_mannequin_face_truth.mat"
 TMF8820 = "tmf8820_distance_data.json"
 
-NATIVE_BIN_S = 8e-12
 _IN_SCAN = np.s_[0:340, 3:343]  # of the truth's 350 x 350: what registers to the capture
 _FACE_BINS = 3550.0, 3700.0
 _WALL_BIN = 4000.0

@@ -27,7 +27,7 @@ AXES = ("row", "col", "bin")
 PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 """Fields of our own layouts that tell a pulse together."""
 
-_LARGEST_COUNT = 2**32 - 1
+LARGEST_COUNT = 2**32 - 1
 _MOST_SAMPLES = 2**20
 
 
@@ -46,7 +46,7 @@ def whole_counts(
     require_cube(cube, name)
     lowest, highest = cube.min().item(), cube.max().item()
     require(name, lowest, lowest >= 0, "counts, 0 or more")
-    require(name, highest, highest <= _LARGEST_COUNT, f"counts up to {_LARGEST_COUNT:,}")
+    require(name, highest, highest <= LARGEST_COUNT, f"counts up to {LARGEST_COUNT:,}")
     dtype = dtype or count_dtype(highest)
     require_fits(name, cube.size * dtype.itemsize)
     counts = np.array(cube, dtype, order="C")

@@ -27,7 +27,7 @@ from scipy.constants import speed_of_light
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import COUNT_TYPES, Capture, CaptureError, Detection
 from core.checks import require
-from core.readers import hdf5, netcdf3, zarr
+from core.readers import hdf5, netcdf3, wording, zarr
 from core.readers.dense import (
     AXES,
     PULSE,
@@ -56,8 +56,9 @@ NAMES = {
 """Names by which each axis is known, in small letters."""
 
 _SECONDS = {"": "s", "milli": "ms", "micro": "us", "nano": "ns", "pico": "ps"}
-UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12}
-UNITS_S |= {f"{name}second{s}": UNITS_S[unit] for s in ("", "s") for name, unit in _SECONDS.items()}
+UNITS_S = wording.UNITS_S | {
+    f"{name}second{s}": wording.UNITS_S[unit] for s in ("", "s") for name, unit in _SECONDS.items()
+}
 UNITS_S |= dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 2 / speed_of_light)
 UNITS_S["km"] = 1e3 * UNITS_S["m"]
 """Seconds of the light's way there and back, for each unit of a coordinate along the bins."""

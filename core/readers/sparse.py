@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.readers.dense import count_dtype, dense_capture
+from core.readers.dense import LARGEST_COUNT, count_dtype, dense_capture
 from core.readers.guards import require_fits
 from core.readers.request import Request
-
-_LARGEST_COUNT = 2**32 - 1
 
 
 class Sparse(NamedTuple):
@@ -99,7 +97,7 @@ def _entries(
     inside = bool(((row >= 0) & (row < n_rows)).all())
     once = bool((np.diff(col * n_rows + row) > 0).all())
     require(f"rows of {name}", "out of order", inside and once, f"rising ones below {n_rows}")
-    odd = ~((values >= 0) & (values <= _LARGEST_COUNT) & (values == np.floor(values)))
+    odd = ~((values >= 0) & (values <= LARGEST_COUNT) & (values == np.floor(values)))
     if odd.any():
-        require(name, values[odd][0].item(), False, f"whole counts from 0 to {_LARGEST_COUNT:,}")
+        require(name, values[odd][0].item(), False, f"whole counts from 0 to {LARGEST_COUNT:,}")
     return row, col, values.astype(np.int64)

@@ -24,7 +24,6 @@ __all__ = ["SceneError", "read_scene"]
 _LEAST_BINS, _MOST_BINS = 100, 1024
 _SPARE_BINS = 20  # at either side of the surfaces
 _N_PULSES = 1000
-_FARTHEST_M = 1e8
 
 
 class SceneError(ValueError):
@@ -121,8 +120,8 @@ def suitable_acquisition(range_m: Floats, pixel_angle_rad: float | None) -> Acqu
     n_targets = int(np.count_nonzero(np.isfinite(range_m)))
     require("pixels with a target", n_targets, n_targets > 0, "a view that meets some surface")
     nearest, farthest = float(np.nanmin(range_m)), float(np.nanmax(range_m))
-    accepted = nearest > 0 and farthest <= _FARTHEST_M
-    require("ranges", (nearest, farthest), accepted, f"metres above 0, up to {_FARTHEST_M:g}")
+    accepted = nearest > 0 and farthest <= mesh.FARTHEST_M
+    require("ranges", (nearest, farthest), accepted, f"metres above 0, up to {mesh.FARTHEST_M:g}")
     first_ns, last_ns = Acquisition(1, 1e-9, 0.0).range_m_to_bin([nearest, farthest])
     # One bin more for each edge that lies within a bin.
     width_ns = max(1, ceil((last_ns - first_ns) / (_MOST_BINS - 2 * _SPARE_BINS - 2)))

@@ -26,7 +26,7 @@ _MOST_FACES = 4_000_000
 _BYTES_A_FACE = 400  # of memory: its corners, twice, and the tree that finds it
 _BYTES_A_BYTE, _BYTES_A_LINE = 12, 256  # of memory that a parser takes for its file
 _RAYS_AT_ONCE = 2**18
-_FARTHEST_M = 1e8
+FARTHEST_M = 1e8
 _MISSED_M = 1e30  # Embree answers with 1e37
 
 
@@ -83,7 +83,7 @@ def read(path: Path, unit_m: float, view: View) -> tuple[Floats, float]:
     with np.errstate(over="ignore", invalid="ignore"):  # what is out of range shows below
         seen = _as_seen(triangles.vertices * unit_m, view)
     farthest_m = float(np.abs(seen).max())
-    require("coordinates", farthest_m, farthest_m < _FARTHEST_M, f"metres up to {_FARTHEST_M:g}")
+    require("coordinates", farthest_m, farthest_m < FARTHEST_M, f"metres up to {FARTHEST_M:g}")
     angle_rad = view.pixel_angle_rad or _angle_to_fill(seen, size)
     return _ranges_m(Triangles(seen, triangles.faces), sight_lines(size, angle_rad)), angle_rad
 

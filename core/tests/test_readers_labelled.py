@@ -6,7 +6,6 @@ import io
 import json
 import os
 import pickle
-import sys
 import tracemalloc
 import zlib
 from collections.abc import Callable, Mapping
@@ -817,7 +816,6 @@ def test_a_process_finds_what_is_installed_here(
             guards.isolated(script, "the file")
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows sets a process no such limits")
 def test_a_process_has_so_much_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guards, "MAX_CHILD_BYTES", 2**29)
     file = io.BytesIO()
