@@ -1,12 +1,20 @@
 """What so many pulses can tell: whether a histogram shows which of two models drew it.
 
 Two distributions of one pulse's outcome, ``P`` and ``Q``, overlap by ``ρ = Σ √(P_k Q_k)``, the bins
-and "no trigger" being the outcomes (Bhattacharyya 1943); those of n pulses overlap by ``ρⁿ``. The
-best test there is, that of the likelihood ratio (Neyman & Pearson 1933), errs on average by at
-least ``(1 - √(1 - ρ²ⁿ)) / 2`` and at most ``ρⁿ / 2`` (Kraft 1955; Kailath 1967). Where many pulses
-tell a small difference the logarithm of the ratio is normal, with ``z`` of its standard deviations
-between its mean and its zero, and the errors are ``Φ(-z)`` with ``-n ln ρ = z² / 2``. A difference
-counts as told where both errors are at most `ERROR`.
+and "no trigger" being the outcomes (Bhattacharyya 1943); those of n pulses overlap by ``ρⁿ``. Their
+own total variation, the most by which the probability of any event can differ, lies between ``1 -
+ρⁿ`` and ``√(1 - ρ²ⁿ)`` (Le Cam 1973; Tsybakov 2009, section 2.4). Where many pulses see a small
+difference the logarithm of the likelihood ratio is normal, and it is ``2 Φ(z) - 1`` with ``z² / 2 =
+-n ln ρ``, the evidence. Two thresholds follow.
+
+Told: the best test, that of the likelihood ratio (Neyman & Pearson 1933), takes either model for
+the other with a probability of ``Φ(-z)``, at most `ERROR`. A model that is told is wrong as the
+data show.
+
+Hidden: no event is more likely by `ERROR` under one than under the other, a right answer of any
+estimator included.
+
+Between the two a single histogram does not show the difference, but answers may move.
 """
 
 from __future__ import annotations
@@ -20,13 +28,15 @@ from scipy.special import ndtri
 from core.acquisition import Floats
 
 ERROR = 0.05
-"""How often the best test may take either model for the other where it tells them apart."""
 
 TOLD = float(ndtri(ERROR)) ** 2 / 2
-"""``-n ln ρ`` from which n pulses tell two models apart."""
+"""Evidence from which a difference is told: 1.35."""
+
+HIDDEN = float(ndtri((1 + ERROR) / 2)) ** 2 / 2
+"""Evidence up to which it is hidden: 0.002."""
 
 FEW = 0.01
-"""A difference told in no larger a share of the pixels is nothing that an image needs."""
+"""What holds in no larger a share of the pixels does not count for an image."""
 
 
 class Difference(NamedTuple):
@@ -38,9 +48,14 @@ class Difference(NamedTuple):
     """``-n ln ρ``."""
 
     @property
-    def is_told(self) -> NDArray[np.bool_]:
-        """Whether the pulses tell the models apart."""
+    def told(self) -> NDArray[np.bool_]:
+        """Whether the pulses tell the models apart, shape (...)."""
         return np.asarray(self.evidence >= TOLD)
+
+    @property
+    def is_hidden(self) -> bool:
+        """Whether all but a few pixels hide the difference."""
+        return bool(np.mean(self.evidence > HIDDEN) <= FEW)
 
     @property
     def resolvable(self) -> Floats:
@@ -50,11 +65,6 @@ class Difference(NamedTuple):
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(self.total_variation * np.sqrt(TOLD / self.evidence))
-
-    @property
-    def is_needed(self) -> bool:
-        """Whether the pulses tell the models apart in more than `FEW` of the pixels."""
-        return bool(np.mean(self.is_told) > FEW)
 
 
 def difference(one: ArrayLike, other: ArrayLike, n_pulses: int | None) -> Difference:

@@ -136,7 +136,7 @@ def study(path: Path, workers: int, memory_bytes: int, progress: Progress) -> It
 def _one_by_one(path: Path, progress: Progress) -> tuple[NDArray[Any], int]:
     counts = open_capture(path)
     description, settings = describe(counts, Request()), settings_of(METHOD)
-    common = learned(counts.data, description, METHOD, settings, None)
+    *common, _ = learned(counts.data, description, METHOD, settings, None)
     images = np.empty((*counts.shape[:2], len(IMAGES)))
     parts = list(da.core.slices_from_chunks(counts.data.chunks[:2]))
     with _Memory(lambda: [os.getpid()]) as memory, dask.config.set(scheduler="synchronous"):
