@@ -84,7 +84,7 @@ def estimate_large(
     require("axes", counts.dims, counts.dims == AXES, "row, col and bin")
     description = describe(counts, Request())
     array = da.asarray(counts.data).rechunk({2: -1})
-    *common, remark = learned(array, description, method, settings, false_alarm)
+    lighting, calibration, remark = learned(array, description, method, settings, false_alarm)
     margin = estimator.reach(settings) // 2
     around = {0: margin, 1: margin, 2: 0}
     # Chunks of an edge may be narrower than the margin: Dask joins them.
@@ -94,7 +94,8 @@ def estimate_large(
         description,
         method,
         settings,
-        *common,
+        lighting,
+        calibration,
         dtype=float,
         chunks=(*parts.chunks[:2], (len(IMAGES),)),
         meta=np.empty((0, 0, 0)),
