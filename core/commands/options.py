@@ -7,12 +7,13 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from core.acquisition import Pulse
+from core.acquisition import Flux, Pulse
+from core.checks import require
 from core.readers.wording import UNITS_S
 
 _MOST_WITHOUT_UNIT_S = 1e-3
@@ -105,6 +106,33 @@ def reading(chosen: argparse.Namespace) -> dict[str, Any]:
     if told["shape"] is not None:
         told["shape"] = tuple(told["shape"])
     return told
+
+
+LIGHT_NAMES = ("sbr", "ppp", "seed")
+
+
+def add_light(command: Any) -> None:
+    """Add the options that tell how a scene is lit."""
+    group = command.add_argument_group("how a scene is lit")
+    usual = Flux()
+    group.add_argument("--sbr", type=float, help=f"signal over background ({usual.sbr})")
+    group.add_argument("--ppp", type=float, help=f"signal photons per pulse ({usual.signal})")
+    group.add_argument("--seed", type=int, help="of the simulation (0)")
+
+
+def flux(chosen: argparse.Namespace) -> Flux:
+    """The light that these options tell."""
+    usual = Flux()
+    return Flux(
+        usual.signal if chosen.ppp is None else chosen.ppp,
+        usual.sbr if chosen.sbr is None else chosen.sbr,
+    )
+
+
+def require_none(told: Mapping[str, Any], names: Sequence[str], why: str) -> None:
+    """Refuse what makes no sense beside other options."""
+    for name in names:
+        require(name, told[name], told[name] is None, f"None: {why}")
 
 
 def as_options(message: str) -> str:
