@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import panel as pn
+import panel_material_ui as pmui
 from bokeh.events import Tap
 from bokeh.models import Range1d
 
 from app import plots
-from app.controls import Knob, Sentence
+from app.controls import Knob, Sentence, Table
 from app.looks import Look
 from app.method_views import TITLES, ScaleBar
 from app.paper_words import (
     COLUMN_HELP,
-    COMPUTING,
     OUTSIDE_NOTE,
     PLACE_HELP,
     RECONSTRUCTION,
@@ -25,7 +25,7 @@ from app.paper_words import (
 from app.parts import card
 from app.theme import LIGHT, RANGE_COLORS, Palette
 from app.views import Layers, paint_frame, pane_of, round_up
-from app.words import number
+from app.words import COMPUTING, number
 from core.experiments import items
 from core.parameters import Number
 
@@ -104,6 +104,24 @@ class CurveCard:
         paint_frame(drawing, self._colors)
         self.card.insert(0, pane_of(drawing))
         return _layers(drawing)
+
+
+class TableCard:
+    """A table with its title above and its note below."""
+
+    def __init__(self, waiting: str = COMPUTING) -> None:
+        self._title = pmui.Typography(waiting, variant="subtitle2", margin=(6, 8))
+        self._table = Table(sizing_mode="stretch_width", margin=0)
+        self._note = Sentence(sizing_mode="stretch_width", margin=(6, 8, 12, 8))
+        self.layout = pn.Column(
+            self._title, self._table, self._note, sizing_mode="stretch_width", margin=0
+        )
+
+    def show(self, item: items.Table) -> None:
+        """Show a table, in place of the last."""
+        columns, rows = table_of(item)
+        self._table.param.update(title=item.title, columns=columns, rows=rows)
+        self._title.object, self._note.text = f"**{item.title}**", item.note
 
 
 class Gallery:

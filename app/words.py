@@ -17,6 +17,8 @@ FIELD_OF_VIEW_UNKNOWN = (
 
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
 
+COMPUTING = "Computing …"
+
 EXPLANATION = """
 **What is seen.** Each pixel sends pulses and keeps only the *first* photon of each. In daylight
 most pulses are spent on background before the echo arrives: the histogram piles up at the front.
@@ -157,3 +159,12 @@ def share(value: float) -> str:
 def milliseconds(seconds: float) -> str:
     """A duration as one reads it."""
     return f"{1000 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
+
+
+def progress(done: int, of: int, noun: str, is_running: bool) -> str:
+    """How far a study has come."""
+    if of == 0:
+        return ""
+    if is_running:
+        return f"{done} of {of} {noun}."
+    return f"Done: {of} {noun}." if done == of else f"Stopped after {done} of {of} {noun}."
