@@ -20,7 +20,7 @@ from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
 from app.parts import card, choice, part, select
 from app.session import Session
-from app.state import Reading
+from app.state import Less, Reading
 from app.store import Answer, Source, file_source
 from app.theme import DARK, LIGHT, SIZES
 from core import PRESETS, TrackingParameters
@@ -141,6 +141,7 @@ class Layout:
         self._light = SettingsPanel(state.light, lambda new: state.param.update(light=new))
         self._viewing = SettingsPanel(state.viewing, lambda new: state.param.update(viewing=new))
         self._tracking = SettingsPanel(state.tracking, self._tracking_changed)
+        self._less = SettingsPanel(state.less, lambda new: state.param.update(less=new))
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
@@ -210,6 +211,7 @@ class Layout:
                 field.value = answer.request.reading.as_text(name)
         self._light_card.visible, self._reading_card.visible = is_scene, not is_scene
         self._provenance.text = words.provenance(answer)[:2000]
+        self._less.show(self.session.state.less)
         self._viewing.show(self.session.state.viewing)
         own = self.session.own_field_of_view_deg
         self._viewing.controls["field_of_view_deg"].initial = own
@@ -225,7 +227,7 @@ class Layout:
 
     def _go_to(self, key: str) -> None:
         if key != self.session.state.source:
-            self.session.state.param.update(source=key, reading=Reading())
+            self.session.state.param.update(source=key, reading=Reading(), less=Less())
 
     def _tracking_changed(self, settings: TrackingParameters) -> None:
         names = [name for name, preset in PRESETS.items() if preset == settings]
@@ -299,6 +301,7 @@ class Layout:
             self._light_card,
             self._reading_card,
             part("Tracking differentiator", self._preset, self._tracking.layout),
+            part("Less data, faster", self._less.layout, is_open=False),
             first,
             part("What is this?", pmui.Typography(words.EXPLANATION, margin=8), is_open=False),
         ]

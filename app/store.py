@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from app.state import Light, Reading
+from app.state import Less, Light, Reading
 from core import (
     Capture,
     Run,
@@ -88,6 +88,7 @@ class Request:
     light: Light
     reading: Reading
     tracking: TrackingParameters
+    less: Less
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,8 @@ class Answer:
     run: Run
     capture_s: float
     """Seconds spent simulating or reading."""
+    whole: Capture
+    """What the capture that was ranged is a part of, or that capture itself."""
 
     @property
     def capture(self) -> Capture:
@@ -107,18 +110,27 @@ class Answer:
 
 def compute(request: Request, previous: Answer | None) -> Answer:
     """Answer a request; what the previous answer already holds is not computed again."""
-    if previous is not None and _same_capture(request, previous.request):
+    started = perf_counter()
+    if previous is None or not _same(request, previous.request, "source", "light", "reading"):
+        whole = request.source.load(request.light, request.reading)
+    else:
+        whole = previous.whole
+    if previous is not None and whole is previous.whole and request.less == previous.request.less:
         capture, capture_s = previous.capture, previous.capture_s
     else:
-        started = perf_counter()
-        capture = request.source.load(request.light, request.reading)
+        capture = request.less.reduction(whole.acquisition.n_bins).of(whole)
         posterior_of(capture)  # what every answer's confidence rests on, whatever the method
         capture_s = perf_counter() - started
-    return Answer(request, run(capture, "tracking", request.tracking), capture_s)
+    return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole)
 
 
-def _same_capture(one: Request, other: Request) -> bool:
-    return (one.source, one.light, one.reading) == (other.source, other.light, other.reading)
+def same_view(one: Request, other: Request) -> bool:
+    """Whether the answers to both show the same pixels and bins, in whatever light."""
+    return _same(one, other, "source", "reading", "less")
+
+
+def _same(one: Request, other: Request, *names: str) -> bool:
+    return all(getattr(one, name) == getattr(other, name) for name in names)
 
 
 @dataclass(frozen=True)

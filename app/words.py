@@ -85,7 +85,7 @@ def pixel_numbers(answer: Answer, pixel: Pixel) -> list[Fact]:
         (
             "Confidence",
             share(pixel.confidence),
-            "Probability that noise alone would nowhere have shown such an excess.",
+            "Probability that there is a surface within 3 bins of the estimate.",
         ),
         ("σ", number(sigma, "counts"), "Standard deviation of the histogram."),
         ("r small", number(r_small, ""), "l·σ, bound of the small scale's acceleration."),

@@ -17,7 +17,7 @@ from app.compare import CLOUDS, FIRST_PICKS, MOST_PICTURES, Compare
 from app.jobs import LatestWins
 from app.layout import Layout
 from app.ranking import Result, Task
-from app.state import Light, Reading
+from app.state import Less, Light, Reading
 from app.store import Request, built_in_sources, compute
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
@@ -27,7 +27,7 @@ from tests.browser import eventually, fact
 
 
 def answer_to(source):
-    request = Request(built_in_sources()[source], Light(), Reading(), TrackingParameters())
+    request = Request(built_in_sources()[source], Light(), Reading(), TrackingParameters(), Less())
     return compute(request, None)
 
 
