@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats
 from core.checks import require
+from core.parts import Backscatter, FaultyPixels, Jitter, Motion, SecondSurface
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Surfaces seen by each pixel.
+    """Surfaces seen by each pixel, and the `PARTS` that some scenes have besides.
 
     Parameters
     ----------
@@ -24,6 +27,8 @@ class Scene:
         Factor on the signal, non-negative; None means 1 everywhere.
     acquisition : Acquisition
         The instrument setting that suits this scene (`simulate` takes its own).
+    second_surface, backscatter, faulty_pixels, motion, jitter : optional
+        Parts of `core.parts`; one that is None costs nothing.
 
     Raises
     ------
@@ -34,6 +39,11 @@ class Scene:
     range_m: Floats
     reflectivity: Floats | None = None
     acquisition: Acquisition = field(default_factory=Acquisition)
+    second_surface: SecondSurface | None = None
+    backscatter: Backscatter | None = None
+    faulty_pixels: FaultyPixels | None = None
+    motion: Motion | None = None
+    jitter: Jitter | None = None
 
     def __post_init__(self) -> None:
         shape = np.shape(self.range_m)
@@ -49,6 +59,39 @@ class Scene:
             )
             low, high = float(np.min(self.reflectivity)), float(np.max(self.reflectivity))
             require("reflectivity", (low, high), 0 <= low <= high < np.inf, "finite factors >= 0")
+        for name in ("second_surface", "faulty_pixels"):
+            part = getattr(self, name)
+            fits = part is None or part.shape == shape
+            require(name, f"shape {part and part.shape}", fits, f"shape {shape}, that of range_m")
+
+
+PARTS = {
+    "reflectivity": "reflectivity",
+    "second_surface": "second surface",
+    "backscatter": "backscatter of fog",
+    "faulty_pixels": "hot and dead pixels",
+    "motion": "motion during the pulses",
+    "jitter": "timing jitter",
+}
+"""What a scene may have besides ranges, a pulse and uniform background: its fields, in words."""
+
+
+def parts_of(scene: Scene) -> tuple[str, ...]:
+    """Those of `PARTS` that a scene has."""
+    return tuple(part for part in PARTS if getattr(scene, part) is not None)
+
+
+def without(scene: Scene, part: str) -> Scene:
+    """The same scene with one of `PARTS` absent.
+
+    Raises
+    ------
+    ValueError
+        If there is no part of that name.
+    """
+    require("part", part, part in PARTS, " or ".join(map(repr, PARTS)))
+    absent: dict[str, Any] = {part: None}
+    return replace(scene, **absent)
 
 
 def _near_gate(pixel_angle_rad: float) -> Acquisition:
@@ -248,10 +291,138 @@ def _wall_range_m(direction: Floats, box: _Box) -> Floats:
     return np.where(window, range_m + _WINDOW_DEPTH_M / facing, range_m)
 
 
+_RAYS = 4  # across and down a pixel, which sees what all of them meet
+_APART_BINS = 2.0  # surfaces that are nearer to each other return one echo
+
+
+def edges(size: int = 64) -> Scene:
+    """The corner house, each pixel seeing its whole area: at edges two surfaces return its echo.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns, 8 or more; view and gate are the building's.
+
+    Returns
+    -------
+    Scene
+        Of 16 rays in each pixel. Its range is that of the surface which most of them meet, its
+        reflectivity the share of them that meet any.
+
+    Raises
+    ------
+    ValueError
+        If `size` is below 8.
+    """
+    acquisition = building(size).acquisition
+    rays = building(_RAYS * size).range_m.reshape(size, _RAYS, size, _RAYS).swapaxes(1, 2)
+    rays = np.sort(rays.reshape(size, size, -1))  # those that meet nothing, last
+    step = np.nan_to_num(np.diff(rays), nan=0.0)
+    near = np.arange(_RAYS**2) <= step.argmax(axis=-1)[..., np.newaxis]
+    near |= step.max(axis=-1, keepdims=True) < _APART_BINS * acquisition.bin_length_m
+    met = np.isfinite(rays)
+    near_m, far_m = _mean(rays, near & met), _mean(rays, ~near & met)
+    count, near_count = met.sum(axis=-1), (near & met).sum(axis=-1)
+    far_share = 1 - near_count / np.maximum(count, 1)
+    mostly_near = far_share <= 0.5
+    return Scene(
+        np.where(mostly_near, near_m, far_m),
+        count / _RAYS**2,
+        acquisition,
+        second_surface=SecondSurface(
+            np.where(mostly_near, far_m, near_m), np.minimum(far_share, 1 - far_share)
+        ),
+    )
+
+
+def _mean(values: Floats, chosen: NDArray[np.bool_]) -> Floats:
+    """Mean of the chosen along the last axis; NaN where there are none."""
+    count = chosen.sum(axis=-1)
+    total = np.where(chosen, values, 0.0).sum(axis=-1)
+    nothing = np.full(count.shape, np.nan)
+    return np.asarray(np.divide(total, count, out=nothing, where=count > 0))
+
+
+def fog(size: int = 64) -> Scene:
+    """The car at 50 m in fog, seen through a gate that opens at 5 m: the fog answers first.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns, 64 or 256.
+
+    Returns
+    -------
+    Scene
+        Visibility is 300 m, an extinction of 0.01 per metre: what passes to the car and back is
+        e⁻¹ = 37 %.
+
+    Raises
+    ------
+    ValueError
+        If there is no image of that size.
+    """
+    clear = car(size)
+    gate = replace(clear.acquisition, n_bins=350, gate_delay_s=34e-9)
+    return Scene(clear.range_m, acquisition=gate, backscatter=Backscatter(0.01))
+
+
+def approach(size: int = 64) -> Scene:
+    """The car at 50 m, approached at 20 m/s: at 20,000 pulses a second it comes 1 m nearer.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns, 64 or 256.
+
+    Returns
+    -------
+    Scene
+        Its ranges are those at half the time that the pulses take.
+
+    Raises
+    ------
+    ValueError
+        If there is no image of that size.
+    """
+    still = car(size)
+    return replace(still, motion=Motion(speed_m_per_s=-20.0, pulse_rate_hz=20e3))
+
+
+def worn(size: int = 64) -> Scene:
+    """The car at 50 m through a worn instrument: a clock that jitters, hot pixels and dead ones.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns, 64 or 256.
+
+    Returns
+    -------
+    Scene
+        Jitter of 1.5 ns; 2 % of the pixels, drawn at random, are hot, with 10⁷ to 10⁹ dark counts
+        a second, and 2 % are dead.
+
+    Raises
+    ------
+    ValueError
+        If there is no image of that size.
+    """
+    new = car(size)
+    drawn = np.random.default_rng(0).uniform(size=new.range_m.shape)
+    hot, dead = drawn < 0.02, drawn > 0.98
+    faulty = FaultyPixels(np.where(hot, 10 ** (7 + 2 * np.minimum(drawn / 0.02, 1.0)), 0.0), dead)
+    return replace(new, faulty_pixels=faulty, jitter=Jitter(1.5e-9))
+
+
 scenes: dict[str, Callable[..., Scene]] = {
     "car": car,
     "building": building,
     "staircase": staircase,
     "uniform": uniform,
+    "edges": edges,
+    "fog": fog,
+    "approach": approach,
+    "worn": worn,
 }
 """Built-in scenes by name; the first line of a builder's docstring describes its scene."""

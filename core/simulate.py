@@ -3,7 +3,8 @@
 The first photon of a pulse arrives after time ``t`` with probability ``exp(-Λ(t))``, ``Λ`` being
 the expected photons before ``t``. So ``1 - exp(-Λ)`` at the bin edges is the distribution of the
 trigger bin, and one uniform number a pulse, looked up in it, is an exact draw: over the pulses of a
-pixel exactly the multinomial of Eq. 1, "no trigger" included.
+pixel exactly the multinomial of Eq. 1, "no trigger" included. The parts that a scene may have
+(`core.parts`) change Λ or that distribution, and nothing else.
 
 Each pixel has its own stream of random numbers, keyed by (seed, pixel): the cube is the same for
 any number of threads, and neighbouring settings share their randomness, so that a slider moves the
@@ -12,6 +13,7 @@ scene and not the dice.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from numbers import Integral
 from typing import TypeVar
@@ -24,7 +26,7 @@ from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.checks import require
 from core.parallel import COMPILED, KERNEL_LOCK, PARALLEL
-from core.scene import Scene
+from core.scene import Scene, parts_of
 
 _Light = TypeVar("_Light", float, Floats)
 
@@ -44,7 +46,7 @@ def simulate(
     Parameters
     ----------
     scene : Scene
-        Ranges and reflectivities; a pixel without a target sees background alone.
+        Ranges and, maybe, parts; a pixel without a target sees no echo.
     acquisition : Acquisition
         Gate, bins and pulses.
     flux : Flux
@@ -57,7 +59,8 @@ def simulate(
     Returns
     -------
     Capture
-        With its truth: range, signal and background.
+        With its truth: range and, where the light is one echo over uniform background and nothing
+        else, signal and background.
 
     Raises
     ------
@@ -65,30 +68,27 @@ def simulate(
         If the number of pulses is not known or 2**32 or more, or the seed is not an integer from 0
         to 2**63 - 1.
     """
-    n_pulses = acquisition.n_pulses
-    if n_pulses is None:
-        raise ValueError("n_pulses = None is not accepted: give the number of pulses to simulate.")
+    n_pulses = pulses_sent(acquisition)
     require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
     _require_seed(seed)
     shape = np.shape(scene.range_m)
-    has_target = np.isfinite(scene.range_m)
-    reflectivity = np.ones(shape) if scene.reflectivity is None else scene.reflectivity
-    signal = np.where(has_target, flux.signal * reflectivity, 0.0)
-    onset_bin = acquisition.range_m_to_bin(scene.range_m)
-    triggered = _triggered_by_each_edge(onset_bin, signal, flux.background, pulse, acquisition)
-    cube = np.zeros((signal.size, acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32)
+    triggered = triggered_by_each_edge(scene, acquisition, flux, pulse)
+    cube = np.zeros(
+        (len(triggered), acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32
+    )
     if n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
         with KERNEL_LOCK:
             _draw_pulses(triggered, n_pulses, np.uint64(seed), cube)
     else:
         _draw_multinomial(triggered, n_pulses, seed, cube)
+    is_plain = set(parts_of(scene)) <= {"reflectivity"}
     return Capture(
         cube.reshape(*shape, acquisition.n_bins),
         acquisition,
         pulse,
         truth_range_m=np.array(scene.range_m, float),
-        signal=signal,
-        background=flux.background,
+        signal=_signal(scene, flux) if is_plain else None,
+        background=flux.background if is_plain else None,
         source=f"simulated, seed {seed}",
     )
 
@@ -152,25 +152,103 @@ def _require_seed(seed: int) -> None:
     require("seed", seed, whole and 0 <= seed < 2**63, "an integer from 0 to 2**63 - 1")
 
 
-def _triggered_by_each_edge(
-    onset_bin: Floats, signal: Floats, background: float, pulse: Pulse, acquisition: Acquisition
+def pulses_sent(acquisition: Acquisition) -> int:
+    """Pulses of an acquisition to be simulated.
+
+    Raises
+    ------
+    ValueError
+        If that number is not known.
+    """
+    if acquisition.n_pulses is None:
+        raise ValueError("n_pulses = None is not accepted: give the number of pulses to simulate.")
+    return acquisition.n_pulses
+
+
+def _signal(scene: Scene, flux: Flux) -> Floats:
+    """Signal photons per pulse of each pixel, shape (row, col); 0 where there is no target."""
+    reflectivity = 1.0 if scene.reflectivity is None else scene.reflectivity
+    return np.where(np.isfinite(scene.range_m), flux.signal * reflectivity, 0.0)
+
+
+def triggered_by_each_edge(
+    scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse
 ) -> Floats:
-    """Probability ``1 - exp(-Λ)`` to have fired before each bin edge, shape (pixel, n_bins + 1)."""
-    onset_bin, signal = onset_bin.reshape(-1), signal.reshape(-1, 1)
+    """Probability that a pulse is recorded to have fired before each bin edge.
+
+    ``1 - exp(-Λ)`` of the photons ``Λ`` expected before the edge, but for what motion and jitter
+    make of it.
+
+    Returns
+    -------
+    ndarray, shape (pixel, n_bins + 1)
+        From 0 at the gate's opening to ``1 - P_none``; differences are trigger probabilities.
+
+    Raises
+    ------
+    ValueError
+        If the scene moves and the number of pulses is not known.
+    """
     n_edges = acquisition.n_bins + 1
-    uniform = background * np.linspace(0.0, 1.0, n_edges)
-    triggered = np.empty((onset_bin.size, n_edges))
+    share_of_gate = np.linspace(0.0, 1.0, n_edges)
+    everywhere = flux.background * share_of_gate
+    if scene.backscatter is not None:
+        everywhere += scene.backscatter.photons_before(flux.signal, pulse, acquisition)
+    shifts_m = (
+        np.zeros(1)
+        if scene.motion is None
+        else scene.motion.shifts_m(pulse, acquisition, pulses_sent(acquisition))
+    )
+    echoes = [
+        (np.ravel(range_m), signal.reshape(-1, 1)) for range_m, signal in _echoes(scene, flux)
+    ]
+    faulty = scene.faulty_pixels
+    dark = None if faulty is None else faulty.photons(acquisition).reshape(-1, 1)
+    triggered = np.zeros((np.size(scene.range_m), n_edges))
     # Some pixels at a time: temporaries of the whole cube cost ten times their arithmetic.
     pixels_at_once = max(1, 2**15 // n_edges)
-    for first in range(0, onset_bin.size, pixels_at_once):
+    for first in range(0, len(triggered), pixels_at_once):
         some = slice(first, first + pixels_at_once)
-        before = pulse.cumulative(onset_bin[some], acquisition.n_bins, acquisition.bin_width_s)
-        before -= before[:, :1].copy()  # the part of an echo that came before the gate opened
-        before *= signal[some]
-        before += uniform
-        np.expm1(np.negative(before, out=before), out=before)
-        np.negative(before, out=triggered[some])
+        for shift_m in shifts_m:
+            before = _echo_before(echoes[0], some, shift_m, pulse, acquisition)
+            for other in echoes[1:]:
+                before += _echo_before(other, some, shift_m, pulse, acquisition)
+            before += everywhere
+            if dark is not None:
+                before += dark[some] * share_of_gate
+            np.expm1(np.negative(before, out=before), out=before)
+            triggered[some] -= before
+    if shifts_m.size > 1:
+        triggered /= shifts_m.size
+    if faulty is not None:
+        triggered[faulty.dead.reshape(-1)] = 0.0
+    if scene.jitter is not None:
+        triggered = scene.jitter.recorded(triggered, acquisition.bin_width_s)
     return triggered
+
+
+def _echoes(scene: Scene, flux: Flux) -> Iterator[tuple[Floats, Floats]]:
+    """Range and signal photons per pulse of each surface that pixels see, shape (row, col)."""
+    signal, second, fog = _signal(scene, flux), scene.second_surface, scene.backscatter
+    surfaces = [(scene.range_m, signal)]
+    if second is not None:
+        share = second.seen_share
+        surfaces = [(scene.range_m, (1 - share) * signal), (second.range_m, share * signal)]
+    for range_m, photons in surfaces:
+        dimmed = photons if fog is None else photons * np.nan_to_num(fog.transmission(range_m))
+        yield range_m, dimmed
+
+
+def _echo_before(
+    echo: tuple[Floats, Floats], some: slice, shift_m: float, pulse: Pulse, acquisition: Acquisition
+) -> Floats:
+    """Photons of an echo before each edge, within the gate; shape (pixel, n_bins + 1)."""
+    range_m, signal = echo
+    onset_bin = acquisition.range_m_to_bin(range_m[some] + shift_m)
+    before = pulse.cumulative(onset_bin, acquisition.n_bins, acquisition.bin_width_s)
+    before -= before[:, :1].copy()  # the part that came before the gate opened
+    before *= signal[some]
+    return before
 
 
 def _draw_multinomial(
