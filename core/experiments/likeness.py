@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from core.posterior import light_of, posterior_of, rate_and_armed
 from core.scene import Scene
 from core.simulate import simulate
 from core.trigger import rate_per_bin
+
+MARGIN_BINS = 5
 
 SURE = 0.5
 """Least confidence of an answer that `like` takes for the truth."""
@@ -69,9 +72,29 @@ class Simulation:
             detection=self.detection,
         )
 
+    @property
+    def window(self) -> tuple[int, int]:
+        """First bin and end of the shortest window of the gate that holds the targets' echoes."""
+        return window(self.scene.range_m, self.pulse, self.acquisition)
+
     def with_pulses(self, n_pulses: int) -> Simulation:
         """The same with another number of pulses."""
         return replace(self, acquisition=replace(self.acquisition, n_pulses=n_pulses))
+
+
+def window(range_m: Floats, pulse: Pulse, acquisition: Acquisition) -> tuple[int, int]:
+    """First bin and end of the shortest window that holds the echoes, `MARGIN_BINS` to spare.
+
+    Parameters
+    ----------
+    range_m : ndarray, shape (row, col)
+        NaN where there is no target; at least one.
+    """
+    onset = acquisition.range_m_to_bin(range_m)
+    begin_s, end_s = pulse.quantile_s(0.01), pulse.quantile_s(0.99)
+    first = math.floor(np.nanmin(onset) + begin_s / acquisition.bin_width_s) - MARGIN_BINS
+    end = math.ceil(np.nanmax(onset) + end_s / acquisition.bin_width_s) + MARGIN_BINS
+    return max(0, first), min(acquisition.n_bins, end)
 
 
 def like(capture: Capture, name: str) -> Simulation:

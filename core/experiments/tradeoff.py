@@ -260,14 +260,41 @@ class Cancelled(Exception):
     """Somebody no longer wants to know."""
 
 
-def candidates(
-    methods: Sequence[Method] = (), merges: Sequence[int] = (1, 2, 4)
-) -> list[Candidate]:
+MERGES = (1, 2, 4)
+VARIED = ("tracking", "cfar", "coates", "likelihood")
+"""Methods of which more is tried than merged bins: those that fronts are made of."""
+
+
+def candidates(methods: Sequence[Method] = (), merges: Sequence[int] = MERGES) -> list[Candidate]:
     """Methods, all registered ones where none is given, with bins merged."""
     return [
         Candidate(method, Reduction(merge=merge))
         for method in methods or as_they_come()
         for merge in merges
+    ]
+
+
+def variations(
+    methods: Sequence[Method] = (), window: tuple[int, int] | None = None
+) -> list[Candidate]:
+    """Methods, those `VARIED` where none is given, with one thing left out or done otherwise.
+
+    Parameters
+    ----------
+    methods : sequence of Method
+    window : tuple of int, optional
+        First bin and end to which the gate is cut, as who knows where the targets are can cut it.
+    """
+    reductions = [Reduction(skip=2), Reduction(skip=4), Reduction(pool=2)]
+    reductions += [Reduction(merge=2, pool=2), Reduction(merge=4, pool=2)]
+    if window is not None:
+        reductions += [Reduction(gate=window), Reduction(gate=window, merge=2)]
+    chosen = methods or [each for each in as_they_come() if each.name in VARIED]
+    return [Candidate(method, each) for method in chosen for each in reductions] + [
+        Candidate(method, kernel=kernel)
+        for method in chosen
+        for kernel, of in KERNELS.items()
+        if kernel and method.estimator in of
     ]
 
 
@@ -316,7 +343,7 @@ def study(
     require("seeds", len(seeds), len(seeds) >= 2, "at least 2")
     known = [_known(source, ways) for source, ways in plan]
     pieces = [
-        _Piece(place, source, tuple(ways), seed)
+        Piece(place, source, tuple(ways), seed)
         for place, (source, ways) in enumerate(known)
         for seed in (seeds if isinstance(source, Simulation) else seeds[:1])
     ]
@@ -333,7 +360,7 @@ def study(
 
     told(0)
     scores: dict[tuple[int, int], list[list[Score]]] = {}
-    for piece, found in computed(_scored, pieces, processes):
+    for piece, found in computed(scored, pieces, processes):
         scores[piece.place, piece.seed] = found
         told(len(piece.candidates))
     points = []
@@ -346,13 +373,24 @@ def study(
     return points
 
 
+def studied(capture: Capture) -> Source:
+    """What a study looks at in a capture's place: itself, its middle, or its likeness.
+
+    Raises
+    ------
+    ValueError
+        If it has no truth, and nothing in it is clear enough to stand for one.
+    """
+    middle = _middle(capture)
+    return like(middle, middle.source) if middle.truth_range_m is None else middle
+
+
 def _known(source: Source, ways: Sequence[Candidate]) -> tuple[Source, list[Candidate]]:
     """What is studied in a source's place, and the candidates that know enough to range it."""
-    if isinstance(source, Capture):
-        source = _middle(source)
-        if source.truth_range_m is None:
-            source = like(source, source.source)
+    source = studied(source) if isinstance(source, Capture) else source
     seen = _drawn(source, 0)
+    targets = int(np.isfinite(np.asarray(seen.truth_range_m)).sum())
+    require("targets", targets, targets > 0, "a scene in which some pixel sees a surface")
     is_lit = seen.signal is not None and seen.background is not None
     return source, [each for each in ways if is_lit or not each.is_told_the_light]
 
@@ -381,8 +419,8 @@ def _drawn(source: Source, seed: int) -> Capture:
     return source.capture(seed) if isinstance(source, Simulation) else source
 
 
-class _Piece(NamedTuple):
-    """What one process scores."""
+class Piece(NamedTuple):
+    """What one process scores at once; `place` is that of its source in a plan."""
 
     place: int
     source: Source
@@ -390,7 +428,7 @@ class _Piece(NamedTuple):
     seed: int
 
 
-def _scored(piece: _Piece) -> list[list[Score]]:
+def scored(piece: Piece) -> list[list[Score]]:
     """Scores of each candidate on one capture: one, or one for each part of a measured one."""
     capture = _drawn(piece.source, piece.seed)
     truth_m = np.asarray(capture.truth_range_m)
