@@ -79,6 +79,11 @@ class Session:
         """Whether there is a browser on the other side."""
         return self.page is not None and self.page.session_context is not None
 
+    @property
+    def is_gone(self) -> bool:
+        """Whether there was a browser, and is none any more."""
+        return self._served and not self.is_served
+
     def _watch(self) -> None:
         watch = self.state.param.watch
         watch(lambda *_: self._ask(), ["source", "light", "reading", "less", "tracking"])

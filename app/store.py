@@ -15,6 +15,7 @@ from app.state import Less, Light, Reading
 from core import (
     Capture,
     Run,
+    Scene,
     Signals,
     TrackingParameters,
     first_difference,
@@ -40,7 +41,13 @@ class Source:
 
     title: str
     load: Callable[[Light, Reading], Capture]
-    is_scene: bool
+    scene: Callable[[], Scene] | None = None
+    """None for a file."""
+
+    @property
+    def is_scene(self) -> bool:
+        """Whether it is simulated."""
+        return self.scene is not None
 
 
 def scene_source(title: str, name: str, **arguments: Any) -> Source:
@@ -52,7 +59,7 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
         scene = build()
         return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
-    return Source(title, load, is_scene=True)
+    return Source(title, load, build)
 
 
 def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
@@ -65,7 +72,7 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
         return capture
 
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, lambda _light, reading: get(reading), is_scene=False)
+    return Source(title or path.name, lambda _light, reading: get(reading))
 
 
 def built_in_sources() -> dict[str, Source]:
@@ -76,6 +83,10 @@ def built_in_sources() -> dict[str, Source]:
         "building": scene_source("Building at 830–860 m", "building"),
         "staircase": scene_source("Staircase through the gate", "staircase"),
         "uniform": scene_source("Random depths", "uniform"),
+        "edges": scene_source("Building, edges seen whole", "edges"),
+        "fog": scene_source("Car in fog", "fog"),
+        "approach": scene_source("Car approached at 20 m/s", "approach"),
+        "worn": scene_source("Car, worn instrument", "worn"),
         "sample": file_source(ASSETS / "sample_capture.npz", "Sample capture (file)"),
     }
 
@@ -111,7 +122,7 @@ class Answer:
 def compute(request: Request, previous: Answer | None) -> Answer:
     """Answer a request; what the previous answer already holds is not computed again."""
     started = perf_counter()
-    if previous is None or not _same(request, previous.request, "source", "light", "reading"):
+    if previous is None or not same_capture(request, previous.request):
         whole = request.source.load(request.light, request.reading)
     else:
         whole = previous.whole
@@ -122,6 +133,11 @@ def compute(request: Request, previous: Answer | None) -> Answer:
         posterior_of(capture)  # what every answer's confidence rests on, whatever the method
         capture_s = perf_counter() - started
     return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole)
+
+
+def same_capture(one: Request, other: Request) -> bool:
+    """Whether both look at the same capture, however much of it."""
+    return _same(one, other, "source", "light", "reading")
 
 
 def same_view(one: Request, other: Request) -> bool:
