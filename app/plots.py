@@ -273,6 +273,7 @@ def curves(item: items.Plot, colors: Palette) -> Any:
     legend = Legend(
         items=entries,
         orientation="vertical" if many else "horizontal",
+        ncols=3 if 4 < len(entries) <= 6 else "auto",
         click_policy="hide",
         background_fill_alpha=0.0,
     )

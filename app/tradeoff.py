@@ -35,9 +35,11 @@ Array = NDArray[Any]
 PLOT_HEIGHT = 430
 WHOLE = ":host { height: auto !important; flex: none !important; }"
 CURVES = """
-:host { display: grid !important; gap: 8px; height: auto !important;
-  grid-template-columns: repeat(auto-fit, minmax(430px, 1fr)); grid-auto-rows: 330px; }
-@media (max-width: 900px) { :host { grid-template-columns: minmax(0, 1fr); } }
+:host { display: grid !important; gap: 8px; flex: none !important; height: 668px !important;
+  grid-template: repeat(2, 330px) / repeat(2, minmax(0, 1fr)); }
+@media (max-width: 900px) {
+  :host { grid-template: repeat(3, 330px) / minmax(0, 1fr); height: 1006px !important; }
+}
 """
 ANY_MERGE = "1, 2 and 4"
 
