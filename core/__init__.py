@@ -8,7 +8,7 @@ from core.export import save_capture, save_image, save_pixel
 from core.large import as_image, estimate_large
 from core.pipeline import Run, run
 from core.readers import open_capture, read_capture
-from core.scene import Scene, scenes
+from core.scene import PARTS, Scene, parts_of, scenes, without
 from core.scene_files import SceneError, read_scene
 from core.simulate import first_photons, simulate
 from core.tracking import PRESETS, Signals, TrackingParameters, tracking_signals
@@ -23,6 +23,7 @@ from core.warmup import warm_up
 
 __all__ = [
     "ESTIMATORS",
+    "PARTS",
     "PRESETS",
     "Acquisition",
     "Capture",
@@ -46,6 +47,7 @@ __all__ = [
     "metrics",
     "no_trigger_probability",
     "open_capture",
+    "parts_of",
     "rate_per_bin",
     "read_capture",
     "read_scene",
@@ -59,4 +61,5 @@ __all__ = [
     "tracking_signals",
     "trigger_probability",
     "warm_up",
+    "without",
 ]

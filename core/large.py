@@ -63,9 +63,10 @@ def estimate_large(
     -------
     Dataset
         `IMAGES`, each of shape (row, col), NaN where there is no answer; its attributes tell of the
-        acquisition, of the detection and of the source. Nothing is ranged before
-        ``.compute()`` or a ``.to_…()``; a sample of the image is read at once. Dask ranges on
-        threads, or on the cluster of the `dask.distributed.Client` that is open.
+        acquisition, of the detection, of the source and, as ``remark``, what the method leaves out.
+        Nothing is ranged before ``.compute()`` or a ``.to_…()``; a sample of the image is read at
+        once. Dask ranges on threads, or on the cluster of the `dask.distributed.Client` that is
+        open.
 
     Raises
     ------
@@ -83,7 +84,7 @@ def estimate_large(
     require("axes", counts.dims, counts.dims == AXES, "row, col and bin")
     description = describe(counts, Request())
     array = da.asarray(counts.data).rechunk({2: -1})
-    common = learned(array, description, method, settings, false_alarm)
+    lighting, calibration, remark = learned(array, description, method, settings, false_alarm)
     margin = estimator.reach(settings) // 2
     around = {0: margin, 1: margin, 2: 0}
     # Chunks of an edge may be narrower than the margin: Dask joins them.
@@ -93,13 +94,14 @@ def estimate_large(
         description,
         method,
         settings,
-        *common,
+        lighting,
+        calibration,
         dtype=float,
         chunks=(*parts.chunks[:2], (len(IMAGES),)),
         meta=np.empty((0, 0, 0)),
     )
     images = da.overlap.trim_internal(ranged, around, boundary="none")
-    return _dataset(images, description)
+    return _dataset(images, description, remark)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,10 +184,11 @@ def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:
 
 def learned(
     array: Any, description: Description, method: str, settings: Any, false_alarm: float | None
-) -> tuple[Lighting, Calibration]:
-    """What a sample of a Dask array (row, col, bin) tells of all its pixels."""
-    sample = _capture(sample_of(array), description)
-    return lighting_of(sample), ESTIMATORS[method].calibration(sample, settings, false_alarm)
+) -> tuple[Lighting, Calibration, str]:
+    """What a sample of a Dask array (row, col, bin) tells of all its pixels; `Estimator.remark`."""
+    sample, estimator = _capture(sample_of(array), description), ESTIMATORS[method]
+    calibration = estimator.calibration(sample, settings, false_alarm)
+    return lighting_of(sample), calibration, estimator.remark(sample)
 
 
 def range_part(
@@ -210,11 +213,11 @@ def _capture(cube: NDArray[Any], description: Description) -> Capture:
     return Capture(counts, acquisition, pulse, source=source, detection=detection)
 
 
-def _dataset(images: Any, description: Description) -> xr.Dataset:
+def _dataset(images: Any, description: Description, remark: str) -> xr.Dataset:
     import xarray as xr  # noqa: PLC0415
 
     acquisition, _, detection, source = description
-    about = {**vars(acquisition), "detection": detection, "source": source}
+    about = {**vars(acquisition), "detection": detection, "source": source, "remark": remark}
     return xr.Dataset(
         {
             name: (AXES[:2], images[..., number], {"long_name": words, "units": unit})

@@ -34,6 +34,8 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.blocks import LANES, lane_rows, to_blocks
 from core.capture import Capture, once_per_capture
 from core.parallel import COMPILED, PARALLEL, entering
+from core.resolution import FEW, Difference, difference, pile_up
+from core.trigger import rate_per_bin, trigger_probability
 
 TOLERANCE_BINS = 3
 """An answer is right within this many bins: the tolerance that reproduces the paper's tables."""
@@ -52,6 +54,8 @@ class Conditions(NamedTuple):
     """Background photons per pulse over the gate, likewise."""
     contrast: float
     """Signal over background, both as they are on average over the image."""
+    pile_up: bool = True
+    """`Light.pile_up`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +74,8 @@ class Light:
         How much more often than in others a surface's delay falls in each bin; 1 on average.
     image_contrast : float, optional
         `contrast` of the image that these pixels are a part of; None where they are all of it.
+    pile_up : bool
+        Whether the pulses show that early photons hide later ones.
     """
 
     signal: Floats
@@ -77,6 +83,7 @@ class Light:
     share: Floats
     depth: Floats
     image_contrast: float | None = None
+    pile_up: bool = True
 
     @property
     def typical_signal(self) -> Floats:
@@ -106,6 +113,7 @@ class Light:
             self.share,
             self.depth,
             self.contrast,
+            self.pile_up,
         )
 
 
@@ -124,6 +132,14 @@ class Lighting(NamedTuple):
     """Share of a background's deviation from the mean that is no chance."""
     contrast: float | None = None
     """`Light.contrast` of the image."""
+    pile_up: bool = True
+    """`Light.pile_up`."""
+
+    def with_one_level(self) -> Lighting:
+        """The same with the mean of all signals for each of them."""
+        some = self.share[1:].sum()
+        mean = float(self.share[1:] @ self.levels[1:] / some)
+        return self._replace(levels=np.array([0.0, mean]), share=np.array([self.share[0], some]))
 
     def light(self, total: Floats, least_background: float) -> Light:
         """The light of pixels of which the total rates are known, shape (row, col)."""
@@ -136,6 +152,7 @@ class Lighting(NamedTuple):
             self.share,
             self.depth,
             self.contrast,
+            self.pile_up,
         )
 
 
@@ -168,15 +185,49 @@ def light_of(capture: Capture) -> Light:
 
 @once_per_capture
 def lighting_of(capture: Capture) -> Lighting:
-    """What a capture tells of the light that all its pixels see.
+    """What a capture tells of the light that its pixels see, in the cheapest model that will do.
+
+    Pile-up that the pulses hide is taken for none (`core.resolution`). The mean of all levels of
+    signal is taken for each of them, where a pixel's pulses do not tell them from it: a pixel that
+    cannot tell its level orders delays by any of them much alike.
+
+    A part of an image too large for memory is told that of a sample of the image,
+    ``lighting_of.tell(part, lighting)``.
+    """
+    found, n_pulses = detailed_lighting_of(capture), capture.armed_pulses
+    if n_pulses is not None:
+        is_hidden = pile_up(capture.counts / n_pulses, n_pulses).is_hidden
+        found = found._replace(pile_up=not is_hidden)
+    told = level_differences(found, capture).told
+    return found.with_one_level() if found.share[1:] @ told <= FEW else found
+
+
+def level_differences(lighting: Lighting, capture: Capture) -> Difference:
+    """How far each level of signal lies from their mean, shape (level - 1,).
+
+    For an echo at the beginning of the gate, where most pulses are armed.
+    """
+    _, first = capture.pulse.taps(capture.acquisition.n_bins, capture.acquisition.bin_width_s)
+    signal = np.concatenate([lighting.with_one_level().levels[1:], lighting.levels[1:]])
+    rate = rate_per_bin(
+        np.full(signal.size, max(-first, 0.0)),
+        signal,
+        max(float(np.mean(lighting.background)), _least_background(capture)),
+        capture.pulse,
+        capture.acquisition,
+    )
+    model = rate if capture.armed_pulses is None else trigger_probability(rate)
+    return difference(model[1:], model[0], capture.armed_pulses)
+
+
+@once_per_capture
+def detailed_lighting_of(capture: Capture) -> Lighting:
+    """`lighting_of` with every level of signal that the pixels together tell.
 
     The total of a pixel's rates (Coates 1968) is signal and background together. What a level of
     signal leaves of it is background, drawn towards the image's mean background as far as its
     scatter is what chance alone makes (James & Stein 1961, the chance being Greenwood's 1926
     variance): where all pixels see the same background, all are given the same.
-
-    A part of an image too large for memory is told that of a sample of the image,
-    ``lighting_of.tell(part, lighting)``.
     """
     total, chance = _totals(capture)
     flat = capture.cube.reshape(total.size, -1)
@@ -362,12 +413,15 @@ def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Flo
     """
     prepared = _prepare(capture, capture.cube, light, steps_per_bin)
     delay, score = np.empty((2, prepared.counts.shape[0], LANES))
-    for some, density, top in _densities(prepared):
-        at = density.argmax(axis=1)[:, np.newaxis]
-        last = density.shape[1] - 1
+    # Of one level there is nothing to average: its logarithms do, and exponentials are what costs.
+    is_one = len(prepared.signal) == 2
+    for some, curve, top in _log_densities(prepared) if is_one else _densities(prepared):
+        at = curve.argmax(axis=1)[:, np.newaxis]
+        last = curve.shape[1] - 1
         around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
-        # A neighbour of density 0 has a logarithm too, far below.
-        log = np.log(np.maximum(np.take_along_axis(density, around, axis=1), 1e-30))
+        log = np.take_along_axis(curve, around, axis=1)
+        if not is_one:  # a neighbour of density 0 has a logarithm too, far below
+            log = np.log(np.maximum(log, 1e-30))
         left, middle, right = log.astype(float).transpose(1, 0, 2)
         curvature = np.minimum(left - 2 * middle + right, -1e-9)
         inside = (at[:, 0] > 0) & (at[:, 0] < last)
@@ -517,6 +571,13 @@ def _densities(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32]
         density = np.exp(weighted, out=weighted).sum(axis=1)
         density *= prepared.depth[:, np.newaxis]
         yield some, density, top[:, 0, 0].astype(float)
+
+
+def _log_densities(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32], float]]:
+    """Logarithm of what `_densities` gives, for one level of signal, in units of 1."""
+    weight = np.log(prepared.depth) + np.float32(prepared.log_share[1])
+    for some, log in _log_likelihoods(prepared):
+        yield some, log[:, 1] + weight[:, np.newaxis], 0.0
 
 
 def _log_likelihoods(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32]]]:

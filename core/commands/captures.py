@@ -153,7 +153,7 @@ def _estimate(chosen: argparse.Namespace) -> None:
         save_image(seen, image, path, overwrite=chosen.overwrite)
     known = {
         "source": seen.source,
-        "remark": ESTIMATORS[chosen.method].remark(seen),
+        "remark": facts.pop("remark"),
         "settings": str(settings),
         "pixels": image.valid.size,
         "pixels_answered": int(image.valid.sum()),
@@ -181,6 +181,7 @@ def _ranged_at_once(
     _require_angle(chosen, capture.acquisition)
     found = run(capture, chosen.method, settings, chosen.false_alarm)
     facts: dict[str, Any] = found.figures | {
+        "remark": ESTIMATORS[chosen.method].remark(capture),
         "light_s": found.light_s,
         "estimate_s": found.estimate_s,
     }
@@ -202,7 +203,8 @@ def _ranged_in_parts(
     started = perf_counter()
     parts = large.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)
     seen, image = large.as_image(large.computed(parts, chosen.scheduler))
-    return seen, image, {"seconds": perf_counter() - started}
+    facts = {"remark": parts.attrs["remark"], "seconds": perf_counter() - started}
+    return seen, image, facts
 
 
 # -- simulate and export ---------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core import posterior
 from core.acquisition import Floats
-from core.capture import Capture, Seen, once_per_capture
+from core.capture import Capture, once_per_capture
 from core.parameters import Number
 from core.posterior import Conditions, Light
 from core.spatial import pooled, pooled_at
@@ -95,6 +95,9 @@ class Estimator:
     undoes_pile_up : bool
         Whether the estimator takes counts for first photons and undoes that early ones hide later
         ones, where the number of pulses is known.
+    spares : callable
+        ``capture -> sentence``: what it leaves out of its model since the capture's pulses do not
+        tell it, at less cost; empty where nothing.
     whole_image : bool
         Whether a pixel's answer depends on pixels beyond its `reach`, so that no part of an image
         can be ranged without the rest.
@@ -111,6 +114,7 @@ class Estimator:
     reconstructed: str = ""
     null_side: int = NULL_SIDE
     undoes_pile_up: bool = False
+    spares: Callable[[Capture], str] = lambda _: ""
     whole_image: bool = False
 
     def __call__(
@@ -134,13 +138,14 @@ class Estimator:
         """
         return self.ranged(capture, parameters, self.calibration(capture, parameters, false_alarm))
 
-    def remark(self, capture: Seen) -> str:
+    def remark(self, capture: Capture) -> str:
         """What the estimator leaves out for a capture; empty where nothing."""
-        if not self.undoes_pile_up or capture.armed_pulses is not None:
-            return ""
-        if capture.detection == "all":
-            return "no pile-up is undone: the capture holds all photons, none hides another"
-        return "no pile-up is undone: the number of pulses is not known"
+        said = [self.spares(capture)]
+        if self.undoes_pile_up and capture.armed_pulses is None:
+            every = "the capture holds all photons, none hides another"
+            why = every if capture.detection == "all" else "the number of pulses is not known"
+            said.append(f"no pile-up is undone: {why}")
+        return "; ".join(filter(None, said))
 
     def calibration(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
@@ -268,6 +273,7 @@ def conditions_of(capture: Capture, light: Light, reach: int = 1) -> Conditions:
         signal * more,
         background * more,
         light.contrast,
+        light.pile_up,
     )
 
 

@@ -2,7 +2,8 @@
 
 The corrected rate of bin k is known to ``sqrt(λ / A_k)`` only, A_k pulses being armed, so that bins
 count in proportion to A_k: the score is the weighted least-squares amplitude of an echo over its
-standard deviation.
+standard deviation. Where the pulses hide pile-up (`core.resolution`), counts are rates and all
+bins count alike, which costs half.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from core.acquisition import Floats
+from core.capture import Capture
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate, echo_shape
-from core.posterior import Conditions, rate_and_armed
+from core.posterior import Conditions, lighting_of, rate_and_armed
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,11 @@ class CoatesParameters:
 def _curve(histogram: Floats, conditions: Conditions, parameters: CoatesParameters) -> Floats:
     """``Σ_k A_k (λ_k - λ) p(k - d) / sqrt(λ Σ_k A_k p(k - d)²)`` at each bin's beginning d."""
     echo, first = echo_shape(conditions)
-    rate, armed = rate_and_armed(histogram, conditions.n_pulses)
+    n_pulses = conditions.n_pulses
+    if conditions.pile_up or n_pulses is None:
+        rate, armed = rate_and_armed(histogram, n_pulses)
+    else:
+        rate, armed = histogram / n_pulses, np.full(histogram.shape[-1], float(n_pulses))
     mean = np.maximum(rate.mean(axis=-1, keepdims=True), np.finfo(float).tiny)
     amplitude = correlate(armed * (rate - mean), echo, first)
     # Where next to no pulse is armed an echo cannot show: one pulse keeps the ratio finite.
@@ -33,6 +39,16 @@ def _curve(histogram: Floats, conditions: Conditions, parameters: CoatesParamete
     return np.asarray(amplitude / spread)
 
 
+def _spares(capture: Capture) -> str:
+    if lighting_of(capture).pile_up or capture.armed_pulses is None:
+        return ""
+    return "Coates undoes no pile-up: too few pulses fire for one photon to hide another"
+
+
 ESTIMATOR = Estimator(
-    "Coates correction, matched filter", CoatesParameters, _curve, undoes_pile_up=True
+    "Coates correction, matched filter",
+    CoatesParameters,
+    _curve,
+    undoes_pile_up=True,
+    spares=_spares,
 )

@@ -15,7 +15,14 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
 from core.parameters import Choice, Number, check_fields, parameter
-from core.posterior import Conditions, Light, log_likelihood_ratio, most_likely
+from core.posterior import (
+    Conditions,
+    Light,
+    detailed_lighting_of,
+    lighting_of,
+    log_likelihood_ratio,
+    most_likely,
+)
 
 Depths = Literal["alike", "learned"]
 
@@ -60,6 +67,12 @@ def curve(histogram: Floats, conditions: Conditions, parameters: LikelihoodParam
     return log_likelihood_ratio(histogram, conditions)
 
 
+def _spares(capture: Capture) -> str:
+    if lighting_of(capture).levels.size == detailed_lighting_of(capture).levels.size:
+        return ""
+    return "the likelihood takes one level of signal for all pixels: none tells its own"
+
+
 ESTIMATOR = Estimator(
     "Likelihood, light estimated",
     LikelihoodParameters,
@@ -67,4 +80,5 @@ ESTIMATOR = Estimator(
     locate,
     finds_delay=True,
     undoes_pile_up=True,
+    spares=_spares,
 )

@@ -134,7 +134,9 @@ def test_estimate_says_where_pile_up_is_not_undone(
     assert "no pile-up is undone: the capture holds all photons" in told["remark"]
     told = facts(capsys, "estimate", "coates", *reading, "--detection", "first")
     assert "number of pulses is not known" in told["remark"]
-    assert "remark" not in facts(capsys, "estimate", "coates", *reading, "--pulses", 500)
+    told = facts(capsys, "estimate", "coates", *reading, "--pulses", 500)
+    assert "too few pulses fire for one photon to hide another" in told["remark"]
+    assert "remark" not in facts(capsys, "estimate", "coates", *reading, "--pulses", 40)
     assert "remark" not in facts(capsys, "estimate", "peak", *reading)
 
 

@@ -1,0 +1,115 @@
+"""What an estimator takes into account of a capture, switched on and off; and what that changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import stdtrit
+
+from core import metrics
+from core.acquisition import Floats, Pulse
+from core.capture import Capture
+from core.estimators import ESTIMATORS
+from core.experiments.timing import FEWEST_REPEATS, interleaved, median_interval
+from core.metrics import Interval
+from core.posterior import (
+    TOLERANCE_BINS,
+    detailed_lighting_of,
+    level_differences,
+    light_of,
+    lighting_of,
+)
+from core.resolution import Difference
+
+
+def with_correction(capture: Capture, correction: str) -> Capture:
+    """The same counts for an estimator that makes one of `CORRECTIONS`, whatever it would spare."""
+    if correction == "pulse_shape":
+        return capture
+    full = replace(capture)
+    lighting_of.tell(full, detailed_lighting_of(capture))
+    return full
+
+
+def without_correction(capture: Capture, correction: str) -> Capture:
+    """The same counts for an estimator that does not make it.
+
+    Without pile-up all photons count; without levels of signal, their mean is that of all pixels;
+    and without its shape the pulse is a Gaussian of the same mean and width.
+    """
+    if correction == "pile_up":
+        return replace(capture, detection="all")
+    if correction == "pulse_shape":
+        mean_s, sigma_s = moments_s(capture.pulse)
+        # A Gaussian's time zero is its centre: the gate opens that much earlier after it.
+        gate_delay_s = capture.acquisition.gate_delay_s - mean_s
+        acquisition = replace(capture.acquisition, gate_delay_s=gate_delay_s)
+        return replace(capture, acquisition=acquisition, pulse=Pulse.gaussian(sigma_s))
+    one = replace(capture)
+    lighting_of.tell(one, detailed_lighting_of(capture).with_one_level())
+    return one
+
+
+def moments_s(pulse: Pulse) -> tuple[float, float]:
+    """Mean and standard deviation of a photon's time, in seconds after time zero."""
+    longest = len(pulse.samples) + 40.0
+    edge_s = np.linspace(-longest, longest, 2**16) * pulse.tau_s
+    share, middle_s = np.diff(pulse.cdf(edge_s)), (edge_s[1:] + edge_s[:-1]) / 2
+    mean_s = float(share @ middle_s)
+    return mean_s, math.sqrt(float(share @ (middle_s - mean_s) ** 2))
+
+
+def levels_apart(capture: Capture) -> Difference:
+    """How far each pixel's level of signal lies from the mean level, for 1000 pixels."""
+    lighting = detailed_lighting_of(capture)
+    share = lighting.share[1:] / lighting.share[1:].sum()
+    pixels = np.maximum(np.round(1000 * share), 1).astype(int)
+    return Difference(*(np.repeat(each, pixels) for each in level_differences(lighting, capture)))
+
+
+def answers_m(capture: Capture, method: str) -> Floats:
+    """Ranges by a method's defaults, shape (row, col); NaN where there is none."""
+    estimator = ESTIMATORS[method]
+    bins, _ = estimator.delays(capture, estimator.parameters())
+    return capture.acquisition.bin_to_range_m(bins)
+
+
+def score(range_m: Floats, capture: Capture) -> tuple[float, float]:
+    """Restoration degree within 3 bins, and RMSE in metres."""
+    truth_m, tolerance_m = capture.truth_range_m, TOLERANCE_BINS * capture.acquisition.bin_length_m
+    if truth_m is None:
+        raise ValueError("truth_range_m = None is not accepted: give a capture with a truth.")
+    rd = metrics.restoration_degree(range_m, truth_m, tolerance_m)
+    return rd, metrics.rmse_m(range_m, truth_m)
+
+
+def changes(with_it: Floats, without_it: Floats) -> tuple[Interval, Interval]:
+    """Of restoration degree and of RMSE, from paired scores (repetition, 2)."""
+    rd, rmse_m = (with_it - without_it).T
+    return student(rd), student(rmse_m)
+
+
+def student(change: Floats) -> Interval:
+    """Mean of paired changes (n,), NaN left out, with Student's 95 % interval."""
+    known = change[np.isfinite(change)]
+    if known.size < 2:
+        return Interval(math.nan, math.nan, math.nan)
+    mean = float(np.mean(known))
+    half = float(stdtrit(known.size - 1, 0.975) * np.std(known, ddof=1) / math.sqrt(known.size))
+    return Interval(mean, mean - half, mean + half)
+
+
+def ranging_ratio(with_it: Capture, without_it: Capture, method: str) -> Interval:
+    """Time of a method on one capture over that on another, their light known."""
+    for each in (with_it, without_it):
+        light_of(each)
+    return time_ratio(lambda: answers_m(with_it, method), lambda: answers_m(without_it, method))
+
+
+def time_ratio(one: Callable[[], object], other: Callable[[], object]) -> Interval:
+    """Median of the ratio of two times, taken in turn."""
+    seconds = interleaved({"one": one, "other": other}, FEWEST_REPEATS + 3)
+    return median_interval(seconds["one"] / seconds["other"])
