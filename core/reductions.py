@@ -101,10 +101,10 @@ def skip_pixels(capture: Capture, step: int) -> Capture:
         If `step` is not an integer from 1 to the smaller side of the image.
     """
     _require_whole("step", step, min(capture.shape))
-    kept = np.s_[(step - 1) // 2 :: step, (step - 1) // 2 :: step]
+    kept = np.ix_(*(_kept(size, step) for size in capture.shape))
     return replace(
         capture,
-        cube=np.ascontiguousarray(capture.cube[kept]),
+        cube=capture.cube[kept],
         acquisition=_coarser(capture, step),
         truth_range_m=None if capture.truth_range_m is None else capture.truth_range_m[kept],
         signal=None if capture.signal is None else capture.signal[kept],
@@ -198,6 +198,13 @@ class Reduction:
     skip: int = 1
     pool: int = 1
 
+    def fits(self, shape: tuple[int, int, int]) -> bool:
+        """Whether a capture of these rows, columns and bins holds enough for it."""
+        side, n_bins = min(shape[:2]), shape[2]
+        first, end = self.gate or (0, n_bins)
+        enough_pixels = self.skip <= side and self.pool <= len(_kept(side, self.skip))
+        return enough_pixels and 0 <= first < end <= n_bins and self.merge <= end - first
+
     def of(self, capture: Capture) -> Capture:
         """The capture with the reductions done, pixels first, then the gate, then the bins.
 
@@ -229,8 +236,7 @@ class Reduction:
 
     def _taken_from(self, full: int, own: int) -> NDArray[np.intp]:
         """Row (or column) of the reduced image that each of the full one's is taken from."""
-        kept = len(range((self.skip - 1) // 2, full, self.skip))
-        after_skipping = np.minimum(np.arange(full) // self.skip, kept - 1)
+        after_skipping = np.minimum(np.arange(full) // self.skip, len(_kept(full, self.skip)) - 1)
         return np.asarray(np.minimum(after_skipping // self.pool, own - 1))
 
     def __str__(self) -> str:
@@ -249,6 +255,11 @@ class Reduction:
 def _require_whole(name: str, value: object, most: int) -> None:
     accepted = isinstance(value, Integral) and 1 <= int(value) <= most
     require(name, value, accepted, f"an integer from 1 to {most}")
+
+
+def _kept(size: int, step: int) -> range:
+    """Rows (or columns) left where one of each `step` is kept: the middle one."""
+    return range((step - 1) // 2, size, step)
 
 
 def _share(background: float | None, share: float) -> float | None:

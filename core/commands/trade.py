@@ -33,6 +33,8 @@ from core.scene import scenes
 
 SCENES, SBRS = ("car", "uniform"), (0.04, 0.06, 0.2)
 SHORT_SCENES, SHORT_SBRS = ("car",), (0.06,)
+SAID = ("answers", "fronts", "needed")
+"""Tables that are printed, too."""
 
 
 def add(commands: Any) -> None:
@@ -84,6 +86,8 @@ def add(commands: Any) -> None:
 
 
 def _tradeoff(chosen: argparse.Namespace) -> None:
+    from core.experiments import report  # noqa: PLC0415 - draws, which nothing else here needs
+
     plan, simulations = _of_capture(chosen) if chosen.capture else _of_scenes(chosen)
     seeds = range(chosen.seeds or (3 if chosen.short else 8))
     points = study(
@@ -98,17 +102,18 @@ def _tradeoff(chosen: argparse.Namespace) -> None:
     )
     if chosen.with_light:
         points = with_light(points)
-    questions = page.answers(points, chosen.within, chosen.reach, chosen.tolerance)
-    tables = [page.fronts_table(points, chosen.tolerance), questions]
-    for each in [*tables, *([page.needed(found)] if found else [])]:
-        _show(each)
+    items = page.items(points, found, chosen.within, chosen.reach, chosen.tolerance)
+    for each in items:
+        if isinstance(each, Table) and each.key in SAID:
+            print(f"{each.title}\n\n{as_markdown(each.columns, each.rows)}\n", flush=True)
     introduction = [
         f"{len(points)} ways and conditions, {len(seeds)} seeds, the same for all ways.",
         *dict.fromkeys(f"{each.source}: {each.note}." for each in points if each.note),
     ]
     if chosen.with_light:
         introduction.append("Times include finding the light: each image is a new one.")
-    print(page.write_page(points, found, questions, chosen.folder, introduction, chosen.tolerance))
+    page.write_settings(points, chosen.folder)
+    print(report.write(items, chosen.folder, "Speed against accuracy", introduction))
 
 
 def _of_scenes(chosen: argparse.Namespace) -> tuple[page.Plan, list[Simulation]]:
@@ -155,7 +160,3 @@ def _on_bar(what: str) -> Callable[[int, int], None]:
             print(file=sys.stderr)
 
     return told
-
-
-def _show(table: Table) -> None:
-    print(f"{table.title}\n\n{as_markdown(table.columns, table.rows)}\n", flush=True)

@@ -53,14 +53,12 @@ class Sweep:
     simulated: Mapping[str, tuple[Interval, ...]]
 
 
-def over_pulses(simulation: Simulation, n_pulses: Sequence[int] = PULSES) -> list[Simulation]:
+def over_pulses(simulation: Simulation, n_pulses: Sequence[int]) -> list[Simulation]:
     """The simulation with other numbers of pulses."""
     return [simulation.with_pulses(n) for n in n_pulses]
 
 
-def over_exposures(
-    simulation: Simulation, factors: Sequence[float] = EXPOSURES
-) -> list[Simulation]:
+def over_exposures(simulation: Simulation, factors: Sequence[float]) -> list[Simulation]:
     """The simulation with signal and background times a factor: attenuated below 1."""
     flux = simulation.flux
     return [replace(simulation, flux=Flux(flux.signal * each, flux.sbr)) for each in factors]

@@ -167,7 +167,7 @@ def _log(axes: Axes, which: Literal["x", "y"]) -> None:
 
 
 def _scattered(scatter: Scatter) -> Figure:
-    figure = Figure(figsize=(10, 6), layout="constrained")
+    figure = Figure(figsize=(12, 7), layout="constrained")
     axes = figure.add_subplot()
     for i, (name, (x, y)) in enumerate(scatter.groups.items()):
         axes.errorbar(
@@ -183,9 +183,12 @@ def _scattered(scatter: Scatter) -> Figure:
             elinewidth=0.5,
         )
     line_x, line_y, texts = scatter.line
-    axes.step(line_x, line_y, where="post", color="black", lw=1, label=scatter.line_label, zorder=1)
-    for at_x, at_y, text in zip(line_x, line_y, texts, strict=True):
-        axes.annotate(text, (at_x, at_y), (5, 5), textcoords="offset points", fontsize=8)
+    if len(texts):
+        axes.step(line_x, line_y, "k", where="post", lw=1, label=scatter.line_label, zorder=1)
+    # Numbers, told beside the picture: places of a front lie too close together for words.
+    for i, (at_x, at_y, text) in enumerate(zip(line_x, line_y, texts, strict=True)):
+        axes.annotate(f"{i + 1}", (at_x, at_y), (4, 4), textcoords="offset points")
+        axes.plot([], [], " ", label=f"{i + 1}: {text}")
     _log(axes, "x")
     _log(axes, "y")
     axes.set(title=scatter.title, xlabel=scatter.x_label, ylabel=scatter.y_label)

@@ -30,7 +30,7 @@ from core.checks import require
 from core.estimators import ESTIMATORS, Estimator
 from core.estimators.cfar import CfarParameters
 from core.experiments.likeness import Simulation, like
-from core.experiments.timing import interleaved, median_interval
+from core.experiments.timing import FEWEST_REPEATS, interleaved, median_interval
 from core.experiments.trials import (
     Method,
     Score,
@@ -123,7 +123,8 @@ class Candidate:
         return self.reduction.spread(reduced.acquisition.bin_to_range_m(bins), shape)
 
     def __str__(self) -> str:
-        threads = "" if self.threads is None else f"{self.threads} threads"
+        plural = "" if self.threads == 1 else "s"
+        threads = "" if self.threads is None else f"{self.threads} thread{plural}"
         reduction = "" if self.reduction == Reduction() else str(self.reduction)
         return ", ".join(filter(None, (self.method.name, reduction, self.kernel, threads)))
 
@@ -315,18 +316,19 @@ def study(
         What is looked at, and what ranges it. A `Simulation` is drawn with each seed. A `Capture`
         with a truth is scored by parts (`TILES`). One without is stood for by a simulation like it
         (`core.experiments.likeness.like`), and its points say so. Of a capture above `MOST_COUNTS`
-        the middle is taken, and its points say so. Candidates that must be told the light are left
-        out where it is not known.
+        the middle is taken, and its points say so. Candidates are left out that must be told the
+        light where it is not known, or that leave out more than there is.
     seeds : sequence of int
         At least 2.
     repeats : int
-        Rounds of timing, at least 6, in each of which every candidate of a condition has its turn.
+        Rounds of timing, at least `FEWEST_REPEATS`, in each of which every candidate of a source
+        has its turn.
     processes : int
         That share the scoring. Times are taken afterwards, in this one alone.
     progress : callable
         ``(images ranged, images in all)``.
     cancelled : callable
-        Asked before each image.
+        Asked whenever `progress` is told.
 
     Returns
     -------
@@ -336,11 +338,12 @@ def study(
     Raises
     ------
     ValueError
-        If a candidate does not fit what it is to range, or the seeds or repeats are too few.
+        If there is no target, or the seeds or repeats are too few.
     Cancelled
         If `cancelled` said so.
     """
     require("seeds", len(seeds), len(seeds) >= 2, "at least 2")
+    require("repeats", repeats, repeats >= FEWEST_REPEATS, f"at least {FEWEST_REPEATS}")
     known = [_known(source, ways) for source, ways in plan]
     pieces = [
         Piece(place, source, tuple(ways), seed)
@@ -392,7 +395,12 @@ def _known(source: Source, ways: Sequence[Candidate]) -> tuple[Source, list[Cand
     targets = int(np.isfinite(np.asarray(seen.truth_range_m)).sum())
     require("targets", targets, targets > 0, "a scene in which some pixel sees a surface")
     is_lit = seen.signal is not None and seen.background is not None
-    return source, [each for each in ways if is_lit or not each.is_told_the_light]
+    shape = (*seen.shape, seen.acquisition.n_bins)
+    return source, [
+        each
+        for each in ways
+        if each.reduction.fits(shape) and (is_lit or not each.is_told_the_light)
+    ]
 
 
 def _middle(capture: Capture) -> Capture:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from scipy.special import stdtrit
 
 from core.acquisition import Floats, Flux
 from core.experiments import acquiring
@@ -24,7 +25,7 @@ from core.experiments.front import (
 )
 from core.experiments.items import Item, Plot, Scatter, Table
 from core.experiments.likeness import Simulation
-from core.experiments.timing import machine
+from core.experiments.timing import machine, median_interval
 from core.experiments.tradeoff import (
     MERGES,
     Candidate,
@@ -91,10 +92,7 @@ def threaded(sbr: float, signal: float) -> Plan:
 
 def front_items(points: Sequence[Point], tolerance_bins: int = 3) -> Iterator[Item]:
     """The points of each scene and SBR with their front, and the fronts of all pulses."""
-    by_light: dict[tuple[str, float | None], list[Point]] = {}
-    for condition, some in by_condition(points).items():
-        by_light.setdefault(condition[:2], []).extend(some)
-    for (source, sbr), some in by_light.items():
+    for (source, sbr), some in _by_light(points).items():
         fronts = {n: front(each, tolerance_bins) for (_, _, n), each in by_condition(some).items()}
         most = max(by_condition(some).values(), key=len)
         yield _scatter(most, tolerance_bins)
@@ -109,6 +107,14 @@ def front_items(points: Sequence[Point], tolerance_bins: int = 3) -> Iterator[It
                 "",
                 note="Only points that no other one of as many pulses beats.",
             )
+
+
+def _by_light(points: Sequence[Point]) -> dict[tuple[str, float | None], list[Point]]:
+    """Points of one source and SBR, whatever the pulses."""
+    found: dict[tuple[str, float | None], list[Point]] = {}
+    for point in points:
+        found.setdefault((point.source, point.sbr), []).append(point)
+    return found
 
 
 _MILLISECONDS = "Time to reduce and range an image, its light known (ms)"
@@ -165,9 +171,14 @@ def answers(
     reached: Sequence[float],
     tolerance_bins: int = 3,
 ) -> Table:
-    """Both questions for each condition, with how sure the answers are."""
+    """Both questions for each source and SBR, with how sure the answers are.
+
+    Where there are several numbers of pulses, for the one with most to choose from.
+    """
     rows: list[tuple[Any, ...]] = []
-    for (source, sbr, n_pulses), some in by_condition(points).items():
+    for (source, sbr), of_light in _by_light(points).items():
+        some = max(by_condition(of_light).values(), key=len)
+        n_pulses = some[0].n_pulses
         where = (source, _number(sbr), _number(n_pulses))
         for each in within_ms:
             best = best_within(some, each, tolerance_bins)
@@ -253,6 +264,67 @@ _WHAT_IS_TIMED = (
 )
 
 
+def differences(points: Sequence[Point]) -> Table:
+    """What leaving something out, or doing it otherwise, changes: paired with the method as it is.
+
+    Ratios of time are those of the same rounds, differences of degree those of the same seeds.
+    """
+    rows = []
+    for some in by_condition(points).values():
+        plain = {
+            (each.candidate.method, each.candidate.threads): each
+            for each in some
+            if each.candidate == Candidate(each.candidate.method, threads=each.candidate.threads)
+        }
+        for point in some:
+            candidate = point.candidate
+            base = plain.get((candidate.method, None), plain.get((candidate.method, 1)))
+            if base is None or base is point:
+                continue
+            ratio = median_interval(np.divide(point.seconds, base.seconds))
+            light = point.light_ms.value / base.light_ms.value if base.light_ms.value else math.nan
+            rows.append(
+                (
+                    point.source,
+                    _number(point.sbr),
+                    _number(point.n_pulses),
+                    str(candidate),
+                    _interval(ratio, 2),
+                    f"{light:.2f}",
+                    *(_interval(_more_restored(point, base, n), 4) for n in (3, 1)),
+                    f"{(point.peak_bytes - base.peak_bytes) / 1e6:+.1f}",
+                )
+            )
+    degrees = [f"RD, {_bins(n)}, difference [95 %]" for n in (3, 1)]
+    return Table(
+        "differences",
+        "What one change does, against the same method on the whole capture",
+        (
+            "source",
+            "SBR",
+            "pulses",
+            "way",
+            "time, ratio [95 %]",
+            "light, ratio",
+            *degrees,
+            "memory, MB more",
+        ),
+        tuple(rows),
+        note="Paired: ratios of the same rounds of timing, differences on the same seeds.",
+    )
+
+
+def _more_restored(point: Point, base: Point, tolerance_bins: int) -> Interval:
+    """Mean difference of the restoration degree over seeds, with Student's 95 % interval."""
+    more = [
+        (mine.restored[tolerance_bins - 1] - theirs.restored[tolerance_bins - 1]) / mine.targets
+        for mine, theirs in zip(point.scores, base.scores, strict=True)
+    ]
+    mean, count = float(np.mean(more)), len(more)
+    half = float(stdtrit(count - 1, 0.975) * np.std(more, ddof=1) / math.sqrt(count))
+    return Interval(mean, mean - half, mean + half)
+
+
 def points_table(points: Sequence[Point]) -> Table:
     """Everything that was measured, as numbers."""
     ends = ("", ", low", ", high")
@@ -325,8 +397,8 @@ def acquired(
     for each in simulations:
         gates = acquiring.over_gates(each)
         knobs += [
-            (acquiring.PULSES, acquiring.over_pulses(each)),
-            (acquiring.EXPOSURES, acquiring.over_exposures(each)),
+            (acquiring.PULSES, acquiring.over_pulses(each, acquiring.PULSES)),
+            (acquiring.EXPOSURES, acquiring.over_exposures(each, acquiring.EXPOSURES)),
             ([gate.acquisition.n_bins for gate in gates], gates),
         ]
     found = acquiring.sweeps(knobs, seeds=seeds, processes=processes, progress=progress)
@@ -457,24 +529,20 @@ def _interval(found: Interval, digits: int) -> str:
     return f"{found.value:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
 
 
-def write_page(
+def items(
     points: Sequence[Point],
     found: Sequence[Acquiring],
-    questions: Table,
-    folder: Path,
-    introduction: Sequence[str],
+    within_ms: Sequence[float] = WITHIN_MS,
+    reached: Sequence[float] = REACHED,
     tolerance_bins: int = 3,
-) -> Path:
-    """Write everything into a folder; returns the page."""
-    from core.experiments import report  # noqa: PLC0415 - draws, which nothing else here needs
-
-    items = [
-        questions,
+) -> list[Item]:
+    """Everything that is shown: answers first, then pictures, then numbers."""
+    return [
+        answers(points, within_ms, reached, tolerance_bins),
         *front_items(points, tolerance_bins),
         fronts_table(points, tolerance_bins),
+        differences(points),
         *acquiring_items(found),
         points_table(points),
         machine(),
     ]
-    write_settings(points, folder)
-    return report.write(items, folder, "Speed against accuracy", introduction)
