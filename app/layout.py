@@ -254,7 +254,9 @@ class Layout:
 
     def _go_to(self, key: str) -> None:
         if key != self.session.state.source:
-            self.session.state.param.update(source=key, reading=Reading(), less=Less())
+            self.session.state.param.update(
+                source=key, reading=Reading(), less=Less(), absent=frozenset()
+            )
 
     def _tracking_changed(self, settings: TrackingParameters) -> None:
         self._preset.value = _preset_of(settings)

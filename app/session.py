@@ -86,7 +86,7 @@ class Session:
 
     def _watch(self) -> None:
         watch = self.state.param.watch
-        watch(lambda *_: self._ask(), ["source", "light", "reading", "less", "tracking"])
+        watch(lambda *_: self._ask(), ["source", "light", "reading", "less", "absent", "tracking"])
         watch(lambda *_: self._draw_pixel(), ["pixel", "difference"])
         watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
         self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
@@ -110,7 +110,7 @@ class Session:
     def _request(self) -> Request:
         state = self.state
         source = self.sources[state.source]
-        return Request(source, state.light, state.reading, state.tracking, state.less)
+        return Request(source, state.light, state.reading, state.tracking, state.less, state.absent)
 
     def _ask(self) -> None:
         request = self._request()
@@ -160,7 +160,10 @@ class Session:
         if request == self._request():
             with param.discard_events(state):
                 state.param.update(
-                    source=self._key(shown.source), reading=shown.reading, less=shown.less
+                    source=self._key(shown.source),
+                    reading=shown.reading,
+                    less=shown.less,
+                    absent=shown.absent,
                 )
         self._settle(self.answer)
         self.fail(error)

@@ -188,6 +188,9 @@ class State(param.Parameterized):
     light = param.ClassSelector(class_=Light, default=Light())
     reading = param.ClassSelector(class_=Reading, default=Reading())
     less = param.ClassSelector(class_=Less, default=Less())
+    absent = param.ClassSelector(
+        class_=frozenset, default=frozenset(), doc="Parts and corrections that are switched off."
+    )
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
     pixel = param.NumericTuple(default=(31, 24), length=2, doc="Row and column on show.")
     image = param.Selector(default="Estimate", objects=list(IMAGES))

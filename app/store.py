@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -28,7 +28,10 @@ from core import (
     trigger_probability,
 )
 from core.checks import require
+from core.experiments.corrections import without_correction
+from core.experiments.requirement import CORRECTIONS
 from core.posterior import posterior_of
+from core.scene import PARTS, without
 
 MOST_PIXELS = 2**20
 
@@ -40,7 +43,8 @@ class Source:
     """Something to look at: a built-in scene to simulate, or a file to read."""
 
     title: str
-    load: Callable[[Light, Reading], Capture]
+    load: Callable[[Light, Reading, Collection[str]], Capture]
+    """Makes the capture, parts of some names left out of a scene."""
     scene: Callable[[], Scene] | None = None
     """None for a file."""
 
@@ -50,13 +54,21 @@ class Source:
         return self.scene is not None
 
 
+def bare(scene: Scene, absent: Collection[str]) -> Scene:
+    """A scene without those of its parts that are switched off."""
+    for part in PARTS:
+        if part in absent:
+            scene = without(scene, part)
+    return scene
+
+
 def scene_source(title: str, name: str, **arguments: Any) -> Source:
     """A built-in scene of `core.scenes`."""
 
     build = cache(partial(scenes[name], **arguments))
 
-    def load(light: Light, _reading: Reading) -> Capture:
-        scene = build()
+    def load(light: Light, _reading: Reading, absent: Collection[str]) -> Capture:
+        scene = bare(build(), absent)
         return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
     return Source(title, load, build)
@@ -72,7 +84,7 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
         return capture
 
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, lambda _light, reading: get(reading))
+    return Source(title or path.name, lambda _light, reading, _absent: get(reading))
 
 
 def built_in_sources() -> dict[str, Source]:
@@ -100,6 +112,8 @@ class Request:
     reading: Reading
     tracking: TrackingParameters
     less: Less
+    absent: frozenset[str] = frozenset()
+    """Parts of the scene and corrections of the estimators that are switched off."""
 
 
 @dataclass(frozen=True)
@@ -123,21 +137,33 @@ def compute(request: Request, previous: Answer | None) -> Answer:
     """Answer a request; what the previous answer already holds is not computed again."""
     started = perf_counter()
     if previous is None or not same_capture(request, previous.request):
-        whole = request.source.load(request.light, request.reading)
+        whole = request.source.load(request.light, request.reading, request.absent)
     else:
         whole = previous.whole
-    if previous is not None and whole is previous.whole and request.less == previous.request.less:
+    if (
+        previous is not None
+        and whole is previous.whole
+        and _same(request, previous.request, "less", "absent")
+    ):
         capture, capture_s = previous.capture, previous.capture_s
     else:
         capture = request.less.reduction(whole.acquisition.n_bins).of(whole)
+        for name in CORRECTIONS:
+            if name in request.absent:
+                capture = without_correction(capture, name)
         posterior_of(capture)  # what every answer's confidence rests on, whatever the method
         capture_s = perf_counter() - started
     return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole)
 
 
+def same_subject(one: Request, other: Request) -> bool:
+    """Whether both look at the same scene in the same light, or the same file, part or no part."""
+    return _same(one, other, "source", "light", "reading")
+
+
 def same_capture(one: Request, other: Request) -> bool:
     """Whether both look at the same capture, however much of it."""
-    return _same(one, other, "source", "light", "reading")
+    return same_subject(one, other) and one.absent & {*PARTS} == other.absent & {*PARTS}
 
 
 def same_view(one: Request, other: Request) -> bool:

@@ -16,8 +16,9 @@ from app.items import CurveCard, TableCard, layers_of
 from app.method_views import title_of
 from app.pages import Pages, View
 from app.parts import card, part
+from app.requires import Requires
 from app.session import Session
-from app.store import Answer, same_capture
+from app.store import Answer, bare, same_capture
 from app.studies import OnePiece, Work, aside
 from app.theme import LIGHT, method_style, palette
 from app.views import paint_frame, pane_of
@@ -101,6 +102,7 @@ class Tradeoff:
             {
                 "Speed against accuracy": lambda: Ways(session, open_point).view,
                 "How to acquire": lambda: Acquisition(session).view,
+                "What the model needs": lambda: Requires(session).view,
             },
             label="Part of the trade",
             help=trade_words.SECTIONS_HELP,
@@ -394,7 +396,7 @@ def source_of(answer: Answer) -> Source:
     request = answer.request
     if request.source.scene is None:
         return answer.whole
-    scene, light = request.source.scene(), request.light
+    scene, light = bare(request.source.scene(), request.absent), request.light
     acquisition = light.acquisition(scene.acquisition)
     return Simulation(request.source.title, scene, acquisition, light.flux)
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from app.store import Answer, Pixel
+from core.experiments.requirement import TITLES
 
 Fact = tuple[str, str, str]
 """Name, value, and a line of help."""
@@ -110,8 +111,10 @@ def provenance(answer: Answer) -> str:
     acquisition, rows_cols = answer.capture.acquisition, answer.capture.shape
     opens_ns = acquisition.gate_delay_s * 1e9
     closes_ns = opens_ns + acquisition.n_bins * acquisition.bin_width_s * 1e9
+    absent = ", ".join(TITLES[name] for name in TITLES if name in answer.request.absent)
+    switched_off = f" Switched off: {absent}." if absent else ""
     return (
-        f"{answer.capture.source}. {rows_cols[0]} × {rows_cols[1]} pixels, "
+        f"{answer.capture.source}.{switched_off} {rows_cols[0]} × {rows_cols[1]} pixels, "
         f"{acquisition.n_bins} bins of {acquisition.bin_width_s * 1e9:.4g} ns, "
         f"gate {opens_ns:.6g} to {closes_ns:.6g} ns "
         f"({float(acquisition.bin_to_range_m(0)):.6g} to "

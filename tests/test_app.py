@@ -232,9 +232,9 @@ def test_a_file_is_a_source(small_file, small_capture):
     source = file_source(small_file)
     assert source.title == "small.npz"
     assert not source.is_scene
-    read = source.load(Light(), Reading())
+    read = source.load(Light(), Reading(), ())
     np.testing.assert_array_equal(read.cube, small_capture.cube)
-    again = source.load(Light(), Reading(bin_width_s=3e-9))
+    again = source.load(Light(), Reading(bin_width_s=3e-9), ())
     assert again.acquisition.bin_width_s == 3e-9
 
 
