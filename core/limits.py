@@ -12,9 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import ArrayLike
-from scipy.ndimage import map_coordinates
-from scipy.special import exprel, log_ndtr, ndtr
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
@@ -296,7 +295,8 @@ def _right(
     per_bin = background / n_bins
     armed = _armed(echo + per_bin)
 
-    seen = np.vecdot(armed * exprel(-echo - per_bin), echo)  # by one pulse: a first signal photon
+    first = armed * scipy.special.exprel(-echo - per_bin)
+    seen = np.vecdot(first, echo)  # by one pulse: a first signal photon
     chance = _overlap(begin, end, 0.0, n_bins) / n_bins
     ceiling = np.asarray(1 - (1 - seen) ** n_pulses * (1 - chance))
     if n_pulses * background < 1e-6:  # not one background photon in a million pixels
@@ -310,6 +310,7 @@ def _right(
     score = mean[:, np.newaxis] + sd[:, np.newaxis] * SCORES
     noise_mean, noise_sd = moments(per_bin)
     noise = _standard(score, noise_mean[:, np.newaxis], noise_sd[:, np.newaxis])
+    ndtr = scipy.special.ndtr
     below_here = ndtr(SCORES) * ndtr(noise) ** (2 * SAME_PLACE_SPACINGS - 1)
 
     cells = min(MOST_PLACES, math.ceil(n_bins / spacing))
@@ -323,7 +324,7 @@ def _right(
     standard = _standard(
         score[..., np.newaxis], mean[:, np.newaxis], _root(variance)[:, np.newaxis]
     )
-    below_elsewhere = np.exp((log_ndtr(standard) @ rivals[..., np.newaxis])[..., 0])
+    below_elsewhere = np.exp((scipy.special.log_ndtr(standard) @ rivals[..., np.newaxis])[..., 0])
 
     middle = (below_elsewhere[:, 1:] + below_elsewhere[:, :-1]) / 2
     return np.asarray(np.minimum(np.vecdot(np.diff(below_here, axis=-1), middle), ceiling))
@@ -360,4 +361,4 @@ def _interpolated(
         np.interp(np.log(signal), logs, np.arange(logs.size)),
         np.interp(onset, onsets, np.arange(onsets.size)),
     ]
-    return np.asarray(map_coordinates(table, at, order=1, mode="nearest"))
+    return np.asarray(scipy.ndimage.map_coordinates(table, at, order=1, mode="nearest"))
