@@ -23,6 +23,7 @@ from core.commands.options import (
     whole_from_to,
 )
 from core.experiments import tradeoff_page as page
+from core.experiments import tradeoff_plan as plans
 from core.experiments.front import with_light
 from core.experiments.items import Table, as_markdown
 from core.experiments.likeness import Simulation, like, window
@@ -88,6 +89,11 @@ def add(commands: Any) -> None:
 def _tradeoff(chosen: argparse.Namespace) -> None:
     from core.experiments import report  # noqa: PLC0415 - draws, which nothing else here needs
 
+    for milliseconds in chosen.within:
+        require("within", milliseconds, milliseconds > 0, "milliseconds above 0")
+    for rd in chosen.reach:
+        require("reach", rd, 0 < rd <= 1, "a share of the targets, above 0 and up to 1")
+    chosen.folder.mkdir(parents=True, exist_ok=True)  # before the work, not behind it
     plan, simulations = _of_capture(chosen) if chosen.capture else _of_scenes(chosen)
     seeds = range(chosen.seeds or (3 if chosen.short else 8))
     points = study(
@@ -116,7 +122,7 @@ def _tradeoff(chosen: argparse.Namespace) -> None:
     print(report.write(items, chosen.folder, "Speed against accuracy", introduction))
 
 
-def _of_scenes(chosen: argparse.Namespace) -> tuple[page.Plan, list[Simulation]]:
+def _of_scenes(chosen: argparse.Namespace) -> tuple[plans.Plan, list[Simulation]]:
     """What is studied of built-in scenes, and what is acquired of them."""
     told = {name: getattr(chosen, name) for name in READING_NAMES if name != "n_pulses"}
     for name, value in told.items():
@@ -125,17 +131,17 @@ def _of_scenes(chosen: argparse.Namespace) -> tuple[page.Plan, list[Simulation]]
     names = chosen.scene or (SHORT_SCENES if chosen.short else SCENES)
     sbrs = chosen.sbr or (SHORT_SBRS if chosen.short else SBRS)
     simulations = [
-        page.simulated(name, sbr, signal, chosen.n_pulses) for name in names for sbr in sbrs
+        plans.simulated(name, sbr, signal, chosen.n_pulses) for name in names for sbr in sbrs
     ]
-    plan: page.Plan = []
+    plan: plans.Plan = []
     for each in simulations:
-        plan += [(each, page.around(each))] if chosen.short else page.over_pulses(each)
+        plan += [(each, plans.around(each))] if chosen.short else plans.over_pulses(each)
     if not chosen.short:
-        plan += page.threaded(sbrs[-1], signal)
+        plan += plans.threaded(sbrs[-1], signal)
     return plan, simulations
 
 
-def _of_capture(chosen: argparse.Namespace) -> tuple[page.Plan, list[Simulation]]:
+def _of_capture(chosen: argparse.Namespace) -> tuple[plans.Plan, list[Simulation]]:
     """What is studied of a file, and what is acquired of a simulation like it."""
     for name in ("sbr", "ppp"):
         told = getattr(chosen, name)
@@ -149,7 +155,7 @@ def _of_capture(chosen: argparse.Namespace) -> tuple[page.Plan, list[Simulation]
         simulation = like(source, source.source)
     else:
         around, simulation = source.window, source
-    plan: page.Plan = [(source, candidates() + variations(window=around))]
+    plan: plans.Plan = [(source, candidates() + variations(window=around))]
     return plan, [simulation] if capture.armed_pulses else []
 
 

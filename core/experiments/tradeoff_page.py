@@ -1,4 +1,4 @@
-"""What the trade looks like: its plan for some scenes, its pictures, its tables, its answers."""
+"""What the trade looks like: its answers, its pictures, its tables."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from scipy.special import stdtrit
 
-from core.acquisition import Floats, Flux
+from core.acquisition import Floats
 from core.experiments import acquiring
 from core.experiments.acquiring import Sweep
 from core.experiments.front import (
@@ -26,81 +25,46 @@ from core.experiments.front import (
 from core.experiments.items import Item, Plot, Scatter, Table
 from core.experiments.likeness import Simulation
 from core.experiments.timing import machine, median_interval
-from core.experiments.tradeoff import (
-    MERGES,
-    Candidate,
-    Point,
-    Source,
-    candidates,
-    variations,
-)
-from core.experiments.trials import as_they_come
+from core.experiments.tradeoff import Candidate, Point
 from core.metrics import Interval
-from core.scene import scenes
 
-PULSES = (50, 100, 200, 500, 1000, 2000, 5000, 10_000)
-MERGED_AT = (100, 10_000)
-"""Numbers of pulses, besides the scene's own, with which bins are merged, too."""
 WITHIN_MS = (2.0, 5.0, 10.0, 20.0, 50.0)
 REACHED = (0.5, 0.9, 0.95, 0.99, 0.999)
-THREADED = ("tracking", "likelihood")
-THREADED_SIZE = 256
-"""Rows and columns of the image on which threads are tried: of smaller ones kernels use one."""
-
-Plan = list[tuple[Source, Sequence[Candidate]]]
 
 
-def simulated(scene: str, sbr: float, signal: float, n_pulses: int | None = None) -> Simulation:
-    """A built-in scene; with its own number of pulses where none is given."""
-    built = scenes[scene]()
-    simulation = Simulation(scene, built, built.acquisition, Flux(signal, sbr))
-    return simulation if n_pulses is None else simulation.with_pulses(n_pulses)
-
-
-def around(simulation: Simulation) -> list[Candidate]:
-    """Everything that is tried on a scene at its own number of pulses."""
-    return candidates() + variations(window=simulation.window)
-
-
-def over_pulses(simulation: Simulation) -> Plan:
-    """Every method at every number of pulses; with bins merged at some; all there is at its own."""
-    own = simulation.acquisition.n_pulses
-    plan: Plan = []
-    for n_pulses in sorted({*PULSES, *([own] if own else [])}):
-        ways = candidates(merges=MERGES if n_pulses in MERGED_AT else (1,))
-        plan.append(
-            (simulation.with_pulses(n_pulses), around(simulation) if n_pulses == own else ways)
-        )
-    return plan
-
-
-def threaded(sbr: float, signal: float) -> Plan:
-    """A large car, by 1 thread and by more."""
-    built = scenes["car"](THREADED_SIZE)
-    name = f"car, {THREADED_SIZE} x {THREADED_SIZE}"
-    ways = [
-        Candidate(method, threads=n)
-        for method in as_they_come()
-        if method.name in THREADED
-        for n in range(1, numba.config.NUMBA_NUM_THREADS + 1)
+def items(
+    points: Sequence[Point],
+    found: Sequence[Acquiring],
+    within_ms: Sequence[float] = WITHIN_MS,
+    reached: Sequence[float] = REACHED,
+    tolerance_bins: int = 3,
+) -> list[Item]:
+    """Everything that is shown: answers first, then pictures, then numbers."""
+    return [
+        answers(points, within_ms, reached, tolerance_bins),
+        *front_items(points, tolerance_bins),
+        fronts_table(points, tolerance_bins),
+        differences(points),
+        *acquiring_items(found),
+        points_table(points),
+        machine(),
     ]
-    return [(Simulation(name, built, built.acquisition, Flux(signal, sbr)), ways)]
 
 
 # -- the front -------------------------------------------------------------------------------------
 
 
 def front_items(points: Sequence[Point], tolerance_bins: int = 3) -> Iterator[Item]:
-    """The points of each scene and SBR with their front, and the fronts of all pulses."""
-    for (source, sbr), some in _by_light(points).items():
+    """The points of each source and SBR with their front, and the fronts of all pulses."""
+    for some in _by_light(points):
+        yield _scatter(_fullest(some), tolerance_bins)
         fronts = {n: front(each, tolerance_bins) for (_, _, n), each in by_condition(some).items()}
-        most = max(by_condition(some).values(), key=len)
-        yield _scatter(most, tolerance_bins)
         if len(fronts) > 1:
+            source, sbr, _ = some[0].condition
             yield Scatter(
                 _key("fronts", source, sbr),
-                f"{_told(source, sbr)}: the fronts of other numbers of pulses",
-                _MILLISECONDS,
+                f"{_told(source, sbr)}: the fronts of all numbers of pulses",
+                _time_label(some),
                 _missed_label(tolerance_bins),
                 {f"{n} pulses": _places(each, tolerance_bins) for n, each in fronts.items()},
                 (np.empty(0), np.empty(0), ()),
@@ -109,15 +73,23 @@ def front_items(points: Sequence[Point], tolerance_bins: int = 3) -> Iterator[It
             )
 
 
-def _by_light(points: Sequence[Point]) -> dict[tuple[str, float | None], list[Point]]:
-    """Points of one source and SBR, whatever the pulses."""
+def _by_light(points: Sequence[Point]) -> list[list[Point]]:
+    """Points by source and SBR, whatever the pulses."""
     found: dict[tuple[str, float | None], list[Point]] = {}
     for point in points:
         found.setdefault((point.source, point.sbr), []).append(point)
-    return found
+    return list(found.values())
 
 
-_MILLISECONDS = "Time to reduce and range an image, its light known (ms)"
+def _fullest(points: Sequence[Point]) -> list[Point]:
+    """Those of the number of pulses with most to choose from."""
+    return max(by_condition(points).values(), key=len)
+
+
+def _time_label(points: Sequence[Point]) -> str:
+    if any(point.light_ms.value for point in points):
+        return "Time to reduce and range an image, its light known (ms)"
+    return "Time to reduce an image, find its light and range it (ms)"
 
 
 def _missed_label(tolerance_bins: int) -> str:
@@ -139,7 +111,7 @@ def _scatter(points: Sequence[Point], tolerance_bins: int) -> Scatter:
     return Scatter(
         _key("front", source, sbr, n_pulses),
         f"{_told(source, sbr)}, {_pulses(n_pulses)}: what each way costs, how often it errs",
-        _MILLISECONDS,
+        _time_label(points),
         _missed_label(tolerance_bins),
         {name: _places(some, tolerance_bins) for name, some in groups.items()},
         (x[0], y[0], [str(point.candidate) for point in chosen]),
@@ -171,15 +143,10 @@ def answers(
     reached: Sequence[float],
     tolerance_bins: int = 3,
 ) -> Table:
-    """Both questions for each source and SBR, with how sure the answers are.
-
-    Where there are several numbers of pulses, for the one with most to choose from.
-    """
+    """Both questions for each source and SBR, with how sure the answers are."""
     rows: list[tuple[Any, ...]] = []
-    for (source, sbr), of_light in _by_light(points).items():
-        some = max(by_condition(of_light).values(), key=len)
-        n_pulses = some[0].n_pulses
-        where = (source, _number(sbr), _number(n_pulses))
+    for some in map(_fullest, _by_light(points)):
+        where = _where(some[0])
         for each in within_ms:
             best = best_within(some, each, tolerance_bins)
             rows.append((*where, f"best within {each:g} ms", *_answer(best, tolerance_bins)))
@@ -190,9 +157,7 @@ def answers(
         "answers",
         "Which way to take",
         (
-            "source",
-            "SBR",
-            "pulses",
+            *_WHERE,
             "asked",
             "answer",
             "ms",
@@ -234,9 +199,7 @@ def fronts_table(points: Sequence[Point], tolerance_bins: int = 3) -> Table:
     """The fronts of all conditions, as people read them."""
     rows = tuple(
         (
-            point.source,
-            _number(point.sbr),
-            _number(point.n_pulses),
+            *_where(point),
             str(point.candidate),
             _interval(point.milliseconds, 2),
             f"{point.light_ms.value:.1f}",
@@ -251,26 +214,23 @@ def fronts_table(points: Sequence[Point], tolerance_bins: int = 3) -> Table:
     )
     intervals = ("RD, 3 bins [95 %]", "RD, 1 bin [95 %]", "RMSE, m [95 %]")
     costs = ("ms [95 %]", "light, ms", "ns per pixel and bin")
-    columns = ("source", "SBR", "pulses", "way", *costs, *intervals, "peak memory, MB")
+    columns = (*_WHERE, "way", *costs, *intervals, "peak memory, MB")
     return Table("fronts", "What no other way beats", columns, rows, note=_WHAT_IS_TIMED)
 
 
 _WHAT_IS_TIMED = (
     "Milliseconds are those of reducing the capture and ranging it, the light that it tells of "
     "being known (a capture keeps it); finding that light, once for each capture, stands beside "
-    "them. Memory is what numpy holds at most meanwhile, beyond the capture. Errors are those of "
+    "them, or is counted in and stands as 0. Memory is what numpy holds at most meanwhile, beyond the capture. Errors are those of "
     "the whole image at the capture's own bin width: pixels that are left out take their "
     "neighbour's answer."
 )
 
 
 def differences(points: Sequence[Point]) -> Table:
-    """What leaving something out, or doing it otherwise, changes: paired with the method as it is.
-
-    Ratios of time are those of the same rounds, differences of degree those of the same seeds.
-    """
+    """What leaving something out, or doing it otherwise, changes of a method; paired."""
     rows = []
-    for some in by_condition(points).values():
+    for some in map(_fullest, _by_light(points)):
         plain = {
             (each.candidate.method, each.candidate.threads): each
             for each in some
@@ -285,9 +245,7 @@ def differences(points: Sequence[Point]) -> Table:
             light = point.light_ms.value / base.light_ms.value if base.light_ms.value else math.nan
             rows.append(
                 (
-                    point.source,
-                    _number(point.sbr),
-                    _number(point.n_pulses),
+                    *_where(point),
                     str(candidate),
                     _interval(ratio, 2),
                     f"{light:.2f}",
@@ -299,16 +257,7 @@ def differences(points: Sequence[Point]) -> Table:
     return Table(
         "differences",
         "What one change does, against the same method on the whole capture",
-        (
-            "source",
-            "SBR",
-            "pulses",
-            "way",
-            "time, ratio [95 %]",
-            "light, ratio",
-            *degrees,
-            "memory, MB more",
-        ),
+        (*_WHERE, "way", "time, ratio [95 %]", "light, ratio", *degrees, "memory, MB more"),
         tuple(rows),
         note="Paired: ratios of the same rounds of timing, differences on the same seeds.",
     )
@@ -333,9 +282,7 @@ def points_table(points: Sequence[Point]) -> Table:
     ]
     rows = [
         (
-            point.source,
-            _number(point.sbr),
-            _number(point.n_pulses),
+            *_where(point),
             str(point.candidate),
             *_ends(point.milliseconds),
             *_ends(point.rd(3)),
@@ -352,7 +299,7 @@ def points_table(points: Sequence[Point]) -> Table:
     return Table(
         "points",
         "Everything that was measured",
-        ("source", "SBR", "pulses", "way", *measured, *more),
+        (*_WHERE, "way", *measured, *more),
         tuple(rows),
         note="points.json, beside this page, holds the settings that make each of them again.",
     )
@@ -427,7 +374,7 @@ def acquiring_items(found: Sequence[Acquiring]) -> Iterator[Item]:
             {f"as it is: {bins}": float(bins)},
         )
     if found:
-        yield needed(found)
+        yield _needed(found)
 
 
 _SAID = {
@@ -458,7 +405,7 @@ def _curves(
     )
 
 
-def needed(found: Sequence[Acquiring]) -> Table:
+def _needed(found: Sequence[Acquiring]) -> Table:
     """Pulses with which each degree of `REACHED` is reached."""
     rows = []
     for each in found:
@@ -521,28 +468,16 @@ def _pulses(n_pulses: int | None) -> str:
     return "pulses not known" if n_pulses is None else f"{n_pulses} pulses"
 
 
+_WHERE = ("source", "SBR", "pulses")
+
+
+def _where(point: Point) -> tuple[str, str, str]:
+    return point.source, _number(point.sbr), _number(point.n_pulses)
+
+
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _interval(found: Interval, digits: int) -> str:
     return f"{found.value:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
-
-
-def items(
-    points: Sequence[Point],
-    found: Sequence[Acquiring],
-    within_ms: Sequence[float] = WITHIN_MS,
-    reached: Sequence[float] = REACHED,
-    tolerance_bins: int = 3,
-) -> list[Item]:
-    """Everything that is shown: answers first, then pictures, then numbers."""
-    return [
-        answers(points, within_ms, reached, tolerance_bins),
-        *front_items(points, tolerance_bins),
-        fronts_table(points, tolerance_bins),
-        differences(points),
-        *acquiring_items(found),
-        points_table(points),
-        machine(),
-    ]

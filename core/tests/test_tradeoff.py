@@ -517,12 +517,14 @@ def test_the_command_studies_a_capture(
         (["--scene", "car", "--bin-width", "1ns"], "--bin-width = 1e-09 is not accepted"),
         (["--capture", "x.npz", "--sbr", "0.1"], "sbr = [0.1] is not accepted"),
         (["--sbr", "-1"], "sbr = -1.0 is not accepted"),
+        (["--within", "0"], "within = 0.0 is not accepted"),
+        (["--reach", "1.2"], "reach = 1.2 is not accepted"),
     ],
 )
 def test_the_command_refuses_what_does_not_fit(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["tradeoff", *arguments]) == 2
+    assert main(["tradeoff", "--folder", str(tmp_path), *arguments]) == 2
     assert said in capsys.readouterr().err
 
 
