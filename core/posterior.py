@@ -29,6 +29,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
+from scipy.special import logsumexp
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.blocks import LANES, lane_rows, to_blocks
@@ -310,7 +311,7 @@ def posterior_of(capture: Capture) -> Posterior:
     n_blocks, n_bins, _ = prepared.counts.shape
     near = np.empty((n_blocks, LANES, n_bins), np.float32)
     surface = np.empty((n_blocks, LANES))
-    for some, density, top in _densities(prepared):
+    for some, density, top, _ in _densities(prepared):
         # What lies before each delay, from so many bins before the gate to so many behind it.
         before = np.zeros((len(top), n_bins + 2 * TOLERANCE_BINS + 1, LANES), np.float32)
         behind = TOLERANCE_BINS + n_bins
@@ -362,13 +363,16 @@ def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Flo
     """
     prepared = _prepare(capture, capture.cube, light, steps_per_bin)
     delay, score = np.empty((2, prepared.counts.shape[0], LANES))
-    for some, density, top in _densities(prepared):
+    for some, density, top, weighted in _densities(prepared):
         at = density.argmax(axis=1)[:, np.newaxis]
         last = density.shape[1] - 1
         around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
-        # A neighbour of density 0 has a logarithm too, far below.
-        log = np.log(np.maximum(np.take_along_axis(density, around, axis=1), 1e-30))
-        left, middle, right = log.astype(float).transpose(1, 0, 2)
+        # Not of the density: beside an echo of many photons that is 0, and has no logarithm.
+        log = logsumexp(
+            np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float), axis=1
+        )
+        log += np.log(prepared.depth[around]) - top[:, np.newaxis]
+        left, middle, right = log.transpose(1, 0, 2)
         curvature = np.minimum(left - 2 * middle + right, -1e-9)
         inside = (at[:, 0] > 0) & (at[:, 0] < last)
         shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
@@ -405,6 +409,9 @@ def rate_and_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Flo
     return np.asarray(-np.log1p(-np.minimum(fired, most))), np.maximum(armed, 0.0)
 
 
+_DARKEST = 1e-100  # photons: with none at all one count would outweigh every other, without end
+
+
 def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
     """``T(d)`` of the module's docstring at each bin's beginning, as written.
 
@@ -421,7 +428,7 @@ def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
     n_bins = acquisition.n_bins
     echo = conditions.pulse.bin_probability(np.arange(n_bins), n_bins, acquisition.bin_width_s)
     s = np.asarray(conditions.signal)[..., np.newaxis, np.newaxis] * echo
-    b = np.asarray(conditions.background)[..., np.newaxis, np.newaxis] / n_bins
+    b = np.maximum(conditions.background, _DARKEST)[..., np.newaxis, np.newaxis] / n_bins
     if n_pulses is None:
         gain, unfired = np.log1p(s / b), np.ones_like(histogram)
     else:
@@ -499,7 +506,9 @@ def _level_densities(prepared: _Prepared) -> NDArray[np.float32]:
     return density.reshape(-1, *log.shape[1:3])[: prepared.n_pixels]
 
 
-def _densities(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32], Floats]]:
+def _densities(
+    prepared: _Prepared,
+) -> Iterator[tuple[slice, NDArray[np.float32], Floats, NDArray[np.float32]]]:
     """Likelihood of each delay over that of no echo, all levels of signal weighted.
 
     Yields
@@ -508,15 +517,17 @@ def _densities(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32]
     density : ndarray, shape (block, delay, LANES)
         In units of ``exp(top)``.
     top : ndarray, shape (block, LANES)
+    weighted : ndarray, shape (block, level, delay, LANES)
+        Logarithms that the density is made of, level by level, `Light.depth` left out.
     """
     weight = prepared.log_share[1:, np.newaxis, np.newaxis].astype(np.float32)
     for some, log in _log_likelihoods(prepared):
-        weighted = log[:, 1:] + weight
+        weighted = np.add(log[:, 1:], weight, out=log[:, 1:])
         top = weighted.max(axis=(1, 2), keepdims=True)
-        weighted -= top
-        density = np.exp(weighted, out=weighted).sum(axis=1)
+        part = weighted - top
+        density = np.exp(part, out=part).sum(axis=1)
         density *= prepared.depth[:, np.newaxis]
-        yield some, density, top[:, 0, 0].astype(float)
+        yield some, density, top[:, 0, 0].astype(float), weighted
 
 
 def _log_likelihoods(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32]]]:
