@@ -148,6 +148,23 @@ class Pulse:
         t *= decay
         return np.asarray(np.subtract(1.0, t))
 
+    def density(self, time_s: ArrayLike) -> Floats:
+        """Photons per second at `time_s` (any shape) after time zero: the slope of `cdf`.
+
+        Where a measured pulse steps from one sample to the next it is that of the sample before.
+        """
+        t = np.divide(time_s, self.tau_s)
+        if self.shape == "gaussian":
+            share = np.exp(-0.5 * t * t) / math.sqrt(2 * math.pi)
+        elif self.shape == "measured":
+            samples = np.concatenate([[0.0], self.samples, [0.0]])
+            at = np.clip(np.ceil(t), 0, samples.size - 1).astype(np.intp)
+            share = samples[at] / samples.sum()
+        else:
+            t = np.maximum(t, 0.0)
+            share = t * np.exp(-t)
+        return np.asarray(share / self.tau_s)
+
     @cached_property
     def span_s(self) -> tuple[float, float]:
         """Times after time zero by which a tenth and nine tenths of the photons have arrived."""
@@ -182,7 +199,8 @@ class Pulse:
         first : int
             The bin of the first tap.
         """
-        first = math.floor(max(self.quantile_s(1e-3) / bin_width_s, -n_bins))
+        # In a gate that closes before that much has arrived, its last bin is what there is to see.
+        first = math.floor(min(max(self.quantile_s(1e-3) / bin_width_s, -n_bins), n_bins - 1))
         end = math.ceil(min(self.quantile_s(1 - 1e-3) / bin_width_s, n_bins)) + 1
         delay = np.asarray(delay_bin, float) - first
         return self.bin_probability(delay, end - first, bin_width_s), first

@@ -282,9 +282,13 @@ def common_weight(n_bins: int, parameters: TrackingParameters) -> Floats:
     bins = np.arange(n_bins)
     rise = (bins / n_bins) ** 3
     if parameters.weight == "cubic":
-        weight = parameters.alpha * rise
+        # A strength that has lost its digits would give its shape to the weight: it is none.
+        weight = (parameters.alpha if parameters.alpha >= np.finfo(float).tiny else 0.0) * rise
     elif parameters.weight == "exponential":
-        weight = np.exp(np.minimum(parameters.alpha * rise, 600.0))  # times a count, still finite
+        # Where it spans more than float32 does, the last bins win, as they should, and the others
+        # are still something; times a count it is finite.
+        power = parameters.alpha * rise
+        weight = np.exp(np.maximum(power, power[-1] - 60.0) - max(power[-1] - 600.0, 0.0))
     else:
         weight = np.ones(n_bins)
     return np.where(bins >= parameters.t_n, weight, 0.0)

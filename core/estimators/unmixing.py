@@ -297,7 +297,7 @@ def smoothed(values: Floats, precision: Floats, smoothness: float) -> Floats:
     for _ in range(_STEPS):
         flow[0, :-1] += step * np.diff(ahead, axis=0)
         flow[1, :, :-1] += step * np.diff(ahead, axis=1)
-        flow /= np.maximum(1.0, np.hypot(*flow) / smoothness)
+        flow *= smoothness / np.maximum(smoothness, np.hypot(*flow))
         spread = -flow.sum(axis=0)  # the negative divergence
         spread[1:] += flow[0, :-1]
         spread[:, 1:] += flow[1, :, :-1]
