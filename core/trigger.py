@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.checks import require
@@ -62,6 +62,26 @@ def trigger_probability(rate: ArrayLike) -> Floats:
 def no_trigger_probability(rate: ArrayLike) -> Floats:
     """Probability that a pulse triggers nowhere in the gate, ``exp(-Σ λ)``; shape (...)."""
     return np.asarray(np.exp(-_checked_rate(rate).sum(axis=-1)))
+
+
+def drawn(
+    rate: ArrayLike, n_pulses: int | None, rng: np.random.Generator
+) -> NDArray[np.unsignedinteger]:
+    """Histograms drawn from rates, shape (..., bin): the multinomial of Eq. 1.
+
+    Parameters
+    ----------
+    rate : array_like, shape (..., bin)
+        As for `trigger_probability`; where `n_pulses` is None, photons expected in each bin.
+    n_pulses : int or None
+        Pulses sent; where None, counts are Poisson.
+    """
+    if n_pulses is None:
+        return rng.poisson(np.asarray(rate, float)).astype(np.uint32)
+    chance = trigger_probability(rate)
+    none = np.maximum(1 - chance.sum(axis=-1, keepdims=True), 0)
+    counts = rng.multinomial(n_pulses, np.concatenate([chance, none], axis=-1))
+    return counts[..., :-1].astype(np.uint16 if n_pulses < 2**16 else np.uint32)
 
 
 def first_difference(probability: ArrayLike) -> Floats:

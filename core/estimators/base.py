@@ -16,7 +16,7 @@ from core.capture import Capture, once_per_capture
 from core.parameters import Number
 from core.posterior import Conditions, Light
 from core.spatial import pooled, pooled_at
-from core.trigger import rate_per_bin, trigger_probability
+from core.trigger import drawn, rate_per_bin, trigger_probability
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,9 +321,4 @@ def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     pixels = _null_pixels(capture)
     background = posterior.light_of(capture).of_pixels(pixels).typical_background
     rate = np.repeat(background[..., np.newaxis] / n_bins, n_bins, axis=2)
-    if n_pulses is None:
-        return rng.poisson(rate).astype(np.uint32)
-    chance = trigger_probability(rate)
-    none = 1 - chance.sum(axis=2, keepdims=True)
-    drawn = rng.multinomial(n_pulses, np.concatenate([chance, np.maximum(none, 0)], axis=2))
-    return drawn[..., :-1].astype(np.uint16 if n_pulses < 2**16 else np.uint32)
+    return drawn(rate, n_pulses, rng)

@@ -70,20 +70,24 @@ def levels_apart(capture: Capture) -> Difference:
     return Difference(*(np.repeat(each, pixels) for each in level_differences(lighting, capture)))
 
 
-def answers_m(capture: Capture, method: str) -> Floats:
-    """Ranges by a method's defaults, shape (row, col); NaN where there is none."""
+def delays(capture: Capture, method: str) -> Floats:
+    """A method's answers by its defaults, in fractional bins; shape (row, col)."""
     estimator = ESTIMATORS[method]
-    bins, _ = estimator.delays(capture, estimator.parameters())
-    return capture.acquisition.bin_to_range_m(bins)
+    return estimator.delays(capture, estimator.parameters())[0]
 
 
-def score(range_m: Floats, capture: Capture) -> tuple[float, float]:
-    """Restoration degree within 3 bins, and RMSE in metres."""
-    truth_m, tolerance_m = capture.truth_range_m, TOLERANCE_BINS * capture.acquisition.bin_length_m
-    if truth_m is None:
-        raise ValueError("truth_range_m = None is not accepted: give a capture with a truth.")
-    rd = metrics.restoration_degree(range_m, truth_m, tolerance_m)
-    return rd, metrics.rmse_m(range_m, truth_m)
+def answers_m(capture: Capture, method: str) -> Floats:
+    """The same as ranges, NaN where there is none."""
+    return capture.acquisition.bin_to_range_m(delays(capture, method))
+
+
+def score(range_m: Floats, truth_m: Floats, capture: Capture) -> tuple[float, float]:
+    """Restoration degree within 3 bins, and RMSE in metres, of answers to some of its pixels."""
+    tolerance_m = TOLERANCE_BINS * capture.acquisition.bin_length_m
+    return (
+        metrics.restoration_degree(range_m, truth_m, tolerance_m),
+        metrics.rmse_m(range_m, truth_m),
+    )
 
 
 def changes(with_it: Floats, without_it: Floats) -> tuple[Interval, Interval]:

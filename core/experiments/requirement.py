@@ -137,7 +137,7 @@ def _verdict_on_part(apart: Difference, rd: Interval, rmse: Interval) -> tuple[V
         return "needed", "single histograms hardly show it, but answers move"
     if apart.is_hidden:
         return "not needed", _HIDDEN
-    if all(-1 <= each.low and each.high <= 1 for each in changes):
+    if all(each.low >= -1 and each.high <= 1 for each in changes):
         return "not needed", f"{shown}, and answers stay"
-    unknown = "no truth says which answers are better"
+    unknown = "how far answers move is not known"
     return "cannot tell", f"{shown}, and {unknown if math.isnan(rd.value) else _VARIES}"

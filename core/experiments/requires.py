@@ -63,7 +63,7 @@ def requirements(
     require("method", method, method in ESTIMATORS, " or ".join(map(repr, ESTIMATORS)))
     rows: list[Callable[[], Requirement]]
     if isinstance(seen, Capture):
-        rows = [partial(judge, seen, method) for judge in capture_parts.JUDGES]
+        rows = capture_parts.rows(seen, method)
     else:
         require("seeds", seeds, len(seeds) >= 2, "at least 2 of them")
         gate = acquisition or seen.acquisition
@@ -117,8 +117,9 @@ class _Study:
 
     def scored(self, captures: Sequence[Capture]) -> Floats:
         """`corrections.score` of each capture, shape (capture, 2)."""
-        answers = ((each, corrections.answers_m(each, self.method)) for each in captures)
-        return np.array([corrections.score(range_m, each) for each, range_m in answers])
+        truth_m = np.asarray(self.scene.range_m, float)
+        answers = ((corrections.answers_m(each, self.method), each) for each in captures)
+        return np.array([corrections.score(found_m, truth_m, each) for found_m, each in answers])
 
     def apart(self, other: _Study) -> Difference:
         """The models of one pulse, compared pixel by pixel."""
