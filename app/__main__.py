@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = {f"path {n}": file_source(p, shared=True) for n, p in enumerate(chosen.captures)}
     for source in given.values():
         try:
-            print(source.load(Light(), Reading()).source, flush=True)
+            print(source.load(Light(), Reading(), ()).source, flush=True)
         except core.CaptureError as error:
             parser.error(str(error))
     sources = given | built_in_sources()

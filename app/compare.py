@@ -106,6 +106,18 @@ class Compare:
         """The page."""
         return View(self._main(), self._aside(), self._show, self._follow, self._paint)
 
+    def pick(self, method: str, settings: Any) -> None:
+        """Have a method among those compared, with these settings."""
+        self._settings[method] = settings
+        if method in self._own:
+            self._own[method].show(settings)
+        if method in self._picks.value:
+            self._picked()
+        else:
+            self._picks.value = [
+                each for each in ESTIMATORS if each in (*self._picks.value, method)
+            ]
+
     # Controls and views
 
     def _make_controls(self) -> None:
@@ -125,10 +137,14 @@ class Compare:
             "only where its score exceeds what noise alone would show. 1 answers all.",
         )
         self._false_alarm.param.watch(lambda _: self._refresh(), "value")
-        self._panels = {
-            method: part(each.title, self._panel(method).layout, is_open=False)
+        self._own = {
+            method: self._panel(method)
             for method, each in ESTIMATORS.items()
             if method != "tracking" and fields(each.parameters)
+        }
+        self._panels = {
+            method: part(ESTIMATORS[method].title, panel.layout, is_open=False)
+            for method, panel in self._own.items()
         }
         self._view_panel = SettingsPanel(self._viewing, self._viewing_changed)
         self._kind = pmui.RadioButtonGroup(

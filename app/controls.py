@@ -133,8 +133,10 @@ class Table(JSComponent):
         default=[],
         doc="""Of each row a dict of ``name``, ``note`` on it, ``color`` and ``dash`` of its line,
         ``cells`` of text, value to sort by and a smaller second line, a ``message`` in place of
-        cells, and ``last``: whether it stays below the others.""",
+        cells, and ``last``: whether it stays below the others. One with an ``action`` has a button
+        of that name, which reports the row's ``key``.""",
     )
+    acted = param.List(default=[], doc="Key of the row whose button was pressed, and when.")
 
     _esm = Path(__file__).with_name("table.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("table.css")]

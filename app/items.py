@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import panel as pn
+import panel_material_ui as pmui
 from bokeh.events import Tap
 from bokeh.models import Range1d
 
 from app import plots
-from app.controls import Knob, Sentence
+from app.controls import Knob, Sentence, Table
 from app.looks import Look
 from app.method_views import TITLES, ScaleBar
 from app.paper_words import (
     COLUMN_HELP,
-    COMPUTING,
     OUTSIDE_NOTE,
     PLACE_HELP,
     RECONSTRUCTION,
@@ -25,7 +25,7 @@ from app.paper_words import (
 from app.parts import card
 from app.theme import LIGHT, RANGE_COLORS, Palette
 from app.views import Layers, paint_frame, pane_of, round_up
-from app.words import number
+from app.words import COMPUTING, number
 from core.experiments import items
 from core.parameters import Number
 
@@ -45,13 +45,13 @@ class CurveCard:
 
     Parameters
     ----------
-    across : Range1d
-        The horizontal axis, that of several plots above each other.
+    across : Range1d, optional
+        The horizontal axis, that of several plots above each other; its own where None.
     waiting : str
         Shown until there is something to show.
     """
 
-    def __init__(self, across: Range1d, waiting: str = "") -> None:
+    def __init__(self, across: Range1d | None = None, waiting: str = "") -> None:
         self._across = across
         self._note = Sentence(text=waiting, sizing_mode="stretch_width", margin=(2, 10, 6, 10))
         self._plot: Layers | None = None
@@ -65,10 +65,10 @@ class CurveCard:
         return self._plot and self._plot.figure
 
     def show(self, item: items.Plot) -> None:
-        """Draw curves; the same ones each time, with other values."""
-        self._item = item
-        if self._plot is None:
+        """Draw curves; those of the same names are only given other values."""
+        if self._plot is None or self._item is None or _names(item) != _names(self._item):
             self._plot = self._built(item)
+        self._item = item
         figure = self._plot.figure
         low, high = (
             round_up(1.1 * max(float(np.nanmax(sign * curve, initial=0.0)) for curve in curves))
@@ -77,7 +77,9 @@ class CurveCard:
         if (-low, high) != (figure.y_range.start, figure.y_range.end):
             figure.y_range.update(start=-low, end=high, reset_start=-low, reset_end=high)
         for name, values in item.curves.items():
-            self._plot.write(name, **{"top" if name == plots.BARS else "y": values})
+            self._plot.write(name, **{"x": item.x, "top" if name == plots.BARS else "y": values})
+        for name, (below, above) in item.bands.items():
+            self._plot.write(f"{name} band", x=item.x, y1=below, y2=above)
         for name, place in item.marks.items():
             x, y = plots.marker_line(place, high, -low)
             self._plot.write(name, x=x, y=y)
@@ -96,14 +98,41 @@ class CurveCard:
                 glyph.update(fill_color=color, line_color=color)
             else:
                 glyph.update(line_color=color, line_dash=dash)
+            if name in self._item.bands:
+                self._plot.layers[f"{name} band"]["glyph"].fill_color = color
 
     def _built(self, item: items.Plot) -> Layers:
         drawing = plots.curves(item, self._colors)
-        drawing.x_range, drawing.y_range = self._across, Range1d(0, 1)
+        if self._across is not None:
+            drawing.x_range = self._across
+        drawing.y_range = Range1d(0, 1)
         drawing.min_border_left = 68
         paint_frame(drawing, self._colors)
-        self.card.insert(0, pane_of(drawing))
-        return _layers(drawing)
+        self.card.objects = [pane_of(drawing), self._note]
+        return layers_of(drawing)
+
+
+def _names(item: items.Plot) -> list[str]:
+    """What a plot's layers are called."""
+    return [*item.curves, *item.marks]
+
+
+class TableCard:
+    """A table with its title above and its note below."""
+
+    def __init__(self, waiting: str = COMPUTING) -> None:
+        self._title = pmui.Typography(waiting, variant="subtitle2", margin=(6, 8))
+        self._table = Table(sizing_mode="stretch_width", margin=0)
+        self._note = Sentence(sizing_mode="stretch_width", margin=(6, 8, 12, 8))
+        self.layout = pn.Column(
+            self._title, self._table, self._note, sizing_mode="stretch_width", margin=0
+        )
+
+    def show(self, item: items.Table) -> None:
+        """Show a table, in place of the last."""
+        columns, rows = table_of(item)
+        self._table.param.update(title=item.title, columns=columns, rows=rows)
+        self._title.object, self._note.text = f"**{item.title}**", item.note
 
 
 class Gallery:
@@ -156,7 +185,7 @@ class Gallery:
             paint_frame(drawing, colors)
 
     def _build(self, item: items.Pictures) -> None:
-        self._drawn = [_layers(drawing) for drawing in plots.pictures(item)]
+        self._drawn = [layers_of(drawing) for drawing in plots.pictures(item)]
         panes = [pane_of(drawing) for drawing in self.figures]
         for pane, drawing in zip(panes, self.figures, strict=True):
             pane.sizing_mode, pane.height = "stretch_width", PICTURE_HEIGHT
@@ -184,7 +213,7 @@ class Gallery:
             drawn.figure.title.text = f"{spelled(name)}: {told}"
 
 
-def _layers(drawing: Any) -> Layers:
+def layers_of(drawing: Any) -> Layers:
     """The named renderers of a Bokeh figure."""
     found = {
         each.name: {"source": each.data_source, "glyph": each.glyph, "glyph_renderer": each}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,10 +21,12 @@ from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
 from app.parts import card, choice, part, select
 from app.session import Session
-from app.state import Reading
+from app.state import Less, Reading
 from app.store import Answer, Source, file_source
 from app.theme import DARK, LIGHT, SIZES
+from app.tradeoff import Tradeoff
 from core import PRESETS, TrackingParameters
+from core.experiments.tradeoff import Point
 from core.readers import READERS
 
 MAX_UPLOAD_BYTES = 100 * 2**20
@@ -60,7 +63,11 @@ THEME = {
     )
 }
 IN_THE_BAR = {
-    "& .MuiToggleButton-root": {"color": "#ffffff", "borderColor": "#ffffff80"},
+    "& .MuiToggleButton-root": {
+        "color": "#ffffff",
+        "borderColor": "#ffffff80",
+        "whiteSpace": "nowrap",
+    },
     "& .MuiToggleButton-root.Mui-selected": {"color": "#0b3f4c", "backgroundColor": "#ffffff"},
     "& .MuiToggleButton-root.Mui-selected:hover": {"backgroundColor": "#e3eef1"},
     "@media (max-width: 500px)": {
@@ -141,6 +148,7 @@ class Layout:
         self._light = SettingsPanel(state.light, lambda new: state.param.update(light=new))
         self._viewing = SettingsPanel(state.viewing, lambda new: state.param.update(viewing=new))
         self._tracking = SettingsPanel(state.tracking, self._tracking_changed)
+        self._less = SettingsPanel(state.less, lambda new: state.param.update(less=new))
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
@@ -161,7 +169,8 @@ class Layout:
         self.pages = Pages(
             {
                 "Explore": self._explore,
-                "Compare": lambda: Compare(session).view,
+                "Compare": lambda: self._compare.view,
+                "Trade-off": lambda: Tradeoff(session, self._open_point).view,
                 "Paper": lambda: Paper(session, self._put_away).view,
             },
             label="",
@@ -185,6 +194,11 @@ class Layout:
             pn.state.onload(lambda: self.page.param.update(sidebar_open=not session.figures.narrow))
             pn.state.on_session_destroyed(lambda _: self._forget())
             pn.config.exception_handler = session.fail  # of this session alone
+
+    @cached_property
+    def _compare(self) -> Compare:
+        """The page that puts methods side by side; made when it is first asked for."""
+        return Compare(self.session)
 
     def _titles(self) -> dict[str, str]:
         """Key of each source by its title; of two files of one name the second is told apart."""
@@ -210,6 +224,7 @@ class Layout:
                 field.value = answer.request.reading.as_text(name)
         self._light_card.visible, self._reading_card.visible = is_scene, not is_scene
         self._provenance.text = words.provenance(answer)[:2000]
+        self._less.show(self.session.state.less)
         self._viewing.show(self.session.state.viewing)
         own = self.session.own_field_of_view_deg
         self._viewing.controls["field_of_view_deg"].initial = own
@@ -223,13 +238,28 @@ class Layout:
 
     # What the user does
 
+    def _open_point(self, point: Point) -> None:
+        """Show a measured way to range: the paper's method on Explore, others on Compare."""
+        state, candidate = self.session.state, point.candidate
+        less = Less.of(candidate.reduction, point.shape[2])
+        if candidate.method.estimator == "tracking":
+            state.param.update(less=less, tracking=candidate.settings)
+            self._tracking.show(candidate.settings)
+            self._preset.value = _preset_of(candidate.settings)
+            self.pages.choice.value = "Explore"
+        else:
+            state.less = less
+            self._compare.pick(candidate.method.estimator, candidate.settings)
+            self.pages.choice.value = "Compare"
+
     def _go_to(self, key: str) -> None:
         if key != self.session.state.source:
-            self.session.state.param.update(source=key, reading=Reading())
+            self.session.state.param.update(
+                source=key, reading=Reading(), less=Less(), absent=frozenset()
+            )
 
     def _tracking_changed(self, settings: TrackingParameters) -> None:
-        names = [name for name, preset in PRESETS.items() if preset == settings]
-        self._preset.value = names[0] if names else CUSTOM
+        self._preset.value = _preset_of(settings)
         self.session.state.tracking = settings
 
     def _preset_changed(self, name: str) -> None:
@@ -299,6 +329,7 @@ class Layout:
             self._light_card,
             self._reading_card,
             part("Tracking differentiator", self._preset, self._tracking.layout),
+            part("Less data, faster", self._less.layout, is_open=False),
             first,
             part("What is this?", pmui.Typography(words.EXPLANATION, margin=8), is_open=False),
         ]
@@ -335,3 +366,8 @@ class Layout:
             for content in (left, right)
         )
         return pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both")
+
+
+def _preset_of(settings: TrackingParameters) -> str:
+    """Name of the preset that these are."""
+    return next((name for name, preset in PRESETS.items() if preset == settings), CUSTOM)

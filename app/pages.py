@@ -74,8 +74,8 @@ class Pages:
         self,
         builders: Mapping[str, Callable[[], View]],
         label: str = "Page",
-        help: str = "Explore looks into one method, Compare puts methods side by side, Paper "
-        "computes what the paper prints.",
+        help: str = "Explore looks into one method, Compare puts methods side by side, Trade-off "
+        "measures speed against accuracy, Paper computes what the paper prints.",
         orientation: str = "horizontal",
     ) -> None:
         self._builders = builders

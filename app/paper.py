@@ -9,16 +9,17 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 import panel as pn
-import panel_material_ui as pmui
 from bokeh.models import Range1d
 
 from app import paper_words
-from app.controls import Sentence, SettingsPanel, Table
-from app.items import CurveCard, Gallery, table_of
-from app.jobs import InSteps, LatestWins, Step
+from app.controls import Sentence, SettingsPanel
+from app.items import CurveCard, Gallery, TableCard
+from app.jobs import LatestWins, Step
 from app.pages import Pages, View
 from app.session import Session
+from app.studies import Study, aside
 from app.theme import palette
+from app.words import COMPUTING
 from core import PRESETS, Flux
 from core.experiments import items, paper
 from core.experiments.trials import Condition, Method, Results, trials
@@ -266,16 +267,14 @@ class Sliders(Generic[Settings]):
         self._words = words
         self._jobs: LatestWins[Sequence[items.Plot]] = LatestWins(session.on_page)
         across = Range1d(-0.5, 100)
-        self._cards = [CurveCard(across, paper_words.COMPUTING) for _ in range(count)]
+        self._cards = [CurveCard(across, COMPUTING) for _ in range(count)]
         self._panel = SettingsPanel(settings, self._ask)
         self._ask(settings)
 
     @property
     def view(self) -> View:
         """The figures, and their controls."""
-        return View(
-            _stack(*self._cards), _aside(self._words, self._panel.layout), paint=self._paint
-        )
+        return View(_stack(*self._cards), aside(self._words, self._panel.layout), paint=self._paint)
 
     def _ask(self, settings: Settings) -> None:
         self._jobs.submit(partial(self._compute, settings), self._draw, self._session.fail)
@@ -288,69 +287,6 @@ class Sliders(Generic[Settings]):
     def _paint(self, dark: bool) -> None:
         for card in self._cards:
             card.paint(palette(dark))
-
-
-class Study:
-    """Long work with its controls: start, cancel, a bar, a sentence.
-
-    It begins when it first comes on screen, and pauses while it is not.
-
-    Parameters
-    ----------
-    steps : callable
-        The work, by the controls of that moment.
-    noun : str
-        What the steps are called.
-    """
-
-    def __init__(
-        self, session: Session, steps: Callable[[], Sequence[Step[Any]]], noun: str
-    ) -> None:
-        self._steps = steps
-        self._noun = noun
-        self._work = InSteps(session.on_page, self._tell, session.fail)
-        self._start = pmui.Button(
-            label="Compute",
-            description="Compute: begins anew with the settings above.",
-            size="small",
-            margin=(6, 4, 6, 8),
-        )
-        self._cancel = pmui.Button(
-            label="Cancel",
-            description="Cancel: stops, and keeps what there is.",
-            variant="outlined",
-            size="small",
-            disabled=True,
-            margin=(6, 4),
-        )
-        self._bar = pmui.LinearProgress(
-            variant="determinate", value=0, sizing_mode="stretch_width", margin=(4, 8)
-        )
-        self._sentence = Sentence(sizing_mode="stretch_width", margin=(0, 8, 8, 8))
-        self._start.on_click(lambda _: self.start())
-        self._cancel.on_click(lambda _: self._work.cancel())
-
-    @property
-    def controls(self) -> list[Any]:
-        """Buttons, bar and sentence."""
-        buttons = pn.Row(self._start, self._cancel, margin=0)
-        return [buttons, self._bar, self._sentence]
-
-    def start(self) -> None:
-        """Begin anew."""
-        self._work.start(self._steps())
-
-    def show(self, is_on_screen: bool) -> None:
-        """Begin or go on when it comes on screen, and pause when it leaves."""
-        self._work.pause(not is_on_screen)
-        if is_on_screen and self._work.of == 0:
-            self.start()
-
-    def _tell(self) -> None:
-        work = self._work
-        self._cancel.disabled = not work.is_running
-        self._bar.value = round(100 * work.done / max(work.of, 1))
-        self._sentence.text = paper_words.progress(work.done, work.of, self._noun, work.is_running)
 
 
 class Trials(Generic[Settings]):
@@ -388,7 +324,7 @@ class Trials(Generic[Settings]):
     @property
     def view(self) -> View:
         """The table, and its controls."""
-        controls = _aside(self._words, self._panel.layout, *self._study.controls)
+        controls = aside(self._words, self._panel.layout, *self._study.controls)
         return View(self._card.layout, controls, show=self._study.show)
 
     def _choose(self, settings: Settings) -> None:
@@ -413,24 +349,6 @@ class Trials(Generic[Settings]):
                 self._card.show(replace(item, title=title, note=note))
 
 
-class TableCard:
-    """A table with its title above and its note below."""
-
-    def __init__(self, waiting: str = paper_words.COMPUTING) -> None:
-        self._title = pmui.Typography(waiting, variant="subtitle2", margin=(6, 8))
-        self._table = Table(sizing_mode="stretch_width", margin=0)
-        self._note = Sentence(sizing_mode="stretch_width", margin=(6, 8, 12, 8))
-        self.layout = pn.Column(
-            self._title, self._table, self._note, sizing_mode="stretch_width", margin=0
-        )
-
-    def show(self, item: items.Table) -> None:
-        """Show a table, in place of the last."""
-        columns, rows = table_of(item)
-        self._table.param.update(title=item.title, columns=columns, rows=rows)
-        self._title.object, self._note.text = f"**{item.title}**", item.note
-
-
 class RangeImages:
     """Figures 8, 9 and 12."""
 
@@ -445,7 +363,7 @@ class RangeImages:
     def view(self) -> View:
         """The images, and their controls."""
         self._panel.controls["sbr"].visible = False
-        controls = _aside(
+        controls = aside(
             paper_words.IMAGES,
             self._panel.layout,
             *self._study.controls,
@@ -483,7 +401,7 @@ class LeftUnsaid:
         self._panel = SettingsPanel(self._settings, self._choose)
         self._study = Study(session, self._steps, "steps")
         across = Range1d(0, 100)
-        self._no_echo, self._by_place = (CurveCard(across, paper_words.COMPUTING) for _ in range(2))
+        self._no_echo, self._by_place = (CurveCard(across, COMPUTING) for _ in range(2))
         self._limits, self._arithmetic = TableCard(), TableCard()
 
     @property
@@ -494,7 +412,7 @@ class LeftUnsaid:
             self._limits.layout,
             self._arithmetic.layout,
         )
-        controls = _aside(paper_words.UNSAID, self._panel.layout, *self._study.controls)
+        controls = aside(paper_words.UNSAID, self._panel.layout, *self._study.controls)
         main = pn.Column(*content, sizing_mode="stretch_both", margin=0)
         return View(main, controls, self._study.show, paint=self._paint)
 
@@ -533,8 +451,3 @@ def joined(plots: Sequence[items.Plot], x: Sequence[float]) -> items.Plot:
 def _stack(*cards: CurveCard) -> pn.Column:
     content = [card.card for card in cards]
     return pn.Column(*content, stylesheets=[STACK], sizing_mode="stretch_both", margin=0)
-
-
-def _aside(words: str, *controls: Any) -> pn.Column:
-    text = pmui.Typography(words, variant="body2", margin=(8, 8, 4, 8))
-    return pn.Column(text, *controls, sizing_mode="stretch_width", margin=0)

@@ -50,7 +50,6 @@ READING_TRIALS = (
 OUTSIDE_NOTE = "Grey: answers beyond both ends of the scale."
 PLACE_HELP = "Of the pixel whose range stands above each picture; a tap on one chooses it, too."
 NEEDS_TWO = "The table begins with the second repetition: an interval needs two."
-COMPUTING = "Computing …"
 
 COLUMN_HELP: dict[str, tuple[str, int]] = {
     "SBR": ("Signal over background, both in photons per pulse.", -1),
@@ -73,12 +72,3 @@ COLUMN_HELP: dict[str, tuple[str, int]] = {
     "Cramér-Rao bound m": ("Least scatter of answers that are not grossly wrong.", 1),
 }
 """Of each column a line of help, and 1 or -1: whether its lowest or highest value comes first."""
-
-
-def progress(done: int, of: int, noun: str, is_running: bool) -> str:
-    """How far a study has come."""
-    if of == 0:
-        return ""
-    if is_running:
-        return f"{done} of {of} {noun}."
-    return f"Done: {of} {noun}." if done == of else f"Stopped after {done} of {of} {noun}."

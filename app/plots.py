@@ -10,7 +10,15 @@ from typing import Any
 
 import holoviews as hv
 import numpy as np
-from bokeh.models import DataRange1d, Legend, LegendItem, LinearColorMapper
+from bokeh.models import (
+    ColumnDataSource,
+    DataRange1d,
+    HoverTool,
+    Legend,
+    LegendItem,
+    LinearColorMapper,
+    Span,
+)
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
@@ -230,10 +238,12 @@ BARS = "histogram"
 def curves(item: items.Plot, colors: Palette) -> Any:
     """A Bokeh figure of a study's curves, and upright lines at its marks, as named renderers.
 
-    Without HoloViews, which would take five times as long: these are built while someone waits.
+    The band of a curve has the curve's name and "band". Without HoloViews, which would take five
+    times as long: these are built while someone waits.
     """
     drawing = figure(
         title=item.title,
+        x_axis_type="log" if item.x_is_log else "linear",
         x_axis_label=item.x_label,
         y_axis_label=item.y_label,
         sizing_mode="stretch_both",
@@ -245,7 +255,12 @@ def curves(item: items.Plot, colors: Palette) -> Any:
     lines = {name: (item.x, values) for name, values in item.curves.items()}
     lines |= {name: marker_line(place, 1.0) for name, place in item.marks.items()}
     entries = []
-    for name, (color, dash) in curve_styles(item, colors).items():
+    styles = curve_styles(item, colors)
+    for name, (low, high) in item.bands.items():
+        color, _ = styles[name]
+        band = {"x": item.x, "y1": low, "y2": high}
+        drawing.varea(**band, fill_color=color, fill_alpha=0.2, name=f"{name} band")
+    for name, (color, dash) in styles.items():
         x, y = lines[name]
         if name == BARS:
             renderer = drawing.vbar(x=x, top=y, width=1.0, color=color, line_width=0, name=name)
@@ -258,6 +273,7 @@ def curves(item: items.Plot, colors: Palette) -> Any:
     legend = Legend(
         items=entries,
         orientation="vertical" if many else "horizontal",
+        ncols=3 if 4 < len(entries) <= 6 else "auto",
         click_policy="hide",
         background_fill_alpha=0.0,
     )
@@ -318,3 +334,81 @@ def pictures(item: items.Pictures) -> list[Any]:
     for ranges in (across, down):  # frames do not widen the view
         ranges.renderers = shown
     return drawings
+
+
+MARKERS = ("circle", "square", "triangle")
+"""Of methods that share a colour."""
+
+
+def tradeoff(colors: Palette) -> Any:
+    """A Bokeh figure of missed targets against time, as named renderers.
+
+    ``points`` are measured ways to range, ``times`` and ``degrees`` their whiskers, ``front`` the
+    line of those that none beats, ``chosen`` a ring around what is recommended.
+    """
+    drawing = figure(
+        x_axis_type="log",
+        y_axis_type="log",
+        x_axis_label="Time for an image (ms)",
+        y_axis_label="Not within 3 bins (share of the target pixels)",
+        title="Further left is faster, further down is right more often",
+        sizing_mode="stretch_both",
+        min_height=240,
+        tools="box_zoom,tap",
+        toolbar_location=None,
+        outline_line_color=None,
+    )
+    for name, dimension in _ASKED.items():
+        drawing.add_layout(Span(name=name, dimension=dimension, line_dash=[6, 3]))
+    drawing.step("x", "y", source=_empty("x", "y"), mode="after", line_width=2, name="front")
+    for name in ("times", "degrees"):
+        source = _empty("x0", "y0", "x1", "y1", "color")
+        ends = {"x0": "x0", "y0": "y0", "x1": "x1", "y1": "y1"}
+        drawing.segment(**ends, line_color="color", source=source, name=name)
+    drawing.scatter(
+        "x", "y", source=_empty("x", "y"), size=19, fill_alpha=0, line_width=2.5, name="chosen"
+    )
+    points = drawing.scatter(
+        "x",
+        "y",
+        source=_empty("x", "y", "color", "marker", "method", "way", "told"),
+        size=9,
+        color="color",
+        marker="marker",
+        legend_field="method",
+        name="points",
+    )
+    points.nonselection_glyph = points.selection_glyph = None
+    drawing.add_tools(
+        HoverTool(
+            renderers=[points], tooltips=[("", "@way"), ("", "@told")], point_policy="snap_to_data"
+        )
+    )
+    legend = drawing.legend[0]
+    legend.background_fill_alpha = 0.0
+    drawing.add_layout(legend, "right")
+    paint_tradeoff(drawing, colors)
+    return drawing
+
+
+_ASKED = {"asked time": "height", "asked degree": "width"}
+"""Lines at what was asked for, and along what they run."""
+
+
+def show_asked(drawing: Any, milliseconds: float, degree: float) -> None:
+    """Draw what was asked of the ways to range; a degree of 1 lies below any axis."""
+    missed = 1 - degree or None
+    for name, place in zip(_ASKED, (milliseconds, missed), strict=True):
+        drawing.select_one({"name": name}).location = place
+
+
+def paint_tradeoff(drawing: Any, colors: Palette) -> None:
+    """Colours of the lines between the points, which have their own."""
+    for name, color in (("front", colors.text), ("chosen", colors.answer)):
+        drawing.select_one({"name": name}).glyph.line_color = color
+    for name in _ASKED:
+        drawing.select_one({"name": name}).line_color = colors.muted
+
+
+def _empty(*columns: str) -> ColumnDataSource:
+    return ColumnDataSource({column: [] for column in columns})

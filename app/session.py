@@ -19,7 +19,7 @@ from app.controls import Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
 from app.state import CLOUD_COLORS, IMAGES, NEED_TRUTH, State
-from app.store import Answer, Request, Source, compute, inspect
+from app.store import Answer, Request, Source, compute, inspect, same_view
 from app.theme import WRONG_COLOR, palette
 from app.views import ImageView, SignalPlots
 
@@ -79,9 +79,14 @@ class Session:
         """Whether there is a browser on the other side."""
         return self.page is not None and self.page.session_context is not None
 
+    @property
+    def is_gone(self) -> bool:
+        """Whether there was a browser, and is none any more."""
+        return self._served and not self.is_served
+
     def _watch(self) -> None:
         watch = self.state.param.watch
-        watch(lambda *_: self._ask(), ["source", "light", "reading", "tracking"])
+        watch(lambda *_: self._ask(), ["source", "light", "reading", "less", "absent", "tracking"])
         watch(lambda *_: self._draw_pixel(), ["pixel", "difference"])
         watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
         self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
@@ -104,7 +109,8 @@ class Session:
 
     def _request(self) -> Request:
         state = self.state
-        return Request(self.sources[state.source], state.light, state.reading, state.tracking)
+        source = self.sources[state.source]
+        return Request(source, state.light, state.reading, state.tracking, state.less, state.absent)
 
     def _ask(self) -> None:
         request = self._request()
@@ -153,7 +159,12 @@ class Session:
         shown, state = self.answer.request, self.state
         if request == self._request():
             with param.discard_events(state):
-                state.param.update(source=self._key(shown.source), reading=shown.reading)
+                state.param.update(
+                    source=self._key(shown.source),
+                    reading=shown.reading,
+                    less=shown.less,
+                    absent=shown.absent,
+                )
         self._settle(self.answer)
         self.fail(error)
 
@@ -167,8 +178,7 @@ class Session:
 
     def _show(self, answer: Answer, first: bool = False) -> None:
         previous, self.answer = self.answer, answer
-        seen = (answer.request.source, answer.request.reading)
-        if first or seen != (previous.request.source, previous.request.reading):
+        if first or not same_view(answer.request, previous.request):
             self._enter(answer)
         self.complain(words.lack(answer))
         self._draw_pixel()

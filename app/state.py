@@ -12,6 +12,7 @@ from core import Acquisition, Flux, Pulse, TrackingParameters
 from core.checks import require
 from core.parameters import Number, check_fields, parameter
 from core.readers.request import Request
+from core.reductions import Reduction
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,55 @@ class Viewing:
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+
+@dataclass(frozen=True)
+class Less:
+    """Less of a capture than there is: quicker to range, or clearer, and never as fine."""
+
+    merge: int = parameter(
+        1,
+        Number("Bins merged", 1, 8, whole=True, least=1, unit="bins"),
+        "Neighbouring bins added to one: less to range, and a coarser answer. T_n counts the "
+        "merged ones.",
+    )
+    gate_from: float = parameter(
+        0.0,
+        Number("Gate from", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
+        "Bins before are left out, and the pulses that fired in them.",
+    )
+    gate_to: float = parameter(
+        1.0,
+        Number("Gate to", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
+        "Bins behind are left out: an echo there is lost.",
+    )
+    pool: int = parameter(
+        1,
+        Number("Pixels added", 1, 8, whole=True, least=1, unit="rows and columns"),
+        "Histograms of so many rows and columns of neighbours added to one: more photons in each, "
+        "and a blurred image.",
+    )
+    skip: int = parameter(
+        1,
+        Number("Pixels skipped to", 1, 8, whole=True, least=1, unit="rows and columns"),
+        "One pixel is kept of so many rows and columns.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @classmethod
+    def of(cls, reduction: Reduction, n_bins: int) -> Less:
+        """The settings that reduce a capture of so many bins like this."""
+        first, end = reduction.gate or (0, n_bins)
+        return cls(reduction.merge, first / n_bins, end / n_bins, reduction.pool, reduction.skip)
+
+    def reduction(self, n_bins: int) -> Reduction:
+        """What is to be done to a capture of so many bins."""
+        first = min(round(self.gate_from * n_bins), n_bins - 1)
+        end = max(round(self.gate_to * n_bins), first + 1)
+        gate = None if (first, end) == (0, n_bins) else (first, end)
+        return Reduction(merge=self.merge, gate=gate, skip=self.skip, pool=self.pool)
 
 
 def _gaussian(text: str) -> Pulse:
@@ -137,6 +187,10 @@ class State(param.Parameterized):
     source = param.String(default="car", doc="Key of the catalogue.")
     light = param.ClassSelector(class_=Light, default=Light())
     reading = param.ClassSelector(class_=Reading, default=Reading())
+    less = param.ClassSelector(class_=Less, default=Less())
+    absent = param.ClassSelector(
+        class_=frozenset, default=frozenset(), doc="Parts and corrections that are switched off."
+    )
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
     pixel = param.NumericTuple(default=(31, 24), length=2, doc="Row and column on show.")
     image = param.Selector(default="Estimate", objects=list(IMAGES))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from app.state import Light, Reading
+from app.state import Less, Light, Reading
 from core import (
     Capture,
     Run,
+    Scene,
     Signals,
     TrackingParameters,
     first_difference,
@@ -27,7 +28,10 @@ from core import (
     trigger_probability,
 )
 from core.checks import require
+from core.experiments.corrections import without_correction
+from core.experiments.requirement import CORRECTIONS
 from core.posterior import posterior_of
+from core.scene import PARTS, without
 
 MOST_PIXELS = 2**20
 
@@ -39,8 +43,23 @@ class Source:
     """Something to look at: a built-in scene to simulate, or a file to read."""
 
     title: str
-    load: Callable[[Light, Reading], Capture]
-    is_scene: bool
+    load: Callable[[Light, Reading, Collection[str]], Capture]
+    """Makes the capture, parts of some names left out of a scene."""
+    scene: Callable[[], Scene] | None = None
+    """None for a file."""
+
+    @property
+    def is_scene(self) -> bool:
+        """Whether it is simulated."""
+        return self.scene is not None
+
+
+def bare(scene: Scene, absent: Collection[str]) -> Scene:
+    """A scene without those of its parts that are switched off."""
+    for part in PARTS:
+        if part in absent:
+            scene = without(scene, part)
+    return scene
 
 
 def scene_source(title: str, name: str, **arguments: Any) -> Source:
@@ -48,11 +67,11 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
 
     build = cache(partial(scenes[name], **arguments))
 
-    def load(light: Light, _reading: Reading) -> Capture:
-        scene = build()
+    def load(light: Light, _reading: Reading, absent: Collection[str]) -> Capture:
+        scene = bare(build(), absent)
         return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
-    return Source(title, load, is_scene=True)
+    return Source(title, load, build)
 
 
 def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
@@ -65,7 +84,7 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
         return capture
 
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, lambda _light, reading: get(reading), is_scene=False)
+    return Source(title or path.name, lambda _light, reading, _absent: get(reading))
 
 
 def built_in_sources() -> dict[str, Source]:
@@ -76,6 +95,10 @@ def built_in_sources() -> dict[str, Source]:
         "building": scene_source("Building at 830–860 m", "building"),
         "staircase": scene_source("Staircase through the gate", "staircase"),
         "uniform": scene_source("Random depths", "uniform"),
+        "edges": scene_source("Building, edges seen whole", "edges"),
+        "fog": scene_source("Car in fog", "fog"),
+        "approach": scene_source("Car approached at 20 m/s", "approach"),
+        "worn": scene_source("Car, worn instrument", "worn"),
         "sample": file_source(ASSETS / "sample_capture.npz", "Sample capture (file)"),
     }
 
@@ -88,6 +111,9 @@ class Request:
     light: Light
     reading: Reading
     tracking: TrackingParameters
+    less: Less
+    absent: frozenset[str] = frozenset()
+    """Parts of the scene and corrections of the estimators that are switched off."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +124,8 @@ class Answer:
     run: Run
     capture_s: float
     """Seconds spent simulating or reading."""
+    whole: Capture
+    """What the capture that was ranged is a part of, or that capture itself."""
 
     @property
     def capture(self) -> Capture:
@@ -107,18 +135,44 @@ class Answer:
 
 def compute(request: Request, previous: Answer | None) -> Answer:
     """Answer a request; what the previous answer already holds is not computed again."""
-    if previous is not None and _same_capture(request, previous.request):
+    started = perf_counter()
+    if previous is None or not same_capture(request, previous.request):
+        whole = request.source.load(request.light, request.reading, request.absent)
+    else:
+        whole = previous.whole
+    if (
+        previous is not None
+        and whole is previous.whole
+        and _same(request, previous.request, "less", "absent")
+    ):
         capture, capture_s = previous.capture, previous.capture_s
     else:
-        started = perf_counter()
-        capture = request.source.load(request.light, request.reading)
+        capture = request.less.reduction(whole.acquisition.n_bins).of(whole)
+        for name in CORRECTIONS:
+            if name in request.absent:
+                capture = without_correction(capture, name)
         posterior_of(capture)  # what every answer's confidence rests on, whatever the method
         capture_s = perf_counter() - started
-    return Answer(request, run(capture, "tracking", request.tracking), capture_s)
+    return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole)
 
 
-def _same_capture(one: Request, other: Request) -> bool:
-    return (one.source, one.light, one.reading) == (other.source, other.light, other.reading)
+def same_subject(one: Request, other: Request) -> bool:
+    """Whether both look at the same scene in the same light, or the same file, part or no part."""
+    return _same(one, other, "source", "light", "reading")
+
+
+def same_capture(one: Request, other: Request) -> bool:
+    """Whether both look at the same capture, however much of it."""
+    return same_subject(one, other) and one.absent & {*PARTS} == other.absent & {*PARTS}
+
+
+def same_view(one: Request, other: Request) -> bool:
+    """Whether the answers to both show the same pixels and bins, in whatever light."""
+    return _same(one, other, "source", "reading", "less")
+
+
+def _same(one: Request, other: Request, *names: str) -> bool:
+    return all(getattr(one, name) == getattr(other, name) for name in names)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-// A table whose headers sort its rows: by click, or by Enter and Space as on any button.
+// A table whose headers sort its rows: by click, or by Enter and Space as on any button. A row may
+// have a button of its own, which reports the row's key.
 
 const ORDER = { 1: "ascending", "-1": "descending" };
 
@@ -52,6 +53,12 @@ export function render({ model }) {
     const name = element("th", row.name, { scope: "row" });
     if (row.color) name.prepend(line(row));
     if (row.note) name.append(element("small", row.note));
+    if (row.action) {
+      const button = element("button", row.action, { type: "button", class: "action" });
+      button.setAttribute("aria-label", `${row.action}: ${row.name}`);
+      button.addEventListener("click", () => (model.acted = [row.key, Date.now()]));
+      name.append(button);
+    }
     line_.append(name);
     if (row.message) {
       const span = String(model.columns.length - 1);

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from app.store import Answer, Pixel
+from core.experiments.requirement import TITLES
 
 Fact = tuple[str, str, str]
 """Name, value, and a line of help."""
@@ -16,6 +17,8 @@ FIELD_OF_VIEW_UNKNOWN = (
 )
 
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
+
+COMPUTING = "Computing …"
 
 EXPLANATION = """
 **What is seen.** Each pixel sends pulses and keeps only the *first* photon of each. In daylight
@@ -83,7 +86,7 @@ def pixel_numbers(answer: Answer, pixel: Pixel) -> list[Fact]:
         (
             "Confidence",
             share(pixel.confidence),
-            "Probability that noise alone would nowhere have shown such an excess.",
+            "Probability that there is a surface within 3 bins of the estimate.",
         ),
         ("σ", number(sigma, "counts"), "Standard deviation of the histogram."),
         ("r small", number(r_small, ""), "l·σ, bound of the small scale's acceleration."),
@@ -108,8 +111,10 @@ def provenance(answer: Answer) -> str:
     acquisition, rows_cols = answer.capture.acquisition, answer.capture.shape
     opens_ns = acquisition.gate_delay_s * 1e9
     closes_ns = opens_ns + acquisition.n_bins * acquisition.bin_width_s * 1e9
+    absent = ", ".join(TITLES[name] for name in TITLES if name in answer.request.absent)
+    switched_off = f" Switched off: {absent}." if absent else ""
     return (
-        f"{answer.capture.source}. {rows_cols[0]} × {rows_cols[1]} pixels, "
+        f"{answer.capture.source}.{switched_off} {rows_cols[0]} × {rows_cols[1]} pixels, "
         f"{acquisition.n_bins} bins of {acquisition.bin_width_s * 1e9:.4g} ns, "
         f"gate {opens_ns:.6g} to {closes_ns:.6g} ns "
         f"({float(acquisition.bin_to_range_m(0)):.6g} to "
@@ -157,3 +162,12 @@ def share(value: float) -> str:
 def milliseconds(seconds: float) -> str:
     """A duration as one reads it."""
     return f"{1000 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
+
+
+def progress(done: int, of: int, noun: str, is_running: bool) -> str:
+    """How far a study has come."""
+    if of == 0:
+        return ""
+    if is_running:
+        return f"{done} of {of} {noun}."
+    return f"Done: {of} {noun}." if done == of else f"Stopped after {done} of {of} {noun}."

@@ -1,6 +1,6 @@
 """Range estimation from first-photon (Geiger-mode APD) lidar captures, without a screen."""
 
-from core import limits, metrics
+from core import limits, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
@@ -51,6 +51,7 @@ __all__ = [
     "rate_per_bin",
     "read_capture",
     "read_scene",
+    "reductions",
     "run",
     "save_capture",
     "save_image",

@@ -9,14 +9,14 @@ from numbers import Integral
 from typing import Literal
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import ArrayLike, NDArray
-from scipy.constants import speed_of_light
-from scipy.optimize import brentq
-from scipy.special import ndtr
 
 from core.checks import require
 
 Floats = NDArray[np.float64]
+
+SPEED_OF_LIGHT_M_S = 299_792_458.0  # exactly: this is what a metre is
 
 
 @dataclass(frozen=True)
@@ -77,17 +77,17 @@ class Acquisition:
     def bin_to_range_m(self, bins: ArrayLike) -> Floats:
         """Range in metres of a (fractional) bin position, any shape; NaN stays NaN."""
         time_s = self.gate_delay_s + np.asarray(bins, float) * self.bin_width_s
-        return np.asarray(time_s * (speed_of_light / 2))
+        return np.asarray(time_s * (SPEED_OF_LIGHT_M_S / 2))
 
     def range_m_to_bin(self, range_m: ArrayLike) -> Floats:
         """Fractional bin position of a range in metres, any shape; NaN stays NaN."""
-        time_s = np.asarray(range_m, float) * (2 / speed_of_light)
+        time_s = np.asarray(range_m, float) * (2 / SPEED_OF_LIGHT_M_S)
         return np.asarray((time_s - self.gate_delay_s) / self.bin_width_s)
 
     @property
     def bin_length_m(self) -> float:
         """Range covered by one bin, in metres."""
-        return float(self.bin_width_s * speed_of_light / 2)
+        return float(self.bin_width_s * SPEED_OF_LIGHT_M_S / 2)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Pulse:
         """Share of the pulse's photons that arrived before `time_s` (any shape) after time zero."""
         t = np.divide(time_s, self.tau_s)
         if self.shape == "gaussian":
-            return np.asarray(ndtr(t))
+            return np.asarray(scipy.special.ndtr(t))
         if self.shape == "measured":
             share = np.concatenate([[0.0], np.cumsum(self.samples)])
             return np.asarray(np.interp(t, np.arange(share.size), share / share[-1]))
@@ -148,6 +148,23 @@ class Pulse:
         t *= decay
         return np.asarray(np.subtract(1.0, t))
 
+    def density(self, time_s: ArrayLike) -> Floats:
+        """Photons per second at `time_s` (any shape) after time zero: the slope of `cdf`.
+
+        Where a measured pulse steps from one sample to the next it is that of the sample before.
+        """
+        t = np.divide(time_s, self.tau_s)
+        if self.shape == "gaussian":
+            share = np.exp(-0.5 * t * t) / math.sqrt(2 * math.pi)
+        elif self.shape == "measured":
+            samples = np.concatenate([[0.0], self.samples, [0.0]])
+            at = np.clip(np.ceil(t), 0, samples.size - 1).astype(np.intp)
+            share = samples[at] / samples.sum()
+        else:
+            t = np.maximum(t, 0.0)
+            share = t * np.exp(-t)
+        return np.asarray(share / self.tau_s)
+
     @cached_property
     def span_s(self) -> tuple[float, float]:
         """Times after time zero by which a tenth and nine tenths of the photons have arrived."""
@@ -155,12 +172,12 @@ class Pulse:
 
     def quantile_s(self, share: float) -> float:
         """Time after time zero by which `share` of the photons, in (0, 1), have arrived."""
-        longest = len(self.samples) + 40.0
-
-        def excess(t: float) -> float:
-            return float(self.cdf(t * self.tau_s)) - share
-
-        return self.tau_s * float(brentq(excess, -longest, longest))
+        high = len(self.samples) + 40.0
+        low = -high
+        for _ in range(64):  # halved so often, the interval is as narrow as a float is exact
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self.cdf(middle * self.tau_s) > share else (middle, high)
+        return self.tau_s * high
 
     def taps(
         self, n_bins: int, bin_width_s: float, delay_bin: ArrayLike = 0.0
@@ -182,7 +199,8 @@ class Pulse:
         first : int
             The bin of the first tap.
         """
-        first = math.floor(max(self.quantile_s(1e-3) / bin_width_s, -n_bins))
+        # In a gate that closes before that much has arrived, its last bin is what there is to see.
+        first = math.floor(min(max(self.quantile_s(1e-3) / bin_width_s, -n_bins), n_bins - 1))
         end = math.ceil(min(self.quantile_s(1 - 1e-3) / bin_width_s, n_bins)) + 1
         delay = np.asarray(delay_bin, float) - first
         return self.bin_probability(delay, end - first, bin_width_s), first

@@ -15,12 +15,16 @@ LANES = 64
 """Pixels treated together: four vectors of sixteen float32, in flight side by side."""
 
 
+_PIXELS_AT_ONCE = 8
+_BINS_AT_ONCE = 4  # between reading and writing their sums, which costs more than to add
+
+
 class Blocks(NamedTuple):
     """Counts with neighbouring pixels side by side; the last block is filled up with zeros."""
 
     counts: NDArray[np.unsignedinteger]
     """Shape (block, bin, LANES)."""
-    largest: NDArray[np.float64]
+    largest: NDArray[np.unsignedinteger]
     """Largest count of each pixel, shape (block, LANES)."""
     sigma: NDArray[np.float64]
     """Standard deviation of each pixel's histogram over the gate, shape (block, LANES)."""
@@ -36,34 +40,68 @@ def to_blocks(cube: NDArray[np.unsignedinteger]) -> Blocks:
     if cube.dtype == np.uint8 or (cube.dtype == np.uint32 and cube.max(initial=0) < 2**16):
         cube = cube.astype(np.uint16)
     n_bins = cube.shape[-1]
-    pixels = cube.reshape(-1, n_bins)
+    pixels = np.ascontiguousarray(cube).reshape(-1, n_bins)
+    pixels.setflags(write=False)  # kernels are compiled for what may be written, too
     n_pixels = pixels.shape[0]
-    missing = -n_pixels % LANES
-    if missing:
-        pixels = np.concatenate([pixels, np.zeros((missing, n_bins), cube.dtype)])
-    counts = np.ascontiguousarray(pixels.reshape(-1, LANES, n_bins).transpose(0, 2, 1))
-    largest = counts.max(axis=1).astype(np.float64)
-    return Blocks(counts, largest, lane_sigma(counts, n_bins), n_pixels)
+    filled, left = divmod(n_pixels, LANES)
+    counts = np.empty((filled + (left > 0), n_bins, LANES), cube.dtype)
+    _lay_out(pixels, counts[:filled])
+    counts[filled:] = 0
+    counts[filled:, :, :left] = pixels[filled * LANES :].T
+    largest, sigma = lane_spread(counts, n_bins)
+    return Blocks(counts, largest, sigma, n_pixels)
 
 
 @njit(**COMPILED)
-def lane_sigma(counts, n_bins):  # type: ignore[no-untyped-def]
-    """Standard deviation over the first `n_bins` of (block, bin, LANES) counts; 0 over none."""
+def _lay_out(pixels, counts):  # type: ignore[no-untyped-def]
+    """Pixels (pixel, bin) side by side in full blocks."""
+    for b in range(counts.shape[0]):
+        # A few pixels at a time: their rows lie far apart, and the cache holds few such lines.
+        for first in range(0, LANES, _PIXELS_AT_ONCE):
+            for k in range(counts.shape[1]):
+                for i in range(first, first + _PIXELS_AT_ONCE):
+                    counts[b, k, i] = pixels[b * LANES + i, k]
+
+
+@njit(**COMPILED)
+def lane_spread(counts, n_bins):  # type: ignore[no-untyped-def]
+    """Largest count and standard deviation over the first `n_bins` of (block, bin, LANES) counts.
+
+    Both of shape (block, LANES); 0 over no bins.
+    """
+    largest = np.zeros((counts.shape[0], LANES), counts.dtype)
     sigma = np.zeros((counts.shape[0], LANES))
-    total, squares = np.empty(LANES), np.empty(LANES)
+    total, squares = np.empty(LANES, np.int64), np.empty(LANES)
+    paired = n_bins - n_bins % _BINS_AT_ONCE
     for b in range(counts.shape[0] if n_bins > 0 else 0):
-        total[:] = 0.0
+        block, top = counts[b], largest[b]
+        total[:] = 0
         squares[:] = 0.0
-        # Moments about the first count: a constant histogram has a σ of exactly 0.
-        for k in range(n_bins):
+        for k in range(0, paired, _BINS_AT_ONCE):
             for i in range(LANES):
-                c = np.float64(counts[b, k, i]) - np.float64(counts[b, 0, i])
-                total[i] += c
-                squares[i] += c * c
+                sums = total[i], squares[i], top[i]
+                for j in range(_BINS_AT_ONCE):
+                    sums = _with(block[k + j, i], block[0, i], sums)
+                total[i], squares[i], top[i] = sums
+        for k in range(paired, n_bins):
+            for i in range(LANES):
+                sums = total[i], squares[i], top[i]
+                total[i], squares[i], top[i] = _with(block[k, i], block[0, i], sums)
         for i in range(LANES):
             mean = total[i] / n_bins
             sigma[b, i] = math.sqrt(max(squares[i] / n_bins - mean * mean, 0.0))
-    return sigma
+    return largest, sigma
+
+
+@njit(**COMPILED, inline="always")
+def _with(count, first, sums):  # type: ignore[no-untyped-def]
+    """Sum, sum of squares and maximum, a count added.
+
+    Moments about the first count: a constant histogram has a σ of exactly 0.
+    """
+    total, squares, top = sums
+    more = np.int64(count) - np.int64(first)
+    return total + more, squares + float(more) * float(more), count if count > top else top
 
 
 @njit(**COMPILED)

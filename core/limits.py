@@ -12,14 +12,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import ArrayLike
-from scipy.ndimage import map_coordinates
-from scipy.special import exprel, log_ndtr, ndtr
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
 from core.checks import require
-from core.trigger import rate_per_bin
 
 # The score of the true place, in standard deviations about its mean, where it meets the others'.
 SCORES = np.linspace(-5.0, 5.0, 65)
@@ -29,6 +27,8 @@ SAME_PLACE_SPACINGS = 1.5
 
 MOST_PLACES = 32  # rival places computed; each stands for several where a gate holds more
 MOST_PAIRS = 128  # different (onset, signal) computed one by one
+ROUNDING_OF_SHARES = 1e-12  # of a pulse's photons in a bin, as a difference of its CDF rounds
+
 MOST_ONSETS = 512  # nodes of the interpolation where there are more
 
 
@@ -258,16 +258,17 @@ def _information(
     onset: Floats, signal: Floats, background: float, pulse: Pulse, acquisition: Acquisition
 ) -> Floats:
     """Fisher information of one pulse on the delay, per square bin; 0 where there is no echo."""
-    rate = rate_per_bin(onset, signal, background, pulse, acquisition)
-    # A difference of the pulse's own CDF serves any shape; measured ones have no other slope. It
-    # is short beside the pulse (1e-8 of the slope is lost) and long beside rounding (1e-12).
-    step = 1e-4 * pulse.tau_s / acquisition.bin_width_s
-    slope = rate_per_bin(onset + step, signal, 0.0, pulse, acquisition)
-    slope -= rate_per_bin(onset - step, signal, 0.0, pulse, acquisition)
-    slope /= 2 * step
+    n_bins, bin_width_s = acquisition.n_bins, acquisition.bin_width_s
+    share = pulse.bin_probability(onset, n_bins, bin_width_s)
+    rate = signal[..., np.newaxis] * share + background / n_bins
+    edges_s = (np.arange(n_bins + 1) - onset[..., np.newaxis]) * bin_width_s
+    slope = -signal[..., np.newaxis] * np.diff(pulse.density(edges_s), axis=-1) * bin_width_s
     with np.errstate(over="ignore"):  # a bin that fires every pulse tells nothing
         odds = np.expm1(rate)
-    told = np.divide(_armed(rate) * slope**2, odds, out=np.zeros_like(odds), where=odds > 0)
+    # A share that is rounding has a slope that is none: over next to no background it would tell
+    # more of the delay than all other bins.
+    seen = (share > ROUNDING_OF_SHARES) & (odds > 0)
+    told = np.divide(_armed(rate) * slope**2, odds, out=np.zeros_like(odds), where=seen)
     return np.asarray(told.sum(axis=-1))
 
 
@@ -296,7 +297,8 @@ def _right(
     per_bin = background / n_bins
     armed = _armed(echo + per_bin)
 
-    seen = np.vecdot(armed * exprel(-echo - per_bin), echo)  # by one pulse: a first signal photon
+    first = armed * scipy.special.exprel(-echo - per_bin)
+    seen = np.vecdot(first, echo)  # by one pulse: a first signal photon
     chance = _overlap(begin, end, 0.0, n_bins) / n_bins
     ceiling = np.asarray(1 - (1 - seen) ** n_pulses * (1 - chance))
     if n_pulses * background < 1e-6:  # not one background photon in a million pixels
@@ -310,6 +312,7 @@ def _right(
     score = mean[:, np.newaxis] + sd[:, np.newaxis] * SCORES
     noise_mean, noise_sd = moments(per_bin)
     noise = _standard(score, noise_mean[:, np.newaxis], noise_sd[:, np.newaxis])
+    ndtr = scipy.special.ndtr
     below_here = ndtr(SCORES) * ndtr(noise) ** (2 * SAME_PLACE_SPACINGS - 1)
 
     cells = min(MOST_PLACES, math.ceil(n_bins / spacing))
@@ -323,7 +326,7 @@ def _right(
     standard = _standard(
         score[..., np.newaxis], mean[:, np.newaxis], _root(variance)[:, np.newaxis]
     )
-    below_elsewhere = np.exp((log_ndtr(standard) @ rivals[..., np.newaxis])[..., 0])
+    below_elsewhere = np.exp((scipy.special.log_ndtr(standard) @ rivals[..., np.newaxis])[..., 0])
 
     middle = (below_elsewhere[:, 1:] + below_elsewhere[:, :-1]) / 2
     return np.asarray(np.minimum(np.vecdot(np.diff(below_here, axis=-1), middle), ceiling))
@@ -360,4 +363,4 @@ def _interpolated(
         np.interp(np.log(signal), logs, np.arange(logs.size)),
         np.interp(onset, onsets, np.arange(onsets.size)),
     ]
-    return np.asarray(map_coordinates(table, at, order=1, mode="nearest"))
+    return np.asarray(scipy.ndimage.map_coordinates(table, at, order=1, mode="nearest"))

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
 
 from core.acquisition import Floats
 from core.checks import require
@@ -193,7 +193,7 @@ def wilson(hits: int, trials: int, level: float = 0.95) -> Interval:
     require("trials", trials, trials >= 1, "at least 1")
     require("hits", hits, 0 <= hits <= trials, f"0 to {trials}")
     require("level", level, 0 < level < 1, "between 0 and 1")
-    z = float(ndtri(0.5 + level / 2))
+    z = float(scipy.special.ndtri(0.5 + level / 2))
     share = hits / trials
     centre = (share + z * z / (2 * trials)) / (1 + z * z / trials)
     half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))

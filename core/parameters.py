@@ -15,6 +15,21 @@ from core.checks import require
 
 
 @dataclass(frozen=True)
+class Zone:
+    """Values, from `low` to `high`, with which an answer is in doubt, and a sentence that says why.
+
+    ``python -m core stability`` measures what becomes of the answers there.
+    """
+
+    low: float
+    high: float
+    why: str
+
+    def __contains__(self, value: float) -> bool:
+        return self.low <= value <= self.high
+
+
+@dataclass(frozen=True)
 class Number:
     """A number: its symbol, the range worth exploring, and what is refused.
 
@@ -34,6 +49,8 @@ class Number:
         Smallest and largest value accepted at all.
     open_below : bool
         Whether `least` itself is refused.
+    doubtful : tuple of Zone
+        Values that are accepted, but with which answers are in doubt.
     """
 
     symbol: str
@@ -45,18 +62,22 @@ class Number:
     least: float = -math.inf
     most: float = math.inf
     open_below: bool = False
+    doubtful: tuple[Zone, ...] = ()
 
     def check(self, name: str, value: object) -> None:
         """Raise ``ValueError`` unless `value` is acceptable."""
-        kind, noun = (Integral, "an integer") if self.whole else (Real, "a number")
+        noun = "an integer" if self.whole else "a number"
         relation = "above" if self.open_below else "from"
-        accepted = isinstance(value, kind) and not isinstance(value, bool)
-        if accepted:
-            above: Any = value
-            accepted = self.least <= above <= self.most
-            accepted = accepted and not (self.open_below and above == self.least)
         bounds = f"{noun} {relation} {self.least:g} to {self.most:g}"
-        require(name, value, bool(accepted), bounds)
+        require(name, value, self.takes(value), bounds)
+
+    def takes(self, value: Any) -> bool:
+        """Whether `value` is acceptable."""
+        if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
+            return False
+        above: Any = value
+        within = self.least <= above <= self.most
+        return bool(within and not (self.open_below and above == self.least))
 
 
 @dataclass(frozen=True)

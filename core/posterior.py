@@ -28,7 +28,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.blocks import LANES, lane_rows, to_blocks
@@ -349,9 +348,19 @@ def _shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Flo
             [[1 + (none * share[0] / total).sum()], (mass.T / total).sum(axis=1)]
         )
         share = np.maximum(share / share.sum(), 1e-12)  # never quite impossible
-        found = gaussian_filter1d(found, _SMOOTHING_BINS, mode="nearest")
+        found = _smoothed(found)
         depth = (1 - _ALIKE) * found / found.sum() + _ALIKE / n_bins
     return share, depth * n_bins
+
+
+def _smoothed(density: Floats) -> Floats:
+    """Convolved with a Gaussian of `_SMOOTHING_BINS`; beyond its ends a density stays as it is.
+
+    (As `scipy.ndimage.gaussian_filter1d` does it, which takes a quarter of a second to load.)
+    """
+    reach = round(4 * _SMOOTHING_BINS)
+    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING_BINS) ** 2)
+    return np.convolve(np.pad(density, reach, mode="edge"), weight / weight.sum(), mode="valid")
 
 
 @once_per_capture
@@ -361,7 +370,7 @@ def posterior_of(capture: Capture) -> Posterior:
     n_blocks, n_bins, _ = prepared.counts.shape
     near = np.empty((n_blocks, LANES, n_bins), np.float32)
     surface = np.empty((n_blocks, LANES))
-    for some, density, top in _densities(prepared):
+    for some, density, top, _ in _densities(prepared):
         # What lies before each delay, from so many bins before the gate to so many behind it.
         before = np.zeros((len(top), n_bins + 2 * TOLERANCE_BINS + 1, LANES), np.float32)
         behind = TOLERANCE_BINS + n_bins
@@ -396,8 +405,10 @@ def near(capture: Capture, bins: Floats) -> Floats:
     at = np.clip(np.nan_to_num(bins), 0, last)
     below = np.minimum(at.astype(np.intp), max(last - 1, 0))
     above = np.minimum(below + 1, last)
-    pair = np.take_along_axis(table, np.stack([below, above], axis=2), axis=2)
-    between = pair[..., 0] + (at - below) * (pair[..., 1] - pair[..., 0])
+    # By flat indices: those of `numpy.take_along_axis` cost more than all the rest.
+    first = np.arange(at.size).reshape(at.shape) * table.shape[2]
+    low, high = table.take(first + below), table.take(first + above)
+    between = low + (at - below) * (high - low)
     return np.where(np.isnan(bins), 0.0, np.clip(between, 0.0, 1.0))
 
 
@@ -413,21 +424,19 @@ def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Flo
     """
     prepared = _prepare(capture, capture.cube, light, steps_per_bin)
     delay, score = np.empty((2, prepared.counts.shape[0], LANES))
-    # Of one level there is nothing to average: its logarithms do, and exponentials are what costs.
-    is_one = len(prepared.signal) == 2
-    for some, curve, top in _log_densities(prepared) if is_one else _densities(prepared):
+    for some, curve, weighted in _curves(prepared):
         at = curve.argmax(axis=1)[:, np.newaxis]
         last = curve.shape[1] - 1
         around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
-        log = np.take_along_axis(curve, around, axis=1)
-        if not is_one:  # a neighbour of density 0 has a logarithm too, far below
-            log = np.log(np.maximum(log, 1e-30))
-        left, middle, right = log.astype(float).transpose(1, 0, 2)
+        # Not of the density: beside an echo of many photons that is 0, and has no logarithm.
+        log = np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float)
+        log = np.logaddexp.reduce(log, axis=1) + np.log(prepared.depth[around])
+        left, middle, right = log.transpose(1, 0, 2)
         curvature = np.minimum(left - 2 * middle + right, -1e-9)
         inside = (at[:, 0] > 0) & (at[:, 0] < last)
         shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
         delay[some] = (at[:, 0] + 0.5 + shift) / steps_per_bin
-        score[some] = top + middle
+        score[some] = middle
     pixels, shape = slice(capture.shape[0] * capture.shape[1]), capture.shape
     return delay.reshape(-1)[pixels].reshape(shape), score.reshape(-1)[pixels].reshape(shape)
 
@@ -459,6 +468,9 @@ def rate_and_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Flo
     return np.asarray(-np.log1p(-np.minimum(fired, most))), np.maximum(armed, 0.0)
 
 
+_DARKEST = 1e-100  # photons: with none at all one count would outweigh every other, without end
+
+
 def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
     """``T(d)`` of the module's docstring at each bin's beginning, as written.
 
@@ -475,7 +487,7 @@ def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
     n_bins = acquisition.n_bins
     echo = conditions.pulse.bin_probability(np.arange(n_bins), n_bins, acquisition.bin_width_s)
     s = np.asarray(conditions.signal)[..., np.newaxis, np.newaxis] * echo
-    b = np.asarray(conditions.background)[..., np.newaxis, np.newaxis] / n_bins
+    b = np.maximum(conditions.background, _DARKEST)[..., np.newaxis, np.newaxis] / n_bins
     if n_pulses is None:
         gain, unfired = np.log1p(s / b), np.ones_like(histogram)
     else:
@@ -553,7 +565,9 @@ def _level_densities(prepared: _Prepared) -> NDArray[np.float32]:
     return density.reshape(-1, *log.shape[1:3])[: prepared.n_pixels]
 
 
-def _densities(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32], Floats]]:
+def _densities(
+    prepared: _Prepared,
+) -> Iterator[tuple[slice, NDArray[np.float32], Floats, NDArray[np.float32]]]:
     """Likelihood of each delay over that of no echo, all levels of signal weighted.
 
     Yields
@@ -562,22 +576,34 @@ def _densities(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32]
     density : ndarray, shape (block, delay, LANES)
         In units of ``exp(top)``.
     top : ndarray, shape (block, LANES)
+    weighted : ndarray, shape (block, level, delay, LANES)
+        Logarithms that the density is made of, level by level, `Light.depth` left out.
     """
     weight = prepared.log_share[1:, np.newaxis, np.newaxis].astype(np.float32)
     for some, log in _log_likelihoods(prepared):
-        weighted = log[:, 1:] + weight
+        weighted = np.add(log[:, 1:], weight, out=log[:, 1:])
         top = weighted.max(axis=(1, 2), keepdims=True)
-        weighted -= top
-        density = np.exp(weighted, out=weighted).sum(axis=1)
+        part = weighted - top
+        density = np.exp(part, out=part).sum(axis=1)
         density *= prepared.depth[:, np.newaxis]
-        yield some, density, top[:, 0, 0].astype(float)
+        yield some, density, top[:, 0, 0].astype(float), weighted
 
 
-def _log_densities(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32], float]]:
-    """Logarithm of what `_densities` gives, for one level of signal, in units of 1."""
-    weight = np.log(prepared.depth) + np.float32(prepared.log_share[1])
+def _curves(
+    prepared: _Prepared,
+) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.float32]]]:
+    """A curve that is highest where the density of `_densities` is, and what that is made of.
+
+    Of one level there is nothing to average: its logarithms do, and exponentials are what costs.
+    """
+    if len(prepared.signal) > 2:
+        for some, density, _, weighted in _densities(prepared):
+            yield some, density, weighted
+        return
+    depth = np.log(prepared.depth)[:, np.newaxis]
     for some, log in _log_likelihoods(prepared):
-        yield some, log[:, 1] + weight[:, np.newaxis], 0.0
+        weighted = log[:, 1:] + np.float32(prepared.log_share[1])
+        yield some, weighted[:, 0] + depth, weighted
 
 
 def _log_likelihoods(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.float32]]]:

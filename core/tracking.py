@@ -36,7 +36,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from core.acquisition import Floats
-from core.blocks import LANES, Blocks, lane_rows, lane_sigma
+from core.blocks import LANES, Blocks, lane_rows, lane_spread
 from core.checks import require
 from core.parallel import COMPILED, KERNEL_LOCK, PARALLEL, SERIAL_BELOW
 from core.parameters import Choice, Number, check_fields, parameter
@@ -178,7 +178,7 @@ def tracking_signals(
         _differentiate_rows(rows, r, float(parameters.h), float(parameters.m), first, scale)
     residual = np.maximum(large - small, 0.0)
     residual[~(residual > ROUNDING_32 * rows.max(axis=1, keepdims=True))] = 0.0
-    weight = np.broadcast_to(_weights(rows.shape[1], parameters), rows.shape)
+    weight = np.broadcast_to(common_weight(rows.shape[1], parameters), rows.shape)
     pulses = _pulses_for_survival(parameters, n_pulses)
     if pulses is not None:
         armed = pulses - (np.cumsum(rows, axis=1) - rows)
@@ -220,17 +220,18 @@ def track(
         The enhanced signal there, in counts; 0 where there is none.
     """
     n_blocks, n_bins, _ = blocks.counts.shape
-    weight = _weights(n_bins, parameters)
+    weight = common_weight(n_bins, parameters)
     top = weight.max() or 1.0
     settings = _Settings(
         k_per_sigma=float((parameters.m * parameters.h) ** 2 * parameters.l),
+        r_small=1.0,
         n=float(parameters.n),
         m=float(parameters.m),
         start_bins=min(START_BINS, n_bins) if parameters.start == "mean" else 0,
         n_pulses=_pulses_for_survival(parameters, n_pulses) or 0,
     )
     sigma_bins = _sigma_bins(parameters, n_bins)
-    sigma = blocks.sigma if sigma_bins == n_bins else lane_sigma(blocks.counts, sigma_bins)
+    sigma = blocks.sigma if sigma_bins == n_bins else lane_spread(blocks.counts, sigma_bins)[1]
     position = np.empty((n_blocks, LANES), np.float32)
     score = np.empty_like(position)
     lanes = _Lanes(sigma, blocks.largest, position, score)
@@ -245,7 +246,7 @@ class _Lanes(NamedTuple):
     """One number a pixel, each of shape (block, LANES): what goes in, and what comes out."""
 
     sigma: NDArray[np.float64]
-    largest: NDArray[np.float64]
+    largest: NDArray[np.unsignedinteger]
     position: NDArray[np.float32]
     score: NDArray[np.float32]
 
@@ -254,6 +255,7 @@ class _Settings(NamedTuple):
     """What the kernel needs to know; 0 in `start_bins` and `n_pulses` means "not used"."""
 
     k_per_sigma: float
+    r_small: float
     n: float
     m: float
     start_bins: int
@@ -275,54 +277,75 @@ def _pulses_for_survival(parameters: TrackingParameters, n_pulses: int | None) -
     return n_pulses
 
 
-def _weights(n_bins: int, parameters: TrackingParameters) -> Floats:
+def common_weight(n_bins: int, parameters: TrackingParameters) -> Floats:
     """The part of the weight that is the same for every pixel (Eq. 13), shape (bin,)."""
     bins = np.arange(n_bins)
     rise = (bins / n_bins) ** 3
     if parameters.weight == "cubic":
-        weight = parameters.alpha * rise
+        # A strength that has lost its digits would give its shape to the weight: it is none.
+        weight = (parameters.alpha if parameters.alpha >= np.finfo(float).tiny else 0.0) * rise
     elif parameters.weight == "exponential":
-        weight = np.exp(np.minimum(parameters.alpha * rise, 600.0))  # times a count, still finite
+        # Where it spans more than float32 does, the last bins win, as they should, and the others
+        # are still something; times a count it is finite.
+        power = parameters.alpha * rise
+        weight = np.exp(np.maximum(power, power[-1] - 60.0) - max(power[-1] - 600.0, 0.0))
     else:
         weight = np.ones(n_bins)
     return np.where(bins >= parameters.t_n, weight, 0.0)
 
 
 @njit(**COMPILED)
-def _differentiate(s, r, h, m, x1, out):  # type: ignore[no-untyped-def]
-    """One tracking differentiator over one row, the equations as written."""
-    h0 = m * h
+def differentiator_step(x1, x2, s, r, h, h0):  # type: ignore[no-untyped-def]
+    """One step of a tracking differentiator, the equations as written: x1 and x2 after it."""
     d = r * h0
     d0 = h0 * d
+    y = x1 - s + h0 * x2
+    if abs(y) > d0:
+        a0 = math.sqrt(d * d + 8.0 * r * abs(y))
+        a = x2 + (a0 - d) / 2.0 * np.sign(y)
+    else:
+        a = x2 + y / h0
+    # With r = 0 the second form is 0/0: nothing may accelerate.
+    fh = -r * np.sign(a) if abs(a) > d else (-r * a / d if d > 0.0 else 0.0)
+    return x1 + h * x2, x2 + h * fh
+
+
+@njit(**COMPILED)
+def differentiate(s, r, h, m, x1, out):  # type: ignore[no-untyped-def]
+    """One tracking differentiator over one row."""
     x2 = 0.0
     for k in range(s.size):
-        y = x1 - s[k] + h0 * x2
-        if abs(y) > d0:
-            a0 = math.sqrt(d * d + 8.0 * r * abs(y))
-            a = x2 + (a0 - d) / 2.0 * np.sign(y)
-        else:
-            a = x2 + y / h0
-        # With r = 0 the second form is 0/0: nothing may accelerate.
-        fh = -r * np.sign(a) if abs(a) > d else (-r * a / d if d > 0.0 else 0.0)
-        x1, x2 = x1 + h * x2, x2 + h * fh
+        x1, x2 = differentiator_step(x1, x2, s[k], r, h, m * h)
         out[k] = x1
 
 
 @njit(**COMPILED)
 def _differentiate_rows(rows, r, h, m, first, out):  # type: ignore[no-untyped-def]
     for i in range(rows.shape[0]):
-        _differentiate(rows[i], r[i], h, m, first[i], out[i])
+        differentiate(rows[i], r[i], h, m, first[i], out[i])
 
 
 # The kernel's registers: one row of LANES float32 each, at a constant place in one array, which is
 # what lets the compiler keep 16 pixels in a vector and see that no two rows overlap.
 _X1_SMALL, _X2_SMALL, _X1_LARGE, _X2_LARGE = 0 * LANES, 1 * LANES, 2 * LANES, 3 * LANES
-_SCALE, _FLOOR, _WEIGHT, _ARMED = 4 * LANES, 5 * LANES, 6 * LANES, 7 * LANES
+_SCALE, _FLOOR, _GAIN, _ARMED = 4 * LANES, 5 * LANES, 6 * LANES, 7 * LANES
 _BEST, _AT = 8 * LANES, 9 * LANES
 _ROWS = 10
 
 _ALTERNATING = np.float32(1e-20)  # keeps a filter at rest out of the slow subnormal numbers
 _SCALED_MAX = 1e18  # a count beyond this many K: squares still fit a float32, echoes no longer show
+
+
+@njit(**COMPILED, inline="always")
+def _follow(x1, x2, s, r, per_m):  # type: ignore[no-untyped-def]
+    """One step of a scale in its own units: X1' and X2' of the module's docstring."""
+    quarter, half, two = np.float32(0.25), np.float32(0.5), np.float32(2.0)
+    y = x1 + x2 - s
+    t = abs(y)
+    a = x2 + math.copysign(math.sqrt(quarter * r * r + two * r * t) - half * r if t > r else t, y)
+    a = a if a < r else r
+    a = a if a > -r else -r
+    return x1 + x2 * per_m, x2 - a * per_m
 
 
 @njit(**COMPILED)
@@ -334,43 +357,28 @@ def _track_block(b, blocks, lanes, weight, settings, row):  # type: ignore[no-un
     counts = blocks[b]
     _prepare_rows(counts, lanes.sigma[b], lanes.largest[b], settings, row)
     zero, one = np.float32(0.0), np.float32(1.0)
-    quarter, half, two = np.float32(0.25), np.float32(0.5), np.float32(2.0)
-    r = np.float32(settings.n)
-    r_quarter, r_half, r_two = quarter * r * r, half * r, two * r
+    r_small, r_large = np.float32(settings.r_small), np.float32(settings.n)
     per_m = np.float32(1.0 / settings.m)
     for k in range(counts.shape[0]):
         if settings.n_pulses > 0:
             for i in range(LANES):
-                row[_WEIGHT + i] = weight[k] * settings.n_pulses / max(row[_ARMED + i], one)
+                row[_GAIN + i] = np.float32(settings.n_pulses) / max(row[_ARMED + i], one)
                 row[_ARMED + i] -= np.float32(counts[k, i])
-        else:
-            for i in range(LANES):
-                row[_WEIGHT + i] = weight[k]
+        weight_of_bin = weight[k]
         bin_number = np.float32(k)
         offset = _ALTERNATING if k & 1 else -_ALTERNATING
         for i in range(LANES):
             s = row[_SCALE + i] * np.float32(counts[k, i]) + offset
-
-            x1, x2 = row[_X1_SMALL + i], row[_X2_SMALL + i]
-            y = x1 + x2 - s
-            t = abs(y)
-            a = x2 + math.copysign(math.sqrt(quarter + two * t) - half if t > one else t, y)
-            a = a if a < one else one
-            a = a if a > -one else -one
-            small = x1 + x2 * per_m
-            row[_X1_SMALL + i], row[_X2_SMALL + i] = small, x2 - a * per_m
-
-            x1, x2 = row[_X1_LARGE + i], row[_X2_LARGE + i]
-            y = x1 + x2 - s
-            t = abs(y)
-            a = x2 + math.copysign(math.sqrt(r_quarter + r_two * t) - r_half if t > r else t, y)
-            a = a if a < r else r
-            a = a if a > -r else -r
-            large = x1 + x2 * per_m
-            row[_X1_LARGE + i], row[_X2_LARGE + i] = large, x2 - a * per_m
-
+            small, row[_X2_SMALL + i] = _follow(
+                row[_X1_SMALL + i], row[_X2_SMALL + i], s, r_small, per_m
+            )
+            large, row[_X2_LARGE + i] = _follow(
+                row[_X1_LARGE + i], row[_X2_LARGE + i], s, r_large, per_m
+            )
+            row[_X1_SMALL + i], row[_X1_LARGE + i] = small, large
             residual = large - small
-            enhanced = residual * row[_WEIGHT + i] if residual > row[_FLOOR + i] else zero
+            gain = weight_of_bin * row[_GAIN + i]
+            enhanced = residual * gain if residual > row[_FLOOR + i] else zero
             best = row[_BEST + i]
             row[_AT + i] = bin_number if enhanced > best else row[_AT + i]
             row[_BEST + i] = enhanced if enhanced > best else best
@@ -398,6 +406,7 @@ def _prepare_rows(counts, sigma, largest, settings, row):  # type: ignore[no-unt
         if settings.start_bins > 0:
             row[_X1_SMALL + i] *= np.float32(scale / settings.start_bins)
         row[_X1_LARGE + i] = row[_X1_SMALL + i]
+        row[_GAIN + i] = 1.0
         row[_ARMED + i] = settings.n_pulses
 
 

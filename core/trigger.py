@@ -121,7 +121,8 @@ def coates_rate(counts: ArrayLike, n_pulses: int) -> Floats:
     require("n_pulses", n_pulses, n_pulses >= total, f"at least {total}, the detections of a pixel")
     armed = n_pulses - (np.cumsum(counts, axis=-1) - counts)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(-np.log1p(-counts / armed))
+        # ln(1 + n / (A - n)) keeps its digits where few of the armed pulses fire, and where all do.
+        return np.asarray(np.log1p(counts / (armed - counts)))
 
 
 def _checked_rate(rate: ArrayLike) -> Floats:

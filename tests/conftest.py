@@ -84,6 +84,22 @@ def page(open_watched: Callable[..., Page], troubles: list[str]) -> Iterator[Cal
     assert found == []
 
 
+@pytest.fixture(scope="module")
+def lasting_page(open_watched: Callable[..., Page]) -> Iterator[Page]:
+    """The page that a module's tests share, because a page costs seconds; see `one_page`."""
+    opened = open_watched()
+    yield opened
+    opened.context.close()
+
+
+@pytest.fixture
+def one_page(lasting_page: Page, troubles: list[str]) -> Iterator[Page]:
+    """A shared page that may have had no trouble in this test, which leaves it as it found it."""
+    yield lasting_page
+    found, troubles[:] = list(troubles), []
+    assert found == []
+
+
 @pytest.fixture
 def real_capture() -> Callable[[str], Path]:
     """Path of a published capture."""

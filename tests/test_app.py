@@ -17,12 +17,13 @@ from app import looks, plots, words
 from app.controls import Knob, SettingsPanel
 from app.jobs import LatestWins
 from app.layout import CUSTOM, Layout
-from app.state import Light, Reading, Viewing
+from app.state import Less, Light, Reading, Viewing
 from app.store import Request, built_in_sources, compute, file_source, inspect, is_wrong
 from app.theme import DARK, LIGHT, OUTSIDE_COLOR
 from app.views import ImageView, Plot, SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
 from core.parameters import Number, spec_of
+from core.reductions import Reduction
 
 NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
 
@@ -36,7 +37,12 @@ def until(condition):
 
 
 def ask(source="car", **chosen):
-    choices = {"light": Light(), "reading": Reading(), "tracking": TrackingParameters()} | chosen
+    choices = {
+        "light": Light(),
+        "reading": Reading(),
+        "tracking": TrackingParameters(),
+        "less": Less(),
+    } | chosen
     known = built_in_sources()
     return Request(known[source] if isinstance(source, str) else source, **choices)
 
@@ -148,6 +154,29 @@ def test_only_what_changed_is_computed_again(car):
         assert compute(replace(car.request, **change), car).capture is not car.capture
 
 
+def test_less_of_a_capture_is_taken_from_the_whole_of_it(car):
+    less = Less(merge=2, gate_from=0.2, gate_to=0.9, pool=2)
+    reduced = compute(replace(car.request, less=less), car)
+    assert reduced.whole is car.whole is car.capture
+    assert reduced.capture.cube.shape == (32, 32, 35)
+    assert compute(car.request, reduced).whole is car.whole
+    np.testing.assert_array_equal(
+        reduced.capture.cube, Reduction(merge=2, gate=(20, 90), pool=2).of(car.capture).cube
+    )
+
+
+@pytest.mark.parametrize(
+    "reduction", [Reduction(), Reduction(4, (7, 33), skip=2), Reduction(gate=(0, 99), pool=3)]
+)
+def test_a_reduction_is_what_its_settings_say(reduction):
+    for n_bins in (100, 334, 876):
+        assert Less.of(reduction, n_bins).reduction(n_bins) == reduction
+
+
+def test_a_gate_is_never_empty():
+    assert Less(gate_from=1.0, gate_to=0.0).reduction(10) == Reduction(gate=(9, 10))
+
+
 def test_an_answer_is_what_core_computes(car):
     scene, light = core.scenes["car"](), Light()
     capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
@@ -203,9 +232,9 @@ def test_a_file_is_a_source(small_file, small_capture):
     source = file_source(small_file)
     assert source.title == "small.npz"
     assert not source.is_scene
-    read = source.load(Light(), Reading())
+    read = source.load(Light(), Reading(), ())
     np.testing.assert_array_equal(read.cube, small_capture.cube)
-    again = source.load(Light(), Reading(bin_width_s=3e-9))
+    again = source.load(Light(), Reading(bin_width_s=3e-9), ())
     assert again.acquisition.bin_width_s == 3e-9
 
 
@@ -590,7 +619,7 @@ def test_plots_follow_the_page_into_the_dark():
 # -- controls --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("settings", [TrackingParameters(), Light(), Viewing()])
+@pytest.mark.parametrize("settings", [TrackingParameters(), Light(), Less(), Viewing()])
 def test_every_field_has_a_control_made_from_its_metadata(settings):
     controls = SettingsPanel(settings, lambda new: None).controls
     assert list(controls) == [each.name for each in fields(settings)]
@@ -767,6 +796,22 @@ def test_typed_text_changes_how_a_file_is_read(layout, small_file):
     control(layout, "Bin width (s)").value = "3e-9"
     control(layout, "Read again").clicks += 1
     assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9
+
+
+def test_less_of_a_capture_is_another_view_of_it(layout):
+    panel = layout._less.controls
+    panel["pool"].value = 4
+    assert next_answer(layout).capture.shape == (16, 16)
+    assert max(layout.session.state.pixel) < 16
+    panel["merge"].value = 2
+    assert next_answer(layout).capture.cube.shape == (16, 16, 50)
+    panel["gate_from"].value = 1.0  # leaves one bin, where two are to be merged
+    next_answer(layout)
+    assert "factor = 2 is not accepted" in complaint(layout)
+    assert (panel["merge"].value, panel["gate_from"].value) == (2, 0.0)
+    control(layout, "Scene or capture").value = "staircase"
+    assert next_answer(layout).capture.shape == (64, 64)
+    assert panel["pool"].value == 1
 
 
 def test_a_capture_without_truth_hides_what_needs_one(layout, real_capture):

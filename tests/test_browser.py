@@ -159,20 +159,10 @@ def rmse(run: core.Run) -> str:
 # -- the page --------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def one_page(open_watched):
-    return open_watched()
-
-
 @pytest.fixture
-def car_page(one_page, troubles):
-    """A page on the car that tests share, because a page costs four seconds; put back after each.
-
-    The pixel on show stays, and the camera.
-    """
+def car_page(one_page):
+    """The shared page on the car, put back after each test but for pixel and camera."""
     yield one_page
-    found, troubles[:] = list(troubles), []
-    assert found == []
     if chosen(one_page, "Scene or capture").inner_text() != "Car at 50 m":
         choose(one_page, "Scene or capture", "Car at 50 m")
     resets = one_page.get_by_role("button", name=re.compile("^Reset "))

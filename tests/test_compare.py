@@ -17,7 +17,7 @@ from app.compare import CLOUDS, FIRST_PICKS, MOST_PICTURES, Compare
 from app.jobs import LatestWins
 from app.layout import Layout
 from app.ranking import Result, Task
-from app.state import Light, Reading
+from app.state import Less, Light, Reading
 from app.store import Request, built_in_sources, compute
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
@@ -27,7 +27,7 @@ from tests.browser import eventually, fact
 
 
 def answer_to(source):
-    request = Request(built_in_sources()[source], Light(), Reading(), TrackingParameters())
+    request = Request(built_in_sources()[source], Light(), Reading(), TrackingParameters(), Less())
     return compute(request, None)
 
 
@@ -334,11 +334,23 @@ def test_the_hidden_page_is_not_drawn_and_catches_up(stage):
 # -- in a browser ----------------------------------------------------------------------------------
 
 
-def open_compare(page):
-    page.get_by_role("button", name="Compare", exact=True).click()
-    expect(page.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible()
-    expect(page.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
-    page.wait_for_function("Bokeh.documents[0].is_idle")
+@pytest.fixture
+def here(one_page):
+    """The shared page, five methods of the car compared."""
+    one_page.get_by_role("button", name="Compare", exact=True).click()
+    expect(one_page.get_by_text("5 methods compared")).to_be_visible()
+    expect(one_page.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
+    one_page.wait_for_function("Bokeh.documents[0].is_idle")
+    return one_page
+
+
+def press(page, name):
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def open_source(page, title):
+    page.get_by_role("combobox", name=re.compile("^Scene or capture")).click()
+    page.get_by_role("menuitem", name=title, exact=True).click()
 
 
 def pictures(page):
@@ -356,24 +368,22 @@ def first_row(page):
 
 
 @pytest.mark.browser
-def test_five_methods_stand_side_by_side(page):
-    here = page()
-    open_compare(here)
-    expect(here.get_by_text("5 methods compared")).to_be_visible()
+def test_five_methods_stand_side_by_side(here):
     expect(here.locator("tbody").first.locator("tr")).to_have_count(5)
     eventually(lambda: len(colors_of(pictures(here)) & set(RANGE_COLORS)) > 50)
-    here.get_by_role("checkbox", name="Matched filter", exact=True).check()
+    another = here.get_by_role("checkbox", name="Matched filter", exact=True)
+    another.check()
     expect(here.get_by_text("6 methods compared")).to_be_visible()
     expect(here.locator("tbody").first.locator("tr")).to_have_count(6)
     # Explore is as it was.
-    here.get_by_role("button", name="Explore", exact=True).click()
+    press(here, "Explore")
     expect(fact(here, "RMSE")).to_be_visible()
+    press(here, "Compare")
+    another.uncheck()
 
 
 @pytest.mark.browser
-def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all(page):
-    here = page()
-    open_compare(here)
+def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all(here):
     before = fact(here, "Pixel").inner_text()
     box = pictures(here).locator(".bk-Figure").first.bounding_box()
     here.mouse.click(box["x"] + 0.4 * box["width"], box["y"] + 0.5 * box["height"])
@@ -388,9 +398,7 @@ def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all(page):
 
 
 @pytest.mark.browser
-def test_the_table_is_sorted_by_click_and_by_keyboard(page):
-    here = page()
-    open_compare(here)
+def test_the_table_is_sorted_by_click_and_by_keyboard(here):
     header = here.get_by_role("button", name="Within 3 bins")
     header.click()
     expect(here.locator("th[aria-sort=descending]")).to_have_text("Within 3 bins")
@@ -403,10 +411,8 @@ def test_the_table_is_sorted_by_click_and_by_keyboard(page):
 
 
 @pytest.mark.browser
-def test_clouds_turn_together(page):
-    here = page()
-    open_compare(here)
-    here.get_by_role("button", name="3D clouds", exact=True).click()
+def test_clouds_turn_together(here):
+    press(here, "3D clouds")
     stages = here.locator(".stage").filter(visible=True)
     expect(stages).to_have_count(5)
     for stage in stages.all():
@@ -416,42 +422,25 @@ def test_clouds_turn_together(page):
     here.keyboard.press("ArrowLeft")
     expect(stages.last).not_to_have_attribute("data-camera", before)
     eventually(lambda: len({each.get_attribute("data-camera") for each in stages.all()}) == 1)
+    press(here, "Range")
 
 
 @pytest.mark.browser
-def test_it_follows_the_page_into_the_dark(page):
-    here = page()
-    open_compare(here)
-    here.get_by_role("button", name=re.compile("theme", re.IGNORECASE)).click()
+def test_it_follows_the_page_into_the_dark(here):
+    press(here, "Toggle theme")
     curves = here.locator(".bk-Figure").filter(has_text="answer, own lag removed")
     eventually(lambda: {method_style(0, DARK)[0], DARK.paper} <= colors_of(curves))
+    press(here, "Toggle theme")
 
 
 @pytest.mark.browser
-def test_a_file_without_truth_says_what_is_not_known(page):
-    here = page()
-    open_compare(here)
-    here.get_by_role("combobox", name=re.compile("^Scene or capture")).click()
-    here.get_by_role("menuitem", name="Sample capture (file)", exact=True).click()
+def test_a_file_without_truth_says_what_is_not_known(here):
+    open_source(here, "Sample capture (file)")
     expect(here.get_by_text("That is agreement, not accuracy.")).to_be_visible()
     expect(here.get_by_role("button", name="Error", exact=True)).to_have_count(0)
     expect(here.get_by_text(re.compile("^Not possible here: .*true signal"))).to_be_visible()
     expect(here.get_by_text(re.compile("^Not known here"))).to_be_visible()
-
-
-@pytest.mark.browser
-def test_the_comparison_can_be_stopped(page):
-    here = page()
-    open_compare(here)
-    here.get_by_role("checkbox", name=re.compile("^Unmixing")).check()
-    expect(here.get_by_text("6 methods compared")).to_be_visible()
-    here.get_by_role("combobox", name=re.compile("^Scene or capture")).click()
-    # Large enough to be under way still when the button is pressed.
-    here.get_by_role("menuitem", name="Car at 50 m, 256 × 256", exact=True).click()
-    here.get_by_role("button", name="Cancel", exact=True).click()
-    expect(here.get_by_text(re.compile("^Stopped: .* of 6 done"))).to_be_visible()
-    here.get_by_role("button", name="Go on", exact=True).click()
-    expect(here.get_by_text("6 methods compared")).to_be_visible()
+    open_source(here, "Car at 50 m")
 
 
 @pytest.mark.browser

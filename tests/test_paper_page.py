@@ -386,11 +386,12 @@ def titles(page: Page) -> dict[str, str]:
 
 
 @pytest.fixture
-def paper_page(page):
-    opened = page()
-    opened.get_by_role("button", name="Paper", exact=True).click()
-    expect(figure(opened, "background alone")).to_be_visible(timeout=SOON_MS)
-    return opened
+def paper_page(one_page):
+    """The shared page, the first figures of Paper on screen."""
+    one_page.get_by_role("button", name="Paper", exact=True).click()
+    go(one_page, "Figures 1, 2")
+    expect(figure(one_page, "background alone")).to_be_visible(timeout=SOON_MS)
+    return one_page
 
 
 @pytest.mark.browser
@@ -433,9 +434,11 @@ def test_the_page_is_dark_where_the_app_is(paper_page):
     paper_page.get_by_role("button", name="Toggle theme").click()
     go(paper_page, "Figure 6")
     expect(figure(paper_page, "weight cubic")).to_be_visible(timeout=SOON_MS)
-    eventually(lambda: sum(text.startswith("Figure") for text in titles(paper_page)) == 3)
-    colors = {color for text, color in titles(paper_page).items() if text.startswith("Figure")}
+    figures = ("Figure 1", "Figure 2", "Figure 6")
+    eventually(lambda: sum(text.startswith(figures) for text in titles(paper_page)) == 3)
+    colors = {color for text, color in titles(paper_page).items() if text.startswith(figures)}
     assert colors == {DARK.text}
+    paper_page.get_by_role("button", name="Toggle theme").click()
 
 
 @pytest.mark.browser

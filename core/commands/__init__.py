@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 
-from core.commands import captures, studies
+from core.commands import captures, studies, trade
 from core.commands.options import as_options
 
 ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
@@ -22,6 +22,7 @@ def main(arguments: list[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     captures.add(commands)
     studies.add(commands)
+    trade.add(commands)
     chosen = parser.parse_args(arguments)
     try:
         chosen.work(chosen)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -98,6 +99,14 @@ def add_reading(command: Any) -> None:
         group.add_argument(f"--{name}", **kind)
 
 
+def add_processes(command: Any) -> None:
+    """Add the option that tells how many processes share the work."""
+    cores = os.cpu_count() or 1
+    command.add_argument(
+        "--processes", type=whole_from_to(1, 256), default=cores, help=f"({cores})"
+    )
+
+
 def reading(chosen: argparse.Namespace) -> dict[str, Any]:
     """The arguments of `core.read_capture`."""
     told = {name: getattr(chosen, name) for name in READING_NAMES}
@@ -143,10 +152,10 @@ def as_options(message: str) -> str:
     return message
 
 
-def show_progress(done: int, of: int) -> None:
+def show_progress(done: int, of: int, what: str = "pieces") -> None:
     """A bar on standard error."""
     bar = "#" * (40 * done // max(of, 1))
-    print(f"\r[{bar:<40}] {done} of {of} pieces", end="", file=sys.stderr, flush=True)
+    print(f"\r[{bar:<40}] {done} of {of} {what}", end="", file=sys.stderr, flush=True)
 
 
 def show(facts: Mapping[str, Any], as_json: bool) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
-from core.commands.options import show_progress, whole_from_to
+from core.commands.options import add_processes, show_progress, whole_from_to
 from core.experiments import calibration, field, paper, recommend, uniform
 from core.experiments.items import as_markdown, as_text
 from core.experiments.printed import TABLE_2
@@ -32,7 +31,7 @@ def _add_paper(commands: Any) -> None:
     command.add_argument("--repetitions", type=whole_from_to(2, MOST_SEEDS), default=MOST_SEEDS)
     command.add_argument("--folder", type=Path, default=Path("paper"), help="written to (paper)")
     command.add_argument("--field", type=Path, help="a measured capture to compare methods on")
-    _add_processes(command)
+    add_processes(command)
     command.set_defaults(work=_paper)
 
 
@@ -56,7 +55,7 @@ def _add_table2(commands: Any) -> None:
     command = commands.add_parser("table2", help="the car under six SBRs, beside the paper's")
     command.add_argument("--seeds", type=whole_from_to(2, MOST_SEEDS), default=20)
     command.add_argument("--preset", choices=PRESETS, default="recommended")
-    _add_processes(command)
+    add_processes(command)
     command.set_defaults(work=_table2)
 
 
@@ -72,7 +71,7 @@ def _table2(chosen: argparse.Namespace) -> None:
 def _add_uniform(commands: Any) -> None:
     command = commands.add_parser("uniform", help="every method on depths uniform over the gate")
     command.add_argument("--seeds", type=whole_from_to(2, MOST_SEEDS), default=24)
-    _add_processes(command)
+    add_processes(command)
     command.set_defaults(work=_uniform)
 
 
@@ -158,13 +157,6 @@ def _recommend(chosen: argparse.Namespace) -> None:
     rows = [(c.margin, *c.rd.values(), "yes" if c.passes else "no", c.settings) for c in found[:12]]
     reached = (f"RD at SBR {sbr:g}" for sbr in uniform.SBRS)
     print("\n\n" + as_markdown(("smallest margin", *reached, "passes Table 2", "settings"), rows))
-
-
-def _add_processes(command: Any) -> None:
-    cores = os.cpu_count() or 1
-    command.add_argument(
-        "--processes", type=whole_from_to(1, 256), default=cores, help=f"({cores})"
-    )
 
 
 def _tried(plan: Any, chosen: argparse.Namespace) -> Results:

@@ -230,8 +230,9 @@ class Estimator:
         onset = (places[:, np.newaxis] + np.arange(8) / 8).ravel()
         # Not the largest score but the largest that the echo adds: noise-free, a falling background
         # is still there, and where an echo is weak it would take the scores near it for the echo's.
+        without = _expected(onset[:1], given._replace(signal=np.zeros(())))  # the same for all
         added = self.curve(_expected(onset, given), given, parameters) - self.curve(
-            _expected(onset, given._replace(signal=np.zeros(()))), given, parameters
+            without, given, parameters
         )
         found = added.max(axis=1) > 0
         if not found.any():

@@ -72,7 +72,8 @@ def gaussian_taps(sigma_bins: float) -> Floats:
     half = math.ceil(4 * sigma_bins)
     if half == 0:
         return np.ones(1)
-    taps = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma_bins) ** 2)
+    with np.errstate(over="ignore"):  # one so narrow that no neighbour is reached
+        taps = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma_bins) ** 2)
     return np.asarray(taps / taps.sum())
 
 

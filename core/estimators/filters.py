@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import correlate1d
+import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
 from core.posterior import Conditions
@@ -34,4 +34,4 @@ def correlate(values: Floats, taps: Floats, first: int) -> Floats:
     half = max(-first, last, 0)
     centred = np.zeros(2 * half + 1)
     centred[half + first : half + last + 1] = taps
-    return np.asarray(correlate1d(values, centred, axis=-1, mode="constant"))
+    return np.asarray(scipy.ndimage.correlate1d(values, centred, axis=-1, mode="constant"))

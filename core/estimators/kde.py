@@ -19,7 +19,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
+import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
 from core.estimators.base import Estimator
@@ -60,7 +60,7 @@ def kernel_taps(bandwidth_bins: float) -> Floats:
     """Density at whole bins' distance from a trigger, averaged over its bin; shape (odd,)."""
     half = math.ceil(5 * bandwidth_bins)  # beyond five standard deviations lies one in 2 million
     edges = np.arange(-half, half + 2) - 0.5
-    return np.diff(ndtr(edges / bandwidth_bins))
+    return np.diff(scipy.special.ndtr(edges / bandwidth_bins))
 
 
 def _curve(histogram: Floats, conditions: Conditions, parameters: KdeParameters) -> Floats:

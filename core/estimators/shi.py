@@ -19,8 +19,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numba import njit
-from scipy.ndimage import correlate1d
 
 from core.acquisition import Floats
 from core.estimators.base import Estimator
@@ -129,7 +129,7 @@ def _fill_prominences(rows, found):  # type: ignore[no-untyped-def]
 def _curve(histogram: Floats, conditions: Conditions, parameters: ShiParameters) -> Floats:
     """Prominence of the recovered waveform's local peaks; see the module's docstring."""
     taps = sample_function(parameters.width_bins)
-    waveform = correlate1d(histogram, taps, axis=-1, mode="nearest")
+    waveform = scipy.ndimage.correlate1d(histogram, taps, axis=-1, mode="nearest")
     return prominences(median_of_three(waveform))
 
 

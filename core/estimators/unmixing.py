@@ -45,9 +45,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
-from scipy.special import betainc, rel_entr
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
@@ -142,6 +141,7 @@ def scan(counts: Floats, exposure: Floats, window: int) -> _Windows:
     lasts = window_sums(exposure, window) / exposure.sum(axis=-1, keepdims=True)
     length = np.clip(lasts, 0.0, 1.0)  # sums round
     share = np.where(total > 0, inside / np.maximum(total, 1.0), length)  # none: as noise has it
+    rel_entr = scipy.special.rel_entr
     ratio = total * (rel_entr(share, length) + rel_entr(1 - share, 1 - length))
     score = np.copysign(np.sqrt(2 * np.maximum(ratio, 0.0)), share - length)
     return _Windows(inside, length, score)
@@ -217,6 +217,7 @@ def _clusters(counts: Floats, exposure: Floats, ruler: _Ruler, false_acceptance:
 
 def binomial_from(least: Floats, trials: Floats, chance: Floats) -> Floats:
     """Probability of `least` or more successes, all of them whole numbers."""
+    betainc = scipy.special.betainc
     tail = betainc(np.maximum(least, 1.0), trials - least + 1, np.clip(chance, 0.0, 1.0))
     return np.where(least > 0, tail, 1.0)
 
@@ -296,7 +297,7 @@ def smoothed(values: Floats, precision: Floats, smoothness: float) -> Floats:
     for _ in range(_STEPS):
         flow[0, :-1] += step * np.diff(ahead, axis=0)
         flow[1, :, :-1] += step * np.diff(ahead, axis=1)
-        flow /= np.maximum(1.0, np.hypot(*flow) / smoothness)
+        flow *= smoothness / np.maximum(smoothness, np.hypot(*flow))
         spread = -flow.sum(axis=0)  # the negative divergence
         spread[1:] += flow[0, :-1]
         spread[:, 1:] += flow[1, :, :-1]
@@ -316,7 +317,8 @@ def _locate(
     known = np.isfinite(clusters.delay) & ~dropped
     if not known.any():
         return clusters.delay, clusters.score
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    transform = scipy.ndimage.distance_transform_edt
+    nearest = transform(~known, return_distances=False, return_indices=True)
     precision = np.where(known, clusters.precision, 0.0)
     delay = smoothed(clusters.delay[tuple(nearest)], precision, parameters.smoothness)
     return np.where(np.isfinite(clusters.delay), delay, np.nan), clusters.score

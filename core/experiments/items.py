@@ -11,7 +11,10 @@ from core.acquisition import Floats
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Curves over one axis; `marks` are places on it, `x` and each curve have the same length."""
+    """Curves over one axis; `marks` are places on it, `x` and each curve have the same length.
+
+    A curve of which `bands` knows the lowest and the highest is drawn with what lies between.
+    """
 
     key: str
     title: str
@@ -20,6 +23,26 @@ class Plot:
     x: Floats
     curves: Mapping[str, Floats]
     marks: Mapping[str, float] = field(default_factory=dict)
+    note: str = ""
+    bands: Mapping[str, tuple[Floats, Floats]] = field(default_factory=dict)
+    x_is_log: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Groups of places on two logarithmic axes, with intervals, some joined by a line.
+
+    Each coordinate has the shape (3, n): value, lowest, highest. `line` names some of the places:
+    (n,) each of x, y and text.
+    """
+
+    key: str
+    title: str
+    x_label: str
+    y_label: str
+    groups: Mapping[str, tuple[Floats, Floats]]
+    line: tuple[Floats, Floats, Sequence[str]]
+    line_label: str
     note: str = ""
 
 
@@ -47,7 +70,7 @@ class Table:
     note: str = ""
 
 
-Item = Plot | Pictures | Table
+Item = Plot | Scatter | Pictures | Table
 
 
 def as_text(value: Any) -> str:

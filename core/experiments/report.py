@@ -8,14 +8,19 @@ import io
 from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
-from core.experiments.items import Item, Pictures, Plot, Table, as_text
+from core.experiments.items import Item, Pictures, Plot, Scatter, Table, as_text
 
 _STYLES = ("-", "--", "-.", ":")
+_MARKERS = ("o", "s", "^", "v", "D", "P", "X")
+_ENDS = ("", ", low", ", high")
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -41,7 +46,7 @@ td.word {{ text-align: left; white-space: normal; min-width: 9em; }}
 
 
 def write(items: Sequence[Item], folder: Path, title: str, introduction: Sequence[str]) -> Path:
-    """Write each item's data (CSV) and picture (PNG), and one page with everything.
+    """Write each item's data (CSV) and picture (PNG, curves as SVG, too), and one page with all.
 
     Returns
     -------
@@ -56,8 +61,11 @@ def write(items: Sequence[Item], folder: Path, title: str, introduction: Sequenc
         if isinstance(item, Table):
             parts.append(_table(item))
         else:
-            picture = _draw(item)
+            figure = _draw(item)
+            picture = _saved(figure, "png")
             (folder / f"{item.key}.png").write_bytes(picture)
+            if not isinstance(item, Pictures):
+                (folder / f"{item.key}.svg").write_bytes(_saved(figure, "svg"))
             source = f"data:image/png;base64,{b64encode(picture).decode()}"
             parts.append(f'<figure><img src="{source}" alt="{html.escape(item.title)}"></figure>')
         if item.note:
@@ -71,8 +79,19 @@ def _write_csv(item: Item, folder: Path) -> None:
     if isinstance(item, Table):
         _csv(folder / f"{item.key}.csv", item.columns, item.rows)
     elif isinstance(item, Plot):
-        columns = (item.x_label, *item.curves)
-        _csv(folder / f"{item.key}.csv", columns, zip(item.x, *item.curves.values(), strict=True))
+        curves = dict(item.curves)
+        for name, (low, high) in item.bands.items():
+            curves |= {f"{name}, low": low, f"{name}, high": high}
+        columns = (item.x_label, *curves)
+        _csv(folder / f"{item.key}.csv", columns, zip(item.x, *curves.values(), strict=True))
+    elif isinstance(item, Scatter):
+        ends = [f"{label}{end}" for label in (item.x_label, item.y_label) for end in _ENDS]
+        places = (
+            (name, *place)
+            for name, (x, y) in item.groups.items()
+            for place in zip(*x, *y, strict=True)
+        )
+        _csv(folder / f"{item.key}.csv", ("group", *ends), places)
     else:
         rows = (
             (name, row, col, value)
@@ -105,11 +124,18 @@ def _cell(tag: str, text: str, is_word: bool) -> str:
     return f"<{tag}{attribute}>{html.escape(text)}</{tag}>"
 
 
-def _draw(item: Plot | Pictures) -> bytes:
-    figure = _plotted(item) if isinstance(item, Plot) else _pictured(item)
+def _draw(item: Plot | Scatter | Pictures) -> Figure:
+    if isinstance(item, Plot):
+        return _plotted(item)
+    return _scattered(item) if isinstance(item, Scatter) else _pictured(item)
+
+
+def _saved(figure: Figure, format: str) -> bytes:
+    """The same bytes for the same data: no date, and identifiers that do not change."""
     buffer = io.BytesIO()
-    # Without the date of its making the same data give the same file.
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    told = {"png": {"Software": None}, "svg": {"Date": None, "Creator": "firstphoton"}}
+    with rc_context({"svg.hashsalt": "firstphoton", "svg.fonttype": "none"}):
+        figure.savefig(buffer, format=format, dpi=110, metadata=told[format])
     return buffer.getvalue()
 
 
@@ -118,10 +144,54 @@ def _plotted(plot: Plot) -> Figure:
     axes = figure.add_subplot()
     for i, (name, curve) in enumerate(plot.curves.items()):
         axes.plot(plot.x, curve, label=name, color=f"C{i % 10}", linestyle=_STYLES[i // 10])
+        if name in plot.bands:
+            axes.fill_between(plot.x, *plot.bands[name], color=f"C{i % 10}", alpha=0.25, lw=0)
     for i, (name, place) in enumerate(plot.marks.items()):
         if np.isfinite(place):
             axes.axvline(place, label=name, color="black", linestyle=_STYLES[1 + i % 3])
     axes.set(title=plot.title, xlabel=plot.x_label, ylabel=plot.y_label)
+    if plot.x_is_log:
+        _log(axes, "x")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    return figure
+
+
+def _log(axes: Axes, which: Literal["x", "y"]) -> None:
+    """A logarithmic axis with numbers as people write them."""
+    axes.set(**{f"{which}scale": "log"})
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=20))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _scattered(scatter: Scatter) -> Figure:
+    figure = Figure(figsize=(12, 7), layout="constrained")
+    axes = figure.add_subplot()
+    for i, (name, (x, y)) in enumerate(scatter.groups.items()):
+        axes.errorbar(
+            x[0],
+            y[0],
+            xerr=np.abs(x[1:] - x[0]),
+            yerr=np.abs(y[1:] - y[0]),
+            fmt=_MARKERS[i % len(_MARKERS)],
+            color=f"C{i % 10}",
+            markerfacecolor=f"C{i}" if i < 10 else "white",
+            label=name,
+            markersize=5,
+            elinewidth=0.5,
+        )
+    line_x, line_y, texts = scatter.line
+    if len(texts):
+        axes.step(line_x, line_y, "k", where="post", lw=1, label=scatter.line_label, zorder=1)
+    # Numbers, told beside the picture: places of a front lie too close together for words.
+    for i, (at_x, at_y, text) in enumerate(zip(line_x, line_y, texts, strict=True)):
+        axes.annotate(f"{i + 1}", (at_x, at_y), (4, 4), textcoords="offset points")
+        axes.plot([], [], " ", label=f"{i + 1}: {text}")
+    _log(axes, "x")
+    _log(axes, "y")
+    axes.set(title=scatter.title, xlabel=scatter.x_label, ylabel=scatter.y_label)
     axes.grid(alpha=0.3)
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
     return figure

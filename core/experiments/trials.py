@@ -12,7 +12,7 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -20,7 +20,7 @@ from scipy.special import stdtrit
 
 import core
 from core import metrics
-from core.acquisition import Flux
+from core.acquisition import Floats, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS
 from core.metrics import Interval
@@ -82,8 +82,12 @@ def score(capture: Capture, method: Method) -> Score:
     started = perf_counter()
     bins, _ = ESTIMATORS[method.estimator].delays(capture, method.settings)
     seconds = perf_counter() - started
-    range_m, truth_m = capture.acquisition.bin_to_range_m(bins), np.asarray(capture.truth_range_m)
-    bin_m = capture.acquisition.bin_length_m
+    acquisition, truth_m = capture.acquisition, np.asarray(capture.truth_range_m)
+    return compared(acquisition.bin_to_range_m(bins), truth_m, acquisition.bin_length_m, seconds)
+
+
+def compared(range_m: Floats, truth_m: Floats, bin_m: float, seconds: float) -> Score:
+    """An answer beside the truth, both of one shape, and what it took."""
     within = [metrics.restored(range_m, truth_m, t * bin_m) for t in TOLERANCES_BINS]
     error = metrics.errors_m(range_m, truth_m)
     error = error[np.isfinite(error)]
@@ -191,7 +195,7 @@ def trials(
     done = {piece: known[_key(piece)] for piece in pieces if _key(piece) in known}
     progress(len(done), len(pieces))
     missing = [piece for piece in pieces if piece not in done]
-    for piece, scores in _computed(missing, processes):
+    for piece, scores in computed(_work, missing, processes):
         done[piece] = scores
         if store:
             with store.open("a", encoding="utf-8") as file:
@@ -210,11 +214,16 @@ def trials(
 
 _Piece = tuple[Condition, tuple[Method, ...], tuple[int, ...]]
 _Scores = list[list[Any]]
+Piece = TypeVar("Piece")
+Found = TypeVar("Found")
 
 
-def _computed(pieces: Sequence[_Piece], processes: int) -> Iterator[tuple[_Piece, _Scores]]:
+def computed(
+    work: Callable[[Piece], Found], pieces: Sequence[Piece], processes: int
+) -> Iterator[tuple[Piece, Found]]:
+    """Do pieces of work, each as soon as a process is free; `work` is a module's own function."""
     if processes == 1:
-        yield from ((piece, _work(piece)) for piece in pieces)
+        yield from ((piece, work(piece)) for piece in pieces)
         return
     # Forked processes would inherit the state of kernels' threads without the threads.
     pool = ProcessPoolExecutor(
@@ -224,7 +233,7 @@ def _computed(pieces: Sequence[_Piece], processes: int) -> Iterator[tuple[_Piece
         initargs=(1,),
     )
     with pool:
-        futures = {pool.submit(_work, piece): piece for piece in pieces}
+        futures = {pool.submit(work, piece): piece for piece in pieces}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()

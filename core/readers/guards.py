@@ -27,6 +27,7 @@ MAX_CUBE_BYTES = 2 * 1024**3
 # What a process may take that looks at a file for us; on Windows, the time alone is limited.
 MAX_CHILD_BYTES = 2 * 1024**3
 MAX_CHILD_SECONDS = 120
+_LEAST_CHILD_SECONDS, _CHILD_SECONDS_A_MIB = 15, 2  # a small file has no reason to take long
 
 _LAST_BYTES = 2**12  # of what a process complained of
 
@@ -52,7 +53,9 @@ def decoding(what: str) -> Iterator[None]:
         ) from error
 
 
-def isolated(script: Path, what: str, *arguments: str) -> tuple[Any, dict[str, NDArray[Any]]]:
+def isolated(
+    script: Path, path: Path, what: str, task: str, *arguments: str
+) -> tuple[Any, dict[str, NDArray[Any]]]:
     """Run a script in a process of its own, which may crash, hang or swell in place of this one.
 
     Parameters
@@ -61,10 +64,12 @@ def isolated(script: Path, what: str, *arguments: str) -> tuple[Any, dict[str, N
         Limits itself to the bytes and seconds that are its first two arguments, and writes an
         ``.npz`` to its standard output: ``_told``, a JSON text, and other arrays. In place of an
         answer the text may have ``refused``, a sentence, or an ``error``.
+    path : Path
+        The file that it reads: a larger one may take longer.
     what : str
         What to call in a refusal that which it reads.
-    arguments : str
-        The script's others.
+    task, arguments : str
+        The script's others: `task`, the file's path, `arguments`.
 
     Returns
     -------
@@ -77,9 +82,12 @@ def isolated(script: Path, what: str, *arguments: str) -> tuple[Any, dict[str, N
     ValueError
         If the script refuses, takes more than it may, or ends otherwise.
     """
-    limits = (str(MAX_CHILD_BYTES), str(MAX_CHILD_SECONDS))
+    allowed = _LEAST_CHILD_SECONDS + _CHILD_SECONDS_A_MIB * path.stat().st_size // 2**20
+    seconds = min(allowed, MAX_CHILD_SECONDS)
+    told_limits = (str(MAX_CHILD_BYTES), str(seconds))
     # Without the script's own folder, whose modules are named like others.
-    command = [sys.executable, "-P", str(script), *limits, *arguments]
+    command = [sys.executable, "-P", str(script), *told_limits, task, str(path.absolute())]
+    command += arguments
     # Each thread of a linear algebra that nobody asked for would reserve memory of its own. And no
     # plugin is loaded that a file may name. What is installed here is so there.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}
@@ -92,12 +100,12 @@ def isolated(script: Path, what: str, *arguments: str) -> tuple[Any, dict[str, N
                 stdin=subprocess.DEVNULL,
                 stdout=answer,
                 stderr=complaints,
-                timeout=MAX_CHILD_SECONDS,
+                timeout=seconds,
                 env=environment,
                 check=False,
             ).returncode
         except subprocess.TimeoutExpired:
-            found = f"{what} = more than {MAX_CHILD_SECONDS} s to look at is not accepted: give"
+            found = f"{what} = more than {seconds} s to look at is not accepted: give"
             raise CaptureError(f"{found} {remedy}.") from None
         if status == 1:
             _require_installed(what, complaints)

@@ -28,7 +28,7 @@ _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     """All arrays of a file, and the attributes of its groups by name; the file's own are ``""``."""
-    told, tables = isolated(_SURVEY, "the file", "survey", str(path.absolute()))
+    told, tables = isolated(_SURVEY, path, "the file", "survey")
     with decoding("the list of arrays"):
         groups = {name: _plain(known) for name, known in told["groups"].items()}
         found = [
@@ -41,8 +41,7 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
 
 def cells(path: Path, name: str, most_values: int) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """The vectors in an array of references, one after the other, and the size of each."""
-    arguments = ("cells", str(path.absolute()), name, str(most_values))
-    _, found = isolated(_SURVEY, name, *arguments)
+    _, found = isolated(_SURVEY, path, name, "cells", name, str(most_values))
     return found["values"], found["sizes"]
 
 

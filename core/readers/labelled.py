@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import speed_of_light
 
-from core.acquisition import Acquisition, Floats, Pulse
+from core.acquisition import SPEED_OF_LIGHT_M_S, Acquisition, Floats, Pulse
 from core.capture import COUNT_TYPES, Capture, CaptureError, Detection
 from core.checks import require
 from core.readers import hdf5, netcdf3, wording, zarr
@@ -59,7 +58,7 @@ _SECONDS = {"": "s", "milli": "ms", "micro": "us", "nano": "ns", "pico": "ps"}
 UNITS_S = wording.UNITS_S | {
     f"{name}second{s}": wording.UNITS_S[unit] for s in ("", "s") for name, unit in _SECONDS.items()
 }
-UNITS_S |= dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 2 / speed_of_light)
+UNITS_S |= dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 2 / SPEED_OF_LIGHT_M_S)
 UNITS_S["km"] = 1e3 * UNITS_S["m"]
 """Seconds of the light's way there and back, for each unit of a coordinate along the bins."""
 

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
-from scipy.io import loadmat
 
 from core.capture import Capture
 from core.checks import require
@@ -138,7 +138,7 @@ def _load(variable: Variable, header: bytes, order: str) -> NDArray[Any]:
     found = "a nested, complex or non-numeric array"
     require(f"content of {name}", found, bool(plain.all()), "real numbers, one vector in each cell")
     with decoding(name):
-        array: NDArray[Any] = loadmat(BytesIO(b"".join((header, element))))[name]
+        array: NDArray[Any] = scipy.io.loadmat(BytesIO(b"".join((header, element))))[name]
     return array
 
 

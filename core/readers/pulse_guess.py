@@ -25,10 +25,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
-from scipy import fft
-from scipy.ndimage import median_filter
-from scipy.special import ndtr
 
 from core.acquisition import Floats, Pulse
 
@@ -112,7 +110,7 @@ def pairs_by_lag(cube: NDArray[np.unsignedinteger], n_lags: int) -> Floats:
         Sums of the products of both photons' weights.
     """
     n_bins = cube.shape[2]
-    size = fft.next_fast_len(n_bins + n_lags, real=True)
+    size = scipy.fft.next_fast_len(n_bins + n_lags, real=True)
     histograms = cube.reshape(-1, n_bins)
     stride = -(-histograms.shape[0] * size // _MOST_NUMBERS)
     weight = _weights(histograms[::stride].mean(axis=0))
@@ -123,18 +121,18 @@ def pairs_by_lag(cube: NDArray[np.unsignedinteger], n_lags: int) -> Floats:
         members = histograms[group * stride :: _GROUPS * stride]
         for first in range(0, members.shape[0], pixels_at_once):
             some = members[first : first + pixels_at_once] * weight
-            spectrum = fft.rfft(some, size, axis=1)
+            spectrum = scipy.fft.rfft(some, size, axis=1)
             for part in (spectrum.real, spectrum.imag):
                 power[group] += np.einsum("pf,pf->f", part, part)
             with_themselves[group] += (some @ weight).sum(dtype=float)
-    pairs = fft.irfft(power, size, axis=1)[:, :n_lags]
+    pairs = scipy.fft.irfft(power, size, axis=1)[:, :n_lags]
     pairs[:, 0] -= with_themselves
     return np.asarray(pairs)
 
 
 def _weights(mean: Floats) -> NDArray[np.float32]:
     """Weight of a photon in each bin that levels the mean histogram, but for narrow peaks."""
-    level = median_filter(mean, size=max(3, mean.size // 4), mode="nearest")
+    level = scipy.ndimage.median_filter(mean, size=max(3, mean.size // 4), mode="nearest")
     typical = max(float(mean.mean()), np.finfo(float).tiny)
     return np.asarray(typical / np.maximum(level, typical / _MOST_WEIGHT), np.float32)
 
@@ -179,7 +177,7 @@ def _peak(lag: NDArray[np.int64], sigma_bins: float) -> Floats:
 
     def integrated_twice(gap: NDArray[np.floating]) -> Floats:
         density = np.exp(-0.5 * (gap / width) ** 2) / np.sqrt(2 * np.pi)
-        return np.asarray(gap * ndtr(gap / width) + width * density)
+        return np.asarray(gap * scipy.special.ndtr(gap / width) + width * density)
 
     below, at, above = (integrated_twice(lag + shift) for shift in (-1.0, 0.0, 1.0))
     return np.asarray(below - 2 * at + above)

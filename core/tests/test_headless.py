@@ -42,6 +42,23 @@ def test_no_source_imports_a_screen_library(path: Path) -> None:
     assert not SCREEN & {name.partition(".")[0] for name in imported}
 
 
+SLOW_TO_LOAD = ("dask", "h5py", "matplotlib", "PIL", "trimesh", "xarray", "zarr")
+SLOW_TO_LOAD += ("scipy.io", "scipy.ndimage", "scipy.optimize", "scipy.special", "scipy.stats")
+FIRST_IMAGE = """
+import sys, core
+acquisition = core.Acquisition(n_pulses=1)
+scene = core.Scene(core.scenes["car"]().range_m[:1, :1], acquisition=acquisition)
+core.estimate(core.simulate(scene, acquisition, core.Flux()), "tracking")
+print(*sys.modules)
+"""
+
+
+def test_a_first_range_image_waits_for_no_library_that_it_does_not_need() -> None:
+    loaded = run_python("-c", FIRST_IMAGE).stdout.split()
+    assert "core.tracking" in loaded
+    assert not set(SLOW_TO_LOAD) & set(loaded)
+
+
 def test_core_is_a_command() -> None:
     printed = run_python("-m", "core", "--help").stdout
     for command in ("table2", "recommend"):

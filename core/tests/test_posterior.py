@@ -210,11 +210,10 @@ def assert_equals_twin(
         if k in (0, peak.size - 1):
             assert delay[i] == expected.delay[k]
         else:
-            left, middle, right = np.maximum(peak[k - 1 : k + 2], peak[k] - 69)
+            left, middle, right = peak[k - 1 : k + 2]
             curvature = left - 2 * middle + right
             vertex = expected.delay[k] + 0.5 * (left - right) / curvature / steps_per_bin
-            # Densities end at 1e-30 in units of a level's largest: exp(-69) of the sum, or about.
-            blur = 4 * (far[i, 0] + OF_SUMS) + 2.0 * (middle - min(left, right) > 67)
+            blur = 4 * (far[i, 0] + OF_SUMS)
             assert delay[i] == pytest.approx(vertex, abs=blur / -curvature / steps_per_bin)
 
     if steps_per_bin > 1:

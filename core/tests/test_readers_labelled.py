@@ -790,11 +790,11 @@ def test_zarr_holds_no_links_and_no_pipes(tmp_path: Path) -> None:
 def test_what_becomes_of_a_process(
     does: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guards, "MAX_CHILD_SECONDS", 1)
+    monkeypatch.setattr(guards, "_LEAST_CHILD_SECONDS", 1)
     script = tmp_path / "script.py"
     script.write_text(does)
     with pytest.raises(ValueError, match=f"the file .*{message}"):
-        guards.isolated(script, "the file")
+        guards.isolated(script, script, "the file", "look")
 
 
 def test_a_process_finds_what_is_installed_here(
@@ -809,11 +809,11 @@ def test_a_process_finds_what_is_installed_here(
     script = tmp_path / "script" / "script.py"
     answer = "import sys, numpy; numpy.savez(sys.stdout.buffer, _told=numpy.array('{}'))"
     script.write_text(f"import only_installed; {answer}")
-    assert guards.isolated(script, "the file") == ({}, {})
+    assert guards.isolated(script, script, "the file", "look") == ({}, {})
     for folder in ("script", "current"):
         script.write_text(f"import only_{folder}; {answer}")
         with pytest.raises(ValueError, match=f"No module named 'only_{folder}'"):
-            guards.isolated(script, "the file")
+            guards.isolated(script, script, "the file", "look")
 
 
 def test_a_process_has_so_much_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,300 @@
+"""Less of a capture: fewer bins, a shorter gate, fewer pixels or fewer pulses.
+
+What costs less to range tells less. Each reduction gives a `Capture` that says in its acquisition
+what it is now, so that every estimator takes it as it takes any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Acquisition, Floats
+from core.capture import Capture
+from core.checks import require
+
+MOST_PULSES = 10**9
+"""Of which `first_pulses` can draw some: numpy's hypergeometric law ends there."""
+
+
+def merge_bins(capture: Capture, factor: int) -> Capture:
+    """Add the counts of each `factor` neighbouring bins.
+
+    Exact for first photons: a pulse fires in the merged bin where it fires in one of its parts.
+    Bins left over at the end of the gate are dropped, which is exact, too: what would have come
+    later hides nothing.
+
+    Raises
+    ------
+    ValueError
+        If `factor` is not an integer from 1 to the number of bins.
+    """
+    before = capture.acquisition
+    _require_whole("factor", factor, before.n_bins)
+    n_bins = before.n_bins // factor
+    end = n_bins * factor
+    return replace(
+        capture,
+        cube=_sum([capture.cube[:, :, i:end:factor] for i in range(factor)]),
+        acquisition=replace(before, n_bins=n_bins, bin_width_s=before.bin_width_s * factor),
+        background=_share(capture.background, end / before.n_bins),
+        source=f"{capture.source}; {factor} bins merged",
+    )
+
+
+def cut_gate(capture: Capture, first_bin: int, end_bin: int) -> Capture:
+    """Keep the bins from `first_bin` to before `end_bin`.
+
+    Of first photons, pulses that fired before the window are no longer armed in it: the window of a
+    pixel is an exact capture of ``A`` pulses, ``A`` being those still armed at its opening, which
+    differs from pixel to pixel. A `Capture` knows one number for all. It is told the mean of ``A``
+    over the image, rounded, or the most detections of a pixel where these are more. Expected counts
+    then stand to this number of pulses as those of a gate that opens later do to its own; a single
+    pixel's rates are off by the factor that its own ``A`` differs by (2 % where 700 of 1000 pulses
+    are left), alike in all bins. A gate that begins where the old one does, and a capture of all
+    photons, lose nothing.
+
+    The truth stays: a target whose echo falls outside the window is one that is lost.
+
+    Raises
+    ------
+    ValueError
+        If the window is empty or not within the gate.
+    """
+    before = capture.acquisition
+    window = (first_bin, end_bin)
+    whole = all(isinstance(each, Integral) for each in window)
+    within = whole and 0 <= first_bin < end_bin <= before.n_bins
+    require("first_bin, end_bin", window, within, f"two integers in order, 0 to {before.n_bins}")
+    cube = np.ascontiguousarray(capture.cube[:, :, first_bin:end_bin])
+    n_pulses, source = before.n_pulses, f"{capture.source}; bins {first_bin} to {end_bin - 1}"
+    if capture.armed_pulses is not None and first_bin > 0:
+        fired = capture.cube[:, :, :first_bin].sum(axis=2, dtype=np.int64)
+        most = int(cube.sum(axis=2, dtype=np.int64).max())
+        n_pulses = max(round(capture.armed_pulses - float(fired.mean())), most, 1)
+        source += f", at whose opening {n_pulses} pulses are armed on average"
+    return replace(
+        capture,
+        cube=cube,
+        acquisition=replace(
+            before,
+            n_bins=end_bin - first_bin,
+            gate_delay_s=before.gate_delay_s + first_bin * before.bin_width_s,
+            n_pulses=n_pulses,
+        ),
+        background=_share(capture.background, (end_bin - first_bin) / before.n_bins),
+        source=source,
+    )
+
+
+def skip_pixels(capture: Capture, step: int) -> Capture:
+    """Keep one pixel of each `step` x `step`, the middle one (left and up of it where even).
+
+    Raises
+    ------
+    ValueError
+        If `step` is not an integer from 1 to the smaller side of the image.
+    """
+    _require_whole("step", step, min(capture.shape))
+    kept = np.ix_(*(_kept(size, step) for size in capture.shape))
+    return replace(
+        capture,
+        cube=capture.cube[kept],
+        acquisition=_coarser(capture, step),
+        truth_range_m=None if capture.truth_range_m is None else capture.truth_range_m[kept],
+        signal=None if capture.signal is None else capture.signal[kept],
+        source=f"{capture.source}; 1 pixel of each {step} x {step}",
+    )
+
+
+def pool_pixels(capture: Capture, side: int) -> Capture:
+    """Add the histograms of each `side` x `side` neighbouring pixels.
+
+    That many times the pulses look where all of these pixels look: exact where they see the same.
+    Where they do not, there is more than one surface. The truth told is the median of theirs, the
+    signal their mean. Rows and columns left over at the end are dropped.
+
+    Raises
+    ------
+    ValueError
+        If `side` is not an integer from 1 to the smaller side of the image.
+    """
+    _require_whole("side", side, min(capture.shape))
+    acquisition, n_pulses = _coarser(capture, side), capture.acquisition.n_pulses
+    truth_m, signal = capture.truth_range_m, capture.signal
+    return replace(
+        capture,
+        cube=_sum(_each_of_tile(capture.cube, side)),
+        acquisition=replace(acquisition, n_pulses=n_pulses and n_pulses * side * side),
+        truth_range_m=None if truth_m is None else _median(_each_of_tile(truth_m, side)),
+        signal=None if signal is None else np.mean(_each_of_tile(signal, side), axis=0),
+        source=f"{capture.source}; {side} x {side} pixels added",
+    )
+
+
+def first_pulses(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
+    """What the capture would have been with fewer pulses, an exact draw.
+
+    Which of its pulses fired when is not kept in a histogram, and does not matter: the pulses are
+    exchangeable, and any of them are as good as the first. Of first photons, `n_pulses` of a
+    pixel's pulses are drawn without replacement (multivariate hypergeometric, "no trigger" being
+    one of the outcomes). Of all photons, each one falls in any pulse alike, and is kept with
+    probability ``n_pulses / sent``.
+
+    Raises
+    ------
+    ValueError
+        If the capture does not know its number of pulses, or sent fewer.
+    """
+    before = capture.acquisition
+    sent = before.n_pulses
+    if sent is None:
+        raise ValueError("n_pulses = None is not accepted: give a capture that knows its pulses.")
+    require("n_pulses of the capture", sent, sent <= MOST_PULSES, f"{MOST_PULSES} or fewer")
+    _require_whole("n_pulses", n_pulses, sent)
+    rng = np.random.default_rng(seed)
+    if capture.detection == "all":
+        cube = rng.binomial(capture.cube, n_pulses / sent)
+    else:
+        cube = np.empty(capture.cube.shape, np.int64)
+        rest = np.full(capture.shape, sent)  # pulses of which it is not decided yet
+        left = np.full(capture.shape, n_pulses)  # that are still to be drawn among them
+        for k in range(before.n_bins):
+            fired = capture.cube[:, :, k].astype(np.int64)
+            rest -= fired
+            cube[:, :, k] = rng.hypergeometric(fired, rest, left)
+            left -= cube[:, :, k]
+    return replace(
+        capture,
+        cube=cube.astype(capture.cube.dtype),
+        acquisition=replace(before, n_pulses=n_pulses),
+        source=f"{capture.source}; {n_pulses} of {sent} pulses, seed {seed}",
+    )
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """Several reductions of a capture, and the way back to its own pixels.
+
+    Parameters
+    ----------
+    merge : int
+        Bins merged into one.
+    gate : tuple of int, optional
+        First bin and end of the window, in bins of the capture.
+    skip : int
+        One pixel of each ``skip`` x ``skip`` is kept.
+    pool : int
+        Rows and columns of pixels that are added.
+    """
+
+    merge: int = 1
+    gate: tuple[int, int] | None = None
+    skip: int = 1
+    pool: int = 1
+
+    def fits(self, shape: tuple[int, int, int]) -> bool:
+        """Whether a capture of these rows, columns and bins holds enough for it."""
+        side, n_bins = min(shape[:2]), shape[2]
+        first, end = self.gate or (0, n_bins)
+        enough_pixels = self.skip <= side and self.pool <= len(_kept(side, self.skip))
+        return enough_pixels and 0 <= first < end <= n_bins and self.merge <= end - first
+
+    def of(self, capture: Capture) -> Capture:
+        """The capture with the reductions done, pixels first, then the gate, then the bins.
+
+        Raises
+        ------
+        ValueError
+            If one of them does not fit the capture.
+        """
+        if self.skip != 1:
+            capture = skip_pixels(capture, self.skip)
+        if self.pool != 1:
+            capture = pool_pixels(capture, self.pool)
+        if self.gate is not None:
+            capture = cut_gate(capture, *self.gate)
+        return merge_bins(capture, self.merge) if self.merge != 1 else capture
+
+    def spread(self, image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+        """An image of the reduced capture at full resolution: what is missing takes its neighbour.
+
+        Parameters
+        ----------
+        image : ndarray, shape (row, col) of the reduced capture
+        shape : tuple of int
+            Rows and columns of the capture itself.
+        """
+        rows = self._taken_from(shape[0], image.shape[0])
+        cols = self._taken_from(shape[1], image.shape[1])
+        return image[np.ix_(rows, cols)]
+
+    def _taken_from(self, full: int, own: int) -> NDArray[np.intp]:
+        """Row (or column) of the reduced image that each of the full one's is taken from."""
+        after_skipping = np.minimum(np.arange(full) // self.skip, len(_kept(full, self.skip)) - 1)
+        return np.asarray(np.minimum(after_skipping // self.pool, own - 1))
+
+    def __str__(self) -> str:
+        done = []
+        if self.skip != 1:
+            done.append(f"1 pixel of {self.skip} x {self.skip}")
+        if self.pool != 1:
+            done.append(f"{self.pool} x {self.pool} pixels added")
+        if self.gate is not None:
+            done.append(f"bins {self.gate[0]} to {self.gate[1] - 1}")
+        if self.merge != 1:
+            done.append(f"{self.merge} bins merged")
+        return ", ".join(done) or "whole"
+
+
+def _require_whole(name: str, value: object, most: int) -> None:
+    accepted = isinstance(value, Integral) and 1 <= int(value) <= most
+    require(name, value, accepted, f"an integer from 1 to {most}")
+
+
+def _kept(size: int, step: int) -> range:
+    """Rows (or columns) left where one of each `step` is kept: the middle one."""
+    return range((step - 1) // 2, size, step)
+
+
+def _share(background: float | None, share: float) -> float | None:
+    return None if background is None else background * share
+
+
+def _sum(cubes: Sequence[NDArray[np.unsignedinteger]]) -> NDArray[np.unsignedinteger]:
+    """Their sum, in a type that holds it.
+
+    One array after the other: numpy's sum over a short axis takes ten times as long.
+    """
+    most = sum(int(cube.max(initial=0)) for cube in cubes)
+    require("counts", most, most < 2**32, "a capture whose sums are below 2**32")
+    total: NDArray[Any] = cubes[0].astype(np.uint16 if most < 2**16 else np.uint32)
+    for cube in cubes[1:]:
+        total += cube.astype(total.dtype, copy=False)
+    return total
+
+
+def _coarser(capture: Capture, step: int) -> Acquisition:
+    """The acquisition with pixels `step` times as far apart."""
+    angle_rad = capture.acquisition.pixel_angle_rad
+    wider_rad = None if angle_rad is None or angle_rad * step >= 1 else angle_rad * step
+    return replace(capture.acquisition, pixel_angle_rad=wider_rad)
+
+
+def _each_of_tile(image: NDArray[Any], side: int) -> list[NDArray[Any]]:
+    """The first pixel of each `side` x `side`, the second, ...; each of shape (row, col, ...)."""
+    rows, cols = (size - size % side for size in image.shape[:2])
+    return [image[i:rows:side, j:cols:side] for i in range(side) for j in range(side)]
+
+
+def _median(images: Sequence[Floats]) -> Floats:
+    """Median of what is finite, pixel by pixel, NaN where nothing is."""
+    ordered = np.sort(images, axis=0)  # NaN last
+    known = np.isfinite(ordered).sum(axis=0, keepdims=True)
+    middle = np.concatenate([np.maximum(known - 1, 0) // 2, known // 2])
+    return np.asarray(np.take_along_axis(ordered, middle, axis=0).mean(axis=0))

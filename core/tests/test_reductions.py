@@ -1,0 +1,224 @@
+"""Less of a capture is a capture: its counts follow the law that its own acquisition promises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from core.acquisition import Acquisition, Flux
+from core.capture import Capture
+from core.reductions import (
+    Reduction,
+    cut_gate,
+    first_pulses,
+    merge_bins,
+    pool_pixels,
+    skip_pixels,
+)
+from core.scene import Scene
+from core.simulate import simulate
+from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
+
+SIDE = 12 if numba.config.DISABLE_JIT else 32  # rows and columns of 500 pulses each
+PULSES = 500 * SIDE**2
+SIGNIFICANCE = 1e-4  # by chance, one fixed seed in ten thousand would fall below
+
+ACQUISITION = Acquisition(n_bins=60, n_pulses=500)
+ONSET_BIN = 32.3
+
+
+@pytest.fixture(scope="module")
+def wall() -> Capture:
+    """A square image of one range, its counts too many for uint8."""
+    scene = Scene(np.full((SIDE, SIDE), ACQUISITION.bin_to_range_m(ONSET_BIN)))
+    return simulate(scene, ACQUISITION, Flux(0.4, 0.3), seed=1)
+
+
+def expected_share(capture: Capture) -> np.ndarray:
+    """What a pulse does, by the light and the acquisition that a capture of one range tells of."""
+    acquisition = capture.acquisition
+    onset = acquisition.range_m_to_bin(np.asarray(capture.truth_range_m)[0, 0])
+    signal = np.asarray(capture.signal)[0, 0]
+    rate = rate_per_bin(onset, signal, capture.background or 0.0, capture.pulse, acquisition)
+    return np.append(trigger_probability(rate), no_trigger_probability(rate))
+
+
+def fits(capture: Capture, n_pulses: int) -> bool:
+    """Whether the counts of all pixels together are those of so many pulses."""
+    bins = capture.cube.sum(axis=(0, 1), dtype=np.int64)
+    found = np.append(bins, n_pulses - bins.sum())
+    expected = expected_share(capture) * n_pulses
+    assert expected.min() > 5  # where chi-square holds
+    return bool(stats.chisquare(found, expected).pvalue > SIGNIFICANCE)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4, 7])
+def test_merged_bins_are_what_wider_bins_would_have_recorded(wall: Capture, factor: int) -> None:
+    merged = merge_bins(wall, factor)
+    assert merged.acquisition.n_bins == 60 // factor
+    assert merged.acquisition.bin_width_s == pytest.approx(factor * 1e-9)
+    assert fits(merged, PULSES)
+    end = 60 // factor * factor
+    np.testing.assert_array_equal(merged.counts, wall.cube[:, :, :end].sum(axis=2))
+
+
+def test_merging_commutes_with_the_expectation(wall: Capture) -> None:
+    fine, coarse = expected_share(wall), expected_share(merge_bins(wall, 4))
+    np.testing.assert_allclose(fine[:60].reshape(15, 4).sum(axis=1), coarse[:15], rtol=1e-12)
+    assert fine[60] == pytest.approx(coarse[15], rel=1e-12)
+
+
+def test_a_later_window_is_a_gate_that_opens_later(wall: Capture) -> None:
+    window = cut_gate(wall, 20, 50)
+    armed = 500 - wall.cube[:, :, :20].sum(axis=2, dtype=np.int64)
+    assert window.acquisition.n_pulses == round(armed.mean())
+    assert f"{window.acquisition.n_pulses} pulses are armed" in window.source
+    assert window.acquisition.bin_to_range_m(0) == pytest.approx(ACQUISITION.bin_to_range_m(20))
+    assert fits(window, int(armed.sum()))
+    # As simulated with a gate that does open later: each pixel's counts are told the same share.
+    later = simulate(
+        Scene(np.asarray(wall.truth_range_m)),
+        window.acquisition,
+        Flux(0.4, 0.4 / (window.background or 0.0)),
+        seed=2,
+    )
+    bins = [c.cube.sum(axis=(0, 1), dtype=np.int64) for c in (window, later)]
+    assert stats.chi2_contingency(bins).pvalue > SIGNIFICANCE
+
+
+def test_a_gate_that_only_ends_earlier_loses_no_pulse(wall: Capture) -> None:
+    window = cut_gate(wall, 0, 50)
+    assert window.acquisition.n_pulses == 500
+    assert fits(window, PULSES)
+
+
+def test_a_window_of_few_pulses_still_holds_its_detections() -> None:
+    cube = np.array([[[10, 0, 0], [0, 10, 0]]], np.uint16)
+    window = cut_gate(Capture(cube, Acquisition(n_bins=3, n_pulses=10)), 1, 3)
+    assert window.acquisition.n_pulses == 10  # five on average are fewer than one pixel's ten
+
+
+def test_photons_that_hide_nothing_stay_armed(wall: Capture) -> None:
+    photons = replace(wall, detection="all")
+    assert cut_gate(photons, 20, 50).acquisition.n_pulses == 500
+
+
+def test_pooled_pixels_are_as_many_pulses_as_all_of_them(wall: Capture) -> None:
+    pooled = pool_pixels(wall, 3)
+    assert pooled.shape == (SIDE // 3, SIDE // 3)
+    assert pooled.acquisition.n_pulses == 4500
+    assert fits(pooled, 4500 * (SIDE // 3) ** 2)
+
+
+def test_pooled_truth_is_of_the_pixels_that_have_one() -> None:
+    truth_m = np.array([[1.0, 5.0, np.nan, np.nan], [2.0, 9.0, 7.0, np.nan]])
+    capture = Capture(
+        np.full((2, 4, 3), 200, np.uint8),
+        Acquisition(n_bins=3, n_pulses=None),
+        truth_range_m=truth_m,
+        signal=np.array([[0.0, 1.0, 2.0, 2.0], [2.0, 1.0, 2.0, 2.0]]),
+    )
+    pooled = pool_pixels(capture, 2)
+    np.testing.assert_array_equal(pooled.truth_range_m, [[3.5, 7.0]])
+    np.testing.assert_array_equal(pooled.signal, [[1.0, 2.0]])
+    np.testing.assert_array_equal(pooled.cube, np.full((1, 2, 3), 800))  # more than uint8 holds
+    sky = replace(capture, truth_range_m=np.full((2, 4), np.nan))
+    assert np.isnan(np.asarray(pool_pixels(sky, 2).truth_range_m)).all()
+
+
+def test_fewer_pulses_have_the_moments_of_a_draw_without_replacement() -> None:
+    side, n, sent = 60, 120, 200
+    histogram = np.array([40, 0, 100, 7, 13])  # and 40 pulses that fired nowhere
+    cube = np.tile(histogram.astype(np.uint16), (side, side, 1))
+    capture = Capture(cube, Acquisition(n_bins=5, n_pulses=sent))
+    drawn = first_pulses(capture, n, seed=3).cube.reshape(-1, 5).astype(float)
+    share = histogram / sent
+    covariance = n * (sent - n) / (sent - 1) * (np.diag(share) - np.outer(share, share))
+    sd = np.sqrt(np.diag(covariance))
+    # Five standard errors: of a mean sd/√N, of a covariance below √2·sd·sd/√N.
+    np.testing.assert_array_less(
+        np.abs(drawn.mean(axis=0) - n * share), 5 * sd / side + 1e-12, strict=False
+    )
+    error = np.abs(np.cov(drawn.T) - covariance)
+    assert (error <= 5 * np.sqrt(2) * np.outer(sd, sd) / side + 1e-12).all()
+
+
+def test_fewer_pulses_follow_the_law_of_as_many(wall: Capture) -> None:
+    fewer = first_pulses(wall, 40, seed=5)
+    assert fewer.acquisition.n_pulses == 40
+    assert fits(fewer, 40 * SIDE**2)
+    np.testing.assert_array_equal(first_pulses(wall, 500).cube, wall.cube)
+
+
+def test_all_photons_are_kept_each_by_chance() -> None:
+    cube = np.full((80, 80, 4), 50, np.uint16)
+    capture = Capture(cube, Acquisition(n_bins=4, n_pulses=10), detection="all")
+    drawn = first_pulses(capture, 3, seed=1).cube
+    found = np.bincount(drawn.ravel(), minlength=51)
+    law = stats.binom(50, 0.3)
+    tails = [law.cdf(8), *law.pmf(np.arange(9, 23)), law.sf(22)]
+    found = [found[:9].sum(), *found[9:23], found[23:].sum()]
+    assert stats.chisquare(found, np.array(tails) * cube.size).pvalue > SIGNIFICANCE
+
+
+@given(st.tuples(st.integers(1, 12), st.integers(1, 12)), st.integers(1, 4), st.integers(1, 3))
+def test_what_is_left_out_takes_its_neighbours_answer(
+    shape: tuple[int, int], skip: int, pool: int
+) -> None:
+    row, col = np.indices(shape)
+    marked = Capture(
+        np.ones((*shape, 2), np.uint16),
+        Acquisition(n_bins=2, n_pulses=None),
+        truth_range_m=(row + 0.01 * col).astype(float),
+    )
+    if min(shape) < skip or len(range((skip - 1) // 2, min(shape), skip)) < pool:
+        with pytest.raises(ValueError, match="an integer from 1 to"):
+            Reduction(skip=skip, pool=pool).of(marked)
+        return
+    reduction = Reduction(skip=skip, pool=pool)
+    found_m = reduction.spread(np.asarray(reduction.of(marked).truth_range_m), shape)
+    assert found_m.shape == shape
+    row_off = np.abs(np.round(found_m) - row)
+    col_off = np.abs(found_m % 1 / 0.01 - col) if pool == 1 else np.zeros(shape)
+    # Within the tile, or one tile behind where the image ends in a part of one.
+    assert max(row_off.max(), col_off.max()) < 2 * skip * pool
+    if pool == 1:
+        kept = np.s_[(skip - 1) // 2 :: skip, (skip - 1) // 2 :: skip]
+        np.testing.assert_array_equal(found_m[kept], np.asarray(marked.truth_range_m)[kept])
+
+
+def test_reductions_add_up(wall: Capture) -> None:
+    both = Reduction(merge=2, gate=(10, 50), skip=2, pool=2)
+    found = both.of(wall)
+    assert found.cube.shape == (SIDE // 4, SIDE // 4, 20)
+    assert str(both) == "1 pixel of 2 x 2, 2 x 2 pixels added, bins 10 to 49, 2 bins merged"
+    assert found.acquisition.pixel_angle_rad == pytest.approx(4 * 2e-3)
+    assert Reduction().of(wall) is wall
+    assert str(Reduction()) == "whole"
+
+
+@pytest.mark.parametrize(
+    "refused",
+    [
+        lambda c: merge_bins(c, 0),
+        lambda c: merge_bins(c, 61),
+        lambda c: cut_gate(c, 5, 5),
+        lambda c: cut_gate(c, -1, 5),
+        lambda c: cut_gate(c, 0, 61),
+        lambda c: skip_pixels(c, SIDE + 1),
+        lambda c: pool_pixels(c, 1.5),
+        lambda c: first_pulses(c, 501),
+        lambda c: first_pulses(c, 0),
+        lambda c: first_pulses(replace(c, acquisition=Acquisition(n_bins=60, n_pulses=None)), 5),
+    ],
+)
+def test_what_does_not_fit_is_refused(wall: Capture, refused: Callable[[Capture], Capture]) -> None:
+    with pytest.raises(ValueError, match="is not accepted: give"):
+        refused(wall)
