@@ -161,9 +161,7 @@ def show_progress(done: int, of: int, what: str = "pieces") -> None:
 def show(facts: Mapping[str, Any], as_json: bool) -> None:
     """Print facts, one a line or as one JSON object; what is no number there is null."""
     if as_json:
-        print(
-            json.dumps({name: _plain(value) for name, value in facts.items()}, ensure_ascii=False)
-        )
+        print(json.dumps(_plain(facts), ensure_ascii=False))
         return
     width = max(map(len, facts))
     for name, value in facts.items():
@@ -172,6 +170,8 @@ def show(facts: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

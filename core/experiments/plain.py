@@ -1,6 +1,6 @@
-"""The model of one echo over uniform background: what a scene without parts must not cost more than.
+"""One echo over uniform background and nothing else: what absent parts are compared with.
 
-It is what `core.simulate.triggered_by_each_edge` does with every part left out of its code.
+It is `core.simulate.triggered_by_each_edge` with every part left out of its code.
 """
 
 from __future__ import annotations
