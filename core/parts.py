@@ -186,15 +186,16 @@ class Motion:
         require("speed_m_per_s", speed, math.isfinite(speed), "finite metres per second")
         require("pulse_rate_hz", rate_hz, 0 < rate_hz < np.inf, "pulses a second, positive")
 
-    def shifts_m(self, pulse: Pulse, acquisition: Acquisition, n_pulses: int) -> Floats:
+    def shifts_bins(self, pulse: Pulse, acquisition: Acquisition, n_pulses: int) -> Floats:
         """How far the scene stands from its ranges, at pulses or, closer than echoes tell, groups.
 
         Groups lie a quarter of a bin apart, or of the pulse's time constant if that is shorter.
         """
         travel_m = abs(self.speed_m_per_s) * n_pulses / self.pulse_rate_hz
-        step_m = acquisition.bin_length_m / 4 * min(1.0, pulse.tau_s / acquisition.bin_width_s)
-        groups = min(n_pulses, max(1, math.ceil(travel_m / step_m)))
-        return np.asarray(((np.arange(groups) + 0.5) / groups - 0.5) * travel_m)
+        travel_bins = travel_m / acquisition.bin_length_m
+        step_bins = min(1.0, pulse.tau_s / acquisition.bin_width_s) / 4
+        groups = min(n_pulses, max(1, math.ceil(travel_bins / step_bins)))
+        return np.asarray(((np.arange(groups) + 0.5) / groups - 0.5) * travel_bins)
 
 
 @dataclass(frozen=True)

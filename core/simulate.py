@@ -194,32 +194,34 @@ def triggered_by_each_edge(
     everywhere = flux.background * share_of_gate
     if scene.backscatter is not None:
         everywhere += scene.backscatter.photons_before(flux.signal, pulse, acquisition)
-    shifts_m = (
-        np.zeros(1)
-        if scene.motion is None
-        else scene.motion.shifts_m(pulse, acquisition, pulses_sent(acquisition))
-    )
+    shifts_bins = np.zeros(1)
+    if scene.motion is not None:
+        shifts_bins = scene.motion.shifts_bins(pulse, acquisition, pulses_sent(acquisition))
     echoes = [
-        (np.ravel(range_m), signal.reshape(-1, 1)) for range_m, signal in _echoes(scene, flux)
+        (np.ravel(acquisition.range_m_to_bin(range_m)), signal.reshape(-1, 1))
+        for range_m, signal in _echoes(scene, flux)
     ]
     faulty = scene.faulty_pixels
     dark = None if faulty is None else faulty.photons(acquisition).reshape(-1, 1)
-    triggered = np.zeros((np.size(scene.range_m), n_edges))
+    triggered = np.empty((np.size(scene.range_m), n_edges))
     # Some pixels at a time: temporaries of the whole cube cost ten times their arithmetic.
     pixels_at_once = max(1, 2**15 // n_edges)
     for first in range(0, len(triggered), pixels_at_once):
         some = slice(first, first + pixels_at_once)
-        for shift_m in shifts_m:
-            before = _echo_before(echoes[0], some, shift_m, pulse, acquisition)
+        for group, shift_bins in enumerate(shifts_bins):
+            before = _echo_before(echoes[0], some, shift_bins, pulse, acquisition)
             for other in echoes[1:]:
-                before += _echo_before(other, some, shift_m, pulse, acquisition)
+                before += _echo_before(other, some, shift_bins, pulse, acquisition)
             before += everywhere
             if dark is not None:
                 before += dark[some] * share_of_gate
             np.expm1(np.negative(before, out=before), out=before)
-            triggered[some] -= before
-    if shifts_m.size > 1:
-        triggered /= shifts_m.size
+            if group == 0:
+                np.negative(before, out=triggered[some])
+            else:
+                triggered[some] -= before
+    if shifts_bins.size > 1:
+        triggered /= shifts_bins.size
     if faulty is not None:
         triggered[faulty.dead.reshape(-1)] = 0.0
     if scene.jitter is not None:
@@ -240,14 +242,17 @@ def _echoes(scene: Scene, flux: Flux) -> Iterator[tuple[Floats, Floats]]:
 
 
 def _echo_before(
-    echo: tuple[Floats, Floats], some: slice, shift_m: float, pulse: Pulse, acquisition: Acquisition
+    echo: tuple[Floats, Floats],
+    some: slice,
+    shift_bins: float,
+    pulse: Pulse,
+    acquisition: Acquisition,
 ) -> Floats:
     """Photons of an echo before each edge, within the gate; shape (pixel, n_bins + 1)."""
-    range_m, signal = echo
-    onset_bin = acquisition.range_m_to_bin(range_m[some] + shift_m)
+    onset_bin, signal = echo[0][some] + shift_bins, echo[1][some]
     before = pulse.cumulative(onset_bin, acquisition.n_bins, acquisition.bin_width_s)
     before -= before[:, :1].copy()  # the part that came before the gate opened
-    before *= signal[some]
+    before *= signal
     return before
 
 

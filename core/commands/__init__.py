@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 
-from core.commands import captures, studies, trade
+from core.commands import captures, requires, studies, trade
 from core.commands.options import as_options
 
 ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
@@ -23,6 +23,7 @@ def main(arguments: list[str] | None = None) -> int:
     captures.add(commands)
     studies.add(commands)
     trade.add(commands)
+    requires.add(commands)
     chosen = parser.parse_args(arguments)
     try:
         chosen.work(chosen)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from time import perf_counter
@@ -12,10 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from core.acquisition import Acquisition, Flux, Pulse
+from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, Seen
 from core.checks import require
-from core.commands.options import READING_NAMES, add_reading, reading, show, whole_from_to
+from core.commands.options import (
+    LIGHT_NAMES,
+    READING_NAMES,
+    add_light,
+    add_reading,
+    flux,
+    reading,
+    require_none,
+    show,
+    whole_from_to,
+)
 from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage
 from core.export import (
     CAPTURE_SUFFIXES,
@@ -38,7 +48,6 @@ from core.simulate import simulate
 from core.tracking import PRESETS
 
 _CONFIDENT = 0.9
-_LIGHT = ("sbr", "ppp", "seed")
 _VIEW = ("unit_m", "distance_m", "pixel_angle_rad")
 
 
@@ -104,7 +113,7 @@ def _add_estimate(commands: Any) -> None:
         seen = method.add_mutually_exclusive_group()
         seen.add_argument("--capture", type=Path, help="a file that `info` can read")
         seen.add_argument("--scene", choices=scenes, default="car", help="to simulate (car)")
-        _add_light(method)
+        add_light(method)
         method.add_argument(
             "--false-alarm",
             type=float,
@@ -233,7 +242,7 @@ def _add_simulate(commands: Any) -> None:
         type=float,
         help="between neighbouring pixels, in radians",
     )
-    _add_light(command)
+    add_light(command)
     _add_out(command, "the capture", CAPTURE_SUFFIXES, required=True)
     _add_json(command)
     command.set_defaults(work=_simulate)
@@ -259,7 +268,7 @@ def _scene(chosen: argparse.Namespace) -> Scene:
         require("scene", chosen.scene, Path(chosen.scene).suffix != "", f"{known}, or a file")
         seen = {name: getattr(chosen, name) for name in _VIEW}
         return read_scene(chosen.scene, size=None if size is None else (size, size), **seen)
-    _require_none(vars(chosen), _VIEW, "a built-in scene has a view of its own")
+    require_none(vars(chosen), _VIEW, "a built-in scene has a view of its own")
     return scenes[chosen.scene](**({} if size is None else {"size": size}))
 
 
@@ -306,14 +315,6 @@ def _save_captures(capture: Capture, chosen: argparse.Namespace) -> None:
 # -- what they share -------------------------------------------------------------------------------
 
 
-def _add_light(command: Any) -> None:
-    group = command.add_argument_group("how a scene is lit")
-    usual = Flux()
-    group.add_argument("--sbr", type=float, help=f"signal over background ({usual.sbr})")
-    group.add_argument("--ppp", type=float, help=f"signal photons per pulse ({usual.signal})")
-    group.add_argument("--seed", type=int, help="of the simulation (0)")
-
-
 def _add_out(command: Any, what: str, suffixes: Sequence[str], required: bool = False) -> None:
     command.add_argument(
         "--out",
@@ -351,22 +352,12 @@ def _require_free(chosen: argparse.Namespace) -> None:
 
 def _capture(chosen: argparse.Namespace) -> Capture:
     if chosen.capture:
-        _require_none(vars(chosen), _LIGHT, "a capture is lit already")
+        require_none(vars(chosen), LIGHT_NAMES, "a capture is lit already")
         return read_capture(chosen.capture, **reading(chosen))
-    _require_none(reading(chosen), READING_NAMES, "a scene is not read from a file")
+    require_none(reading(chosen), READING_NAMES, "a scene is not read from a file")
     scene = scenes[chosen.scene]()
     return _simulated(scene, scene.acquisition, chosen)
 
 
 def _simulated(scene: Scene, acquisition: Acquisition, chosen: argparse.Namespace) -> Capture:
-    usual = Flux()
-    flux = Flux(
-        usual.signal if chosen.ppp is None else chosen.ppp,
-        usual.sbr if chosen.sbr is None else chosen.sbr,
-    )
-    return simulate(scene, acquisition, flux, seed=chosen.seed or 0)
-
-
-def _require_none(told: Mapping[str, Any], names: Sequence[str], why: str) -> None:
-    for name in names:
-        require(name, told[name], told[name] is None, f"None: {why}")
+    return simulate(scene, acquisition, flux(chosen), seed=chosen.seed or 0)

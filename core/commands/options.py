@@ -8,12 +8,13 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from core.acquisition import Pulse
+from core.acquisition import Flux, Pulse
+from core.checks import require
 from core.readers.wording import UNITS_S
 
 _MOST_WITHOUT_UNIT_S = 1e-3
@@ -116,6 +117,33 @@ def reading(chosen: argparse.Namespace) -> dict[str, Any]:
     return told
 
 
+LIGHT_NAMES = ("sbr", "ppp", "seed")
+
+
+def add_light(command: Any) -> None:
+    """Add the options that tell how a scene is lit."""
+    group = command.add_argument_group("how a scene is lit")
+    usual = Flux()
+    group.add_argument("--sbr", type=float, help=f"signal over background ({usual.sbr})")
+    group.add_argument("--ppp", type=float, help=f"signal photons per pulse ({usual.signal})")
+    group.add_argument("--seed", type=int, help="of the simulation (0)")
+
+
+def flux(chosen: argparse.Namespace) -> Flux:
+    """The light that these options tell."""
+    usual = Flux()
+    return Flux(
+        usual.signal if chosen.ppp is None else chosen.ppp,
+        usual.sbr if chosen.sbr is None else chosen.sbr,
+    )
+
+
+def require_none(told: Mapping[str, Any], names: Sequence[str], why: str) -> None:
+    """Refuse what makes no sense beside other options."""
+    for name in names:
+        require(name, told[name], told[name] is None, f"None: {why}")
+
+
 def as_options(message: str) -> str:
     """A message of `core` in the words of the command line."""
     for name, argument in zip(READING, READING_NAMES, strict=True):
@@ -133,9 +161,7 @@ def show_progress(done: int, of: int, what: str = "pieces") -> None:
 def show(facts: Mapping[str, Any], as_json: bool) -> None:
     """Print facts, one a line or as one JSON object; what is no number there is null."""
     if as_json:
-        print(
-            json.dumps({name: _plain(value) for name, value in facts.items()}, ensure_ascii=False)
-        )
+        print(json.dumps(_plain(facts), ensure_ascii=False))
         return
     width = max(map(len, facts))
     for name, value in facts.items():
@@ -144,6 +170,8 @@ def show(facts: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

@@ -15,7 +15,7 @@ from core.checks import require
 from core.estimators import ESTIMATORS
 from core.experiments import capture_parts, corrections
 from core.experiments.items import Table
-from core.experiments.requirement import CORRECTIONS, TITLES, Requirement, judged
+from core.experiments.requirement import CORRECTIONS, MARGIN_RD, TITLES, Requirement, judged
 from core.metrics import Interval
 from core.resolution import Difference, difference
 from core.scene import Scene, parts_of, without
@@ -192,6 +192,15 @@ def table(rows: Sequence[Requirement], title: str) -> Table:
         NOTE,
     )
 
+
+RULE = (
+    "A part of a scene is needed where the pulses of more than 1 % of the pixels tell a model with "
+    "it from one without (the likelihood-ratio test errs in at most 5 %), or where the answers "
+    f"move by more than {MARGIN_RD:g} in RD or half a bin in RMSE; a correction is needed where it "
+    "makes them better by as much. Neither is needed where nothing is likelier by 5 % with it in "
+    "99 % of the pixels, or where the whole 95 % interval of both changes lies within these "
+    "margins. Otherwise the data do not tell."
+)
 
 NOTE = (
     "Total variation: how far the part, or what the correction corrects, moves the trigger "
