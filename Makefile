@@ -5,7 +5,7 @@ PORT ?= 5006
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: app test bench paper table2 uniform calibration field large fuzz clean
+.PHONY: app test bench speed tradeoff stability paper table2 uniform calibration field large fuzz clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
@@ -20,6 +20,15 @@ test: $(VENV)/.test ## everything that CI checks
 
 bench: $(VENV)/.test ## slider to changed pixels, through a real browser
 	$(BIN)/python -m tests.latency
+
+speed: $(VENV)/.app ## the kernels beside plain ones and the machine's floors; fails where a ratio is lost
+	$(BIN)/python -m core speed
+
+tradeoff: $(VENV)/.app ## what accuracy costs, and what to choose; CAPTURE=path for your own
+	$(BIN)/python -m core tradeoff $(if $(CAPTURE),--capture "$(CAPTURE)")
+
+stability: $(VENV)/.app ## laws held at every extreme, and the range within which each setting is trustworthy
+	$(BIN)/python -m core stability
 
 paper: $(VENV)/.app ## every figure and table of the paper beside ours, as one page in paper/
 	$(BIN)/python -m core paper $(if $(REPETITIONS),--repetitions $(REPETITIONS)) $(if $(FIELD),--field "$(FIELD)")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from threading import Lock
@@ -15,6 +15,9 @@ Result = TypeVar("Result")
 # use all cores take turns by a lock of their own.
 _WORKERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="firstphoton")
 
+# Where studies wait for each other, and nobody's slider for them.
+LONG = ThreadPoolExecutor(max_workers=2, thread_name_prefix="firstphoton-long")
+
 
 class LatestWins(Generic[Result]):
     """Runs the newest request of one session and forgets those it overtook.
@@ -23,10 +26,15 @@ class LatestWins(Generic[Result]):
     ----------
     on_page : callable
         Runs a function on the session's page thread, soon.
+    workers : Executor
+        Shared with all sessions.
     """
 
-    def __init__(self, on_page: Callable[[Callable[[], None]], None]) -> None:
+    def __init__(
+        self, on_page: Callable[[Callable[[], None]], None], workers: Executor = _WORKERS
+    ) -> None:
         self._on_page = on_page
+        self._workers = workers
         self._lock = Lock()
         self._waiting: Callable[[], None] | None = None
         self._busy = False
@@ -55,7 +63,7 @@ class LatestWins(Generic[Result]):
                 self._waiting = attempt
                 return
             self._busy = True
-        _WORKERS.submit(attempt)
+        self._workers.submit(attempt)
 
     @property
     def has_more(self) -> bool:
@@ -72,7 +80,7 @@ class LatestWins(Generic[Result]):
                 following, self._waiting = self._waiting, None
                 self._busy = following is not None
             if following is not None:
-                _WORKERS.submit(following)
+                self._workers.submit(following)
 
 
 @dataclass(frozen=True)
@@ -113,7 +121,7 @@ class InSteps:
         told: Callable[[], None],
         failed: Callable[[Exception], None],
     ) -> None:
-        self._jobs: LatestWins[Any] = LatestWins(on_page)
+        self._jobs: LatestWins[Any] = LatestWins(on_page, LONG)
         self._told = told
         self._failed = failed
         self._steps: Sequence[Step[Any]] = ()

@@ -11,7 +11,7 @@ import panel as pn
 import panel_material_ui as pmui
 
 from app.controls import Sentence
-from app.jobs import InSteps, LatestWins, Step
+from app.jobs import LONG, InSteps, LatestWins, Step
 from app.session import Session
 from app.words import progress
 
@@ -123,7 +123,7 @@ class OnePiece(Generic[Result]):
         self._session = session
         self._work = work
         self._draw = draw
-        self._jobs: LatestWins[Result] = LatestWins(session.on_page)
+        self._jobs: LatestWins[Result] = LatestWins(session.on_page, LONG)
         self._controls = WorkControls(self.start, self.cancel, noun)
         self._run = _Run()
 

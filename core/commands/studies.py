@@ -9,7 +9,7 @@ from typing import Any
 
 from core.commands.options import add_processes, show_progress, whole_from_to
 from core.experiments import calibration, field, paper, recommend, uniform
-from core.experiments.items import as_markdown, as_text
+from core.experiments.items import Table, as_markdown, as_text
 from core.experiments.printed import TABLE_2
 from core.experiments.trials import Condition, Method, Results, trials
 from core.readers import read_capture
@@ -22,6 +22,7 @@ def add(commands: Any) -> None:
     """Add these commands to a parser's."""
     for each in (_add_paper, _add_table2, _add_uniform, _add_calibration, _add_field, _add_large):
         each(commands)
+    _add_speed(commands)
     search = commands.add_parser("recommend", help="the search that found the recommended preset")
     search.set_defaults(work=_recommend)
 
@@ -146,6 +147,31 @@ def _large(chosen: argparse.Namespace) -> None:
     print(as_markdown(table.columns, table.rows))
     if not all(each.same for each in found):
         raise ValueError("same answer = NO is not accepted: see the table.")
+
+
+def _add_speed(commands: Any) -> None:
+    command = commands.add_parser(
+        "speed", help="how fast tracking is: beside plain code, as captures grow, from a cold start"
+    )
+    command.add_argument("--folder", type=Path, default=Path("speed"), help="written to (speed)")
+    command.add_argument(
+        "--rounds", type=whole_from_to(6, 1000), default=21, help="of each measurement (21)"
+    )
+    command.set_defaults(work=_speed)
+
+
+def _speed(chosen: argparse.Namespace) -> None:
+    from core.experiments import report, speed  # noqa: PLC0415 - draws, as no other study does
+
+    found = speed.study(speed.Extent(rounds=chosen.rounds), show_progress)
+    page = report.write(found.items, chosen.folder, "Speed", speed.INTRODUCTION)
+    print(file=sys.stderr)
+    for item in found.items:
+        if isinstance(item, Table):
+            print(f"{item.title}\n\n{as_markdown(item.columns, item.rows)}\n")
+    print(page)
+    if found.regressions:
+        sys.exit("\n".join(found.regressions))
 
 
 def _recommend(chosen: argparse.Namespace) -> None:

@@ -221,9 +221,9 @@ def fronts_table(points: Sequence[Point], tolerance_bins: int = 3) -> Table:
 _WHAT_IS_TIMED = (
     "Milliseconds are those of reducing the capture and ranging it, the light that it tells of "
     "being known (a capture keeps it); finding that light, once for each capture, stands beside "
-    "them, or is counted in and stands as 0. Memory is what numpy holds at most meanwhile, beyond the capture. Errors are those of "
-    "the whole image at the capture's own bin width: pixels that are left out take their "
-    "neighbour's answer."
+    "them, or is counted in and stands as 0. Memory is what numpy holds at most meanwhile, beyond "
+    "the capture. Errors are those of the whole image at the capture's own bin width: pixels that "
+    "are left out take their neighbour's answer."
 )
 
 

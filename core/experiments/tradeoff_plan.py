@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numba
 
 from core.acquisition import Flux
+from core.experiments.acquiring import PULSES
 from core.experiments.likeness import Simulation
 from core.experiments.tradeoff import MERGES, Candidate, Source, candidates, variations
 from core.experiments.trials import as_they_come
 from core.scene import scenes
 
-PULSES = (50, 100, 200, 500, 1000, 2000, 5000, 10_000)
 MERGED_AT = (100, 10_000)
 """Numbers of pulses, besides the scene's own, with which bins are merged, too."""
 THREADED = ("tracking", "likelihood")

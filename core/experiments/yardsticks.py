@@ -1,8 +1,8 @@
 """The tracking estimator as one writes it at first: what the fast kernel is measured against.
 
-All in float64 and as the equations stand. Each gives the position of the echo in every pixel, as
-`core.tracking.track` does, for settings whose start is "mean", whose σ is that of the gate and
-whose weight all pixels share; other settings are left to the estimator.
+As exact as the numbers given (float64, mostly), the equations as they stand. Each gives the
+position of the echo in every pixel, as `core.tracking.track` does, for settings whose start is
+"mean", whose σ is that of the gate and whose weight all pixels share; others are the estimator's.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from core.tracking import (
     differentiator_step,
 )
 
-Pixels = NDArray[np.float64]
+Pixels = NDArray[np.floating]
 """Counts, shape (pixel, bin)."""
 
 
-def numpy_over_bins(pixels: Pixels, settings: TrackingParameters) -> Floats:
-    """All pixels at once by numpy, one bin after the other."""
+def numpy_over_bins(pixels: Pixels, settings: TrackingParameters) -> Pixels:
+    """All pixels at once by numpy, one bin after the other, as exact as the numbers given."""
     r_small = settings.l * pixels.std(axis=1)
     first = pixels[:, :START_BINS].mean(axis=1)
     floor = ROUNDING_32 * pixels.max(axis=1)
@@ -44,8 +44,8 @@ def numpy_over_bins(pixels: Pixels, settings: TrackingParameters) -> Floats:
 
 
 def _numpy_step(
-    x1: Floats, x2: Floats, s: Floats, r: Floats, settings: TrackingParameters
-) -> tuple[Floats, Floats]:
+    x1: Pixels, x2: Pixels, s: Pixels, r: Pixels, settings: TrackingParameters
+) -> tuple[Pixels, Pixels]:
     """`core.tracking.differentiator_step` of many pixels."""
     h, h0 = settings.h, settings.m * settings.h
     d = r * h0

@@ -39,6 +39,14 @@ def test_blocks_of_a_view_are_those_of_its_copy() -> None:
     np.testing.assert_array_equal(to_blocks(view).counts, to_blocks(view.copy()).counts)
 
 
+def test_a_cube_may_be_kept_from_being_written() -> None:
+    cube = random_cube(LANES, 6)
+    to_blocks(cube)
+    assert cube.flags.writeable  # it still may be, if it was
+    cube.setflags(write=False)
+    np.testing.assert_array_equal(to_blocks(cube).counts[0].T, cube[0])
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_sigma_is_the_standard_deviation_over_the_gate(dtype: type) -> None:
     cube = random_cube(2 * LANES, 50, dtype)
@@ -58,9 +66,16 @@ def test_sigma_over_no_bins_is_zero() -> None:
     assert not np.any(lane_spread(to_blocks(random_cube(3, 5)).counts, 0))
 
 
-@pytest.mark.parametrize("count", [0, 1, 3, 65_535])
+@pytest.mark.parametrize("count", [0, 1, 3, 65_535, 65_536, 2**32 - 1])
 def test_a_constant_histogram_has_no_deviation_at_all(count: int) -> None:
-    assert (to_blocks(np.full((2, 3, 49), count, np.uint16)).sigma == 0).all()
+    assert (to_blocks(np.full((2, 3, 49), count, np.uint32)).sigma == 0).all()
+
+
+def test_sigma_of_the_largest_counts_does_not_overflow() -> None:
+    one_hot = np.zeros((1, 1, 1000), np.uint32)
+    one_hot[0, 0, 500] = 2**32 - 1
+    assert to_blocks(one_hot).sigma[0, 0] == pytest.approx(one_hot.std(), rel=1e-12)
+    assert to_blocks(one_hot).largest[0, 0] == 2**32 - 1
 
 
 @pytest.mark.parametrize("n_rows", [1, 10])

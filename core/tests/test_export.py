@@ -665,7 +665,7 @@ def answers(draw: st.DrawFn) -> tuple[Capture, RangeImage]:
     return Capture(cube, acquisition, source=draw(st.text())), image
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(answers())
 def test_any_answer_is_read_from_any_format_as_it_was(answer: tuple[Capture, RangeImage]) -> None:
     capture, image = answer

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -21,7 +22,7 @@ from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.commands import main
 from core.estimators import ESTIMATORS
-from core.experiments import acquiring, tradeoff, trials
+from core.experiments import acquiring, tradeoff, tradeoff_plan, trials
 from core.experiments.acquiring import Sweep
 from core.experiments.front import best_within, by_condition, cheapest_reaching, front, with_light
 from core.experiments.items import Plot, Scatter
@@ -31,6 +32,7 @@ from core.experiments.tradeoff import Cancelled, Candidate, Piece, Point, scored
 from core.experiments.trials import Condition, Method, Score
 from core.export import save_capture
 from core.metrics import Interval
+from core.parallel import SERIAL_BELOW
 from core.reductions import Reduction
 from core.scene import Scene, scenes
 from core.simulate import simulate
@@ -299,6 +301,23 @@ def test_a_study_refuses_what_it_cannot_measure(stairs: Simulation) -> None:
         study([(sky, WAYS[:1])])
     with pytest.raises(ValueError, match="kernel = 'float64, by rows' is not accepted"):
         Candidate(method("peak"), kernel="float64, by rows")
+
+
+def test_the_plan_holds_every_method_and_every_factor() -> None:
+    plan = tradeoff_plan.over_pulses(tradeoff_plan.simulated("car", 0.06, 0.1041))
+    assert [source.acquisition.n_pulses for source, _ in plan] == list(acquiring.PULSES)
+    for source, ways in plan:
+        assert {way.method.estimator for way in ways} == set(ESTIMATORS)
+        merges = {way.reduction.merge for way in ways}
+        assert merges == ({1, 2, 4} if source.acquisition.n_pulses in (100, 1000, 10_000) else {1})
+    everything = plan[acquiring.PULSES.index(1000)][1]
+    assert {way.kernel for way in everything} == set(tradeoff.KERNELS)
+    assert {way.reduction.gate for way in everything} == {None, plan[4][0].window}
+    assert {(way.reduction.skip, way.reduction.pool) for way in everything} >= {(2, 1), (1, 2)}
+    assert len(set(everything)) == len(everything)
+    ((large, ways),) = tradeoff_plan.threaded(0.2, 0.1)
+    assert large.acquisition.n_bins * 256**2 > SERIAL_BELOW
+    assert {way.threads for way in ways} == set(range(1, numba.config.NUMBA_NUM_THREADS + 1))
 
 
 # -- captures, and simulations like them -----------------------------------------------------------
