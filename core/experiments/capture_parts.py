@@ -27,9 +27,10 @@ from core.resolution import FEW, Difference, difference
 from core.trigger import drawn, trigger_probability
 
 _SURE = 0.95  # confidence of answers that are taken for the surface
-_SAMPLE = 4096  # pixels, at most, that are looked at closely
+_SAMPLE = 2048  # pixels, at most, that are looked at closely
 _FEWEST = 32
 _NEIGHBOURS = 3  # rows and columns that an image needs for any
+_AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 _NOT_SURE = "too few pixels are sure of their surface"
 _BY_CHANCE = 1e-6  # probability of counts that are taken for no chance
 
@@ -55,7 +56,7 @@ def pile_up(capture: Capture, method: str) -> Requirement:
     if capture.detection == "all":
         why = "the capture holds all photons, none hides another"
         return Requirement("pile_up", "not needed", why, 0.0, 0.0, told_share=0.0)
-    return judged("pile_up", None, 0.0, note="the number of pulses is not known")
+    return _unknown("pile_up", "the number of pulses is not known")
 
 
 def signal_levels(capture: Capture, method: str) -> Requirement:
@@ -142,9 +143,8 @@ def _groups(n_bins: int) -> int:
 def _echo_bins(capture: Capture, delay_bin: Floats) -> NDArray[np.intp]:
     """Bins that hold an echo, one more on either side; shape (pixel, n), some beyond the gate."""
     echo, first = capture.pulse.taps(capture.acquisition.n_bins, capture.acquisition.bin_width_s)
-    return np.floor(delay_bin).astype(np.intp)[:, np.newaxis] + np.arange(
-        first - 1, first + echo.size + 1
-    )
+    here = np.floor(delay_bin).astype(np.intp)[:, np.newaxis]
+    return here + np.arange(first - 1, first + echo.size + 1)
 
 
 def _beyond_chance(apart: Difference, n_free: int, n_pixels: int) -> Difference:
@@ -158,7 +158,7 @@ def backscatter(capture: Capture) -> Requirement:
     """Whether the background changes over the gate, as that of fog does."""
     sample = _sample_of(capture)
     if sample is None:
-        return judged("backscatter", None, 0.0, note=_NOT_SURE)
+        return _unknown("backscatter", _NOT_SURE)
     n_pulses, n_bins, rate = capture.armed_pulses, sample.background.size, sample.background
     even = np.full(n_bins, rate.mean())
     if n_pulses is not None:  # a share of the armed pulses fires, of the rate that makes it do so
@@ -181,11 +181,13 @@ def pulse_shape(capture: Capture) -> Requirement:
     """
     sample = _sample_of(capture)
     if sample is None:
-        return judged("pulse_shape", None, 0.0, note=_NOT_SURE)
-    twin = _twin(capture, sample)
-    seen, flat = _mean_echo(capture, sample.counts, sample.delay_bin, sample)
-    assumed, _ = _mean_echo(capture, *twin, sample)
-    wider = _width(seen - flat) / _width(assumed - flat)
+        return _unknown("pulse_shape", _NOT_SURE)
+    real = _mean_echo(capture, sample, sample.counts, sample.delay_bin)
+    twin = _mean_echo(capture, sample, *_twin(capture, sample))
+    if real is None or twin is None:
+        return _unknown("pulse_shape", _NOT_SURE)
+    (seen, flat), (assumed, _) = real, twin
+    wider = _width(seen - flat) / max(_width(assumed - flat), np.finfo(float).tiny)
     assumed *= seen.sum() / max(float(assumed.sum()), np.finfo(float).tiny)  # shapes alone
     apart = difference(seen[np.newaxis], assumed[np.newaxis], None)
     return judged(
@@ -211,12 +213,17 @@ def _twin(capture: Capture, sample: _Sample) -> tuple[NDArray[np.unsignedinteger
 
 
 def _mean_echo(
-    capture: Capture, counts: NDArray[Any], delay_bin: Floats, sample: _Sample
-) -> tuple[Floats, Floats]:
-    """Mean counts about delays that were found, and what of them is background; shape (n,)."""
+    capture: Capture, sample: _Sample, counts: NDArray[Any], delay_bin: Floats
+) -> tuple[Floats, Floats] | None:
+    """Mean counts about delays that were found, and what of them is background; shape (n,).
+
+    Of echoes that lie within the gate, None where they are too few.
+    """
     found = np.abs(np.nan_to_num(delay_bin, nan=np.inf) - sample.delay_bin) <= TOLERANCE_BINS
     at = _echo_bins(capture, sample.delay_bin)
     found &= (at[:, 0] >= TOLERANCE_BINS) & (at[:, -1] < counts.shape[1] - TOLERANCE_BINS)
+    if np.count_nonzero(found) < _FEWEST:
+        return None
     at = _echo_bins(capture, delay_bin[found])
     background = sample.armed * sample.background
     echo, flat = (np.take_along_axis(x[found], at, 1).mean(axis=0) for x in (counts, background))
@@ -234,10 +241,10 @@ def second_surface(capture: Capture) -> Requirement:
     """Whether some place beside the echo holds more photons than the background explains."""
     sample = _sample_of(capture)
     if sample is None:
-        return judged("second_surface", None, 0.0, note=_NOT_SURE)
+        return _unknown("second_surface", _NOT_SURE)
     if pulse_shape(capture).verdict == "needed":
         why = "echoes have not the shape that is assumed, and their wings would look like it"
-        return judged("second_surface", None, 0.0, note=why)
+        return _unknown("second_surface", why)
     beside, width = sample.beside, capture.echo_bins
     counts, others = sample.counts * beside, sample.armed * sample.background * beside
     # A pixel that sees more background than others is none with a second echo.
@@ -265,19 +272,16 @@ def _windows(values: Floats, width: int) -> Floats:
 def faulty_pixels(capture: Capture) -> Requirement:
     """Whether single pixels detect more, or less, than all their neighbours by more than chance."""
     if min(capture.shape) < _NEIGHBOURS:
-        return judged("faulty_pixels", None, 0.0, note="an image so narrow has no neighbours")
+        return _unknown("faulty_pixels", "an image so narrow has no neighbours")
     counts, n_pulses = capture.counts, capture.armed_pulses
     usual = median_filter(counts, footprint=_AROUND)
     hot, dead = _standing_out(capture)
     if not (hot | dead).any() and _fewer(0, np.median(usual), n_pulses) > _BY_CHANCE:
-        return judged("faulty_pixels", None, 0.0, note="too few photons to tell a dead pixel")
+        return _unknown("faulty_pixels", "too few photons to tell a dead pixel")
     sent = n_pulses or np.maximum(np.maximum(counts, usual), 1)
     moved = np.where(hot | dead, np.abs(counts - usual) / sent, 0.0)
     note = f"{np.count_nonzero(hot)} stand out as hot and {np.count_nonzero(dead)} as dead"
     return _found("faulty_pixels", hot | dead, moved, note)
-
-
-_AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 
 
 def _standing_out(capture: Capture) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -305,14 +309,19 @@ def _fewer(
     return np.asarray(bdtr(counts, n_pulses, expected / n_pulses))
 
 
-def motion(capture: Capture) -> Requirement:
-    """A histogram keeps no order of pulses."""
-    return judged("motion", None, 0.0, note="it widens echoes as a longer pulse does")
+def motion(_: Capture) -> Requirement:
+    """Never: a histogram keeps no order of pulses."""
+    return _unknown("motion", "it widens echoes as a longer pulse does")
 
 
-def jitter(capture: Capture) -> Requirement:
-    """What a pulse that was measured holds already."""
-    return judged("jitter", None, 0.0, note="it widens echoes as a longer pulse does")
+def jitter(_: Capture) -> Requirement:
+    """Never: a pulse that was measured holds it already."""
+    return _unknown("jitter", "it widens echoes as a longer pulse does")
+
+
+def _unknown(part: str, why: str) -> Requirement:
+    """A part of which the data say nothing."""
+    return Requirement(part, "cannot tell", why)
 
 
 def _found(part: str, shows: NDArray[np.bool_], variation: Floats, note: str) -> Requirement:

@@ -29,9 +29,12 @@ def with_correction(capture: Capture, correction: str) -> Capture:
     """The same counts for an estimator that makes one of `CORRECTIONS`, whatever it would spare."""
     if correction == "pulse_shape":
         return capture
-    full = replace(capture)
-    lighting_of.tell(full, detailed_lighting_of(capture))
-    return full
+    made = replace(capture)
+    light = detailed_lighting_of(capture)
+    if correction == "pile_up":
+        light = lighting_of(capture)._replace(pile_up=True)
+    lighting_of.tell(made, light)
+    return made
 
 
 def without_correction(capture: Capture, correction: str) -> Capture:

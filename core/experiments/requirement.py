@@ -71,24 +71,22 @@ class Requirement:
 
 def judged(
     part: str,
-    apart: Difference | None,
+    apart: Difference,
     bin_length_m: float,
     rd_change: Interval = UNKNOWN,
     rmse_change_m: Interval = UNKNOWN,
     time_ratio: Interval = UNKNOWN,
     note: str = "",
 ) -> Requirement:
-    """Give a verdict on a part or a correction.
+    """Give a verdict on a part or a correction of which something is known.
 
     Parameters
     ----------
-    apart : Difference or None
-        The models with and without it, per pixel; None where the data do not say.
+    apart : Difference
+        The models with and without it, per pixel.
     note : str
         What is to be added to the reason.
     """
-    if apart is None:
-        return Requirement(part, "cannot tell", note)
     rd = _in_margins(rd_change, MARGIN_RD)
     rmse = _in_margins(rmse_change_m, MARGIN_BINS * bin_length_m)
     if part in CORRECTIONS and not math.isnan(rd.value):

@@ -80,12 +80,6 @@ def test_the_rule(part: str, evidence: float, rd: Interval, rmse_m: Interval, ve
     assert found.told_share == (evidence >= TOLD)
 
 
-def test_what_the_data_do_not_say_cannot_be_told() -> None:
-    found = judged("jitter", None, 0.15, note="nobody knows")
-    assert (found.verdict, found.why) == ("cannot tell", "nobody knows")
-    assert math.isnan(found.total_variation)
-
-
 # -- scenes ----------------------------------------------------------------------------------------
 
 
@@ -277,7 +271,7 @@ def test_coates_undoes_no_pile_up_that_pulses_hide() -> None:
         assert not lighting_of(faint).pile_up
         assert "Coates undoes no pile-up" in ESTIMATORS["coates"].remark(faint)
         exact = corrections.with_correction(faint, "pile_up")
-        lighting_of.tell(exact, lighting_of(faint)._replace(pile_up=True))
+        assert lighting_of(exact).pile_up
         _stays_within_its_uncertainty(faint, "coates", exact, faint)
     bright = seen(DAY)
     assert lighting_of(bright).pile_up
