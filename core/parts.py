@@ -10,9 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
-from scipy.special import expn, ndtr
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.checks import require
@@ -113,7 +112,7 @@ class Backscatter:
         edge = np.arange(1 - first - spread.size, n_bins + 1 - first)
         range_m = np.maximum(acquisition.bin_to_range_m(edge), OVERLAP_M)
         extinction = self.extinction_per_m
-        beyond = expn(2, 2 * extinction * range_m) / range_m
+        beyond = scipy.special.expn(2, 2 * extinction * range_m) / range_m
         scale = math.pi * signal * self.reference_m**2 * extinction / LIDAR_RATIO_SR
         ramp = scale * np.convolve(-np.diff(beyond), spread / spread.sum(), mode="valid")
         return np.concatenate([[0.0], np.cumsum(ramp)])
@@ -233,6 +232,8 @@ class Jitter:
         x = np.arange(-reach - 1, reach + 2.0)
         with np.errstate(over="ignore"):  # next to no jitter: infinitely many of its σ away
             z = x / sigma_bins
-            ramp = x * ndtr(z) + sigma_bins * np.exp(-z * z / 2) / math.sqrt(2 * math.pi)
-        recorded = correlate1d(triggered, np.diff(ramp, 2), axis=1, mode="nearest")
+            ramp = x * scipy.special.ndtr(z) + sigma_bins * np.exp(-z * z / 2) / math.sqrt(
+                2 * math.pi
+            )
+        recorded = scipy.ndimage.correlate1d(triggered, np.diff(ramp, 2), axis=1, mode="nearest")
         return np.asarray(recorded - recorded[:, :1])

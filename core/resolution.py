@@ -19,20 +19,20 @@ Between the two a single histogram does not show the difference, but answers may
 
 from __future__ import annotations
 
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
 
 from core.acquisition import Floats
 
 ERROR = 0.05
 
-TOLD = float(ndtri(ERROR)) ** 2 / 2
+TOLD = NormalDist().inv_cdf(ERROR) ** 2 / 2
 """Evidence from which a difference is told: 1.35."""
 
-HIDDEN = float(ndtri((1 + ERROR) / 2)) ** 2 / 2
+HIDDEN = NormalDist().inv_cdf((1 + ERROR) / 2) ** 2 / 2
 """Evidence up to which it is hidden: 0.002."""
 
 FEW = 0.01
