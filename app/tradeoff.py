@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 import panel as pn
+import panel_material_ui as pmui
 from numpy.typing import NDArray
 
 from app import plots, trade_words
@@ -24,9 +26,10 @@ from app.theme import LIGHT, method_style, palette
 from app.views import paint_frame, pane_of
 from core import ESTIMATORS
 from core.experiments.front import best_within, cheapest_reaching, front, with_light
+from core.experiments.items import as_csv
 from core.experiments.likeness import Simulation, like
 from core.experiments.tradeoff import Cancelled, Point, Source, candidates, study
-from core.experiments.tradeoff_page import acquired, acquiring_items
+from core.experiments.tradeoff_page import acquired, acquiring_items, points_table
 from core.experiments.trials import Method, as_they_come
 from core.metrics import Interval
 from core.parameters import Choice, Number, check_fields, parameter
@@ -159,6 +162,15 @@ class Ways:
         self._table = Table(title=trade_words.TITLE, sizing_mode="stretch_width", margin=(6, 0))
         self._table.param.watch(lambda event: self._open(event.new[0]), "acted")
         self._subject.text = trade_words.WAITING
+        self._download = pmui.FileDownload(
+            callback=self._points_file,
+            filename="firstphoton_tradeoff.csv",
+            label="Points as CSV",
+            variant="outlined",
+            size="small",
+            disabled=True,
+            margin=(6, 8),
+        )
 
     @property
     def view(self) -> View:
@@ -174,7 +186,12 @@ class Ways:
             part("What is asked", self._wanted_panel.layout),
             part(
                 "What is measured",
-                aside(trade_words.EXPLANATION, self._effort_panel.layout, *self._study.controls),
+                aside(
+                    trade_words.EXPLANATION,
+                    self._effort_panel.layout,
+                    *self._study.controls,
+                    self._download,
+                ),
             ),
         ]
         return View(main, controls, follow=self._follow, paint=self._paint)
@@ -208,6 +225,11 @@ class Ways:
     def _open(self, key: int) -> None:
         self._open_point(self._measured[key])
 
+    def _points_file(self) -> BytesIO:
+        """Everything that was measured."""
+        table = points_table(self._measured)
+        return BytesIO(as_csv(table.columns, table.rows).encode())
+
     # What is measured and drawn
 
     def _work(self) -> Work[list[Point]]:
@@ -231,6 +253,7 @@ class Ways:
 
     def _arrived(self, points: list[Point]) -> None:
         self._measured, self._of = points, self._asked
+        self._download.disabled = False
         self._follow(self._session.answer)
         self._draw()
 

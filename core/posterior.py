@@ -34,6 +34,7 @@ from core.blocks import LANES, lane_rows, to_blocks
 from core.capture import Capture, once_per_capture
 from core.parallel import COMPILED, PARALLEL, entering
 from core.resolution import FEW, Difference, difference, pile_up
+from core.spatial import weighted_median
 from core.trigger import rate_per_bin, trigger_probability
 
 TOLERANCE_BINS = 3
@@ -173,6 +174,7 @@ _DEPTH_STEPS = 30
 _SMOOTHING_BINS = 2.0
 _ALIKE = 0.1  # share of the surfaces of which nothing is learned
 _MISSED = 2.0  # log likelihood that faint levels must be worth to be kept
+_TOO_FEW = 3  # unfired pulses, of which the logarithm is chance
 _RARE = 1e-3  # levels with a smaller share are left out
 
 
@@ -279,7 +281,23 @@ def _totals(capture: Capture) -> tuple[Floats, float]:
         return capture.counts.astype(float), float(capture.counts.mean())  # Poisson
     unfired = np.maximum(n_pulses - capture.counts, 0.5)
     variance = 1 / unfired - 1 / n_pulses
-    return np.log(n_pulses / unfired) - variance / 2, float(variance.mean())
+    total = np.log(n_pulses / unfired) - variance / 2
+    spent = capture.counts > n_pulses - _TOO_FEW
+    if spent.any():
+        total[spent] = np.maximum(total[spent], _background_of(capture.cube[spent], n_pulses))
+    return total, float(variance.mean())
+
+
+def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats:
+    """Total rate of the background of pixels (pixel, bin) whose pulses fired, all or nearly all.
+
+    The bins behind the last pulse tell nothing; their rate is taken for the median of the others,
+    each counting as often as it has pulses armed: that is the background where it fired the pulses,
+    and next to nothing where an echo did. Without them, light that fires every pulse early in the
+    gate would be an echo there, beyond all doubt.
+    """
+    rate, armed = rate_and_armed(pixels.astype(float), n_pulses)
+    return np.asarray(weighted_median(rate.T, armed.T) * pixels.shape[1])
 
 
 def _trust(total: Floats, unrelated: float) -> float:

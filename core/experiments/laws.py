@@ -43,7 +43,7 @@ from core.experiments.extremes import (
 )
 from core.experiments.trials import Condition
 from core.large import estimate_large
-from core.posterior import Conditions, light_of, log_likelihood_ratio
+from core.posterior import TOLERANCE_BINS, Conditions, light_of, log_likelihood_ratio
 from core.scene import Scene
 from core.simulate import simulate
 from core.tracking import PRESETS, TrackingParameters, track, tracking_signals
@@ -450,6 +450,22 @@ def _evidence(grid: Grid) -> Iterator[Case]:
             yield float(np.count_nonzero(left | doubts)), where
 
 
+def _confidence(grid: Grid) -> Iterator[Case]:
+    """By how much the mean confidence exceeds the share of answers that are right."""
+    for sbr in sorted({*grid.sbr, *SATURATING}):
+        capture = _car(sbr=sbr, rows=32)
+        truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
+        for method in ("likelihood", "coates", "tracking"):
+            image = estimate(capture, method)
+            right = np.abs(image.bin - truth)[image.valid] <= TOLERANCE_BINS
+            told = image.confidence[image.valid]
+            yield float((told - right).mean()) if told.size else 0.0, f"{method}, SBR {sbr:g}"
+
+
+SATURATING = (0.02, 0.015, 0.01, 0.003, 1e-4)
+"""SBRs at which the background fires every pulse, or nearly."""
+
+
 # --- Precision ---
 
 
@@ -683,6 +699,14 @@ LAWS = {
             0.0,
             "pixels",
             _evidence,
+        ),
+        Law(
+            "confidence",
+            "Confidence is not told where there is no reason for it: under no light does it exceed "
+            "the share of right answers.",
+            0.05,
+            "by so much on average",
+            _confidence,
         ),
         Law(
             "precision",

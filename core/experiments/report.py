@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import html
 import io
 from base64 import b64encode
@@ -16,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from core.experiments.items import Item, Pictures, Plot, Scatter, Table, as_text
+from core.experiments.items import Item, Pictures, Plot, Scatter, Table, as_csv, as_text
 
 _STYLES = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
@@ -102,10 +101,7 @@ def _write_csv(item: Item, folder: Path) -> None:
 
 
 def _csv(path: Path, columns: Sequence[str], rows: Any) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(rows)
+    path.write_text(as_csv(columns, rows), encoding="utf-8", newline="")
 
 
 def _table(table: Table) -> str:

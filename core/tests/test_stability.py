@@ -1,4 +1,4 @@
-"""What must hold at the extremes, on a short grid; the long one is ``python -m core stability``'s."""
+"""What must hold at the extremes: a short grid; ``python -m core stability`` has the full one."""
 
 from __future__ import annotations
 
