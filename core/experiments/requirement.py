@@ -113,7 +113,7 @@ def _in_margins(change: Interval, margin: float) -> Interval:
 
 
 _HIDDEN = f"nothing is likelier by {ERROR:.0%} with it, in nearly all pixels"
-_VARIES = "answers vary too much between repetitions"
+_VARIES = "the interval of the answers' change reaches beyond a margin"
 
 
 def _verdict_on_correction(apart: Difference, rd: Interval, rmse: Interval) -> tuple[Verdict, str]:
