@@ -174,7 +174,7 @@ class Pulse:
         """Time after time zero by which `share` of the photons, in (0, 1), have arrived."""
         high = len(self.samples) + 40.0
         low = -high
-        for _ in range(64):  # halved so often, the interval is as narrow as a float is exact
+        for _ in range(64):  # halvings: less is left than between two floats
             middle = 0.5 * (low + high)
             low, high = (low, middle) if self.cdf(middle * self.tau_s) > share else (middle, high)
         return self.tau_s * high

@@ -14,7 +14,6 @@ from core.parallel import COMPILED
 LANES = 64
 """Pixels treated together: four vectors of sixteen float32, in flight side by side."""
 
-
 _PIXELS_AT_ONCE = 8
 _BINS_AT_ONCE = 4  # between reading and writing their sums, which costs more than to add
 
@@ -41,7 +40,7 @@ def to_blocks(cube: NDArray[np.unsignedinteger]) -> Blocks:
         cube = cube.astype(np.uint16)
     n_bins = cube.shape[-1]
     pixels = np.ascontiguousarray(cube).reshape(-1, n_bins)
-    pixels.setflags(write=False)  # kernels are compiled for what may be written, too
+    pixels.setflags(write=False)  # one kernel for both: whether writable is part of a type
     n_pixels = pixels.shape[0]
     filled, left = divmod(n_pixels, LANES)
     counts = np.empty((filled + (left > 0), n_bins, LANES), cube.dtype)
@@ -72,18 +71,18 @@ def lane_spread(counts, n_bins):  # type: ignore[no-untyped-def]
     largest = np.zeros((counts.shape[0], LANES), counts.dtype)
     sigma = np.zeros((counts.shape[0], LANES))
     total, squares = np.empty(LANES, np.int64), np.empty(LANES)
-    paired = n_bins - n_bins % _BINS_AT_ONCE
+    grouped = n_bins - n_bins % _BINS_AT_ONCE
     for b in range(counts.shape[0] if n_bins > 0 else 0):
         block, top = counts[b], largest[b]
         total[:] = 0
         squares[:] = 0.0
-        for k in range(0, paired, _BINS_AT_ONCE):
+        for k in range(0, grouped, _BINS_AT_ONCE):
             for i in range(LANES):
                 sums = total[i], squares[i], top[i]
                 for j in range(_BINS_AT_ONCE):
                     sums = _with(block[k + j, i], block[0, i], sums)
                 total[i], squares[i], top[i] = sums
-        for k in range(paired, n_bins):
+        for k in range(grouped, n_bins):
             for i in range(LANES):
                 sums = total[i], squares[i], top[i]
                 total[i], squares[i], top[i] = _with(block[k, i], block[0, i], sums)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import ndimage, stats
 
 from core import posterior
 from core.acquisition import Acquisition, Flux, Pulse
@@ -789,3 +789,10 @@ def test_surfaces_are_as_many_as_were_told() -> None:
     n, told = surface.size, float(surface.mean())
     low, high = stats.binom.ppf([FOUR_SIGMA, 1 - FOUR_SIGMA], n, told)
     assert low <= n / 2 <= high
+
+
+@pytest.mark.parametrize("n_bins", [1, 2, 9, 100])
+def test_depths_are_smoothed_by_a_gaussian(n_bins: int) -> None:
+    density = np.random.default_rng(n_bins).random(n_bins)
+    expected = ndimage.gaussian_filter1d(density, 2.0, mode="nearest")
+    np.testing.assert_allclose(posterior._smoothed(density), expected, rtol=1e-13)
