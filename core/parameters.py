@@ -103,6 +103,26 @@ def spec_of(dataclass_field: Field[Any]) -> Number | Choice:
     return spec
 
 
+def doubts(settings: Any) -> list[str]:
+    """Why answers are in doubt with these settings, one sentence a reason.
+
+    First those of single fields that lie in a doubtful `Zone`, then those that concern several, as
+    the settings' own ``joint_doubts`` tells them.
+    """
+    found = []
+    for each in fields(settings):
+        spec, value = spec_of(each), getattr(settings, each.name)
+        if isinstance(spec, Number):
+            found += [zone.why for zone in spec.doubtful if value in zone]
+    return found + joint_doubts(settings)
+
+
+def joint_doubts(settings: Any) -> list[str]:
+    """`doubts` that no single field has, empty for settings that know of none."""
+    told: list[str] = settings.joint_doubts() if hasattr(settings, "joint_doubts") else []
+    return told
+
+
 def check_fields(settings: Any) -> None:
     """Check every field of a settings object against its own specification."""
     for each in fields(settings):

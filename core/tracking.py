@@ -39,7 +39,7 @@ from core.acquisition import Floats
 from core.blocks import LANES, Blocks, lane_rows, lane_spread
 from core.checks import require
 from core.parallel import COMPILED, KERNEL_LOCK, PARALLEL, SERIAL_BELOW
-from core.parameters import Choice, Number, check_fields, parameter
+from core.parameters import Choice, Number, Zone, check_fields, parameter
 
 Weight = Literal["cubic", "exponential", "survival", "none"]
 Start = Literal["zero", "mean"]
@@ -60,24 +60,68 @@ class TrackingParameters:
 
     l: float = parameter(  # noqa: E741 - the paper's letter
         0.004,
-        Number("l", 1e-4, 1.0, log=True, least=0.0, most=1e6),
+        Number(
+            "l",
+            1e-4,
+            1.0,
+            log=True,
+            least=0.0,
+            most=1e6,
+            doubtful=(
+                Zone(0.0, 7e-4, "So slow a small scale leaves dim pixels without an answer."),
+                Zone(0.03, 1e6, "So fast a small scale follows the echo, too: it is lost in it."),
+            ),
+        ),
         "Speed of the small scale, r_small = l·σ: smaller follows only the slow trend.",
     )
     n: float = parameter(
         1000.0,
-        Number("n", 1.0, 1e4, log=True, least=0.0, most=1e9),
+        Number(
+            "n",
+            1.0,
+            1e4,
+            log=True,
+            least=0.0,
+            most=1e9,
+            doubtful=(
+                Zone(0.0, 70.0, "The scales are too much alike; at n = 1 nothing is left of them."),
+            ),
+        ),
         "Large scale over small scale, r_large = n·r_small: larger follows the echo's jump faster.",
     )
     h: float = parameter(
         1.0,
-        Number("h", 0.25, 4.0, log=True, least=0.0, most=1e6, open_below=True, unit="bins"),
+        Number(
+            "h",
+            0.25,
+            4.0,
+            log=True,
+            least=0.0,
+            most=1e6,
+            open_below=True,
+            unit="bins",
+            doubtful=(
+                Zone(0.0, 0.42, "As too small an l: dim pixels are left without an answer."),
+                Zone(2.6, 1e6, "As too large an l: the small scale follows the echo, too."),
+            ),
+        ),
         "Step of the integration. Only (m·h)²·l counts: h and l are one knob.",
     )
     m: float = parameter(
         1.4,
-        Number("m", 0.9, 5.0, least=1e-3, most=1e6),
-        "Smoothing, h0 = m·h: delays by 2m - 1 bins. At 1 a pure delay; below about 0.8 chaotic, "
-        "and unstable at ½.",
+        Number(
+            "m",
+            0.4,
+            5.0,
+            least=1e-3,
+            most=1e6,
+            doubtful=(
+                Zone(1e-3, 0.5, "It never comes to rest: at ½ and below it cycles for ever."),
+                Zone(0.5, 0.8, "Chaotic: rounding decides, and float32 finds other echoes."),
+                Zone(0.8, 1.0, "It smooths nothing: at 1 a pure delay, below it overshoots."),
+            ),
+        ),
+        "Smoothing, h0 = m·h: delays by 2m - 1 bins.",
     )
     alpha: float = parameter(
         0.15,
@@ -113,6 +157,37 @@ class TrackingParameters:
     def __post_init__(self) -> None:
         check_fields(self)
 
+    def joint_doubts(self) -> list[str]:
+        """Why answers are in doubt with settings that are sound one by one."""
+        linear = (self.m * self.h) ** 2 * self.l
+        found = []
+        if linear >= LINEAR:
+            found.append(
+                f"(m·h)²·l = {linear:.2g}: from about {LINEAR:g} on both scales turn linear and "
+                "move alike, which leaves little residual or none."
+            )
+        if self.weight == "exponential" and self.alpha >= STEEP_ALPHA:
+            found.append(
+                f"An exponential weight of α = {self.alpha:g}, {STEEP_ALPHA:g} or more, favours "
+                "the end of the gate over any echo before it."
+            )
+        if self.start == "zero" and self.weight != "cubic":
+            found.append(
+                "From zero both scales must first jump up to the background; only the cubic weight "
+                "hides that jump."
+            )
+        if self.sigma_from == "before T_n" and self.t_n < FEW_BINS:
+            found.append(
+                f"σ of the {self.t_n} bins before T_n, fewer than {FEW_BINS}, is chance; of one "
+                "bin or none it is 0, and nothing is answered."
+            )
+        return found
+
+
+# From where on settings are in doubt together, as `python -m core stability` measures it.
+LINEAR = 1.0
+STEEP_ALPHA = 1.6
+FEW_BINS = 4
 
 PRESETS: dict[str, TrackingParameters] = {
     "recommended": TrackingParameters(),

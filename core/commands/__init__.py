@@ -6,11 +6,11 @@ import argparse
 import os
 import sys
 
-from core.commands import captures, requires, studies, trade
+from core.commands import captures, requires, stability, studies, trade
 from core.commands.options import as_options
 
 ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
-"""Exit codes: done; the machine failed (a full disk, say); bad input; Ctrl-C."""
+"""Exit codes: done; the machine failed (a full disk, say), or a law; bad input; Ctrl-C."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -24,6 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
     studies.add(commands)
     trade.add(commands)
     requires.add(commands)
+    stability.add(commands)
     chosen = parser.parse_args(arguments)
     try:
         chosen.work(chosen)
@@ -33,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read us has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except OSError as error:
+    except (OSError, stability.BrokenLaw) as error:
         return _said(FAILED, error)
     except MemoryError as error:
         return _said(FAILED, f"memory is too small: {error}")

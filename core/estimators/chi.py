@@ -36,7 +36,7 @@ from core.estimators.base import Estimator
 from core.estimators.filters import correlate
 from core.estimators.kde import kernel_taps
 from core.parallel import COMPILED
-from core.parameters import Number, check_fields, parameter
+from core.parameters import Number, Zone, check_fields, parameter
 from core.posterior import TOLERANCE_BINS, Conditions, Light
 from core.spatial import neighbours, pooled, weighted_median
 
@@ -58,7 +58,18 @@ class ChiParameters:
 
     bandwidth_bins: float = parameter(
         0.4,
-        Number("h₀", 0.1, 3.0, log=True, unit="bins", least=0.01, most=100.0),
+        Number(
+            "h₀",
+            0.1,
+            3.0,
+            log=True,
+            unit="bins",
+            least=0.01,
+            most=100.0,
+            doubtful=(
+                Zone(2.4, 100.0, "So wide a kernel drowns the echo in the background before it."),
+            ),
+        ),
         "Bandwidth of the first density; each trigger's own lies between half and thrice of it.",
     )
 

@@ -24,7 +24,7 @@ import scipy  # loads a submodule when it is first used
 from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
-from core.parameters import Choice, Number, check_fields, parameter
+from core.parameters import Choice, Number, Zone, check_fields, parameter
 from core.posterior import Conditions
 
 REACH = {"1x1": 1, "3x3": 3, "5x5": 5}
@@ -48,7 +48,18 @@ class KdeParameters:
     )
     bandwidth_bins: float = parameter(
         0.4,
-        Number("h", 0.1, 3.0, log=True, unit="bins", least=0.01, most=100.0),
+        Number(
+            "h",
+            0.1,
+            3.0,
+            log=True,
+            unit="bins",
+            least=0.01,
+            most=100.0,
+            doubtful=(
+                Zone(2.0, 100.0, "So wide a kernel drowns the echo in the background before it."),
+            ),
+        ),
         "Standard deviation of the Gaussian that stands for each trigger.",
     )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,13 +12,16 @@ import pytest
 from core.acquisition import Acquisition, Flux, Pulse
 from core.blocks import to_blocks
 from core.capture import Capture
-from core.estimators import estimate
+from core.commands import main
+from core.estimators import ESTIMATORS, estimate
+from core.experiments import stability, trust
 from core.experiments.extremes import SHORT, SUBNORMAL
 from core.experiments.laws import LAWS, Law, verdict
 from core.limits import cramer_rao_bins
+from core.parameters import doubts
 from core.scene import Scene
 from core.simulate import simulate
-from core.tracking import TrackingParameters, track, tracking_signals
+from core.tracking import PRESETS, TrackingParameters, track, tracking_signals
 from core.trigger import coates_rate
 
 # Of these the kernels are few or none; the others range whole images.
@@ -118,3 +123,91 @@ def test_a_gate_that_closes_before_the_echo_begins_is_ranged() -> None:
     capture = Capture(cube, Acquisition(1, n_pulses=5), Pulse(1e-6))
     image = estimate(capture, "unmixing")
     assert ((image.bin[image.valid] >= 0) & (image.bin[image.valid] <= 1)).all()
+
+
+# --- Doubtful settings. ---
+
+
+@pytest.mark.compiled
+def test_doubtful_zones_are_what_is_measured() -> None:
+    rows = list(trust.zone_rows())
+    assert {row[-1] for row in rows} == {"yes"}
+    assert {row[1] for row in rows} >= {"l", "n", "h", "m", "(m·h)²·l"}
+
+
+def test_presets_and_defaults_are_in_no_doubt() -> None:
+    for each in (*PRESETS.values(), *(each.parameters() for each in ESTIMATORS.values())):
+        assert doubts(each) == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"m": 0.45}, "cycles for ever"),
+        ({"m": 0.7}, "Chaotic"),
+        ({"m": 1.0}, "a pure delay"),
+        ({"n": 1.0}, "too much alike"),
+        ({"l": 0.6}, "leaves little residual or none"),
+        ({"l": 0.1, "m": 3.0, "h": 2.0}, "leaves little residual or none"),
+        ({"alpha": 5.0}, "favours the end of the gate"),
+        ({"start": "zero"}, "jump up to the background"),
+        ({"sigma_from": "before T_n", "t_n": 2}, "is chance"),
+    ],
+)
+def test_doubts_say_why(changed: dict[str, Any], why: str) -> None:
+    told = doubts(TrackingParameters(**changed))
+    assert any(why in sentence for sentence in told)
+    assert all(sentence.endswith(".") for sentence in told)
+
+
+def test_zones_lie_within_what_is_accepted() -> None:
+    for _, name, spec, default in trust.numbers():
+        for zone in spec.doubtful:
+            assert spec.least <= zone.low < zone.high <= spec.most, name
+            assert default not in zone
+
+
+def sweep_of(shares: list[int]) -> trust.Sweep:
+    """Ten thousand pixels with so many right answers each."""
+    right = [np.arange(10_000) < share for share in shares]
+    points = [trust.Point(float(i), each, 1.0, 0.5) for i, each in enumerate(right)]
+    return trust.Sweep("peak", "width", 0.1, points)
+
+
+def test_ranges_of_trust_follow_the_losses() -> None:
+    sweep = sweep_of([0, 4000, 8500, 9400, 10_000, 9900, 6000, 9900])
+    assert sweep.best.value == 4
+    assert sweep.ranges("trusted") == "3 to 5, 7"
+    assert sweep.ranges("degraded") == "2, 6"
+    assert sweep.ranges("failing") == "0 to 1"
+    assert sweep.worst.value == 0
+
+
+@pytest.mark.files
+def test_the_command_writes_its_page_and_fails_with_a_broken_law(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    holds = Law("one", "One holds.", 1.0, "units", lambda grid: [(0.5, "here")])
+    broken = Law("two", "Two holds.", 1.0, "units", lambda grid: [(2.0, "there")])
+    swept = sweep_of([5000, 10_000])
+    tracking = [
+        replace(swept, method="tracking", parameter=name, points=points)
+        for name, points in (
+            (n, [trust.Point(v, swept.points[0].right, 1.0, 0.5) for v in (0.5, 1.0)])
+            for n in ("l", "n", "h", "m", "alpha")
+        )
+    ]
+    scene = [replace(swept, parameter=name) for name in ("sbr", "n_pulses", "tau_bins")]
+    monkeypatch.setattr(trust, "setting_sweeps", lambda progress: tracking)
+    monkeypatch.setattr(trust, "scene_sweeps", lambda progress: scene)
+    monkeypatch.setattr(trust, "zone_rows", lambda: iter([("a", "b", "c", "d", "e", "f", "yes")]))
+    for laws, code in (([holds], 0), ([holds, broken], 1)):
+        monkeypatch.setattr(stability, "LAWS", {law.name: law for law in laws})
+        assert main(["stability", "--folder", str(tmp_path / "report")]) == code
+    told = capsys.readouterr()
+    assert (
+        "Law 'two' does not hold (Two holds.): 2 units, where 1 is allowed, at there." in told.err
+    )
+    assert "| One holds. | yes | 0.5 | 1 | units | 1 | here |" in told.out
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert all(title in page for title in ("Laws", "Doubtful settings", "Scenes"))
