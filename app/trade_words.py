@@ -18,7 +18,10 @@ A tap on a point, or its button in the table, opens it.
 
 WAITING = "Compute measures every method here and now: some ten seconds for 64 × 64 pixels."
 
-SECTIONS_HELP = "What ranging costs and gives, and what recording costs and gives."
+SECTIONS_HELP = (
+    "What ranging costs and gives, what recording costs and gives, which parts of a model are "
+    "needed, and within which range of each setting answers are to be trusted."
+)
 
 ACQUIRING = """
 How many pulses, how much light, and how long a gate reach the restoration degree that is wanted:

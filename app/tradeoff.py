@@ -23,6 +23,7 @@ from app.session import Session
 from app.store import Answer, bare, same_capture
 from app.studies import OnePiece, Work, aside
 from app.theme import LIGHT, method_style, palette
+from app.trust import Trust
 from app.views import paint_frame, pane_of
 from core import ESTIMATORS
 from core.experiments.front import best_within, cheapest_reaching, front, with_light
@@ -106,6 +107,7 @@ class Tradeoff:
                 "Speed against accuracy": lambda: Ways(session, open_point).view,
                 "How to acquire": lambda: Acquisition(session).view,
                 "What the model needs": lambda: Requires(session).view,
+                "How far to trust": lambda: Trust(session).view,
             },
             label="Part of the trade",
             help=trade_words.SECTIONS_HELP,

@@ -19,9 +19,11 @@ from app.store import built_in_sources
 from app.studies import OnePiece
 from app.theme import DARK, LIGHT
 from app.tradeoff import Acquisition, Effort, Swept, Ways, source_of
+from app.trust import Trust
 from core import ESTIMATORS
 from core.experiments.front import best_within, cheapest_reaching, front
 from core.experiments.tradeoff import Cancelled
+from core.experiments.trust import numbers
 from core.scene import parts_of
 from tests.browser import eventually
 
@@ -290,6 +292,24 @@ def test_verdicts_are_those_of_the_scene_in_its_light(worn):
     eventually(lambda: worn.answer.request.light.sbr == 0.5)
     section._follow(worn.answer)
     assert all("message" in row for row in section._table.rows)
+
+
+# -- how far to trust ------------------------------------------------------------------------------
+
+
+def test_every_setting_of_a_method_is_swept():
+    section = Trust(Session(built_in_sources()))
+    view = section.view
+    view.show(True)
+    eventually(lambda: len(section._found) == 6)
+    fields = [field for method, field, *_ in numbers() if method == "tracking"]
+    assert [sweep.parameter for sweep in section._found] == fields
+    eventually(lambda: all(each.figure for each in section._cards))
+    section._panel.controls["method"].value = ESTIMATORS["kde"].title
+    eventually(lambda: [sweep.method for sweep in section._found] == ["kde"])
+    eventually(lambda: section._cards[0].figure)
+    section._paint(True)
+    assert section._cards[0].figure.title.text_color == DARK.text
 
 
 # -- in a browser ----------------------------------------------------------------------------------

@@ -182,18 +182,19 @@ def plots(settings: Sequence[Sweep], scene: Sequence[Sweep]) -> Iterator[Plot]:
 def setting_plot(sweep: Sweep, spec: Number) -> Plot:
     """What becomes of the answers along a setting's slider, with the ends of its doubtful zones."""
     shown = [p for p in sweep.points if spec.low <= p.value <= spec.high]
+    begins = {zone.low for zone in spec.doubtful}
     ends = {
         f"doubtful {side} {end:g}": float(end)
         for zone in spec.doubtful
         for side, end in (("from", zone.low), ("to", zone.high))
-        if spec.low < end < spec.high
+        if spec.low < end < spec.high and not (side == "to" and end in begins)
     }
     unit = f" ({spec.unit})" if spec.unit else ""
     return Plot(
         f"{sweep.method}_{sweep.parameter}",
         f"{ESTIMATORS[sweep.method].title}, SBR {sweep.sbr:g}: {spec.symbol}",
         f"{spec.symbol}{unit}",
-        "RD within 3 bins, and what goes with it",
+        "Share of the pixels within 3 bins",
         np.array([point.value for point in shown]),
         {
             "right": np.array([point.share for point in shown]),
