@@ -158,8 +158,9 @@ def plots(settings: Sequence[Sweep], scene: Sequence[Sweep]) -> Iterator[Plot]:
     specs = {field: spec for method, field, spec, _ in trust.numbers() if method == "tracking"}
     for parameter in ("l", "n", "h", "m", "alpha"):
         spec = specs[parameter]
+        scale, axis = (np.log10, "log10 of ") if spec.log else (np.asarray, "")
         edges = {
-            f"doubtful {side} {end:g}": float(np.log10(end))
+            f"doubtful {side} {end:g}": float(scale(end))
             for zone in spec.doubtful
             for side, end in (("from", zone.low), ("to", zone.high))
             if spec.low < end < spec.high
@@ -168,9 +169,9 @@ def plots(settings: Sequence[Sweep], scene: Sequence[Sweep]) -> Iterator[Plot]:
         yield Plot(
             f"tracking_{parameter}",
             f"Tracking differentiator, SBR {own[parameter].sbr:g}: {spec.symbol}",
-            f"log10 of {spec.symbol}",
+            f"{axis}{spec.symbol}",
             "RD within 3 bins, and what goes with it",
-            np.log10([point.value for point in shown]),
+            scale([point.value for point in shown]),
             {
                 "right": np.array([point.share for point in shown]),
                 "answered": np.array([point.answered for point in shown]),
