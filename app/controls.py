@@ -12,7 +12,7 @@ import panel_material_ui as pmui
 import param
 from panel.custom import Child, JSComponent
 
-from core.parameters import Number, spec_of
+from core.parameters import Number, joint_doubts, spec_of
 
 Settings = TypeVar("Settings")
 
@@ -20,7 +20,9 @@ Settings = TypeVar("Settings")
 class Knob(JSComponent):
     """A number with a slider, a field to type in, its unit, a line of help and a reset.
 
-    Only values between `low` and `high` can be set; the field says so when something else is typed.
+    Values with which answers are in doubt are marked on the slider; while one of them is set, a
+    sentence below says why. Only values between `low` and `high` can be set; the field says so when
+    something else is typed.
     """
 
     value = param.Number(default=0.0)
@@ -32,6 +34,7 @@ class Knob(JSComponent):
     label = param.String(default="")
     unit = param.String(default="")
     help = param.String(default="")
+    doubtful = param.List(default=[], doc="Zones of values in doubt: low, high, and why.")
 
     _esm = Path(__file__).with_name("knob.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("knob.css")]
@@ -49,9 +52,16 @@ class Knob(JSComponent):
             label=spec.symbol,
             unit=spec.unit,
             help=help,
+            doubtful=[[zone.low, zone.high, zone.why] for zone in spec.doubtful],
             sizing_mode="stretch_width",
             margin=(0, 8, 2, 8),
         )
+
+
+# As a knob tells of its own doubts.
+DOUBT = """
+.note { padding: 2px 0 4px 8px; border-left: 3px solid var(--mui-palette-warning-dark, #e65100); }
+"""
 
 
 class SettingsPanel(Generic[Settings]):
@@ -70,6 +80,11 @@ class SettingsPanel(Generic[Settings]):
         self._changed = changed
         self._silent = False
         self.controls: dict[str, Any] = {}
+        # Of settings that are sound one by one; each knob tells of its own.
+        self.doubts = Sentence(
+            live=True, stylesheets=[DOUBT], sizing_mode="stretch_width", margin=(0, 8, 4, 8)
+        )
+        self.doubts.text = " ".join(joint_doubts(settings))
         for each in fields(settings):  # type: ignore[arg-type]
             spec, value, help = spec_of(each), getattr(settings, each.name), each.metadata["help"]
             control = (
@@ -90,8 +105,9 @@ class SettingsPanel(Generic[Settings]):
 
     @property
     def layout(self) -> pn.Column:
-        """All controls, in the order of the fields."""
-        return pn.Column(*self.controls.values(), sizing_mode="stretch_width", margin=0)
+        """All controls, in the order of the fields, and what is to be doubted of them together."""
+        content = (*self.controls.values(), self.doubts)
+        return pn.Column(*content, sizing_mode="stretch_width", margin=0)
 
     def show(self, settings: Settings) -> None:
         """Set every control without reporting a change."""
@@ -101,7 +117,7 @@ class SettingsPanel(Generic[Settings]):
                 control.value = getattr(settings, name)
         finally:
             self._silent = False
-        self._settings = settings
+        self._settle(settings)
 
     def _collect(self, _event: param.parameterized.Event) -> None:
         if self._silent:
@@ -109,8 +125,12 @@ class SettingsPanel(Generic[Settings]):
         values = {name: control.value for name, control in self.controls.items()}
         whole = {n for n, c in self.controls.items() if isinstance(c, Knob) and c.whole}
         values = {n: round(v) if n in whole else v for n, v in values.items()}
-        self._settings = replace(self._settings, **values)  # type: ignore[type-var]
+        self._settle(replace(self._settings, **values))  # type: ignore[type-var]
         self._changed(self._settings)
+
+    def _settle(self, settings: Settings) -> None:
+        self._settings = settings
+        self.doubts.text = " ".join(joint_doubts(settings))
 
 
 class Facts(JSComponent):

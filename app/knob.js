@@ -13,11 +13,13 @@ export function render({ model }) {
       <button class="reset" type="button">↺</button>
       <button class="ask" type="button" aria-expanded="false">?</button>
     </div>
-    <input class="track" type="range">
+    <div class="rail"><div class="zones"></div><input class="track" type="range"></div>
     <div class="error" role="alert"></div>
+    <div class="doubt" id="doubt" role="status"></div>
     <div class="help" id="help" hidden></div>`;
   const part = (name) => root.querySelector("." + name);
-  const [field, track, error, help, ask] = ["field", "track", "error", "help", "ask"].map(part);
+  const [field, track, error, help, ask, zones, doubt] =
+    ["field", "track", "error", "help", "ask", "zones", "doubt"].map(part);
 
   // Position on the track <-> value.
   const toValue = (position) => {
@@ -36,6 +38,26 @@ export function render({ model }) {
     return size !== 0 && (size < 1e-3 || size >= 1e6) ? value.toExponential() : String(value);
   };
 
+  // Values in doubt, as far as the track reaches.
+  const reached = () =>
+    model.doubtful
+      .map(([from, to, why]) => [Math.max(from, model.low), Math.min(to, model.high), why])
+      .filter(([from, to]) => from <= to);
+  const mark = () => {
+    zones.replaceChildren(
+      ...reached().map(([from, to, why]) => {
+        const [left, right] = [from, to].map((at) => (100 * toPosition(at)) / track.max);
+        const zone = document.createElement("div");
+        zone.className = "zone";
+        zone.style.cssText = `left: ${left}%; width: ${right - left}%`;
+        zone.title = why;
+        return zone;
+      }),
+    );
+  };
+  const doubts = (value) =>
+    model.doubtful.filter(([from, to]) => from <= value && value <= to).map(([, , why]) => why);
+
   const show = () => {
     const { value, low, high, label, unit, whole, log } = model;
     track.min = 0;
@@ -45,10 +67,14 @@ export function render({ model }) {
     field.value = text(value);
     part("label").textContent = label;
     part("unit").textContent = unit ? `(${unit})` : "";
-    help.textContent = `${model.help} ${text(low)} to ${text(high)}${unit ? " " + unit : ""}.`;
+    const inDoubt = reached().map(([from, to, why]) => ` In doubt from ${text(from)} to ${text(to)}: ${why}`);
+    help.textContent =
+      `${model.help} ${text(low)} to ${text(high)}${unit ? " " + unit : ""}.` + inDoubt.join("");
+    mark();
+    doubt.textContent = doubts(value).join(" ");
     track.setAttribute("aria-label", unit ? `${label} in ${unit}` : label);
     track.setAttribute("aria-valuetext", `${text(value)} ${unit}`);
-    track.setAttribute("aria-describedby", "help");
+    track.setAttribute("aria-describedby", "help doubt");
     track.title = model.help;
     track.style.setProperty("--filled", `${(100 * track.value) / track.max}%`);
     part("reset").setAttribute("aria-label", `Reset ${label} to ${text(model.initial)}`);
@@ -92,7 +118,7 @@ export function render({ model }) {
     ask.setAttribute("aria-expanded", String(!help.hidden));
   });
 
-  for (const name of ["value", "low", "high", "initial", "label"]) model.on(name, show);
+  for (const name of ["value", "low", "high", "initial", "label", "doubtful"]) model.on(name, show);
   show();
   return root;
 }

@@ -170,4 +170,6 @@ def progress(done: int, of: int, noun: str, is_running: bool) -> str:
         return ""
     if is_running:
         return f"{done} of {of} {noun}."
-    return f"Done: {of} {noun}." if done == of else f"Stopped after {done} of {of} {noun}."
+    if done < of:
+        return f"Stopped after {done} of {of} {noun}."
+    return f"Done: {of} {noun if of != 1 else noun.removesuffix('s')}."

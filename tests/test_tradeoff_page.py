@@ -301,13 +301,13 @@ def test_every_setting_of_a_method_is_swept():
     section = Trust(Session(built_in_sources()))
     view = section.view
     view.show(True)
-    eventually(lambda: len(section._found) == 6)
+    eventually(lambda: section._study.controls[-1].text == "Done: 6 settings.")
     fields = [field for method, field, *_ in numbers() if method == "tracking"]
     assert [sweep.parameter for sweep in section._found] == fields
-    eventually(lambda: all(each.figure for each in section._cards))
+    assert all(each.figure for each in section._cards)
     section._panel.controls["method"].value = ESTIMATORS["kde"].title
-    eventually(lambda: [sweep.method for sweep in section._found] == ["kde"])
-    eventually(lambda: section._cards[0].figure)
+    eventually(lambda: section._study.controls[-1].text == "Done: 1 setting.")
+    assert [sweep.method for sweep in section._found] == ["kde"]
     section._paint(True)
     assert section._cards[0].figure.title.text_color == DARK.text
 

@@ -1,0 +1,110 @@
+"""Settings with which answers are in doubt: marked on the slider, and a sentence that says why."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+from playwright.sync_api import expect
+
+from app.controls import Knob, SettingsPanel
+from core import PRESETS, TrackingParameters
+from core.estimators import ESTIMATORS
+from core.parameters import Number, joint_doubts, spec_of
+
+
+@pytest.mark.parametrize("method", ESTIMATORS)
+def test_knobs_know_the_zones_of_their_settings(method):
+    settings = ESTIMATORS[method].parameters()
+    controls = SettingsPanel(settings, lambda new: None).controls
+    for each in fields(settings):
+        spec = spec_of(each)
+        if isinstance(spec, Number):
+            zones = [[zone.low, zone.high, zone.why] for zone in spec.doubtful]
+            assert controls[each.name].doubtful == zones
+
+
+def test_a_number_without_doubts_has_no_zone():
+    assert Knob.of(Number("x", 0, 1), 0.5, "Any.").doubtful == []
+
+
+def test_what_is_doubted_of_settings_together_is_told_while_it_is_so():
+    panel = SettingsPanel(TrackingParameters(), lambda new: None)
+    assert panel.doubts.live
+    assert panel.doubts.text == ""
+    panel.controls["l"].value = 0.7
+    assert panel.doubts.text == joint_doubts(TrackingParameters(l=0.7))[0]
+    assert panel.doubts.text.startswith("(m·h)²·l = 1.4: from about 1 on")
+    panel.controls["start"].value = "zero"
+    assert "jump up to the background" in panel.doubts.text
+    panel.show(PRESETS["as printed"])
+    assert panel.doubts.text == ""
+
+
+def test_a_panel_tells_of_doubts_from_the_start():
+    settings = replace(TrackingParameters(), alpha=5.0)
+    panel = SettingsPanel(settings, lambda new: None)
+    assert "favours the end of the gate" in panel.doubts.text
+    assert panel.doubts in panel.layout
+
+
+@pytest.mark.browser
+def test_a_slider_shows_its_doubtful_zone_and_says_why_while_it_is_there(page):
+    shown = page()
+    knob = shown.locator(".knob", has=shown.get_by_role("slider", name="m", exact=True))
+    knob = knob.filter(visible=True)
+    zones, doubt = knob.locator(".zone"), knob.get_by_role("status", include_hidden=True)
+    expect(zones).to_have_count(3)
+    expect(doubt).to_be_hidden()
+
+    # Where the thumb stands at a zone's edge, the band ends: half a thumb is beyond either end.
+    knob.locator(".field").fill("0.8")
+    knob.locator(".field").press("Enter")
+    expect(doubt).to_have_text(
+        "Chaotic: rounding decides, and float32 finds other echoes. "
+        "It smooths nothing: at 1 a pure delay, below it overshoots."
+    )
+    track, band = knob.locator(".track").bounding_box(), zones.nth(1).bounding_box()
+    position = float(knob.locator(".track").input_value()) / 400
+    thumb = track["x"] + 8 + position * (track["width"] - 16)
+    assert abs(band["x"] + band["width"] - thumb) <= 1.5
+
+    # What a screen reader is told of the slider includes the sentence, and the help the zones.
+    assert knob.locator(".track").get_attribute("aria-describedby") == "help doubt"
+    knob.get_by_role("button", name="What is m?").click()
+    expect(knob.locator(".help")).to_contain_text("In doubt from 0.8 to 1: It smooths nothing")
+
+    # In both modes it can be told from what is behind it.
+    for name in ("light", "dark"):
+        ratio = zones.nth(1).evaluate(CONTRAST)
+        assert ratio >= 3, name
+        shown.get_by_role("button", name="Toggle theme").click()
+        shown.wait_for_timeout(500)
+
+    knob.get_by_role("button", name="Reset m to 1.4").click()
+    expect(doubt).to_be_hidden()
+
+
+CONTRAST = """
+(element) => {
+  const parts = (text) => text.match(/[\\d.]+/g).map(Number);
+  const light = (rgb) => rgb.slice(0, 3)
+    .map((c) => c / 255)
+    .map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+  let behind = element;
+  const solid = (node) => {
+    const color = parts(getComputedStyle(node).backgroundColor);
+    return color.length < 4 || color[3] === 1 ? color : null;
+  };
+  const up = (node) => node.assignedSlot || node.parentNode || node.host;
+  let color = null;
+  while (behind && !color) {
+    if (behind instanceof Element) color = solid(behind);
+    behind = up(behind);
+  }
+  const border = parts(getComputedStyle(element).borderColor);
+  const pair = [light(border), light(color)].sort((a, b) => b - a);
+  return (pair[0] + 0.05) / (pair[1] + 0.05);
+}
+"""
