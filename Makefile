@@ -5,7 +5,7 @@ PORT ?= 5006
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: app test bench speed tradeoff stability paper table2 uniform calibration field large fuzz clean
+.PHONY: app test bench speed tradeoff stability requires paper table2 uniform calibration field large fuzz clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
@@ -29,6 +29,9 @@ tradeoff: $(VENV)/.app ## what accuracy costs, and what to choose; CAPTURE=path 
 
 stability: $(VENV)/.app ## laws held at every extreme, and the range within which each setting is trustworthy
 	$(BIN)/python -m core stability
+
+requires: $(VENV)/.app ## which parts and corrections a scene needs; SCENE=fog for another
+	$(BIN)/python -m core requires $(if $(SCENE),--scene $(SCENE)) --out requires
 
 paper: $(VENV)/.app ## every figure and table of the paper beside ours, as one page in paper/
 	$(BIN)/python -m core paper $(if $(REPETITIONS),--repetitions $(REPETITIONS)) $(if $(FIELD),--field "$(FIELD)")
