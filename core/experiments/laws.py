@@ -46,7 +46,7 @@ from core.large import estimate_large
 from core.posterior import TOLERANCE_BINS, Conditions, light_of, log_likelihood_ratio
 from core.scene import Scene
 from core.simulate import simulate
-from core.tracking import PRESETS, TrackingParameters, track, tracking_signals
+from core.tracking import CALM_M, PRESETS, TrackingParameters, track, tracking_signals
 from core.trigger import (
     coates_rate,
     no_trigger_probability,
@@ -56,9 +56,6 @@ from core.trigger import (
 
 Case = tuple[float, str]
 """How far from holding, and where."""
-
-CALM_M = 0.8
-"""From here on two precisions find the same echo; below, the tracking differentiator is chaotic."""
 
 DISAGREEING = 1e-3
 """Share of the pixels in which float32 and float64 may choose different bins."""
@@ -298,7 +295,7 @@ def _takes(name: str, value: float, build: Callable[[float], Any]) -> float:
 # --- What must not matter ---
 
 
-def _car(seed: int = 0, sbr: float = 0.06, rows: int = 16) -> Capture:
+def _echoes(seed: int = 0, sbr: float = 0.06, rows: int = 16) -> Capture:
     """Some rows of echoes at depths all over the gate, as the paper's instrument records them."""
     whole = Condition("uniform", sbr).capture(seed)
     truth_m = np.asarray(whole.truth_range_m)[:rows]
@@ -321,7 +318,7 @@ def _differing(found: RangeImage, expected: RangeImage) -> float:
 
 
 def _threads(grid: Grid) -> Iterator[Case]:
-    capture = _car(rows=16)
+    capture = _echoes(rows=16)
     # Many counts, or one thread would do all of it.
     wide = replace(
         capture, cube=np.tile(capture.cube, (grid.tiles, 1, 1)), truth_range_m=None, signal=None
@@ -342,7 +339,7 @@ def _threads(grid: Grid) -> Iterator[Case]:
 def _chunks(grid: Grid) -> Iterator[Case]:
     import xarray as xr  # noqa: PLC0415 - slow to come
 
-    cube = _car(rows=12).cube[:, :20]
+    cube = _echoes(rows=12).cube[:, :20]
     capture = Capture(cube.copy(), Acquisition())
     counts = xr.DataArray(
         cube,
@@ -381,7 +378,9 @@ def _by_rows(capture: Capture, method: str) -> float:
 
 
 def _types(grid: Grid) -> Iterator[Case]:
-    cube = np.minimum(4 * _car(rows=4).cube[:, :16], 255)  # sums beyond what a narrow count holds
+    cube = np.minimum(
+        4 * _echoes(rows=4).cube[:, :16], 255
+    )  # sums beyond what a narrow count holds
     for method in ESTIMATORS:
         found = []
         for dtype in (np.uint8, np.uint16, np.uint32):
@@ -398,7 +397,7 @@ SCALES = (2, 3, 7, 1000, 65_537)
 
 def _scales(grid: Grid) -> Iterator[Case]:
     """Pixels whose answer another unit of counts moves, beyond what rounding leaves open."""
-    capture = _car()
+    capture = _echoes()
     rows = capture.cube.reshape(-1, 100)
     for (name, chosen), scale in product(PRESETS.items(), SCALES):
         scaled = rows.astype(np.uint32) * np.uint32(scale)
@@ -453,7 +452,7 @@ def _evidence(grid: Grid) -> Iterator[Case]:
 def _confidence(grid: Grid) -> Iterator[Case]:
     """By how much the mean confidence exceeds the share of answers that are right."""
     for sbr in sorted({*grid.sbr, *SATURATING}):
-        capture = _car(sbr=sbr, rows=32)
+        capture = _echoes(sbr=sbr, rows=32)
         truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
         for method in ("likelihood", "coates", "tracking"):
             image = estimate(capture, method)
@@ -481,7 +480,7 @@ def compared(
 
 
 def _precisions(grid: Grid) -> Iterator[tuple[float, float, str]]:
-    for name, capture in (("SBR 0.06", _car(rows=8)), ("SBR 10", _car(sbr=10.0, rows=8))):
+    for name, capture in (("SBR 0.06", _echoes(rows=8)), ("SBR 10", _echoes(sbr=10.0, rows=8))):
         rows = capture.cube.reshape(-1, capture.acquisition.n_bins)
         for preset, base in PRESETS.items():
             for chosen in settings("tracking", grid):
@@ -559,7 +558,7 @@ def answer_plainly(path: str) -> None:
 
 def plain_answers() -> Iterator[tuple[str, RangeImage]]:
     """Every estimator on a few pixels, so few that uncompiled kernels answer in seconds."""
-    capture = _car(sbr=0.2, rows=4)
+    capture = _echoes(sbr=0.2, rows=4)
     few = replace(
         capture,
         cube=capture.cube[:, :16, 20:40].copy(),
@@ -725,10 +724,9 @@ LAWS = {
         ),
         Law(
             "likelihood in float32",
-            "No delay is likelier in float64 than the one found in float32, beyond rounding and a "
-            "step.",
+            "No delay is likelier in float64 than the one found in float32, beyond rounding.",
             1.0,
-            "roundings and a step",
+            "roundings",
             _likelihood_in_float32,
         ),
         Law(

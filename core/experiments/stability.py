@@ -78,7 +78,7 @@ def laws_table(verdicts: Sequence[Verdict]) -> Table:
         (
             each.law.sentence,
             "yes" if each.holds else "NO",
-            f"{max(each.worst, 0.0):.2g}",
+            f"{each.worst + 0.0:.2g}",
             f"{each.law.bound:g}",
             each.law.unit,
             each.cases,
@@ -108,9 +108,7 @@ def zones_table(rows: Sequence[tuple[str, ...]]) -> Table:
         "the filter's linear zone undiminished, and a filter that still moves a thousand bins "
         "behind an echo. Where a zone ends in another one nothing is measured beyond."
     )
-    return Table(
-        "zones", "Doubtful settings of the tracking differentiator", columns, tuple(rows), note
-    )
+    return Table("zones", "Doubtful settings", columns, tuple(rows), note)
 
 
 def ranges_table(key: str, title: str, sweeps: Sequence[Sweep]) -> Table:
@@ -160,9 +158,9 @@ def plots(settings: Sequence[Sweep], scene: Sequence[Sweep]) -> Iterator[Plot]:
         spec = specs[parameter]
         scale, axis = (np.log10, "log10 of ") if spec.log else (np.asarray, "")
         edges = {
-            f"doubtful {side} {end:g}": float(scale(end))
+            f"end of a doubtful zone, {end:g}": float(scale(end))
             for zone in spec.doubtful
-            for side, end in (("from", zone.low), ("to", zone.high))
+            for end in (zone.low, zone.high)
             if spec.low < end < spec.high
         }
         shown = [p for p in own[parameter].points if spec.low <= p.value <= spec.high]

@@ -355,5 +355,5 @@ def _borne_out(method: str, within: Sequence[Any], beyond: Sequence[Any]) -> tup
     kind = ESTIMATORS[method].parameters
     doubtful, sound = ([signs(method, kind(**each)) for each in side] for side in (within, beyond))
     good = all(each.is_doubtful for each in doubtful) and not any(x.is_doubtful for x in sound)
-    told = ["; ".join(str(each) or "nothing" for each in side) for side in (doubtful, sound)]
+    told = ["; ".join(str(x) or "nothing" for x in side) or "–" for side in (doubtful, sound)]
     return told[0], told[1], "yes" if good else "NO"
