@@ -17,6 +17,9 @@ from core.parameters import Choice, Number, spec_of
 from core.scene import Scene
 from core.simulate import simulate
 
+Case = tuple[float, str]
+"""How far from holding a law is, and where."""
+
 SUBNORMAL = 5e-324
 SIGNAL = 0.1041  # the paper's photons per pulse
 

@@ -22,7 +22,7 @@ from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
 from core.experiments.extremes import SIGNAL
 from core.experiments.items import as_text
-from core.experiments.laws import compared
+from core.experiments.laws_of_answers import compared
 from core.parameters import Number, Zone, joint_doubts, spec_of
 from core.posterior import TOLERANCE_BINS
 from core.scene import Scene
