@@ -35,7 +35,7 @@ LOSS = 0.1
 FAILING = 0.5
 """Share of the best value's right answers below which a method no longer degrades, but fails."""
 
-DISAGREEING = 0.01
+DIFFERING = 0.01
 """Share of pixels in which two precisions choose other bins from which on rounding decides."""
 
 BASES = (0.06, 0.1, 0.2, 0.5, 1.0)
@@ -286,7 +286,7 @@ class Signs:
     def __str__(self) -> str:
         told = {
             "pixels lost": self.loss > LOSS and f"{self.loss:.2f}",
-            "float32 differs": self.disagreement > DISAGREEING and f"{self.disagreement:.2f}",
+            "float32 differs": self.disagreement > DIFFERING and f"{self.disagreement:.2f}",
             "noise passed": self.noise >= 1 and f"{self.noise:.2f}",
             "ringing": self.ringing > RESTLESS and f"{self.ringing:.1g}",
         }
