@@ -67,7 +67,9 @@ export function render({ model }) {
     field.value = text(value);
     part("label").textContent = label;
     part("unit").textContent = unit ? `(${unit})` : "";
-    const inDoubt = reached().map(([from, to, why]) => ` In doubt from ${text(from)} to ${text(to)}: ${why}`);
+    const inDoubt = reached().map(
+      ([from, to, why]) => ` In doubt from ${text(from)} to ${text(to)}: ${why}`,
+    );
     help.textContent =
       `${model.help} ${text(low)} to ${text(high)}${unit ? " " + unit : ""}.` + inDoubt.join("");
     mark();

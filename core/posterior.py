@@ -296,8 +296,13 @@ def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats
     and next to nothing where an echo did. Without them, light that fires every pulse early in the
     gate would be an echo there, beyond all doubt.
     """
-    rate, armed = rate_and_armed(pixels.astype(float), n_pulses)
-    return np.asarray(weighted_median(rate.T, armed.T) * pixels.shape[1])
+    median = np.empty(len(pixels))
+    at_once = max(1, _AT_ONCE // pixels.shape[1])
+    for first in range(0, len(pixels), at_once):
+        some = slice(first, first + at_once)
+        rate, armed = rate_and_armed(pixels[some].astype(float), n_pulses)
+        median[some] = weighted_median(rate.T, armed.T)
+    return median * pixels.shape[1]
 
 
 def _trust(total: Floats, unrelated: float) -> float:

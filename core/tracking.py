@@ -46,6 +46,13 @@ Start = Literal["zero", "mean"]
 SigmaFrom = Literal["gate", "before T_n"]
 
 
+# Where settings are in doubt, as ``python -m core stability`` measures it.
+CALM_M = 0.8  # chaotic below
+LINEAR = 1.0
+STEEP_ALPHA = 1.6
+FEW_BINS = 4
+
+
 @dataclass(frozen=True)
 class TrackingParameters:
     """Settings of the dual-scale tracking differentiator; the defaults are the recommended preset.
@@ -117,8 +124,16 @@ class TrackingParameters:
             most=1e6,
             doubtful=(
                 Zone(1e-3, 0.5, "It never comes to rest: at ½ and below it cycles for ever."),
-                Zone(0.5, 0.8, "Chaotic: rounding decides, and float32 finds other echoes."),
-                Zone(0.8, 1.0, "It smooths nothing: at 1 a pure delay, below it overshoots."),
+                Zone(
+                    0.5,
+                    CALM_M,
+                    "Chaotic: rounding decides, and float32 finds other echoes.",
+                ),
+                Zone(
+                    CALM_M,
+                    1.0,
+                    "It smooths nothing: at 1 a pure delay, below it overshoots.",
+                ),
             ),
         ),
         "Smoothing, h0 = m·h: delays by 2m - 1 bins.",
@@ -183,11 +198,6 @@ class TrackingParameters:
             )
         return found
 
-
-# From where on settings are in doubt together, as `python -m core stability` measures it.
-LINEAR = 1.0
-STEEP_ALPHA = 1.6
-FEW_BINS = 4
 
 PRESETS: dict[str, TrackingParameters] = {
     "recommended": TrackingParameters(),

@@ -36,7 +36,7 @@ from core.export import (
     save_image,
     save_pixel,
 )
-from core.parameters import Number, spec_of
+from core.parameters import Number, doubts, spec_of
 from core.pipeline import run
 from core.readers import READERS, open_capture, read_capture
 from core.readers.guards import MAX_CUBE_BYTES
@@ -164,6 +164,7 @@ def _estimate(chosen: argparse.Namespace) -> None:
         "source": seen.source,
         "remark": facts.pop("remark"),
         "settings": str(settings),
+        "in_doubt": " ".join(doubts(settings)),
         "pixels": image.valid.size,
         "pixels_answered": int(image.valid.sum()),
         f"of_them_at_confidence_{_CONFIDENT}": int((image.confidence >= _CONFIDENT).sum()),

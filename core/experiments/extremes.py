@@ -17,6 +17,9 @@ from core.parameters import Choice, Number, spec_of
 from core.scene import Scene
 from core.simulate import simulate
 
+Case = tuple[float, str]
+"""How far from holding a law is, and where."""
+
 SUBNORMAL = 5e-324
 SIGNAL = 0.1041  # the paper's photons per pulse
 
@@ -82,13 +85,11 @@ class Light:
     def capture(self, seed: int = 0) -> Capture:
         """Pixels with `onsets`, as they would be recorded, and one without a target."""
         onset = np.append(onsets(self.n_bins), np.nan).reshape(3, -1)
-        # The scene's factor: a flux alone cannot be all background.
-        dark = self.background == 0
-        flux = Flux(self.signal, np.inf) if dark else Flux(self.background, 1.0)
-        factor = np.full(onset.shape, 1.0 if dark else self.signal / self.background)
-        if not np.isfinite(factor).all():
-            flux, factor = Flux(self.signal, self.signal / self.background), np.ones(onset.shape)
-        scene = Scene(self.acquisition.bin_to_range_m(onset), factor)
+        sbr = self.signal / self.background if self.background else np.inf
+        # A flux has no background without a signal: there the scene reflects nothing.
+        flux = Flux(self.signal, sbr) if sbr > 0 else Flux(self.background, 1.0)
+        reflectivity = np.full(onset.shape, 1.0 if sbr > 0 else 0.0)
+        scene = Scene(self.acquisition.bin_to_range_m(onset), reflectivity)
         return simulate(scene, self.acquisition, flux, self.pulse, seed)
 
 

@@ -80,7 +80,7 @@ def laws_table(verdicts: Sequence[Verdict]) -> Table:
         (
             each.law.sentence,
             "yes" if each.holds else "NO",
-            f"{max(each.worst, 0.0):.2g}",
+            f"{each.worst + 0.0:.2g}",
             f"{each.law.bound:g}",
             each.law.unit,
             each.cases,
@@ -110,9 +110,7 @@ def zones_table(rows: Sequence[tuple[str, ...]]) -> Table:
         "the filter's linear zone undiminished, and a filter that still moves a thousand bins "
         "behind an echo. Where a zone ends in another one nothing is measured beyond."
     )
-    return Table(
-        "zones", "Doubtful settings of the tracking differentiator", columns, tuple(rows), note
-    )
+    return Table("zones", "Doubtful settings", columns, tuple(rows), note)
 
 
 def ranges_table(key: str, title: str, sweeps: Sequence[Sweep]) -> Table:
@@ -182,12 +180,11 @@ def plots(settings: Sequence[Sweep], scene: Sequence[Sweep]) -> Iterator[Plot]:
 def setting_plot(sweep: Sweep, spec: Number) -> Plot:
     """What becomes of the answers along a setting's slider, with the ends of its doubtful zones."""
     shown = [p for p in sweep.points if spec.low <= p.value <= spec.high]
-    begins = {zone.low for zone in spec.doubtful}
     ends = {
-        f"doubtful {side} {end:g}": float(end)
+        f"end of a doubtful zone, {end:g}": float(end)
         for zone in spec.doubtful
-        for side, end in (("from", zone.low), ("to", zone.high))
-        if spec.low < end < spec.high and not (side == "to" and end in begins)
+        for end in (zone.low, zone.high)
+        if spec.low < end < spec.high
     }
     unit = f" ({spec.unit})" if spec.unit else ""
     return Plot(

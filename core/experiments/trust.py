@@ -22,7 +22,7 @@ from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
 from core.experiments.extremes import SIGNAL
 from core.experiments.items import as_text
-from core.experiments.laws import compared
+from core.experiments.laws_of_answers import compared
 from core.parameters import Number, Zone, joint_doubts, spec_of
 from core.posterior import TOLERANCE_BINS
 from core.scene import Scene
@@ -35,7 +35,7 @@ LOSS = 0.1
 FAILING = 0.5
 """Share of the best value's right answers below which a method no longer degrades, but fails."""
 
-DISAGREEING = 0.01
+DIFFERING = 0.01
 """Share of pixels in which two precisions choose other bins from which on rounding decides."""
 
 BASES = (0.06, 0.1, 0.2, 0.5, 1.0)
@@ -286,7 +286,7 @@ class Signs:
     def __str__(self) -> str:
         told = {
             "pixels lost": self.loss > LOSS and f"{self.loss:.2f}",
-            "float32 differs": self.disagreement > DISAGREEING and f"{self.disagreement:.2f}",
+            "float32 differs": self.disagreement > DIFFERING and f"{self.disagreement:.2f}",
             "noise passed": self.noise >= 1 and f"{self.noise:.2f}",
             "ringing": self.ringing > RESTLESS and f"{self.ringing:.1g}",
         }
@@ -355,5 +355,5 @@ def _borne_out(method: str, within: Sequence[Any], beyond: Sequence[Any]) -> tup
     kind = ESTIMATORS[method].parameters
     doubtful, sound = ([signs(method, kind(**each)) for each in side] for side in (within, beyond))
     good = all(each.is_doubtful for each in doubtful) and not any(x.is_doubtful for x in sound)
-    told = ["; ".join(str(each) or "nothing" for each in side) for side in (doubtful, sound)]
+    told = ["; ".join(str(x) or "nothing" for x in side) or "–" for side in (doubtful, sound)]
     return told[0], told[1], "yes" if good else "NO"

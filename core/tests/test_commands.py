@@ -140,6 +140,16 @@ def test_estimate_says_where_pile_up_is_not_undone(
     assert "remark" not in facts(capsys, "estimate", "peak", *reading)
 
 
+def test_estimate_says_with_which_settings_answers_are_in_doubt(
+    frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reading = ("--capture", frames, "--axes", "bin row col")
+    told = facts(capsys, "estimate", "tracking", *reading, "--m", 0.7, "--start", "zero")
+    assert "Chaotic: rounding decides" in told["in_doubt"]
+    assert "jump up to the background" in told["in_doubt"]
+    assert "in_doubt" not in facts(capsys, "estimate", "tracking", *reading)
+
+
 @pytest.mark.compiled
 def test_what_exceeds_memory_is_ranged_in_parts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
