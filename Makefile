@@ -16,7 +16,8 @@ test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/mypy
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -n auto core/tests --cov --cov-report=
 	$(BIN)/python -m pytest -n auto core/tests --cov --cov-append --cov-fail-under=95
-	$(BIN)/python -m pytest tests
+	$(BIN)/python -m pytest -n auto tests -m "not browser"
+	$(BIN)/python -m pytest tests -m browser
 
 bench: $(VENV)/.test ## slider to changed pixels, through a real browser
 	$(BIN)/python -m tests.latency

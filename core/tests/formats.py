@@ -102,7 +102,7 @@ class Format:
     told: Mapping[str, Any] = field(default_factory=lambda: {"axes": "row col bin"})
     guesses: tuple[str, ...] = ("bin width 1 ns",)
     refuses: Sequence[Mapping[str, Any]] = CUBES_REFUSE
-    n_damaged: int = 300
+    n_damaged: int = 100
 
 
 def put(path: Path, content: Content) -> Path:
