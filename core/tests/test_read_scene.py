@@ -579,6 +579,8 @@ def test_damaged_bytes_give_nothing_but_a_scene_error(
     monkeypatch.setattr(guards, "MAX_CUBE_BYTES", limit)
     content, path, rng = WHOLE[name](), tmp_path / name, random.Random(name)
     told = {"size": (9, 9)} if path.suffix[1:] in MESHES else {}
+    path.write_bytes(content)
+    read_scene(path, **told)  # and its library, whose memory is not the file's
     n_refused = 0
     tracemalloc.start()
     try:

@@ -595,6 +595,8 @@ def test_damaged_bytes_give_nothing_but_a_capture_error(
     kept = FORMATS[kind]
     content, path, rng = kept.build(), tmp_path / kept.name, random.Random(kind)
     n_refused = 0
+    put(path, content)
+    read_capture(path, **kept.needs)  # and its library, whose memory is not the file's
     tracemalloc.start()
     try:
         for _ in range(kept.n_damaged):
