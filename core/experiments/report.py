@@ -20,6 +20,7 @@ from core.experiments.items import Item, Pictures, Plot, Scatter, Table, as_csv,
 _STYLES = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
 _ENDS = ("", ", low", ", high")
+_LONGEST_FINE = 1e4  # of a logarithmic axis that has numbers between its powers of ten
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -157,7 +158,9 @@ def _log(axes: Axes, which: Literal["x", "y"]) -> None:
     """A logarithmic axis with numbers as people write them."""
     axes.set(**{f"{which}scale": "log"})
     axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=20))
+    low, high = axis.get_view_interval()
+    is_long = low > 0 and high / low > _LONGEST_FINE
+    axis.set_major_locator(LogLocator(subs=(1,) if is_long else (1, 2, 5), numticks=20))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
 
