@@ -160,7 +160,8 @@ def _log(axes: Axes, which: Literal["x", "y"]) -> None:
     axis = axes.xaxis if which == "x" else axes.yaxis
     low, high = axis.get_view_interval()
     is_long = low > 0 and high / low > _LONGEST_FINE
-    axis.set_major_locator(LogLocator(subs=(1,) if is_long else (1, 2, 5), numticks=20))
+    subs, most = ((1,), 9) if is_long else ((1, 2, 5), 20)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=most))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
 
