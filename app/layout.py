@@ -22,7 +22,7 @@ from app.paper import Paper
 from app.parts import card, choice, part, select
 from app.session import Session
 from app.state import Less, Reading
-from app.store import Answer, Source, file_source
+from app.store import Answer, Request, Source, file_source
 from app.theme import DARK, LIGHT, SIZES
 from app.tradeoff import Tradeoff
 from core import PRESETS, TrackingParameters
@@ -238,17 +238,25 @@ class Layout:
 
     # What the user does
 
-    def _open_point(self, point: Point) -> None:
+    def _open_point(self, point: Point, measured: Request) -> None:
         """Show a measured way to range: the paper's method on Explore, others on Compare."""
         state, candidate = self.session.state, point.candidate
-        less = Less.of(candidate.reduction, point.shape[2])
+        seen = {
+            "source": self.session.key(measured.source),
+            "light": measured.light,
+            "reading": measured.reading,
+            "absent": measured.absent,
+            "less": Less.of(candidate.reduction, point.shape[2]),
+        }
+        self._light.show(measured.light)
+        self._announced = None  # how a file is read may be another
         if candidate.method.estimator == "tracking":
-            state.param.update(less=less, tracking=candidate.settings)
+            state.param.update(tracking=candidate.settings, **seen)
             self._tracking.show(candidate.settings)
             self._preset.value = _preset_of(candidate.settings)
             self.pages.choice.value = "Explore"
         else:
-            state.less = less
+            state.param.update(**seen)
             self._compare.pick(candidate.method.estimator, candidate.settings)
             self.pages.choice.value = "Compare"
 

@@ -160,7 +160,7 @@ class Session:
         if request == self._request():
             with param.discard_events(state):
                 state.param.update(
-                    source=self._key(shown.source),
+                    source=self.key(shown.source),
                     reading=shown.reading,
                     less=shown.less,
                     absent=shown.absent,
@@ -173,7 +173,8 @@ class Session:
         log.warning("a request failed", exc_info=error)
         self.complain(words.failure(error))
 
-    def _key(self, source: Source) -> str:
+    def key(self, source: Source) -> str:
+        """Of a source in the catalogue."""
         return next(key for key, known in self.sources.items() if known is source)
 
     def _show(self, answer: Answer, first: bool = False) -> None:
@@ -257,7 +258,7 @@ class Session:
         """Changes when the camera should start anew."""
         answer = self.answer
         acquisition = replace(answer.capture.acquisition, n_pulses=None)
-        return f"{self._key(answer.request.source)} {answer.capture.shape} {acquisition}"
+        return f"{self.key(answer.request.source)} {answer.capture.shape} {acquisition}"
 
 
 def _pixel_to_start_with(answer: Answer) -> tuple[int, int]:

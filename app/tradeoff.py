@@ -20,7 +20,7 @@ from app.pages import Pages, View
 from app.parts import card, part
 from app.requires import Requires
 from app.session import Session
-from app.store import Answer, bare, same_capture
+from app.store import Answer, Request, bare, same_capture
 from app.studies import OnePiece, Work, aside
 from app.theme import LIGHT, method_style, palette
 from app.trust import Trust
@@ -98,10 +98,10 @@ class Tradeoff:
     ----------
     session : Session
     open_point : callable
-        Shows a measured way to range on the page that it belongs to.
+        Shows a way to range, and what it was measured on, on the page that it belongs to.
     """
 
-    def __init__(self, session: Session, open_point: Callable[[Point], None]) -> None:
+    def __init__(self, session: Session, open_point: Callable[[Point, Request], None]) -> None:
         self._sections = Pages(
             {
                 "Speed against accuracy": lambda: Ways(session, open_point).view,
@@ -142,10 +142,10 @@ class Ways:
         Whose scene or capture is measured, in its present light and with its settings of the
         tracking differentiator.
     open_point : callable
-        Shows a measured way to range on the page that it belongs to.
+        Shows a way to range, and what it was measured on, on the page that it belongs to.
     """
 
-    def __init__(self, session: Session, open_point: Callable[[Point], None]) -> None:
+    def __init__(self, session: Session, open_point: Callable[[Point, Request], None]) -> None:
         self._session = session
         self._open_point = open_point
         self._effort, self._wanted = Effort(), Wanted()
@@ -225,7 +225,7 @@ class Ways:
             self._open(chosen[0])
 
     def _open(self, key: int) -> None:
-        self._open_point(self._measured[key])
+        self._open_point(self._measured[key], self._of)
 
     def _points_file(self) -> BytesIO:
         """Everything that was measured."""

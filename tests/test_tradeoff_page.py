@@ -40,7 +40,7 @@ def never():
 @pytest.fixture(scope="module")
 def measured():
     """A small study of the car, and the page's part that asked for it."""
-    ways = Ways(Session(built_in_sources()), lambda point: None)
+    ways = Ways(Session(built_in_sources()), lambda point, of: None)
     ways._effort = Effort(repetitions=2, repeats=6, merges="none")
     return ways._work()(unheard, never)
 
@@ -52,7 +52,7 @@ def opened():
 
 @pytest.fixture
 def ways(measured, opened):
-    page = Ways(Session(built_in_sources()), opened.append)
+    page = Ways(Session(built_in_sources()), lambda point, of: opened.append(point))
     page._arrived(measured)
     return page
 
@@ -202,7 +202,13 @@ def test_opening_the_papers_method_sets_the_sliders(measured):
     layout = Layout(built_in_sources())
     (point,) = (p for p in measured if p.candidate.method.estimator == "tracking")
     less = replace(point.candidate, reduction=Less(merge=2).reduction(100))
-    layout._open_point(replace(point, candidate=less))
+    measured_on = layout.session.answer.request
+    changed = Light(sbr=1.0)
+    layout._light.show(changed)
+    layout.session.state.param.update(light=changed, source="staircase")
+    layout._open_point(replace(point, candidate=less), measured_on)
+    assert (layout.session.state.source, layout.session.state.light) == ("car", Light())
+    assert layout._light.controls["sbr"].value == Light().sbr
     assert layout.pages.choice.value == "Explore"
     assert layout.session.state.less == Less(merge=2)
     assert layout.session.state.tracking == less.settings
@@ -215,7 +221,8 @@ def test_opening_another_method_picks_it_in_compare(measured):
     (point,) = (p for p in measured if p.candidate.method.estimator == "cfar")
     settings = replace(point.candidate.settings, guard_bins=9)
     method = replace(point.candidate.method, settings=settings)
-    layout._open_point(replace(point, candidate=replace(point.candidate, method=method)))
+    another = replace(point, candidate=replace(point.candidate, method=method))
+    layout._open_point(another, layout.session.answer.request)
     assert layout.pages.choice.value == "Compare"
     assert "cfar" in layout._compare._picks.value
     assert layout._compare._tasks["cfar"].settings == settings
