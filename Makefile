@@ -32,7 +32,7 @@ stability: $(VENV)/.app ## laws held at every extreme, and the range within whic
 	$(BIN)/python -m core stability
 
 requires: $(VENV)/.app ## which parts and corrections a scene needs; SCENE=fog for another
-	$(BIN)/python -m core requires $(if $(SCENE),--scene $(SCENE)) --out requires
+	$(BIN)/python -m core requires $(if $(SCENE),--scene $(SCENE)) --folder requires
 
 paper: $(VENV)/.app ## every figure and table of the paper beside ours, as one page in paper/
 	$(BIN)/python -m core paper $(if $(REPETITIONS),--repetitions $(REPETITIONS)) $(if $(FIELD),--field "$(FIELD)")

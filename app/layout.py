@@ -71,7 +71,11 @@ IN_THE_BAR = {
     "& .MuiToggleButton-root.Mui-selected": {"color": "#0b3f4c", "backgroundColor": "#ffffff"},
     "& .MuiToggleButton-root.Mui-selected:hover": {"backgroundColor": "#e3eef1"},
     "@media (max-width: 500px)": {
-        "& .MuiToggleButton-root": {"padding": "5px 4px", "fontSize": "10px"},
+        "& .MuiToggleButton-root": {
+            "padding": "5px 2px",
+            "fontSize": "9px",
+            "letterSpacing": 0,
+        },
     },
 }
 

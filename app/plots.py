@@ -385,8 +385,8 @@ def tradeoff(colors: Palette) -> Any:
         )
     )
     legend = drawing.legend[0]
-    legend.background_fill_alpha = 0.0
-    drawing.add_layout(legend, "right")
+    legend.update(background_fill_alpha=0.0, orientation="horizontal", ncols=3)
+    drawing.add_layout(legend, "below")  # beside the plot it would leave a phone none
     paint_tradeoff(drawing, colors)
     return drawing
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from app import plots, trade_words
 from app.controls import Sentence, SettingsPanel, Table
-from app.items import CurveCard, TableCard, layers_of
-from app.method_views import title_of
+from app.items import CurveCard, TableCard, layers_of, spelled
 from app.pages import Pages, View
 from app.parts import card, part
 from app.requires import Requires
@@ -292,7 +291,7 @@ class Ways:
             "y": missed["value"],
             "color": color,
             "marker": shapes,
-            "method": [title_of(methods[place]) for place in places],
+            "method": [spelled(methods[place]) for place in places],
             "way": [trade_words.name_of(point.candidate) for point in points],
             "told": [trade_words.told(point) for point in points],
         }

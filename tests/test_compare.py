@@ -446,6 +446,7 @@ def test_a_file_without_truth_says_what_is_not_known(here):
 @pytest.mark.browser
 def test_pages_fit_a_phone(page):
     here = page(width=390, height=844)
+    expect(here.get_by_role("button", name="Toggle theme")).to_be_in_viewport(ratio=1)
     here.get_by_role("button", name="Compare", exact=True).click()
     expect(here.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible()
     for picture in pictures(here).locator(".bk-Figure").all():

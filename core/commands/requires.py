@@ -45,7 +45,7 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--seeds", type=whole_from_to(2, 1000), help=f"captures of a scene ({_SEEDS})"
     )
-    command.add_argument("--out", type=Path, help="a folder for the page and its tables")
+    command.add_argument("--folder", type=Path, help="for a page and its tables")
     command.add_argument("--json", action="store_true", help="one JSON object instead of tables")
     add_reading(command)
     command.set_defaults(work=_requires)
@@ -60,10 +60,10 @@ def _requires(chosen: argparse.Namespace) -> None:
     else:
         for each in tables:
             print(f"{each.title}\n\n{as_markdown(each.columns, each.rows)}\n")
-    if chosen.out is not None:
+    if chosen.folder is not None:
         from core.experiments.report import write  # noqa: PLC0415 - draws, as nothing else here
 
-        page = write([*tables, machine()], chosen.out, title, (requires.RULE,))
+        page = write([*tables, machine()], chosen.folder, title, (requires.RULE,))
         print(page, file=sys.stderr)
 
 

@@ -15,10 +15,10 @@ from core.acquisition import Flux
 from core.capture import Capture
 from core.checks import require
 from core.commands.options import (
-    READING_NAMES,
     add_processes,
     add_reading,
     reading,
+    require_none,
     show_progress,
     whole_from_to,
 )
@@ -124,9 +124,9 @@ def _tradeoff(chosen: argparse.Namespace) -> None:
 
 def _of_scenes(chosen: argparse.Namespace) -> tuple[plans.Plan, list[Simulation]]:
     """What is studied of built-in scenes, and what is acquired of them."""
-    told = {name: getattr(chosen, name) for name in READING_NAMES if name != "n_pulses"}
-    for name, value in told.items():
-        require(name, value, value is None, "None: it tells how to read a --capture")
+    told = reading(chosen)
+    told.pop("n_pulses")
+    require_none(told, sorted(told), "it tells how to read a --capture")
     signal = Flux().signal if chosen.ppp is None else chosen.ppp
     names = chosen.scene or (SHORT_SCENES if chosen.short else SCENES)
     sbrs = chosen.sbr or (SHORT_SBRS if chosen.short else SBRS)
@@ -143,9 +143,7 @@ def _of_scenes(chosen: argparse.Namespace) -> tuple[plans.Plan, list[Simulation]
 
 def _of_capture(chosen: argparse.Namespace) -> tuple[plans.Plan, list[Simulation]]:
     """What is studied of a file, and what is acquired of a simulation like it."""
-    for name in ("sbr", "ppp"):
-        told = getattr(chosen, name)
-        require(name, told, told is None, "None: a capture has its own light")
+    require_none(vars(chosen), ("sbr", "ppp"), "a capture has its own light")
     capture = read_capture(chosen.capture, **reading(chosen))
     print(capture.source, file=sys.stderr)  # with the guesses, before anything rests on them
     source = studied(replace(capture, source=chosen.capture.name))

@@ -303,7 +303,7 @@ def test_the_command_judges_a_scene_and_writes_a_page(
 ) -> None:
     page = tmp_path / "page"
     arguments = ["requires", "--scene", "car", "--pulses", "50", "--seeds", "2"]
-    assert main([*arguments, "--out", str(page)]) == ACCEPTED
+    assert main([*arguments, "--folder", str(page)]) == ACCEPTED
     told = capsys.readouterr().out
     assert "| part or correction | verdict |" in told
     assert "Absent parts cost nothing" in told
