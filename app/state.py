@@ -176,7 +176,10 @@ class Reading(Request):
         return "" if value is None else str(value)
 
 
+PAGES = ("Explore", "Inspect", "Compare", "Trade-off", "Paper")
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
+MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
+UNITS = ("bins", "ns", "m")
 CLOUD_COLORS = ("Range", "Error", "Counts")
 NEED_TRUTH = ("Truth", "Error")
 
@@ -197,3 +200,14 @@ class State(param.Parameterized):
     cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
     viewing = param.ClassSelector(class_=Viewing, default=Viewing())
     difference = param.Boolean(default=False, doc="Whether the first difference is drawn.")
+    page = param.Selector(default="Explore", objects=list(PAGES))
+    unit = param.Selector(default="bins", objects=list(UNITS), doc="Of each axis along the gate.")
+    map = param.Selector(default="Estimate", objects=list(MAPS), doc="What one navigates by.")
+    pins = param.ClassSelector(
+        class_=tuple, default=(), doc="Up to four pixels (row, col) to compare."
+    )
+    region = param.ClassSelector(
+        class_=tuple,
+        default=(),
+        doc="Corners (row, col) of a polygon of pixels that are looked at as one; none if empty.",
+    )
