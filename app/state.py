@@ -104,6 +104,12 @@ class Less:
         Number("Pixels skipped to", 1, 8, whole=True, least=1, unit="rows and columns"),
         "One pixel is kept of so many rows and columns.",
     )
+    pulses: float = parameter(
+        1.0,
+        Number("Pulses accumulated", 1e-3, 1.0, log=True, least=0.0, most=1.0, open_below=True),
+        "Share of the pulses whose detections are kept, as if recording had ended sooner: fewer "
+        "are a part of more.",
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -112,14 +118,23 @@ class Less:
     def of(cls, reduction: Reduction, n_bins: int) -> Less:
         """The settings that reduce a capture of so many bins like this."""
         first, end = reduction.gate or (0, n_bins)
-        return cls(reduction.merge, first / n_bins, end / n_bins, reduction.pool, reduction.skip)
+        return cls(
+            reduction.merge,
+            first / n_bins,
+            end / n_bins,
+            reduction.pool,
+            reduction.skip,
+            reduction.pulses,
+        )
 
     def reduction(self, n_bins: int) -> Reduction:
         """What is to be done to a capture of so many bins."""
         first = min(round(self.gate_from * n_bins), n_bins - 1)
         end = max(round(self.gate_to * n_bins), first + 1)
         gate = None if (first, end) == (0, n_bins) else (first, end)
-        return Reduction(merge=self.merge, gate=gate, skip=self.skip, pool=self.pool)
+        return Reduction(
+            merge=self.merge, gate=gate, skip=self.skip, pool=self.pool, pulses=self.pulses
+        )
 
 
 def _gaussian(text: str) -> Pulse:

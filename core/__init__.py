@@ -1,6 +1,6 @@
 """Range estimation from first-photon (Geiger-mode APD) lidar captures, without a screen."""
 
-from core import limits, metrics, reductions
+from core import inspection, limits, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
@@ -43,6 +43,7 @@ __all__ = [
     "estimate_large",
     "first_difference",
     "first_photons",
+    "inspection",
     "limits",
     "metrics",
     "no_trigger_probability",
