@@ -20,6 +20,7 @@ from core.trigger import (
     trigger_probability,
 )
 from core.warmup import warm_up
+from core.windows import Window, light_of_whole, read_window
 
 __all__ = [
     "ESTIMATORS",
@@ -37,12 +38,14 @@ __all__ = [
     "SceneError",
     "Signals",
     "TrackingParameters",
+    "Window",
     "as_image",
     "coates_rate",
     "estimate",
     "estimate_large",
     "first_difference",
     "first_photons",
+    "light_of_whole",
     "limits",
     "metrics",
     "no_trigger_probability",
@@ -51,6 +54,7 @@ __all__ = [
     "rate_per_bin",
     "read_capture",
     "read_scene",
+    "read_window",
     "reductions",
     "run",
     "save_capture",
