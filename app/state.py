@@ -8,7 +8,7 @@ from typing import Any
 
 import param
 
-from core import Acquisition, Flux, Pulse, TrackingParameters
+from core import Acquisition, Flux, Pulse, TrackingParameters, Window
 from core.checks import require
 from core.parameters import Number, check_fields, parameter
 from core.readers.request import Request
@@ -205,6 +205,9 @@ class State(param.Parameterized):
     source = param.String(default="car", doc="Key of the catalogue.")
     light = param.ClassSelector(class_=Light, default=Light())
     reading = param.ClassSelector(class_=Reading, default=Reading())
+    window = param.ClassSelector(
+        class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."
+    )
     less = param.ClassSelector(class_=Less, default=Less())
     absent = param.ClassSelector(
         class_=frozenset, default=frozenset(), doc="Parts and corrections that are switched off."

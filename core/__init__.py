@@ -20,6 +20,7 @@ from core.trigger import (
     trigger_probability,
 )
 from core.warmup import warm_up
+from core.windows import Window, light_of_whole, read_window
 
 __all__ = [
     "ESTIMATORS",
@@ -37,6 +38,7 @@ __all__ = [
     "SceneError",
     "Signals",
     "TrackingParameters",
+    "Window",
     "as_image",
     "coates_rate",
     "estimate",
@@ -44,6 +46,7 @@ __all__ = [
     "first_difference",
     "first_photons",
     "inspection",
+    "light_of_whole",
     "limits",
     "metrics",
     "no_trigger_probability",
@@ -52,6 +55,7 @@ __all__ = [
     "rate_per_bin",
     "read_capture",
     "read_scene",
+    "read_window",
     "reductions",
     "run",
     "save_capture",
