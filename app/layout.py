@@ -15,13 +15,14 @@ from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
 from app import words
+from app.address import AddressBar, Wanted
 from app.compare import Compare
 from app.controls import Sentence, SettingsPanel
 from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
 from app.parts import card, choice, part, select
 from app.session import Session
-from app.state import Less, Reading
+from app.state import Less, Light, Reading, Viewing
 from app.store import Answer, Request, Source, file_source
 from app.theme import DARK, LIGHT, SIZES
 from app.tradeoff import Tradeoff
@@ -118,15 +119,18 @@ class Page(pmui.Page):
 
 
 def build_page(sources: Mapping[str, Source]) -> pmui.Page:
-    """A new page with a session of its own."""
-    return Layout(sources).page
+    """A new page with a session of its own, as its address asks for."""
+    asked = {
+        name: texts[-1].decode(errors="replace") for name, texts in pn.state.session_args.items()
+    }
+    return Layout(sources, Wanted(asked)).page
 
 
 class Layout:
     """Widgets around one session."""
 
-    def __init__(self, sources: Mapping[str, Source]) -> None:
-        session = self.session = Session(sources)
+    def __init__(self, sources: Mapping[str, Source], wanted: Wanted | None = None) -> None:
+        session = self.session = Session(sources, wanted)
         state = session.state
         self._uploads: list[TemporaryDirectory[str]] = []
         self._alert = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
@@ -149,14 +153,14 @@ class Layout:
             sizing_mode="stretch_width",
             margin=(4, 8),
         )
-        self._light = SettingsPanel(state.light, lambda new: state.param.update(light=new))
-        self._viewing = SettingsPanel(state.viewing, lambda new: state.param.update(viewing=new))
-        self._tracking = SettingsPanel(state.tracking, self._tracking_changed)
-        self._less = SettingsPanel(state.less, lambda new: state.param.update(less=new))
+        self._light = SettingsPanel(Light(), lambda new: state.param.update(light=new))
+        self._viewing = SettingsPanel(Viewing(), lambda new: state.param.update(viewing=new))
+        self._tracking = SettingsPanel(TrackingParameters(), self._tracking_changed)
+        self._less = SettingsPanel(Less(), lambda new: state.param.update(less=new))
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
-            "recommended",
+            _preset_of(state.tracking),
             "recommended: the best on random depths. as printed: the paper's text, literally.",
         )
         self._reading = {
@@ -169,7 +173,10 @@ class Layout:
             )
             for name, label in READING_LABELS.items()
         }
+        self._light.show(state.light)
+        self._tracking.show(state.tracking)
         self._announced: Source | None = None
+        self._address = AddressBar()
         self.pages = Pages(
             {
                 "Explore": self._explore,
@@ -183,9 +190,12 @@ class Layout:
         self.page = self._build()
         self._announce(session.answer)
         self._listen()
+        if session.refused:
+            self._complain(words.not_restored(session.refused))
 
     def _listen(self) -> None:
         session = self.session
+        self._address.follow(session.state, session.query, session.later)
         session.announce, session.complain = self._announce, self._complain
         session.waiting = lambda is_waiting: self._progress.param.update(visible=is_waiting)
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
@@ -312,6 +322,7 @@ class Layout:
 
     def _build(self) -> Page:
         head = pn.Column(
+            self._address,
             self._progress,
             self._alert,
             sizing_mode="stretch_width",
