@@ -152,6 +152,11 @@ class Wanted:
         self._known: set[str] = set()
         self.refused: list[str] = []
 
+    @property
+    def source(self) -> str:
+        """Key of the scene or capture for which it asks, or empty."""
+        return self._entries.get("source", "")
+
     def of(self, bases: Mapping[str, Any]) -> dict[str, Any]:
         """Those of some parameters for which it asks, by name.
 
@@ -162,7 +167,9 @@ class Wanted:
         """
         found = {}
         for name, base in bases.items():
-            value = self._changed(name, base)
+            kind = getattr(State.param[name], "class_", None)
+            optional = base is None and is_dataclass(kind)
+            value = self._made(name, kind) if optional else self._changed(name, base)
             if value is not base:
                 try:
                     _check(name, value)
@@ -198,6 +205,16 @@ class Wanted:
             except (ValueError, TypeError) as error:
                 self.refused.append(str(error))
         return base
+
+    def _made(self, name: str, kind: Any) -> Any:
+        """An object that there is not unless its entries make it."""
+        told = {each.name: self._told(f"{name}.{each.name}", None) for each in fields(kind)}
+        told = {each: value for each, value in told.items() if value is not None}
+        try:
+            return kind(**told) if told else None
+        except (ValueError, TypeError):
+            self.refused.append(f"{name} = {told} is not accepted.")
+            return None
 
     def _reading(self, name: str, base: Reading) -> Reading:
         typed = {each.name: base.as_text(each.name) for each in fields(base)}

@@ -199,3 +199,13 @@ def not_restored(refused: list[str]) -> str:
     if not refused:
         return ""
     return f"The address asks for what cannot be had: {' '.join(refused)} The rest is as it says."
+
+
+def not_kept(error: ValueError | OSError) -> str:
+    """Why a file could not be opened here, and what to do."""
+    if isinstance(error, ValueError):
+        return f"The file is not opened: {error}"
+    return (
+        f"The file is not opened: it cannot be kept here ({error.strerror}). Free room in the "
+        "system's temporary folder, or give the file's path on the command line."
+    )
