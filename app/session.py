@@ -8,17 +8,19 @@ from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import panel as pn
 import param
 
 from app import words
+from app.address import Wanted, defaults, query_of
 from app.cloud import PointCloud, ply_bytes
 from app.controls import Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
-from app.state import CLOUD_COLORS, IMAGES, NEED_TRUTH, State
+from app.state import CLOUD_COLORS, IMAGES, NEED_TRUTH, Comparison, State, Viewing
 from app.store import Answer, Request, Source, compute, inspect, same_view
 from app.theme import WRONG_COLOR, palette
 from app.views import ImageView, SignalPlots
@@ -27,6 +29,12 @@ log = logging.getLogger(__name__)
 
 WAIT_MS = 200
 """What takes longer than this is shown to be under way."""
+
+COMPUTED_FROM = ("source", "light", "reading", "less", "absent", "tracking")
+"""Of the state, what an answer is computed from."""
+
+BROUGHT = ("pixel", "viewing", "comparison")
+"""Of the state, what depends on the capture unless it is chosen."""
 
 REST_MS = 60
 """Image and cloud are drawn this much after the pixel's plots, which are what the eye follows."""
@@ -39,11 +47,17 @@ class Session:
     ----------
     sources : mapping of str to Source
         What can be looked at; copied, so that an upload belongs to this session alone.
+    wanted : Wanted, optional
+        What the address of the page asks for.
 
     Attributes
     ----------
     own_field_of_view_deg : float
         The field of view that suits the present capture.
+    own : dict
+        Values of the state that the server and the present capture bring with them.
+    refused : list of str
+        A sentence on each thing that the address asked for in vain.
     announce : callable
         Called with each new answer, after its plots have been drawn.
     complain : callable
@@ -52,9 +66,11 @@ class Session:
         Called with True when an answer takes long, and with False when it is there.
     """
 
-    def __init__(self, sources: Mapping[str, Source]) -> None:
+    def __init__(self, sources: Mapping[str, Source], wanted: Wanted | None = None) -> None:
+        wanted = wanted or Wanted({})
         self.sources = dict(sources)
-        self.state = State(source=next(iter(sources)))
+        self.own: dict[str, Any] = {"source": next(iter(sources))}
+        self.state = State(**self.own)
         self.signals = SignalPlots()
         self.image = ImageView(self.choose_pixel)
         self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
@@ -70,9 +86,10 @@ class Session:
         self._rest_is_due = False
         self._is_hidden = self._is_outdated = False
         self._asked_s: float | None = None
-        self.answer = compute(self._request(), None)
+        self.answer = self._first_answer(wanted)
         self._show(self.answer, first=True)
         self._watch()
+        self._return_to(wanted)
 
     @property
     def is_served(self) -> bool:
@@ -84,9 +101,44 @@ class Session:
         """Whether there was a browser, and is none any more."""
         return self._served and not self.is_served
 
+    def _first_answer(self, wanted: Wanted) -> Answer:
+        """To what the address asks for; to less of it where that cannot be computed."""
+        before = defaults() | self.own
+        asked = wanted.of({name: before[name] for name in before if name not in BROUGHT})
+        if asked.get("source", self.own["source"]) not in self.sources:
+            wanted.refused.append(words.source_is_gone(asked["source"]))
+            asked = {n: each for n, each in asked.items() if n not in ("source", "reading", "less")}
+        plain = {n: each for n, each in asked.items() if n not in COMPUTED_FROM}
+        here = {n: each for n, each in asked.items() if n == "source"}
+        for attempt in (asked, plain | here, plain):
+            self.state.param.update(before | attempt)
+            try:
+                return compute(self._request(), None)
+            except Exception as error:  # whatever it is, the page must tell it
+                log.warning("what the address asks for failed", exc_info=error)
+                wanted.refused.append(words.reason(error))
+        return compute(self._request(), None)
+
+    def _return_to(self, wanted: Wanted) -> None:
+        """To what the address asks for of what the capture brings, and tell what was refused."""
+        rows, cols = self.answer.capture.shape
+        brought = wanted.of({name: self.own[name] for name in BROUGHT})
+        self.choose_pixel(*brought.pop("pixel", self.state.pixel))
+        self.state.param.update(brought)
+        pins = tuple(pin for pin in self.state.pins if pin[0] < rows and pin[1] < cols)
+        if pins != self.state.pins:
+            wanted.refused.append(words.pins_outside(rows, cols))
+            self.state.pins = pins
+        wanted.refuse_others()
+        self.refused = wanted.refused
+
+    def query(self) -> str:
+        """What the address of a page says that shows what this one does."""
+        return query_of(self.state, self.own)
+
     def _watch(self) -> None:
         watch = self.state.param.watch
-        watch(lambda *_: self._ask(), ["source", "light", "reading", "less", "absent", "tracking"])
+        watch(lambda *_: self._ask(), list(COMPUTED_FROM))
         watch(lambda *_: self._draw_pixel(), ["pixel", "difference"])
         watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
         self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
@@ -121,7 +173,7 @@ class Session:
 
     def _await(self) -> None:
         self._asked_s = perf_counter()
-        self._later(self._admit_waiting, WAIT_MS)
+        self.later(self._admit_waiting, WAIT_MS)
 
     def _admit_waiting(self) -> None:
         """Show that an answer is under way, if the oldest open request is that old."""
@@ -142,7 +194,7 @@ class Session:
         elif self.is_served:  # else the page is gone, and nobody left to see it
             self.page.add_next_tick_callback(act)
 
-    def _later(self, act: Callable[[], None], after_ms: int) -> None:
+    def later(self, act: Callable[[], None], after_ms: int) -> None:
         """Do something on the page's thread, after a while; its failure is told like any other."""
 
         def attempt() -> None:
@@ -187,7 +239,7 @@ class Session:
             self._draw_rest()
         elif not self._rest_is_due:
             self._rest_is_due = True
-            self._later(self._draw_rest, REST_MS)
+            self.later(self._draw_rest, REST_MS)
         self._settle(answer)
 
     def _enter(self, answer: Answer) -> None:
@@ -202,8 +254,20 @@ class Session:
             if getattr(self.state, name) not in possible:
                 setattr(self.state, name, possible[0])
         self.own_field_of_view_deg = float(f"{_field_of_view_deg(answer):.3g}")
-        viewing = replace(self.state.viewing, field_of_view_deg=self.own_field_of_view_deg)
-        self.state.param.update(pixel=_pixel_to_start_with(answer), viewing=viewing)
+        own = {"field_of_view_deg": self.own_field_of_view_deg}
+        state, pixel = self.state, _pixel_to_start_with(answer)
+        compared = replace(state.comparison.viewing, **own)
+        state.param.update(
+            pixel=pixel,
+            viewing=replace(state.viewing, **own),
+            comparison=replace(state.comparison, viewing=compared),
+        )
+        first = Comparison()
+        self.own |= {
+            "pixel": pixel,
+            "viewing": Viewing(**own),
+            "comparison": replace(first, viewing=replace(first.viewing, **own)),
+        }
 
     def choose_pixel(self, row: int, col: int) -> None:
         """Show another pixel; one outside the image means the nearest inside."""
