@@ -9,7 +9,7 @@ from typing import Any
 
 import param
 
-from core import ESTIMATORS, Acquisition, Flux, Pulse, TrackingParameters
+from core import ESTIMATORS, Acquisition, Flux, Pulse, TrackingParameters, Window
 from core.checks import require
 from core.estimators import FALSE_ALARM
 from core.experiments.requirement import TITLES
@@ -107,6 +107,12 @@ class Less:
         Number("Pixels skipped to", 1, 8, whole=True, least=1, unit="rows and columns"),
         "One pixel is kept of so many rows and columns.",
     )
+    pulses: float = parameter(
+        1.0,
+        Number("Pulses accumulated", 1e-3, 1.0, log=True, least=0.0, most=1.0, open_below=True),
+        "Share of the pulses whose detections are kept, as if recording had ended sooner: fewer "
+        "are a part of more.",
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -115,14 +121,23 @@ class Less:
     def of(cls, reduction: Reduction, n_bins: int) -> Less:
         """The settings that reduce a capture of so many bins like this."""
         first, end = reduction.gate or (0, n_bins)
-        return cls(reduction.merge, first / n_bins, end / n_bins, reduction.pool, reduction.skip)
+        return cls(
+            reduction.merge,
+            first / n_bins,
+            end / n_bins,
+            reduction.pool,
+            reduction.skip,
+            reduction.pulses,
+        )
 
     def reduction(self, n_bins: int) -> Reduction:
         """What is to be done to a capture of so many bins."""
         first = min(round(self.gate_from * n_bins), n_bins - 1)
         end = max(round(self.gate_to * n_bins), first + 1)
         gate = None if (first, end) == (0, n_bins) else (first, end)
-        return Reduction(merge=self.merge, gate=gate, skip=self.skip, pool=self.pool)
+        return Reduction(
+            merge=self.merge, gate=gate, skip=self.skip, pool=self.pool, pulses=self.pulses
+        )
 
 
 def _gaussian(text: str) -> Pulse:
@@ -276,6 +291,9 @@ class State(param.Parameterized):
     source = param.String(default="car", doc="Key of the catalogue.")
     light = param.ClassSelector(class_=Light, default=Light())
     reading = param.ClassSelector(class_=Reading, default=Reading())
+    window = param.ClassSelector(
+        class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."
+    )
     less = param.ClassSelector(class_=Less, default=Less())
     absent: Any = Checked(
         frozenset(), _check_absent, doc="Parts and corrections that are switched off."

@@ -203,6 +203,35 @@ def lighting_of(capture: Capture) -> Lighting:
     return found.with_one_level() if found.share[1:] @ told <= FEW else found
 
 
+def total_rates(capture: Capture) -> Floats:
+    """Signal and background of each pixel together, shape (row, col)."""
+    return _totals(capture)[0]
+
+
+def level_evidence(
+    capture: Capture, pixels: NDArray[np.intp], lighting: Lighting, steps_per_bin: int
+) -> Floats:
+    """Log likelihood of each level of signal over that of none, all delays being alike.
+
+    Parameters
+    ----------
+    capture : Capture
+    pixels : ndarray, shape (pixel,)
+        Flat indices.
+    lighting : Lighting
+    steps_per_bin : int
+        Delays tried within each bin.
+
+    Returns
+    -------
+    ndarray, shape (pixel, level)
+    """
+    some = pixels[np.newaxis]
+    light = lighting.light(_totals(capture)[0].ravel()[some], _least_background(capture))
+    cube = capture.cube.reshape(-1, capture.cube.shape[2])[some]
+    return _level_evidence(_prepare(capture, cube, light, steps_per_bin))
+
+
 def level_differences(lighting: Lighting, capture: Capture) -> Difference:
     """How far each level of signal lies from their mean, shape (level - 1,).
 

@@ -12,14 +12,21 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats
 from core.capture import Capture
 from core.checks import require
+from core.parallel import PARALLEL, entering
+from core.streams import pixel_key, uniform_at
+
+DRAWN_ONE_BY_ONE = 2**27
+"""Detections up to which fewer pulses are drawn detection by detection; more take less time bin by
+bin."""
 
 MOST_PULSES = 10**9
-"""Of which `first_pulses` can draw some: numpy's hypergeometric law ends there."""
+"""Of which `first_pulses` can draw some bin by bin: numpy's hypergeometric law ends there."""
 
 
 def merge_bins(capture: Capture, factor: int) -> Capture:
@@ -105,7 +112,7 @@ def skip_pixels(capture: Capture, step: int) -> Capture:
     return replace(
         capture,
         cube=capture.cube[kept],
-        acquisition=_coarser(capture, step),
+        acquisition=coarser(capture.acquisition, step),
         truth_range_m=None if capture.truth_range_m is None else capture.truth_range_m[kept],
         signal=None if capture.signal is None else capture.signal[kept],
         source=f"{capture.source}; 1 pixel of each {step} x {step}",
@@ -125,7 +132,7 @@ def pool_pixels(capture: Capture, side: int) -> Capture:
         If `side` is not an integer from 1 to the smaller side of the image.
     """
     _require_whole("side", side, min(capture.shape))
-    acquisition, n_pulses = _coarser(capture, side), capture.acquisition.n_pulses
+    acquisition, n_pulses = coarser(capture.acquisition, side), capture.acquisition.n_pulses
     truth_m, signal = capture.truth_range_m, capture.signal
     return replace(
         capture,
@@ -146,35 +153,131 @@ def first_pulses(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
     one of the outcomes). Of all photons, each one falls in any pulse alike, and is kept with
     probability ``n_pulses / sent``.
 
+    Of one seed, the detections of fewer pulses are a part of those of more, unless detections are
+    more than `DRAWN_ONE_BY_ONE`.
+
     Raises
     ------
     ValueError
-        If the capture does not know its number of pulses, or sent fewer.
+        If the capture does not know its number of pulses, or sent fewer; or if detections are more
+        than `DRAWN_ONE_BY_ONE` and pulses more than `MOST_PULSES`.
     """
-    before = capture.acquisition
-    sent = before.n_pulses
+    sent = capture.acquisition.n_pulses
     if sent is None:
         raise ValueError("n_pulses = None is not accepted: give a capture that knows its pulses.")
-    require("n_pulses of the capture", sent, sent <= MOST_PULSES, f"{MOST_PULSES} or fewer")
     _require_whole("n_pulses", n_pulses, sent)
-    rng = np.random.default_rng(seed)
     if capture.detection == "all":
-        cube = rng.binomial(capture.cube, n_pulses / sent)
+        cube = _thinned(capture.cube, n_pulses / sent, seed)
     else:
-        cube = np.empty(capture.cube.shape, np.int64)
-        rest = np.full(capture.shape, sent)  # pulses of which it is not decided yet
-        left = np.full(capture.shape, n_pulses)  # that are still to be drawn among them
-        for k in range(before.n_bins):
-            fired = capture.cube[:, :, k].astype(np.int64)
-            rest -= fired
-            cube[:, :, k] = rng.hypergeometric(fired, rest, left)
-            left -= cube[:, :, k]
+        cube = _of_pulses(capture, sent, n_pulses, seed)
     return replace(
         capture,
-        cube=cube.astype(capture.cube.dtype),
-        acquisition=replace(before, n_pulses=n_pulses),
+        cube=cube,
+        acquisition=replace(capture.acquisition, n_pulses=n_pulses),
         source=f"{capture.source}; {n_pulses} of {sent} pulses, seed {seed}",
     )
+
+
+def share_of_pulses(capture: Capture, share: float, seed: int = 0) -> Capture:
+    """What the capture would have been with a share of its pulses, an exact draw.
+
+    Where the number of pulses is known these are so many as come nearest to the share, at least
+    one: `first_pulses`. Where it is not, each pulse is taken by chance, with probability `share`,
+    and with it what it left in the histogram: each detection is kept likewise. That assumes nothing
+    but pulses (or, of all photons, photons) that are independent of each other; the number of
+    pulses taken is then not the same in all pixels. True light in photons of all pulses together,
+    where a capture without pulses knows it, is that share of it.
+
+    Raises
+    ------
+    ValueError
+        If the share is not above 0 and at most 1; as `first_pulses`.
+    """
+    require("share", share, 0 < share <= 1, "above 0 and at most 1")
+    sent = capture.acquisition.n_pulses
+    if sent is not None:
+        return first_pulses(capture, max(1, round(share * sent)), seed)
+    return replace(
+        capture,
+        cube=_thinned(capture.cube, share, seed),
+        signal=None if capture.signal is None else capture.signal * share,
+        background=_share(capture.background, share),
+        source=f"{capture.source}; {share:.3g} of the pulses, seed {seed}",
+    )
+
+
+def _of_pulses(
+    capture: Capture, sent: int, n_pulses: int, seed: int
+) -> NDArray[np.unsignedinteger]:
+    """First photons of some of the pulses."""
+    if _are_few(capture.cube):
+        drawn = np.empty(capture.cube.shape, capture.cube.dtype)
+        with entering(drawn.size):
+            _draw_pulses(capture.cube, sent, n_pulses, np.uint64(seed), drawn)
+        return drawn
+    require("n_pulses of the capture", sent, sent <= MOST_PULSES, f"{MOST_PULSES} or fewer")
+    rng = np.random.default_rng(seed)
+    cube = np.empty(capture.cube.shape, capture.cube.dtype)
+    rest = np.full(capture.shape, sent)  # pulses of which it is not decided yet
+    left = np.full(capture.shape, n_pulses)  # that are still to be drawn among them
+    for k in range(cube.shape[2]):
+        fired = capture.cube[:, :, k].astype(np.int64)
+        rest -= fired
+        found = rng.hypergeometric(fired, rest, left)
+        cube[:, :, k] = found
+        left -= found
+    return cube
+
+
+def _thinned(
+    cube: NDArray[np.unsignedinteger], share: float, seed: int
+) -> NDArray[np.unsignedinteger]:
+    """Each detection kept with probability `share`."""
+    if not _are_few(cube):
+        return np.random.default_rng(seed).binomial(cube, share).astype(cube.dtype)
+    kept = np.empty(cube.shape, cube.dtype)
+    with entering(cube.size):
+        _keep_by_chance(cube, share, np.uint64(seed), kept)
+    return kept
+
+
+def _are_few(cube: NDArray[np.unsignedinteger]) -> bool:
+    return int(cube.sum(dtype=np.int64)) <= DRAWN_ONE_BY_ONE
+
+
+@njit(**PARALLEL)
+def _draw_pulses(fired, sent, n_pulses, seed, drawn):  # type: ignore[no-untyped-def]
+    """Selection sampling (Fan, Muller & Rezucha 1962), of a pixel's detections one by one.
+
+    Each is drawn with the probability that `left` of the `rest` are, which are not decided yet.
+    With the same random numbers a larger `n_pulses` never has fewer of them left, and so draws
+    whatever a smaller one does.
+    """
+    rows, cols, n_bins = fired.shape
+    for row in prange(rows):
+        for col in range(cols):
+            key, draw = pixel_key(seed, row * cols + col), 0
+            left = np.int64(n_pulses)
+            for k in range(n_bins):
+                before = left
+                for _ in range(fired[row, col, k]):
+                    left -= uniform_at(key, draw) * (sent - draw) < left
+                    draw += 1
+                drawn[row, col, k] = before - left
+
+
+@njit(**PARALLEL)
+def _keep_by_chance(photons, share, seed, kept):  # type: ignore[no-untyped-def]
+    rows, cols, n_bins = photons.shape
+    for row in prange(rows):
+        for col in range(cols):
+            key, draw = pixel_key(seed, row * cols + col), 0
+            for k in range(n_bins):
+                count = 0
+                for _ in range(photons[row, col, k]):
+                    count += uniform_at(key, draw) < share
+                    draw += 1
+                kept[row, col, k] = count
 
 
 @dataclass(frozen=True)
@@ -191,12 +294,15 @@ class Reduction:
         One pixel of each ``skip`` x ``skip`` is kept.
     pool : int
         Rows and columns of pixels that are added.
+    pulses : float
+        Share of the pulses that are left, above 0 and at most 1.
     """
 
     merge: int = 1
     gate: tuple[int, int] | None = None
     skip: int = 1
     pool: int = 1
+    pulses: float = 1.0
 
     def fits(self, shape: tuple[int, int, int]) -> bool:
         """Whether a capture of these rows, columns and bins holds enough for it."""
@@ -206,7 +312,7 @@ class Reduction:
         return enough_pixels and 0 <= first < end <= n_bins and self.merge <= end - first
 
     def of(self, capture: Capture) -> Capture:
-        """The capture with the reductions done, pixels first, then the gate, then the bins.
+        """The capture with the reductions done: pixels first, then pulses, the gate, the bins.
 
         Raises
         ------
@@ -215,6 +321,8 @@ class Reduction:
         """
         if self.skip != 1:
             capture = skip_pixels(capture, self.skip)
+        if self.pulses != 1:
+            capture = share_of_pulses(capture, self.pulses)
         if self.pool != 1:
             capture = pool_pixels(capture, self.pool)
         if self.gate is not None:
@@ -241,6 +349,8 @@ class Reduction:
 
     def __str__(self) -> str:
         done = []
+        if self.pulses != 1:
+            done.append(f"{self.pulses:.3g} of the pulses")
         if self.skip != 1:
             done.append(f"1 pixel of {self.skip} x {self.skip}")
         if self.pool != 1:
@@ -279,11 +389,11 @@ def _sum(cubes: Sequence[NDArray[np.unsignedinteger]]) -> NDArray[np.unsignedint
     return total
 
 
-def _coarser(capture: Capture, step: int) -> Acquisition:
-    """The acquisition with pixels `step` times as far apart."""
-    angle_rad = capture.acquisition.pixel_angle_rad
+def coarser(acquisition: Acquisition, step: int) -> Acquisition:
+    """An acquisition with pixels `step` times as far apart."""
+    angle_rad = acquisition.pixel_angle_rad
     wider_rad = None if angle_rad is None or angle_rad * step >= 1 else angle_rad * step
-    return replace(capture.acquisition, pixel_angle_rad=wider_rad)
+    return replace(acquisition, pixel_angle_rad=wider_rad)
 
 
 def _each_of_tile(image: NDArray[Any], side: int) -> list[NDArray[Any]]:

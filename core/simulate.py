@@ -27,6 +27,7 @@ from core.capture import Capture
 from core.checks import require
 from core.parallel import COMPILED, KERNEL_LOCK, PARALLEL
 from core.scene import Scene, parts_of
+from core.streams import pixel_key, uniform_at
 
 _Light = TypeVar("_Light", float, Floats)
 
@@ -263,27 +264,6 @@ def _draw_multinomial(
     cube[:] = np.random.default_rng(seed).multinomial(n_pulses, probability)[:, :-1]
 
 
-@njit(**COMPILED, inline="always")
-def _splitmix64(state):  # type: ignore[no-untyped-def]
-    """Output of the SplitMix64 generator (Steele, Lea & Flood 2014) at a state."""
-    z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return z ^ (z >> np.uint64(31))
-
-
-@njit(**COMPILED, inline="always")
-def _pixel_key(seed, pixel):  # type: ignore[no-untyped-def]
-    """Where the stream of random numbers of a pixel begins."""
-    return _splitmix64(_splitmix64(seed + np.uint64(1)) + np.uint64(pixel))
-
-
-@njit(**COMPILED, inline="always")
-def _uniform(key, draw):  # type: ignore[no-untyped-def]
-    """Number `draw` of a stream, uniform in [0, 1)."""
-    state = key + np.uint64(draw) * np.uint64(0x9E3779B97F4A7C15)
-    return np.float64(_splitmix64(state) >> np.uint64(11)) * 2.0**-53
-
-
 @njit(**COMPILED)
 def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
     """Add `n_pulses` first-photon draws to `counts`, whose last element stands for "no trigger".
@@ -302,7 +282,7 @@ def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignor
     while done < n_pulses:
         batch = min(uniform.size, n_pulses - done)
         for i in range(batch):
-            uniform[i] = _uniform(key, done + i)
+            uniform[i] = uniform_at(key, done + i)
         for i in range(batch):
             k = np.uint64(guide[np.uint64(uniform[i] * guide.size)])
             # One step without a jump settles nearly every draw; a mispredicted jump costs five.
@@ -322,7 +302,7 @@ def _draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-de
         guide = np.empty(256, np.uint32)
         uniform = np.empty(64)
         counts = np.zeros(n_bins + 1, np.int64)
-        _draw_pixel(fired_by, n_pulses, _pixel_key(seed, pixel), guide, uniform, counts)
+        _draw_pixel(fired_by, n_pulses, pixel_key(seed, pixel), guide, uniform, counts)
         for k in range(n_bins):
             cube[pixel, k] = counts[k]
 
@@ -332,11 +312,11 @@ def _fire_once(photons, n_pulses, seed, fired):  # type: ignore[no-untyped-def]
     rows, cols, n_bins = photons.shape
     for row in prange(rows):
         for col in range(cols):
-            key = _pixel_key(seed, row * cols + col)
+            key = pixel_key(seed, row * cols + col)
             armed, draw = n_pulses, 0
             for k in range(n_bins):
                 for _ in range(photons[row, col, k]):
-                    if _uniform(key, draw) * n_pulses < armed:
+                    if uniform_at(key, draw) * n_pulses < armed:
                         fired[row, col, k] += 1
                         armed -= 1
                     draw += 1

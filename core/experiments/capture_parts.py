@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, median_filter, minimum_filter
-from scipy.special import bdtr, bdtrc, pdtr, pdtrc
+from scipy.special import pdtrc
 
-from core import posterior, resolution
+from core import faults, posterior, resolution
 from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
+from core.corrections import without_correction
 from core.experiments import corrections
 from core.experiments.requirement import UNKNOWN, Requirement, judged
 from core.metrics import Interval
@@ -29,10 +29,7 @@ from core.trigger import drawn, trigger_probability
 _SURE = 0.95  # confidence of answers that are taken for the surface
 _SAMPLE = 2048  # pixels, at most, that are looked at closely
 _FEWEST = 32
-_NEIGHBOURS = 3  # rows and columns that an image needs for any
-_AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 _NOT_SURE = "too few pixels are sure of their surface"
-_BY_CHANCE = 1e-6  # probability of counts that are taken for no chance
 
 
 def rows(capture: Capture, method: str) -> list[Callable[[], Requirement]]:
@@ -66,7 +63,7 @@ def signal_levels(capture: Capture, method: str) -> Requirement:
 
 def _corrected(capture: Capture, method: str, correction: str, apart: Difference) -> Requirement:
     made = corrections.with_correction(capture, correction)
-    spared = corrections.without_correction(capture, correction)
+    spared = without_correction(capture, correction)
     one_m, other_m = (corrections.answers_m(each, method) for each in (made, spared))
     bin_length_m = capture.acquisition.bin_length_m
     moved = float(np.mean(np.abs(one_m - other_m) > TOLERANCE_BINS * bin_length_m))
@@ -116,8 +113,9 @@ def _sample_of(capture: Capture) -> _Sample | None:
     """None where too few pixels are sure of their surface."""
     bins = corrections.delays(capture, "likelihood")
     sure = posterior.near(capture, bins) >= _SURE
-    if min(capture.shape) >= _NEIGHBOURS:
-        sure &= ~np.logical_or(*_standing_out(capture))
+    faulty = faults.standing_out(capture)
+    if faulty is not None:
+        sure &= ~(faulty.hot | faulty.dead)
     pixels = np.random.default_rng(0).permutation(np.flatnonzero(sure))[:_SAMPLE]
     if pixels.size < _FEWEST:
         return None
@@ -254,7 +252,7 @@ def second_surface(capture: Capture) -> Requirement:
     whole = _windows(beside.astype(float), width) > width - 0.5
     chance = np.where(whole, pdtrc(np.maximum(seen - 1, 0), expected), 1.0)
     chance[seen < 1] = 1.0
-    shows = chance.min(axis=1) * whole.sum(axis=1) < _BY_CHANCE
+    shows = chance.min(axis=1) * whole.sum(axis=1) < faults.BY_CHANCE
     excess = np.where(shows, (seen - expected).max(axis=1), 0.0)
     sent = capture.armed_pulses or sample.counts.sum(axis=1)
     return _found("second_surface", shows, excess / sent, f"{shows.size} of them looked at")
@@ -271,42 +269,18 @@ def _windows(values: Floats, width: int) -> Floats:
 
 def faulty_pixels(capture: Capture) -> Requirement:
     """Whether single pixels detect more, or less, than all their neighbours by more than chance."""
-    if min(capture.shape) < _NEIGHBOURS:
+    found = faults.standing_out(capture)
+    if found is None:
         return _unknown("faulty_pixels", "an image so narrow has no neighbours")
     counts, n_pulses = capture.counts, capture.armed_pulses
-    usual = median_filter(counts, footprint=_AROUND)
-    hot, dead = _standing_out(capture)
-    if not (hot | dead).any() and _fewer(0, np.median(usual), n_pulses) > _BY_CHANCE:
+    usual, faulty = faults.usual_counts(capture), found.hot | found.dead
+    too_dark = faults.fewer_by_chance(0, int(np.median(usual)), n_pulses) > faults.BY_CHANCE
+    if not faulty.any() and too_dark:
         return _unknown("faulty_pixels", "too few photons to tell a dead pixel")
     sent = n_pulses or np.maximum(np.maximum(counts, usual), 1)
-    moved = np.where(hot | dead, np.abs(counts - usual) / sent, 0.0)
-    note = f"{np.count_nonzero(hot)} stand out as hot and {np.count_nonzero(dead)} as dead"
-    return _found("faulty_pixels", hot | dead, moved, note)
-
-
-def _standing_out(capture: Capture) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pixels with more counts than any neighbour by more than chance, and with fewer than any."""
-    counts, n_pulses = capture.counts, capture.armed_pulses
-    most, least = (f(counts, footprint=_AROUND) for f in (maximum_filter, minimum_filter))
-    hot = (counts > most) & (_more(counts, most, n_pulses) < _BY_CHANCE)
-    return hot, (counts < least) & (_fewer(counts, least, n_pulses) < _BY_CHANCE)
-
-
-def _more(counts: NDArray[np.int64], expected: NDArray[np.int64], n_pulses: int | None) -> Floats:
-    """Probability of so many counts, or more."""
-    if n_pulses is None:
-        return np.asarray(pdtrc(counts - 1, np.maximum(expected, 1)))
-    share = np.clip(expected / n_pulses, 1 / n_pulses, 1 - 1 / n_pulses)
-    return np.asarray(bdtrc(counts - 1, n_pulses, share))
-
-
-def _fewer(
-    counts: NDArray[np.int64] | int, expected: NDArray[np.int64], n_pulses: int | None
-) -> Floats:
-    """Probability of so few counts, or fewer."""
-    if n_pulses is None:
-        return np.asarray(pdtr(counts, expected))
-    return np.asarray(bdtr(counts, n_pulses, expected / n_pulses))
+    moved = np.where(faulty, np.abs(counts - usual) / sent, 0.0)
+    hot, dead = np.count_nonzero(found.hot), np.count_nonzero(found.dead)
+    return _found("faulty_pixels", faulty, moved, f"{hot} stand out as hot and {dead} as dead")
 
 
 def motion(_: Capture) -> Requirement:

@@ -21,7 +21,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if numba.config.DISABLE_JIT:
         config.addinivalue_line(
             "filterwarnings",
-            r"ignore:overflow encountered in scalar (add|multiply):RuntimeWarning:core\.simulate",
+            r"ignore:overflow encountered in scalar (add|multiply):RuntimeWarning:core\.streams",
         )
 
 

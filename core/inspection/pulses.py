@@ -1,0 +1,108 @@
+"""What fewer pulses would have told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy  # loads a submodule when it is first used
+
+from core import metrics
+from core.acquisition import Floats
+from core.capture import Capture
+from core.checks import require
+from core.estimators import RangeImage, estimate, settings_of
+from core.metrics import Interval
+from core.posterior import TOLERANCE_BINS
+from core.reductions import share_of_pulses
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How good answers to a share of a capture's pulses are."""
+
+    share: float
+    n_pulses: int | None
+    """None where the capture does not know its pulses."""
+    against: Literal["truth", "all pulses"]
+    """What answers are held against: the truth or, where it is not known, the answers to all
+    pulses, which may be wrong themselves."""
+    within: Interval | None
+    """Share of the pixels within 3 bins of it, with Wilson's 95 % interval; None where there is
+    nothing to hold against."""
+    rmse_m: Interval | None
+    """Root mean square distance from it, over answered pixels, with a 95 % interval from the
+    scatter of its squares; None where there is none."""
+    confidence: float
+    """Mean over all pixels, 0 where there is no answer."""
+
+
+def accuracy_over_pulses(
+    capture: Capture, shares: Sequence[float], method: str = "tracking", settings: Any = None
+) -> Iterator[Accuracy]:
+    """Range a capture with some of its pulses, one step for each share.
+
+    Nothing is computed before the first step is asked for. Fewer pulses are a part of more
+    (`core.reductions.share_of_pulses`).
+
+    Parameters
+    ----------
+    capture : Capture
+    shares : sequence of float
+        Shares of the pulses, each above 0 and at most 1.
+    method : str
+        A key of `core.ESTIMATORS`.
+    settings : object, optional
+        The method's own settings; its defaults where None.
+
+    Raises
+    ------
+    ValueError
+        If a share is out of its range, or the method or its settings are not known.
+    """
+    for share in shares:
+        require("share", share, 0 < share <= 1, "above 0 and at most 1")
+    settings = settings_of(method, settings)
+    return _steps(capture, shares, method, settings)
+
+
+def _steps(
+    capture: Capture, shares: Sequence[float], method: str, settings: Any
+) -> Iterator[Accuracy]:
+    truth_m, against = capture.truth_range_m, "truth"
+    if truth_m is None:
+        truth_m, against = estimate(capture, method, settings).range_m, "all pulses"
+    for share in shares:
+        some = share_of_pulses(capture, share)
+        yield _accuracy(some, estimate(some, method, settings), truth_m, share, against)
+
+
+def _accuracy(
+    some: Capture, image: RangeImage, truth_m: Floats, share: float, against: Any
+) -> Accuracy:
+    tolerance_m = TOLERANCE_BINS * some.acquisition.bin_length_m
+    hits, targets = metrics.restored(image.range_m, truth_m, tolerance_m)
+    error_m = metrics.errors_m(image.range_m, truth_m)
+    return Accuracy(
+        share,
+        some.acquisition.n_pulses,
+        against,
+        metrics.wilson(hits, targets) if targets else None,
+        _root_mean_square(error_m[np.isfinite(error_m)]),
+        float(image.confidence.mean()),
+    )
+
+
+def _root_mean_square(error_m: Floats) -> Interval | None:
+    if not error_m.size:
+        return None
+    squares, mean = error_m**2, float(np.mean(error_m**2))
+    half = 0.0
+    if squares.size > 1:
+        z = float(scipy.special.ndtri(0.975))
+        half = z * float(np.std(squares, ddof=1)) / math.sqrt(squares.size)
+    low, high = math.sqrt(max(mean - half, 0.0)), math.sqrt(mean + half)
+    return Interval(math.sqrt(mean), low, high)

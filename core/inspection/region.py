@@ -1,0 +1,151 @@
+"""All that is known of a region: its pixels one by one, and added to one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.capture import Capture
+from core.checks import require
+from core.estimators import RangeImage, estimate
+from core.inspection.light import LightFound
+from core.inspection.mean_light import METHOD, mean_light
+from core.inspection.pixel import PixelReport, light_unit, pixel_report
+
+
+@dataclass(frozen=True, eq=False)
+class RegionReport:
+    """All that is known of a region.
+
+    Added to one, the pixels' histograms are that of one pixel that was sent all their pulses: true
+    where they see the same surface in the same light. Where they do not, `pixel` holds several
+    surfaces, and its signal and background are no pixel's.
+    """
+
+    n_pixels: int
+    summed: Capture
+    """Their histograms added, shape (1, 1, bin), and their pulses."""
+    image: RangeImage
+    """The answer of that one pixel, shape (1, 1)."""
+    pixel: PixelReport
+    """All that is known of it."""
+    share_answered: float
+    """Of the region's pixels."""
+    median_m: float
+    """Of the answers; NaN where there is none."""
+    spread_m: float
+    """Half the range of the middle 68 % of the answers; NaN where there is none."""
+    mean_confidence: float
+    mean_counts: float
+    light: LightFound
+    """Mean signal and background of the pixels, and their ratio, with 95 % intervals."""
+    light_unit: str
+    light_method: str
+
+
+def pixels_in(polygon: Sequence[tuple[float, float]], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Pixels whose centre lies in a polygon or on its edge, shape (row, col).
+
+    Parameters
+    ----------
+    polygon : sequence of (row, col)
+        Its corners, at least 3, in pixels; the centre of the first pixel is (0, 0).
+    shape : tuple of int
+        Rows and columns of the image.
+
+    Raises
+    ------
+    ValueError
+        If the corners are fewer, or not finite.
+    """
+    from matplotlib.path import Path  # noqa: PLC0415 - only who draws waits for it
+
+    corners = np.asarray(polygon, float)
+    usable = corners.ndim == 2 and corners.shape[1] == 2 and len(corners) >= 3
+    usable = usable and bool(np.isfinite(corners).all())
+    require("polygon", f"{len(polygon)} corners", usable, "3 or more finite (row, col)")
+    path, centres = Path(corners), np.indices(shape).reshape(2, -1).T
+    # On the edge: a hair outside is inside, on whichever side the polygon's turn puts it.
+    inside = [path.contains_points(centres, radius=hair) for hair in (-1e-9, 1e-9)]
+    return np.asarray(np.logical_or(*inside).reshape(shape))
+
+
+def region_report(
+    capture: Capture,
+    image: RangeImage,
+    mask: NDArray[np.bool_],
+    method: str = "tracking",
+    settings: Any = None,
+) -> RegionReport:
+    """All that is known of a region.
+
+    Parameters
+    ----------
+    capture : Capture
+    image : RangeImage
+        The capture's, by this method and these settings.
+    mask : ndarray of bool, shape (row, col)
+        Its pixels, at least one.
+    method : str
+        A key of `core.ESTIMATORS`.
+    settings : object, optional
+        The method's own settings; its defaults where None.
+
+    Raises
+    ------
+    ValueError
+        If the region is empty or of another shape, or the method or its settings are not known.
+    """
+    require("mask", f"shape {mask.shape}", mask.shape == capture.shape, f"{capture.shape}")
+    n_pixels = int(np.count_nonzero(mask))
+    require("region", f"{n_pixels} pixels", n_pixels > 0, "one that holds the centre of a pixel")
+    own, summed = _own(capture, mask), _summed(capture, mask)
+    of_sum = estimate(summed, method, settings)
+    range_m = image.range_m[mask & image.valid]
+    low_m, median_m, high_m = (
+        np.quantile(range_m, [0.16, 0.5, 0.84]) if range_m.size else np.full(3, np.nan)
+    )
+    return RegionReport(
+        n_pixels=n_pixels,
+        summed=summed,
+        image=of_sum,
+        pixel=pixel_report(summed, of_sum, 0, 0, method, settings),
+        share_answered=range_m.size / n_pixels,
+        median_m=float(median_m),
+        spread_m=float(high_m - low_m) / 2,
+        mean_confidence=float(image.confidence[mask].mean()),
+        mean_counts=float(capture.counts[mask].mean()),
+        light=mean_light(own),
+        light_unit=light_unit(own),
+        light_method=METHOD,
+    )
+
+
+def _own(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
+    """The region's pixels in one row."""
+    return replace(
+        capture,
+        cube=capture.cube[mask][np.newaxis],
+        truth_range_m=None,
+        signal=None,
+        source=f"{capture.source}; a region of it",
+    )
+
+
+def _summed(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
+    """The region's pixels added to one, and their pulses."""
+    total = capture.cube[mask].sum(axis=0, dtype=np.int64)
+    require("counts", int(total.max()), int(total.max()) < 2**32, "a region of sums below 2**32")
+    n_pulses, n_pixels = capture.acquisition.n_pulses, int(np.count_nonzero(mask))
+    return replace(
+        capture,
+        cube=total.astype(np.uint32)[np.newaxis, np.newaxis],
+        acquisition=replace(capture.acquisition, n_pulses=n_pulses and n_pulses * n_pixels),
+        truth_range_m=None,
+        signal=None,
+        source=f"{capture.source}; {n_pixels} pixels added",
+    )
