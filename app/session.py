@@ -30,10 +30,10 @@ log = logging.getLogger(__name__)
 WAIT_MS = 200
 """What takes longer than this is shown to be under way."""
 
-COMPUTED_FROM = ("source", "light", "reading", "less", "absent", "tracking")
+COMPUTED_FROM = ("source", "light", "reading", "window", "less", "absent", "tracking")
 """Of the state, what an answer is computed from."""
 
-BROUGHT = ("pixel", "viewing", "comparison")
+BROUGHT = ("pixel", "pins", "region", "viewing", "comparison")
 """Of the state, what depends on the capture unless it is chosen."""
 
 REST_MS = 60
@@ -107,7 +107,8 @@ class Session:
         asked = wanted.of({name: before[name] for name in before if name not in BROUGHT})
         if asked.get("source", self.own["source"]) not in self.sources:
             wanted.refused.append(words.source_is_gone(asked["source"]))
-            asked = {n: each for n, each in asked.items() if n not in ("source", "reading", "less")}
+            of_it = ("source", "reading", "window", "less")
+            asked = {name: each for name, each in asked.items() if name not in of_it}
         plain = {n: each for n, each in asked.items() if n not in COMPUTED_FROM}
         here = {n: each for n, each in asked.items() if n == "source"}
         for attempt in (asked, plain | here, plain):
@@ -122,13 +123,13 @@ class Session:
     def _return_to(self, wanted: Wanted) -> None:
         """To what the address asks for of what the capture brings, and tell what was refused."""
         rows, cols = self.answer.capture.shape
-        brought = wanted.of({name: self.own[name] for name in BROUGHT})
-        self.choose_pixel(*brought.pop("pixel", self.state.pixel))
-        self.state.param.update(brought)
-        pins = tuple(pin for pin in self.state.pins if pin[0] < rows and pin[1] < cols)
-        if pins != self.state.pins:
+        brought = wanted.of({name: (defaults() | self.own)[name] for name in BROUGHT})
+        asked, row_col = brought.get("pins", ()), brought.pop("pixel", self.state.pixel)
+        brought["pins"] = tuple(pin for pin in asked if pin[0] < rows and pin[1] < cols)
+        if brought["pins"] != asked:
             wanted.refused.append(words.pins_outside(rows, cols))
-            self.state.pins = pins
+        self.choose_pixel(*row_col)
+        self.state.param.update(brought)
         wanted.refuse_others()
         self.refused = wanted.refused
 

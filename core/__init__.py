@@ -3,6 +3,7 @@
 from core import inspection, limits, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
+from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
 from core.export import save_capture, save_image, save_pixel
 from core.large import as_image, estimate_large
@@ -23,6 +24,7 @@ from core.warmup import warm_up
 from core.windows import Window, light_of_whole, read_window
 
 __all__ = [
+    "CORRECTIONS",
     "ESTIMATORS",
     "PARTS",
     "PRESETS",
@@ -67,4 +69,5 @@ __all__ = [
     "trigger_probability",
     "warm_up",
     "without",
+    "without_correction",
 ]

@@ -16,6 +16,7 @@ from core.parameters import Choice
 
 OTHERWISE: dict[str, list[Any]] = {
     "source": ["building", "a b&c=d/é?#", "17"],
+    "window": [Window((0, 8), (3, 9)), Window((2, 30), (0, 40), step=3)],
     "absent": [frozenset({"jitter"}), frozenset({"pile_up", "signal_levels", "motion"})],
     "pixel": [(0, 0), (63, 5)],
     "pins": [((1, 2),), ((1, 2), (3, 4), (0, 0), (9, 9))],
