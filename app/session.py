@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import panel as pn
@@ -18,8 +19,8 @@ from app.cloud import PointCloud, ply_bytes
 from app.controls import Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
-from app.state import CLOUD_COLORS, IMAGES, NEED_TRUTH, State
-from app.store import Answer, Request, Source, compute, inspect, same_view
+from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, State
+from app.store import Answer, Request, Source, compute, inspect, same_pixels, same_view
 from app.theme import WRONG_COLOR, palette
 from app.views import ImageView, SignalPlots
 
@@ -54,7 +55,9 @@ class Session:
 
     def __init__(self, sources: Mapping[str, Source]) -> None:
         self.sources = dict(sources)
-        self.state = State(source=next(iter(sources)))
+        key, first = next(iter(self.sources.items()))
+        # Who brings a file wants to look into it.
+        self.state = State(source=key, page="Explore" if first.is_scene else "Inspect")
         self.signals = SignalPlots()
         self.image = ImageView(self.choose_pixel)
         self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
@@ -68,7 +71,7 @@ class Session:
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._rest_is_due = False
-        self._is_hidden = self._is_outdated = False
+        self._is_hidden, self._is_outdated = self.state.page != "Explore", False
         self._asked_s: float | None = None
         self.answer = compute(self._request(), None)
         self._show(self.answer, first=True)
@@ -87,7 +90,7 @@ class Session:
     def _watch(self) -> None:
         watch = self.state.param.watch
         watch(lambda *_: self._ask(), ["source", "light", "reading", "less", "absent", "tracking"])
-        watch(lambda *_: self._draw_pixel(), ["pixel", "difference"])
+        watch(lambda *_: self._draw_pixel(), ["pixel", "difference", "unit"])
         watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
         self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
         self.cloud.param.watch(lambda event: self.pick(event.new), "selected")
@@ -121,7 +124,7 @@ class Session:
 
     def _await(self) -> None:
         self._asked_s = perf_counter()
-        self._later(self._admit_waiting, WAIT_MS)
+        self.later(self._admit_waiting, WAIT_MS)
 
     def _admit_waiting(self) -> None:
         """Show that an answer is under way, if the oldest open request is that old."""
@@ -142,7 +145,7 @@ class Session:
         elif self.is_served:  # else the page is gone, and nobody left to see it
             self.page.add_next_tick_callback(act)
 
-    def _later(self, act: Callable[[], None], after_ms: int) -> None:
+    def later(self, act: Callable[[], None], after_ms: int) -> None:
         """Do something on the page's thread, after a while; its failure is told like any other."""
 
         def attempt() -> None:
@@ -180,30 +183,33 @@ class Session:
     def _show(self, answer: Answer, first: bool = False) -> None:
         previous, self.answer = self.answer, answer
         if first or not same_view(answer.request, previous.request):
-            self._enter(answer)
+            self._enter(answer, is_another=first or not same_pixels(answer, previous))
         self.complain(words.lack(answer))
         self._draw_pixel()
         if first or not self.is_served:
             self._draw_rest()
         elif not self._rest_is_due:
             self._rest_is_due = True
-            self._later(self._draw_rest, REST_MS)
+            self.later(self._draw_rest, REST_MS)
         self._settle(answer)
 
-    def _enter(self, answer: Answer) -> None:
-        """Come to a capture of another kind: its own pixel, field of view and camera."""
+    def _enter(self, answer: Answer, is_another: bool) -> None:
+        """Come to a capture of another kind: its own field of view, camera and, maybe, pixel."""
         rows, cols = answer.capture.shape
         self.image_keys.shape = [rows, cols]
         self.image.enter(rows, cols)
         has_truth = answer.capture.truth_range_m is not None
-        for name, kinds in (("image", IMAGES), ("cloud_color", CLOUD_COLORS)):
+        for name, kinds in (("image", IMAGES), ("map", MAPS), ("cloud_color", CLOUD_COLORS)):
             possible = [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
             self.state.param[name].objects = possible
             if getattr(self.state, name) not in possible:
                 setattr(self.state, name, possible[0])
         self.own_field_of_view_deg = float(f"{_field_of_view_deg(answer):.3g}")
         viewing = replace(self.state.viewing, field_of_view_deg=self.own_field_of_view_deg)
-        self.state.param.update(pixel=_pixel_to_start_with(answer), viewing=viewing)
+        chosen: dict[str, Any] = {"viewing": viewing}
+        if is_another:
+            chosen |= {"pixel": _pixel_to_start_with(answer), "pins": (), "region": ()}
+        self.state.param.update(**chosen)
 
     def choose_pixel(self, row: int, col: int) -> None:
         """Show another pixel; one outside the image means the nearest inside."""
@@ -222,9 +228,10 @@ class Session:
             return
         row, col = self.state.pixel
         pixel = inspect(self.answer, row, col)
-        numbers = words.pixel_numbers(self.answer, pixel)
+        acquisition, state = self.answer.capture.acquisition, self.state
+        numbers = words.pixel_numbers(self.answer, pixel, state.unit)
         with pn.io.hold(self.page):
-            self.signals.update(pixel, self.answer.capture.acquisition, self.state.difference)
+            self.signals.update(pixel, acquisition, state.difference, state.unit)
             self.image.mark(row, col)
             self.image_keys.pixel = [row, col]
             self.cloud.selected = row * self.answer.capture.shape[1] + col
