@@ -175,9 +175,9 @@ def range_image(image: Array, low: float, high: float) -> hv.Overlay:
     )
 
 
-def pixel_frame(row: int, col: int) -> tuple[float, float, float, float]:
+def pixel_frame(row: int, col: int, half: float = 1.5) -> tuple[float, float, float, float]:
     """Left, bottom, right and top of a frame around a pixel that leaves the pixel itself free."""
-    return col - 1.5, row - 1.5, col + 1.5, row + 1.5
+    return col - half, row - half, col + half, row + half
 
 
 def score_curves(colors: Palette) -> hv.Overlay:
