@@ -126,8 +126,8 @@ READ_OUT = """
 const bin = special_vars.index;
 if (format === "bin") return String(bin);
 if (format in along) {
-  const [origin, step] = along[format];
-  return `${(origin + step * (bin + 0.5)).toPrecision(7).replace(/\\.?0+$/, "")} ${format}`;
+  const [origin, step, decimals] = along[format];
+  return `${(origin + step * (bin + 0.5)).toFixed(decimals)} ${format}`;
 }
 const found = sources[format].data[columns[format]][bin];
 return Number.isFinite(found) ? String(Number(found.toPrecision(4))) : "–";
@@ -175,7 +175,7 @@ class GateReadOut:
         self._acquisition = acquisition
         along = {name: scale(name, acquisition) for name in ("ns", "m")}
         self._names.args = {
-            "along": {name: [each.origin, each.step] for name, each in along.items()},
+            "along": {n: [each.origin, each.step, each.decimals] for n, each in along.items()},
             "sources": self._sources,
             "columns": self._columns,
         }

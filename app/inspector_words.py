@@ -86,7 +86,6 @@ def _pixel_facts(answer: Answer, seen: Seen, unit: str) -> list[Fact]:
         *found,
         ("Detections", counts, f"{fired}."),
         *_light(report.light, report.light_unit),
-        ("Verdict", report.verdict.health, report.verdict.why),
     ]
 
 
@@ -127,7 +126,7 @@ def _light(found: LightFound, unit: str) -> list[Fact]:
 def remark(seen: Seen) -> str:
     """What is to be said of a pixel or a region besides its numbers."""
     if seen.region is None:
-        return seen.report.verdict.why
+        return f"Verdict: {seen.report.verdict.health}. {seen.report.verdict.why}"
     return (
         f"The plots show its pixels added to one. Light of a pixel on average: "
         f"{seen.region.light_method}."

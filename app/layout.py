@@ -53,7 +53,15 @@ THEME = {
         "typography": {"fontSize": 13},
         "components": {
             "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": bar, "color": "#ffffff"}}},
-            "MuiToolbar": {"styleOverrides": {"root": {"minHeight": "48px !important"}}},
+            "MuiToolbar": {
+                "styleOverrides": {
+                    "root": {
+                        "minHeight": "48px !important",
+                        # On a phone the buttons need the room.
+                        "@media (max-width: 500px)": {"& .title": {"display": "none"}},
+                    }
+                }
+            },
         },
     }
     for mode, main, bar, page, paper in (
@@ -222,9 +230,7 @@ class Layout:
         if session.is_served:
             let_pages_come(session.page)
             # On a phone the controls would cover what they control.
-            self._viewport.param.watch(
-                lambda event: self.page.param.update(sidebar_open=not event.new), "narrow"
-            )
+            pn.state.onload(lambda: self.page.param.update(sidebar_open=not self._viewport.narrow))
             pn.state.on_session_destroyed(lambda _: self._forget())
             pn.config.exception_handler = session.fail  # of this session alone
 
