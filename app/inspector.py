@@ -17,6 +17,7 @@ from app.inspector_pins import MOST_PINS, Pins, pin_colors
 from app.inspector_pixel import Sight, framed
 from app.inspector_views import MODES, Corners, Navigator, rectangle
 from app.jobs import LatestWins
+from app.large_view import LargeView
 from app.looks import Look, map_of
 from app.pages import Pages, View
 from app.parts import part
@@ -61,8 +62,9 @@ class Inspector:
         self._session = session
         self._jobs: LatestWins[tuple[Any, Look]] = LatestWins(session.on_page)
         self._is_on_screen = self._dark = False
-        self._shape = (0, 0)
+        self._entered: tuple[Any, ...] = ()
         self._navigator = Navigator(session.choose_pixel, self._select)
+        self._large = LargeView(session, self._navigator.figure)
         self._keys = PixelKeys(
             label="Picture to navigate by. Arrow keys move the pixel, with Shift by eight; "
             "P pins it.",
@@ -153,6 +155,7 @@ class Inspector:
         left = pn.Column(
             _row(self._map, self._mode, self._clear),
             framed(self._navigator.pane, self._keys),
+            self._large.layout,
             _row(*self._place, self._pin),
             _row(*self._span, self._add),
             self._refusal,
@@ -179,9 +182,11 @@ class Inspector:
             self._enter()
             self._mark()
             self._ask_map()
+        self._large.show(is_on_screen)
         self._subjects.show(is_on_screen)
 
     def _follow(self, answer: Answer) -> None:
+        self._large.follow(answer)
         if self._is_on_screen:
             self._enter()
             self._mark()
@@ -210,20 +215,24 @@ class Inspector:
         state = self._session.state
 
         def go() -> None:
-            pixel = list(state.pixel)
-            pixel[axis] = _whole(self._place[axis].label.lower(), typed, self._shape[axis])
-            state.pixel = tuple(pixel)
+            place = list(here)
+            name = self._place[axis].label.lower()
+            place[axis] = _whole(name, typed, *self._ends(axis))
+            state.pixel = grid.pixel(*place)
 
-        if typed != str(state.pixel[axis]):  # else it was not typed
+        grid = self._session.answer.grid
+        here = grid.place(*state.pixel)
+        if typed != str(here[axis]):  # else it was not typed
             self._refusing(go)
 
     def _select_rectangle(self) -> None:
         def select() -> None:
             rows, cols = (
-                _span(field.label.lower(), field.value, size)
-                for field, size in zip(self._span, self._shape, strict=True)
+                _span(field.label.lower(), field.value, *self._ends(axis))
+                for axis, field in enumerate(self._span)
             )
-            self._select(rectangle(rows, cols))
+            grid = self._session.answer.grid
+            self._select(tuple(grid.index(*corner) for corner in rectangle(rows, cols)))
 
         self._refusing(select)
 
@@ -254,12 +263,18 @@ class Inspector:
     # What is drawn
 
     def _enter(self) -> None:
-        """Come to another capture, if it is one of another size."""
-        shape = self._session.answer.capture.shape
-        if shape != self._shape:
-            self._shape = shape
+        """Come to another capture, if it is one of other pixels."""
+        shape, grid = self._session.answer.capture.shape, self._session.answer.grid
+        if (shape, grid) != self._entered:
+            self._entered = shape, grid
             self._keys.shape = list(shape)
-            self._navigator.enter(*shape)
+            self._navigator.enter(*shape, grid)
+
+    def _ends(self, axis: int) -> tuple[int, int]:
+        """First and last row of the file that can be chosen here, or column."""
+        answer = self._session.answer
+        last = answer.grid.place(*(size - 1 for size in answer.capture.shape))
+        return answer.grid.first[axis], last[axis]
 
     def _mark(self) -> None:
         """Frame the pixel and the pins, outline the region."""
@@ -273,10 +288,11 @@ class Inspector:
             self._navigator.outline(state.region)
             self._keys.pixel = list(state.pixel)
             self._clear.disabled = not state.region
-            for field, at in zip(self._place, state.pixel, strict=True):
+            grid = self._session.answer.grid
+            for field, at in zip(self._place, grid.place(*state.pixel), strict=True):
                 field.value = str(at)
             self._chips.chips = [
-                [list(pin), inspector_words.pixel_name(pin), color]
+                [list(pin), inspector_words.pixel_name(pin, grid), color]
                 for pin, color in zip(state.pins, colors, strict=False)
             ]
 
@@ -310,17 +326,17 @@ def _field(label: str, example: str) -> pmui.TextInput:
     )
 
 
-def _whole(name: str, text: str, size: int) -> int:
+def _whole(name: str, text: str, first: int, last: int) -> int:
     """A row or column that was typed."""
     text = text.strip()
-    inside = text.isdecimal() and int(text) < size
-    require(name, text, inside, f"a whole number from 0 to {size - 1}")
+    inside = text.isdecimal() and first <= int(text) <= last
+    require(name, text, inside, f"a whole number from {first} to {last}")
     return int(text)
 
 
-def _span(name: str, text: str, size: int) -> tuple[int, int]:
+def _span(name: str, text: str, first: int, last: int) -> tuple[int, int]:
     """From which row to which, or column, as typed."""
     ends = [int(each) for each in re.findall(r"\d+", text)]
-    inside = len(ends) in (1, 2) and max(ends) < size
-    require(name, text, inside, f"two whole numbers from 0 to {size - 1}, such as 10-20")
+    inside = len(ends) in (1, 2) and first <= min(ends) and max(ends) <= last
+    require(name, text, inside, f"two whole numbers from {first} to {last}, such as 10-20")
     return min(ends), max(ends)

@@ -92,6 +92,7 @@ class Pins:
             return  # the user has moved on
         unit, acquisition = session.state.unit, answer.capture.acquisition
         colors = pin_colors(self._dark)[: len(found)]
+        names = [inspector_words.pixel_name(pin, answer.grid) for pin in pins]
         scales = inspector_words.both_scales(unit, answer)
         with pn.io.hold(session.page):
             n_bins = acquisition.n_bins
@@ -106,15 +107,15 @@ class Pins:
                     "xs": [plots.centres(n_bins).astype(np.float32)] * len(found),
                     "ys": [np.asarray(curve, np.float32) for curve in curves],
                     "color": list(colors),
-                    "label": [inspector_words.pixel_name(pin) for pin in pins],
+                    "label": names,
                 }
                 plot.frame(*curves, np.zeros(1))
             self._note.text = "" if pins else inspector_words.NO_PINS
             self._table.param.update(
                 columns=inspector_words.pin_columns(unit) if pins else [],
                 rows=[
-                    inspector_words.pin_row(each, color, *scales)
-                    for each, color in zip(found, colors, strict=True)
+                    inspector_words.pin_row(each, name, color, *scales)
+                    for each, name, color in zip(found, names, colors, strict=True)
                 ],
             )
 

@@ -89,7 +89,8 @@ class Navigator(ImageView):
 
         def select(event: SelectionGeometry) -> None:
             if event.final:
-                selected(corners_of(event.geometry))
+                drawn = corners_of(event.geometry)
+                selected(tuple(_rounded(self._grid.index(*each)) for each in drawn))
 
         drawing.on_event(SelectionGeometry, select)
 
@@ -99,14 +100,15 @@ class Navigator(ImageView):
 
     def outline(self, region: Corners) -> None:
         """Draw a region's outline; none if it is empty."""
-        cols, rows = [col for _, col in region], [row for row, _ in region]
+        places = [self._grid.place(*corner) for corner in region]
+        cols, rows = [col for _, col in places], [row for row, _ in places]
         for source in self._region:
             source.data = {"xs": [cols] if region else [], "ys": [rows] if region else []}
 
     def pin(self, pins: Sequence[tuple[int, int]], colors: Sequence[str]) -> None:
         """Frame pixels, each in its colour."""
         frames = np.array(
-            [plots.pixel_frame(*pin, self.half_frame) for pin in pins], float
+            [plots.pixel_frame(*self._grid.place(*pin), self.half_frame) for pin in pins], float
         ).reshape(-1, 4)
         sides = dict(zip(("left", "bottom", "right", "top"), frames.T, strict=True))
         self._pins.data = {**sides, "color": list(colors[: len(pins)])}
@@ -122,7 +124,12 @@ def corners_of(geometry: Mapping[str, Any]) -> Corners:
     else:
         drawn = list(zip(geometry["y"], geometry["x"], strict=True))
         drawn = drawn[:: -(-len(drawn) // MOST_CORNERS)]
-    return tuple((round(float(row), 2), round(float(col), 2)) for row, col in drawn)
+    return tuple((float(row), float(col)) for row, col in drawn)
+
+
+def _rounded(corner: tuple[float, float]) -> tuple[float, float]:
+    """As fine as an address needs it."""
+    return round(corner[0], 2), round(corner[1], 2)
 
 
 def rectangle(rows: tuple[int, int], cols: tuple[int, int]) -> Corners:

@@ -8,6 +8,7 @@ from typing import Any
 
 from app.gate import COMPLEMENT, TITLES, Scale, scale
 from app.inspector_answers import Seen
+from app.large import Grid
 from app.store import Answer
 from app.words import Fact, number, share
 from core.inspection import Accuracy, Candidate, CaptureReport, LightFound
@@ -68,7 +69,11 @@ def facts(answer: Answer, seen: Seen, unit: str) -> list[Fact]:
 def _pixel_facts(answer: Answer, seen: Seen, unit: str) -> list[Fact]:
     pixel, report = seen.pixel, seen.report
     found = [
-        ("Pixel", pixel_name((pixel.row, pixel.col)), "Row and column; arrow keys move it."),
+        (
+            "Pixel",
+            pixel_name((pixel.row, pixel.col), answer.grid),
+            "Row and column; arrow keys move it.",
+        ),
         *_estimate(seen, scale(unit, answer.capture.acquisition)),
     ]
     if answer.capture.truth_range_m is not None:
@@ -171,7 +176,7 @@ def pin_columns(unit: str) -> list[Sequence[Any]]:
     ]
 
 
-def pin_row(seen: Seen, color: str, along: Scale, other: Scale) -> dict[str, Any]:
+def pin_row(seen: Seen, name: str, color: str, along: Scale, other: Scale) -> dict[str, Any]:
     """A pinned pixel."""
     pixel, report = seen.pixel, seen.report
     sbr = report.light.sbr
@@ -179,7 +184,7 @@ def pin_row(seen: Seen, color: str, along: Scale, other: Scale) -> dict[str, Any
     known = not math.isnan(pixel.answer_bin)
     below = other.place(pixel.answer_bin) if known else "no answer"
     return {
-        "name": pixel_name((pixel.row, pixel.col)),
+        "name": name,
         "color": color,
         "dash": [],
         "cells": [
@@ -191,9 +196,10 @@ def pin_row(seen: Seen, color: str, along: Scale, other: Scale) -> dict[str, Any
     }
 
 
-def pixel_name(pixel: tuple[int, int]) -> str:
-    """A pixel as short as can be."""
-    return f"{pixel[0]}, {pixel[1]}"
+def pixel_name(pixel: tuple[int, int], grid: Grid) -> str:
+    """Row and column of a pixel in its file, as short as can be."""
+    row, col = grid.place(*pixel)
+    return f"{row}, {col}"
 
 
 # The capture as a whole

@@ -17,6 +17,7 @@ from app.compare import Compare
 from app.connection import Connection
 from app.controls import Sentence, SettingsPanel, Viewport
 from app.inspector import Inspector
+from app.large_view import LargeView
 from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
 from app.parts import card, choice, part, select
@@ -290,6 +291,7 @@ class Layout:
             "light": measured.light,
             "reading": measured.reading,
             "absent": measured.absent,
+            "window": measured.window,
             "less": Less.of(candidate.reduction, point.shape[2]),
         }
         self._light.show(measured.light)
@@ -305,7 +307,7 @@ class Layout:
     def _go_to(self, key: str) -> None:
         if key != self.session.state.source:
             self.session.state.param.update(
-                source=key, reading=Reading(), less=Less(), absent=frozenset()
+                source=key, reading=Reading(), less=Less(), absent=frozenset(), window=None
             )
 
     def _show_tracking(self, settings: TrackingParameters) -> None:
@@ -388,6 +390,7 @@ class Layout:
     def _explore(self) -> View:
         """The page that looks into the tracking differentiator."""
         session = self.session
+        large = LargeView(session, session.image.figure)
         difference = pmui.Switch.from_param(
             session.state.param.difference, label="First difference", size="small", margin=(0, 8)
         )
@@ -399,18 +402,25 @@ class Layout:
             size="small",
             margin=(6, 8),
         )
+
+        def show(is_on_screen: bool) -> None:
+            session.show(is_on_screen)
+            large.show(is_on_screen)
+
         return View(
-            [session.figures, self._board()],
+            [session.figures, self._board(large)],
             [part("View", self._viewing.layout, difference, cloud_file)],
-            show=session.show,
+            show=show,
+            follow=large.follow,
             paint=session.paint,
         )
 
-    def _board(self) -> pn.Column:
+    def _board(self, large: LargeView) -> pn.Column:
         session, state = self.session, self.session.state
         image_kind = choice("What the image shows", state.param.image)
         cloud_color = choice("What the cloud is coloured by", state.param.cloud_color)
-        left = (card(image_kind, session.image_keys), card(cloud_color, session.cloud))
+        image = card(image_kind, session.image_keys)
+        left = (image, large.layout, card(cloud_color, session.cloud))
         right = (session.numbers, *map(card, session.signals.panes))
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")

@@ -175,7 +175,7 @@ def range_image(image: Array, low: float, high: float) -> hv.Overlay:
     )
 
 
-def pixel_frame(row: int, col: int, half: float = 1.5) -> tuple[float, float, float, float]:
+def pixel_frame(row: float, col: float, half: float = 1.5) -> tuple[float, float, float, float]:
     """Left, bottom, right and top of a frame around a pixel that leaves the pixel itself free."""
     return col - half, row - half, col + half, row + half
 

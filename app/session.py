@@ -24,6 +24,7 @@ from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State,
 from app.store import Answer, Request, Source, compute, inspect, same_pixels, same_view
 from app.theme import WRONG_COLOR, palette
 from app.views import ImageView, SignalPlots
+from core.inspection import pixels_in
 
 log = logging.getLogger(__name__)
 
@@ -164,7 +165,19 @@ class Session:
     def _request(self) -> Request:
         state = self.state
         source = self.sources[state.source]
-        return Request(source, state.light, state.reading, state.tracking, state.less, state.absent)
+        return Request(
+            source,
+            state.light,
+            state.reading,
+            state.tracking,
+            state.less,
+            state.absent,
+            state.window,
+        )
+
+    def renew(self) -> None:
+        """Answer again: more has been read of what is looked at."""
+        self._ask()
 
     def _ask(self) -> None:
         request = self._request()
@@ -218,6 +231,7 @@ class Session:
                     reading=shown.reading,
                     less=shown.less,
                     absent=shown.absent,
+                    window=shown.window,
                 )
         self._settle(self.answer)
         self.fail(error)
@@ -234,7 +248,7 @@ class Session:
     def _show(self, answer: Answer, first: bool = False) -> None:
         previous, self.answer = self.answer, answer
         if first or not same_view(answer.request, previous.request):
-            self._enter(answer, is_another=first or not same_pixels(answer, previous))
+            self._enter(answer, previous)
         self.complain(words.lack(answer))
         self._draw_pixel()
         if first or not self.is_served:
@@ -244,11 +258,11 @@ class Session:
             self.later(self._draw_rest, REST_MS)
         self._settle(answer)
 
-    def _enter(self, answer: Answer, is_another: bool) -> None:
+    def _enter(self, answer: Answer, previous: Answer) -> None:
         """Come to a capture of another kind: its own field of view, camera and, maybe, pixel."""
         rows, cols = answer.capture.shape
         self.image_keys.shape = [rows, cols]
-        self.image.enter(rows, cols)
+        self.image.enter(rows, cols, answer.grid)
         has_truth = answer.capture.truth_range_m is not None
         for name, kinds in (("image", IMAGES), ("map", MAPS), ("cloud_color", CLOUD_COLORS)):
             possible = [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
@@ -259,13 +273,13 @@ class Session:
         self.own_field_of_view_deg = own["viewing"].field_of_view_deg
         as_wide = {"field_of_view_deg": self.own_field_of_view_deg}
         compared = replace(state.comparison.viewing, **as_wide)
-        chosen: dict[str, Any] = {
-            "viewing": replace(state.viewing, **as_wide),
-            "comparison": replace(state.comparison, viewing=compared),
-        }
-        if is_another:
-            chosen |= {"pixel": own["pixel"], "pins": (), "region": ()}
-        state.param.update(**chosen)
+        here = {"pixel": state.pixel, "pins": state.pins, "region": state.region}
+        state.param.update(
+            viewing=replace(state.viewing, **as_wide),
+            comparison=replace(state.comparison, viewing=compared),
+            **{"pixel": own["pixel"], "pins": (), "region": ()}
+            | (carried(here, previous, answer) if answer is not previous else {}),
+        )
 
     def choose_pixel(self, row: int, col: int) -> None:
         """Show another pixel; one outside the image means the nearest inside."""
@@ -319,9 +333,10 @@ class Session:
 
     def scene_id(self) -> str:
         """Changes when the camera should start anew."""
-        answer = self.answer
+        answer, cutout = self.answer, self.answer.cutout
         acquisition = replace(answer.capture.acquisition, n_pulses=None)
-        return f"{self.key(answer.request.source)} {answer.capture.shape} {acquisition}"
+        part = "" if cutout is None else f"{cutout.window} {cutout.read}"
+        return f"{self.key(answer.request.source)} {answer.capture.shape} {acquisition} {part}"
 
 
 def brought_by(answer: Answer) -> dict[str, Any]:
@@ -332,6 +347,31 @@ def brought_by(answer: Answer) -> dict[str, Any]:
         "pixel": _pixel_to_start_with(answer),
         "viewing": Viewing(**as_wide),
         "comparison": replace(comparison, viewing=replace(comparison.viewing, **as_wide)),
+    }
+
+
+def carried(here: Mapping[str, Any], before: Answer, answer: Answer) -> dict[str, Any]:
+    """Pixel, pins and region of an answer as they are in another one, as far as they are in it."""
+    if same_pixels(answer, before):
+        return dict(here)
+    files = [None if each.cutout is None else each.cutout.file for each in (before, answer)]
+    if files[0] is None or files[0] is not files[1]:
+        return {}
+
+    def moved(row: int, col: int) -> tuple[int, int]:
+        return answer.grid.pixel(*before.grid.place(row, col))
+
+    def inside(pixel: tuple[int, int]) -> bool:
+        return all(0 <= at < size for at, size in zip(pixel, answer.capture.shape, strict=True))
+
+    pixel = moved(*here["pixel"])
+    pins = filter(inside, dict.fromkeys(moved(*pin) for pin in here["pins"]))
+    region = tuple(answer.grid.index(*before.grid.place(*each)) for each in here["region"])
+    holds_some = bool(region) and pixels_in(region, answer.capture.shape).any()
+    return {
+        **({"pixel": pixel} if inside(pixel) else {}),
+        "pins": tuple(pins),
+        "region": region if holds_some else (),
     }
 
 
