@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from time import perf_counter
@@ -46,6 +46,10 @@ class Source:
     """Makes the capture, parts of some names left out of a scene."""
     scene: Callable[[], Scene] | None = None
     """None for a file."""
+    name: str = ""
+    """Of the scene in `core.scenes`, or of the file."""
+    arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """With which the scene is built."""
 
     @property
     def is_scene(self) -> bool:
@@ -70,7 +74,7 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
         scene = bare(build(), absent)
         return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
-    return Source(title, load, build)
+    return Source(title, load, build, name, arguments)
 
 
 def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
@@ -83,7 +87,7 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
         return capture
 
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, lambda _light, reading, _absent: get(reading))
+    return Source(title or path.name, lambda _light, reading, _absent: get(reading), name=path.name)
 
 
 def built_in_sources() -> dict[str, Source]:
