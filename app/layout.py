@@ -16,12 +16,15 @@ from app.address import AddressBar, Wanted
 from app.compare import Compare
 from app.connection import Connection
 from app.controls import Sentence, SettingsPanel
+from app.large_view import LargeView
 from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
 from app.parts import card, choice, part, select
+from app.script import script_of
 from app.session import Session
 from app.state import Less, Light, Reading, Viewing
 from app.store import Answer, Request, Source
+from app.takeaway import TakeAway
 from app.theme import DARK, LIGHT, SIZES
 from app.tradeoff import Tradeoff
 from app.uploads import MAX_UPLOAD_BYTES, Uploads
@@ -179,6 +182,9 @@ class Layout:
         self._tracking.show(state.tracking)
         self._announced: Source | None = None
         self._address = AddressBar()
+        self._takeaway = TakeAway(
+            lambda: script_of(session.answer, state), sizing_mode="stretch_width", margin=8
+        )
         self._connection = Connection(session.page.session_context.id if session.is_served else "")
         self.pages = Pages(
             {
@@ -268,6 +274,7 @@ class Layout:
             "light": measured.light,
             "reading": measured.reading,
             "absent": measured.absent,
+            "window": measured.window,
             "less": Less.of(candidate.reduction, point.shape[2]),
         }
         self._light.show(measured.light)
@@ -285,7 +292,7 @@ class Layout:
     def _go_to(self, key: str) -> None:
         if key != self.session.state.source:
             self.session.state.param.update(
-                source=key, reading=Reading(), less=Less(), absent=frozenset()
+                source=key, reading=Reading(), less=Less(), absent=frozenset(), window=None
             )
 
     def _tracking_changed(self, settings: TrackingParameters) -> None:
@@ -359,6 +366,7 @@ class Layout:
             self._reading_card,
             part("Tracking differentiator", self._preset, self._tracking.layout),
             part("Less data, faster", self._less.layout, is_open=False),
+            part("Take it away", self._takeaway),
             first,
             part("What is this?", pmui.Typography(words.EXPLANATION, margin=8), is_open=False),
         ]
@@ -366,6 +374,7 @@ class Layout:
     def _explore(self) -> View:
         """The page that looks into the tracking differentiator."""
         session = self.session
+        large = LargeView(session, session.image.figure)
         difference = pmui.Switch.from_param(
             session.state.param.difference, label="First difference", size="small", margin=(0, 8)
         )
@@ -377,18 +386,25 @@ class Layout:
             size="small",
             margin=(6, 8),
         )
+
+        def show(is_on_screen: bool) -> None:
+            session.show(is_on_screen)
+            large.show(is_on_screen)
+
         return View(
-            [session.figures, self._board()],
+            [session.figures, self._board(large)],
             [part("View", self._viewing.layout, difference, cloud_file)],
-            show=session.show,
+            show=show,
+            follow=large.follow,
             paint=session.paint,
         )
 
-    def _board(self) -> pn.Column:
+    def _board(self, large: LargeView) -> pn.Column:
         session, state = self.session, self.session.state
         image_kind = choice("What the image shows", state.param.image)
         cloud_color = choice("What the cloud is coloured by", state.param.cloud_color)
-        left = (card(image_kind, session.image_keys), card(cloud_color, session.cloud))
+        image = card(image_kind, session.image_keys)
+        left = (image, large.layout, card(cloud_color, session.cloud))
         right = (session.numbers, *map(card, session.signals.panes))
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")

@@ -62,7 +62,10 @@ def image_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array,
     capture, image = answer.capture, answer.run.image
     truth_m = capture.truth_range_m
     if kind == "Counts":
-        return capture.counts.astype(float), _count_look(capture.counts)
+        counts = capture.counts.astype(float)
+        if answer.cutout is not None and answer.cutout.read < 1:
+            counts[counts == 0] = np.nan  # not read yet
+        return counts, _count_look(capture.counts)
     if kind == "Confidence":
         sure = np.where(shown(answer, least_confidence), image.confidence, np.nan)
         return sure, Look("Confidence: probability of being right", "", 0.0, 1.0, COUNT_COLORS)

@@ -12,7 +12,7 @@ from textwrap import indent
 from typing import Any
 
 from app.state import CLOUDS, Comparison, State, Viewing
-from app.store import Answer, Request
+from app.store import Answer
 from core import CORRECTIONS, ESTIMATORS, PARTS, Pulse, inspection
 
 LINE = 88
@@ -54,19 +54,18 @@ def script_of(answer: Answer, state: State) -> str:
     compares = state.page == "Compare"
     has_clouds = not compares or state.comparison.kind == CLOUDS
     body = _comparison if compares else _tracking
-    lines = [*_capture(answer.request), *_less(answer), *body(answer, state)]
+    lines = [*_capture(answer), *_less(answer), *body(answer, state)]
     return HEAD.format(math="import math\n" if has_clouds else "") + "\n".join(lines) + "\n"
 
 
 # The capture
 
 
-def _capture(request: Request) -> Lines:
+def _capture(answer: Answer) -> Lines:
+    request = answer.request
     source, light = request.source, request.light
     if source.scene is None:
-        yield "# The capture; put its folder before its name, if it lies elsewhere."
-        yield f"path = {_literal(source.name)}"
-        yield _assign("capture", "core.read_capture", "path", **_told(request.reading))
+        yield from _file(answer)
         return
     yield "# The scene, and its capture in this light."
     yield _assign("scene", f"core.scenes[{_literal(source.name)}]", **_literals(source.arguments))
@@ -82,6 +81,20 @@ def _capture(request: Request) -> Lines:
     flux = _call("core.Flux", **_told(light.flux))
     seed = {"seed": _literal(light.seed)} if light.seed else {}
     yield _assign("capture", "core.simulate", "scene", gate, flux, **seed)
+
+
+def _file(answer: Answer) -> Lines:
+    request, cutout = answer.request, answer.cutout
+    yield "# The capture; put its folder before its name, if it lies elsewhere."
+    yield f"path = {_literal(request.source.name)}"
+    window = request.window if cutout is None else cutout.window
+    reading = _told(request.reading)
+    if window is None:
+        yield _assign("capture", "core.read_capture", "path", **reading)
+    else:
+        yield _assign("counts", "core.open_capture", "path", **reading)
+        yield _assign("window", "core.Window", **_told(window))
+        yield _assign("capture", "core.read_window", "counts", "window")
 
 
 def _less(answer: Answer) -> Lines:
@@ -133,13 +146,14 @@ def _angle(viewing: Viewing) -> Lines:
 
 
 def _cloud(file: str) -> Lines:
+    yield f"cloud = {file}"
     yield "if sure.any():  # a cloud needs points"
-    yield indent(_saved(file, pixel_angle_rad="angle_rad"), "    ")
+    yield indent(_saved("cloud", pixel_angle_rad="angle_rad"), "    ")
 
 
 def _saved(file: str, **options: str) -> str:
-    of = ("capture", "shown", file)
-    return _assign("", "core.save_image", *of, **options, overwrite="True")
+    """Of a file, its name as code."""
+    return _assign("", "core.save_image", "capture", "shown", file, **options, overwrite="True")
 
 
 def _inspected(state: State) -> Lines:
@@ -210,10 +224,8 @@ def _comparison(answer: Answer, state: State) -> Lines:
 
 def _told(settings: Any) -> dict[str, str]:
     """The fields of a settings object that are not as they are unless told, as code."""
-    first = type(settings)()
-    names = [each.name for each in fields(settings)]
-    told = {name: getattr(settings, name) for name in names}
-    return _literals({n: each for n, each in told.items() if each != getattr(first, n)})
+    told = {each: getattr(settings, each.name) for each in fields(settings)}
+    return _literals({each.name: value for each, value in told.items() if value != each.default})
 
 
 def _literals(values: Mapping[str, Any]) -> dict[str, str]:

@@ -163,7 +163,19 @@ class Session:
     def _request(self) -> Request:
         state = self.state
         source = self.sources[state.source]
-        return Request(source, state.light, state.reading, state.tracking, state.less, state.absent)
+        return Request(
+            source,
+            state.light,
+            state.reading,
+            state.tracking,
+            state.less,
+            state.absent,
+            state.window,
+        )
+
+    def renew(self) -> None:
+        """Answer again: more has been read of what is looked at."""
+        self._ask()
 
     def _ask(self) -> None:
         request = self._request()
@@ -217,6 +229,7 @@ class Session:
                     reading=shown.reading,
                     less=shown.less,
                     absent=shown.absent,
+                    window=shown.window,
                 )
         self._settle(self.answer)
         self.fail(error)
@@ -233,7 +246,7 @@ class Session:
     def _show(self, answer: Answer, first: bool = False) -> None:
         previous, self.answer = self.answer, answer
         if first or not same_view(answer.request, previous.request):
-            self._enter(answer)
+            self._enter(answer, previous)
         self.complain(words.lack(answer))
         self._draw_pixel()
         if first or not self.is_served:
@@ -243,11 +256,11 @@ class Session:
             self.later(self._draw_rest, REST_MS)
         self._settle(answer)
 
-    def _enter(self, answer: Answer) -> None:
+    def _enter(self, answer: Answer, previous: Answer) -> None:
         """Come to a capture of another kind: its own pixel, field of view and camera."""
         rows, cols = answer.capture.shape
         self.image_keys.shape = [rows, cols]
-        self.image.enter(rows, cols)
+        self.image.enter(rows, cols, answer.grid)
         has_truth = answer.capture.truth_range_m is not None
         for name, kinds in (("image", IMAGES), ("cloud_color", CLOUD_COLORS)):
             possible = [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
@@ -256,10 +269,10 @@ class Session:
                 setattr(self.state, name, possible[0])
         self.own_field_of_view_deg = float(f"{_field_of_view_deg(answer):.3g}")
         own = {"field_of_view_deg": self.own_field_of_view_deg}
-        state, pixel = self.state, _pixel_to_start_with(answer)
+        state, pixel = self.state, _pixel_to_start_with(answer, answer, self.state.pixel)
         compared = replace(state.comparison.viewing, **own)
         state.param.update(
-            pixel=pixel,
+            pixel=_pixel_to_start_with(answer, previous, state.pixel),
             viewing=replace(state.viewing, **own),
             comparison=replace(state.comparison, viewing=compared),
         )
@@ -321,13 +334,24 @@ class Session:
 
     def scene_id(self) -> str:
         """Changes when the camera should start anew."""
-        answer = self.answer
+        answer, cutout = self.answer, self.answer.cutout
         acquisition = replace(answer.capture.acquisition, n_pulses=None)
-        return f"{self.key(answer.request.source)} {answer.capture.shape} {acquisition}"
+        part = "" if cutout is None else f"{cutout.window} {cutout.read}"
+        return f"{self.key(answer.request.source)} {answer.capture.shape} {acquisition} {part}"
 
 
-def _pixel_to_start_with(answer: Answer) -> tuple[int, int]:
-    """The answered pixel nearest to the centre, among those that have a target if that is known."""
+def _pixel_to_start_with(
+    answer: Answer, previous: Answer, shown: tuple[int, int]
+) -> tuple[int, int]:
+    """The pixel that was shown before, if it is in another window of the same file.
+
+    Else the answered pixel nearest to the centre, among those that have a target if that is known.
+    """
+    if answer is not previous and answer.cutout is not None and previous.cutout is not None:
+        same = answer.grid.pixel(*previous.grid.place(*shown))
+        inside = all(0 <= at < size for at, size in zip(same, answer.capture.shape, strict=True))
+        if inside and answer.cutout.file is previous.cutout.file:
+            return same
     truth_m = answer.capture.truth_range_m
     image = answer.run.image
     good = image.confidence >= 0.9 if truth_m is None else np.isfinite(truth_m)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from app.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.state import Less, Light, Reading
 from core import (
     Capture,
@@ -18,6 +19,7 @@ from core import (
     Scene,
     Signals,
     TrackingParameters,
+    Window,
     first_difference,
     rate_per_bin,
     read_capture,
@@ -27,12 +29,9 @@ from core import (
     tracking_signals,
     trigger_probability,
 )
-from core.checks import require
 from core.corrections import CORRECTIONS, without_correction
 from core.posterior import posterior_of
 from core.scene import PARTS, without
-
-MOST_PIXELS = 2**20
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
 
@@ -46,6 +45,8 @@ class Source:
     """Makes the capture, parts of some names left out of a scene."""
     scene: Callable[[], Scene] | None = None
     """None for a file."""
+    large: Callable[[Reading], LargeFile | None] = lambda _reading: None
+    """Opens a file of which only windows are read; None where all of it is."""
     name: str = ""
     """Of the scene in `core.scenes`, or of the file."""
     arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
@@ -74,7 +75,7 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
         scene = bare(build(), absent)
         return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
-    return Source(title, load, build, name, arguments)
+    return Source(title, load, build, name=name, arguments=arguments)
 
 
 def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
@@ -82,12 +83,19 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
 
     def read(reading: Reading) -> Capture:
         capture = read_capture(path, **vars(reading))
-        pixels = capture.shape[0] * capture.shape[1]
-        require("pixels", pixels, pixels <= MOST_PIXELS, f"at most {MOST_PIXELS:,} to this page")
+        require_small(path, capture.cube.nbytes)
         return capture
 
+    def load(_light: Light, reading: Reading, _absent: Collection[str]) -> Capture:
+        large = opened(reading)
+        return get(reading) if large is None else large.preview.capture
+
+    @lru_cache(maxsize=1)
+    def opened(reading: Reading) -> LargeFile | None:
+        return open_large(path, vars(reading))
+
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, lambda _light, reading, _absent: get(reading), name=path.name)
+    return Source(title or path.name, load, large=opened, name=path.name)
 
 
 def built_in_sources() -> dict[str, Source]:
@@ -117,6 +125,8 @@ class Request:
     less: Less
     absent: frozenset[str] = frozenset()
     """Parts of the scene and corrections of the estimators that are switched off."""
+    window: Window | None = None
+    """Of a capture larger than memory; None for all of it."""
 
 
 @dataclass(frozen=True)
@@ -129,17 +139,31 @@ class Answer:
     """Seconds spent simulating or reading."""
     whole: Capture
     """What the capture that was ranged is a part of, or that capture itself."""
+    cutout: Cutout | None = None
+    """Of a file larger than memory, what is in memory."""
 
     @property
     def capture(self) -> Capture:
         """The capture that was ranged."""
         return self.run.capture
 
+    @property
+    def grid(self) -> Grid:
+        """Which rows and columns of its file the pixels of the capture are."""
+        if self.cutout is None:
+            return Grid()
+        rows, cols = self.cutout.window.picked
+        less = self.request.less
+        return Grid((rows[0], cols[0]), rows.step).thinned(less.skip, less.pool)
+
 
 def compute(request: Request, previous: Answer | None) -> Answer:
     """Answer a request; what the previous answer already holds is not computed again."""
     started = perf_counter()
-    if previous is None or not same_capture(request, previous.request):
+    cutout = _cutout(request, previous)
+    if cutout is not None:
+        whole = cutout.capture
+    elif previous is None or not same_capture(request, previous.request):
         whole = request.source.load(request.light, request.reading, request.absent)
     else:
         whole = previous.whole
@@ -156,12 +180,22 @@ def compute(request: Request, previous: Answer | None) -> Answer:
                 capture = without_correction(capture, name)
         posterior_of(capture)  # what every answer's confidence rests on, whatever the method
         capture_s = perf_counter() - started
-    return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole)
+    return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole, cutout)
+
+
+def _cutout(request: Request, previous: Answer | None) -> Cutout | None:
+    """What is looked at of a file larger than memory; of its preview, as much as has been read."""
+    if previous is None or not same_capture(request, previous.request):
+        large = request.source.large(request.reading)
+        return None if large is None else large.cutout(request.window)
+    if previous.cutout is None or request.window is not None:
+        return previous.cutout
+    return previous.cutout.file.preview
 
 
 def same_subject(one: Request, other: Request) -> bool:
     """Whether both look at the same scene in the same light, or the same file, part or no part."""
-    return _same(one, other, "source", "light", "reading")
+    return _same(one, other, "source", "light", "reading", "window")
 
 
 def same_capture(one: Request, other: Request) -> bool:
@@ -171,7 +205,7 @@ def same_capture(one: Request, other: Request) -> bool:
 
 def same_view(one: Request, other: Request) -> bool:
     """Whether the answers to both show the same pixels and bins, in whatever light."""
-    return _same(one, other, "source", "reading", "less")
+    return _same(one, other, "source", "reading", "less", "window")
 
 
 def _same(one: Request, other: Request, *names: str) -> bool:

@@ -21,11 +21,18 @@ Result = TypeVar("Result")
 class WorkControls:
     """Buttons that start and cancel long work, a bar, and a sentence on how far it is."""
 
-    def __init__(self, start: Callable[[], None], cancel: Callable[[], None], noun: str) -> None:
+    def __init__(
+        self,
+        start: Callable[[], None],
+        cancel: Callable[[], None],
+        noun: str,
+        label: str = "Compute",
+        help: str = "Compute: begins anew with the settings above.",
+    ) -> None:
         self._noun = noun
         self._start = pmui.Button(
-            label="Compute",
-            description="Compute: begins anew with the settings above.",
+            label=label,
+            description=help,
             size="small",
             margin=(6, 4, 6, 8),
         )
@@ -111,6 +118,8 @@ class OnePiece(Generic[Result]):
         Shows, on the page, what came out.
     noun : str
         What its progress counts.
+    **start : str
+        ``label`` and ``help`` of the button that starts it.
     """
 
     def __init__(
@@ -119,12 +128,13 @@ class OnePiece(Generic[Result]):
         work: Callable[[], Work[Result]],
         draw: Callable[[Result], None],
         noun: str,
+        **start: str,
     ) -> None:
         self._session = session
         self._work = work
         self._draw = draw
         self._jobs: LatestWins[Result] = LatestWins(session.on_page, LONG)
-        self._controls = WorkControls(self.start, self.cancel, noun)
+        self._controls = WorkControls(self.start, self.cancel, noun, **start)
         self._run = _Run()
 
     @property
@@ -132,11 +142,11 @@ class OnePiece(Generic[Result]):
         """Buttons, bar and sentence."""
         return self._controls.layout
 
-    def start(self) -> None:
-        """Begin anew; what is under way ends without an answer."""
+    def start(self, work: Work[Result] | None = None) -> None:
+        """Begin anew, with other work than the button's if told; what is under way ends."""
+        work, page = work or self._work(), self._session
         self.cancel()
         run = self._run = _Run(is_running=True)
-        work, page = self._work(), self._session
 
         def told(done: int, of: int) -> None:
             run.done, run.of = done, of

@@ -13,6 +13,7 @@ import panel as pn
 from bokeh.events import DoubleTap, Tap
 from bokeh.models import (
     BasicTicker,
+    BoxZoomTool,
     ColorBar,
     CustomJS,
     CustomJSTickFormatter,
@@ -23,6 +24,7 @@ from bokeh.models import (
 from numpy.typing import ArrayLike, NDArray
 
 from app import plots
+from app.large import Grid
 from app.looks import Look
 from app.store import Pixel
 from app.theme import LIGHT, SIZES, Palette
@@ -251,7 +253,7 @@ class ImageView:
         self._plot = Plot(
             plots.range_image(np.zeros((2, 2)), 0.0, 1.0), ("picture", "shadow", "frame")
         )
-        self._shape = (0, 0)
+        self._shape, self._grid = (0, 0), Grid()
         self.figure = self._plot.figure
         self.pane = pane_of(self.figure)
         self.figure.match_aspect = True
@@ -262,13 +264,20 @@ class ImageView:
             ranges.renderers = [picture["glyph_renderer"]]
         self._mapper = picture["color_mapper"]
         (self._bar,) = self.figure.select(ColorBar)
+        (zoom,) = self.figure.select(BoxZoomTool)
+        zoom.match_aspect = True
+        self.figure.toolbar.active_drag = (
+            zoom  # HoloViews adds others, of which Bokeh takes the first
+        )
 
         def tap(event: Tap) -> None:
-            row, col = math.floor(event.y + 0.5), math.floor(event.x + 0.5)
+            row, col = self._grid.pixel(event.y, event.x)
             if 0 <= row < self._shape[0] and 0 <= col < self._shape[1]:
                 tapped(row, col)
 
         self.figure.on_event(Tap, tap)
+        reset = CustomJS(args={"figure": self.figure}, code="figure.reset.emit()")
+        self.figure.js_on_change("tags", reset)
 
     def join(self, first: ImageView) -> None:
         """Become one of several side by side, with one view, and one scale that stands by them."""
@@ -285,12 +294,19 @@ class ImageView:
         """Take on the colours of the mode."""
         paint_frame(self.figure, colors)
 
-    def enter(self, rows: int, cols: int) -> None:
-        """Make room for an image of another size."""
-        self._shape = (rows, cols)
+    def enter(self, rows: int, cols: int, grid: Grid = Grid()) -> None:  # noqa: B008 - frozen
+        """Make room for another image, and show all of it."""
+        self._shape, self._grid = (rows, cols), grid
         blank = [np.full((rows, cols), np.nan, np.float32)]
-        corner = {"x": [-0.5], "y": [-0.5], "dw": [cols], "dh": [rows]}
-        self._plot.source("picture").data = {"image": blank, **corner}
+        left, above, *_ = plots.pixel_frame(*grid.place(0, 0), grid.step, 0.5)
+        size = {"dw": [cols * grid.step], "dh": [rows * grid.step]}
+        self._plot.source("picture").data = {"image": blank, "x": [left], "y": [above], **size}
+        self.figure.tags = [
+            *grid.first,
+            grid.step,
+            rows,
+            cols,
+        ]  # which ends a zoom
 
     def update(self, image: Array, look: Look) -> None:
         """Show an image (row, col); NaN is left blank."""
@@ -307,6 +323,7 @@ class ImageView:
 
     def mark(self, row: int, col: int) -> None:
         """Frame a pixel."""
-        left, bottom, right, top = plots.pixel_frame(row, col)
+        place = self._grid.place(row, col)
+        left, bottom, right, top = plots.pixel_frame(*place, self._grid.step)
         for layer in ("shadow", "frame"):
             self._plot.write(layer, left=[left], bottom=[bottom], right=[right], top=[top])

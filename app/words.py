@@ -71,8 +71,9 @@ def pixel_numbers(answer: Answer, pixel: Pixel) -> list[Fact]:
     tracking, sigma = answer.request.tracking, float(pixel.signals.sigma)
     n_pulses = answer.capture.armed_pulses
     r_small = tracking.l * sigma
+    row, col = answer.grid.place(pixel.row, pixel.col)
     entries = [
-        ("Pixel", f"row {pixel.row}, col {pixel.col}", "Arrow keys on the image move it."),
+        ("Pixel", f"row {row}, col {col}", "Arrow keys on the image move it."),
         ("Estimate", number(pixel.range_m, "m"), "Range of the surface, lag removed."),
     ]
     if answer.capture.truth_range_m is not None:

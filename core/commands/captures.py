@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from core.acquisition import Acquisition, Pulse
+from core.acquisition import Acquisition
 from core.capture import Capture, Seen
 from core.checks import require
 from core.commands.options import (
@@ -38,9 +38,9 @@ from core.export import (
 )
 from core.parameters import Number, doubts, spec_of
 from core.pipeline import run
-from core.readers import READERS, open_capture, read_capture
+from core.readers import READERS, bytes_of, open_capture, read_capture
 from core.readers.guards import MAX_CUBE_BYTES
-from core.readers.labelled import LAZY, describe
+from core.readers.labelled import describe
 from core.readers.request import Request
 from core.scene import Scene, scenes
 from core.scene_files import read_scene
@@ -176,11 +176,8 @@ def _estimate(chosen: argparse.Namespace) -> None:
 
 
 def _exceeds_memory(chosen: argparse.Namespace) -> bool:
-    if chosen.capture is None or chosen.capture.suffix.lower() not in LAZY:
-        return False
-    # With nothing left to guess, nothing is read.
-    told = reading(chosen) | {"pulse": Pulse(), "detection": "all"}
-    return bool(open_capture(chosen.capture, **told).nbytes > MAX_CUBE_BYTES)
+    n_bytes = chosen.capture and bytes_of(chosen.capture, **reading(chosen))
+    return n_bytes is not None and n_bytes > MAX_CUBE_BYTES
 
 
 def _ranged_at_once(

@@ -20,7 +20,7 @@ from core.readers.request import Request
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["MAX_CUBE_BYTES", "READERS", "open_capture", "read_capture"]
+__all__ = ["MAX_CUBE_BYTES", "READERS", "bytes_of", "open_capture", "read_capture"]
 
 READERS: dict[str, Callable[[Path, Request], Capture]] = {
     ".npz": npz.read,
@@ -164,6 +164,20 @@ def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
         if _suffix(path) in labelled.LAZY:
             return labelled.open_counts(path, request)
         return labelled.dataset(READERS[_suffix(path)](path, request))["counts"]
+
+
+def bytes_of(path: str | os.PathLike[str], **options: Any) -> int | None:
+    """Bytes of all counts of a file, of which none is read; None where they would have to be.
+
+    Parameters
+    ----------
+    path, **options
+        As of `open_capture`, which raises the same.
+    """
+    if Path(path).suffix.lower() not in labelled.LAZY:
+        return None
+    # With nothing left to guess, nothing is read.
+    return int(open_capture(path, **options | {"pulse": Pulse(), "detection": "all"}).nbytes)
 
 
 def _suffix(path: Path) -> str:

@@ -307,7 +307,8 @@ def _blocks(counts: Counts, time_axis: int) -> tuple[int, ...]:
     for axis in reversed(range(len(block))):
         n_bytes = prod(block) * counts.dtype.itemsize
         block[axis] = min(counts.shape[axis], block[axis] * max(1, BLOCK_BYTES // n_bytes))
-    require_fits(f"a block of {counts.name} with all its bins", prod(block) * counts.dtype.itemsize)
+    what, remedy = f"a block of {counts.name} with all its bins", "chunks of fewer pixels"
+    require_fits(what, prod(block) * counts.dtype.itemsize, remedy)
     return tuple(block)
 
 
