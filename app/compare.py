@@ -102,7 +102,7 @@ class Compare:
         self._make_controls()
         self._make_views()
         self._enter()
-        session.state.param.watch(lambda _: self._choose_pixel(), "pixel")
+        session.state.param.watch(lambda *_: self._choose_pixel(), ["pixel", "unit"])
 
     @property
     def view(self) -> View:
@@ -516,4 +516,5 @@ class Compare:
                 float(acquisition.range_m_to_bin(truth)),
                 acquisition,
                 self._styles(),
+                self._session.state.unit,
             )

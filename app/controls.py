@@ -138,7 +138,6 @@ class Facts(JSComponent):
 
     facts = param.List(default=[], doc="Name, value and one line of help, each a string.")
     timed = param.Boolean(default=False, doc="Whether the page adds how long its drawing took.")
-    narrow = param.Boolean(default=False, doc="Whether the page is as narrow as a phone.")
 
     _esm = Path(__file__).with_name("facts.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("facts.css")]
@@ -197,6 +196,31 @@ class Sentence(JSComponent):
     ]
 
 
+class Viewport(JSComponent):
+    """How wide the page is; nothing is to be seen of it."""
+
+    narrow = param.Boolean(default=False, doc="Whether that is as narrow as a phone.")
+
+    _esm = """
+    export function render({ model }) {
+      model.narrow = window.innerWidth < 900;
+      return document.createElement("div");
+    }
+    """
+
+
+class Chips(JSComponent):
+    """Small labels, each with a colour, a button of its text, and one that removes it."""
+
+    label = param.String(default="", doc="What a screen reader says of them.")
+    chips = param.List(default=[], doc="Of each chip its key, text and colour.")
+    chosen = param.List(default=[], doc="Key of the chip that was pressed, and when.")
+    removed = param.List(default=[], doc="Key of the chip that was removed, and when.")
+
+    _esm = Path(__file__).with_name("chips.js")
+    _stylesheets: ClassVar = [Path(__file__).with_name("chips.css")]
+
+
 class PixelKeys(JSComponent):
     """Holds a picture that takes the keyboard: arrow keys move the pixel, with Shift by eight.
 
@@ -212,6 +236,8 @@ class PixelKeys(JSComponent):
         default="Range image. Arrow keys move the pixel on show, with Shift by eight.",
         doc="What a screen reader says of the picture.",
     )
+    letters = param.String(default="", doc="Further keys that are reported.")
+    pressed = param.List(default=[], doc="The letter that was pressed, and when.")
 
     _esm = """
     export function render({ model, el }) {
@@ -240,7 +266,11 @@ class PixelKeys(JSComponent):
       describe();
       const moves = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
       root.addEventListener("keydown", (event) => {
-        const move = moves[event.key];
+        const [move, letter] = [moves[event.key], event.key.toLowerCase()];
+        const isBare = !(event.ctrlKey || event.metaKey || event.altKey);
+        if (letter.length === 1 && model.letters.includes(letter) && isBare) {
+          model.pressed = [letter, Date.now()];
+        }
         if (!move) return;
         event.preventDefault();
         const step = event.shiftKey ? 8 : 1;

@@ -34,7 +34,6 @@ export function render({ model }) {
     requestAnimationFrame(() => painted.port2.postMessage(null));
   };
   model.on("facts", show);
-  model.narrow = window.innerWidth < 900;
   show();
   return root;
 }

@@ -15,7 +15,8 @@ from app import words
 from app.address import AddressBar, Wanted
 from app.compare import Compare
 from app.connection import Connection
-from app.controls import Sentence, SettingsPanel
+from app.controls import Sentence, SettingsPanel, Viewport
+from app.inspector import Inspector
 from app.large_view import LargeView
 from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
@@ -55,7 +56,15 @@ THEME = {
         "typography": {"fontSize": 13},
         "components": {
             "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": bar, "color": "#ffffff"}}},
-            "MuiToolbar": {"styleOverrides": {"root": {"minHeight": "48px !important"}}},
+            "MuiToolbar": {
+                "styleOverrides": {
+                    "root": {
+                        "minHeight": "48px !important",
+                        # On a phone the buttons need the room.
+                        "@media (max-width: 500px)": {"& .title": {"display": "none"}},
+                    }
+                }
+            },
         },
     }
     for mode, main, bar, page, paper in (
@@ -63,6 +72,7 @@ THEME = {
         ("dark", "#4fb3cb", "#0c3a48", "#0f141a", DARK.paper),
     )
 }
+AS_WRITTEN = {"& .MuiToggleButton-root": {"textTransform": "none", "padding": "3px 8px"}}
 IN_THE_BAR = {
     "& .MuiToggleButton-root": {
         "color": "#ffffff",
@@ -138,6 +148,7 @@ class Layout:
         wanted, self._uploads = wanted or Wanted({}), uploads or Uploads()
         session = self.session = Session(self._with_upload(sources, wanted.source), wanted)
         state = session.state
+        self._viewport = Viewport(margin=0)
         self._alert = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
         self._provenance = Sentence(sizing_mode="stretch_width", margin=(4, 12))
         self._progress = pmui.LinearProgress(
@@ -160,7 +171,9 @@ class Layout:
         )
         self._light = SettingsPanel(Light(), lambda new: state.param.update(light=new))
         self._viewing = SettingsPanel(Viewing(), lambda new: state.param.update(viewing=new))
-        self._tracking = SettingsPanel(TrackingParameters(), self._tracking_changed)
+        self._tracking = SettingsPanel(
+            TrackingParameters(), lambda new: state.param.update(tracking=new)
+        )
         self._less = SettingsPanel(Less(), lambda new: state.param.update(less=new))
         self._preset = select(
             "Preset",
@@ -180,6 +193,11 @@ class Layout:
         }
         self._light.show(state.light)
         self._tracking.show(state.tracking)
+        unit = choice(words.UNIT_HELP, state.param.unit)
+        unit.param.update(
+            label="Gate axes in", sx=AS_WRITTEN, sizing_mode="stretch_width", margin=(4, 8)
+        )
+        self._unit = unit
         self._announced: Source | None = None
         self._address = AddressBar()
         self._takeaway = TakeAway(
@@ -189,12 +207,15 @@ class Layout:
         self.pages = Pages(
             {
                 "Explore": self._explore,
+                "Inspect": lambda: Inspector(session).view,
                 "Compare": lambda: self._compare.view,
                 "Trade-off": lambda: Tradeoff(session, self._open_point).view,
                 "Paper": lambda: Paper(session, self._put_away).view,
             },
             label="",
+            first=state.page,
         )
+        self.pages.choice.link(state, value="page", bidirectional=True)
         self.pages.choice.param.update(sx=IN_THE_BAR, margin=(0, 0, 0, 8))
         self.page = self._build()
         self._announce(session.answer)
@@ -210,11 +231,12 @@ class Layout:
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._file.param.watch(lambda event: self._upload(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
+        session.state.param.watch(lambda event: self._show_tracking(event.new), "tracking")
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if session.is_served:
             let_pages_come(session.page)
             # On a phone the controls would cover what they control.
-            pn.state.onload(lambda: self.page.param.update(sidebar_open=not session.figures.narrow))
+            pn.state.onload(lambda: self.page.param.update(sidebar_open=not self._viewport.narrow))
             pn.state.on_session_destroyed(lambda _: self._forget())
             pn.config.exception_handler = session.fail  # of this session alone
 
@@ -262,7 +284,7 @@ class Layout:
     def _put_away(self, is_away: bool) -> None:
         """Put away what belongs to the session's capture, or bring it back."""
         self._provenance.visible = not is_away
-        self.page.sidebar_open = not (is_away or self.session.figures.narrow)
+        self.page.sidebar_open = not (is_away or self._viewport.narrow)
 
     # What the user does
 
@@ -281,8 +303,6 @@ class Layout:
         self._announced = None  # how a file is read may be another
         if candidate.method.estimator == "tracking":
             state.param.update(tracking=candidate.settings, **seen)
-            self._tracking.show(candidate.settings)
-            self._preset.value = _preset_of(candidate.settings)
             self.pages.choice.value = "Explore"
         else:
             state.param.update(**seen)
@@ -295,13 +315,12 @@ class Layout:
                 source=key, reading=Reading(), less=Less(), absent=frozenset(), window=None
             )
 
-    def _tracking_changed(self, settings: TrackingParameters) -> None:
+    def _show_tracking(self, settings: TrackingParameters) -> None:
+        self._tracking.show(settings)
         self._preset.value = _preset_of(settings)
-        self.session.state.tracking = settings
 
     def _preset_changed(self, name: str) -> None:
         if name in PRESETS:
-            self._tracking.show(PRESETS[name])
             self.session.state.tracking = PRESETS[name]
 
     def _upload(self, content: bytes | None) -> None:
@@ -316,6 +335,7 @@ class Layout:
         self.session.sources = self._with_upload(self.session.sources, key)
         self._source.options = self._titles()
         self._source.value = key
+        self.session.state.page = "Inspect"
 
     def _read_again(self) -> None:
         try:
@@ -336,6 +356,7 @@ class Layout:
         head = pn.Column(
             self._address,
             self._connection,
+            self._viewport,
             self._progress,
             self._alert,
             sizing_mode="stretch_width",
@@ -361,6 +382,7 @@ class Layout:
         return [
             self._source,
             self._file,
+            self._unit,
             *others,
             self._light_card,
             self._reading_card,

@@ -13,10 +13,17 @@ from app.cloud import point_cloud
 from app.state import Viewing
 from app.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS, OUTSIDE_COLOR, RANGE_COLORS
+from core import inspection
 
 Array = NDArray[Any]
 
 ERROR_SCALE_BINS = 5
+
+MAP_TITLES = {
+    "Peak": "Largest count of each pixel",
+    "Fired": "Share of the pulses that fired",
+    "SBR": "Signal over background, as the counts tell",
+}
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,16 @@ def image_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array,
         return truth_m, _range_look(answer, "True range")
     range_m = np.where(shown(answer, least_confidence), image.range_m, np.nan)
     return range_m, _range_look(answer, "Estimated range")
+
+
+def map_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array, Look]:
+    """The image (row, col) of one of `app.state.MAPS`, NaN where there is nothing, and its look."""
+    if kind not in inspection.maps:
+        return image_of(answer, kind, least_confidence)
+    values = inspection.maps[kind](answer.capture)
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, [1, 99]).tolist() if known.size else (0.0, 1.0)
+    return values, Look(MAP_TITLES[kind], "", low, max(high, low + 1e-6), COUNT_COLORS)
 
 
 def color_values(answer: Answer, kind: str) -> tuple[Array, Look]:

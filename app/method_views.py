@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from app import plots
 from app.cloud import PointCloud
 from app.controls import Sentence
+from app.gate import GateAxes
 from app.looks import Look
 from app.store import Answer
 from app.theme import LIGHT, WRONG_COLOR, Palette
-from app.views import ImageView, MetreAxis, Plot, paint_frame, pane_of
+from app.views import ImageView, Plot, paint_frame, pane_of
 from core import ESTIMATORS, Acquisition
 
 Array = NDArray[Any]
@@ -168,7 +169,7 @@ class CurvePlot:
         drawing = self._plot.figure
         drawing.x_range, drawing.y_range = Range1d(0, 1), Range1d(0, 1)
         drawing.min_border_left, drawing.min_border_right = 46, 14
-        self._metres = MetreAxis(drawing)
+        self._axes = GateAxes(drawing)
         renderer = self._plot.layers["lines"]["glyph_renderer"]
         drawing.legend[0].items.insert(
             0, LegendItem(label={"field": "title"}, renderers=[renderer])
@@ -183,12 +184,13 @@ class CurvePlot:
         truth_bin: float,
         acquisition: Acquisition,
         styles: Mapping[str, Style],
+        unit: str,
     ) -> None:
         """Show a pixel: curves (bin,), answers in bins and lines' styles, by method."""
         plot, bins = self._plot, self._plot.figure.x_range
         if bins.end != acquisition.n_bins:
             bins.update(end=acquisition.n_bins, reset_end=acquisition.n_bins)
-        self._metres.follow(acquisition)
+        self._axes.follow(unit, acquisition)
         centres = plots.centres(acquisition.n_bins)
         self._lines.update({method: (centres, curve) for method, curve in curves.items()}, styles)
         lowest = min((float(curve.min()) for curve in curves.values()), default=0.0)

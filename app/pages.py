@@ -63,20 +63,24 @@ class Pages:
     Parameters
     ----------
     builders : mapping of str to callable
-        What builds each page, by the name on its button; the first one is opened at once.
+        What builds each page, by the name on its button.
     label, help : str
         What the buttons choose, and a sentence about it.
     orientation : {"horizontal", "vertical"}
         How the buttons stand.
+    first : str, optional
+        The page that is opened at once; the first of all if not given.
     """
 
     def __init__(
         self,
         builders: Mapping[str, Callable[[], View]],
         label: str = "Page",
-        help: str = "Explore looks into one method, Compare puts methods side by side, Trade-off "
-        "measures speed against accuracy, Paper computes what the paper prints.",
+        help: str = "Explore looks into one method, Inspect into any pixel of a capture, Compare "
+        "puts methods side by side, Trade-off measures speed against accuracy, Paper computes what "
+        "the paper prints.",
         orientation: str = "horizontal",
+        first: str | None = None,
     ) -> None:
         self._builders = builders
         self._built: dict[str, View] = {}
@@ -85,7 +89,7 @@ class Pages:
         self.asides = {name: _holder(margin=0) for name in builders}
         self.choice = pmui.RadioButtonGroup(
             options=list(builders),
-            value=next(iter(builders)),
+            value=first or next(iter(builders)),
             label=label,
             description=help,
             orientation=orientation,

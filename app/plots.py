@@ -175,15 +175,9 @@ def range_image(image: Array, low: float, high: float) -> hv.Overlay:
     )
 
 
-def pixel_frame(
-    row: int, col: int, step: int = 1, reach: float = 1.5
-) -> tuple[float, float, float, float]:
-    """Left, bottom, right and top of a frame around a pixel that leaves the pixel itself free.
-
-    Pixels stand `step` apart; the frame, `reach` times as far from the middle of its own.
-    """
-    away = reach * step
-    return col - away, row - away, col + away, row + away
+def pixel_frame(row: int, col: int, half: float = 1.5) -> tuple[float, float, float, float]:
+    """Left, bottom, right and top of a frame around a pixel that leaves the pixel itself free."""
+    return col - half, row - half, col + half, row + half
 
 
 def score_curves(colors: Palette) -> hv.Overlay:

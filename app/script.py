@@ -157,8 +157,13 @@ def _saved(file: str, **options: str) -> str:
 
 
 def _inspected(state: State) -> Lines:
-    pixel = ("capture", "image", "row", "col", '"tracking"', "settings")
-    yield _assign("report", "core.inspection.pixel_report", *pixel)
+    by = ('"tracking"', "settings")
+    if state.subject == "Pixel":
+        pixel = ("capture", "image", "row", "col", *by)
+        yield _assign("report", "core.inspection.pixel_report", *pixel)
+    if state.subject == "Capture":
+        yield "\n# The capture as a whole."
+        yield _assign("report", "core.inspection.capture_report", "capture")
     if state.pins:
         yield "\n# The pinned pixels."
         yield "pinned = {}"
@@ -168,7 +173,7 @@ def _inspected(state: State) -> Lines:
         yield "\n# The region."
         yield _assign("corners", "", *map(_literal, state.region))
         yield _assign("mask", "core.inspection.pixels_in", "corners", "capture.shape")
-        region = ("capture", "image", "mask", '"tracking"', "settings")
+        region = ("capture", "image", "mask", *by)
         yield _assign("region", "core.inspection.region_report", *region)
 
 

@@ -20,8 +20,8 @@ from app.cloud import PointCloud, ply_bytes
 from app.controls import Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
-from app.state import CLOUD_COLORS, IMAGES, NEED_TRUTH, Comparison, State, Viewing
-from app.store import Answer, Request, Source, compute, inspect, same_view
+from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State, Viewing
+from app.store import Answer, Request, Source, compute, inspect, same_pixels, same_view
 from app.theme import WRONG_COLOR, palette
 from app.views import ImageView, SignalPlots
 
@@ -54,8 +54,6 @@ class Session:
     ----------
     own_field_of_view_deg : float
         The field of view that suits the present capture.
-    own : dict
-        Values of the state that the server and the present capture bring with them.
     refused : list of str
         A sentence on each thing that the address asked for in vain.
     announce : callable
@@ -69,8 +67,10 @@ class Session:
     def __init__(self, sources: Mapping[str, Source], wanted: Wanted | None = None) -> None:
         wanted = wanted or Wanted({})
         self.sources = dict(sources)
-        self.own: dict[str, Any] = {"source": next(iter(sources))}
-        self.state = State(**self.own)
+        key, first = next(iter(self.sources.items()))
+        # Who brings a file wants to look into it.
+        self._own = {"source": key, "page": "Explore" if first.is_scene else "Inspect"}
+        self.state = State(**self._own)
         self.signals = SignalPlots()
         self.image = ImageView(self.choose_pixel)
         self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
@@ -84,9 +84,9 @@ class Session:
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._rest_is_due = False
-        self._is_hidden = self._is_outdated = False
         self._asked_s: float | None = None
         self.answer = self._first_answer(wanted)
+        self._is_hidden, self._is_outdated = self.state.page != "Explore", False
         self._show(self.answer, first=True)
         self._watch()
         self._return_to(wanted)
@@ -103,9 +103,9 @@ class Session:
 
     def _first_answer(self, wanted: Wanted) -> Answer:
         """To what the address asks for; to less of it where that cannot be computed."""
-        before = defaults() | self.own
+        before = defaults() | self._own
         asked = wanted.of({name: before[name] for name in before if name not in BROUGHT})
-        if asked.get("source", self.own["source"]) not in self.sources:
+        if asked.get("source", self._own["source"]) not in self.sources:
             wanted.refused.append(words.source_is_gone(asked["source"]))
             of_it = ("source", "reading", "window", "less")
             asked = {name: each for name, each in asked.items() if name not in of_it}
@@ -123,7 +123,8 @@ class Session:
     def _return_to(self, wanted: Wanted) -> None:
         """To what the address asks for of what the capture brings, and tell what was refused."""
         rows, cols = self.answer.capture.shape
-        brought = wanted.of({name: (defaults() | self.own)[name] for name in BROUGHT})
+        before = defaults() | brought_by(self.answer)
+        brought = wanted.of({name: before[name] for name in BROUGHT})
         asked, row_col = brought.get("pins", ()), brought.pop("pixel", self.state.pixel)
         brought["pins"] = tuple(pin for pin in asked if pin[0] < rows and pin[1] < cols)
         if brought["pins"] != asked:
@@ -135,12 +136,12 @@ class Session:
 
     def query(self) -> str:
         """What the address of a page says that shows what this one does."""
-        return query_of(self.state, self.own)
+        return query_of(self.state, self._own | brought_by(self.answer))
 
     def _watch(self) -> None:
         watch = self.state.param.watch
         watch(lambda *_: self._ask(), list(COMPUTED_FROM))
-        watch(lambda *_: self._draw_pixel(), ["pixel", "difference"])
+        watch(lambda *_: self._draw_pixel(), ["pixel", "difference", "unit"])
         watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
         self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
         self.cloud.param.watch(lambda event: self.pick(event.new), "selected")
@@ -246,7 +247,8 @@ class Session:
     def _show(self, answer: Answer, first: bool = False) -> None:
         previous, self.answer = self.answer, answer
         if first or not same_view(answer.request, previous.request):
-            self._enter(answer, previous)
+            is_another = first or not same_pixels(answer, previous)
+            self._enter(answer, previous, is_another)
         self.complain(words.lack(answer))
         self._draw_pixel()
         if first or not self.is_served:
@@ -256,32 +258,29 @@ class Session:
             self.later(self._draw_rest, REST_MS)
         self._settle(answer)
 
-    def _enter(self, answer: Answer, previous: Answer) -> None:
-        """Come to a capture of another kind: its own pixel, field of view and camera."""
+    def _enter(self, answer: Answer, previous: Answer, is_another: bool) -> None:
+        """Come to a capture of another kind: its own field of view, camera and, maybe, pixel."""
         rows, cols = answer.capture.shape
         self.image_keys.shape = [rows, cols]
         self.image.enter(rows, cols, answer.grid)
         has_truth = answer.capture.truth_range_m is not None
-        for name, kinds in (("image", IMAGES), ("cloud_color", CLOUD_COLORS)):
+        for name, kinds in (("image", IMAGES), ("map", MAPS), ("cloud_color", CLOUD_COLORS)):
             possible = [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
             self.state.param[name].objects = possible
             if getattr(self.state, name) not in possible:
                 setattr(self.state, name, possible[0])
-        self.own_field_of_view_deg = float(f"{_field_of_view_deg(answer):.3g}")
-        own = {"field_of_view_deg": self.own_field_of_view_deg}
-        state, pixel = self.state, _pixel_to_start_with(answer, answer, self.state.pixel)
-        compared = replace(state.comparison.viewing, **own)
-        state.param.update(
-            pixel=_pixel_to_start_with(answer, previous, state.pixel),
-            viewing=replace(state.viewing, **own),
-            comparison=replace(state.comparison, viewing=compared),
-        )
-        first = Comparison()
-        self.own |= {
-            "pixel": pixel,
-            "viewing": Viewing(**own),
-            "comparison": replace(first, viewing=replace(first.viewing, **own)),
+        own, state = brought_by(answer), self.state
+        self.own_field_of_view_deg = own["viewing"].field_of_view_deg
+        as_wide = {"field_of_view_deg": self.own_field_of_view_deg}
+        compared = replace(state.comparison.viewing, **as_wide)
+        chosen: dict[str, Any] = {
+            "viewing": replace(state.viewing, **as_wide),
+            "comparison": replace(state.comparison, viewing=compared),
         }
+        if is_another:
+            pixel = _still(answer, previous, state.pixel) or own["pixel"]
+            chosen |= {"pixel": pixel, "pins": (), "region": ()}
+        state.param.update(**chosen)
 
     def choose_pixel(self, row: int, col: int) -> None:
         """Show another pixel; one outside the image means the nearest inside."""
@@ -300,9 +299,10 @@ class Session:
             return
         row, col = self.state.pixel
         pixel = inspect(self.answer, row, col)
-        numbers = words.pixel_numbers(self.answer, pixel)
+        acquisition, state = self.answer.capture.acquisition, self.state
+        numbers = words.pixel_numbers(self.answer, pixel, state.unit)
         with pn.io.hold(self.page):
-            self.signals.update(pixel, self.answer.capture.acquisition, self.state.difference)
+            self.signals.update(pixel, acquisition, state.difference, state.unit)
             self.image.mark(row, col)
             self.image_keys.pixel = [row, col]
             self.cloud.selected = row * self.answer.capture.shape[1] + col
@@ -340,18 +340,28 @@ class Session:
         return f"{self.key(answer.request.source)} {answer.capture.shape} {acquisition} {part}"
 
 
-def _pixel_to_start_with(
-    answer: Answer, previous: Answer, shown: tuple[int, int]
-) -> tuple[int, int]:
-    """The pixel that was shown before, if it is in another window of the same file.
+def brought_by(answer: Answer) -> dict[str, Any]:
+    """Values of the state that an answer brings with it; others have to be chosen."""
+    as_wide = {"field_of_view_deg": float(f"{_field_of_view_deg(answer):.3g}")}
+    comparison = Comparison()
+    return {
+        "pixel": _pixel_to_start_with(answer),
+        "viewing": Viewing(**as_wide),
+        "comparison": replace(comparison, viewing=replace(comparison.viewing, **as_wide)),
+    }
 
-    Else the answered pixel nearest to the centre, among those that have a target if that is known.
-    """
-    if answer is not previous and answer.cutout is not None and previous.cutout is not None:
-        same = answer.grid.pixel(*previous.grid.place(*shown))
-        inside = all(0 <= at < size for at, size in zip(same, answer.capture.shape, strict=True))
-        if inside and answer.cutout.file is previous.cutout.file:
-            return same
+
+def _still(answer: Answer, previous: Answer, shown: tuple[int, int]) -> tuple[int, int] | None:
+    """The pixel that was shown before, if it is in another window of the same file."""
+    if answer is previous or answer.cutout is None or previous.cutout is None:
+        return None
+    same = answer.grid.pixel(*previous.grid.place(*shown))
+    inside = all(0 <= at < size for at, size in zip(same, answer.capture.shape, strict=True))
+    return same if inside and answer.cutout.file is previous.cutout.file else None
+
+
+def _pixel_to_start_with(answer: Answer) -> tuple[int, int]:
+    """The answered pixel nearest to the centre, among those that have a target if that is known."""
     truth_m = answer.capture.truth_range_m
     image = answer.run.image
     good = image.confidence >= 0.9 if truth_m is None else np.isfinite(truth_m)

@@ -230,6 +230,7 @@ PAGES = ("Explore", "Inspect", "Compare", "Trade-off", "Paper")
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
 UNITS = ("bins", "ns", "m")
+SUBJECTS = ("Pixel", "Region", "Pins", "Capture")
 CLOUD_COLORS = ("Range", "Error", "Counts")
 NEED_TRUTH = ("Truth", "Error")
 
@@ -307,6 +308,7 @@ class State(param.Parameterized):
     page = param.Selector(default="Explore", objects=list(PAGES))
     unit = param.Selector(default="bins", objects=list(UNITS), doc="Of each axis along the gate.")
     map = param.Selector(default="Estimate", objects=list(MAPS), doc="What one navigates by.")
+    subject = param.Selector(default="Pixel", objects=list(SUBJECTS), doc="What is inspected.")
     pins: Any = Checked((), _check_pins, doc="Up to four pixels (row, col) to compare.")
     region: Any = Checked(
         (),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from time import perf_counter
@@ -174,10 +174,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
     ):
         capture, capture_s = previous.capture, previous.capture_s
     else:
-        capture = request.less.reduction(whole.acquisition.n_bins).of(whole)
-        for name in CORRECTIONS:
-            if name in request.absent:
-                capture = without_correction(capture, name)
+        capture = reduced(whole, request)
         posterior_of(capture)  # what every answer's confidence rests on, whatever the method
         capture_s = perf_counter() - started
     return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole, cutout)
@@ -193,6 +190,15 @@ def _cutout(request: Request, previous: Answer | None) -> Cutout | None:
     return previous.cutout.file.preview
 
 
+def reduced(whole: Capture, request: Request) -> Capture:
+    """As much of a capture as is asked for, some corrections switched off."""
+    capture = request.less.reduction(whole.acquisition.n_bins).of(whole)
+    for name in CORRECTIONS:
+        if name in request.absent:
+            capture = without_correction(capture, name)
+    return capture
+
+
 def same_subject(one: Request, other: Request) -> bool:
     """Whether both look at the same scene in the same light, or the same file, part or no part."""
     return _same(one, other, "source", "light", "reading", "window")
@@ -205,7 +211,14 @@ def same_capture(one: Request, other: Request) -> bool:
 
 def same_view(one: Request, other: Request) -> bool:
     """Whether the answers to both show the same pixels and bins, in whatever light."""
-    return _same(one, other, "source", "reading", "less", "window")
+    seen = (replace(each.less, pulses=1.0) for each in (one, other))
+    return _same(one, other, "source", "reading", "window") and len({*seen}) == 1
+
+
+def same_pixels(one: Answer, other: Answer) -> bool:
+    """Whether a row and a column mean the same in both."""
+    same_source = one.request.source is other.request.source
+    return same_source and one.capture.shape == other.capture.shape and one.grid == other.grid
 
 
 def _same(one: Request, other: Request, *names: str) -> bool:

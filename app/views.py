@@ -16,14 +16,13 @@ from bokeh.models import (
     BoxZoomTool,
     ColorBar,
     CustomJS,
-    CustomJSTickFormatter,
     DataRange1d,
-    LinearAxis,
     Range1d,
 )
 from numpy.typing import ArrayLike, NDArray
 
 from app import plots
+from app.gate import GateAxes, GateReadOut
 from app.large import Grid
 from app.looks import Look
 from app.store import Pixel
@@ -112,31 +111,14 @@ def paint_frame(figure: Any, colors: Palette) -> None:
         bar.title_text_color = bar.major_label_text_color = colors.muted
 
 
-class MetreAxis:
-    """Metres along the top of a plot over bins."""
-
-    def __init__(self, figure: Any) -> None:
-        self._formatter = CustomJSTickFormatter(
-            args={"start": 0.0, "step": 1.0}, code="return (start + step * tick).toFixed(1)"
-        )
-        axis = LinearAxis(formatter=self._formatter, axis_label="Range (m)")
-        figure.add_layout(axis, "above")
-
-    def follow(self, acquisition: Acquisition) -> None:
-        """Take on another gate."""
-        start, step = float(acquisition.bin_to_range_m(0)), acquisition.bin_length_m
-        self._formatter.args = {"start": start, "step": step}
-
-
 class SignalPlots:
-    """The pixel's three plots, linked on the bin axis, with metres along the top of the first."""
+    """The pixel's three plots, linked along the gate."""
 
     def __init__(self) -> None:
         one = np.zeros(1)
         self.histogram = Plot(plots.histogram(one, one, one, one, LIGHT), plots.HISTOGRAM_LAYERS)
         self.residual = Plot(plots.residual(one, one, LIGHT), plots.RESIDUAL_LAYERS)
         self.enhanced = Plot(plots.enhanced(one, one, LIGHT), plots.ENHANCED_LAYERS)
-        self._acquisition: Acquisition | None = None
         self._bins = Range1d(0, 1)
         for plot in self._plots:
             figure = plot.figure
@@ -144,7 +126,25 @@ class SignalPlots:
             figure.min_border_left, figure.min_border_right = 46, 14
             figure.min_border_top = figure.min_border_bottom = 4
             figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
-        self._metres = MetreAxis(self.histogram.figure)
+        # The second axis once: the plots stand above each other.
+        self._axes = [GateAxes(plot.figure, plot is self.histogram) for plot in self._plots]
+        raw = ("Counts", self.histogram.source("raw"), "top")
+        small, large = (
+            (f"{name} scale".capitalize(), self.histogram.source(name), "counts")
+            for name in ("small", "large")
+        )
+        rest = (
+            ("Residual", self.residual.source("residual"), "residual"),
+            ("Enhanced", self.enhanced.source("enhanced"), "enhanced"),
+        )
+        self._read_outs = [
+            GateReadOut(plot.figure, plot.layers[layer]["glyph_renderer"], rows)
+            for plot, layer, rows in (
+                (self.histogram, "raw", (raw, small, large)),
+                (self.residual, "residual", rest),
+                (self.enhanced, "enhanced", rest),
+            )
+        ]
 
     @property
     def panes(self) -> list[pn.pane.Bokeh]:
@@ -160,10 +160,16 @@ class SignalPlots:
         for plot in self._plots:
             plot.paint(colors)
 
-    def update(self, pixel: Pixel, acquisition: Acquisition, with_difference: bool) -> None:
-        """Show a pixel."""
-        if acquisition != self._acquisition:
-            self._follow(acquisition)
+    def update(
+        self, pixel: Pixel, acquisition: Acquisition, with_difference: bool, unit: str = "bins"
+    ) -> None:
+        """Show a pixel, positions in a unit."""
+        for axes in self._axes:
+            axes.follow(unit, acquisition)
+        for read_out in self._read_outs:
+            read_out.follow(acquisition)
+        if acquisition.n_bins != self._bins.reset_end:
+            self._follow(acquisition.n_bins)
         signals, nothing = pixel.signals, np.full(acquisition.n_bins, np.nan)
         expected = nothing if pixel.expected is None else pixel.expected
         self.histogram.write("raw", top=signals.raw)
@@ -186,12 +192,9 @@ class SignalPlots:
         self.enhanced.write("weight", enhanced=weight)
         self._frame(self.enhanced, pixel, 0.0, signals.enhanced, weight)
 
-    def _follow(self, acquisition: Acquisition) -> None:
-        """Lay out the axes for another gate."""
-        self._acquisition = acquisition
-        n_bins = acquisition.n_bins
+    def _follow(self, n_bins: int) -> None:
+        """Lay out the plots for another number of bins."""
         self._bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
-        self._metres.follow(acquisition)
         edges, centres = plots.edges(n_bins), plots.centres(n_bins)
         empty = np.zeros(n_bins)
         bars = {"left": edges[:-1], "right": edges[1:], "top": empty, "bottom": empty}
@@ -298,7 +301,7 @@ class ImageView:
         """Make room for another image, and show all of it."""
         self._shape, self._grid = (rows, cols), grid
         blank = [np.full((rows, cols), np.nan, np.float32)]
-        left, above, *_ = plots.pixel_frame(*grid.place(0, 0), grid.step, 0.5)
+        left, above, *_ = plots.pixel_frame(*grid.place(0, 0), 0.5 * grid.step)
         size = {"dw": [cols * grid.step], "dh": [rows * grid.step]}
         self._plot.source("picture").data = {"image": blank, "x": [left], "y": [above], **size}
         self.figure.tags = [
@@ -321,9 +324,15 @@ class ImageView:
         self._bar.title = look.unit
         self.figure.title.text = look.title
 
+    @property
+    def half_frame(self) -> float:
+        """Half the side of a frame, in pixels: large enough to be seen in a large image."""
+        return max(1.5, 0.014 * max(self._shape))
+
     def mark(self, row: int, col: int) -> None:
         """Frame a pixel."""
         place = self._grid.place(row, col)
-        left, bottom, right, top = plots.pixel_frame(*place, self._grid.step)
+        half = self.half_frame * self._grid.step
+        left, bottom, right, top = plots.pixel_frame(*place, half)
         for layer in ("shadow", "frame"):
             self._plot.write(layer, left=[left], bottom=[bottom], right=[right], top=[top])

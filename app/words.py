@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from app.gate import scale
 from app.store import Answer, Pixel
 from core.experiments.requirement import TITLES
 
@@ -19,6 +20,8 @@ FIELD_OF_VIEW_UNKNOWN = (
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
 
 COMPUTING = "Computing …"
+
+UNIT_HELP = "What axes and read-outs along the gate count in: bins, nanoseconds or metres."
 
 EXPLANATION = """
 **What is seen.** Each pixel sends pulses and keeps only the *first* photon of each. In daylight
@@ -66,8 +69,8 @@ def figure_strip(answer: Answer) -> list[Fact]:
     return strip
 
 
-def pixel_numbers(answer: Answer, pixel: Pixel) -> list[Fact]:
-    """Name, value and help of each number of a pixel."""
+def pixel_numbers(answer: Answer, pixel: Pixel, unit: str = "bins") -> list[Fact]:
+    """Name, value and help of each number of a pixel; positions along the gate in a unit."""
     tracking, sigma = answer.request.tracking, float(pixel.signals.sigma)
     n_pulses = answer.capture.armed_pulses
     r_small = tracking.l * sigma
@@ -76,6 +79,9 @@ def pixel_numbers(answer: Answer, pixel: Pixel) -> list[Fact]:
         ("Pixel", f"row {row}, col {col}", "Arrow keys on the image move it."),
         ("Estimate", number(pixel.range_m, "m"), "Range of the surface, lag removed."),
     ]
+    if unit != "m":
+        place = scale(unit, answer.capture.acquisition).place(pixel.answer_bin)
+        entries.append(("Position", place, "Where the estimate stands along the gate."))
     if answer.capture.truth_range_m is not None:
         truth = "no target" if math.isnan(pixel.truth_m) else number(pixel.truth_m, "m")
         error_m = pixel.range_m - pixel.truth_m

@@ -76,8 +76,11 @@ class Acquisition:
 
     def bin_to_range_m(self, bins: ArrayLike) -> Floats:
         """Range in metres of a (fractional) bin position, any shape; NaN stays NaN."""
-        time_s = self.gate_delay_s + np.asarray(bins, float) * self.bin_width_s
-        return np.asarray(time_s * (SPEED_OF_LIGHT_M_S / 2))
+        return np.asarray(self.bin_to_time_s(bins) * (SPEED_OF_LIGHT_M_S / 2))
+
+    def bin_to_time_s(self, bins: ArrayLike) -> Floats:
+        """Seconds from the pulse to a (fractional) bin position, any shape; NaN stays NaN."""
+        return np.asarray(self.gate_delay_s + np.asarray(bins, float) * self.bin_width_s)
 
     def range_m_to_bin(self, range_m: ArrayLike) -> Floats:
         """Fractional bin position of a range in metres, any shape; NaN stays NaN."""

@@ -80,7 +80,8 @@ def open_page(
     watch(page)
     page.add_init_script(prepare)
     page.goto(address)
-    page.locator(".stage[data-camera]").wait_for()
+    # Explore's cloud or, where a capture is opened, the pins of Inspect.
+    page.locator(".stage[data-camera], .chips").first.wait_for(state="attached")
     page.wait_for_function("Bokeh.documents[0].is_idle")
     return page
 

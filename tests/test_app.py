@@ -567,8 +567,8 @@ def test_another_gate_lays_the_axes_anew(car, small_file):
             lengths = {len(column) for column in columns(plot, layer).values()}
             assert lengths == ({2} if layer in ("truth", "answer") else {37}), layer
     start_m, step_m = 149.896229, 0.299792458
-    metres = views.histogram.figure.above[0].formatter
-    assert metres.args == pytest.approx({"start": start_m, "step": step_m})
+    metres = views.histogram.figure.above[0].formatter.args
+    assert (metres["origin"], metres["step"]) == pytest.approx((start_m, step_m))
 
 
 def legend(plot):

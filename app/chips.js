@@ -1,0 +1,33 @@
+// Labels of what is kept, each to go to and to remove; what has the keyboard keeps it.
+
+const element = (tag, text, attributes) => {
+  const node = document.createElement(tag);
+  node.textContent = text;
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  return node;
+};
+
+export function render({ model }) {
+  const root = element("div", "", { role: "list", class: "chips" });
+
+  const chip = ([key, text, color]) => {
+    const item = element("span", "", { role: "listitem", class: "chip" });
+    const go = element("button", text, { type: "button", title: `Show ${text}` });
+    const remove = element("button", "×", { type: "button", "aria-label": `Remove ${text}` });
+    item.style.setProperty("--mark", color);
+    go.addEventListener("click", () => (model.chosen = [key, Date.now()]));
+    remove.addEventListener("click", () => (model.removed = [key, Date.now()]));
+    item.append(go, remove);
+    return item;
+  };
+  const show = () => {
+    root.setAttribute("aria-label", model.label);
+    const buttons = () => [...root.querySelectorAll("button")];
+    const focused = buttons().indexOf(root.getRootNode().activeElement);
+    root.replaceChildren(...model.chips.map(chip));
+    if (focused >= 0) buttons()[Math.min(focused, buttons().length - 1)]?.focus();
+  };
+  model.on("chips", show);
+  show();
+  return root;
+}

@@ -1,0 +1,326 @@
+"""The Inspect page: any pixel of any capture, understood, and believed or not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+
+from app import inspector_words
+from app.controls import Chips, PixelKeys, Sentence
+from app.inspector_capture import Whole
+from app.inspector_pins import MOST_PINS, Pins, pin_colors
+from app.inspector_pixel import Sight, framed
+from app.inspector_views import MODES, Corners, Navigator, rectangle
+from app.jobs import LatestWins
+from app.looks import Look, map_of
+from app.pages import Pages, View
+from app.parts import part
+from app.session import REST_MS, Session
+from app.store import Answer
+from app.theme import palette
+from core.checks import require
+
+# One screen on a laptop: the navigator with a table below on the left, plots on the right.
+BOARD = """
+:host { display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
+  gap: 10px; flex: none !important; height: max(600px, calc(100vh - 92px)) !important; }
+@media (max-width: 1100px) {
+  :host { display: flex !important; flex-direction: column; height: auto !important; }
+}
+"""
+COLUMN = """
+:host { display: flex !important; flex-direction: column; gap: 6px; height: 100%; min-height: 0;
+  min-width: 0; }
+@media (max-width: 1100px) { :host { height: auto !important; flex: none !important; } }
+"""
+STAGES = """
+:host { flex: 1 1 0 !important; min-height: 0; min-width: 0; }
+@media (max-width: 1100px) { :host { height: auto !important; flex: none !important; } }
+"""
+TABLES = """
+:host { flex: 0 1 auto !important; min-height: 0; min-width: 0; max-height: 34%; overflow-y: auto; }
+@media (max-width: 1100px) { :host { max-height: none } }
+"""
+ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 4px 6px; }"
+
+
+class Inspector:
+    """The page around one session: a navigator, and what is looked at.
+
+    Parameters
+    ----------
+    session : Session
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._jobs: LatestWins[tuple[Any, Look]] = LatestWins(session.on_page)
+        self._is_on_screen = self._dark = False
+        self._shape = (0, 0)
+        self._navigator = Navigator(session.choose_pixel, self._select)
+        self._keys = PixelKeys(
+            label="Picture to navigate by. Arrow keys move the pixel, with Shift by eight; "
+            "P pins it.",
+            letters="p",
+            width=0,
+            height=0,
+            margin=0,
+            styles={"position": "absolute"},
+        )
+        self._refusal = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
+        self._chips = Chips(label="Pinned pixels", sizing_mode="stretch_width", margin=0)
+        self._make_controls()
+        self._subjects = Pages(
+            {
+                "Pixel": lambda: Sight(session, "pixel").view,
+                "Region": lambda: Sight(session, "region").view,
+                "Pins": lambda: Pins(session).view,
+                "Capture": lambda: Whole(session).view,
+            },
+            label="",
+            help=inspector_words.SUBJECT_HELP,
+            first=session.state.subject,
+        )
+        self._subjects.choice.link(session.state, value="subject", bidirectional=True)
+        self._listen()
+
+    @property
+    def view(self) -> View:
+        """The page."""
+        explanation = pmui.Typography(inspector_words.EXPLANATION, margin=8)
+        return View(
+            self._board(),
+            part("How to read this page", explanation, is_open=False),
+            self._show,
+            self._follow,
+            self._paint,
+        )
+
+    # Controls
+
+    def _make_controls(self) -> None:
+        state = self._session.state
+        self._map = pmui.Select.from_param(
+            state.param.map,
+            label="Map",
+            description=inspector_words.MAP_HELP,
+            size="small",
+            width=118,
+            margin=(6, 0, 0, 0),
+        )
+        self._mode = pmui.RadioButtonGroup(
+            options=list(MODES),
+            value=next(iter(MODES)),
+            label="",
+            description=inspector_words.MODE_HELP,
+            size="small",
+            margin=0,
+        )
+        self._place = [_field(name, "0") for name in ("Row", "Column")]
+        self._span = [_field(name, "10-20") for name in ("Rows", "Columns")]
+        self._pin = _button("Pin this pixel", inspector_words.PIN_HELP, self._pin_pixel)
+        self._add = _button(
+            "Select region",
+            "Select region: the rectangle of these rows and columns.",
+            self._select_rectangle,
+        )
+        self._clear = _button(
+            "Clear region", "Clear region: there is none then.", lambda: self._select(())
+        )
+
+    def _listen(self) -> None:
+        state = self._session.state
+        self._keys.param.watch(lambda event: self._session.choose_pixel(*event.new), "pixel")
+        self._keys.param.watch(lambda _: self._pin_pixel(), "pressed")
+        self._mode.param.watch(lambda event: self._navigator.drag(event.new), "value")
+        for axis, field in enumerate(self._place):
+            field.param.watch(lambda event, at=axis: self._go_to_typed(at, event.new), "value")
+        self._chips.param.watch(lambda event: self._session.choose_pixel(*event.new[0]), "chosen")
+        self._chips.param.watch(lambda event: self._unpin(event.new[0]), "removed")
+        state.param.watch(lambda *_: self._mark(), ["pixel", "pins", "region"])
+        state.param.watch(lambda *_: self._ask_map(), ["map", "viewing"])
+
+    def _board(self) -> pn.Column:
+        subjects = self._subjects
+        for main, below in zip(subjects.mains.values(), subjects.asides.values(), strict=True):
+            main.param.update(stylesheets=[STAGES], sizing_mode="stretch_both", margin=0)
+            below.param.update(stylesheets=[TABLES], sizing_mode="stretch_width", margin=0)
+        left = pn.Column(
+            _row(self._map, self._mode, self._clear),
+            framed(self._navigator.pane, self._keys),
+            _row(*self._place, self._pin),
+            _row(*self._span, self._add),
+            self._refusal,
+            self._chips,
+            *subjects.asides.values(),
+            stylesheets=[COLUMN],
+            sizing_mode="stretch_both",
+            margin=0,
+        )
+        right = pn.Column(
+            subjects.choice,
+            *subjects.mains.values(),
+            stylesheets=[COLUMN],
+            sizing_mode="stretch_both",
+            margin=0,
+        )
+        return pn.Column(left, right, stylesheets=[BOARD], sizing_mode="stretch_both", margin=0)
+
+    # What the app tells the page
+
+    def _show(self, is_on_screen: bool) -> None:
+        self._is_on_screen = is_on_screen
+        if is_on_screen:
+            self._enter()
+            self._mark()
+            self._ask_map()
+        self._subjects.show(is_on_screen)
+
+    def _follow(self, answer: Answer) -> None:
+        if self._is_on_screen:
+            self._enter()
+            self._mark()
+            self._subjects.follow(answer)
+            # As on Explore: the eye follows the plots.
+            self._session.later(self._ask_map, REST_MS)
+
+    def _paint(self, dark: bool) -> None:
+        self._dark = dark
+        self._navigator.paint(palette(dark))
+        self._subjects.paint(dark)
+        self._mark()
+
+    # What the user does
+
+    def _refusing(self, act: Callable[[], None]) -> None:
+        """Do something, or say why not."""
+        try:
+            act()
+        except ValueError as error:
+            self._refusal.text = str(error).capitalize()
+        else:
+            self._refusal.text = ""
+
+    def _go_to_typed(self, axis: int, typed: str) -> None:
+        state = self._session.state
+
+        def go() -> None:
+            pixel = list(state.pixel)
+            pixel[axis] = _whole(self._place[axis].label.lower(), typed, self._shape[axis])
+            state.pixel = tuple(pixel)
+
+        if typed != str(state.pixel[axis]):  # else it was not typed
+            self._refusing(go)
+
+    def _select_rectangle(self) -> None:
+        def select() -> None:
+            rows, cols = (
+                _span(field.label.lower(), field.value, size)
+                for field, size in zip(self._span, self._shape, strict=True)
+            )
+            self._select(rectangle(rows, cols))
+
+        self._refusing(select)
+
+    def _select(self, region: Corners) -> None:
+        state = self._session.state
+        state.region = region
+        if region:
+            state.subject = "Region"
+        elif state.subject == "Region":
+            state.subject = "Pixel"
+
+    def _pin_pixel(self) -> None:
+        state = self._session.state
+
+        def pin() -> None:
+            if state.pixel not in state.pins:
+                if len(state.pins) >= MOST_PINS:
+                    raise ValueError(inspector_words.TOO_MANY_PINS)
+                state.pins = (*state.pins, state.pixel)
+
+        self._refusing(pin)
+
+    def _unpin(self, pixel: list[int]) -> None:
+        state = self._session.state
+        state.pins = tuple(pin for pin in state.pins if pin != tuple(pixel))
+        self._refusal.text = ""
+
+    # What is drawn
+
+    def _enter(self) -> None:
+        """Come to another capture, if it is one of another size."""
+        shape = self._session.answer.capture.shape
+        if shape != self._shape:
+            self._shape = shape
+            self._keys.shape = list(shape)
+            self._navigator.enter(*shape)
+
+    def _mark(self) -> None:
+        """Frame the pixel and the pins, outline the region."""
+        if not self._is_on_screen:
+            return
+        state = self._session.state
+        colors = pin_colors(self._dark)
+        with pn.io.hold(self._session.page):
+            self._navigator.mark(*state.pixel)
+            self._navigator.pin(state.pins, colors)
+            self._navigator.outline(state.region)
+            self._keys.pixel = list(state.pixel)
+            self._clear.disabled = not state.region
+            for field, at in zip(self._place, state.pixel, strict=True):
+                field.value = str(at)
+            self._chips.chips = [
+                [list(pin), inspector_words.pixel_name(pin), color]
+                for pin, color in zip(state.pins, colors, strict=False)
+            ]
+
+    def _ask_map(self) -> None:
+        if self._is_on_screen:
+            session, state = self._session, self._session.state
+            work = partial(map_of, session.answer, state.map, state.viewing.least_confidence)
+            self._jobs.submit(work, partial(self._draw_map, session.answer), session.fail)
+
+    def _draw_map(self, answer: Answer, drawn: tuple[Any, Look]) -> None:
+        if answer is self._session.answer:
+            with pn.io.hold(self._session.page):
+                self._navigator.update(*drawn)
+
+
+def _row(*content: Any) -> pn.Row:
+    return pn.Row(*content, stylesheets=[ROW], sizing_mode="stretch_width", margin=0)
+
+
+def _button(label: str, help: str, act: Callable[[], None]) -> pmui.Button:
+    made = pmui.Button(
+        label=label, description=help, variant="outlined", size="small", margin=(6, 0, 0, 0)
+    )
+    made.on_click(lambda _: act())
+    return made
+
+
+def _field(label: str, example: str) -> pmui.TextInput:
+    return pmui.TextInput(
+        label=label, placeholder=example, size="small", width=86, margin=(6, 0, 0, 0)
+    )
+
+
+def _whole(name: str, text: str, size: int) -> int:
+    """A row or column that was typed."""
+    text = text.strip()
+    inside = text.isdecimal() and int(text) < size
+    require(name, text, inside, f"a whole number from 0 to {size - 1}")
+    return int(text)
+
+
+def _span(name: str, text: str, size: int) -> tuple[int, int]:
+    """From which row to which, or column, as typed."""
+    ends = [int(each) for each in re.findall(r"\d+", text)]
+    inside = len(ends) in (1, 2) and max(ends) < size
+    require(name, text, inside, f"two whole numbers from 0 to {size - 1}, such as 10-20")
+    return min(ends), max(ends)

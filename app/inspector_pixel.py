@@ -1,0 +1,136 @@
+"""The part of Inspect that looks into one pixel, or into a region's pixels added to one."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import panel as pn
+
+from app import inspector_words
+from app.controls import Facts, Sentence, Table
+from app.inspector_answers import Seen, pixel_seen, region_seen
+from app.inspector_views import PixelPlots
+from app.jobs import LatestWins
+from app.pages import View
+from app.parts import card
+from app.session import Session
+from app.store import Answer
+from app.theme import palette
+from app.words import COMPUTING
+
+FACTS = ".fact-list { grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)) !important; }"
+STAGE = """
+:host { display: flex !important; flex-direction: column; gap: 6px; flex: 1 1 0 !important;
+  min-height: 0; min-width: 0; }
+@media (max-width: 1100px) { :host { height: auto !important; flex: none !important; } }
+"""
+FRAME = """
+@media (max-width: 1100px) { :host { flex: none !important; height: 330px !important; } }
+"""
+NARROW = """
+th, td { padding: 3px 6px !important; }
+tbody th { min-width: 40px !important; }
+"""
+
+
+def framed(*content: Any) -> pn.Column:
+    """A framed picture that keeps its height where the page's parts follow each other."""
+    made = card(*content)
+    made.stylesheets = [*made.stylesheets, FRAME]
+    return made
+
+
+def stage(*content: Any) -> pn.Column:
+    """What stands beside the navigator, from top to bottom."""
+    return pn.Column(*content, stylesheets=[STAGE], sizing_mode="stretch_both", margin=0)
+
+
+class Sight:
+    """Everything about the pixel on show, or about the region.
+
+    Parameters
+    ----------
+    session : Session
+    watched : str
+        What of the state it shows: "pixel" or "region".
+    """
+
+    def __init__(self, session: Session, watched: str) -> None:
+        self._session = session
+        self._watched = watched
+        self._jobs: LatestWins[Seen] = LatestWins(session.on_page)
+        self._is_on_screen = False
+        self._plots = PixelPlots()
+        self._cards = [framed(pane) for pane in self._plots.panes]
+        self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width", margin=0)
+        self._remark = Sentence(live=True, sizing_mode="stretch_width", margin=0)
+        self._table = Table(
+            title=inspector_words.CANDIDATES,
+            stylesheets=[NARROW],
+            sizing_mode="stretch_width",
+            margin=0,
+        )
+        session.state.param.watch(lambda *_: self._ask(), [watched, "unit"])
+
+    @property
+    def view(self) -> View:
+        """The part, for the navigation."""
+        return View(
+            stage(self._facts, self._remark, *self._cards),
+            self._table,
+            show=self._show,
+            follow=lambda _: self._ask(),
+            paint=self._paint,
+        )
+
+    def _show(self, is_on_screen: bool) -> None:
+        self._is_on_screen = is_on_screen
+        self._ask()
+
+    def _paint(self, dark: bool) -> None:
+        self._plots.paint(palette(dark))
+
+    def _ask(self) -> None:
+        session = self._session
+        if not self._is_on_screen:
+            return
+        answer, state = session.answer, session.state
+        if self._watched == "pixel":
+            work = partial(pixel_seen, answer, *state.pixel)
+        elif state.region:
+            work = partial(region_seen, answer, state.region)
+            self._remark.text = COMPUTING
+        else:
+            self._lack(inspector_words.NO_REGION)
+            return
+        self._jobs.submit(work, partial(self._draw, answer), self._failed)
+
+    def _failed(self, error: Exception) -> None:
+        if isinstance(error, ValueError):
+            self._lack(str(error))
+        else:
+            self._session.fail(error)
+
+    def _lack(self, why: str) -> None:
+        """Say why there is nothing to see."""
+        with pn.io.hold(self._session.page):
+            self._facts.facts, self._remark.text, self._table.rows = [], why, []
+            for each in self._cards:
+                each.visible = False
+
+    def _draw(self, answer: Answer, found: Seen) -> None:
+        if not self._is_on_screen or answer is not self._session.answer:
+            return  # the user has moved on
+        unit = self._session.state.unit
+        scales = inspector_words.both_scales(unit, answer)
+        with pn.io.hold(self._session.page):
+            self._plots.update(found.curves, unit, answer.capture.acquisition)
+            for each in self._cards:
+                each.visible = True
+            self._facts.facts = inspector_words.facts(answer, found, unit)
+            self._remark.text = inspector_words.remark(found)
+            self._table.param.update(
+                columns=inspector_words.candidate_columns(unit),
+                rows=inspector_words.candidate_rows(found.report.candidates, *scales),
+            )

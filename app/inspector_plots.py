@@ -1,0 +1,218 @@
+"""Figures of the Inspect page as pure functions: Bokeh figures with named renderers.
+
+Figures over the gate have an extra vertical range ``marks`` from 0 to 1, in which upright lines
+reach from bottom to top whatever the data do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bokeh.models import ColumnDataSource, HoverTool, LinearAxis, PrintfTickFormatter, Range1d
+from bokeh.plotting import figure
+
+MARKS = "marks"
+RATE_TITLES = {
+    "photons per pulse": "Rate, with undone what early photons hid (Coates)",
+    "photons": "Rate: as counted, since no pile-up is known to be undone",
+}
+CANDIDATE_HEIGHT = 0.05
+"""Of the candidates' marks within a plot: near the bottom, where no legend hides them."""
+
+
+def empty(*columns: str) -> ColumnDataSource:
+    """A source of nothing yet."""
+    return ColumnDataSource({name: [] for name in columns})
+
+
+def counts(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
+    """Counts of each bin as bars, both scales and the model's expectation over them."""
+    drawing = _over_the_gate("Counts, and the two scales that follow them", "Counts", bins)
+    source = empty("bin", "raw", "expected", "small", "large")
+    _bars(drawing, source, "raw", "counts")
+    _line(drawing, source, "expected", "expected", 1.5, line_dash="dotted")
+    _line(drawing, source, "small", "small scale")
+    _line(drawing, source, "large", "large scale")
+    return _marked(drawing, marks, with_ranks=True)
+
+
+def rate(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
+    """Detection rate of each bin, what earlier bins hid being undone."""
+    drawing = _over_the_gate("", "", bins)
+    source = empty("bin", "rate")
+    _bars(drawing, source, "rate", "rate")
+    return _marked(drawing, marks)
+
+
+def stages(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
+    """Residual of the two scales, and on an axis of its own what the weight makes of it."""
+    drawing = _over_the_gate("Residual, and enhanced by the weight", "Residual (counts)", bins)
+    source = empty("bin", "residual", "enhanced")
+    drawing.extra_y_ranges["enhanced"] = Range1d(0, 1)
+    axis = LinearAxis(y_range_name="enhanced", axis_label="Enhanced (counts × weight)")
+    drawing.add_layout(axis, "right")
+    _line(drawing, source, "residual", "residual")
+    _line(drawing, source, "enhanced", "enhanced", y_range_name="enhanced", line_dash=[6, 3])
+    return _marked(drawing, marks)
+
+
+def overlay(bins: Range1d, title: str, unit: str) -> Any:
+    """A line for each pin."""
+    drawing = _over_the_gate(title, unit, bins)
+    drawing.multi_line(
+        "xs",
+        "ys",
+        line_color="color",
+        legend_field="label",
+        line_width=1.8,
+        source=empty("xs", "ys", "color", "label"),
+        name="lines",
+    )
+    return _with_legend(drawing)
+
+
+def aggregate(bins: Range1d) -> Any:
+    """Counts of all pixels together, the gate that is suggested, and T_n."""
+    drawing = _over_the_gate("Counts of all pixels along the gate", "Counts", bins)
+    _bars(drawing, empty("bin", "raw"), "raw", "counts")
+    drawing.quad(
+        "left",
+        "right",
+        source=empty("left", "right"),
+        top=1.0,
+        bottom=0.0,
+        y_range_name=MARKS,
+        fill_alpha=0.12,
+        line_width=0,
+        name="window",
+        legend_label="suggested gate",
+    )
+    for name, label, dash in (("t_n", "T_n", "solid"), ("suggested", "suggested T_n", "dashed")):
+        drawing.line(
+            "x",
+            "y",
+            source=empty("x", "y"),
+            y_range_name=MARKS,
+            line_width=1.8,
+            line_dash=dash,
+            name=name,
+            legend_label=label,
+        )
+    return _with_legend(drawing)
+
+
+def accuracy() -> Any:
+    """Share of pixels that are right against the pulses that are taken, with 95 % intervals."""
+    drawing = figure(
+        x_axis_type="log",
+        x_axis_label="Pulses",
+        y_axis_label="Within 3 bins",
+        x_range=Range1d(1, 1000),
+        y_range=Range1d(0, 1.05),
+        sizing_mode="stretch_both",
+        min_height=110,
+        tools="",
+        toolbar_location=None,
+        outline_line_color=None,
+    )
+    source = empty("pulses", "value", "low", "high", "rmse_m")
+    drawing.segment(
+        "pulses",
+        "low",
+        "pulses",
+        "high",
+        source=source,
+        line_width=5,
+        line_alpha=0.4,
+        name="interval",
+        legend_label="95 % interval",
+    )
+    drawing.line("pulses", "value", source=source, line_width=1.5, name="line")
+    points = drawing.scatter(
+        "pulses", "value", source=source, size=6, name="points", legend_label="within 3 bins"
+    )
+    drawing.add_tools(
+        HoverTool(
+            renderers=[points],
+            tooltips=[
+                ("Pulses", "@pulses"),
+                ("Within 3 bins", "@value{0.0000} [@low{0.0000}, @high{0.0000}]"),
+                ("RMSE (m)", "@rmse_m{0.000}"),
+            ],
+        )
+    )
+    drawing.xaxis.formatter = PrintfTickFormatter(format="%.3g")
+    drawing.extra_y_ranges = {MARKS: Range1d(0, 1)}
+    drawing.line(
+        "x",
+        "y",
+        source=empty("x", "y"),
+        y_range_name=MARKS,
+        line_width=1.8,
+        name="answer",
+        legend_label="taken at present",
+    )
+    drawing.min_border_left, drawing.min_border_right = 52, 52
+    return _with_legend(drawing, "bottom_right")
+
+
+def _over_the_gate(title: str, unit: str, bins: Range1d) -> Any:
+    drawing = figure(
+        title=title,
+        x_range=bins,
+        y_range=Range1d(0, 1),
+        y_axis_label=unit,
+        sizing_mode="stretch_both",
+        min_height=110,
+        tools="xbox_zoom,xwheel_zoom",
+        active_scroll="xwheel_zoom",
+        toolbar_location=None,
+        outline_line_color=None,
+    )
+    drawing.extra_y_ranges = {MARKS: Range1d(0, 1)}
+    drawing.min_border_left, drawing.min_border_right = 52, 52
+    drawing.min_border_top = drawing.min_border_bottom = 2
+    return drawing
+
+
+def _bars(drawing: Any, source: ColumnDataSource, column: str, label: str) -> None:
+    drawing.vbar(
+        x="bin", top=column, width=1.0, source=source, line_width=0, name=column, legend_label=label
+    )
+
+
+def _line(
+    drawing: Any, source: ColumnDataSource, column: str, label: str, width: float = 2, **style: Any
+) -> None:
+    drawing.line(
+        "bin", column, source=source, line_width=width, name=column, legend_label=label, **style
+    )
+
+
+def _marked(drawing: Any, marks: Mapping[str, ColumnDataSource], with_ranks: bool = False) -> Any:
+    """Truth, answer and candidates, from sources that figures share."""
+    for name, style in (
+        ("truth", {"line_width": 2.5, "line_dash": "4 2"}),
+        ("answer", {"line_width": 1.5}),
+    ):
+        drawing.line(
+            "x", "y", source=marks[name], y_range_name=MARKS, name=name, legend_label=name, **style
+        )
+    places = {"source": marks["candidates"], "y_range_name": MARKS}
+    drawing.scatter("x", "y", marker="triangle", size=8, **places, name="candidates")
+    if with_ranks:
+        drawing.text(
+            "x", "y", "rank", **places, x_offset=6, y_offset=3, text_font_size="11px", name="ranks"
+        )
+    return _with_legend(drawing)
+
+
+def _with_legend(drawing: Any, location: str = "top_right") -> Any:
+    drawing.legend.update(
+        orientation="horizontal",
+        location=location,
+        click_policy="hide",
+        background_fill_alpha=0.8,
+    )
+    return drawing
