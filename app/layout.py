@@ -21,9 +21,11 @@ from app.large_view import LargeView
 from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
 from app.parts import card, choice, part, select
+from app.script import script_of
 from app.session import Session
 from app.state import Less, Light, Reading, Viewing
 from app.store import Answer, Request, Source
+from app.takeaway import TakeAway
 from app.theme import DARK, LIGHT, SIZES
 from app.tradeoff import Tradeoff
 from app.uploads import MAX_UPLOAD_BYTES, Uploads
@@ -198,6 +200,9 @@ class Layout:
         self._unit = unit
         self._announced: Source | None = None
         self._address = AddressBar()
+        self._takeaway = TakeAway(
+            lambda: script_of(session.answer, state), sizing_mode="stretch_width", margin=8
+        )
         self._connection = Connection(session.page.session_context.id if session.is_served else "")
         self.pages = Pages(
             {
@@ -383,6 +388,7 @@ class Layout:
             self._reading_card,
             part("Tracking differentiator", self._preset, self._tracking.layout),
             part("Less data, faster", self._less.layout, is_open=False),
+            part("Take it away", self._takeaway),
             first,
             part("What is this?", pmui.Typography(words.EXPLANATION, margin=8), is_open=False),
         ]

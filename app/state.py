@@ -268,8 +268,8 @@ def _check_pins(name: str, value: Any) -> None:
 
 def _check_region(name: str, value: Any) -> None:
     corners = isinstance(value, tuple) and all(_is_pair(each, Real, -(2**31)) for each in value)
-    few = corners and len(value) <= MOST_CORNERS
-    require(name, value, few, f"rows and columns of at most {MOST_CORNERS} corners")
+    fit = corners and (len(value) == 0 or 3 <= len(value) <= MOST_CORNERS)
+    require(name, value, fit, f"rows and columns of 3 to {MOST_CORNERS} corners, or nothing")
 
 
 def _is_pair(value: Any, kind: type, least: int) -> bool:

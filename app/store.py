@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from time import perf_counter
@@ -47,6 +47,10 @@ class Source:
     """None for a file."""
     large: Callable[[Reading], LargeFile | None] = lambda _reading: None
     """Opens a file of which only windows are read; None where all of it is."""
+    name: str = ""
+    """Of the scene in `core.scenes`, or of the file."""
+    arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """With which the scene is built."""
 
     @property
     def is_scene(self) -> bool:
@@ -71,7 +75,7 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
         scene = bare(build(), absent)
         return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
-    return Source(title, load, build)
+    return Source(title, load, build, name=name, arguments=arguments)
 
 
 def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
@@ -91,7 +95,7 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
         return open_large(path, vars(reading))
 
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, load, large=opened)
+    return Source(title or path.name, load, large=opened, name=path.name)
 
 
 def built_in_sources() -> dict[str, Source]:

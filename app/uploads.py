@@ -11,10 +11,11 @@ import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import rmtree
+from tempfile import mkdtemp
 from threading import Lock
 from typing import Any
-from weakref import WeakSet, WeakValueDictionary
+from weakref import WeakSet, WeakValueDictionary, finalize
 
 from app.store import Source, file_source
 from core import Capture
@@ -36,12 +37,27 @@ class Bounds:
     all_bytes: int = 2048 * MEBIBYTE
 
 
-@dataclass
 class _Upload:
-    source: Source
-    folder: TemporaryDirectory[str]
-    n_bytes: int
-    users: WeakSet[object]
+    """A file in a folder of its own, which goes with this object, at the latest with the process.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; nothing of it is left then.
+    """
+
+    def __init__(self, name: str, content: bytes, user: object) -> None:
+        folder = mkdtemp(prefix="firstphoton-")
+        self.remove = finalize(self, rmtree, folder, ignore_errors=True)
+        self.n_bytes, self.users = len(content), WeakSet([user])
+        path = Path(folder) / harmless(name)
+        try:
+            path.write_bytes(content)
+        except OSError:
+            self.remove()
+            raise
+        source = file_source(path)
+        self.source = replace(source, load=kept_while_used(source.load))
 
 
 class Uploads:
@@ -67,21 +83,14 @@ class Uploads:
         ------
         ValueError
             If it is too large, or there are too many: says which bound it exceeds.
+        OSError
+            If it cannot be written.
         """
         with self._lock:
             self._sweep()
             self._require_room(len(content), user)
-            folder = TemporaryDirectory(prefix="firstphoton-")
-            try:
-                path = Path(folder.name) / harmless(name)
-                path.write_bytes(content)
-            except OSError:
-                folder.cleanup()
-                raise
             key = secrets.token_urlsafe(16)
-            source = file_source(path)
-            shared = replace(source, load=kept_while_used(source.load))
-            self._kept[key] = _Upload(shared, folder, len(content), WeakSet([user]))
+            self._kept[key] = _Upload(name, content, user)
             return key
 
     def use(self, key: str, user: object) -> Source | None:
@@ -104,7 +113,7 @@ class Uploads:
         """Remove the files that nobody uses."""
         unused = [key for key, upload in self._kept.items() if not upload.users]
         for key in unused:
-            self._kept.pop(key).folder.cleanup()
+            self._kept.pop(key).remove()
 
     def _require_room(self, n_bytes: int, user: object) -> None:
         bounds, everything = self.bounds, list(self._kept.values())

@@ -48,10 +48,10 @@ def chromium() -> Iterator[Browser]:
 
 
 @contextmanager
-def serving(*captures: Path) -> Iterator[str]:
+def serving(*arguments: str | Path) -> Iterator[str]:
     """The app in a process of its own, at the address that is yielded."""
     port = _free_port()
-    command = [sys.executable, "-m", "app", "--port", str(port), *map(str, captures)]
+    command = [sys.executable, "-m", "app", "--port", str(port), *map(str, arguments)]
     # Into a file: a pipe that nobody reads would stop the server once it is full.
     with (
         TemporaryFile("w+") as log,

@@ -10,7 +10,7 @@ import numpy as np
 import param
 
 from app.address import defaults
-from app.state import Comparison, Reading, State
+from app.state import CLOUDS, Comparison, Reading, State
 from core import ESTIMATORS, Pulse, Window
 from core.parameters import Choice
 
@@ -52,10 +52,11 @@ def otherwise(settings: Any) -> Iterator[Any]:
         yield replace(settings, false_alarm=0.1)
         yield replace(settings, kind="Error")
         for viewing in otherwise(settings.viewing):
-            yield replace(settings, viewing=viewing)
+            yield replace(settings, viewing=viewing, kind=CLOUDS)
         for method, own in settings.settings.items():
             for changed in otherwise(own):
-                yield replace(settings, settings={**settings.settings, method: changed})
+                own_settings = {**settings.settings, method: changed}
+                yield replace(settings, settings=own_settings, methods=(method,))
         return
     for each in fields(settings):
         yield replace(settings, **{each.name: other_value(each, getattr(settings, each.name))})

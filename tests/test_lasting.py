@@ -1,0 +1,181 @@
+"""What outlasts a reload, a lost connection and the way to another tab, in a real browser."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser import ROOT, eventually, fact, open_page, serving
+from tests.test_browser import chosen, image, look, pixel_on_show, slider, upload, warning
+
+pytestmark = pytest.mark.browser
+
+CUT = """
+window.sockets = [];
+window.WebSocket = class extends WebSocket {
+  constructor(...given) { super(...given); window.sockets.push(this); }
+};
+"""
+
+
+def rests(page: Page, *told: str) -> None:
+    """Wait until the address says all of this."""
+    eventually(lambda: all(each in page.url for each in told))
+
+
+def same_pictures(page: Page, other: Page) -> Callable[[], bool]:
+    def compare() -> bool:
+        one, two = look(page), look(other)
+        return all(one[name].tobytes() == two[name].tobytes() for name in one)
+
+    return compare
+
+
+def test_the_facade_comes_back_after_a_reload_and_in_another_tab(page, address):
+    first = page(f"{address}?source=building&tracking.l=0.006&image=Error")
+    expect(chosen(first, "Scene or capture")).to_have_text("Building at 830–860 m")
+    image(first).press("Shift+ArrowRight")
+    slider(first, "SBR").press("ArrowRight")
+    slider(first, "Bins merged").press("ArrowRight")
+    rests(first, "pixel=[", "light.sbr=", "less.merge=2")
+    length, rmse = first.evaluate("history.length"), fact(first, "RMSE").inner_text()
+    place = pixel_on_show(first)
+    first.reload()
+    expect(fact(first, "RMSE")).to_have_text(rmse)
+    assert pixel_on_show(first) == place
+    assert first.evaluate("history.length") == length
+    other = page(first.url)
+    expect(fact(other, "RMSE")).to_have_text(rmse)
+    eventually(same_pictures(first, other))
+    slider(other, "SBR").press("ArrowRight")
+    eventually(lambda: other.url != first.url)
+    expect(fact(first, "RMSE")).to_have_text(rmse)
+    assert pixel_on_show(first) == place
+    expect(warning(first)).to_be_hidden()
+
+
+def test_nonsense_in_an_address_is_told_and_the_rest_is_there(page, address):
+    trap = "<img src=x onerror='window.trapped = 1'>"
+    new = page(f"{address}?source={trap}&light.sbr=-1&light.seed=1&page={trap}&{trap}=1")
+    told = new.get_by_role("alert").filter(has_text="The address asks for what cannot be had")
+    for said in ("sbr = -1", "no scene or capture '<img", "page = '<img", "nothing called <img"):
+        expect(told).to_contain_text(said)
+    assert new.evaluate("window.trapped") is None
+    rests(new, "?light.seed=1")
+    slider(new, "Seed").press("ArrowRight")
+    rests(new, "?light.seed=2")
+    expect(told).to_be_hidden()
+
+
+def cut(page: Page) -> None:
+    """Let the page lose its server."""
+    page.context.set_offline(True)
+    page.evaluate("sockets.at(-1).close()")
+    expect(page.get_by_role("alertdialog")).to_contain_text("connection to the server is lost")
+
+
+def mend(page: Page, said: str) -> None:
+    """Let it find its server again."""
+    page.context.set_offline(False)
+    expect(page.get_by_role("status").filter(has_text="The connection is back")).to_contain_text(
+        said
+    )
+    expect(page.get_by_role("alertdialog")).to_have_count(0)
+    page.locator(".stage[data-camera]").wait_for()
+
+
+def test_an_uploaded_capture_outlasts_reload_and_lost_connection(browser, address, real_capture):
+    path = real_capture("21km_K11_night.mat")
+    page = open_page(browser, address, prepare=CUT)
+    upload(page, path.name, path.read_bytes())
+    read = page.get_by_text("256 × 256 pixels, 200 bins of 1 ns")
+    expect(read).to_be_visible()
+    image(page).press("Shift+ArrowDown")
+    rests(page, "source=", "pixel=[")
+    estimate, place = fact(page, "Estimate").inner_text(), pixel_on_show(page)
+
+    def expect_all_there(page: Page) -> None:
+        expect(fact(page, "Estimate")).to_have_text(estimate)
+        expect(chosen(page, "Scene or capture")).to_have_text(path.name)
+        expect(read).to_be_visible()
+        assert pixel_on_show(page) == place
+
+    page.reload()
+    expect_all_there(page)
+    with page.context.expect_page() as opened:
+        page.evaluate("window.open(location.href, '_blank', 'noopener')")
+    expect_all_there(opened.value)
+    opened.value.close()
+    cut(page)
+    mend(page, "everything is as it was")
+    expect_all_there(page)
+    slider(page, "l").press("ArrowRight")
+    rests(page, "tracking.l=")
+    page.context.close()
+
+
+def test_a_session_that_is_gone_begins_anew_and_its_file_is_removed(
+    browser, tmp_path, monkeypatch, real_capture
+):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+
+    def held() -> list[Path]:
+        return list(tmp_path.glob("firstphoton-*/*"))
+
+    with serving("--linger", "1") as address:
+        page = open_page(browser, f"{address}?tracking.l=0.006", prepare=CUT)
+        upload(page, "../face.mat", real_capture("data_face.mat").read_bytes())
+        expect(chosen(page, "Scene or capture")).to_have_text("face.mat")
+        rests(page, "source=")
+        assert [path.name for path in held()] == ["face.mat"]
+        cut(page)
+        eventually(lambda: not held())
+        mend(page, "had to begin anew")
+        expect(page.get_by_role("alert").filter(has_text="There is no scene")).to_be_visible()
+        rests(page, "?tracking.l=0.006")
+        upload(page, "again.mat", real_capture("data_face.mat").read_bytes())
+        eventually(held)
+        page.context.close()
+        eventually(lambda: not held())
+        other = open_page(browser, address)
+        upload(other, "last.mat", real_capture("data_face.mat").read_bytes())
+        eventually(held)
+    eventually(lambda: not list(tmp_path.glob("firstphoton-*")))
+    other.context.close()
+
+
+def test_the_script_and_the_link_are_taken_away(page, address, tmp_path):
+    new = page(f"{address}?source=building&light.seed=3&tracking.l=0.006&less.pool=2")
+    new.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    new.get_by_role("button", name="Link", exact=True).click()
+    expect(new.get_by_role("status").filter(has_text="The link is copied.")).to_be_visible()
+    assert new.evaluate("navigator.clipboard.readText()") == new.url
+    new.get_by_role("button", name="Python script").click()
+    dialog = new.get_by_role("dialog", name="What is on the screen, as Python")
+    with new.expect_download() as saved:
+        dialog.get_by_role("button", name="Download").click()
+    assert saved.value.suggested_filename == "firstphoton.py"
+    script = saved.value.path().read_text("utf-8")
+    dialog.get_by_role("button", name="Copy").click()
+    expect(dialog.get_by_role("status")).to_have_text("The script is copied.")
+    assert new.evaluate("navigator.clipboard.readText()") == script
+    assert dialog.get_by_label("Script").text_content() == script
+    new.keyboard.press("Escape")
+    expect(dialog).to_have_count(0)
+    more = "print(f'{core.metrics.rmse_m(image.range_m, capture.truth_range_m):.4g} m')"
+    done = subprocess.run(
+        [sys.executable, "-c", script + more],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == fact(new, "RMSE").inner_text()
+    assert (tmp_path / "range.png").exists()

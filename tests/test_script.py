@@ -1,0 +1,212 @@
+"""The state as code: run in a fresh process it gives what the session shows, bit for bit."""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from urllib.parse import parse_qsl
+
+import numpy as np
+import pytest
+
+import core
+from app.address import Wanted, defaults, query_of
+from app.looks import image_of
+from app.ranking import run_task, tasks_of
+from app.script import script_of
+from app.session import Session
+from app.state import PAGES, State
+from app.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
+from tests.browser import ROOT
+from tests.states import another, random_state
+
+NOT_CODE = {"cloud_color", "unit"}
+"""Of the state, what changes nothing that `core` could find: colours, and units on axes."""
+
+RUN_EACH = """
+import os, runpy, sys
+import numpy as np
+
+for folder in sys.argv[1:]:
+    os.chdir(folder)
+    found = runpy.run_path("script.py")
+    answers = {"image": found["image"]} | found.get("images", {})
+    kept = {"picture": found.get("picture", 0)}
+    for name, image in answers.items():
+        kept |= {f"{name} {each}": value for each, value in vars(image).items()}
+    for name, signals in ({"signals": found.get("signals")} | found.get("pinned", {})).items():
+        kept |= {f"{name} {n}": each for n, each in (signals._asdict() if signals else {}).items()}
+    if "region" in found:
+        kept["region"] = found["region"].summed.cube
+    if "pictures" in found:
+        kept |= {f"{name} picture": each for name, each in found["pictures"].items()}
+    np.savez("kept.npz", **kept)
+"""
+
+
+def opened(query: str, **files: Path) -> Session:
+    sources = built_in_sources() | {name: file_source(path) for name, path in files.items()}
+    session = Session(sources, Wanted(dict(parse_qsl(query))))
+    assert session.refused == []
+    return session
+
+
+def run(folder: Path, sessions: dict[str, Session], *files: Path) -> dict[str, dict]:
+    """What each session's script finds, all run in one fresh process, by the names it has there."""
+    for name, session in sessions.items():
+        (folder / name).mkdir()
+        (folder / name / "script.py").write_text(script_of(session.answer, session.state), "utf-8")
+        for file in files:
+            shutil.copy(file, folder / name)
+    check_style(folder)
+    command = [sys.executable, "-c", RUN_EACH, *(str(folder / name) for name in sessions)]
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return {name: dict(np.load(folder / name / "kept.npz")) for name in sessions}
+
+
+def check_style(folder: Path) -> None:
+    """By the project's own rules, and as any formatter has it."""
+    for arguments in (
+        ("check", "--config", str(ROOT / "pyproject.toml")),
+        ("check", "--isolated"),
+        ("format", "--check", "--isolated"),
+    ):
+        command = [sys.executable, "-m", "ruff", *arguments, "--no-cache", str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout
+
+
+def same(found: dict, name: str, expected) -> None:
+    """All arrays of a range image, or of signals, bit for bit."""
+    whole = expected._asdict() if hasattr(expected, "_asdict") else vars(expected)
+    for each, value in whole.items():
+        assert np.array_equal(found[f"{name} {each}"], np.asarray(value), equal_nan=True), each
+
+
+# -- what it finds ---------------------------------------------------------------------------------
+
+STATES = {
+    "first": "",
+    "changed": "source=worn&light.sbr=0.3&light.n_pulses=500&light.seed=4&less.merge=2&less.pool=2"
+    "&less.gate_from=0.1&less.pulses=0.7&absent=[%22jitter%22,%22pile_up%22]&tracking.l=0.01"
+    "&tracking.n=500&tracking.m=1.5&tracking.alpha=0.3&tracking.t_n=10&tracking.weight=cubic"
+    "&tracking.start=zero&image=Error&viewing.least_confidence=0.4&difference=true&pixel=[3,17]",
+    "larger": "source=car_256&less.skip=3&image=Counts&absent=[%22signal_levels%22]",
+    "inspected": "source=building&page=Inspect&map=SBR&pins=[[1,2],[30,41]]&pixel=[12,13]"
+    "&region=[[1,2],[1,12],[14,9.5]]&absent=[%22pulse_shape%22,%22reflectivity%22]",
+    "file": "source=sample&reading.bin_width_s=1.5e-9&image=Counts",
+}
+
+
+def test_scripts_find_what_is_on_the_screen(tmp_path):
+    sessions = {name: opened(query) for name, query in STATES.items()}
+    found = run(tmp_path, sessions, ASSETS / "sample_capture.npz")
+    for name, session in sessions.items():
+        answer, state = session.answer, session.state
+        same(found[name], "image", answer.run.image)
+        same(found[name], "signals", inspect(answer, *state.pixel).signals)
+        for file in ("range.png", "cloud.ply", "pixel.csv"):
+            assert (tmp_path / name / file).stat().st_size > 0
+        if name != "inspected":
+            picture, _ = image_of(answer, state.image, state.viewing.least_confidence)
+            assert np.array_equal(found[name]["picture"], picture, equal_nan=True)
+    answer, more = sessions["inspected"].answer, found["inspected"]
+    for pixel in ((1, 2), (30, 41)):
+        same(more, str(pixel), inspect(answer, *pixel).signals)
+    mask = core.inspection.pixels_in(sessions["inspected"].state.region, answer.capture.shape)
+    assert np.array_equal(more["region"].ravel(), answer.capture.cube[mask].sum(axis=0))
+    sbr = core.inspection.maps["SBR"](answer.capture)
+    assert np.array_equal(more["picture"], sbr, equal_nan=True)
+
+
+def test_random_states_are_found_again(tmp_path):
+    """Whatever is chosen: bad settings leave an image without answers, and a script that runs."""
+    sessions = {}
+    for seed in range(4):
+        state = random_state(np.random.default_rng(seed))
+        state.param.update(source="car", page="Explore", pixel=(5, 6), region=(), pins=())
+        state.param.update(window=None, image="Counts", comparison=State().comparison)
+        session = Session(built_in_sources(), Wanted(dict(parse_qsl(query_of(state, {})))))
+        sessions[str(seed)] = session
+    for name, found in run(tmp_path, sessions).items():
+        same(found, "image", sessions[name].answer.run.image)
+        same(found, "signals", inspect(sessions[name].answer, 5, 6).signals)
+
+
+def test_a_real_capture_is_found_again(tmp_path, real_capture):
+    path = real_capture("21km_K11_night.mat")
+    query = "source=it&less.pool=2&reading.n_pulses=20000&tracking.l=0.01&pixel=[60,70]"
+    session = opened(query, it=path)
+    found = run(tmp_path, {"it": session}, path)["it"]
+    same(found, "image", session.answer.run.image)
+    same(found, "signals", inspect(session.answer, 60, 70).signals)
+    assert str(path.parent) not in script_of(session.answer, session.state)
+
+
+def test_methods_are_compared_by_a_script_alike(tmp_path):
+    query = (
+        "page=Compare&comparison.methods=[%22peak%22,%22kde%22,%22tracking%22,%22oracle%22]"
+        "&comparison.false_alarm=0.1&comparison.settings.kde.bandwidth_bins=0.7&tracking.l=0.01"
+    )
+    sessions = {
+        "car": opened(query + "&comparison.kind=Error&comparison.viewing.least_confidence=0.5"),
+        "file": opened(query + "&source=sample"),
+    }
+    found = run(tmp_path, sessions, ASSETS / "sample_capture.npz")
+    for name, session in sessions.items():
+        answer, chosen = session.answer, session.state.comparison
+        for method, task in tasks_of(chosen, answer.request.tracking).items():
+            if name == "file" and method == "oracle":
+                assert "oracle range_m" not in found[name]
+                continue
+            compared = run_task(task, answer).answer
+            same(found[name], method, compared.run.image)
+            kind = "Error" if name == "car" else "Estimate"
+            picture, _ = image_of(compared, kind, chosen.viewing.least_confidence)
+            assert np.array_equal(found[name][f"{method} picture"], picture, equal_nan=True)
+
+
+# -- what it says ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def car() -> Answer:
+    return opened("").answer
+
+
+@pytest.mark.parametrize("name", sorted(defaults().keys() - NOT_CODE))
+def test_every_parameter_is_in_the_script_of_some_page(name, car):
+    """Fails for a new parameter, or a new field of one, of which a script knows nothing."""
+    first = {"source": "sample" if name in ("reading", "window") else "worn"}
+    for value in ["building"] if name == "source" else another(name):
+        seen = [{"page": page, **first} for page in PAGES]
+        assert any(
+            told_by(car, State(**one)) != told_by(car, State(**one | {name: value})) for one in seen
+        )
+
+
+def told_by(answer: Answer, state: State, **of_source: str) -> str:
+    """The script of a state, as if it had been computed."""
+    chosen = {each.name: getattr(state, each.name) for each in fields(Request)}
+    source = replace(built_in_sources()[state.source], **of_source)
+    request = Request(**chosen | {"source": source})
+    return script_of(replace(answer, request=request), state)
+
+
+def test_a_name_from_outside_is_never_code(car):
+    name = 'a"b\'c\n\\"""; import os #{x}\u2028%s.npz'
+    text = told_by(car, State(source="sample"), name=name)
+    (told,) = (
+        node.value.value
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "path"
+    )
+    assert told == name
+    assert text.replace("\n", "").isprintable()

@@ -1,0 +1,140 @@
+"""Files that users open: kept while somebody uses them, within bounds, and then gone."""
+
+from __future__ import annotations
+
+import gc
+import re
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.state import Light, Reading
+from app.uploads import Bounds, Uploads, harmless
+from core import Acquisition, Capture, save_capture
+
+
+class Session:
+    """What uses files."""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where temporary files go."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+def held(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.glob("*/*"))
+
+
+@pytest.fixture
+def content(tmp_path_factory):
+    path = tmp_path_factory.mktemp("made") / "small.npz"
+    cube = np.random.default_rng(3).poisson(5, (4, 6, 37)).astype(np.uint16)
+    save_capture(Capture(cube, Acquisition(37, 2e-9, 1e-6, None, 1e-3), source="made"), path)
+    return path.read_bytes()
+
+
+def test_a_file_is_there_for_who_has_its_key_until_the_last_one_leaves(folder, content):
+    uploads, first, other = Uploads(), Session(), Session()
+    key = uploads.add("mine.npz", content, first)
+    assert held(folder) == ["mine.npz"]
+    source = uploads.use(key, other)
+    capture = source.load(Light(), Reading(), ())
+    assert capture.shape == (4, 6)
+    assert source.title == "mine.npz"
+    uploads.leave(first)
+    assert held(folder) == ["mine.npz"]
+    uploads.leave(other)
+    assert list(folder.iterdir()) == []
+    assert uploads.use(key, other) is None
+
+
+def test_a_session_that_is_forgotten_keeps_nothing(folder, content):
+    uploads, session = Uploads(), Session()
+    uploads.add("mine.npz", content, session)
+    del session
+    gc.collect()
+    uploads.leave(Session())
+    assert list(folder.iterdir()) == []
+
+
+def test_all_files_go_with_the_process(folder, content):
+    uploads, session = Uploads(), Session()
+    uploads.add("mine.npz", content, session)
+    del uploads
+    gc.collect()
+    assert list(folder.iterdir()) == []
+
+
+def test_what_one_page_has_loaded_is_not_loaded_again_for_the_next(folder, content):
+    uploads, first, other = Uploads(), Session(), Session()
+    key = uploads.add("mine.npz", content, first)
+    one = uploads.use(key, first).load(Light(), Reading(), ())
+    assert uploads.use(key, other).load(Light(), Reading(), ()) is one
+    assert uploads.use(key, other).load(Light(), Reading(bin_width_s=1e-9), ()) is not one
+
+
+def test_keys_cannot_be_guessed(folder, content):
+    uploads, session = Uploads(), Session()
+    keys = {uploads.add("mine.npz", content, session) for _ in range(5)}
+    assert len(keys) == 5
+    assert all(re.fullmatch(r"[\w-]{22}", key) for key in keys)
+    for guess in ("", "mine.npz", "../mine.npz", "file 1"):
+        assert uploads.use(guess, session) is None
+
+
+@pytest.mark.parametrize(
+    ("bounds", "sessions", "named"),
+    [
+        (Bounds(file_bytes=9), [0], "size of the file"),
+        (Bounds(session_files=2), [0, 0, 0], "files of this page = 3"),
+        (Bounds(session_bytes=29), [0, 0, 0], "size of the files of this page"),
+        (Bounds(all_files=2), [0, 1, 2], "files of all pages = 3"),
+        (Bounds(all_bytes=29), [0, 1, 2], "size of the files of all pages"),
+    ],
+)
+def test_too_much_is_refused_in_words_and_room_is_made_by_leaving(folder, bounds, sessions, named):
+    uploads, users = Uploads(bounds), [Session() for _ in range(3)]
+    for user in sessions[:-1]:
+        uploads.add("a.npz", bytes(10), users[user])
+    before = held(folder)
+    with pytest.raises(ValueError, match=named):
+        uploads.add("a.npz", bytes(10), users[sessions[-1]])
+    assert held(folder) == before
+    if before:
+        uploads.leave(users[0])
+        uploads.add("a.npz", bytes(10), users[sessions[-1]])
+
+
+def test_a_full_disk_leaves_nothing_behind(folder, content, monkeypatch):
+    def fail(_path, _content):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    uploads, session = Uploads(), Session()
+    with pytest.raises(OSError, match="No space"):
+        uploads.add("mine.npz", content, session)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("21km_K11_night.mat", "21km_K11_night.mat"),
+        ("../../etc/passwd", "passwd"),
+        ("..\\..\\boot.ini", "boot.ini"),
+        ("/", "upload"),
+        ("..", "upload"),
+        ("", "upload"),
+        (".npz", "npz"),
+        ("<img src=x onerror=alert(1)>.mat", "_img_src_x_onerror_alert_1_.mat"),
+        ("a\x00b\nc.npz", "a_b_c.npz"),
+        ("x" * 300 + ".npz", "x" * 76 + ".npz"),
+    ],
+)
+def test_a_name_from_outside_keeps_only_harmless_letters(name, kept):
+    assert harmless(name) == kept
