@@ -36,6 +36,9 @@ class Knob(JSComponent):
     help = param.String(default="")
     doubtful = param.List(default=[], doc="Zones of values in doubt: low, high, and why.")
 
+    # That someone drags is no news to the server's other pages, whom Panel would tell each time.
+    _busy__ignore: ClassVar = ["value"]
+
     _esm = Path(__file__).with_name("knob.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("knob.css")]
 
@@ -212,6 +215,8 @@ class PixelKeys(JSComponent):
         default="Range image. Arrow keys move the pixel on show, with Shift by eight.",
         doc="What a screen reader says of the picture.",
     )
+
+    _busy__ignore: ClassVar = ["pixel"]  # as of a knob
 
     _esm = """
     export function render({ model, el }) {

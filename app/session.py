@@ -12,6 +12,7 @@ from time import perf_counter
 import numpy as np
 import panel as pn
 import param
+from tornado.ioloop import IOLoop
 
 from app import words
 from app.cloud import PointCloud, ply_bytes
@@ -21,6 +22,7 @@ from app.looks import cloud_of, image_of
 from app.state import CLOUD_COLORS, IMAGES, NEED_TRUTH, State
 from app.store import Answer, Request, Source, compute, inspect, same_view
 from app.theme import WRONG_COLOR, palette
+from app.turns import TURNS
 from app.views import ImageView, SignalPlots
 
 log = logging.getLogger(__name__)
@@ -30,6 +32,9 @@ WAIT_MS = 200
 
 REST_MS = 60
 """Image and cloud are drawn this much after the pixel's plots, which are what the eye follows."""
+
+REST_AT_MOST_S = 1.0
+"""Where other pages wait for their turn, image and cloud wait too, but not longer than this."""
 
 
 class Session:
@@ -67,7 +72,9 @@ class Session:
         self.page = pn.state.curdoc
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
-        self._rest_is_due = False
+        self._loop = IOLoop.current() if self._served else None
+        self._rest_is_due = self._pixel_is_due = False
+        self._rest_asked_s = 0.0
         self._is_hidden = self._is_outdated = False
         self._asked_s: float | None = None
         self.answer = compute(self._request(), None)
@@ -87,8 +94,8 @@ class Session:
     def _watch(self) -> None:
         watch = self.state.param.watch
         watch(lambda *_: self._ask(), ["source", "light", "reading", "less", "absent", "tracking"])
-        watch(lambda *_: self._draw_pixel(), ["pixel", "difference"])
-        watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
+        watch(lambda *_: self._ask_pixel(), ["pixel", "difference"])
+        watch(lambda *_: self.on_page(self._draw_rest), ["image", "cloud_color", "viewing"])
         self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
         self.cloud.param.watch(lambda event: self.pick(event.new), "selected")
 
@@ -136,11 +143,16 @@ class Session:
             self._await()
 
     def on_page(self, act: Callable[[], None]) -> None:
-        """Do something on the page's thread, soon, if the page is still there."""
-        if not self._served:
+        """Do something on the page's thread, in turn with other pages, if it is still there."""
+        if self._loop is None:
             act()
-        elif self.is_served:  # else the page is gone, and nobody left to see it
-            self.page.add_next_tick_callback(act)
+            return
+
+        def begin() -> None:
+            if self.is_served:  # else the page is gone, and nobody left to see it
+                self.page.add_next_tick_callback(act)
+
+        self._loop.add_callback(TURNS.ask, begin)
 
     def _later(self, act: Callable[[], None], after_ms: int) -> None:
         """Do something on the page's thread, after a while; its failure is told like any other."""
@@ -187,7 +199,8 @@ class Session:
             self._draw_rest()
         elif not self._rest_is_due:
             self._rest_is_due = True
-            self._later(self._draw_rest, REST_MS)
+            self._rest_asked_s = perf_counter()
+            self._later(self._ask_rest, REST_MS)
         self._settle(answer)
 
     def _enter(self, answer: Answer) -> None:
@@ -215,8 +228,22 @@ class Session:
         if index >= 0:
             self.choose_pixel(*divmod(index, self.answer.capture.shape[1]))
 
+    def _ask_pixel(self) -> None:
+        """Draw the pixel soon; once for all that is chosen until then."""
+        if not self._pixel_is_due:
+            self._pixel_is_due = True
+            self.on_page(self._draw_pixel)
+
+    def _ask_rest(self) -> None:
+        """Draw image and cloud, unless others wait for what comes first."""
+        if TURNS.is_crowded and perf_counter() - self._rest_asked_s < REST_AT_MOST_S:
+            self._later(self._ask_rest, REST_MS)
+        else:
+            self.on_page(self._draw_rest)
+
     def _draw_pixel(self) -> None:
         """The pixel's plots and numbers, and the frames that mark it."""
+        self._pixel_is_due = False
         if self._is_hidden:
             self._is_outdated = True
             return
