@@ -36,6 +36,9 @@ class Knob(JSComponent):
     help = param.String(default="")
     doubtful = param.List(default=[], doc="Zones of values in doubt: low, high, and why.")
 
+    # That someone drags is no news to the server's other pages, whom Panel would tell each time.
+    _busy__ignore: ClassVar = ["value"]
+
     _esm = Path(__file__).with_name("knob.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("knob.css")]
 
@@ -238,6 +241,8 @@ class PixelKeys(JSComponent):
     )
     letters = param.String(default="", doc="Further keys that are reported.")
     pressed = param.List(default=[], doc="The letter that was pressed, and when.")
+
+    _busy__ignore: ClassVar = ["pixel"]  # as of a knob
 
     _esm = """
     export function render({ model, el }) {

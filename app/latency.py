@@ -1,25 +1,44 @@
-"""Two defaults of the libraries that cost most of a slider's time, changed in one place.
+"""Defaults of the libraries that cost most of a slider's time, changed in one place.
 
-Measured by ``python -m tests.latency``: neither change alone gains much, both together halve the
-time from a slider's move to changed pixels.
+Measured by ``python -m tests.latency``: neither of the first two changes alone gains much, both
+together halve the time from a slider's move to changed pixels. The others are for many sessions at
+once, see ``python -m tests.load``.
 """
 
 from __future__ import annotations
 
+import asyncio
+import json
+import sys
+from contextlib import suppress
 from typing import Any
 
+from bokeh.protocol.message import Message
 from bokeh.server.views.ws import WSHandler
 from panel.reactive import Syncable
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
+
+from app.turns import TURNS
 
 DEBOUNCE_MS = 4
 """Panel collects property changes for 50 ms. So short a time suits callbacks as short as ours,
 which hand the work to `app.jobs`; under slow ones it would build a backlog."""
 
+CROWDED_MS = 50
+"""Panel's own time, for when pages wait for each other: what a drag overtakes meanwhile costs
+nothing more."""
+
+SWITCH_S = 5e-4
+"""A thread that computes keeps the others waiting for 5 ms whenever they have let go of the
+interpreter, as the page's thread does for every message it sends."""
+
 
 def tune() -> None:
-    """Apply both changes to this process."""
-    Syncable._debounce = DEBOUNCE_MS
+    """Apply the changes to this process."""
+    Syncable._debounce = property(lambda _: CROWDED_MS if TURNS.is_crowded else DEBOUNCE_MS)
     WSHandler.open = _open_without_delay(WSHandler.open)
+    WSHandler.send_message = _send_at_once
+    sys.setswitchinterval(SWITCH_S)
 
 
 def _open_without_delay(open_: Any) -> Any:
@@ -29,3 +48,19 @@ def _open_without_delay(open_: Any) -> Any:
         return open_(self, *arguments, **options)
 
     return open_now
+
+
+async def _send_at_once(socket: WSHandler, message: Message[Any]) -> None:
+    # Bokeh lets all other sessions have their turn after each of the parts, and Panel keeps what
+    # it has to say until the last of them is sent.
+    parts: list[tuple[str | bytes, bool]] = [
+        (message.header_json, False),
+        (message.metadata_json, False),
+        (message.content_json, False),
+    ]
+    for buffer in message.buffers:
+        parts += [(json.dumps(buffer.ref), False), (buffer.to_bytes(), True)]
+    with await socket.write_lock.acquire(), suppress(WebSocketClosedError):  # the page is gone
+        await asyncio.gather(
+            *(WebSocketHandler.write_message(socket, part, binary) for part, binary in parts)
+        )

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import panel as pn
 import param
+from tornado.ioloop import IOLoop
 
 from app import words
 from app.address import Wanted, defaults, query_of
@@ -23,6 +24,7 @@ from app.looks import cloud_of, image_of
 from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State, Viewing
 from app.store import Answer, Request, Source, compute, inspect, same_pixels, same_view
 from app.theme import WRONG_COLOR, palette
+from app.turns import TURNS
 from app.views import ImageView, SignalPlots
 from core.inspection import pixels_in
 
@@ -39,6 +41,9 @@ BROUGHT = ("pixel", "pins", "region", "viewing", "comparison")
 
 REST_MS = 60
 """Image and cloud are drawn this much after the pixel's plots, which are what the eye follows."""
+
+REST_AT_MOST_S = 1.0
+"""Where other pages wait for their turn, image and cloud wait too, but not longer than this."""
 
 
 class Session:
@@ -84,7 +89,9 @@ class Session:
         self.page = pn.state.curdoc
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
-        self._rest_is_due = False
+        self._loop = IOLoop.current() if self._served else None
+        self._rest_is_due = self._pixel_is_due = False
+        self._rest_asked_s = 0.0
         self._asked_s: float | None = None
         self.answer = self._first_answer(wanted)
         self._is_hidden, self._is_outdated = self.state.page != "Explore", False
@@ -142,8 +149,8 @@ class Session:
     def _watch(self) -> None:
         watch = self.state.param.watch
         watch(lambda *_: self._ask(), list(COMPUTED_FROM))
-        watch(lambda *_: self._draw_pixel(), ["pixel", "difference", "unit"])
-        watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
+        watch(lambda *_: self._ask_pixel(), ["pixel", "difference", "unit"])
+        watch(lambda *_: self.on_page(self._draw_rest), ["image", "cloud_color", "viewing"])
         self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
         self.cloud.param.watch(lambda event: self.pick(event.new), "selected")
 
@@ -203,11 +210,16 @@ class Session:
             self._await()
 
     def on_page(self, act: Callable[[], None]) -> None:
-        """Do something on the page's thread, soon, if the page is still there."""
-        if not self._served:
+        """Do something on the page's thread, in turn with other pages, if it is still there."""
+        if self._loop is None:
             act()
-        elif self.is_served:  # else the page is gone, and nobody left to see it
-            self.page.add_next_tick_callback(act)
+            return
+
+        def begin() -> None:
+            if self.is_served:  # else the page is gone, and nobody left to see it
+                self.page.add_next_tick_callback(act)
+
+        self._loop.add_callback(TURNS.ask, begin)
 
     def later(self, act: Callable[[], None], after_ms: int) -> None:
         """Do something on the page's thread, after a while; its failure is told like any other."""
@@ -255,7 +267,8 @@ class Session:
             self._draw_rest()
         elif not self._rest_is_due:
             self._rest_is_due = True
-            self.later(self._draw_rest, REST_MS)
+            self._rest_asked_s = perf_counter()
+            self.later(self._ask_rest, REST_MS)
         self._settle(answer)
 
     def _enter(self, answer: Answer, previous: Answer) -> None:
@@ -291,8 +304,22 @@ class Session:
         if index >= 0:
             self.choose_pixel(*divmod(index, self.answer.capture.shape[1]))
 
+    def _ask_pixel(self) -> None:
+        """Draw the pixel soon; once for all that is chosen until then."""
+        if not self._pixel_is_due:
+            self._pixel_is_due = True
+            self.on_page(self._draw_pixel)
+
+    def _ask_rest(self) -> None:
+        """Draw image and cloud, unless others wait for what comes first."""
+        if TURNS.is_crowded and perf_counter() - self._rest_asked_s < REST_AT_MOST_S:
+            self.later(self._ask_rest, REST_MS)
+        else:
+            self.on_page(self._draw_rest)
+
     def _draw_pixel(self) -> None:
         """The pixel's plots and numbers, and the frames that mark it."""
+        self._pixel_is_due = False
         if self._is_hidden:
             self._is_outdated = True
             return

@@ -257,6 +257,7 @@ class ImageView:
             plots.range_image(np.zeros((2, 2)), 0.0, 1.0), ("picture", "shadow", "frame")
         )
         self._shape, self._grid = (0, 0), Grid()
+        self._look: Look | None = None
         self.figure = self._plot.figure
         self.pane = pane_of(self.figure)
         self.figure.match_aspect = True
@@ -308,6 +309,9 @@ class ImageView:
     def update(self, image: Array, look: Look) -> None:
         """Show an image (row, col); NaN is left blank."""
         self._plot.source("picture").data["image"] = [np.asarray(image, np.float32)]
+        if look == self._look:
+            return  # Bokeh would look at every single colour again
+        self._look = look
         self._mapper.update(
             low=look.low,
             high=look.high,

@@ -1,0 +1,47 @@
+"""Whose page is drawn next, where there are many: one after the other, and messages in between."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+
+MESSAGES_FIRST = 6
+"""Times the loop goes round between two turns. A message takes some three: what hands move in the
+meantime arrives before the next page is drawn, and what it overtakes need not be drawn at all."""
+
+
+class Turns:
+    """A queue for the page's thread, which all sessions share.
+
+    Without it each time round the loop draws every page that has something new. A message, which
+    takes several times round, then waits for as many drawings of everyone, and values that have
+    long been overtaken queue up before the newest.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: deque[Callable[[], None]] = deque()
+        self._is_going_round = False
+
+    @property
+    def is_crowded(self) -> bool:
+        """Whether someone waits."""
+        return bool(self._waiting)
+
+    def ask(self, begin: Callable[[], None]) -> None:
+        """Have something begun when its turn comes; from the loop's own thread."""
+        self._waiting.append(begin)
+        if not self._is_going_round:
+            self._is_going_round = True
+            self._task = asyncio.ensure_future(self._go_round())
+
+    async def _go_round(self) -> None:
+        loop = asyncio.get_running_loop()
+        while self._waiting:
+            loop.call_soon(self._waiting.popleft())  # which logs a failure, and goes on
+            for _ in range(MESSAGES_FIRST):
+                await asyncio.sleep(0)
+        self._is_going_round = False
+
+
+TURNS = Turns()

@@ -1,0 +1,178 @@
+"""One session of the served app without a browser: what a page would send, and what it receives.
+
+It speaks Bokeh's protocol and keeps the few models that it follows as plain values: a document of
+real models, as `bokeh.client` has it, would cost more than the server's answer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from tornado.httpclient import AsyncHTTPClient, HTTPRequest
+from tornado.websocket import WebSocketClientConnection, websocket_connect
+
+LARGEST_MESSAGE = 2**30
+
+READY = {
+    "kind": "MessageSent",
+    "msg_type": "bokeh_event",
+    "msg_data": {
+        "type": "event",
+        "name": "document_ready",
+        "values": {"type": "map", "entries": []},
+    },
+}
+"""What a page says once it is drawn; until then the server keeps what it has to tell."""
+
+Model = dict[str, Any]
+
+
+class Wire:
+    """A page that is open, once `open` has returned.
+
+    Attributes
+    ----------
+    models : dict of str to dict
+        Type, and attributes as they were when the page was opened, of each model by its id.
+    values : mapping of (str, str) to object
+        Newest value of each attribute by the model's id; of a source, by the name of the column.
+    news : asyncio.Condition
+        Notified when a message has come, or the connection has ended.
+    troubles : list of str
+        What the server complained of.
+    is_closed : bool
+        Whether the server has ended the connection.
+    """
+
+    def __init__(self) -> None:
+        self.models: dict[str, Model] = {}
+        self.values: dict[tuple[str, str], Any] = {}
+        self.news = asyncio.Condition()
+        self.troubles: list[str] = []
+        self.is_closed = False
+        self._numbers: defaultdict[str, int] = defaultdict(int)
+
+    async def open(self, address: str, **headers: str) -> None:
+        """Fetch the page, connect its session and take over its document."""
+        page = await AsyncHTTPClient().fetch(address, request_timeout=120, headers=headers)
+        self._socket = await connected(address, token_in(page.body.decode()), **headers)
+        await self._receive()
+        await self._send("PULL-DOC-REQ", {})
+        _, content, buffers = await self._receive()
+        for model in _objects(content):
+            self.models[model["id"]] = model
+            for name, value in model["attributes"].items():
+                self._keep(model["id"], name, value, buffers)
+        self._reading = asyncio.ensure_future(self._read())
+        await self._send("PATCH-DOC", {"events": [READY]})
+
+    def close(self) -> None:
+        """Go away as a closed tab does."""
+        self._reading.cancel()
+        self._socket.close()
+
+    def find(self, kind: str, **attributes: Any) -> str:
+        """Id of the first model of a type with these attributes."""
+        return next(
+            key
+            for key, model in self.models.items()
+            if model["name"].startswith(kind)
+            and attributes.items() <= {k: _plain(v) for k, v in model["attributes"].items()}.items()
+        )
+
+    async def set(self, model: str, attribute: str, value: Any) -> None:
+        """Change a model as the page does."""
+        event = {"kind": "ModelChanged", "model": {"id": model}, "attr": attribute, "new": value}
+        await self._send("PATCH-DOC", {"events": [event]})
+
+    async def _send(self, kind: str, content: Any) -> None:
+        self._numbers[kind] += 1
+        header = {"msgid": f"{kind}-{self._numbers[kind]}", "msgtype": kind}
+        for part in (header, {}, content):  # without a pause: nothing can come between
+            sent = self._socket.write_message(json.dumps(part))
+        await sent
+
+    async def _receive(self) -> tuple[str, Any, dict[str, bytes]]:
+        header = json.loads(await self._part())
+        await self._part()
+        content = json.loads(await self._part())
+        buffers = {}
+        for _ in range(header.get("num_buffers", 0)):
+            name = json.loads(await self._part())["id"]
+            buffers[name] = await self._part()
+        return header["msgtype"], content, buffers
+
+    async def _part(self) -> Any:
+        part = await self._socket.read_message()
+        if part is None:
+            raise ConnectionError("the server has closed the connection")
+        return part
+
+    async def _read(self) -> None:
+        try:
+            while True:
+                kind, content, buffers = await self._receive()
+                if kind == "ERROR":
+                    self.troubles.append(content["text"])
+                for event in content.get("events", ()) if kind == "PATCH-DOC" else ():
+                    self._follow(event, buffers)
+                async with self.news:
+                    self.news.notify_all()
+        except ConnectionError as error:
+            self.troubles.append(str(error))
+            self.is_closed = True
+            async with self.news:
+                self.news.notify_all()
+
+    def _follow(self, event: Any, buffers: dict[str, bytes]) -> None:
+        if event["kind"] == "ModelChanged":
+            self._keep(event["model"]["id"], event["attr"], event["new"], buffers)
+        elif event["kind"] == "ColumnDataChanged":
+            self._keep(event["model"]["id"], "data", event["data"], buffers)
+
+    def _keep(self, model: str, name: str, value: Any, buffers: dict[str, bytes]) -> None:
+        if name == "data" and isinstance(value, dict) and value.get("type") == "map":
+            for column, values in value["entries"]:
+                self._keep(model, column, values, buffers)
+        elif isinstance(value, dict) and value.get("type") == "ndarray":
+            buffer = buffers[value["array"]["data"]["id"]]
+            self.values[model, name] = np.frombuffer(buffer, value["dtype"])
+        else:
+            self.values[model, name] = value
+
+
+def token_in(page: str) -> str:
+    """The token that a page's session is connected by."""
+    found = re.search(r'"token":"([^"]+)"', page)
+    if found is None:
+        raise ValueError(f"no page of the app: {page[:200]!r}")
+    return found[1]
+
+
+async def connected(address: str, token: str, **headers: str) -> WebSocketClientConnection:
+    """The websocket of a session; raises `HTTPClientError` where it is refused."""
+    return await websocket_connect(
+        HTTPRequest(address.replace("http", "ws", 1) + "ws", headers=headers),
+        subprotocols=["bokeh", token],
+        max_message_size=LARGEST_MESSAGE,
+    )
+
+
+def _objects(content: Any) -> Iterator[Model]:
+    """Every model in a document, where it is defined."""
+    parts = content.values() if isinstance(content, dict) else content
+    if isinstance(content, dict) and content.get("type") == "object" and "id" in content:
+        yield {"attributes": {}, **content}
+    for part in parts:
+        if isinstance(part, dict | list):
+            yield from _objects(part)
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, str | int | float) else None
