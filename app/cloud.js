@@ -63,7 +63,6 @@ const STYLE = `
 .problem:empty { display: none; }`
 
 const HOME_ICON = "M3 11l9-8 9 8M6 9.5V20h12V9.5"
-const SAVE_ICON = "M12 3v12m-5-5l5 5 5-5M4 20h16"
 
 // ---------------------------------------------------------------------------- small helpers
 
@@ -596,17 +595,17 @@ class CloudView {
     this.moved()
   }
 
-  /* The picture as PNG, tick labels and caption included. The canvas is copied in the task that
-   * drew it, before the browser may clear it. */
-  save() {
+  /* The picture with its tick labels and its caption, as a canvas, and its size on the page. The
+   * view's canvas is copied in the task that drew it, before the browser may clear it. */
+  picture() {
     this.draw()
-    if (!this.window) return
+    if (!this.window) throw new Error(this.problem.textContent || "the cloud is not drawn yet")
     const source = this.surface.getCanvas()
-    const copy = element("canvas", {width: source.width, height: source.height})
-    const pen = copy.getContext("2d")
+    const canvas = element("canvas", {width: source.width, height: source.height})
+    const pen = canvas.getContext("2d")
     const style = getComputedStyle(this.stage.parentNode)
     pen.fillStyle = style.backgroundColor
-    pen.fillRect(0, 0, copy.width, copy.height)
+    pen.fillRect(0, 0, canvas.width, canvas.height)
     pen.drawImage(source, 0, 0)
     pen.scale(this.ratio, this.ratio)
     pen.fillStyle = style.color
@@ -615,12 +614,9 @@ class CloudView {
     for (const {x, y, anchor, text} of this.box.shown) {
       pen.fillText(text, x + anchor * pen.measureText(text).width, y)
     }
-    pen.fillText(this.model.caption, 8, this.stage.clientHeight - 14)
-    copy.toBlob((blob) => {
-      const href = URL.createObjectURL(blob)
-      element("a", {href, download: "point-cloud.png"}).click()
-      setTimeout(() => URL.revokeObjectURL(href), 10000)
-    })
+    const {clientWidth: width, clientHeight: height} = this.stage
+    pen.fillText(this.model.caption, 8, height - 14)
+    return {canvas, width, height}
   }
 
   /* vtk.js does not survive the loss of its context, as when a laptop changes its GPU. */
@@ -735,10 +731,10 @@ export function render({model}) {
   const problem = element("div", {class: "problem", role: "alert"})
   const view = new CloudView(model, stage, problem)
   const tools = element("div", {class: "tools", role: "group", "aria-label": "3D view"},
-    button("Home view (0)", HOME_ICON, () => view.homeByHand()),
-    button("Save picture (PNG)", SAVE_ICON, () => view.save()))
+    button("Home view (0)", HOME_ICON, () => view.homeByHand()))
   const root = element("div", {class: "cloud"}, element("style", {}, STYLE),
     stage, caption, tools, problem)
+  root.picture = () => view.picture() // for whoever saves it
   views.set(model, view)
   listenToPointers(stage, view)
   listenToKeys(stage, view)

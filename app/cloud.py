@@ -1,4 +1,4 @@
-"""The 3D cloud: a range image as a PyVista mesh, as a file, and as points in the browser.
+"""The 3D cloud: a range image as a PyVista mesh, and as points in the browser.
 
 Its coordinates are those of `core.cloud`.
 
@@ -9,7 +9,6 @@ go to the browser, which draws them with the vtk.js that Panel bundles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.theme import WRONG_COLOR, palette
 from core.cloud import points_m
-from core.export import write_ply
 
 Floats = NDArray[np.float64]
 
@@ -36,8 +34,7 @@ def point_cloud(range_m: ArrayLike, pixel_angle_rad: float, **images: ArrayLike)
     pixel_angle_rad : float
         Angle between the lines of sight of neighbouring pixels, in radians.
     **images : array_like, shape (row, col) or (row, col, component)
-        Further images of the same size, kept as point data under their names; one named ``rgb``
-        with three uint8 components gives the colours of an exported PLY file.
+        Further images of the same size, kept as point data under their names.
 
     Returns
     -------
@@ -130,27 +127,6 @@ def _dense_ranges(ranges: Floats) -> tuple[float, float]:
         low, high = np.percentile(ranges, [0.5, 99.5])
         return float(low), float(high)
     return float(edges[dense[0]]), float(edges[dense[-1] + 1])
-
-
-def ply_bytes(cloud: pv.PolyData) -> bytes:
-    """Content of a PLY file that holds the cloud.
-
-    Parameters
-    ----------
-    cloud : pyvista.PolyData
-        From `point_cloud`; point data of one component are kept in their own types, ``rgb`` as
-        red, green and blue.
-    """
-    columns: dict[str, NDArray[Any]] = {}
-    for name in cloud.point_data:
-        values = np.asarray(cloud[name])
-        if name == "rgb":
-            columns |= dict(zip(("red", "green", "blue"), values.T, strict=True))
-        elif values.ndim == 1:
-            columns[name] = values
-    file = BytesIO()
-    write_ply(np.asarray(cloud.points), columns, file)
-    return file.getvalue()
 
 
 class PointCloud(pn.custom.JSComponent):

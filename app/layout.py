@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import panel as pn
@@ -16,6 +16,7 @@ from app.address import AddressBar, Wanted
 from app.compare import Compare
 from app.connection import Connection
 from app.controls import Sentence, SettingsPanel, Viewport
+from app.downloads import CLOUD, IMAGE, PLOT, cloud_on_show, downloadable, pixel_plot, range_image
 from app.inspector import Inspector
 from app.large_view import LargeView
 from app.pages import Pages, View, let_pages_come
@@ -400,14 +401,6 @@ class Layout:
         difference = pmui.Switch.from_param(
             session.state.param.difference, label="First difference", size="small", margin=(0, 8)
         )
-        cloud_file = pmui.FileDownload(
-            callback=session.cloud_file,
-            filename="firstphoton_cloud.ply",
-            label="Cloud as PLY",
-            variant="outlined",
-            size="small",
-            margin=(6, 8),
-        )
 
         def show(is_on_screen: bool) -> None:
             session.show(is_on_screen)
@@ -415,7 +408,7 @@ class Layout:
 
         return View(
             [session.figures, self._board(large)],
-            [part("View", self._viewing.layout, difference, cloud_file)],
+            [part("View", self._viewing.layout, difference)],
             show=show,
             follow=large.follow,
             paint=session.paint,
@@ -425,9 +418,21 @@ class Layout:
         session, state = self.session, self.session.state
         image_kind = choice("What the image shows", state.param.image)
         cloud_color = choice("What the cloud is coloured by", state.param.cloud_color)
-        image = card(image_kind, session.image_keys)
-        left = (image, large.layout, card(cloud_color, session.cloud))
-        right = (session.numbers, *map(card, session.signals.panes))
+        image, cloud = card(image_kind, session.image_keys), card(cloud_color, session.cloud)
+        left = (
+            downloadable(image, session, "image", partial(range_image, session), IMAGE),
+            large.layout,
+            downloadable(cloud, session, "3D cloud", partial(cloud_on_show, session), CLOUD),
+        )
+        plots = (
+            downloadable(
+                card(pane), session, what, partial(pixel_plot, session, pane.object, what), PLOT
+            )
+            for pane, what in zip(
+                session.signals.panes, ("histogram", "residual", "enhanced"), strict=True
+            )
+        )
+        right = (session.numbers, *plots)
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
             for content in (left, right)

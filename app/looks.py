@@ -37,6 +37,11 @@ class Look:
     colors: list[str]
     outside: str | None = None
 
+    @property
+    def legend(self) -> str:
+        """What the colours mean, with the unit."""
+        return f"{self.title} ({self.unit})" if self.unit else self.title
+
     def rgb(self, values: Array) -> NDArray[np.uint8]:
         """Colours of values (n,), as uint8 (n, 3)."""
         table = np.array([_rgb(color) for color in self.colors], np.uint8)
@@ -110,12 +115,12 @@ def cloud_of(
     half_rad = np.radians(viewing.field_of_view_deg) / 2
     angle_rad = float(np.arctan(2 * np.tan(half_rad) / answer.capture.shape[1]))
     range_m = np.where(visible, answer.run.image.range_m, np.nan)
-    cloud = point_cloud(range_m, angle_rad, confidence=answer.run.image.confidence)
-    rgb = look.rgb(values[visible])
-    if rgb.size:  # PyVista keeps no empty array
-        cloud["rgb"] = rgb
     wrong = is_wrong(answer)
-    return cloud, rgb, None if wrong is None else wrong[visible]
+    return (
+        point_cloud(range_m, angle_rad),
+        look.rgb(values[visible]),
+        None if wrong is None else wrong[visible],
+    )
 
 
 def _range_look(answer: Answer, title: str) -> Look:

@@ -130,7 +130,7 @@ class ScaleBar:
     def update(self, look: Look) -> None:
         """Show another scale."""
         self._mapper.update(low=look.low, high=look.high, palette=look.colors)
-        self._bar.title = f"{look.title} ({look.unit})" if look.unit else look.title
+        self._bar.title = look.legend
 
     def paint(self, colors: Palette) -> None:
         """Take on the colours of the mode."""

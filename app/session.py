@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from io import BytesIO
 from time import perf_counter
 from typing import Any
 
@@ -17,7 +16,7 @@ from tornado.ioloop import IOLoop
 
 from app import words
 from app.address import Wanted, defaults, query_of
-from app.cloud import PointCloud, ply_bytes
+from app.cloud import PointCloud
 from app.controls import Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
@@ -348,15 +347,11 @@ class Session:
 
     def _draw_cloud(self) -> None:
         answer, state = self.answer, self.state
-        self._cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing)
-        self.cloud.draw(self._cloud, rgb, crosses, scene_id=self.scene_id())
+        cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing)
+        self.cloud.draw(cloud, rgb, crosses, scene_id=self.scene_id())
         self.cloud.caption = words.cloud_caption(
-            answer, self._cloud.n_points, None if crosses is None else int(crosses.sum())
+            answer, cloud.n_points, None if crosses is None else int(crosses.sum())
         )
-
-    def cloud_file(self) -> BytesIO:
-        """The cloud as it is shown, as a PLY file."""
-        return BytesIO(ply_bytes(self._cloud))
 
     def scene_id(self) -> str:
         """Changes when the camera should start anew."""

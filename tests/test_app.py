@@ -9,7 +9,6 @@ from queue import SimpleQueue
 
 import numpy as np
 import pytest
-import pyvista as pv
 from bokeh.document import Document
 
 import core
@@ -864,15 +863,6 @@ def test_a_pixel_can_be_chosen_by_point_and_by_key(layout):
     session.image_keys.pixel = [11, 20]  # a list, as the browser sends it
     assert session.cloud.selected == 11 * 64 + 20
     assert told(session.numbers)["Pixel"] == "row 11, col 20"
-
-
-def test_the_cloud_file_holds_the_points_on_show(layout, tmp_path):
-    path = tmp_path / "cloud.ply"
-    path.write_bytes(layout.session.cloud_file().read())
-    shown = looks.shown(layout.session.answer, layout.session.state.viewing.least_confidence)
-    range_m = layout.session.answer.run.image.range_m[shown]
-    points = pv.read(path).points
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), range_m, rtol=1e-6)
 
 
 def test_hidden_answers_leave_the_cloud_but_not_the_figures(layout):

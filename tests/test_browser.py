@@ -9,7 +9,6 @@ from io import BytesIO
 
 import numpy as np
 import pytest
-import pyvista as pv
 from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
@@ -321,23 +320,6 @@ def test_the_camera_stays_while_a_slider_moves_and_goes_home_by_key(car_page):
     expect(stage(car_page)).not_to_have_attribute("data-camera", home)
     car_page.get_by_role("button", name="Home view (0)").click()
     expect(stage(car_page)).to_have_attribute("data-camera", home)
-
-
-def test_picture_and_cloud_can_be_saved(car_page, tmp_path):
-    with car_page.expect_download() as download:
-        car_page.get_by_role("button", name="Save picture (PNG)").click()
-    download.value.save_as(tmp_path / "cloud.png")
-    saved = pixels((tmp_path / "cloud.png").read_bytes())
-    box = stage(car_page).bounding_box()
-    assert saved.shape[:2] == (round(box["height"]), round(box["width"]))
-    assert n_ranges(saved) > 10
-    with car_page.expect_download() as download:
-        car_page.get_by_role("button", name="Cloud as PLY").click()
-    assert download.value.suggested_filename == "firstphoton_cloud.ply"
-    download.value.save_as(tmp_path / "cloud.ply")
-    cloud = pv.read(tmp_path / "cloud.ply")
-    assert cloud.n_points == int(stage(car_page).get_attribute("data-points"))
-    assert "RGB" in cloud.point_data
 
 
 # -- sliders and other controls --------------------------------------------------------------------

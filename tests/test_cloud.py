@@ -1,11 +1,7 @@
-import io
-
 import numpy as np
 import pytest
-import pyvista as pv
-import trimesh
 
-from app.cloud import PointCloud, pixel_index, ply_bytes, point_cloud, spacing_m, view_bounds
+from app.cloud import PointCloud, pixel_index, point_cloud, spacing_m, view_bounds
 from app.theme import palette
 from core.cloud import sight_lines
 
@@ -105,24 +101,6 @@ def test_a_cloud_without_points():
     seen = point_cloud(np.full((4, 4), 50.0), ANGLE)
     pane.draw(seen, np.zeros((16, 3), np.uint8), scene_id="empty")
     assert pane.bounds == view_bounds(seen)
-    with pytest.raises(ValueError, match=r"points = 0 .*an image with answers"):
-        ply_bytes(cloud)
-
-
-def test_ply_is_read_with_points_and_colours(cloud, tmp_path):
-    path = tmp_path / "cloud.ply"
-    path.write_bytes(ply_bytes(cloud))
-    again = pv.read(path)
-    np.testing.assert_allclose(again.points, cloud.points, rtol=1e-6, atol=1e-6)
-    np.testing.assert_array_equal(again["RGB"], cloud["rgb"])
-
-
-def test_ply_carries_every_image_of_one_component(cloud):
-    raw = trimesh.load(io.BytesIO(ply_bytes(cloud)), file_type="ply").metadata["_ply_raw"]
-    table = raw["vertex"]["data"]
-    assert len(table) == cloud.n_points
-    for name in ("range_m", "error_m", "counts", "row", "col"):
-        np.testing.assert_array_equal(table[name], cloud[name])
 
 
 def test_drawing_fills_the_buffers_in_one_update(cloud):

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.capture import Capture, Seen
 from core.checks import require
 from core.estimators import RangeImage
 from core.export import las, netcdf, npz, pcd, picture, ply, table, tiff
-from core.export.ply import write_ply
 from core.export.product import Product
+from core.export.table import write_columns
 from core.export.whole import whole_file, whole_folder
 from core.readers.labelled import dataset
 from core.readers.npz import fields
@@ -30,10 +31,11 @@ __all__ = [
     "CLOUD_SUFFIXES",
     "FOLDER_WRITERS",
     "WRITERS",
+    "Product",
     "save_capture",
     "save_image",
     "save_pixel",
-    "write_ply",
+    "write_columns",
 ]
 
 WRITERS: dict[str, Callable[[Product, BinaryIO], None]] = {
@@ -107,6 +109,7 @@ def save_image(
     overwrite: bool = False,
     pixel_angle_rad: float | None = None,
     title: str = "",
+    rgb: NDArray[np.uint8] | None = None,
 ) -> None:
     """Write a range image, whole or not at all; the suffix tells the format.
 
@@ -141,12 +144,14 @@ def save_image(
         None. Clouds need it.
     title : str
         Above a picture; its default says what is seen.
+    rgb : ndarray of uint8, shape (row, col, 3), optional
+        Colours of a cloud's points.
 
     Raises
     ------
     ValueError
-        If the suffix is unknown, image and capture differ in shape, the angle is not between 0 and
-        π/2, or a cloud is asked for and nobody knows the angle.
+        If the suffix is unknown, image and capture, or image and colours, differ in shape, the
+        angle is not between 0 and π/2, or a cloud is asked for and nobody knows the angle.
     FileExistsError
         If the file exists and is not to be replaced.
     OSError
@@ -158,7 +163,7 @@ def save_image(
     require("suffix", path.suffix, suffix in known, "one of " + ", ".join(known))
     if pixel_angle_rad is None:
         pixel_angle_rad = capture.acquisition.pixel_angle_rad
-    product = Product(capture, image, pixel_angle_rad, title)
+    product = Product(capture, image, pixel_angle_rad, title, rgb)
     if suffix in FOLDER_WRITERS:
         with whole_folder(path, overwrite=overwrite) as folder:
             FOLDER_WRITERS[suffix](product, folder)

@@ -2,7 +2,8 @@
 
 Coordinates are whole multiples of a step: the power of ten that is a thousandth of a bin or less,
 down to a hundredth of that; only a cloud too wide for 32 bits gets coarser ones. ``intensity`` is
-the counts, at most 65535. Extra bytes hold all else, their units in their descriptions.
+the counts, at most 65535, and colours fill 16 bits as the standard asks. Extra bytes hold all else,
+their units in their descriptions.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from core.acquisition import Floats
-from core.export.product import Product
+from core.export.product import COLORS, Product
 
 DESCRIPTIONS = {
     "range_m": "range of the surface, m",
@@ -40,7 +41,8 @@ def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
 
     points = product.points()
     columns = product.point_columns(points)
-    header = laspy.LasHeader(version="1.4", point_format=6)
+    colors = {name: columns.pop(name) for name in COLORS if name in columns}
+    header = laspy.LasHeader(version="1.4", point_format=7 if colors else 6)
     header.generating_software = "firstphoton"
     header.global_encoding.wkt = True  # which the standard demands of this point format
     header.offsets, header.scales = _grid(points.xyz_m, product.capture.acquisition.bin_length_m)
@@ -56,6 +58,8 @@ def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
     las.return_number[:] = las.number_of_returns[:] = 1
     for name, values in columns.items():
         las[name] = values
+    for name, values in colors.items():
+        las[name] = values.astype(np.uint16) * 257
     las.write(file, do_compress=compressed)
 
 

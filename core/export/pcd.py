@@ -13,7 +13,7 @@ from core.export.product import Product
 
 
 def write(product: Product, file: BinaryIO) -> None:
-    """Write x, y, z, range_m, counts, confidence, row and col of each point."""
+    """Write x, y, z, range_m, counts, confidence, row and col of each point, and its colour."""
     from pypcd4 import Encoding, PointCloud  # noqa: PLC0415 - only who writes PCD waits for it
 
     points = product.points()

@@ -13,6 +13,9 @@ from core.checks import require
 from core.cloud import Points, points_m
 from core.estimators import RangeImage
 
+COLORS = ("red", "green", "blue")
+"""Columns of a cloud that has colours."""
+
 
 class Plane(NamedTuple):
     """One image of a product, shape (row, col), its unit (by UDUNITS) and its meaning."""
@@ -36,22 +39,30 @@ class Product:
         Angle between the lines of sight of neighbouring pixels, in radians.
     title : str
         For people; see `heading`.
+    rgb : ndarray of uint8, shape (row, col, 3), optional
+        Colours of the points of a cloud.
 
     Raises
     ------
     ValueError
-        If image and capture differ in shape, or the angle is not between 0 and π/2.
+        If image and capture, or image and colours, differ in shape, or the angle is not between 0
+        and π/2.
     """
 
     capture: Seen
     image: RangeImage
     pixel_angle_rad: float | None = None
     title: str = ""
+    rgb: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         shape, angle_rad = self.image.range_m.shape, self.pixel_angle_rad
         known = self.capture.counts.shape
         require("image", f"shape {shape}", shape == known, f"shape {known}, the capture's")
+        if self.rgb is not None:
+            of, dtype = self.rgb.shape, self.rgb.dtype
+            fits = of == (*shape, 3) and dtype == np.uint8
+            require("rgb", f"{dtype} of shape {of}", fits, f"uint8 of shape {(*shape, 3)}")
         possible = angle_rad is None or 0 < angle_rad < np.pi / 2
         require("pixel_angle_rad", angle_rad, possible, "an angle between 0 and π/2 radians")
 
@@ -111,12 +122,14 @@ class Product:
     def point_columns(self, points: Points) -> dict[str, NDArray[Any]]:
         """What a cloud says of each point beside its coordinates; each of shape (point,)."""
         here = points.row, points.col
+        rgb = {} if self.rgb is None else dict(zip(COLORS, self.rgb[here].T, strict=True))
         return {
             "range_m": self.image.range_m[here],
             "counts": np.minimum(self.capture.counts[here], 2**32 - 1).astype(np.uint32),
             "confidence": self.image.confidence[here].astype(np.float32),
             "row": points.row,
             "col": points.col,
+            **rgb,
         }
 
 

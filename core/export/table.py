@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import csv
 import io
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from core.capture import Capture
 from core.export.product import Product
 from core.tracking import TrackingParameters, tracking_signals
+
+ROWS_AT_ONCE = 2**16
+"""Turned into text together: memory stays bounded, however long the columns are."""
 
 
 def write(product: Product, file: BinaryIO) -> None:
@@ -31,7 +33,7 @@ def write(product: Product, file: BinaryIO) -> None:
         "counts": product.capture.counts,
         "valid": image.valid.astype(int),
     }
-    _write(file, list(columns), [_cells(values) for values in columns.values()])
+    write_columns(columns, file)
 
 
 def write_pixel(
@@ -52,16 +54,34 @@ def write_pixel(
         "residual": signals.residual,
         "enhanced": signals.enhanced,
     }
-    _write(file, list(columns), [_cells(values) for values in columns.values()])
+    write_columns(columns, file)
+
+
+def write_columns(columns: Mapping[str, ArrayLike], file: BinaryIO) -> None:
+    """Write columns of one length, one line a place, whatever their shapes.
+
+    Parameters
+    ----------
+    columns : mapping of str to array_like
+        Numbers or text, by the columns' names.
+    file : file object
+        Open for bytes.
+    """
+    arrays = [np.asarray(values).ravel() for values in columns.values()]
+    length = len(arrays[0])
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+    writer = csv.writer(text)
+    writer.writerow(columns)
+    for start in range(0, length, ROWS_AT_ONCE):
+        cells = (_cells(values[start : start + ROWS_AT_ONCE]) for values in arrays)
+        writer.writerows(zip(*cells, strict=True))
+    text.detach()  # flushed, and `file` stays open
 
 
 def _cells(values: NDArray[Any]) -> list[object]:
-    return ["" if math.isnan(value) else value for value in values.ravel().tolist()]
-
-
-def _write(file: BinaryIO, names: Sequence[str], columns: Iterable[Sequence[object]]) -> None:
-    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-    writer = csv.writer(text)
-    writer.writerow(names)
-    writer.writerows(zip(*columns, strict=True))
-    text.detach()  # flushed, and `file` stays open
+    if values.dtype.kind != "f":
+        return list(values.tolist())
+    # Of 32 bits the digits that they have, not those of the double that is equal.
+    numbers = values.tolist() if values.itemsize > 4 else values.astype(str).tolist()
+    missing = np.isnan(values).tolist()
+    return ["" if is_nan else cell for cell, is_nan in zip(numbers, missing, strict=True)]

@@ -1,0 +1,311 @@
+"""Taking away what is on screen: a button for each card, the names of files, and what they hold.
+
+Nothing is computed before it is asked for. Pictures are made by the browser, of what it shows;
+other files are written by a worker to a temporary file on the disk, which travels in pieces and is
+gone once it has arrived.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import unicodedata
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, fields
+from functools import partial
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import IO, Any
+
+import panel as pn
+import param
+from panel.custom import JSComponent
+
+from app import download_words as words
+from app.exports import Write, cloud_files, image_files, plot_file
+from app.jobs import LatestWins
+from app.looks import Look, color_values, image_of
+from app.session import Session
+from app.store import Answer
+from core.parameters import spec_of
+
+log = logging.getLogger(__name__)
+
+# Few at a time, for all sessions together: a large file takes much memory, and waits for no slider.
+_WRITERS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="firstphoton-files")
+
+PIECE_BYTES = 2**20
+"""What travels at once: other messages of the page pass in between."""
+
+PICTURES = ("png", "svg")
+"""Formats that the browser makes."""
+
+PLOT = (*PICTURES, "csv")
+IMAGE = (*PLOT, "npz", "tif")
+CLOUD = ("png", "ply", "las", "csv")
+TABLE = ("csv",)
+"""Formats of each kind of card."""
+
+MOST_LETTERS = 120
+"""In a file's name; some systems take 143 bytes at most."""
+
+CORNER = {"position": "absolute", "top": "3px", "right": "3px", "z-index": "3"}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a file is about.
+
+    Parameters
+    ----------
+    capture : str
+        A scene's key, or a file's name without its suffix.
+    estimator : str
+        Empty where several, or none, have a part in it.
+    settings : sequence of dataclass
+        Settings as controls are made of; only those that are not the default are told.
+    told : str
+        Where the capture came from.
+    """
+
+    capture: str
+    estimator: str = ""
+    settings: Sequence[Any] = ()
+    told: str = ""
+
+    @property
+    def chosen(self) -> list[str]:
+        """Settings that are not the default, as ``symbol value`` without the space."""
+        return [
+            _symbol(each) + _plain(getattr(settings, each.name))
+            for settings in self.settings
+            for each in fields(settings)
+            if getattr(settings, each.name) != each.default
+        ]
+
+    def file_name(self, what: str, suffix: str) -> str:
+        """Name of a file, of letters that harm no system and no shell.
+
+        Parameters
+        ----------
+        what : str
+            What the file shows of the subject.
+        suffix : str
+            Of the format, without the point.
+        """
+        capture, what = _plain(self.capture)[:40].strip("-._") or "capture", _plain(what)[:40]
+        room = MOST_LETTERS - len(f"{capture}_{self.estimator}_{what}.{suffix}")
+        told = ""
+        for each in self.chosen:
+            if len(told) + len(each) < room:
+                told += f"_{each}"
+        method = f"_{self.estimator}" if self.estimator else ""
+        return f"{capture}{method}{told}_{what}.{suffix}"
+
+    def about(self, what: str) -> str:
+        """What a picture's file says of itself."""
+        parts = (self.estimator.replace("_", " "), " ".join(self.chosen), self.told)
+        return "; ".join([f"firstphoton: {what}", *filter(None, parts)])
+
+
+def _plain(value: Any) -> str:
+    """Letters without accents, digits, points, dashes and underscores."""
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    ascii_ = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+    return re.sub(r"[^\w.+-]+", "-", ascii_).strip("-._")
+
+
+def _symbol(of: Any) -> str:
+    """A setting's symbol, or its name where that is no short one of plain letters."""
+    symbol = spec_of(of).symbol.replace("_", "")
+    return symbol if symbol.isascii() and symbol.isalnum() else of.name.replace("_", "-")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a card shows at the moment, ready to be written.
+
+    Parameters
+    ----------
+    subject : Subject
+    what : str
+        What is shown of it; ends up in the files' names.
+    files : mapping of str to callable
+        What writes each format that is no picture of the screen, by suffix without the point.
+    heading : str
+        What stands above a picture that tells it nowhere itself.
+    scale : Look, optional
+        Colours of a picture that has no colour bar of its own.
+    """
+
+    subject: Subject
+    what: str
+    files: Mapping[str, Write] = field(default_factory=dict)
+    heading: str = ""
+    scale: Look | None = None
+
+
+class Download(JSComponent):
+    """The button of a card; see `downloadable`."""
+
+    what = param.String(doc="What a screen reader says the card shows.")
+    formats = param.List(doc="Suffix without the point, and a line of help, of each.")
+
+    # A page has many of these: the browser fetches the code once, by its address.
+    _bundle = Path(__file__).with_name("downloads.js")
+
+    def __init__(self, session: Session, show: Callable[[], Shown], **params: Any) -> None:
+        super().__init__(**params)
+        self._session = session
+        self._show = show
+        self._jobs: LatestWins[IO[bytes]] = LatestWins(session.on_page, _WRITERS)
+        self._file: IO[bytes] | None = None
+        self._name = ""
+        self._size = 0
+
+    def _handle_msg(self, asked: Any) -> None:
+        """The browser asks for a format, for the next piece of a file, or tells what failed."""
+        try:
+            if "suffix" in asked:
+                self._begin(asked["suffix"])
+            elif "from" in asked:
+                self._send_piece(asked["from"])
+            elif "failed" in asked:
+                self._session.complain(words.no_picture(str(asked["failed"])))
+        except Exception as error:  # whatever it is, the page must tell it
+            self._fail(error)
+
+    def _begin(self, suffix: str) -> None:
+        if suffix not in [known for known, _ in self.formats]:
+            return
+        shown = self._show()
+        self._name = shown.subject.file_name(shown.what, suffix)
+        if suffix in PICTURES:
+            self._send_msg({"picture": self._picture(shown, suffix)})
+        else:
+            self._jobs.submit(partial(_written, shown.files[suffix]), self._send_first, self._fail)
+
+    def _picture(self, shown: Shown, suffix: str) -> dict[str, Any]:
+        scale = shown.scale and {
+            "title": shown.scale.legend,
+            "low": f"{shown.scale.low:.4g}",
+            "high": f"{shown.scale.high:.4g}",
+            "colors": shown.scale.colors,
+        }
+        about = shown.subject.about(shown.what)
+        picture = {"suffix": suffix, "name": self._name, "about": about}
+        return picture | {"heading": shown.heading, "scale": scale}
+
+    def _send_first(self, file: IO[bytes]) -> None:
+        self._close()
+        self._file, self._size = file, file.tell()
+        self._send_piece(0)
+
+    def _send_piece(self, start: int) -> None:
+        if self._file is None:
+            return
+        self._file.seek(start)
+        piece = self._file.read(PIECE_BYTES)
+        if start + len(piece) >= self._size:
+            self._close()
+        self._send_msg({"piece": piece, "size": self._size, "name": self._name})
+
+    def _fail(self, error: Exception) -> None:
+        log.warning("a download failed", exc_info=error)
+        self._close()
+        self._session.complain(words.not_saved(error))
+        self._send_msg({"failed": True})
+
+    def _close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def _written(write: Write) -> IO[bytes]:
+    """A file, at its end; gone once it is closed."""
+    # tifffile wants a file that has a name.
+    file = NamedTemporaryFile(prefix="firstphoton-")  # noqa: SIM115 - outlives this function
+    try:
+        write(file)
+        file.flush()
+        file.seek(0, 2)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def downloadable(
+    card: pn.Column,
+    session: Session,
+    what: str,
+    show: Callable[[], Shown],
+    formats: Iterable[str],
+) -> pn.Column:
+    """Put a download button into the corner of a card.
+
+    Parameters
+    ----------
+    card : pn.Column
+        What holds the plot, the cloud or the table.
+    session : Session
+        Whose page it is.
+    what : str
+        What is to be downloaded, for a tooltip and a screen reader.
+    show : callable
+        What the card shows when the button is pressed; raises ``ValueError`` where that is nothing.
+    formats : iterable of str
+        Suffixes without the point: "png" and "svg", and keys of `Shown.files`.
+    """
+    known = [[suffix, words.FORMATS[suffix]] for suffix in formats]
+    button = Download(session, show, what=what, formats=known, styles=CORNER, margin=0)
+    card.append(button)
+    return card
+
+
+# What cards show
+
+
+def subject_of(session: Session, answer: Answer, estimator: str, settings: Any) -> Subject:
+    """What a file is about that shows an answer, of a method with its settings."""
+    request = answer.request
+    if request.source.is_scene:
+        capture, lit = session.key(request.source), [request.light]
+    else:
+        capture, lit = Path(request.source.title).stem, []
+    absent = "".join(f" without {name}" for name in sorted(request.absent))
+    return Subject(
+        capture + absent, estimator, (*lit, request.less, settings), answer.capture.source
+    )
+
+
+def explored(session: Session) -> Subject:
+    """The session's own answer."""
+    return subject_of(session, session.answer, "tracking", session.answer.request.tracking)
+
+
+def pixel_plot(session: Session, figure: Any, what: str) -> Shown:
+    """A plot of the session's pixel."""
+    row, col = session.state.pixel
+    return Shown(explored(session), f"{what} row{row} col{col}", {"csv": plot_file(figure)})
+
+
+def range_image(session: Session) -> Shown:
+    """The session's image, whatever it shows."""
+    answer, state = session.answer, session.state
+    least = state.viewing.least_confidence
+    values, look = image_of(answer, state.image, least)
+    files = image_files(answer, least, values, look, session.image.figure)
+    what = "range image" if state.image == "Estimate" else f"{state.image} image"
+    return Shown(explored(session), what.lower(), files)
+
+
+def cloud_on_show(session: Session) -> Shown:
+    """The session's cloud, with the colour scale that the page shows beside the image alone."""
+    answer, state = session.answer, session.state
+    _, look = color_values(answer, state.cloud_color)
+    files = cloud_files(answer, state.cloud_color, state.viewing)
+    heading = f"3D cloud, coloured by {state.cloud_color.lower()}"
+    return Shown(explored(session), "cloud", files, heading, look)

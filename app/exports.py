@@ -1,0 +1,249 @@
+"""What the files hold that are downloaded: of plots, images, clouds and tables, as shown.
+
+Each function takes what is shown now and returns what writes it later, on a worker.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, BinaryIO
+
+import numpy as np
+from bokeh.models import Axis, GlyphRenderer
+from numpy.typing import NDArray
+
+from app.download_words import NO_POINTS, NOTHING_DRAWN
+from app.looks import Look, cloud_of, shown
+from app.state import Viewing
+from app.store import Answer
+from app.theme import WRONG_COLOR
+from core.experiments.items import Table, as_csv
+from core.export import WRITERS, Product, write_columns
+
+Array = NDArray[Any]
+
+Write = Callable[[BinaryIO], None]
+"""Writes a file, on a worker."""
+
+
+# Plots
+
+
+def plot_file(figure: Any) -> Write:
+    """The curves of a Bokeh figure, as CSV; see `drawn`."""
+    return partial(write_columns, drawn(figure))
+
+
+def drawn(figure: Any) -> dict[str, Array]:
+    """The curves of a Bokeh figure as columns, as far as they are in view.
+
+    The first column is the horizontal axis. Curves over the same places share their lines; those
+    over other places, such as upright marks, follow in lines of their own, NaN in all other
+    columns. What the legend has hidden, and what is of no name, is left out.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    groups: dict[bytes, tuple[Array, dict[str, Array]]] = {}
+    low, high = _view(figure.x_range)
+    for name, x, y in _curves(figure):
+        inside = (x >= low) & (x <= high)
+        _, curves = groups.setdefault(x[inside].tobytes(), (x[inside], {}))
+        curves[f"{name} ({_label(figure.left)})"] = y[inside]
+    if not groups:
+        raise ValueError(NOTHING_DRAWN)
+    columns = {_label(figure.below): np.concatenate([x for x, _ in groups.values()])}
+    for name in dict.fromkeys(name for _, curves in groups.values() for name in curves):
+        pieces = [
+            curves.get(name, np.full(x.size, np.nan, np.float32)) for x, curves in groups.values()
+        ]
+        columns[name] = np.concatenate(pieces)
+    return columns
+
+
+def _curves(figure: Any) -> Iterator[tuple[str, Array, Array]]:
+    """Name, x and y of all that a figure draws."""
+    labels = {
+        renderer.id: item.label.value
+        for legend in figure.legend
+        for item in legend.items
+        if hasattr(item.label, "value")
+        for renderer in item.renderers
+    }
+    for renderer in figure.renderers:
+        if not isinstance(renderer, GlyphRenderer) or not renderer.visible:
+            continue
+        glyph, data = renderer.glyph, renderer.data_source.data
+        kind = type(glyph).__name__
+        name = labels.get(renderer.id, renderer.name)
+        if kind == "MultiLine":
+            for title, x, y in zip(data["title"], data["xs"], data["ys"], strict=True):
+                yield title, np.asarray(x), np.asarray(y)
+        elif not name:
+            continue
+        elif kind == "Quad":
+            middle = (np.asarray(data["left"]) + np.asarray(data["right"])) / 2
+            yield name, middle, np.asarray(data["top"])
+        elif kind == "VArea":
+            for end, column in (("lowest", glyph.y1), ("highest", glyph.y2)):
+                yield f"{name}, {end}", np.asarray(data[glyph.x]), np.asarray(data[column])
+        else:
+            y = glyph.top if kind == "VBar" else glyph.y
+            yield name, np.asarray(data[glyph.x]), np.asarray(data[y])
+
+
+def _label(side: Sequence[Any]) -> str:
+    """Label of the axis on a side of a figure."""
+    return next(each.axis_label for each in side if isinstance(each, Axis))
+
+
+def _view(of: Any) -> tuple[float, float]:
+    """Ends of an axis as it is zoomed; everything where the browser has not told yet."""
+    ends = [of.start, of.end]
+    if any(map(math.isnan, ends)):
+        return -math.inf, math.inf
+    return min(ends), max(ends)
+
+
+# Images
+
+
+def image_files(
+    answer: Answer, least_confidence: float, values: Array, look: Look, figure: Any
+) -> dict[str, Write]:
+    """An image (row, col) as shown, and the answer behind it.
+
+    Parameters
+    ----------
+    answer : Answer
+    least_confidence : float
+        Answers below are left out.
+    values : ndarray, shape (row, col)
+        What the image shows.
+    look : Look
+        What it is called.
+    figure : bokeh.plotting.figure
+        Where it is drawn; a CSV file holds the pixels in view.
+    """
+    product = _product(answer, least_confidence)
+    files = {suffix: partial(WRITERS[f".{suffix}"], product) for suffix in ("npz", "tif")}
+    return {"csv": image_file(values, look, figure), **files}
+
+
+def image_file(values: Array, look: Look, figure: Any) -> Write:
+    """The pixels in view of an image (row, col), one line each, as CSV."""
+    rows, cols = (
+        _in_view(ends, n)
+        for ends, n in zip((figure.y_range, figure.x_range), values.shape, strict=True)
+    )
+
+    def write(file: BinaryIO) -> None:
+        row, col = np.meshgrid(rows, cols, indexing="ij")
+        write_columns({"row": row, "col": col, look.legend: values[np.ix_(rows, cols)]}, file)
+
+    return write
+
+
+def _in_view(of: Any, size: int) -> Array:
+    """Indices of an image's rows or columns that are at least partly in view."""
+    low, high = _view(of)
+    index = np.arange(size)
+    return index[(index + 0.5 > low) & (index - 0.5 < high)]
+
+
+def _product(answer: Answer, least_confidence: float, **more: Any) -> Product:
+    """What is shown of an answer, as `core.export` takes it."""
+    visible, image = shown(answer, least_confidence), answer.run.image
+    range_m = np.where(visible, image.range_m, np.nan)
+    more.setdefault("pixel_angle_rad", answer.capture.acquisition.pixel_angle_rad)
+    return Product(answer.capture, replace(image, range_m=range_m, valid=visible), **more)
+
+
+# Clouds
+
+
+def cloud_files(answer: Answer, kind: str, viewing: Viewing) -> dict[str, Write]:
+    """The points of `app.looks.cloud_of`, with the colours that they have on screen.
+
+    Raises
+    ------
+    ValueError
+        If there are none.
+    """
+    if not shown(answer, viewing.least_confidence).any():
+        raise ValueError(NO_POINTS)
+    prepare = partial(_cloud, answer, kind, viewing)
+
+    def table(file: BinaryIO) -> None:
+        product = prepare()
+        points = product.points()
+        xyz_m = dict(zip(("x_m", "y_m", "z_m"), points.xyz_m.T, strict=True))
+        write_columns(xyz_m | product.point_columns(points), file)
+
+    return {
+        "ply": lambda file: WRITERS[".ply"](prepare(), file),
+        "las": lambda file: WRITERS[".las"](prepare(), file),
+        "csv": table,
+    }
+
+
+def _cloud(answer: Answer, kind: str, viewing: Viewing) -> Product:
+    """The answers on show, and in the image of their colours those of the points on screen."""
+    cloud, rgb, wrong = cloud_of(answer, kind, viewing)
+    rgb = rgb.copy()
+    if wrong is not None:
+        rgb[wrong] = tuple(bytes.fromhex(WRONG_COLOR[1:]))
+    image = np.zeros((*answer.capture.shape, 3), np.uint8)
+    image[shown(answer, viewing.least_confidence)] = rgb
+    angle_rad = float(cloud.field_data["pixel_angle_rad"][0])
+    return _product(answer, viewing.least_confidence, pixel_angle_rad=angle_rad, rgb=image)
+
+
+# Tables
+
+
+def table_file(item: Table) -> Write:
+    """A table with every digit of its numbers, as CSV."""
+    return _text(item.columns, item.rows)
+
+
+def shown_table_file(columns: Sequence[Sequence[Any]], rows: Sequence[Mapping[str, Any]]) -> Write:
+    """Columns and rows of an `app.controls.Table` as they stand there, as CSV.
+
+    A cell's smaller line and a row's note get columns of their own; a percent sign that a whole
+    column carries moves into its name.
+    """
+    (first, *_), *others = columns
+    heads, body = [first], [[row["name"]] for row in rows]
+    for place, (title, *_) in enumerate(others):
+        cells = [row["cells"][place] if row.get("cells") else ("", None, "") for row in rows]
+        texts = ["" if cell[0] == "–" else cell[0].replace(",", "") for cell in cells]
+        in_percent = all(text.endswith(" %") for text in texts if text) and any(texts)
+        heads.append(f"{title} (%)" if in_percent else title)
+        for line, text in zip(body, texts, strict=True):
+            line.append(text.removesuffix(" %"))
+        if any(cell[2] for cell in cells):
+            heads.append(f"{title}, more")
+            for line, cell in zip(body, cells, strict=True):
+                line.append(cell[2])
+    notes = [row.get("message") or row.get("note") or "" for row in rows]
+    return _text([*heads, "note"], [[*line, note] for line, note in zip(body, notes, strict=True)])
+
+
+def _text(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Write:
+    if not rows:
+        raise ValueError(NOTHING_DRAWN)
+    plain = [
+        ["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row]
+        for row in rows
+    ]
+
+    def write(file: BinaryIO) -> None:
+        file.write(as_csv(columns, plain).encode())
+
+    return write
