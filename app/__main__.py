@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from pathlib import Path
 
@@ -10,9 +11,11 @@ import panel as pn
 
 import core
 from app import latency
-from app.layout import MAX_UPLOAD_BYTES, build_page
+from app.connection import LINGER_S, serving_options
+from app.layout import build_page
 from app.state import Light, Reading
 from app.store import built_in_sources, file_source
+from app.uploads import MAX_UPLOAD_BYTES, Uploads
 from core.readers import READERS
 
 
@@ -25,6 +28,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--port", type=int, default=5006, help="default: 5006")
     parser.add_argument("--address", default="127.0.0.1", help="default: this machine only")
     parser.add_argument("--show", action="store_true", help="open a browser")
+    parser.add_argument(
+        "--linger",
+        type=float,
+        default=LINGER_S,
+        metavar="SECONDS",
+        help="for how long a page that is closed or cut off is kept (default: %(default)s)",
+    )
     chosen = parser.parse_args(arguments)
     # The files given come first: the page opens on them.
     given = {f"path {n}": file_source(p, shared=True) for n, p in enumerate(chosen.captures)}
@@ -33,14 +43,15 @@ def main(arguments: list[str] | None = None) -> int:
             print(source.load(Light(), Reading(), ()).source, flush=True)
         except core.CaptureError as error:
             parser.error(str(error))
-    sources = given | built_in_sources()
+    sources, uploads = given | built_in_sources(), Uploads()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # uploads are removed then, too
     print("Compiling what is not compiled yet ...", flush=True)
     core.warm_up()
     latency.tune()
     pn.extension("vtk")
     print(f"Open http://{chosen.address}:{chosen.port} in a browser; Ctrl+C stops.", flush=True)
     pn.serve(
-        {"/": lambda: build_page(sources)},
+        {"/": lambda: build_page(sources, uploads)},
         port=chosen.port,
         address=chosen.address,
         websocket_origin=[f"{host}:{chosen.port}" for host in {chosen.address, "localhost"}],
@@ -48,6 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
         show=chosen.show,
         title="firstphoton",
         verbose=False,
+        **serving_options(chosen.linger),
     )
     return 0
 

@@ -28,9 +28,17 @@ from app.method_views import (
 )
 from app.pages import View
 from app.parts import card, part
-from app.ranking import Result, Task, Yardstick, run_task, score_curves, yardstick
+from app.ranking import (
+    Result,
+    Task,
+    Yardstick,
+    run_task,
+    score_curves,
+    tasks_of,
+    yardstick,
+)
 from app.session import Session
-from app.state import Viewing
+from app.state import CLOUDS, KINDS, Comparison, Viewing
 from app.store import Answer
 from app.theme import method_style, palette
 from core import ESTIMATORS
@@ -38,13 +46,10 @@ from core.estimators import FALSE_ALARM
 
 log = logging.getLogger(__name__)
 
-FIRST_PICKS = ("peak", "coates", "likelihood", "tracking", "oracle")
-
 MOST_PICTURES = 6
 
-CLOUDS = "3D clouds"
-KINDS = {"Range": "Estimate", "Error": "Error", "Confidence": "Confidence", CLOUDS: "Estimate"}
-"""What the pictures may show, and what `app.looks` calls it."""
+LOOKS = {"Range": "Estimate", CLOUDS: "Estimate"}
+"""What `app.looks` calls what the pictures show, where it has another name."""
 
 IMAGE_HEIGHT, CLOUD_HEIGHT = 216, 320
 
@@ -92,8 +97,6 @@ class Compare:
         self._measure: Yardstick | None = None
         self._is_busy = self._is_stopped = self._is_on_screen = False
         self._dark = False
-        self._settings = {method: each.parameters() for method, each in ESTIMATORS.items()}
-        self._viewing = Viewing(0.0, session.state.viewing.field_of_view_deg)
         self._scene_id = ""
         self._bounds: list[float] = []
         self._make_controls()
@@ -108,8 +111,8 @@ class Compare:
 
     def pick(self, method: str, settings: Any) -> None:
         """Have a method among those compared, with these settings."""
-        self._settings[method] = settings
         if method in self._own:
+            self._set(method, settings)
             self._own[method].show(settings)
         if method in self._picks.value:
             self._picked()
@@ -121,22 +124,23 @@ class Compare:
     # Controls and views
 
     def _make_controls(self) -> None:
-        picks = [method for method in ESTIMATORS if method in FIRST_PICKS]
+        chosen = self._chosen
         self._picks = pmui.CheckBoxGroup(
             label="Methods to compare",
             options={title_of(method): method for method in ESTIMATORS},
-            value=picks,
+            value=list(chosen.methods),
             sizing_mode="stretch_width",
             margin=(0, 8),
         )
         self._picks.param.watch(lambda _: self._picked(), "value")
         self._false_alarm = Knob.of(
             FALSE_ALARM,
-            1.0,
+            Comparison().false_alarm,
             "Share of the pixels without an echo that may be answered: lower, and a method answers "
             "only where its score exceeds what noise alone would show. 1 answers all.",
         )
-        self._false_alarm.param.watch(lambda _: self._refresh(), "value")
+        self._false_alarm.value = chosen.false_alarm
+        self._false_alarm.param.watch(lambda event: self._alarmed(event.new), "value")
         self._own = {
             method: self._panel(method)
             for method, each in ESTIMATORS.items()
@@ -146,17 +150,17 @@ class Compare:
             method: part(ESTIMATORS[method].title, panel.layout, is_open=False)
             for method, panel in self._own.items()
         }
-        self._view_panel = SettingsPanel(self._viewing, self._viewing_changed)
+        self._view_panel = SettingsPanel(Comparison().viewing, self._viewing_changed)
         self._kind = pmui.RadioButtonGroup(
             options=list(KINDS),
-            value="Range",
+            value=chosen.kind,
             label="",
             description="What the pictures show, on one scale for all methods.",
             size="small",
             width=345,
             margin=0,
         )
-        self._kind.param.watch(lambda _: self._draw_pictures(), "value")
+        self._kind.param.watch(lambda event: self._kind_changed(event.new), "value")
         self._bar = pmui.LinearProgress(
             variant="determinate", value=0, width=160, margin=(14, 0), visible=False
         )
@@ -172,10 +176,12 @@ class Compare:
 
     def _panel(self, method: str) -> SettingsPanel[Any]:
         def changed(settings: Any) -> None:
-            self._settings[method] = settings
+            self._set(method, settings)
             self._refresh()
 
-        return SettingsPanel(self._settings[method], changed)
+        panel = SettingsPanel(ESTIMATORS[method].parameters(), changed)
+        panel.show(self._chosen.settings[method])
+        return panel
 
     def _make_views(self) -> None:
         self._pictures: list[Picture] = []
@@ -263,12 +269,32 @@ class Compare:
 
     # What the user does
 
+    @property
+    def _chosen(self) -> Comparison:
+        chosen: Comparison = self._session.state.comparison
+        return chosen
+
+    def _choose(self, **changes: Any) -> None:
+        self._session.state.comparison = replace(self._chosen, **changes)
+
+    def _set(self, method: str, settings: Any) -> None:
+        self._choose(settings={**self._chosen.settings, method: settings})
+
     def _picked(self) -> None:
+        self._choose(methods=tuple(each for each in ESTIMATORS if each in self._picks.value))
         self._is_stopped = False
         self._refresh()
 
+    def _alarmed(self, share: float) -> None:
+        self._choose(false_alarm=share)
+        self._refresh()
+
+    def _kind_changed(self, kind: str) -> None:
+        self._choose(kind=kind)
+        self._draw_pictures()
+
     def _viewing_changed(self, viewing: Viewing) -> None:
-        self._viewing = viewing
+        self._choose(viewing=viewing)
         self._draw_pictures()
 
     def _stop_or_go_on(self) -> None:
@@ -286,12 +312,7 @@ class Compare:
     @property
     def _tasks(self) -> dict[str, Task]:
         """What is picked, in the order of the registry."""
-        settings = self._settings | {"tracking": self._session.answer.request.tracking}
-        return {
-            method: Task(method, settings[method], self._false_alarm.value)
-            for method in ESTIMATORS
-            if method in self._picks.value
-        }
+        return tasks_of(self._chosen, self._session.answer.request.tracking)
 
     def _styles(self) -> dict[str, Style]:
         colors = palette(self._dark)
@@ -326,8 +347,7 @@ class Compare:
         if session.scene_id() != self._scene_id:
             self._scene_id = session.scene_id()
             own = session.own_field_of_view_deg
-            self._viewing = replace(self._viewing, field_of_view_deg=own)
-            self._view_panel.show(self._viewing)
+            self._view_panel.show(self._chosen.viewing)
             self._view_panel.controls["field_of_view_deg"].initial = own
             cloud, _, wrong = cloud_of(session.answer, "Range", session.state.viewing)
             self._bounds = view_bounds(cloud, None if wrong is None else ~wrong)
@@ -409,8 +429,9 @@ class Compare:
             self._grid.stylesheets = [
                 GRID.format(columns=columns, few=1 if clouds else 3, fewest=1 if clouds else 2)
             ]
-            least = self._viewing.least_confidence
-            _, look = image_of(self._session.answer, KINDS[self._kind.value], least)
+            least = self._chosen.viewing.least_confidence
+            look_name = LOOKS.get(self._kind.value, self._kind.value)
+            _, look = image_of(self._session.answer, look_name, least)
             self._scale.update(look)
             self._make_pictures(len(methods))
             for picture, method in zip(self._pictures, methods, strict=False):
@@ -420,11 +441,11 @@ class Compare:
                 if method in answers and clouds:
                     self._draw_cloud(picture, method, answers[method])
                 elif method in answers:
-                    values, _ = image_of(answers[method], KINDS[self._kind.value], least)
+                    values, _ = image_of(answers[method], look_name, least)
                     picture.draw_image(values, look)
 
     def _draw_cloud(self, picture: Picture, method: str, answer: Answer) -> None:
-        cloud, rgb, wrong = cloud_of(answer, "Range", self._viewing)
+        cloud, rgb, wrong = cloud_of(answer, "Range", self._chosen.viewing)
         view = picture.show_cloud(self._dark)
         view.label = f"Point cloud: {title_of(method)}. Arrow keys turn all clouds together."
         view.draw(cloud, rgb, wrong, scene_id=self._scene_id, bounds=self._bounds)

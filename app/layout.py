@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import panel as pn
@@ -15,22 +12,23 @@ from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
 from app import words
+from app.address import AddressBar, Wanted
 from app.compare import Compare
+from app.connection import Connection
 from app.controls import Sentence, SettingsPanel, Window
 from app.inspector import Inspector
 from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
 from app.parts import card, choice, part, select
 from app.session import Session
-from app.state import Less, Reading
-from app.store import Answer, Request, Source, file_source
+from app.state import Less, Light, Reading, Viewing
+from app.store import Answer, Request, Source
 from app.theme import DARK, LIGHT, SIZES
 from app.tradeoff import Tradeoff
+from app.uploads import MAX_UPLOAD_BYTES, Uploads
 from core import PRESETS, TrackingParameters
 from core.experiments.tradeoff import Point
 from core.readers import READERS
-
-MAX_UPLOAD_BYTES = 100 * 2**20
 
 CUSTOM = "custom"
 
@@ -127,18 +125,26 @@ class Page(pmui.Page):
         return root
 
 
-def build_page(sources: Mapping[str, Source]) -> pmui.Page:
-    """A new page with a session of its own."""
-    return Layout(sources).page
+def build_page(sources: Mapping[str, Source], uploads: Uploads) -> pmui.Page:
+    """A new page with a session of its own, as its address asks for."""
+    asked = {
+        name: texts[-1].decode(errors="replace") for name, texts in pn.state.session_args.items()
+    }
+    return Layout(sources, Wanted(asked), uploads).page
 
 
 class Layout:
     """Widgets around one session."""
 
-    def __init__(self, sources: Mapping[str, Source]) -> None:
-        session = self.session = Session(sources)
+    def __init__(
+        self,
+        sources: Mapping[str, Source],
+        wanted: Wanted | None = None,
+        uploads: Uploads | None = None,
+    ) -> None:
+        wanted, self._uploads = wanted or Wanted({}), uploads or Uploads()
+        session = self.session = Session(self._with_upload(sources, wanted.source), wanted)
         state = session.state
-        self._uploads: list[TemporaryDirectory[str]] = []
         self._window = Window(margin=0)
         self._alert = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
         self._provenance = Sentence(sizing_mode="stretch_width", margin=(4, 12))
@@ -160,14 +166,16 @@ class Layout:
             sizing_mode="stretch_width",
             margin=(4, 8),
         )
-        self._light = SettingsPanel(state.light, lambda new: state.param.update(light=new))
-        self._viewing = SettingsPanel(state.viewing, lambda new: state.param.update(viewing=new))
-        self._tracking = SettingsPanel(state.tracking, lambda new: state.param.update(tracking=new))
-        self._less = SettingsPanel(state.less, lambda new: state.param.update(less=new))
+        self._light = SettingsPanel(Light(), lambda new: state.param.update(light=new))
+        self._viewing = SettingsPanel(Viewing(), lambda new: state.param.update(viewing=new))
+        self._tracking = SettingsPanel(
+            TrackingParameters(), lambda new: state.param.update(tracking=new)
+        )
+        self._less = SettingsPanel(Less(), lambda new: state.param.update(less=new))
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
-            "recommended",
+            _preset_of(state.tracking),
             "recommended: the best on random depths. as printed: the paper's text, literally.",
         )
         self._reading = {
@@ -185,7 +193,11 @@ class Layout:
             label="Gate axes in", sx=AS_WRITTEN, sizing_mode="stretch_width", margin=(4, 8)
         )
         self._unit = unit
+        self._light.show(state.light)
+        self._tracking.show(state.tracking)
         self._announced: Source | None = None
+        self._address = AddressBar()
+        self._connection = Connection(session.page.session_context.id if session.is_served else "")
         self.pages = Pages(
             {
                 "Explore": self._explore,
@@ -202,9 +214,12 @@ class Layout:
         self.page = self._build()
         self._announce(session.answer)
         self._listen()
+        if session.refused:
+            self._complain(words.not_restored(session.refused))
 
     def _listen(self) -> None:
         session = self.session
+        self._address.follow(session.state, session.query, session.later)
         session.announce, session.complain = self._announce, self._complain
         session.waiting = lambda is_waiting: self._progress.param.update(visible=is_waiting)
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
@@ -233,6 +248,11 @@ class Layout:
                 key
             )
         return titles
+
+    def _with_upload(self, sources: Mapping[str, Source], key: str) -> dict[str, Source]:
+        """What can be looked at, and the upload of a key, if there is one."""
+        upload = self._uploads.use(key, self)
+        return {**sources, key: upload} if upload is not None else dict(sources)
 
     # What the session tells the page
 
@@ -299,15 +319,13 @@ class Layout:
     def _upload(self, content: bytes | None) -> None:
         if not content:
             return
-        folder = TemporaryDirectory(prefix="firstphoton-")
-        self._uploads.append(folder)
-        # A name from outside: only its last part, and only harmless letters of that.
-        name = re.sub(r"[^\w.-]+", "_", Path(self._file.filename).name)[-80:].lstrip(".")
-        path = Path(folder.name) / (name or "upload")
-        path.write_bytes(content)
-        self._file.value = None  # it lies in the folder now; the same file can be chosen again
-        key = f"file {len(self.session.sources)}"
-        self.session.sources[key] = file_source(path)
+        name, self._file.value = self._file.filename, None  # the same file can be chosen again
+        try:
+            key = self._uploads.add(name, content, self)
+        except (ValueError, OSError) as error:
+            self._complain(words.not_kept(error))
+            return
+        self.session.sources = self._with_upload(self.session.sources, key)
         self._source.options = self._titles()
         self._source.value = key
         self.session.state.page = "Inspect"
@@ -323,14 +341,15 @@ class Layout:
     def _forget(self) -> None:
         """Let go of what a closed page would leave behind."""
         pn.config._session_config.pop(self.session.page, None)
-        for folder in self._uploads:
-            folder.cleanup()
+        self._uploads.leave(self)
 
     # Where everything stands
 
     def _build(self) -> Page:
         head = pn.Column(
             self._window,
+            self._address,
+            self._connection,
             self._progress,
             self._alert,
             sizing_mode="stretch_width",

@@ -9,8 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.state import Comparison
 from app.store import Answer, is_wrong
-from core import ESTIMATORS, Capture, RangeImage, estimate, limits, metrics, run
+from core import (
+    ESTIMATORS,
+    Capture,
+    RangeImage,
+    TrackingParameters,
+    estimate,
+    limits,
+    metrics,
+    run,
+)
 
 Array = NDArray[Any]
 
@@ -27,6 +37,16 @@ class Task:
     method: str
     settings: Any
     false_alarm: float = 1.0
+
+
+def tasks_of(chosen: Comparison, tracking: TrackingParameters) -> dict[str, Task]:
+    """What is compared, in the order of the registry."""
+    settings = {**chosen.settings, "tracking": tracking}
+    return {
+        method: Task(method, settings[method], chosen.false_alarm)
+        for method in ESTIMATORS
+        if method in chosen.methods
+    }
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from app.parts import part
 from app.session import Session
 from app.store import Answer, same_subject
 from app.studies import OnePiece, Work, aside
-from core.experiments.requirement import CORRECTIONS, Requirement
+from core.corrections import CORRECTIONS
+from core.experiments.requirement import Requirement
 from core.experiments.requires import requirements
 from core.parameters import Number, check_fields, parameter
 from core.scene import parts_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from io import BytesIO
 from time import perf_counter
 from typing import Any
@@ -15,11 +15,12 @@ import panel as pn
 import param
 
 from app import words
+from app.address import Wanted, defaults, query_of
 from app.cloud import PointCloud, ply_bytes
 from app.controls import Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
-from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, State
+from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State, Viewing
 from app.store import Answer, Request, Source, compute, inspect, same_pixels, same_view
 from app.theme import WRONG_COLOR, palette
 from app.views import ImageView, SignalPlots
@@ -28,6 +29,12 @@ log = logging.getLogger(__name__)
 
 WAIT_MS = 200
 """What takes longer than this is shown to be under way."""
+
+COMPUTED_FROM = ("source", "light", "reading", "window", "less", "absent", "tracking")
+"""Of the state, what an answer is computed from."""
+
+BROUGHT = ("pixel", "pins", "region", "viewing", "comparison")
+"""Of the state, what depends on the capture unless it is chosen."""
 
 REST_MS = 60
 """Image and cloud are drawn this much after the pixel's plots, which are what the eye follows."""
@@ -40,11 +47,17 @@ class Session:
     ----------
     sources : mapping of str to Source
         What can be looked at; copied, so that an upload belongs to this session alone.
+    wanted : Wanted, optional
+        What the address of the page asks for.
 
     Attributes
     ----------
     own_field_of_view_deg : float
         The field of view that suits the present capture.
+    own : dict
+        Values of the state that the server and the present capture bring with them.
+    refused : list of str
+        A sentence on each thing that the address asked for in vain.
     announce : callable
         Called with each new answer, after its plots have been drawn.
     complain : callable
@@ -53,14 +66,14 @@ class Session:
         Called with True when an answer takes long, and with False when it is there.
     """
 
-    def __init__(self, sources: Mapping[str, Source]) -> None:
+    def __init__(self, sources: Mapping[str, Source], wanted: Wanted | None = None) -> None:
+        wanted = wanted or Wanted({})
         self.sources = dict(sources)
         key, first = next(iter(self.sources.items()))
         # Who brings a file wants to look into it.
-        self.state = State(source=key, page="Explore" if first.is_scene else "Inspect")
-        self.signals = SignalPlots()
-        self.image = ImageView(self.choose_pixel)
-        self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
+        page = "Explore" if first.is_scene else "Inspect"
+        self.own: dict[str, Any] = {"source": key, "page": page}
+        self.state = State(**self.own)
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
         self.figures = Facts(timed=True, sizing_mode="stretch_width")
         self.numbers = Facts(sizing_mode="stretch_width", margin=0)
@@ -71,11 +84,13 @@ class Session:
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._rest_is_due = False
-        self._is_hidden, self._is_outdated = self.state.page != "Explore", False
+        self._is_outdated = False
         self._asked_s: float | None = None
-        self.answer = compute(self._request(), None)
+        self.answer = self._first_answer(wanted)
+        self._is_hidden = self.state.page != "Explore"
         self._show(self.answer, first=True)
         self._watch()
+        self._return_to(wanted)
 
     @property
     def is_served(self) -> bool:
@@ -87,12 +102,66 @@ class Session:
         """Whether there was a browser, and is none any more."""
         return self._served and not self.is_served
 
+    # Plots that a page which opens elsewhere need not wait for.
+
+    @cached_property
+    def signals(self) -> SignalPlots:
+        """The pixel's plots."""
+        return SignalPlots()
+
+    @cached_property
+    def image(self) -> ImageView:
+        """The range image."""
+        return ImageView(self.choose_pixel)
+
+    @cached_property
+    def image_keys(self) -> PixelKeys:
+        """The range image, with the keyboard."""
+        made = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
+        made.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
+        return made
+
+    def _first_answer(self, wanted: Wanted) -> Answer:
+        """To what the address asks for; to less of it where that cannot be computed."""
+        before = defaults() | self.own
+        asked = wanted.of({name: before[name] for name in before if name not in BROUGHT})
+        if asked.get("source", self.own["source"]) not in self.sources:
+            wanted.refused.append(words.source_is_gone(asked["source"]))
+            of_it = ("source", "reading", "window", "less")
+            asked = {name: each for name, each in asked.items() if name not in of_it}
+        plain = {n: each for n, each in asked.items() if n not in COMPUTED_FROM}
+        here = {n: each for n, each in asked.items() if n == "source"}
+        for attempt in (asked, plain | here, plain):
+            self.state.param.update(before | attempt)
+            try:
+                return compute(self._request(), None)
+            except Exception as error:  # whatever it is, the page must tell it
+                log.warning("what the address asks for failed", exc_info=error)
+                wanted.refused.append(words.reason(error))
+        return compute(self._request(), None)
+
+    def _return_to(self, wanted: Wanted) -> None:
+        """To what the address asks for of what the capture brings, and tell what was refused."""
+        rows, cols = self.answer.capture.shape
+        brought = wanted.of({name: (defaults() | self.own)[name] for name in BROUGHT})
+        asked, row_col = brought.get("pins", ()), brought.pop("pixel", self.state.pixel)
+        brought["pins"] = tuple(pin for pin in asked if pin[0] < rows and pin[1] < cols)
+        if brought["pins"] != asked:
+            wanted.refused.append(words.pins_outside(rows, cols))
+        self.choose_pixel(*row_col)
+        self.state.param.update(brought)
+        wanted.refuse_others()
+        self.refused = wanted.refused
+
+    def query(self) -> str:
+        """What the address of a page says that shows what this one does."""
+        return query_of(self.state, self.own)
+
     def _watch(self) -> None:
         watch = self.state.param.watch
-        watch(lambda *_: self._ask(), ["source", "light", "reading", "less", "absent", "tracking"])
+        watch(lambda *_: self._ask(), list(COMPUTED_FROM))
         watch(lambda *_: self._draw_pixel(), ["pixel", "difference", "unit"])
         watch(lambda *_: self._draw_rest(), ["image", "cloud_color", "viewing"])
-        self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
         self.cloud.param.watch(lambda event: self.pick(event.new), "selected")
 
     def paint(self, dark: bool) -> None:
@@ -195,9 +264,6 @@ class Session:
 
     def _enter(self, answer: Answer, is_another: bool) -> None:
         """Come to a capture of another kind: its own field of view, camera and, maybe, pixel."""
-        rows, cols = answer.capture.shape
-        self.image_keys.shape = [rows, cols]
-        self.image.enter(rows, cols)
         has_truth = answer.capture.truth_range_m is not None
         for name, kinds in (("image", IMAGES), ("map", MAPS), ("cloud_color", CLOUD_COLORS)):
             possible = [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
@@ -205,11 +271,21 @@ class Session:
             if getattr(self.state, name) not in possible:
                 setattr(self.state, name, possible[0])
         self.own_field_of_view_deg = float(f"{_field_of_view_deg(answer):.3g}")
-        viewing = replace(self.state.viewing, field_of_view_deg=self.own_field_of_view_deg)
-        chosen: dict[str, Any] = {"viewing": viewing}
+        own = {"field_of_view_deg": self.own_field_of_view_deg}
+        state, first = self.state, Comparison()
+        compared = replace(state.comparison.viewing, **own)
+        chosen: dict[str, Any] = {
+            "viewing": replace(state.viewing, **own),
+            "comparison": replace(state.comparison, viewing=compared),
+        }
+        self.own |= {
+            "viewing": Viewing(**own),
+            "comparison": replace(first, viewing=replace(first.viewing, **own)),
+        }
         if is_another:
-            chosen |= {"pixel": _pixel_to_start_with(answer), "pins": (), "region": ()}
-        self.state.param.update(**chosen)
+            self.own["pixel"] = _pixel_to_start_with(answer)
+            chosen |= {"pixel": self.own["pixel"], "pins": (), "region": ()}
+        state.param.update(**chosen)
 
     def choose_pixel(self, row: int, col: int) -> None:
         """Show another pixel; one outside the image means the nearest inside."""
@@ -233,7 +309,7 @@ class Session:
         with pn.io.hold(self.page):
             self.signals.update(pixel, acquisition, state.difference, state.unit)
             self.image.mark(row, col)
-            self.image_keys.pixel = [row, col]
+            self.image_keys.param.update(shape=list(self.answer.capture.shape), pixel=[row, col])
             self.cloud.selected = row * self.answer.capture.shape[1] + col
             self.numbers.facts = numbers
             self.figures.facts = words.figure_strip(self.answer)

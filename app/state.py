@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from numbers import Integral, Real
 from typing import Any
 
 import param
 
-from core import Acquisition, Flux, Pulse, TrackingParameters
+from core import ESTIMATORS, Acquisition, Flux, Pulse, TrackingParameters, Window
 from core.checks import require
+from core.estimators import FALSE_ALARM
+from core.experiments.requirement import TITLES
 from core.parameters import Number, check_fields, parameter
 from core.readers.request import Request
 from core.reductions import Reduction
@@ -191,6 +194,38 @@ class Reading(Request):
         return "" if value is None else str(value)
 
 
+FIRST_METHODS = ("peak", "coates", "likelihood", "tracking", "oracle")
+
+CLOUDS = "3D clouds"
+
+KINDS = ("Range", "Error", "Confidence", CLOUDS)
+"""What the pictures of methods may show."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Which methods are compared, how they are set, and what their pictures show.
+
+    The tracking differentiator has the settings that it has on every page.
+    """
+
+    methods: tuple[str, ...] = tuple(each for each in ESTIMATORS if each in FIRST_METHODS)
+    false_alarm: float = 1.0
+    settings: Mapping[str, Any] = field(
+        default_factory=lambda: {
+            name: each.parameters() for name, each in ESTIMATORS.items() if name != "tracking"
+        }
+    )
+    kind: str = KINDS[0]
+    viewing: Viewing = Viewing(0.0)
+
+    def __post_init__(self) -> None:
+        known = isinstance(self.methods, tuple) and all(each in ESTIMATORS for each in self.methods)
+        require("methods", self.methods, known, "some of " + ", ".join(ESTIMATORS))
+        FALSE_ALARM.check("false_alarm", self.false_alarm)
+        require("kind", self.kind, self.kind in KINDS, " or ".join(map(repr, KINDS)))
+
+
 PAGES = ("Explore", "Inspect", "Compare", "Trade-off", "Paper")
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
@@ -200,18 +235,72 @@ CLOUD_COLORS = ("Range", "Error", "Counts")
 NEED_TRUTH = ("Truth", "Error")
 
 
+MOST_PINS = 4
+
+MOST_CORNERS = 1000
+
+
+class Checked(param.Parameter):
+    """A parameter of which a function knows what is acceptable, and raises ``ValueError`` if not.
+
+    It is called with the parameter's name and a value.
+    """
+
+    __slots__ = ("check",)
+
+    def __init__(self, default: Any, check: Callable[[str, Any], None], **options: Any) -> None:
+        self.check = check
+        super().__init__(default, **options)
+
+    def _validate(self, val: Any) -> None:
+        self.check(self.name, val)
+
+
+def _check_pixel(name: str, value: Any) -> None:
+    require(name, value, _is_pair(value, Integral, 0), "a row and a column, both from 0")
+
+
+def _check_pins(name: str, value: Any) -> None:
+    pixels = isinstance(value, tuple) and all(_is_pair(each, Integral, 0) for each in value)
+    few = pixels and len(value) <= MOST_PINS
+    require(name, value, few, f"rows and columns of at most {MOST_PINS} pixels")
+
+
+def _check_region(name: str, value: Any) -> None:
+    corners = isinstance(value, tuple) and all(_is_pair(each, Real, -(2**31)) for each in value)
+    few = corners and len(value) <= MOST_CORNERS
+    require(name, value, few, f"rows and columns of at most {MOST_CORNERS} corners")
+
+
+def _is_pair(value: Any, kind: type, least: int) -> bool:
+    numbers = isinstance(value, tuple) and all(isinstance(each, kind) for each in value)
+    return numbers and len(value) == 2 and all(least <= each < 2**31 for each in value)
+
+
+def _check_absent(name: str, value: Any) -> None:
+    known = isinstance(value, frozenset) and value <= set(TITLES)
+    require(name, value, known, "some of " + ", ".join(TITLES))
+
+
 class State(param.Parameterized):
-    """Everything a user can choose."""
+    """Everything a user can choose.
+
+    `app.address` writes all of it into the address of the page, and `app.script` what concerns
+    `core` into a script: both know a new parameter, or a new field of one, by its default.
+    """
 
     source = param.String(default="car", doc="Key of the catalogue.")
     light = param.ClassSelector(class_=Light, default=Light())
     reading = param.ClassSelector(class_=Reading, default=Reading())
+    window = param.ClassSelector(
+        class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."
+    )
     less = param.ClassSelector(class_=Less, default=Less())
-    absent = param.ClassSelector(
-        class_=frozenset, default=frozenset(), doc="Parts and corrections that are switched off."
+    absent: Any = Checked(
+        frozenset(), _check_absent, doc="Parts and corrections that are switched off."
     )
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
-    pixel = param.NumericTuple(default=(31, 24), length=2, doc="Row and column on show.")
+    pixel: Any = Checked((31, 24), _check_pixel, doc="Row and column on show.")
     image = param.Selector(default="Estimate", objects=list(IMAGES))
     cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
     viewing = param.ClassSelector(class_=Viewing, default=Viewing())
@@ -220,11 +309,10 @@ class State(param.Parameterized):
     unit = param.Selector(default="bins", objects=list(UNITS), doc="Of each axis along the gate.")
     map = param.Selector(default="Estimate", objects=list(MAPS), doc="What one navigates by.")
     subject = param.Selector(default="Pixel", objects=list(SUBJECTS), doc="What is inspected.")
-    pins = param.ClassSelector(
-        class_=tuple, default=(), doc="Up to four pixels (row, col) to compare."
-    )
-    region = param.ClassSelector(
-        class_=tuple,
-        default=(),
+    pins: Any = Checked((), _check_pins, doc="Up to four pixels (row, col) to compare.")
+    region: Any = Checked(
+        (),
+        _check_region,
         doc="Corners (row, col) of a polygon of pixels that are looked at as one; none if empty.",
     )
+    comparison = param.ClassSelector(class_=Comparison, default=Comparison())

@@ -28,8 +28,7 @@ from core import (
     trigger_probability,
 )
 from core.checks import require
-from core.experiments.corrections import without_correction
-from core.experiments.requirement import CORRECTIONS
+from core.corrections import CORRECTIONS, without_correction
 from core.posterior import posterior_of
 from core.scene import PARTS, without
 

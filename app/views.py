@@ -297,6 +297,8 @@ class ImageView:
 
     def update(self, image: Array, look: Look) -> None:
         """Show an image (row, col); NaN is left blank."""
+        if image.shape != self._shape:
+            self.enter(*image.shape)
         self._plot.source("picture").data["image"] = [np.asarray(image, np.float32)]
         self._mapper.update(
             low=look.low,

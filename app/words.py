@@ -179,3 +179,39 @@ def progress(done: int, of: int, noun: str, is_running: bool) -> str:
     if done < of:
         return f"Stopped after {done} of {of} {noun}."
     return f"Done: {of} {noun if of != 1 else noun.removesuffix('s')}."
+
+
+def reason(error: Exception) -> str:
+    """Why something could not be computed, without a traceback."""
+    named = isinstance(error, ValueError)
+    return str(error) if named else f"This could not be computed ({type(error).__name__})."
+
+
+def source_is_gone(key: str) -> str:
+    """Of a scene or capture that an address names in vain."""
+    return (
+        f"There is no scene or capture {key[:40]!r} here; an uploaded file is kept only while a "
+        "page has it open: open it again."
+    )
+
+
+def pins_outside(rows: int, cols: int) -> str:
+    """Of pinned pixels that an address names in vain."""
+    return f"pins outside of {rows} × {cols} pixels are left out."
+
+
+def not_restored(refused: list[str]) -> str:
+    """What a page could not restore of its address; empty where it could restore all."""
+    if not refused:
+        return ""
+    return f"The address asks for what cannot be had: {' '.join(refused)} The rest is as it says."
+
+
+def not_kept(error: ValueError | OSError) -> str:
+    """Why a file could not be opened here, and what to do."""
+    if isinstance(error, ValueError):
+        return f"The file is not opened: {error}"
+    return (
+        f"The file is not opened: it cannot be kept here ({error.strerror}). Free room in the "
+        "system's temporary folder, or give the file's path on the command line."
+    )

@@ -3,6 +3,7 @@
 from core import inspection, limits, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
+from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
 from core.export import save_capture, save_image, save_pixel
 from core.large import as_image, estimate_large
@@ -20,8 +21,10 @@ from core.trigger import (
     trigger_probability,
 )
 from core.warmup import warm_up
+from core.windows import Window, light_of_whole, read_window
 
 __all__ = [
+    "CORRECTIONS",
     "ESTIMATORS",
     "PARTS",
     "PRESETS",
@@ -37,6 +40,7 @@ __all__ = [
     "SceneError",
     "Signals",
     "TrackingParameters",
+    "Window",
     "as_image",
     "coates_rate",
     "estimate",
@@ -44,6 +48,7 @@ __all__ = [
     "first_difference",
     "first_photons",
     "inspection",
+    "light_of_whole",
     "limits",
     "metrics",
     "no_trigger_probability",
@@ -52,6 +57,7 @@ __all__ = [
     "rate_per_bin",
     "read_capture",
     "read_scene",
+    "read_window",
     "reductions",
     "run",
     "save_capture",
@@ -63,4 +69,5 @@ __all__ = [
     "trigger_probability",
     "warm_up",
     "without",
+    "without_correction",
 ]

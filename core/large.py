@@ -186,7 +186,7 @@ def learned(
     array: Any, description: Description, method: str, settings: Any, false_alarm: float | None
 ) -> tuple[Lighting, Calibration, str]:
     """What a sample of a Dask array (row, col, bin) tells of all its pixels; `Estimator.remark`."""
-    sample, estimator = _capture(sample_of(array), description), ESTIMATORS[method]
+    sample, estimator = captured(sample_of(array), description), ESTIMATORS[method]
     calibration = estimator.calibration(sample, settings, false_alarm)
     return lighting_of(sample), calibration, estimator.remark(sample)
 
@@ -200,14 +200,15 @@ def range_part(
     calibration: Calibration,
 ) -> Floats:
     """Range a part of an image; shape (row, col, len(IMAGES))."""
-    part = _capture(cube, description)
+    part = captured(cube, description)
     lighting_of.tell(part, lighting)
     image = ESTIMATORS[method].ranged(part, settings, calibration)
     known = {name: getattr(image, name) for name in IMAGES if hasattr(image, name)}
     return np.stack([known.get(name, part.counts) for name in IMAGES], axis=2).astype(float)
 
 
-def _capture(cube: NDArray[Any], description: Description) -> Capture:
+def captured(cube: NDArray[Any], description: Description) -> Capture:
+    """Counts that are in memory as a capture, of which the description holds."""
     acquisition, pulse, detection, source = description
     counts = whole_counts(cube, "counts")
     return Capture(counts, acquisition, pulse, source=source, detection=detection)

@@ -112,7 +112,7 @@ def skip_pixels(capture: Capture, step: int) -> Capture:
     return replace(
         capture,
         cube=capture.cube[kept],
-        acquisition=_coarser(capture, step),
+        acquisition=coarser(capture.acquisition, step),
         truth_range_m=None if capture.truth_range_m is None else capture.truth_range_m[kept],
         signal=None if capture.signal is None else capture.signal[kept],
         source=f"{capture.source}; 1 pixel of each {step} x {step}",
@@ -132,7 +132,7 @@ def pool_pixels(capture: Capture, side: int) -> Capture:
         If `side` is not an integer from 1 to the smaller side of the image.
     """
     _require_whole("side", side, min(capture.shape))
-    acquisition, n_pulses = _coarser(capture, side), capture.acquisition.n_pulses
+    acquisition, n_pulses = coarser(capture.acquisition, side), capture.acquisition.n_pulses
     truth_m, signal = capture.truth_range_m, capture.signal
     return replace(
         capture,
@@ -389,11 +389,11 @@ def _sum(cubes: Sequence[NDArray[np.unsignedinteger]]) -> NDArray[np.unsignedint
     return total
 
 
-def _coarser(capture: Capture, step: int) -> Acquisition:
-    """The acquisition with pixels `step` times as far apart."""
-    angle_rad = capture.acquisition.pixel_angle_rad
+def coarser(acquisition: Acquisition, step: int) -> Acquisition:
+    """An acquisition with pixels `step` times as far apart."""
+    angle_rad = acquisition.pixel_angle_rad
     wider_rad = None if angle_rad is None or angle_rad * step >= 1 else angle_rad * step
-    return replace(capture.acquisition, pixel_angle_rad=wider_rad)
+    return replace(acquisition, pixel_angle_rad=wider_rad)
 
 
 def _each_of_tile(image: NDArray[Any], side: int) -> list[NDArray[Any]]:

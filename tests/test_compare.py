@@ -13,11 +13,11 @@ from playwright.sync_api import expect
 
 import core
 from app import ranking, ranking_words
-from app.compare import CLOUDS, FIRST_PICKS, MOST_PICTURES, Compare
+from app.compare import MOST_PICTURES, Compare
 from app.jobs import LatestWins
 from app.layout import Layout
 from app.ranking import Result, Task
-from app.state import Less, Light, Reading
+from app.state import CLOUDS, FIRST_METHODS, Less, Light, Reading
 from app.store import Request, built_in_sources, compute
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
@@ -186,7 +186,7 @@ def test_nothing_is_computed_before_the_page_is_seen(stage):
     assert not stage.page._is_busy
     stage.view.show(True)
     stage.settle()
-    titles = [ESTIMATORS[m].title for m in ESTIMATORS if m in FIRST_PICKS]
+    titles = [ESTIMATORS[m].title for m in ESTIMATORS if m in FIRST_METHODS]
     assert stage.names == [*titles, "Physics’ limit"]
     assert list(stage.figures) == stage.names
     assert stage.page._status.text == "5 methods compared"

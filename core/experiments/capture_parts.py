@@ -18,6 +18,7 @@ from scipy.special import pdtrc
 from core import faults, posterior, resolution
 from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
+from core.corrections import without_correction
 from core.experiments import corrections
 from core.experiments.requirement import UNKNOWN, Requirement, judged
 from core.metrics import Interval
@@ -62,7 +63,7 @@ def signal_levels(capture: Capture, method: str) -> Requirement:
 
 def _corrected(capture: Capture, method: str, correction: str, apart: Difference) -> Requirement:
     made = corrections.with_correction(capture, correction)
-    spared = corrections.without_correction(capture, correction)
+    spared = without_correction(capture, correction)
     one_m, other_m = (corrections.answers_m(each, method) for each in (made, spared))
     bin_length_m = capture.acquisition.bin_length_m
     moved = float(np.mean(np.abs(one_m - other_m) > TOLERANCE_BINS * bin_length_m))

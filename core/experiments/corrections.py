@@ -1,4 +1,4 @@
-"""What an estimator takes into account of a capture, switched on and off; and what that changes."""
+"""What it changes that an estimator takes something into account of a capture."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from core import metrics
-from core.acquisition import Floats, Pulse
+from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators import ESTIMATORS
 from core.experiments.timing import FEWEST_REPEATS, interleaved, median_interval
@@ -35,34 +35,6 @@ def with_correction(capture: Capture, correction: str) -> Capture:
         light = lighting_of(capture)._replace(pile_up=True)
     lighting_of.tell(made, light)
     return made
-
-
-def without_correction(capture: Capture, correction: str) -> Capture:
-    """The same counts for an estimator that does not make it.
-
-    Without pile-up all photons count; without levels of signal, their mean is that of all pixels;
-    and without its shape the pulse is a Gaussian of the same mean and width.
-    """
-    if correction == "pile_up":
-        return replace(capture, detection="all")
-    if correction == "pulse_shape":
-        mean_s, sigma_s = moments_s(capture.pulse)
-        # A Gaussian's time zero is its centre: the gate opens that much earlier after it.
-        gate_delay_s = capture.acquisition.gate_delay_s - mean_s
-        acquisition = replace(capture.acquisition, gate_delay_s=gate_delay_s)
-        return replace(capture, acquisition=acquisition, pulse=Pulse.gaussian(sigma_s))
-    one = replace(capture)
-    lighting_of.tell(one, detailed_lighting_of(capture).with_one_level())
-    return one
-
-
-def moments_s(pulse: Pulse) -> tuple[float, float]:
-    """Mean and standard deviation of a photon's time, in seconds after time zero."""
-    longest = len(pulse.samples) + 40.0
-    edge_s = np.linspace(-longest, longest, 2**16) * pulse.tau_s
-    share, middle_s = np.diff(pulse.cdf(edge_s)), (edge_s[1:] + edge_s[:-1]) / 2
-    mean_s = float(share @ middle_s)
-    return mean_s, math.sqrt(float(share @ (middle_s - mean_s) ** 2))
 
 
 def levels_apart(capture: Capture) -> Difference:

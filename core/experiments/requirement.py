@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 
+from core.corrections import CORRECTIONS
 from core.metrics import Interval
 from core.resolution import ERROR, FEW, Difference
 from core.scene import PARTS
@@ -32,13 +33,6 @@ MARGIN_BINS = 0.5
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
-CORRECTIONS = {
-    "pile_up": "pile-up",
-    "pulse_shape": "shape of the pulse",
-    "signal_levels": "levels of signal",
-}
-"""What an estimator may take into account besides place and strength of an echo, in words."""
-
 TITLES = CORRECTIONS | PARTS
 
 
@@ -47,7 +41,7 @@ class Requirement:
     """One part of a scene, or one correction of an estimator, and whether it is needed."""
 
     part: str
-    """A key of `core.scene.PARTS`, or of `CORRECTIONS`."""
+    """A key of `core.PARTS`, or of `core.CORRECTIONS`."""
     verdict: Verdict
     why: str
     """One sentence."""

@@ -12,10 +12,11 @@ from core import resolution
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.checks import require
+from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS
 from core.experiments import capture_parts, corrections
 from core.experiments.items import Table
-from core.experiments.requirement import CORRECTIONS, MARGIN_RD, TITLES, Requirement, judged
+from core.experiments.requirement import MARGIN_RD, TITLES, Requirement, judged
 from core.metrics import Interval
 from core.resolution import Difference, difference
 from core.scene import Scene, parts_of, without
@@ -139,7 +140,7 @@ def _part(study: _Study, part: str) -> Requirement:
 
 def _correction(study: _Study, correction: str) -> Requirement:
     made = [corrections.with_correction(each, correction) for each in study.captures]
-    spared = [corrections.without_correction(each, correction) for each in study.captures]
+    spared = [without_correction(each, correction) for each in study.captures]
     if correction == "pile_up":
         apart = resolution.pile_up(study.probability.sum(axis=1), study.n_pulses)
     elif correction == "signal_levels":

@@ -60,11 +60,11 @@ def _zstd(data: bytes, most: int, _: int) -> bytes:
 
     unpacked = _zstd_content_size(data)
     if unpacked is None:  # the library then wants to be told, exactly
-        unpacked = most - _ROOM_FOR_CHECKSUMS
+        room = bytearray(most - _ROOM_FOR_CHECKSUMS)
+        zstd.decompress(data, room)
+        return bytes(room)
     require("bytes unpacked", unpacked, unpacked <= most, f"at most {most:,}")
-    room = bytearray(unpacked)
-    zstd.decompress(data, room)
-    return bytes(room)
+    return bytes(zstd.decompress(data))  # which makes room for as many, and no more
 
 
 def _zstd_content_size(data: bytes) -> int | None:
@@ -140,6 +140,23 @@ def _holds(dtype: np.dtype[Any], number: float) -> bool:
     return low <= number <= high and number == int(number)
 
 
+def _picked(box: tuple[slice, ...], shape: tuple[int, ...]) -> list[range]:
+    """Places along each axis that slices of positive steps pick."""
+    return [range(*slice_.indices(n)) for slice_, n in zip(box, shape, strict=True)]
+
+
+def _touched(picked: range, chunk: int) -> Iterator[tuple[int, slice, slice]]:
+    """Chunks along an axis that hold some of what is picked: index, places in it, places in all."""
+    step = picked.step
+    for k in range(picked[0] // chunk, picked[-1] // chunk + 1):
+        # The first place in this chunk, and the first beyond it.
+        first, end = (max(0, -(-(edge * chunk - picked[0]) // step)) for edge in (k, k + 1))
+        end = min(end, len(picked))
+        if first < end:
+            begin = picked[first] - k * chunk
+            yield k, slice(begin, picked[end - 1] - k * chunk + 1, step), slice(first, end)
+
+
 @dataclass(frozen=True)
 class Chunked:
     """An array in a file, of which nothing is read before it is asked for.
@@ -195,24 +212,16 @@ class Chunked:
 
     def __getitem__(self, box: tuple[slice, ...]) -> NDArray[Any]:
         """The numbers in a box of slices, in their own type but the byte order of this machine."""
-        bounds = [slice_.indices(n) for slice_, n in zip(box, self.shape, strict=True)]
-        begin = [first for first, _, _ in bounds]
-        shape = [max(0, stop - first) for first, stop, _ in bounds]
+        picked = _picked(box, self.shape)
+        shape = [len(places) for places in picked]
         dtype = self.dtype.newbyteorder("=")
         require_fits(self.name, prod(shape) * dtype.itemsize)
         answer = np.empty(shape, dtype)
-        touched = (
-            range(first // step, -(-stop // step))
-            for (first, stop, _), step in zip(bounds, self.chunk, strict=True)
-        )
-        for index in product(*touched) if answer.size else ():
-            source, target = [], []
-            for k, first, size, step in zip(index, begin, shape, self.chunk, strict=True):
-                low, high = max(k * step, first), min((k + 1) * step, first + size)
-                source.append(slice(low - k * step, high - k * step))
-                target.append(slice(low - first, high - first))
+        touched = product(*map(_touched, picked, self.chunk)) if answer.size else ()
+        for parts in touched:
+            index, source, target = zip(*parts, strict=True)
             block = self._block(index)
-            answer[tuple(target)] = self.fill if block is None else block[tuple(source)]
+            answer[target] = self.fill if block is None else block[source]
         return answer
 
     def _block(self, index: tuple[int, ...]) -> NDArray[Any] | None:
@@ -282,22 +291,23 @@ class Contiguous:
 
     def __getitem__(self, box: tuple[slice, ...]) -> NDArray[Any]:
         """The numbers in a box of slices, in their own type but the byte order of this machine."""
-        bounds = [slice_.indices(n)[:2] for slice_, n in zip(box, self.shape, strict=True)]
-        shape = [max(0, stop - begin) for begin, stop in bounds]
+        picked = _picked(box, self.shape)
+        shape = [len(places) for places in picked]
         require_fits(self.name, prod(shape) * self.dtype.itemsize)
         answer = np.empty(shape, self.dtype)
         # The numbers of a run lie side by side: all axes after its own are whole.
         own = len(shape) - 1
         while own > 0 and shape[own] == self.shape[own]:
             own -= 1
+        if picked[own].step > 1:
+            own += 1
         strides = [self.dtype.itemsize * prod(self.shape[k + 1 :]) for k in range(len(shape))]
         runs = answer.reshape(prod(shape[:own]), -1) if answer.size else ()
-        outer = product(*(range(begin, stop) for begin, stop in bounds[:own]))
+        outer = product(*picked[:own])
         with decoding(self.name), self.path.open("rb") as file:
             for index, run in zip(outer, runs, strict=True) if answer.size else ():
-                place = sum(
-                    k * step for k, step in zip((*index, bounds[own][0]), strides, strict=False)
-                )
+                begin = (*index, *(places[0] for places in picked[own:]))
+                place = sum(k * step for k, step in zip(begin, strides, strict=True))
                 file.seek(self.offset + place)
                 found = file.readinto(run.view(np.uint8).data)
                 require("bytes read", found, found == run.nbytes, f"{run.nbytes:,}")

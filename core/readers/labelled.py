@@ -139,15 +139,18 @@ class Counts:
 
 
 def _box(key: int | slice, size: int) -> tuple[slice, int | slice]:
-    """The slice of step 1 that an index along an axis lies in, and the index within it."""
+    """The slice of positive step that an index along an axis asks for, and the index within it."""
     if not isinstance(key, slice):
         place = range(size)[key]
         return slice(place, place + 1), 0
     picked = range(*key.indices(size))
     if not picked:
         return slice(0, 0), slice(None)
-    low, high = sorted((picked[0], picked[-1]))
-    return slice(low, high + 1), slice(None, None, picked.step)
+    if picked.step < 0:
+        picked, within = picked[::-1], slice(None, None, -1)
+    else:
+        within = slice(None)
+    return slice(picked[0], picked[-1] + 1, picked.step), within
 
 
 class _File:

@@ -33,7 +33,7 @@ class Numbers(Protocol):
         """The size of a box that is read in one go, along each axis."""
 
     def __getitem__(self, box: tuple[slice, ...]) -> NDArray[Any]:
-        """The numbers in a box of slices."""
+        """The numbers in a box of slices, of any positive step."""
 
 
 def whole(numbers: Numbers) -> NDArray[Any]:

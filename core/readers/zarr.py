@@ -56,6 +56,8 @@ class ChunkFiles:
         """The bytes of a chunk, None where it was never written."""
         path = self.folder / (self.prefix + self.separator.join(map(str, index)))
         if not path.exists():
+            there = self.folder.is_dir()
+            require("folder of the array", self.folder.name, there, "one that has not gone")
             return None
         return Part(read_stretch(path, 0, path.stat().st_size), self.filters)
 

@@ -10,7 +10,10 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pytest
 from numpy.typing import NDArray
+
+from core.readers import chunks
 
 
 def hdf5_bytes(user_block: int = 0, **arrays: Any) -> bytes:
@@ -103,3 +106,24 @@ class Matlab73:
         self._hdf5.close()
         header = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\x00\x02IM"
         return header.ljust(512, b"\0") + self._file.getvalue()[512:]
+
+
+class Reads:
+    """How many bytes of arrays were read from files."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.n_bytes = 0
+        fetch, box = chunks.read_stretch, chunks.Contiguous.__getitem__
+
+        def read_stretch(path: Path, offset: int, n_bytes: int) -> bytes:
+            self.n_bytes += n_bytes
+            return fetch(path, offset, n_bytes)
+
+        def read_box(array: chunks.Contiguous, key: tuple[slice, ...]) -> NDArray[Any]:
+            found = box(array, key)
+            self.n_bytes += found.nbytes
+            return found
+
+        monkeypatch.setattr(chunks, "read_stretch", read_stretch)
+        monkeypatch.setattr("core.readers.zarr.read_stretch", read_stretch)
+        monkeypatch.setattr(chunks.Contiguous, "__getitem__", read_box)

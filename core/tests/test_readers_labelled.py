@@ -18,18 +18,17 @@ import numcodecs
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
-from core.readers import chunks, guards, open_capture, read_capture
+from core.readers import guards, open_capture, read_capture
 from core.readers.labelled import dataset, describe, oriented
 from core.readers.lzf import decompress
 from core.readers.request import Request
 from core.readers.stored import Stored, choose
 from core.tests.formats import Content, bare, put
-from core.tests.labelled_files import hdf5_bytes, netcdf_bytes, zarr_files
+from core.tests.labelled_files import Reads, hdf5_bytes, netcdf_bytes, zarr_files
 from core.tests.refusing import assert_refused
 from core.tests.samples import ACQUISITION, CUBE, npy_bytes
 
@@ -177,27 +176,6 @@ def test_compact_arrays(tmp_path: Path) -> None:
 
 
 # -- nothing is read before it is asked for --------------------------------------------------------
-
-
-class Reads:
-    """How many bytes of arrays were read from files."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.n_bytes = 0
-        fetch, box = chunks.read_stretch, chunks.Contiguous.__getitem__
-
-        def read_stretch(path: Path, offset: int, n_bytes: int) -> bytes:
-            self.n_bytes += n_bytes
-            return fetch(path, offset, n_bytes)
-
-        def read_box(array: chunks.Contiguous, key: tuple[slice, ...]) -> NDArray[Any]:
-            found = box(array, key)
-            self.n_bytes += found.nbytes
-            return found
-
-        monkeypatch.setattr(chunks, "read_stretch", read_stretch)
-        monkeypatch.setattr("core.readers.zarr.read_stretch", read_stretch)
-        monkeypatch.setattr(chunks.Contiguous, "__getitem__", read_box)
 
 
 LARGE = np.random.default_rng(5).poisson(0.05, (64, 48, 200)).astype(np.uint16)

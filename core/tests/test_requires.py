@@ -14,6 +14,7 @@ import pytest
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.commands import ACCEPTED, REFUSED, main
+from core.corrections import moments_s, without_correction
 from core.estimators import ESTIMATORS
 from core.estimators.base import Calibration
 from core.experiments import corrections, plain, requires
@@ -147,7 +148,7 @@ def test_absent_parts_cost_no_bit() -> None:
 
 @pytest.mark.parametrize("pulse", [Pulse(), Pulse.gaussian(2e-9), Pulse.measured([1, 3, 1], 1e-9)])
 def test_moments_of_a_pulse(pulse: Pulse) -> None:
-    mean_s, sigma_s = corrections.moments_s(pulse)
+    mean_s, sigma_s = moments_s(pulse)
     expected = {
         "gamma": (2e-9, math.sqrt(2) * 1e-9),
         "gaussian": (0.0, 2e-9),
@@ -159,7 +160,7 @@ def test_moments_of_a_pulse(pulse: Pulse) -> None:
 @pytest.mark.compiled
 def test_a_gaussian_of_the_same_mean_finds_the_same_place() -> None:
     capture = seen(Flux(0.5, 5.0))
-    other = corrections.without_correction(capture, "pulse_shape")
+    other = without_correction(capture, "pulse_shape")
     assert other.pulse.shape == "gaussian"
     one_m, other_m = (corrections.answers_m(each, "likelihood") for each in (capture, other))
     assert abs(np.median(other_m - one_m)) < 0.1 * GATE.bin_length_m
@@ -235,7 +236,7 @@ def test_one_level_of_signal_is_taken_where_no_pixel_tells_its_own() -> None:
             capture,
             "likelihood",
             corrections.with_correction(capture, "signal_levels"),
-            corrections.without_correction(capture, "signal_levels"),
+            without_correction(capture, "signal_levels"),
         )
     assert merged
 

@@ -1,0 +1,44 @@
+"""A page that loses its server says so, waits, and comes back to the session that it had."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+from typing import Any, ClassVar
+
+import param
+from panel.custom import JSComponent
+
+LINGER_S = 180
+"""A session is kept for so long when no page is connected to it: while a page is loaded anew, or a
+connection is lost for a minute."""
+
+
+def serving_options(linger_s: float = LINGER_S) -> dict[str, Any]:
+    """What ``panel.serve`` must be told for that."""
+    return {
+        "unused_session_lifetime_milliseconds": round(1000 * linger_s),
+        # A quarter more at most is waited for the next look.
+        "check_unused_sessions_milliseconds": max(100, round(250 * linger_s)),
+    }
+
+
+class Connection(JSComponent):
+    """Watches the connection of a page.
+
+    While it is lost a dialog covers the page, for what would be chosen meanwhile would be lost.
+    When the server answers again the page is loaded anew, from the same session if that is still
+    kept, and else from the address.
+
+    Bokeh's own reconnection is not used: until 3.9 at least it leaves a page as it was when it was
+    cut off (bokeh/bokeh#15347), and it gives up after half a minute.
+    """
+
+    session = param.String(default="", doc="By which the server knows the session.")
+    made = param.String(default="", doc="Tells this session from another of the same name.")
+
+    _esm = Path(__file__).with_name("connection.js")
+    _stylesheets: ClassVar = [Path(__file__).with_name("connection.css")]
+
+    def __init__(self, session: str, **params: Any) -> None:
+        super().__init__(session=session, made=secrets.token_hex(8), **params)

@@ -1,0 +1,103 @@
+"""States of the app other than its first: one for each parameter and field, and random ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+import param
+
+from app.address import defaults
+from app.state import Comparison, Reading, State
+from core import ESTIMATORS, Pulse, Window
+from core.parameters import Choice
+
+OTHERWISE: dict[str, list[Any]] = {
+    "source": ["building", "a b&c=d/é?#", "17"],
+    "window": [Window((0, 8), (3, 9)), Window((2, 30), (0, 40), step=3)],
+    "absent": [frozenset({"jitter"}), frozenset({"pile_up", "signal_levels", "motion"})],
+    "pixel": [(0, 0), (63, 5)],
+    "pins": [((1, 2),), ((1, 2), (3, 4), (0, 0), (9, 9))],
+    "region": [((1, 2), (1, 9), (7, 5)), ((0.5, 1.25), (-3.0, 9.0), (7.0, 5.1))],
+    "window": [Window((0, 8), (4, 9)), Window((1, 9), (2, 30), 3)],
+    "reading": [
+        Reading(bin_width_s=1.1e-9, axes="bin, row col", shape=(3, 5), detection="all"),
+        Reading(pulse=Pulse.gaussian(3e-10), variable="a b&c", pixel_angle_rad=0.001),
+        Reading(time_unit_s=1e-12, gate_delay_s=-1e-9, n_bins=7, n_pulses=9, stop_s=1e-6),
+        Reading(no_trigger=-1, first_detections=3),
+    ],
+}
+"""Other values of parameters whose kind does not tell which there are."""
+
+
+def another(name: str) -> Iterator[Any]:
+    """Other values of a parameter than its default; each field of it is changed in one of them."""
+    parameter, default = State.param[name], State.param[name].default
+    if name in OTHERWISE:
+        yield from OTHERWISE[name]
+    elif isinstance(parameter, param.Selector):
+        yield from (each for each in parameter.objects if each != default)
+    elif isinstance(parameter, param.Boolean):
+        yield not default
+    else:
+        yield from otherwise(default)
+
+
+def otherwise(settings: Any) -> Iterator[Any]:
+    """The same settings, each time with another field or entry changed."""
+    if isinstance(settings, Comparison):
+        yield replace(settings, methods=("peak",))
+        yield replace(settings, methods=())
+        yield replace(settings, false_alarm=0.1)
+        yield replace(settings, kind="Error")
+        for viewing in otherwise(settings.viewing):
+            yield replace(settings, viewing=viewing)
+        for method, own in settings.settings.items():
+            for changed in otherwise(own):
+                yield replace(settings, settings={**settings.settings, method: changed})
+        return
+    for each in fields(settings):
+        yield replace(settings, **{each.name: other_value(each, getattr(settings, each.name))})
+
+
+def other_value(field: Any, value: Any, share: float = 0.37) -> Any:
+    """Another value of a field, so far between the ends of its slider."""
+    spec = field.metadata["spec"]
+    if isinstance(spec, Choice):
+        return next(option for option in spec.options if option != value)
+    chosen = spec.low + share * (spec.high - spec.low)
+    chosen = round(chosen) if spec.whole else chosen
+    return chosen if chosen != value else spec.high
+
+
+def random_state(rng: np.random.Generator) -> State:
+    """A state in which about half of everything is chosen."""
+    return State(**{name: random_value(name, rng) for name in defaults() if rng.random() < 0.6})
+
+
+def random_value(name: str, rng: np.random.Generator) -> Any:
+    """Some value of a parameter, with about half of its fields changed."""
+    default = State.param[name].default
+    if not is_dataclass(default) or name in OTHERWISE:
+        values = list(another(name))
+        return values[rng.integers(len(values))]
+    return _random(default, rng)
+
+
+def _random(settings: Any, rng: np.random.Generator) -> Any:
+    if isinstance(settings, Comparison):
+        return Comparison(
+            tuple(method for method in ESTIMATORS if rng.random() < 0.5),
+            float(rng.uniform(0.01, 1)),
+            {method: _random(own, rng) for method, own in settings.settings.items()},
+            "Confidence",
+            _random(settings.viewing, rng),
+        )
+    changed = {
+        each.name: other_value(each, getattr(settings, each.name), float(rng.random()))
+        for each in fields(settings)
+        if rng.random() < 0.5
+    }
+    return replace(settings, **changed)
