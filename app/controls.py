@@ -196,10 +196,10 @@ class Sentence(JSComponent):
     ]
 
 
-class Window(JSComponent):
-    """What the browser's window is like; nothing is to be seen of it."""
+class Viewport(JSComponent):
+    """How wide the page is; nothing is to be seen of it."""
 
-    narrow = param.Boolean(default=False, doc="Whether it is as narrow as a phone.")
+    narrow = param.Boolean(default=False, doc="Whether that is as narrow as a phone.")
 
     _esm = """
     export function render({ model }) {

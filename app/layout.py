@@ -15,7 +15,7 @@ from app import words
 from app.address import AddressBar, Wanted
 from app.compare import Compare
 from app.connection import Connection
-from app.controls import Sentence, SettingsPanel, Window
+from app.controls import Sentence, SettingsPanel, Viewport
 from app.inspector import Inspector
 from app.pages import Pages, View, let_pages_come
 from app.paper import Paper
@@ -145,7 +145,7 @@ class Layout:
         wanted, self._uploads = wanted or Wanted({}), uploads or Uploads()
         session = self.session = Session(self._with_upload(sources, wanted.source), wanted)
         state = session.state
-        self._window = Window(margin=0)
+        self._viewport = Viewport(margin=0)
         self._alert = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
         self._provenance = Sentence(sizing_mode="stretch_width", margin=(4, 12))
         self._progress = pmui.LinearProgress(
@@ -188,13 +188,13 @@ class Layout:
             )
             for name, label in READING_LABELS.items()
         }
+        self._light.show(state.light)
+        self._tracking.show(state.tracking)
         unit = choice(words.UNIT_HELP, state.param.unit)
         unit.param.update(
             label="Gate axes in", sx=AS_WRITTEN, sizing_mode="stretch_width", margin=(4, 8)
         )
         self._unit = unit
-        self._light.show(state.light)
-        self._tracking.show(state.tracking)
         self._announced: Source | None = None
         self._address = AddressBar()
         self._connection = Connection(session.page.session_context.id if session.is_served else "")
@@ -230,7 +230,7 @@ class Layout:
         if session.is_served:
             let_pages_come(session.page)
             # On a phone the controls would cover what they control.
-            pn.state.onload(lambda: self.page.param.update(sidebar_open=not self._window.narrow))
+            pn.state.onload(lambda: self.page.param.update(sidebar_open=not self._viewport.narrow))
             pn.state.on_session_destroyed(lambda _: self._forget())
             pn.config.exception_handler = session.fail  # of this session alone
 
@@ -278,7 +278,7 @@ class Layout:
     def _put_away(self, is_away: bool) -> None:
         """Put away what belongs to the session's capture, or bring it back."""
         self._provenance.visible = not is_away
-        self.page.sidebar_open = not (is_away or self._window.narrow)
+        self.page.sidebar_open = not (is_away or self._viewport.narrow)
 
     # What the user does
 
@@ -347,9 +347,9 @@ class Layout:
 
     def _build(self) -> Page:
         head = pn.Column(
-            self._window,
             self._address,
             self._connection,
+            self._viewport,
             self._progress,
             self._alert,
             sizing_mode="stretch_width",

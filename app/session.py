@@ -54,8 +54,6 @@ class Session:
     ----------
     own_field_of_view_deg : float
         The field of view that suits the present capture.
-    own : dict
-        Values of the state that the server and the present capture bring with them.
     refused : list of str
         A sentence on each thing that the address asked for in vain.
     announce : callable
@@ -71,9 +69,8 @@ class Session:
         self.sources = dict(sources)
         key, first = next(iter(self.sources.items()))
         # Who brings a file wants to look into it.
-        page = "Explore" if first.is_scene else "Inspect"
-        self.own: dict[str, Any] = {"source": key, "page": page}
-        self.state = State(**self.own)
+        self._own = {"source": key, "page": "Explore" if first.is_scene else "Inspect"}
+        self.state = State(**self._own)
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
         self.figures = Facts(timed=True, sizing_mode="stretch_width")
         self.numbers = Facts(sizing_mode="stretch_width", margin=0)
@@ -84,10 +81,9 @@ class Session:
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._rest_is_due = False
-        self._is_outdated = False
         self._asked_s: float | None = None
         self.answer = self._first_answer(wanted)
-        self._is_hidden = self.state.page != "Explore"
+        self._is_hidden, self._is_outdated = self.state.page != "Explore", False
         self._show(self.answer, first=True)
         self._watch()
         self._return_to(wanted)
@@ -123,9 +119,9 @@ class Session:
 
     def _first_answer(self, wanted: Wanted) -> Answer:
         """To what the address asks for; to less of it where that cannot be computed."""
-        before = defaults() | self.own
+        before = defaults() | self._own
         asked = wanted.of({name: before[name] for name in before if name not in BROUGHT})
-        if asked.get("source", self.own["source"]) not in self.sources:
+        if asked.get("source", self._own["source"]) not in self.sources:
             wanted.refused.append(words.source_is_gone(asked["source"]))
             of_it = ("source", "reading", "window", "less")
             asked = {name: each for name, each in asked.items() if name not in of_it}
@@ -143,7 +139,8 @@ class Session:
     def _return_to(self, wanted: Wanted) -> None:
         """To what the address asks for of what the capture brings, and tell what was refused."""
         rows, cols = self.answer.capture.shape
-        brought = wanted.of({name: (defaults() | self.own)[name] for name in BROUGHT})
+        before = defaults() | brought_by(self.answer)
+        brought = wanted.of({name: before[name] for name in BROUGHT})
         asked, row_col = brought.get("pins", ()), brought.pop("pixel", self.state.pixel)
         brought["pins"] = tuple(pin for pin in asked if pin[0] < rows and pin[1] < cols)
         if brought["pins"] != asked:
@@ -155,7 +152,7 @@ class Session:
 
     def query(self) -> str:
         """What the address of a page says that shows what this one does."""
-        return query_of(self.state, self.own)
+        return query_of(self.state, self._own | brought_by(self.answer))
 
     def _watch(self) -> None:
         watch = self.state.param.watch
@@ -270,21 +267,16 @@ class Session:
             self.state.param[name].objects = possible
             if getattr(self.state, name) not in possible:
                 setattr(self.state, name, possible[0])
-        self.own_field_of_view_deg = float(f"{_field_of_view_deg(answer):.3g}")
-        own = {"field_of_view_deg": self.own_field_of_view_deg}
-        state, first = self.state, Comparison()
-        compared = replace(state.comparison.viewing, **own)
+        own, state = brought_by(answer), self.state
+        self.own_field_of_view_deg = own["viewing"].field_of_view_deg
+        as_wide = {"field_of_view_deg": self.own_field_of_view_deg}
+        compared = replace(state.comparison.viewing, **as_wide)
         chosen: dict[str, Any] = {
-            "viewing": replace(state.viewing, **own),
+            "viewing": replace(state.viewing, **as_wide),
             "comparison": replace(state.comparison, viewing=compared),
         }
-        self.own |= {
-            "viewing": Viewing(**own),
-            "comparison": replace(first, viewing=replace(first.viewing, **own)),
-        }
         if is_another:
-            self.own["pixel"] = _pixel_to_start_with(answer)
-            chosen |= {"pixel": self.own["pixel"], "pins": (), "region": ()}
+            chosen |= {"pixel": own["pixel"], "pins": (), "region": ()}
         state.param.update(**chosen)
 
     def choose_pixel(self, row: int, col: int) -> None:
@@ -342,6 +334,17 @@ class Session:
         answer = self.answer
         acquisition = replace(answer.capture.acquisition, n_pulses=None)
         return f"{self.key(answer.request.source)} {answer.capture.shape} {acquisition}"
+
+
+def brought_by(answer: Answer) -> dict[str, Any]:
+    """Values of the state that an answer brings with it; others have to be chosen."""
+    as_wide = {"field_of_view_deg": float(f"{_field_of_view_deg(answer):.3g}")}
+    comparison = Comparison()
+    return {
+        "pixel": _pixel_to_start_with(answer),
+        "viewing": Viewing(**as_wide),
+        "comparison": replace(comparison, viewing=replace(comparison.viewing, **as_wide)),
+    }
 
 
 def _pixel_to_start_with(answer: Answer) -> tuple[int, int]:

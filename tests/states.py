@@ -21,7 +21,6 @@ OTHERWISE: dict[str, list[Any]] = {
     "pixel": [(0, 0), (63, 5)],
     "pins": [((1, 2),), ((1, 2), (3, 4), (0, 0), (9, 9))],
     "region": [((1, 2), (1, 9), (7, 5)), ((0.5, 1.25), (-3.0, 9.0), (7.0, 5.1))],
-    "window": [Window((0, 8), (4, 9)), Window((1, 9), (2, 30), 3)],
     "reading": [
         Reading(bin_width_s=1.1e-9, axes="bin, row col", shape=(3, 5), detection="all"),
         Reading(pulse=Pulse.gaussian(3e-10), variable="a b&c", pixel_angle_rad=0.001),
