@@ -13,7 +13,7 @@ import panel_material_ui as pmui
 from app import inspector_words
 from app.controls import Chips, PixelKeys, Sentence
 from app.inspector_capture import Whole
-from app.inspector_pins import MOST_PINS, Pins, pin_colors
+from app.inspector_pins import Pins, pin_colors
 from app.inspector_pixel import Sight, framed
 from app.inspector_views import MODES, Corners, Navigator, rectangle
 from app.jobs import LatestWins
@@ -22,6 +22,7 @@ from app.looks import Look, map_of
 from app.pages import Pages, View
 from app.parts import part
 from app.session import REST_MS, Session
+from app.state import MOST_PINS
 from app.store import Answer
 from app.theme import palette
 from core.checks import require
@@ -62,7 +63,6 @@ class Inspector:
         self._session = session
         self._jobs: LatestWins[tuple[Any, Look]] = LatestWins(session.on_page)
         self._is_on_screen = self._dark = False
-        self._entered: tuple[Any, ...] = ()
         self._navigator = Navigator(session.choose_pixel, self._select)
         self._large = LargeView(session, self._navigator.figure)
         self._keys = PixelKeys(
@@ -144,7 +144,8 @@ class Inspector:
             field.param.watch(lambda event, at=axis: self._go_to_typed(at, event.new), "value")
         self._chips.param.watch(lambda event: self._session.choose_pixel(*event.new[0]), "chosen")
         self._chips.param.watch(lambda event: self._unpin(event.new[0]), "removed")
-        state.param.watch(lambda *_: self._mark(), ["pixel", "pins", "region"])
+        for name, draw in self._marks.items():
+            state.param.watch(lambda _, draw=draw: self._draw_mark(draw), name)
         state.param.watch(lambda *_: self._ask_map(), ["map", "viewing"])
 
     def _board(self) -> pn.Column:
@@ -180,7 +181,6 @@ class Inspector:
         self._is_on_screen = is_on_screen
         if is_on_screen:
             self._enter()
-            self._mark()
             self._ask_map()
         self._large.show(is_on_screen)
         self._subjects.show(is_on_screen)
@@ -189,7 +189,6 @@ class Inspector:
         self._large.follow(answer)
         if self._is_on_screen:
             self._enter()
-            self._mark()
             self._subjects.follow(answer)
             # As on Explore: the eye follows the plots.
             self._session.later(self._ask_map, REST_MS)
@@ -198,7 +197,7 @@ class Inspector:
         self._dark = dark
         self._navigator.paint(palette(dark))
         self._subjects.paint(dark)
-        self._mark()
+        self._draw_mark(self._frame_pins)
 
     # What the user does
 
@@ -263,12 +262,12 @@ class Inspector:
     # What is drawn
 
     def _enter(self) -> None:
-        """Come to another capture, if it is one of other pixels."""
-        shape, grid = self._session.answer.capture.shape, self._session.answer.grid
-        if (shape, grid) != self._entered:
-            self._entered = shape, grid
-            self._keys.shape = list(shape)
-            self._navigator.enter(*shape, grid)
+        """Come to the capture that is shown now."""
+        answer = self._session.answer
+        self._keys.shape = list(answer.capture.shape)
+        self._navigator.fit(*answer.capture.shape, answer.grid)
+        for draw in self._marks.values():
+            self._draw_mark(draw)
 
     def _ends(self, axis: int) -> tuple[int, int]:
         """First and last row of the file that can be chosen here, or column."""
@@ -276,25 +275,35 @@ class Inspector:
         last = answer.grid.place(*(size - 1 for size in answer.capture.shape))
         return answer.grid.first[axis], last[axis]
 
+    @property
+    def _marks(self) -> dict[str, Callable[[], None]]:
+        """What shows each part of the state on the picture."""
+        return {"pixel": self._mark, "pins": self._frame_pins, "region": self._outline}
+
+    def _draw_mark(self, draw: Callable[[], None]) -> None:
+        if self._is_on_screen:
+            with pn.io.hold(self._session.page):
+                draw()
+
     def _mark(self) -> None:
-        """Frame the pixel and the pins, outline the region."""
-        if not self._is_on_screen:
-            return
-        state = self._session.state
-        colors = pin_colors(self._dark)
-        with pn.io.hold(self._session.page):
-            self._navigator.mark(*state.pixel)
-            self._navigator.pin(state.pins, colors)
-            self._navigator.outline(state.region)
-            self._keys.pixel = list(state.pixel)
-            self._clear.disabled = not state.region
-            grid = self._session.answer.grid
-            for field, at in zip(self._place, grid.place(*state.pixel), strict=True):
-                field.value = str(at)
-            self._chips.chips = [
-                [list(pin), inspector_words.pixel_name(pin, grid), color]
-                for pin, color in zip(state.pins, colors, strict=False)
-            ]
+        pixel, grid = self._session.state.pixel, self._session.answer.grid
+        self._navigator.mark(*pixel)
+        self._keys.pixel = list(pixel)
+        for field, at in zip(self._place, grid.place(*pixel), strict=True):
+            field.value = str(at)
+
+    def _frame_pins(self) -> None:
+        pins, colors = self._session.state.pins, pin_colors(self._dark)
+        self._navigator.pin(pins, colors)
+        self._chips.chips = [
+            [list(pin), inspector_words.pixel_name(pin, self._session.answer.grid), color]
+            for pin, color in zip(pins, colors, strict=False)
+        ]
+
+    def _outline(self) -> None:
+        region = self._session.state.region
+        self._navigator.outline(region)
+        self._clear.disabled = not region
 
     def _ask_map(self) -> None:
         if self._is_on_screen:

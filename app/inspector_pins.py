@@ -17,10 +17,9 @@ from app.inspector_views import GatePlot
 from app.jobs import LatestWins
 from app.pages import View
 from app.session import Session
+from app.state import MOST_PINS
 from app.theme import palette
 from app.views import pane_of
-
-MOST_PINS = 4
 
 
 class Pins:

@@ -86,7 +86,11 @@ class Sight:
 
     def _show(self, is_on_screen: bool) -> None:
         self._is_on_screen = is_on_screen
-        self._ask()
+        if self._table.columns or self._watched != "pixel":
+            self._ask()
+        else:  # the page is to come with the pixel drawn, not empty plots first
+            answer = self._session.answer
+            self._draw(answer, pixel_seen(answer, *self._session.state.pixel))
 
     def _paint(self, dark: bool) -> None:
         self._plots.paint(palette(dark))

@@ -30,7 +30,7 @@ Array = NDArray[Any]
 Corners = tuple[tuple[float, float], ...]
 """Of a polygon, as (row, col)."""
 
-MOST_CORNERS = 60
+ENOUGH_CORNERS = 60
 """Of a region that was drawn by hand: enough for its shape, and short enough for an address."""
 
 MODES = {"Zoom": "box_zoom", "Rectangle": "box_select", "Lasso": "lasso_select"}
@@ -123,7 +123,7 @@ def corners_of(geometry: Mapping[str, Any]) -> Corners:
         drawn = [(top, left), (top, right), (bottom, right), (bottom, left)]
     else:
         drawn = list(zip(geometry["y"], geometry["x"], strict=True))
-        drawn = drawn[:: -(-len(drawn) // MOST_CORNERS)]
+        drawn = drawn[:: -(-len(drawn) // ENOUGH_CORNERS)]
     return tuple((float(row), float(col)) for row, col in drawn)
 
 

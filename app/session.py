@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any
 
@@ -76,9 +76,6 @@ class Session:
         # Who brings a file wants to look into it.
         self._own = {"source": key, "page": "Explore" if first.is_scene else "Inspect"}
         self.state = State(**self._own)
-        self.signals = SignalPlots()
-        self.image = ImageView(self.choose_pixel)
-        self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
         self.figures = Facts(timed=True, sizing_mode="stretch_width")
         self.numbers = Facts(sizing_mode="stretch_width", margin=0)
@@ -107,6 +104,25 @@ class Session:
     def is_gone(self) -> bool:
         """Whether there was a browser, and is none any more."""
         return self._served and not self.is_served
+
+    # Plots that a page which opens elsewhere need not wait for.
+
+    @cached_property
+    def signals(self) -> SignalPlots:
+        """The pixel's plots."""
+        return SignalPlots()
+
+    @cached_property
+    def image(self) -> ImageView:
+        """The range image."""
+        return ImageView(self.choose_pixel)
+
+    @cached_property
+    def image_keys(self) -> PixelKeys:
+        """The range image, with the keyboard."""
+        made = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
+        made.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
+        return made
 
     def _first_answer(self, wanted: Wanted) -> Answer:
         """To what the address asks for; to less of it where that cannot be computed."""
@@ -150,7 +166,6 @@ class Session:
         watch(lambda *_: self._ask(), list(COMPUTED_FROM))
         watch(lambda *_: self._ask_pixel(), ["pixel", "difference", "unit"])
         watch(lambda *_: self.on_page(self._draw_rest), ["image", "cloud_color", "viewing"])
-        self.image_keys.param.watch(lambda event: self.choose_pixel(*event.new), "pixel")
         self.cloud.param.watch(lambda event: self.pick(event.new), "selected")
 
     def paint(self, dark: bool) -> None:
@@ -272,9 +287,6 @@ class Session:
 
     def _enter(self, answer: Answer, previous: Answer) -> None:
         """Come to a capture of another kind: its own field of view, camera and, maybe, pixel."""
-        rows, cols = answer.capture.shape
-        self.image_keys.shape = [rows, cols]
-        self.image.enter(rows, cols, answer.grid)
         has_truth = answer.capture.truth_range_m is not None
         for name, kinds in (("image", IMAGES), ("map", MAPS), ("cloud_color", CLOUD_COLORS)):
             possible = [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
@@ -327,9 +339,10 @@ class Session:
         acquisition, state = self.answer.capture.acquisition, self.state
         numbers = words.pixel_numbers(self.answer, pixel, state.unit)
         with pn.io.hold(self.page):
+            self.image.fit(*self.answer.capture.shape, self.answer.grid)
             self.signals.update(pixel, acquisition, state.difference, state.unit)
             self.image.mark(row, col)
-            self.image_keys.pixel = [row, col]
+            self.image_keys.param.update(shape=list(self.answer.capture.shape), pixel=[row, col])
             self.cloud.selected = row * self.answer.capture.shape[1] + col
             self.numbers.facts = numbers
             self.figures.facts = words.figure_strip(self.answer)

@@ -297,8 +297,13 @@ class ImageView:
         """Take on the colours of the mode."""
         paint_frame(self.figure, colors)
 
-    def enter(self, rows: int, cols: int, grid: Grid = Grid()) -> None:  # noqa: B008 - frozen
-        """Make room for another image, and show all of it."""
+    def fit(self, rows: int, cols: int, grid: Grid) -> None:
+        """Make room for an image of other pixels than the last; of the same ones, the zoom stays."""
+        if ((rows, cols), grid) != (self._shape, self._grid):
+            self.enter(rows, cols, grid)
+
+    def enter(self, rows: int, cols: int, grid: Grid) -> None:
+        """Make room for another image, blank so far."""
         self._shape, self._grid = (rows, cols), grid
         blank = [np.full((rows, cols), np.nan, np.float32)]
         left, above, *_ = plots.pixel_frame(*grid.place(0, 0), grid.step / 2)

@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -85,14 +86,14 @@ class Light:
     image_contrast: float | None = None
     pile_up: bool = True
 
-    @property
+    @cached_property
     def typical_signal(self) -> Floats:
         """Mean signal of the pixels that see an echo, shape (row, col)."""
         share = self.share[1:]
         share = share / share.sum() if share.sum() > 0 else np.full(share.size, 1 / share.size)
         return np.asarray(np.tensordot(share, self.signal[1:], axes=1))
 
-    @property
+    @cached_property
     def typical_background(self) -> Floats:
         """Mean background, shape (row, col)."""
         return np.asarray(np.tensordot(self.share, self.background, axes=1))
