@@ -15,6 +15,22 @@ import panel_material_ui as pmui
 from app import ranking_words
 from app.cloud import view_bounds
 from app.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table
+from app.download_words import NOTHING_DRAWN
+from app.downloads import (
+    CLOUD,
+    CORNER_PX,
+    IMAGE,
+    PLOT,
+    TABLE,
+    Download,
+    Shown,
+    Subject,
+    below,
+    downloadable,
+    looked_at,
+    ranged,
+)
+from app.exports import cloud_files, image_files, plot_file, shown_table_file
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
 from app.method_views import (
@@ -185,6 +201,7 @@ class Compare:
 
     def _make_views(self) -> None:
         self._pictures: list[Picture] = []
+        self._buttons: list[Download] = []
         self._keys = PixelKeys(
             label="Pictures of the methods. Arrow keys move the pixel, with Shift by eight.",
             width=0,
@@ -203,6 +220,7 @@ class Compare:
         self._curves = CurvePlot()
         self._facts = Facts(sizing_mode="stretch_width", margin=(2, 0))
         self._reliability = ReliabilityPlot()
+        self._reliability.pane.object.min_border_top = CORNER_PX
         self._no_reliability = Sentence(text=ranking_words.RELIABILITY_UNKNOWN, margin=12)
         self._table = Table(
             title="Methods by their figures; a column's header sorts.",
@@ -221,9 +239,11 @@ class Compare:
             margin=(4, 0),
         )
         reliability = card(self._reliability.pane, self._no_reliability)
-        below = pn.Column(
-            card(self._curves.pane),
-            reliability,
+        plots = pn.Column(
+            downloadable(
+                card(self._curves.pane), self._session, "scores", self._curves_shown, PLOT
+            ),
+            downloadable(reliability, self._session, "reliability", self._reliability_shown, PLOT),
             stylesheets=[BELOW],
             sizing_mode="stretch_width",
             height=290,
@@ -234,8 +254,8 @@ class Compare:
             self._scale.pane,
             self._remarks,
             self._facts,
-            below,
-            self._table,
+            plots,
+            downloadable(below(self._table), self._session, "table", self._table_shown, TABLE),
         ]
 
     def _aside(self) -> list[Any]:
@@ -404,6 +424,43 @@ class Compare:
             self._session.fail,
         )
 
+    # What is taken away
+
+    @property
+    def _subject(self) -> Subject:
+        """All methods together."""
+        return looked_at(self._session, self._session.answer.request)
+
+    def _picture_shown(self, place: int) -> Shown:
+        method = self._pictured()[place]
+        answer = self._answers().get(method)
+        if answer is None:
+            raise ValueError(NOTHING_DRAWN)
+        kind, viewing = self._kind.value, self._chosen.viewing
+        least = viewing.least_confidence
+        _, look = image_of(self._session.answer, KINDS[kind], least)
+        if kind == CLOUDS:
+            what, files = "cloud", cloud_files(answer, "Range", viewing)
+        else:
+            values, _ = image_of(answer, KINDS[kind], least)
+            figure = self._pictures[place].image.figure
+            what, files = f"{kind} image", image_files(answer, least, values, look, figure)
+        subject = ranged(self._session, answer, method, self._tasks[method].settings)
+        return Shown(subject, what.lower(), files, title_of(method), look)
+
+    def _curves_shown(self) -> Shown:
+        row, col = self._session.state.pixel
+        table = plot_file(self._curves.pane.object, self._capture.acquisition)
+        return Shown(self._subject, f"scores row{row} col{col}", {"csv": table})
+
+    def _reliability_shown(self) -> Shown:
+        table = plot_file(self._reliability.pane.object)
+        return Shown(self._subject, "reliability", {"csv": table})
+
+    def _table_shown(self) -> Shown:
+        table = shown_table_file(self._table.columns, self._table.rows)
+        return Shown(self._subject, "methods", {"csv": table})
+
     # What is drawn
 
     def _tell_progress(self, missing: list[Task]) -> None:
@@ -434,8 +491,11 @@ class Compare:
             _, look = image_of(self._session.answer, look_name, least)
             self._scale.update(look)
             self._make_pictures(len(methods))
-            for picture, method in zip(self._pictures, methods, strict=False):
-                picture.title.text = title_of(method)
+            for picture, button, method in zip(
+                self._pictures, self._buttons, methods, strict=False
+            ):
+                picture.title.text = button.what = title_of(method)
+                button.offer(CLOUD if clouds else IMAGE)
                 picture.dim(method not in answers)
                 picture.resize(CLOUD_HEIGHT if clouds else IMAGE_HEIGHT)
                 if method in answers and clouds:
@@ -454,7 +514,11 @@ class Compare:
         """Have this many pictures in the grid; what they need is made once."""
         while len(self._pictures) < count:
             picture = Picture(self._session.choose_pixel, self._session.pick, IMAGE_HEIGHT)
+            show = partial(self._picture_shown, len(self._pictures))
+            button = Download(self._session, "picture", show, IMAGE)
+            picture.card.append(button)
             self._pictures.append(picture)
+            self._buttons.append(button)
             picture.image.join(self._pictures[0].image)
             picture.image.enter(*self._capture.shape, self._session.answer.grid)
             self._paint_picture(picture)

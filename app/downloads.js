@@ -10,7 +10,7 @@ const MARGIN_PX = 10;
 
 const STYLE = `
 .download > button {
-  all: unset; box-sizing: border-box; display: block; width: 26px; height: 26px; padding: 5px;
+  all: unset; box-sizing: border-box; display: block; width: 24px; height: 24px; padding: 4px;
   border-radius: 6px; cursor: pointer; opacity: 0.55;
   color: var(--mui-palette-text-primary, #1c2430);
   background: var(--mui-palette-background-paper, #fff);
@@ -204,10 +204,9 @@ function save(blob, name) {
 // --------------------------------------------------------------------------------- button and menu
 
 export function render({ model, view }) {
-  const label = `Download: ${model.what}`;
-  const button = element("button", "", { type: "button", title: label, "aria-label": label });
+  const button = element("button", "", { type: "button" });
   button.innerHTML = `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${ICON}"/></svg>`;
-  const menu = element("div", "", { role: "menu", popover: "auto", "aria-label": label });
+  const menu = element("div", "", { role: "menu", popover: "auto" });
   const status = element("div", "", { class: "status", role: "status" });
   button.setAttribute("aria-haspopup", "menu");
   button.popoverTargetElement = menu;
@@ -226,13 +225,25 @@ export function render({ model, view }) {
     status.textContent = `Preparing ${suffix.toUpperCase()} …`;
     model.send_msg({ suffix });
   };
-  const items = model.formats.map(([suffix, help]) => {
+  let items = [];
+  const entry = ([suffix, help]) => {
     const item = element("button", "", { type: "button", role: "menuitem", tabindex: "-1" });
     item.append(element("b", suffix.toUpperCase()), element("span", help));
     item.addEventListener("click", () => ask(suffix));
     return item;
-  });
-  menu.append(...items);
+  };
+  const list = () => {
+    items = model.formats.map(entry);
+    menu.replaceChildren(...items);
+  };
+  const name = () => {
+    button.title = `Download: ${model.what}`;
+    for (const part of [button, menu]) part.setAttribute("aria-label", button.title);
+  };
+  model.on("formats", list);
+  model.on("what", name);
+  list();
+  name();
 
   menu.addEventListener("toggle", ({ newState }) => {
     const isOpen = newState === "open";

@@ -12,11 +12,11 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import IO, Any
+from typing import IO, Any, BinaryIO, cast
 
 import panel as pn
 import param
@@ -27,7 +27,7 @@ from app.exports import Write, cloud_files, image_files, plot_file
 from app.jobs import LatestWins
 from app.looks import Look, color_values, image_of
 from app.session import Session
-from app.store import Answer
+from app.store import Answer, Request
 from core.parameters import spec_of
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,10 @@ TABLE = ("csv",)
 MOST_LETTERS = 120
 """In a file's name; some systems take 143 bytes at most."""
 
-CORNER = {"position": "absolute", "top": "3px", "right": "3px", "z-index": "3"}
+CORNER_PX = 26
+"""Height and width that a button takes."""
+
+CORNER = {"position": "absolute", "top": "1px", "right": "2px", "z-index": "3"}
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ class Subject:
     def chosen(self) -> list[str]:
         """Settings that are not the default, as ``symbol value`` without the space."""
         return [
-            _symbol(each) + _plain(getattr(settings, each.name))
+            _told(_symbol(each), _plain(getattr(settings, each.name)))
             for settings in self.settings
             for each in fields(settings)
             if getattr(settings, each.name) != each.default
@@ -114,6 +117,10 @@ def _plain(value: Any) -> str:
     text = f"{value:.6g}" if isinstance(value, float) else str(value)
     ascii_ = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     return re.sub(r"[^\w.+-]+", "-", ascii_).strip("-._")
+
+
+def _told(symbol: str, value: str) -> str:
+    return value if value.startswith(symbol) else symbol + value
 
 
 def _symbol(of: Any) -> str:
@@ -155,14 +162,21 @@ class Download(JSComponent):
     # A page has many of these: the browser fetches the code once, by its address.
     _bundle = Path(__file__).with_name("downloads.js")
 
-    def __init__(self, session: Session, show: Callable[[], Shown], **params: Any) -> None:
-        super().__init__(**params)
+    def __init__(
+        self, session: Session, what: str, show: Callable[[], Shown], formats: Iterable[str]
+    ) -> None:
+        super().__init__(what=what, styles=CORNER, margin=0)
+        self.offer(formats)
         self._session = session
         self._show = show
         self._jobs: LatestWins[IO[bytes]] = LatestWins(session.on_page, _WRITERS)
         self._file: IO[bytes] | None = None
         self._name = ""
         self._size = 0
+
+    def offer(self, formats: Iterable[str]) -> None:
+        """Offer these formats, by their suffixes without the point."""
+        self.formats = [[suffix, words.FORMATS[suffix]] for suffix in formats]
 
     def _handle_msg(self, asked: Any) -> None:
         """The browser asks for a format, for the next piece of a file, or tells what failed."""
@@ -228,7 +242,7 @@ def _written(write: Write) -> IO[bytes]:
     # tifffile wants a file that has a name.
     file = NamedTemporaryFile(prefix="firstphoton-")  # noqa: SIM115 - outlives this function
     try:
-        write(file)
+        write(cast(BinaryIO, file))
         file.flush()
         file.seek(0, 2)
     except BaseException:
@@ -259,37 +273,50 @@ def downloadable(
     formats : iterable of str
         Suffixes without the point: "png" and "svg", and keys of `Shown.files`.
     """
-    known = [[suffix, words.FORMATS[suffix]] for suffix in formats]
-    button = Download(session, show, what=what, formats=known, styles=CORNER, margin=0)
-    card.append(button)
+    card.append(Download(session, what, show, formats))
     return card
+
+
+def below(table: Any) -> pn.Column:
+    """A table that leaves the corner above it to a download button."""
+    table.margin = (CORNER_PX, 0, 0, 0)
+    return pn.Column(table, sizing_mode="stretch_width", margin=0)
 
 
 # What cards show
 
 
-def subject_of(session: Session, answer: Answer, estimator: str, settings: Any) -> Subject:
-    """What a file is about that shows an answer, of a method with its settings."""
-    request = answer.request
-    if request.source.is_scene:
-        capture, lit = session.key(request.source), [request.light]
-    else:
-        capture, lit = Path(request.source.title).stem, []
+def looked_at(session: Session, request: Request) -> Subject:
+    """The scene or capture of a request, whatever is made of it."""
+    source = request.source
+    capture = session.key(source) if source.is_scene else Path(source.title).stem
     absent = "".join(f" without {name}" for name in sorted(request.absent))
-    return Subject(
-        capture + absent, estimator, (*lit, request.less, settings), answer.capture.source
-    )
+    lit = (request.light,) if source.is_scene else ()
+    return Subject(capture + absent, "", (*lit, request.less))
+
+
+def ranged(session: Session, answer: Answer, estimator: str, settings: Any) -> Subject:
+    """An answer of a method with its settings."""
+    of = looked_at(session, answer.request)
+    told = answer.capture.source
+    return replace(of, estimator=estimator, settings=(*of.settings, settings), told=told)
 
 
 def explored(session: Session) -> Subject:
     """The session's own answer."""
-    return subject_of(session, session.answer, "tracking", session.answer.request.tracking)
+    return ranged(session, session.answer, "tracking", session.answer.request.tracking)
+
+
+def over_the_gate(session: Session, figure: Any, what: str) -> Shown:
+    """A plot over the gate of the session's capture."""
+    table = plot_file(figure, session.answer.capture.acquisition)
+    return Shown(explored(session), what, {"csv": table})
 
 
 def pixel_plot(session: Session, figure: Any, what: str) -> Shown:
     """A plot of the session's pixel."""
     row, col = session.state.pixel
-    return Shown(explored(session), f"{what} row{row} col{col}", {"csv": plot_file(figure)})
+    return over_the_gate(session, figure, f"{what} row{row} col{col}")
 
 
 def range_image(session: Session) -> Shown:

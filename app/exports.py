@@ -6,6 +6,7 @@ Each function takes what is shown now and returns what writes it later, on a wor
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,10 +17,12 @@ from bokeh.models import Axis, GlyphRenderer
 from numpy.typing import NDArray
 
 from app.download_words import NO_POINTS, NOTHING_DRAWN
+from app.gate import TITLES, scale
 from app.looks import Look, cloud_of, shown
-from app.state import Viewing
+from app.state import UNITS, Viewing
 from app.store import Answer
 from app.theme import WRONG_COLOR
+from core import Acquisition
 from core.experiments.items import Table, as_csv
 from core.export import WRITERS, Product, write_columns
 
@@ -32,32 +35,46 @@ Write = Callable[[BinaryIO], None]
 # Plots
 
 
-def plot_file(figure: Any) -> Write:
+def plot_file(figure: Any, acquisition: Acquisition | None = None) -> Write:
     """The curves of a Bokeh figure, as CSV; see `drawn`."""
-    return partial(write_columns, drawn(figure))
+    return partial(write_columns, drawn(figure, acquisition))
 
 
-def drawn(figure: Any) -> dict[str, Array]:
+def drawn(figure: Any, acquisition: Acquisition | None = None) -> dict[str, Array]:
     """The curves of a Bokeh figure as columns, as far as they are in view.
 
     The first column is the horizontal axis. Curves over the same places share their lines; those
-    over other places, such as upright marks, follow in lines of their own, NaN in all other
-    columns. What the legend has hidden, and what is of no name, is left out.
+    over other places follow in lines of their own, NaN in all other columns. A mark, such as an
+    upright line, is a 1 at its place. What the legend has hidden is left out.
+
+    Parameters
+    ----------
+    figure : bokeh.plotting.figure
+    acquisition : Acquisition, optional
+        Of a figure over bins: its first columns are bins, nanoseconds and metres.
 
     Raises
     ------
     ValueError
-        If there is none.
+        If no curve is drawn.
     """
     groups: dict[bytes, tuple[Array, dict[str, Array]]] = {}
     low, high = _view(figure.x_range)
     for name, x, y in _curves(figure):
         inside = (x >= low) & (x <= high)
         _, curves = groups.setdefault(x[inside].tobytes(), (x[inside], {}))
-        curves[f"{name} ({_label(figure.left)})"] = y[inside]
-    if not groups:
+        curves[name] = y[inside]
+    if not any(x.size for x, _ in groups.values()):
         raise ValueError(NOTHING_DRAWN)
-    columns = {_label(figure.below): np.concatenate([x for x, _ in groups.values()])}
+    places = np.concatenate([x for x, _ in groups.values()])
+    if acquisition is None:
+        columns = {_label(figure.below): places}
+    else:
+        along = {unit: scale(unit, acquisition) for unit in UNITS}
+        columns = {
+            TITLES[unit]: each.origin + each.step * places.astype(float)
+            for unit, each in along.items()
+        }
     for name in dict.fromkeys(name for _, curves in groups.values() for name in curves):
         pieces = [
             curves.get(name, np.full(x.size, np.nan, np.float32)) for x, curves in groups.values()
@@ -67,39 +84,65 @@ def drawn(figure: Any) -> dict[str, Array]:
 
 
 def _curves(figure: Any) -> Iterator[tuple[str, Array, Array]]:
-    """Name, x and y of all that a figure draws."""
+    """Name with unit, x and y of all that a figure draws and names."""
     labels = {
-        renderer.id: item.label.value
+        renderer.id: item.label
         for legend in figure.legend
         for item in legend.items
-        if hasattr(item.label, "value")
         for renderer in item.renderers
     }
     for renderer in figure.renderers:
         if not isinstance(renderer, GlyphRenderer) or not renderer.visible:
             continue
-        glyph, data = renderer.glyph, renderer.data_source.data
-        kind = type(glyph).__name__
-        name = labels.get(renderer.id, renderer.name)
+        glyph, kind = renderer.glyph, type(renderer.glyph).__name__
+        columns = renderer.data_source.data
+        label = labels.get(renderer.id)
+        unit = _unit(_label([*figure.left, *figure.right], renderer.y_range_name))
         if kind == "MultiLine":
-            for title, x, y in zip(data["title"], data["xs"], data["ys"], strict=True):
-                yield title, np.asarray(x), np.asarray(y)
-        elif not name:
-            continue
-        elif kind == "Quad":
-            middle = (np.asarray(data["left"]) + np.asarray(data["right"])) / 2
-            yield name, middle, np.asarray(data["top"])
-        elif kind == "VArea":
-            for end, column in (("lowest", glyph.y1), ("highest", glyph.y2)):
-                yield f"{name}, {end}", np.asarray(data[glyph.x]), np.asarray(data[column])
+            names = columns[getattr(label, "field", "title")]
+            lines = zip(names, columns["xs"], columns["ys"], strict=True)
+            found = [(name, np.asarray(x), np.asarray(y)) for name, x, y in lines]
         else:
-            y = glyph.top if kind == "VBar" else glyph.y
-            yield name, np.asarray(data[glyph.x]), np.asarray(data[y])
+            # Beside the legend stand bands and points; other lines only join what has a name.
+            name = renderer.name if kind in ("VArea", "Scatter") else ""
+            data = {name: np.asarray(x) for name, x in columns.items()}
+            found = _shape(kind, getattr(label, "value", name), glyph, data)
+        for name, x, y in found:
+            is_upright = kind == "Line" and x.size == 2 and x[0] == x[1]
+            if name and (is_upright or not unit):  # its height says nothing
+                yield name, np.unique(x), np.ones(np.unique(x).size, np.float32)
+            elif name:
+                yield name if name == unit else f"{name} ({unit})", x, y
 
 
-def _label(side: Sequence[Any]) -> str:
-    """Label of the axis on a side of a figure."""
-    return next(each.axis_label for each in side if isinstance(each, Axis))
+def _shape(
+    kind: str, name: str, glyph: Any, data: Mapping[str, Array]
+) -> list[tuple[str, Array, Array]]:
+    """Name, x and y of what a glyph draws."""
+    if kind == "Quad" and glyph.top in data:
+        return [(name, (data["left"] + data["right"]) / 2, data[glyph.top])]
+    if kind == "Quad":
+        return [(name, np.concatenate([data["left"], data["right"]]), np.empty(0))]
+    if kind in ("VArea", "Segment"):
+        x = data[glyph.x if kind == "VArea" else glyph.x0]
+        ends = (glyph.y1, glyph.y2) if kind == "VArea" else (glyph.y0, glyph.y1)
+        low, high = (data[column] for column in ends)
+        return [(f"{name}, lowest", x, low), (f"{name}, highest", x, high)]
+    if kind in ("VBar", "Line", "Step", "Scatter"):
+        return [(name, data[glyph.x], data[glyph.top if kind == "VBar" else glyph.y])]
+    return []
+
+
+def _label(axes: Sequence[Any], range_name: str = "default") -> str:
+    """Label of the first axis of a vertical range; empty where there is none."""
+    own = (each for each in axes if isinstance(each, Axis) and each.y_range_name == range_name)
+    return next((each.axis_label or "" for each in own), "")
+
+
+def _unit(label: str) -> str:
+    """What an axis counts: what its label has in brackets, or else the label."""
+    in_brackets = re.search(r"\((.*)\)$", label)
+    return in_brackets[1] if in_brackets else label[:1].lower() + label[1:]
 
 
 def _view(of: Any) -> tuple[float, float]:

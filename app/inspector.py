@@ -12,6 +12,8 @@ import panel_material_ui as pmui
 
 from app import inspector_words
 from app.controls import Chips, PixelKeys, Sentence
+from app.downloads import CORNER_PX, IMAGE, Shown, downloadable, explored
+from app.exports import image_files
 from app.inspector_capture import Whole
 from app.inspector_pins import Pins, pin_colors
 from app.inspector_pixel import Sight, framed
@@ -64,6 +66,7 @@ class Inspector:
         self._jobs: LatestWins[tuple[Any, Look]] = LatestWins(session.on_page)
         self._is_on_screen = self._dark = False
         self._navigator = Navigator(session.choose_pixel, self._select)
+        self._navigator.figure.min_border_top = CORNER_PX  # else the button hides a number
         self._large = LargeView(session, self._navigator.figure)
         self._keys = PixelKeys(
             label="Picture to navigate by. Arrow keys move the pixel, with Shift by eight; "
@@ -155,7 +158,9 @@ class Inspector:
             below.param.update(stylesheets=[TABLES], sizing_mode="stretch_width", margin=0)
         left = pn.Column(
             _row(self._map, self._mode, self._clear),
-            framed(self._navigator.pane, self._keys),
+            downloadable(
+                framed(self._navigator.pane, self._keys), self._session, "map", self._shown, IMAGE
+            ),
             self._large.layout,
             _row(*self._place, self._pin),
             _row(*self._span, self._add),
@@ -258,6 +263,14 @@ class Inspector:
         state = self._session.state
         state.pins = tuple(pin for pin in state.pins if pin != tuple(pixel))
         self._refusal.text = ""
+
+    def _shown(self) -> Shown:
+        """The map, as it is taken away."""
+        session, state = self._session, self._session.state
+        least = state.viewing.least_confidence
+        values, look = map_of(session.answer, state.map, least)
+        files = image_files(session.answer, least, values, look, self._navigator.figure)
+        return Shown(explored(session), f"map {state.map}", files)
 
     # What is drawn
 

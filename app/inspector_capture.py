@@ -13,6 +13,8 @@ from bokeh.models import FixedTicker, Range1d
 
 from app import inspector_plots, inspector_words, plots
 from app.controls import Facts, Knob, Sentence
+from app.downloads import PLOT, Shown, downloadable, explored, over_the_gate
+from app.exports import plot_file
 from app.gate import scale
 from app.inspector_answers import SHARES, accuracy_steps, with_gate
 from app.inspector_pixel import FACTS, framed, stage
@@ -73,7 +75,13 @@ class Whole:
     @property
     def view(self) -> View:
         """The part, for the navigation."""
-        drawn = [framed(pane_of(plot.figure)) for plot in (self._counts, self._accuracy)]
+        session = self._session
+        counts, accuracy = (framed(pane_of(plot.figure)) for plot in (self._counts, self._accuracy))
+        all_counts = partial(over_the_gate, session, self._counts.figure, "counts of all pixels")
+        drawn = [
+            downloadable(counts, session, "counts", all_counts, PLOT),
+            downloadable(accuracy, session, "accuracy", self._accuracy_shown, PLOT),
+        ]
         advice = [
             pn.Row(*pair, stylesheets=[ADVICE], sizing_mode="stretch_width", margin=0)
             for pair in zip(self._apply, self._advice, strict=True)
@@ -88,6 +96,10 @@ class Whole:
             follow=lambda _: self._follow(),
             paint=self._paint,
         )
+
+    def _accuracy_shown(self) -> Shown:
+        table = plot_file(self._accuracy.figure)
+        return Shown(explored(self._session), "accuracy against pulses", {"csv": table})
 
     # What the app tells the part
 

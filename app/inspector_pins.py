@@ -11,6 +11,8 @@ from bokeh.models import Range1d
 
 from app import inspector_plots, inspector_words, plots
 from app.controls import Sentence, Table
+from app.downloads import PLOT, TABLE, Shown, below, downloadable, explored, over_the_gate
+from app.exports import shown_table_file
 from app.inspector_answers import Seen, pixel_seen
 from app.inspector_pixel import NARROW, framed, stage
 from app.inspector_views import GatePlot
@@ -52,10 +54,20 @@ class Pins:
     @property
     def view(self) -> View:
         """The part, for the navigation."""
-        drawn = [framed(pane_of(plot.figure)) for plot in self._plots]
+        session = self._session
+        drawn = [
+            downloadable(
+                framed(pane_of(plot.figure)),
+                session,
+                what,
+                partial(over_the_gate, session, plot.figure, f"pins {what}"),
+                PLOT,
+            )
+            for plot, what in zip(self._plots, ("counts", "enhanced"), strict=True)
+        ]
         return View(
             stage(self._note, *drawn),
-            self._table,
+            downloadable(below(self._table), session, "table", self._table_shown, TABLE),
             show=self._show,
             follow=lambda _: self._ask(),
             paint=self._paint,
@@ -64,6 +76,10 @@ class Pins:
     @property
     def _plots(self) -> tuple[GatePlot, GatePlot]:
         return self._counts, self._enhanced
+
+    def _table_shown(self) -> Shown:
+        table = shown_table_file(self._table.columns, self._table.rows)
+        return Shown(explored(self._session), "pins", {"csv": table})
 
     def _show(self, is_on_screen: bool) -> None:
         self._is_on_screen = is_on_screen

@@ -9,6 +9,8 @@ import panel as pn
 
 from app import inspector_words
 from app.controls import Facts, Sentence, Table
+from app.downloads import PLOT, TABLE, Shown, below, downloadable, explored, over_the_gate
+from app.exports import shown_table_file
 from app.inspector_answers import Seen, pixel_seen, region_seen
 from app.inspector_views import PixelPlots
 from app.jobs import LatestWins
@@ -62,7 +64,12 @@ class Sight:
         self._jobs: LatestWins[Seen] = LatestWins(session.on_page)
         self._is_on_screen = False
         self._plots = PixelPlots()
-        self._cards = [framed(pane) for pane in self._plots.panes]
+        self._cards = [
+            downloadable(framed(pane), session, what, partial(self._shown, pane.object, what), PLOT)
+            for pane, what in zip(
+                self._plots.panes, ("counts", "rate", "residual and enhanced"), strict=True
+            )
+        ]
         self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width", margin=0)
         self._remark = Sentence(live=True, sizing_mode="stretch_width", margin=0)
         self._table = Table(
@@ -78,7 +85,7 @@ class Sight:
         """The part, for the navigation."""
         return View(
             stage(self._facts, self._remark, *self._cards),
-            self._table,
+            downloadable(below(self._table), self._session, "table", self._table_shown, TABLE),
             show=self._show,
             follow=lambda _: self._ask(),
             paint=self._paint,
@@ -94,6 +101,18 @@ class Sight:
 
     def _paint(self, dark: bool) -> None:
         self._plots.paint(palette(dark))
+
+    @property
+    def _place(self) -> str:
+        row, col = self._session.state.pixel
+        return f"row{row} col{col}" if self._watched == "pixel" else "region"
+
+    def _shown(self, figure: Any, what: str) -> Shown:
+        return over_the_gate(self._session, figure, f"{what} {self._place}")
+
+    def _table_shown(self) -> Shown:
+        table = shown_table_file(self._table.columns, self._table.rows)
+        return Shown(explored(self._session), f"candidates {self._place}", {"csv": table})
 
     def _ask(self) -> None:
         session = self._session

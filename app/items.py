@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,9 @@ from bokeh.models import Range1d
 
 from app import plots
 from app.controls import Knob, Sentence, Table
+from app.download_words import NOTHING_DRAWN
+from app.downloads import PLOT, TABLE, Shown, Subject, downloadable
+from app.exports import image_file, plot_file, table_file
 from app.looks import Look
 from app.method_views import TITLES, ScaleBar
 from app.paper_words import (
@@ -23,6 +28,7 @@ from app.paper_words import (
     TITLES_OF_PRESETS,
 )
 from app.parts import card
+from app.session import Session
 from app.theme import LIGHT, RANGE_COLORS, Palette
 from app.views import Layers, paint_frame, pane_of, round_up
 from app.words import COMPUTING, number
@@ -63,6 +69,16 @@ class CurveCard:
     def figure(self) -> Any:
         """What is drawn; None before the first curves."""
         return self._plot and self._plot.figure
+
+    def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
+        """Have a download button, for files about a subject."""
+
+        def show() -> Shown:
+            if self._item is None:
+                raise ValueError(NOTHING_DRAWN)
+            return Shown(subject(), self._item.key, {"csv": plot_file(self.figure)})
+
+        downloadable(self.card, session, "curves", show, PLOT)
 
     def show(self, item: items.Plot) -> None:
         """Draw curves; those of the same names are only given other values."""
@@ -108,7 +124,11 @@ class CurveCard:
         drawing.y_range = Range1d(0, 1)
         drawing.min_border_left = 68
         paint_frame(drawing, self._colors)
-        self.card.objects = [pane_of(drawing), self._note]
+        pane = pane_of(drawing)
+        if self._plot is None:
+            self.card.insert(0, pane)
+        else:
+            self.card[0] = pane
         return layers_of(drawing)
 
 
@@ -124,12 +144,24 @@ class TableCard:
         self._title = pmui.Typography(waiting, variant="subtitle2", margin=(6, 8))
         self._table = Table(sizing_mode="stretch_width", margin=0)
         self._note = Sentence(sizing_mode="stretch_width", margin=(6, 8, 12, 8))
+        self._item: items.Table | None = None
         self.layout = pn.Column(
             self._title, self._table, self._note, sizing_mode="stretch_width", margin=0
         )
 
+    def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
+        """Have a download button, for files about a subject."""
+
+        def show() -> Shown:
+            if self._item is None:
+                raise ValueError(NOTHING_DRAWN)
+            return Shown(subject(), self._item.key, {"csv": table_file(self._item)})
+
+        downloadable(self.layout, session, "table", show, TABLE)
+
     def show(self, item: items.Table) -> None:
         """Show a table, in place of the last."""
+        self._item = item
         columns, rows = table_of(item)
         self._table.param.update(title=item.title, columns=columns, rows=rows)
         self._title.object, self._note.text = f"**{item.title}**", item.note
@@ -142,6 +174,7 @@ class Gallery:
         self._drawn: list[Layers] = []
         self._item: items.Pictures | None = None
         self._colors = LIGHT
+        self._framed: Callable[[Any, str], Any] = lambda pane, _: pane
         self._grid = pn.Column(stylesheets=[GRID], sizing_mode="stretch_width", margin=0)
         self.place = [
             Knob.of(Number(symbol, 0, 63, whole=True), 32, PLACE_HELP)
@@ -155,6 +188,24 @@ class Gallery:
         self.layout = pn.Column(
             self._grid, self._scale.pane, self._note, sizing_mode="stretch_width", margin=0
         )
+
+    def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
+        """Have a download button on each picture, for files about a subject."""
+        self._framed = partial(self._with_button, session, subject)
+
+    def _with_button(
+        self, session: Session, subject: Callable[[], Subject], pane: Any, name: str
+    ) -> pn.Column:
+        def show() -> Shown:
+            item = self._item
+            if item is None:
+                raise ValueError(NOTHING_DRAWN)
+            look = _look(item)
+            files = {"csv": image_file(item.images[name], look, pane.object)}
+            return Shown(subject(), f"{item.key} {name}", files, scale=look)
+
+        holder = pn.Column(pane, sizing_mode="stretch_width", height=PICTURE_HEIGHT, margin=0)
+        return downloadable(holder, session, spelled(name), show, PLOT)
 
     @property
     def figures(self) -> list[Any]:
@@ -173,8 +224,7 @@ class Gallery:
             drawn.source("picture").data["image"] = [image.astype(np.float32)]
         self._item = item
         self._mark()
-        look = Look(item.label, "", item.low, item.high, RANGE_COLORS)
-        self._scale.update(look)
+        self._scale.update(_look(item))
         self._scale.pane.visible, self._note.text = True, f"{item.note} {OUTSIDE_NOTE}"
 
     def paint(self, colors: Palette) -> None:
@@ -191,7 +241,9 @@ class Gallery:
             pane.sizing_mode, pane.height = "stretch_width", PICTURE_HEIGHT
             paint_frame(drawing, self._colors)
             drawing.on_event(Tap, self._tapped)
-        self._grid.objects = panes
+        self._grid.objects = [
+            self._framed(pane, name) for pane, name in zip(panes, item.images, strict=True)
+        ]
 
     def _tapped(self, event: Tap) -> None:
         for knob, at in zip(self.place, (event.y, event.x), strict=True):
@@ -220,6 +272,11 @@ def layers_of(drawing: Any) -> Layers:
         for each in drawing.renderers
     }
     return Layers(drawing, found)
+
+
+def _look(item: items.Pictures) -> Look:
+    """The colours that all pictures share."""
+    return Look(item.label, "", item.low, item.high, RANGE_COLORS)
 
 
 def _frame(item: items.Pictures) -> tuple[Any, ...]:

@@ -60,7 +60,10 @@ class Picture:
     ) -> None:
         self.image = ImageView(tapped)
         self.cloud: PointCloud | None = None
-        self.title = Sentence(stylesheets=[TITLE], sizing_mode="stretch_width", margin=(4, 8, 0, 8))
+        # On the right there is room for a download button.
+        self.title = Sentence(
+            stylesheets=[TITLE], sizing_mode="stretch_width", margin=(4, 30, 0, 8)
+        )
         self.caption = Sentence(
             stylesheets=[CAPTION], sizing_mode="stretch_width", margin=(0, 8, 4, 8)
         )

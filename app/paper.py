@@ -13,6 +13,7 @@ from bokeh.models import Range1d
 
 from app import paper_words
 from app.controls import Sentence, SettingsPanel
+from app.downloads import Subject
 from app.items import CurveCard, Gallery, TableCard
 from app.jobs import LatestWins, Step
 from app.pages import Pages, View
@@ -26,6 +27,9 @@ from core.experiments.trials import Condition, Method, Results, trials
 from core.parameters import Choice, Number, check_fields, parameter
 
 Settings = TypeVar("Settings")
+
+PAPER = "paper"
+"""What files are named after that hold something of it."""
 
 # The paper's own method before those that bound it.
 TABLE_2_METHODS = sorted(paper.TABLE_2_METHODS, key=lambda method: method.estimator != "tracking")
@@ -268,7 +272,10 @@ class Sliders(Generic[Settings]):
         self._jobs: LatestWins[Sequence[items.Plot]] = LatestWins(session.on_page)
         across = Range1d(-0.5, 100)
         self._cards = [CurveCard(across, COMPUTING) for _ in range(count)]
+        self._settings = settings
         self._panel = SettingsPanel(settings, self._ask)
+        for card in self._cards:
+            card.offer(session, lambda: Subject(PAPER, "", (self._settings,)))
         self._ask(settings)
 
     @property
@@ -277,6 +284,7 @@ class Sliders(Generic[Settings]):
         return View(_stack(*self._cards), aside(self._words, self._panel.layout), paint=self._paint)
 
     def _ask(self, settings: Settings) -> None:
+        self._settings = settings
         self._jobs.submit(partial(self._compute, settings), self._draw, self._session.fail)
 
     def _draw(self, plots: Sequence[items.Plot]) -> None:
@@ -320,6 +328,7 @@ class Trials(Generic[Settings]):
         self._panel = SettingsPanel(settings, self._choose)
         self._study = Study(session, self._steps, "repetitions")
         self._card = TableCard(paper_words.NEEDS_TWO)
+        self._card.offer(session, lambda: Subject(PAPER, "", (self._settings,)))
 
     @property
     def view(self) -> View:
@@ -358,6 +367,7 @@ class RangeImages:
         self._panel = SettingsPanel(self._settings, self._choose)
         self._study = Study(session, self._steps, "figure")
         self._gallery = Gallery()
+        self._gallery.offer(session, lambda: Subject(PAPER, "", (self._settings,)))
 
     @property
     def view(self) -> View:
@@ -403,6 +413,8 @@ class LeftUnsaid:
         across = Range1d(0, 100)
         self._no_echo, self._by_place = (CurveCard(across, COMPUTING) for _ in range(2))
         self._limits, self._arithmetic = TableCard(), TableCard()
+        for each in (self._no_echo, self._by_place, self._limits, self._arithmetic):
+            each.offer(session, lambda: Subject(PAPER, "", (self._settings,)))
 
     @property
     def view(self) -> View:

@@ -10,6 +10,8 @@ import panel as pn
 
 from app import requires_words
 from app.controls import Sentence, SettingsPanel, Table
+from app.downloads import TABLE, Shown, below, downloadable, looked_at
+from app.exports import shown_table_file
 from app.pages import View
 from app.parts import part
 from app.session import Session
@@ -70,10 +72,18 @@ class Requires:
         """The table, and its controls."""
         controls = aside(requires_words.EXPLANATION, self._panel.layout, *self._study.controls)
         return View(
-            [self._subject, self._table, self._note],
+            [
+                self._subject,
+                downloadable(below(self._table), self._session, "table", self._shown, TABLE),
+                self._note,
+            ],
             part("What is judged", controls),
             follow=self._follow,
         )
+
+    def _shown(self) -> Shown:
+        table = shown_table_file(self._table.columns, self._table.rows)
+        return Shown(looked_at(self._session, self._of), "what the model needs", {"csv": table})
 
     def _follow(self, answer: Answer) -> None:
         if not same_subject(answer.request, self._of):

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from typing import Any
 
 import numpy as np
 import panel as pn
-import panel_material_ui as pmui
 from numpy.typing import NDArray
 
 from app import plots, trade_words
 from app.controls import Sentence, SettingsPanel, Table
+from app.download_words import NOTHING_DRAWN
+from app.downloads import PLOT, TABLE, Shown, Subject, below, downloadable, looked_at
+from app.exports import table_file
 from app.items import CurveCard, TableCard, layers_of, spelled
 from app.pages import Pages, View
 from app.parts import card, part
@@ -26,7 +27,6 @@ from app.trust import Trust
 from app.views import paint_frame, pane_of
 from core import ESTIMATORS
 from core.experiments.front import best_within, cheapest_reaching, front, with_light
-from core.experiments.items import as_csv
 from core.experiments.likeness import Simulation, like
 from core.experiments.tradeoff import Cancelled, Point, Source, candidates, study
 from core.experiments.tradeoff_page import acquired, acquiring_items, points_table
@@ -163,26 +163,20 @@ class Ways:
         self._table = Table(title=trade_words.TITLE, sizing_mode="stretch_width", margin=(6, 0))
         self._table.param.watch(lambda event: self._open(event.new[0]), "acted")
         self._subject.text = trade_words.WAITING
-        self._download = pmui.FileDownload(
-            callback=self._points_file,
-            filename="firstphoton_tradeoff.csv",
-            label="Points as CSV",
-            variant="outlined",
-            size="small",
-            disabled=True,
-            margin=(6, 8),
-        )
 
     @property
     def view(self) -> View:
         """The page, for the navigation."""
         holder = pn.Column(
-            card(pane_of(self._plot.figure)),
+            downloadable(
+                card(pane_of(self._plot.figure)), self._session, "plot", self._shown, PLOT
+            ),
             sizing_mode="stretch_width",
             height=PLOT_HEIGHT,
             margin=0,
         )
-        main = [self._subject, *self._advice, holder, self._table]
+        table = downloadable(below(self._table), self._session, "table", self._shown, TABLE)
+        main = [self._subject, *self._advice, holder, table]
         controls = [
             part("What is asked", self._wanted_panel.layout),
             part(
@@ -191,7 +185,6 @@ class Ways:
                     trade_words.EXPLANATION,
                     self._effort_panel.layout,
                     *self._study.controls,
-                    self._download,
                 ),
             ),
         ]
@@ -226,10 +219,12 @@ class Ways:
     def _open(self, key: int) -> None:
         self._open_point(self._measured[key], self._of)
 
-    def _points_file(self) -> BytesIO:
-        """Everything that was measured."""
-        table = points_table(self._measured)
-        return BytesIO(as_csv(table.columns, table.rows).encode())
+    def _shown(self) -> Shown:
+        """The plot, and everything that was measured."""
+        if not self._measured:
+            raise ValueError(NOTHING_DRAWN)
+        files = {"csv": table_file(points_table(self._measured))}
+        return Shown(looked_at(self._session, self._of), "speed against accuracy", files)
 
     # What is measured and drawn
 
@@ -254,7 +249,6 @@ class Ways:
 
     def _arrived(self, points: list[Point]) -> None:
         self._measured, self._of = points, self._asked
-        self._download.disabled = False
         self._follow(self._session.answer)
         self._draw()
 
@@ -353,6 +347,10 @@ class Acquisition:
         )
         self._cards = [CurveCard() for _ in range(3)]
         self._needed = TableCard(waiting="")
+        self._of = session.answer.request
+        for each in self._cards:
+            each.offer(session, self._about)
+        self._needed.offer(session, self._about)
 
     @property
     def view(self) -> View:
@@ -370,6 +368,9 @@ class Acquisition:
             paint=self._paint,
         )
 
+    def _about(self) -> Subject:
+        return looked_at(self._session, self._of)
+
     def _changed(self, swept: Swept) -> None:
         self._swept = swept
 
@@ -379,6 +380,7 @@ class Acquisition:
 
     def _work(self) -> Work[tuple[str, list[Any]]]:
         source, repetitions = source_of(self._session.answer), self._swept.repetitions
+        self._of = self._session.answer.request
 
         def work(
             progress: Callable[[int, int], None], cancelled: Callable[[], bool]

@@ -9,6 +9,7 @@ import panel as pn
 
 from app import trust_words
 from app.controls import SettingsPanel
+from app.downloads import Subject
 from app.items import CurveCard, TableCard
 from app.jobs import Step
 from app.method_views import TITLES
@@ -65,6 +66,7 @@ class Trust:
         self._cards: list[CurveCard] = []
         self._grid = pn.Column(sizing_mode="stretch_width", margin=0)
         self._table = TableCard()
+        self._table.offer(session, self._subject)
 
     @property
     def view(self) -> View:
@@ -76,6 +78,9 @@ class Trust:
             show=self._study.show,
             paint=self._paint,
         )
+
+    def _subject(self) -> Subject:
+        return Subject("settings swept", METHODS[self._swept.method])
 
     def _changed(self, swept: Swept) -> None:
         self._swept = swept
@@ -91,6 +96,8 @@ class Trust:
         swept = [(field, spec, default) for of, field, spec, default in numbers() if of == method]
         self._found = []
         self._cards = [CurveCard(waiting=trust_words.swept(spec)) for _, spec, _ in swept]
+        for each in self._cards:
+            each.offer(self._session, self._subject)
         self._paint(self._dark)
         rows = (len(swept) + 1) // 2
         with pn.io.hold(self._session.page):

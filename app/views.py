@@ -298,7 +298,7 @@ class ImageView:
         paint_frame(self.figure, colors)
 
     def fit(self, rows: int, cols: int, grid: Grid) -> None:
-        """Make room for an image of other pixels than the last; of the same ones, the zoom stays."""
+        """Make room for an image of other pixels; for one of the same, the zoom stays."""
         if ((rows, cols), grid) != (self._shape, self._grid):
             self.enter(rows, cols, grid)
 

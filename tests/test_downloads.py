@@ -112,15 +112,18 @@ def test_a_plots_table_holds_its_curves(session):
     n_bins = signals.raw.size
     np.testing.assert_array_equal(found["Bin"][:n_bins], np.arange(n_bins) + 0.5)
     for column, values in (
-        ("raw histogram (Counts)", signals.raw),
-        ("small scale (Counts)", signals.small),
-        ("large scale (Counts)", signals.large),
+        ("raw histogram (counts)", signals.raw),
+        ("small scale (counts)", signals.small),
+        ("large scale (counts)", signals.large),
     ):
         np.testing.assert_array_equal(
             found[column][:n_bins], values.astype(np.float32).astype(str).astype(float)
         )
         assert np.isnan(found[column][n_bins:]).all()
-    answer = np.flatnonzero(np.isfinite(found["answer (Counts)"]))
+    acquisition = session.answer.capture.acquisition
+    np.testing.assert_allclose(found["Range (m)"], acquisition.bin_to_range_m(found["Bin"]))
+    np.testing.assert_allclose(found["Time (ns)"], 280 + found["Bin"])
+    (answer,) = np.flatnonzero(found["answer"] == 1)
     at = session.answer.run.image.bin[session.state.pixel]
     np.testing.assert_allclose(found["Bin"][answer], at, rtol=1e-6)
 
@@ -134,8 +137,8 @@ def test_what_is_hidden_or_out_of_view_is_left_out_of_a_plots_table(session):
     finally:
         plot.show("small", True)
         plot.figure.x_range.update(start=0, end=100)
-    assert "small scale (Counts)" not in found
-    assert "large scale (Counts)" in found
+    assert "small scale (counts)" not in found
+    assert "large scale (counts)" in found
     bins = found["Bin"]
     assert (bins.min(), bins.max()) == (20.5, 30.5)
 
@@ -243,7 +246,7 @@ class Heard(Download):
     """A button whose browser is the test."""
 
     def __init__(self, session, show, suffix="csv"):
-        super().__init__(session, show, what="test", formats=[[suffix, ""]])
+        super().__init__(session, "test", show, [suffix])
         self.messages = []
 
     def _send_msg(self, data):
