@@ -589,7 +589,7 @@ def test_lines_that_have_no_place_are_not_drawn(car, sample):
 
 def test_an_image_is_shown_with_its_scale_and_its_frame(car):
     view = ImageView(lambda row, col: None)
-    view.enter(64, 64)
+    view.enter(64, 64, car.grid)
     image, look = looks.image_of(car, "Estimate", 0.9)
     view.update(image, look)
     view.mark(3, 5)
