@@ -209,10 +209,10 @@ def total_rates(capture: Capture) -> Floats:
     return _totals(capture)[0]
 
 
-def level_evidence(
+def level_likelihoods(
     capture: Capture, pixels: NDArray[np.intp], lighting: Lighting, steps_per_bin: int
 ) -> Floats:
-    """Log likelihood of each level of signal over that of none, all delays being alike.
+    """Log likelihood of each level of signal, delays being as likely as `Lighting.depth` says.
 
     Parameters
     ----------
@@ -226,11 +226,19 @@ def level_evidence(
     Returns
     -------
     ndarray, shape (pixel, level)
+        But for what depends on the counts alone.
     """
-    some = pixels[np.newaxis]
+    some, n_bins, n_pulses = pixels[np.newaxis], capture.cube.shape[2], capture.armed_pulses
     light = lighting.light(_totals(capture)[0].ravel()[some], _least_background(capture))
-    cube = capture.cube.reshape(-1, capture.cube.shape[2])[some]
-    return _level_evidence(_prepare(capture, cube, light, steps_per_bin))
+    cube = capture.cube.reshape(-1, n_bins)[some]
+    prepared = _prepare(capture, cube, light, steps_per_bin)
+    evidence = _level_evidence(prepared, prepared.depth[:, np.newaxis])
+    b, counts = light.background[0, 0] / n_bins, cube[0].astype(float)
+    fires, unfired = b, np.ones_like(counts)
+    if n_pulses is not None:
+        fires, unfired = -np.expm1(-b), n_pulses - np.cumsum(counts, axis=1)
+    none = counts.sum(axis=1) * np.log(fires) - b * unfired.sum(axis=1)
+    return np.asarray(evidence + none[:, np.newaxis])
 
 
 def level_differences(lighting: Lighting, capture: Capture) -> Difference:
@@ -402,6 +410,8 @@ def _shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Flo
         )
         share = np.maximum(share / share.sum(), 1e-12)  # never quite impossible
         found = _smoothed(found)
+        if not found.any():  # all pixels are beyond doubt without an echo
+            break
         depth = (1 - _ALIKE) * found / found.sum() + _ALIKE / n_bins
     return share, depth * n_bins
 
@@ -598,14 +608,19 @@ def _lanes(image: Floats) -> Floats:
     return np.ascontiguousarray(filled.reshape(len(image), -1, LANES))
 
 
-def _level_evidence(prepared: _Prepared) -> Floats:
-    """Log likelihood of each level over that of no echo, all delays alike; (pixel, level)."""
+def _level_evidence(prepared: _Prepared, depth: NDArray[np.float32] | float = 1.0) -> Floats:
+    """Log likelihood of each level over that of no echo, (pixel, level).
+
+    How much more often a delay occurs than others is `depth`, of shape (delay, 1).
+    """
     n_levels, n_blocks, _ = prepared.signal.shape
     evidence = np.empty((n_blocks, LANES, n_levels))
     for some, log in _log_likelihoods(prepared):
         top = log.max(axis=2)
         np.subtract(log, top[:, :, np.newaxis], out=log)
-        mean = np.exp(log, out=log).mean(axis=2)
+        density = np.exp(log, out=log)
+        density *= depth
+        mean = density.mean(axis=2)
         evidence[some] = (top + np.log(mean)).transpose(0, 2, 1)
     return evidence.reshape(-1, n_levels)[: prepared.n_pixels]
 

@@ -25,7 +25,7 @@ DRAWN_ONE_BY_ONE = 2**27
 """Detections up to which fewer pulses are drawn detection by detection; more take less time bin by
 bin."""
 
-MOST_PULSES = 10**9
+MOST_PULSES = 10**9 - 1
 """Of which `first_pulses` can draw some bin by bin: numpy's hypergeometric law ends there."""
 
 
@@ -245,6 +245,9 @@ def _are_few(cube: NDArray[np.unsignedinteger]) -> bool:
     return int(cube.sum(dtype=np.int64)) <= DRAWN_ONE_BY_ONE
 
 
+_BATCH = 64  # random numbers: drawn apart from their use, they are computed several at a time
+
+
 @njit(**PARALLEL)
 def _draw_pulses(fired, sent, n_pulses, seed, drawn):  # type: ignore[no-untyped-def]
     """Selection sampling (Fan, Muller & Rezucha 1962), of a pixel's detections one by one.
@@ -255,13 +258,16 @@ def _draw_pulses(fired, sent, n_pulses, seed, drawn):  # type: ignore[no-untyped
     """
     rows, cols, n_bins = fired.shape
     for row in prange(rows):
+        uniform = np.empty(_BATCH)
         for col in range(cols):
-            key, draw = pixel_key(seed, row * cols + col), 0
-            left = np.int64(n_pulses)
+            key, draw, left = pixel_key(seed, row * cols + col), 0, float(n_pulses)
             for k in range(n_bins):
                 before = left
                 for _ in range(fired[row, col, k]):
-                    left -= uniform_at(key, draw) * (sent - draw) < left
+                    if draw % _BATCH == 0:
+                        for i in range(_BATCH):
+                            uniform[i] = uniform_at(key, draw + i) * (sent - draw - i)
+                    left -= 1.0 if uniform[draw % _BATCH] < left else 0.0
                     draw += 1
                 drawn[row, col, k] = before - left
 
@@ -274,9 +280,9 @@ def _keep_by_chance(photons, share, seed, kept):  # type: ignore[no-untyped-def]
             key, draw = pixel_key(seed, row * cols + col), 0
             for k in range(n_bins):
                 count = 0
-                for _ in range(photons[row, col, k]):
-                    count += uniform_at(key, draw) < share
-                    draw += 1
+                for i in range(photons[row, col, k]):
+                    count += uniform_at(key, draw + i) < share
+                draw += photons[row, col, k]
                 kept[row, col, k] = count
 
 

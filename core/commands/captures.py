@@ -26,7 +26,7 @@ from core.commands.options import (
     show,
     whole_from_to,
 )
-from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage
+from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage, estimate
 from core.export import (
     CAPTURE_SUFFIXES,
     CLOUD_SUFFIXES,
@@ -36,6 +36,7 @@ from core.export import (
     save_image,
     save_pixel,
 )
+from core.inspection import LightFound, capture_report, pixel_report
 from core.parameters import Number, doubts, spec_of
 from core.pipeline import run
 from core.readers import READERS, bytes_of, open_capture, read_capture
@@ -48,6 +49,7 @@ from core.simulate import simulate
 from core.tracking import PRESETS
 
 _CONFIDENT = 0.9
+_MOST_REPORTED = 2**27  # counts: of more, what their pixels tell takes minutes
 _VIEW = ("unit_m", "distance_m", "pixel_angle_rad")
 
 
@@ -65,12 +67,23 @@ def _add_info(commands: Any) -> None:
         "info", help="what a capture file holds, and what would be guessed of it"
     )
     command.add_argument("capture", type=Path, help=f"a file: {', '.join(READERS)}")
+    command.add_argument(
+        "--pixel",
+        type=int,
+        nargs=2,
+        metavar=("ROW", "COL"),
+        help="what is known of one pixel, by the tracking differentiator's defaults",
+    )
     _add_json(command)
     add_reading(command)
     command.set_defaults(work=_info)
 
 
 def _info(chosen: argparse.Namespace) -> None:
+    if chosen.pixel is not None:
+        capture = read_capture(chosen.capture, **reading(chosen))
+        show(_of_pixel(capture, *chosen.pixel), chosen.json)
+        return
     counts = open_capture(chosen.capture, **reading(chosen))
     acquisition, pulse, detection, source = describe(counts, Request())
     rows, cols, n_bins = counts.shape
@@ -99,7 +112,52 @@ def _info(chosen: argparse.Namespace) -> None:
             "photons_in_one_pixel_at_most": int(photons.max()),
             "share_of_pixels_empty": float((photons == 0).mean()),
         }
+    if counts.size <= _MOST_REPORTED:
+        facts |= _of_capture(read_capture(chosen.capture, **reading(chosen)))
     show(facts, chosen.json)
+
+
+def _of_capture(capture: Capture) -> dict[str, Any]:
+    """What its pixels together tell."""
+    report = capture_report(capture)
+    suggestion = report.suggestion
+    return {
+        **_light(report.light, report.light_unit),
+        "light_method": report.light_method,
+        "hot_pixels": report.n_hot,
+        "dead_pixels": report.n_dead,
+        "suggested_gate_first_bin": suggestion.gate[0],
+        "suggested_gate_end_bin": suggestion.gate[1],
+        "why_gate": suggestion.why_gate,
+        "suggested_t_n": suggestion.t_n,
+        "why_t_n": suggestion.why_t_n,
+    }
+
+
+def _of_pixel(capture: Capture, row: int, col: int) -> dict[str, Any]:
+    report = pixel_report(capture, estimate(capture, "tracking"), row, col)
+    facts: dict[str, Any] = {
+        "source": capture.source,
+        "row": report.row,
+        "col": report.col,
+        "photons": int(report.counts.sum()),
+        "range_m": report.answer_m,
+        "confidence": report.confidence,
+        **_light(report.light, report.light_unit),
+        "light_method": report.light_method,
+        "verdict": report.verdict.health,
+        "why_verdict": report.verdict.why,
+    }
+    for rank, candidate in enumerate(report.candidates, 1):
+        facts |= {f"candidate_{rank}_{name}": value for name, value in vars(candidate).items()}
+    return facts
+
+
+def _light(light: LightFound, unit: str) -> dict[str, Any]:
+    facts: dict[str, Any] = {"light_unit": unit}
+    for name, interval in light._asdict().items():
+        facts |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return facts
 
 
 # -- estimate --------------------------------------------------------------------------------------

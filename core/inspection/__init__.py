@@ -1,9 +1,10 @@
 """What is known of a pixel, of a region and of a capture, and how well."""
 
-from core.inspection.light import LEVEL, LightFound, light_found
+from core.inspection.light import light_found
 from core.inspection.maps import maps
 from core.inspection.mean_light import mean_light
 from core.inspection.pixel import Candidate, PixelReport, pixel_report
+from core.inspection.profile import LEVEL, LightFound
 from core.inspection.pulses import Accuracy, accuracy_over_pulses
 from core.inspection.region import RegionReport, pixels_in, region_report
 from core.inspection.whole import CaptureReport, Suggestion, capture_report

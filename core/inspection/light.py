@@ -1,153 +1,114 @@
-"""How much signal and background a histogram has seen: estimates and 95 % intervals.
+"""How much signal and background a pixel has seen, and how well that is known.
 
-With ``S`` signal and ``B`` background photons a pulse, the likelihood of a first-photon histogram
-(`core.posterior`) is averaged over all delays of the gate, none being likelier than another: where
-the echo lies is not known, and its largest peak is not taken for it. What is left is a likelihood
-of ``S`` and ``B`` alone. The 95 % interval of each, and of ``S / B``, is the span of its values
-wherever that likelihood falls short of its largest by a logarithm of 1.92 or less: the profile
-likelihood interval (half of chi-square's 95 % quantile with one degree of freedom, Wilks 1938).
+The likelihood of a histogram (`core.posterior`), given signal and background, is averaged over all
+delays of the gate, none being likelier than another: where the echo lies is not known, and the
+largest peak is not taken for it. What is left is a likelihood of signal and background alone.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-import scipy  # loads a submodule when it is first used
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
-from core.metrics import Interval
+from core.inspection.profile import Box, LightFound, spans, zoomed
 
-LEVEL = 0.95
-_DROP = 1.920729  # half of chi-square's 95 % quantile, one degree of freedom
+METHOD = (
+    "95 % profile likelihood intervals of the first-photon likelihood, averaged over all delays"
+)
 
-
-class LightFound(NamedTuple):
-    """What a histogram tells of its light."""
-
-    signal: Interval
-    """Signal photons, per pulse or, where the pulses are not known, in all."""
-    background: Interval
-    """Background photons over the whole gate, likewise."""
-    sbr: Interval
-    """Signal over background: infinite where there may be no background, NaN without a photon."""
-
-    def per_pulse(self, n_pulses: int) -> LightFound:
-        """The same of photons that fell on so many pulses."""
-        signal, background = (
-            Interval(x.value / n_pulses, x.low / n_pulses, x.high / n_pulses)
-            for x in (self.signal, self.background)
-        )
-        return self._replace(signal=signal, background=background)
+_COARSE, _FINE = (9, 17), (13, 25)
+_RIGHT = math.pi / 2
+_DARKEST = 1e-200  # photons: without any a count would be impossible, and its logarithm infinite
+_NEGLIGIBLE = 25.0
+_STEPS, _STEPS_CLOSE = 2, 16  # delays in a bin; where few bins are left
+_FEW_BINS, _MANY_BINS = 8, 8  # left; of an echo so wide that one delay in a bin will do
 
 
 def light_found(
-    histogram: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
+    histograms: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
 ) -> LightFound:
     """Signal, background and their ratio, with 95 % intervals.
 
     Parameters
     ----------
-    histogram : ndarray, shape (bin,)
+    histograms : ndarray, shape (bin,) or (pixel, bin)
+        Counts of one pixel, or of some that see the same light, each with a delay of its own.
     acquisition : Acquisition
     pulse : Pulse
     n_pulses : int or None
         Pulses sent, where these are first photons; where None counts are taken for Poisson, and
         photons are told instead of photons per pulse.
     """
-    surface = _Surface(histogram, acquisition, pulse, n_pulses)
-    box = _zoomed(surface.whole, surface)
-    if surface.forget_delays():  # now that the light is about known
-        box = _zoomed(box, surface)
-    return _spans(box, surface(*box.grid(_FINE)))
+    counts = np.atleast_2d(np.asarray(histograms, float))
+    box = _all_light(counts, n_pulses)
+    pixels = [_Pixel(each, acquisition, pulse, n_pulses) for each in counts]
+
+    def together(root: Floats, angle: Floats) -> Floats:
+        signal, background = _light_at(root, angle)
+        return np.asarray(sum(pixel(signal, background) for pixel in pixels))
+
+    box = zoomed(box, together, _COARSE)
+    # Now that the light is about known, so are the delays.
+    forgotten = [pixel.forget_delays() for pixel in pixels]
+    if any(forgotten):
+        box = zoomed(box, together, _COARSE)
+    likelihood = together(*box.grid(_FINE))
+
+    def light_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
+        signal, background = _light_at(root, angle)
+        if box.high[0] == box.most[0]:  # where every pulse fires, it may be by any light
+            signal[-1, angle > 0] = background[-1, angle < _RIGHT] = np.inf
+        return signal, background
+
+    return spans(box, likelihood, light_at)
 
 
-_COARSE, _FINE, _FINEST = (15, 25), (21, 33), (121, 193)
-_MOST_ZOOMS = 30
-_RIGHT = math.pi / 2
-
-
-class _Box(NamedTuple):
-    """Bounds of ``√(S + B)`` and of ``asin √(S / (S + B))``.
+def _all_light(counts: Floats, n_pulses: int | None) -> Box:
+    """Bounds of ``√(S + B)`` and of ``asin √(S / (S + B))`` for pixels (pixel, bin).
 
     In these, which have about the same standard deviation everywhere, a likelihood's peak is round.
     """
-
-    low: tuple[float, float]
-    high: tuple[float, float]
-    least: tuple[float, float]
-    most: tuple[float, float]
-
-    def grid(self, size: tuple[int, int]) -> tuple[Floats, Floats]:
-        """Values of both along the sides."""
-        root, angle = (np.linspace(*each) for each in zip(self.low, self.high, size, strict=True))
-        return root, angle
-
-    def around(self, inside: NDArray[np.bool_]) -> _Box:
-        """The bounds of what is inside, a step more on each side; wider where it is cut off."""
-        low, high = [], []
-        for axis, size in enumerate(inside.shape):
-            found = np.flatnonzero(inside.any(axis=1 - axis))
-            step = (self.high[axis] - self.low[axis]) / (size - 1)
-            more = [size if found[0] == 0 else 1, size if found[-1] == size - 1 else 1]
-            low.append(max(self.low[axis] + (found[0] - more[0]) * step, self.least[axis]))
-            high.append(min(self.low[axis] + (found[-1] + more[1]) * step, self.most[axis]))
-        return self._replace(low=tuple(low), high=tuple(high))
-
-    def is_much_of(self, other: _Box) -> bool:
-        """Whether going on to this box gains little: within the other, and half as wide or more."""
-        return all(
-            other.low[i] <= self.low[i]
-            and self.high[i] <= other.high[i]
-            and 2 * (self.high[i] - self.low[i]) >= other.high[i] - other.low[i]
-            for i in range(2)
-        )
+    n_pixels, n_bins = counts.shape
+    detected = float(counts.sum())
+    if n_pulses is None:
+        one = 1 / n_pixels
+        total, sd, most = detected * one, math.sqrt(detected) * one, 2 * detected + 100
+    else:
+        sent = n_pulses * n_pixels
+        left, one = max(sent - detected, 0.5), 1 / sent
+        total, sd = math.log(sent / left), math.sqrt(1 / left - one)
+        most = n_bins * math.log(1000.0 * sent)  # where all pulses fire beyond any doubt
+    low, high = max(total - 4 * sd - one, 0.0), min(total + 4 * sd + 4 * one, most)
+    return Box(
+        low=(math.sqrt(low), 0.0),
+        high=(math.sqrt(high), _RIGHT),
+        least=(0.0, 0.0),
+        most=(math.sqrt(most), _RIGHT),
+    )
 
 
-def _zoomed(box: _Box, surface: _Surface) -> _Box:
-    """The bounds of where the likelihood is close to its largest, and little more."""
-    for _ in range(_MOST_ZOOMS):
-        likelihood = surface(*box.grid(_COARSE))
-        around = box.around(likelihood >= likelihood.max() - _DROP)
-        if around.is_much_of(box):
-            break
-        box = around
-    return box
+def _light_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
+    """Signal and background at these coordinates, each of shape (root, angle)."""
+    total = root[:, np.newaxis] ** 2
+    return total * np.sin(angle) ** 2, total * np.where(angle < _RIGHT, np.cos(angle) ** 2, 0.0)
 
 
-class _Surface:
-    """The likelihood of signal and background, averaged over delays."""
+class _Pixel:
+    """A pixel's likelihood of signal and background, averaged over delays."""
 
     def __init__(
-        self, histogram: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
+        self, counts: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
     ) -> None:
-        self._acquisition, self._pulse, self._n_pulses = acquisition, pulse, n_pulses
-        self._counts = np.asarray(histogram, float)
-        n_bins, detected = self._counts.size, float(self._counts.sum())
-        if n_pulses is None:
-            self._unfired = np.ones(n_bins)
-            total, sd, most = detected, math.sqrt(detected), 2 * detected + 100
-        else:
-            self._unfired = n_pulses - np.cumsum(self._counts)
-            left = max(float(self._unfired[-1]), 0.5)
-            total, sd = math.log(n_pulses / left), math.sqrt(1 / left - 1 / n_pulses)
-            most = n_bins * math.log(1000.0 * n_pulses)  # where all pulses fire beyond any doubt
-        one = 1 / (n_pulses or 1)
-        low, high = max(total - 6 * sd - one, 0.0), min(total + 6 * sd + 6 * one, most)
-        self.whole = _Box(
-            low=(math.sqrt(low), 0.0),
-            high=(math.sqrt(high), _RIGHT),
-            least=(0.0, 0.0),
-            most=(math.sqrt(most), _RIGHT),
-        )
+        self._counts, self._n_pulses = counts, n_pulses
+        self._acquisition, self._pulse = acquisition, pulse
+        n_bins = counts.size
+        self._unfired = np.ones(n_bins) if n_pulses is None else n_pulses - np.cumsum(counts)
         self._bins = np.arange(n_bins)
-        self._all_delays = 0
-        self._take_steps(
-            1 if pulse.span_s[1] - pulse.span_s[0] > 8 * acquisition.bin_width_s else 2
-        )
+        wide = pulse.span_s[1] - pulse.span_s[0] > _MANY_BINS * acquisition.bin_width_s
+        self._take_steps(1 if wide else _STEPS)
 
     def _take_steps(self, per_bin: int) -> None:
         """Try so many delays in each of the bins that are left."""
@@ -157,81 +118,46 @@ class _Surface:
         n_taps = self._echo.shape[1]
         # What an echo at each bin meets, shape (tap, bin): nothing beyond the gate.
         before, behind = max(-first, 0), max(first + n_taps - 1, 0)
-        met = (
-            sliding_window_view(np.pad(each, (before, behind)), n_taps)[before + first + self._bins]
+        at = before + first + self._bins
+        self._met_counts, met_unfired = (
+            sliding_window_view(np.pad(each, (before, behind)), n_taps)[at].T
             for each in (self._counts, self._unfired)
         )
-        self._met_counts, met_unfired = (each.T for each in met)
         self._reach = self._echo @ met_unfired
-        self._all_delays = n_bins * per_bin
-        self._best = np.full(self._reach.shape, -np.inf)
+        self._best = np.full(self._bins.size, -np.inf)
 
-    def __call__(self, root: Floats, angle: Floats) -> Floats:
-        """Log likelihood, shape (root, angle)."""
-        signal, background = (x.ravel() for x in _light_at(root, angle))
-        background = np.maximum(background, _DARKEST)
-        log = self._ratios(signal, background)
-        self._best = log.max(axis=0).reshape(self._reach.shape)
-        top = log.max(axis=1)
-        mean = np.exp(log - top[:, np.newaxis]).sum(axis=1) / self._all_delays
-        found = self._flat(background) + top + np.log(mean)
-        return np.asarray(found.reshape(root.size, angle.size))
+    def __call__(self, signal: Floats, background: Floats) -> Floats:
+        """Log likelihood, of the shape of both."""
+        s, b = signal.ravel(), np.maximum(background.ravel(), _DARKEST) / self._counts.size
+        ratio = self._ratio(s[:, np.newaxis, np.newaxis], b[:, np.newaxis, np.newaxis])
+        self._best = ratio.max(axis=(0, 1))
+        ratio = ratio.reshape(s.size, -1)
+        top = ratio.max(axis=1)
+        ratio -= top[:, np.newaxis]
+        mean = np.exp(ratio, out=ratio).sum(axis=1) / (self._counts.size * len(self._echo))
+        return np.asarray((self._flat(b) + top + np.log(mean)).reshape(signal.shape))
 
-    def _flat(self, background: Floats) -> Floats:
-        """Log likelihood of background alone."""
-        b, detected = background / self._counts.size, self._counts.sum()
-        if self._n_pulses is None:
-            return np.asarray(detected * np.log(b) - background)
-        return np.asarray(detected * np.log(-np.expm1(-b)) - b * self._unfired.sum())
+    def _flat(self, b: Floats) -> Floats:
+        """Log likelihood of background alone, ``b`` photons in each bin."""
+        fires = b if self._n_pulses is None else -np.expm1(-b)
+        return np.asarray(self._counts.sum() * np.log(fires) - self._unfired.sum() * b)
 
-    def _ratios(self, signal: Floats, background: Floats) -> Floats:
-        """What an echo adds to it at each delay, shape (light, delay)."""
-        s = signal[:, np.newaxis, np.newaxis] * self._echo
-        b = (background / self._counts.size)[:, np.newaxis, np.newaxis]
+    def _ratio(self, signal: Floats, b: Floats) -> Floats:
+        """What an echo adds to it at each delay, shape (light, step, bin)."""
+        s = signal * self._echo
         if self._n_pulses is None:
             gain = np.log1p(s / b)
         else:
             gain = np.log1p(np.expm1(-s) * np.exp(-b) / np.expm1(-b))
-        ratio = gain @ self._met_counts - signal[:, np.newaxis, np.newaxis] * self._reach
-        return np.asarray(ratio.reshape(signal.size, -1))
+        return np.asarray(gain @ self._met_counts - signal * self._reach)
 
     def forget_delays(self) -> bool:
         """Leave out delays that no light of the last call makes likely; look closer at the rest.
 
         Whether there were any.
         """
-        best = self._best.max(axis=0)
-        likely = best >= best.max() - _NEGLIGIBLE
+        likely = self._best >= self._best.max() - _NEGLIGIBLE
         self._bins = self._bins[likely]
-        self._take_steps(_CLOSE if self._bins.size <= _FEW_BINS else len(self._echo))
+        steps = _STEPS_CLOSE if self._bins.size <= _FEW_BINS else len(self._echo)
+        self._take_steps(steps)
         return not bool(likely.all())
-
-
-_DARKEST = 1e-200  # photons: without any a count would be impossible, and its logarithm infinite
-_NEGLIGIBLE = 25.0
-_CLOSE, _FEW_BINS = 16, 8
-
-
-def _light_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    """Signal and background at the coordinates of a `_Box`, each of shape (root, angle)."""
-    total = root[:, np.newaxis] ** 2
-    return total * np.sin(angle) ** 2, total * np.where(angle < _RIGHT, np.cos(angle) ** 2, 0.0)
-
-
-def _spans(box: _Box, likelihood: Floats) -> LightFound:
-    """Where the likelihood is largest, and its intervals, from its values on a grid."""
-    coarse, (root, angle) = box.grid(likelihood.shape), box.grid(_FINEST)
-    log = np.maximum(likelihood - likelihood.max(), -50.0)
-    smooth = scipy.interpolate.RectBivariateSpline(*coarse, log)(root, angle)
-    best = np.unravel_index(smooth.argmax(), smooth.shape)
-    inside = smooth >= smooth[best] - _DROP
-    signal, background = _light_at(root, angle)
-    if box.high[0] == box.most[0]:  # where every pulse fires, it may be by any light
-        signal[-1, angle > 0] = background[-1, angle < _RIGHT] = np.inf
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sbr = signal / background
-    signal_found, background_found, sbr_found = (
-        Interval(float(x[best]), float(np.nanmin(x[inside])), float(np.nanmax(x[inside])))
-        for x in (signal, background, sbr)
-    )
-    return LightFound(signal_found, background_found, sbr_found)

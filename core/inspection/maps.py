@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
+from core.parallel import PARALLEL, entering
 from core.posterior import posterior_of
 
 
@@ -35,34 +37,44 @@ def likeliest(capture: Capture) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
 
 @once_per_capture
 def sbr(capture: Capture) -> Floats:
-    """Signal over background of each pixel; NaN where it saw nothing, shape (row, col).
+    """Signal over background of each pixel, shape (row, col); NaN where it saw nothing.
 
     Of the delay that the posterior holds likeliest: the rate beside its echo is the background's,
     what the echo's bins hold beyond is signal, and counts as far as there is a surface at all.
+    Infinite where nothing but the echo was seen.
     """
-    posterior, acquisition = posterior_of(capture), capture.acquisition
-    n_bins, n_pulses = acquisition.n_bins, capture.armed_pulses
-    delay = likeliest(capture)[0]
-    echo, first = capture.pulse.taps(n_bins, acquisition.bin_width_s, 0.5)
-    begin = np.clip(delay + first, 0, n_bins)
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.armed_pulses
+    echo, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
+    begin = np.clip(likeliest(capture)[0] + first, 0, n_bins)
     end = np.clip(begin + echo.size, 0, n_bins)
-    until = np.zeros((*capture.shape, n_bins + 1), np.float32)
-    np.cumsum(capture.cube, axis=2, out=until[..., 1:])
-    before, behind = (
-        np.take_along_axis(until, each[..., np.newaxis], axis=2)[..., 0] for each in (begin, end)
-    )
-    seen = behind - before
+    before, inside = np.empty((2, *capture.shape), np.int64)
+    with entering(capture.cube.size):
+        _count(capture.cube, begin, end, before, inside)
+    total = capture.counts
     if n_pulses is None:
-        total = capture.counts.astype(float)
+        echo_photons, all_photons = inside.astype(float), total.astype(float)
     else:
-        left = np.maximum(n_pulses - np.stack([before, behind, capture.counts]), 0.5)
-        seen, total = np.log(left[0] / left[1]), np.log(n_pulses / left[2])
+        left = [np.maximum(n_pulses - each, 0.5) for each in (before, before + inside, total)]
+        echo_photons, all_photons = np.log(left[0] / left[1]), np.log(n_pulses / left[2])
     width = end - begin
-    background = np.where(width < n_bins, (total - seen) / np.maximum(n_bins - width, 1), np.nan)
-    signal = np.maximum(seen - background * width, 0.0) * posterior.surface
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = signal / (background * n_bins)
-    return np.where((capture.counts > 0) & np.isfinite(found), found, np.nan)
+        background = np.maximum(all_photons - echo_photons, 0.0) / (n_bins - width)
+        signal = np.maximum(echo_photons - background * width, 0.0)
+        return np.asarray(signal * posterior_of(capture).surface / (background * n_bins))
+
+
+@njit(**PARALLEL)
+def _count(cube, begin, end, before, inside):  # type: ignore[no-untyped-def]
+    """Counts of each pixel before the bin where something begins, and from there to its end."""
+    for row in prange(cube.shape[0]):
+        for col in range(cube.shape[1]):
+            total = 0
+            for k in range(begin[row, col]):
+                total += cube[row, col, k]
+            before[row, col], total = total, 0
+            for k in range(begin[row, col], end[row, col]):
+                total += cube[row, col, k]
+            inside[row, col] = total
 
 
 maps = {"Peak": peak_counts, "Fired": share_fired, "SBR": sbr}

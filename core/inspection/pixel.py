@@ -14,7 +14,8 @@ from core.capture import Capture, once_per_capture
 from core.checks import require
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.faults import Verdict, verdict
-from core.inspection.light import LightFound, light_found
+from core.inspection.light import METHOD, light_found
+from core.inspection.profile import LightFound
 from core.posterior import rate_and_armed
 
 MOST_CANDIDATES = 5
@@ -64,6 +65,8 @@ class PixelReport:
     pulses are known."""
     light_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
+    light_method: str
+    """How they are found."""
     verdict: Verdict
     """Whether the pixel is hot or dead."""
 
@@ -101,6 +104,7 @@ def pixel_report(
     counts = capture.cube[row, col].astype(float)
     curve = ESTIMATORS[method].curves(capture, row, col, settings)
     lag = lag_bins(capture, method, settings)
+    found = light_found(counts, capture.acquisition, capture.pulse, capture.armed_pulses)
     return PixelReport(
         row=row,
         col=col,
@@ -114,8 +118,9 @@ def pixel_report(
         answer_m=float(image.range_m[row, col]),
         confidence=float(image.confidence[row, col]),
         candidates=_candidates(capture, row, col, curve, lag),
-        light=_light(capture, counts),
+        light=found.of(capture),
         light_unit=light_unit(capture),
+        light_method=METHOD,
         verdict=verdict(capture, row, col),
     )
 
@@ -123,13 +128,6 @@ def pixel_report(
 def light_unit(capture: Capture) -> str:
     """In which light is told: ``"photons per pulse"``, or ``"photons"`` without known pulses."""
     return "photons" if capture.acquisition.n_pulses is None else "photons per pulse"
-
-
-def _light(capture: Capture, counts: Floats) -> LightFound:
-    found = light_found(counts, capture.acquisition, capture.pulse, capture.armed_pulses)
-    if capture.armed_pulses is None and capture.acquisition.n_pulses is not None:
-        return found.per_pulse(capture.acquisition.n_pulses)
-    return found
 
 
 @once_per_capture

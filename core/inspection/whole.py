@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from core.capture import Capture, once_per_capture
 from core.faults import standing_out
-from core.inspection.light import LightFound
 from core.inspection.maps import likeliest
 from core.inspection.mean_light import METHOD, mean_light
 from core.inspection.pixel import lag_bins, light_unit
+from core.inspection.profile import LightFound
 from core.posterior import TOLERANCE_BINS
 from core.tracking import START_BINS, TrackingParameters
 

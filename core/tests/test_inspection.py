@@ -1,0 +1,318 @@
+"""What is known of a pixel, a region and a capture: right, and as well known as it says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from core import inspection
+from core.acquisition import Acquisition, Flux, Pulse
+from core.capture import Capture
+from core.estimators import ESTIMATORS, estimate
+from core.inspection import light_found, pixels_in
+from core.metrics import Interval
+from core.parts import FaultyPixels
+from core.scene import Scene
+from core.simulate import simulate
+
+SIGNIFICANCE = 1e-4  # by chance, one fixed seed in ten thousand would fall below
+ACQUISITION = Acquisition(n_bins=60, n_pulses=400)
+
+
+def random_depths(side: int, seed: int = 0, acquisition: Acquisition = ACQUISITION) -> Scene:
+    onset = np.random.default_rng(seed).uniform(10, acquisition.n_bins - 8, (side, side))
+    return Scene(acquisition.bin_to_range_m(onset), acquisition=acquisition)
+
+
+def covers(found: Interval, truth: float) -> bool:
+    return found.low <= truth <= found.high
+
+
+def is_covered_often_enough(hits: int, trials: int) -> bool:
+    """Whether an interval of 95 % would cover so seldom by chance."""
+    return bool(stats.binom.cdf(hits, trials, inspection.LEVEL) > SIGNIFICANCE)
+
+
+# -- one pixel -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("signal", "sbr", "n_pulses"),
+    [(0.2, 0.1, 400), (0.5, 1.0, 100), (0.3, 30.0, 400), (0.0, 1, 99)],
+)
+def test_the_interval_of_a_pixels_light_covers_it(signal: float, sbr: float, n_pulses: int) -> None:
+    acquisition = replace(ACQUISITION, n_pulses=n_pulses)
+    flux = Flux(signal, sbr) if signal else Flux(1.0, sbr)
+    scene = random_depths(12, acquisition=acquisition)
+    if not signal:
+        scene = replace(scene, range_m=np.full((12, 12), np.nan))
+    capture = simulate(scene, acquisition, flux, seed=1)
+    truth = (signal, flux.background, signal / flux.background)
+    pixels = capture.cube.reshape(-1, acquisition.n_bins)
+    found = [light_found(each, acquisition, capture.pulse, n_pulses) for each in pixels]
+    for number, value in enumerate(truth):
+        hits = sum(covers(each[number], value) for each in found)
+        assert is_covered_often_enough(hits, len(found))
+    widths = [each.background.high - each.background.low for each in found]
+    chance = math.sqrt(math.expm1(flux.background + signal) / n_pulses)
+    assert np.median(widths) < 1.5 * 2 * 1.96 * chance  # and no wider than need be
+
+
+def test_photons_of_unknown_pulses_are_counted() -> None:
+    rng, pulse = np.random.default_rng(3), Pulse()
+    echo = pulse.bin_probability(30.2, 60, 1e-9)
+    hits = np.zeros(3, int)
+    for _ in range(100):
+        counts = rng.poisson(8 * echo + 12 / 60)
+        found = light_found(counts, ACQUISITION, pulse, None)
+        hits += [covers(each, value) for each, value in zip(found, (8, 12, 8 / 12), strict=True)]
+    assert all(is_covered_often_enough(each, 100) for each in hits)
+
+
+def test_pixels_of_the_same_light_tell_more_of_it() -> None:
+    capture = simulate(random_depths(4), ACQUISITION, Flux(0.2, 0.2), seed=2)
+    pixels = capture.cube.reshape(16, -1)
+    one, all_of_them = (
+        light_found(each, ACQUISITION, capture.pulse, 400) for each in (pixels[0], pixels)
+    )
+    assert covers(all_of_them.signal, 0.2) and covers(all_of_them.background, 1.0)
+    narrower = (all_of_them.signal.high - all_of_them.signal.low) / (
+        one.signal.high - one.signal.low
+    )
+    assert narrower < 0.5  # a quarter, by the square root of 16
+
+
+@pytest.mark.parametrize("method", [name for name in ESTIMATORS if name != "oracle"])
+def test_a_pixels_best_candidate_is_its_answer(method: str) -> None:
+    capture = simulate(random_depths(8), ACQUISITION, Flux(0.6, 1.0), seed=4)
+    image = estimate(capture, method)
+    right = 0
+    for row, col in np.ndindex(3, 3):
+        report = inspection.pixel_report(capture, image, row, col, method)
+        scores = [each.score for each in report.candidates]
+        assert scores == sorted(scores, reverse=True)
+        assert report.candidates[0].relative == 1.0
+        assert all(0 <= each.probability <= 1 for each in report.candidates)
+        right += abs(report.candidates[0].bin - report.answer_bin) <= 1.0
+        assert report.answer_bin == image.bin[row, col]
+    assert right >= 8  # neighbours may move a spatial method's
+
+
+def test_a_tracking_candidate_is_told_what_the_image_is() -> None:
+    capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)
+    image = estimate(capture, "tracking")
+    for row, col in np.ndindex(8, 8):
+        best = inspection.pixel_report(capture, image, row, col).candidates[0]
+        assert best.bin == pytest.approx(image.bin[row, col])
+        assert best.probability == pytest.approx(image.confidence[row, col], abs=1e-6)
+
+
+def test_hot_and_dead_pixels_are_told() -> None:
+    hot, dead = np.zeros((9, 9)), np.zeros((9, 9), bool)
+    hot[4, 4] = hot[0, 8] = 3e7
+    dead[7, 2] = dead[0, 0] = True
+    scene = replace(random_depths(9), faulty_pixels=FaultyPixels(hot, dead))
+    capture = simulate(scene, ACQUISITION, Flux(0.2, 0.2), seed=5)
+    image = estimate(capture, "peak")
+
+    def health(row: int, col: int) -> str:
+        return inspection.pixel_report(capture, image, row, col, "peak").verdict.health
+
+    assert [health(4, 4), health(0, 8), health(7, 2), health(0, 0)] == ["hot"] * 2 + ["dead"] * 2
+    assert health(2, 5) == "ordinary"
+    report = inspection.capture_report(capture)
+    assert (report.n_hot, report.n_dead) == (2, 2)
+    dark = Capture(np.zeros((3, 3, 60), np.uint8), ACQUISITION)
+    assert inspection.capture_report(dark).n_dead == 0
+    assert (
+        inspection.pixel_report(dark, estimate(dark, "peak"), 1, 1).verdict.health == "cannot tell"
+    )
+
+
+def test_a_pixel_that_is_none_is_refused() -> None:
+    capture = Capture(np.ones((2, 2, 60), np.uint8), ACQUISITION)
+    image = estimate(capture, "peak")
+    with pytest.raises(ValueError, match=r"row, col = \(2, 0\)"):
+        inspection.pixel_report(capture, image, 2, 0)
+
+
+# -- a region --------------------------------------------------------------------------------------
+
+
+def test_pixels_of_a_polygon_are_those_with_their_centre_in_it() -> None:
+    rectangle = pixels_in([(1, 2), (1, 5), (3, 5), (3, 2)], (6, 8))
+    assert rectangle.sum() == 12 and rectangle[1:4, 2:6].all()
+    np.testing.assert_array_equal(pixels_in([(3, 2), (3, 5), (1, 5), (1, 2)], (6, 8)), rectangle)
+    triangle = pixels_in([(-0.5, -0.5), (-0.5, 3.5), (3.5, -0.5)], (4, 4))
+    np.testing.assert_array_equal(triangle, np.add.outer(range(4), range(4)) <= 3)
+    for refused in ([(0, 0), (1, 1)], [(0, 0), (1, 1), (np.nan, 2)]):
+        with pytest.raises(ValueError, match="3 or more finite"):
+            pixels_in(refused, (4, 4))
+
+
+def test_a_region_is_its_pixels_added_to_one() -> None:
+    wall = Scene(np.full((8, 8), ACQUISITION.bin_to_range_m(30.3)), acquisition=ACQUISITION)
+    capture = simulate(wall, ACQUISITION, Flux(0.1, 0.1), seed=6)
+    image = estimate(capture, "tracking")
+    mask = pixels_in([(2, 2), (2, 6), (6, 6), (6, 2)], capture.shape)
+    report = inspection.region_report(capture, image, mask)
+    assert report.n_pixels == 25
+    assert report.summed.acquisition.n_pulses == 25 * 400
+    np.testing.assert_array_equal(report.pixel.counts, capture.cube[mask].sum(axis=0))
+    assert report.pixel.answer_bin == pytest.approx(30.3, abs=0.7)
+    assert report.pixel.confidence > 0.99
+    assert report.mean_counts == pytest.approx(capture.counts[mask].mean())
+    assert report.median_m == pytest.approx(np.nanmedian(image.range_m[mask]))
+    for light in (report.light, report.pixel.light):
+        assert covers(light.signal, 0.1) and covers(light.background, 1.0)
+    with pytest.raises(ValueError, match="region = '0 pixels'"):
+        inspection.region_report(capture, image, np.zeros((8, 8), bool))
+    with pytest.raises(ValueError, match="mask = "):
+        inspection.region_report(capture, image, np.zeros((8, 7), bool))
+
+
+# -- a capture -------------------------------------------------------------------------------------
+
+
+def _reflecting(side: int, seed: int = 0) -> Scene:
+    """Surfaces of all reflectivities in half of the pixels, sky in the others."""
+    scene, rng = random_depths(side, seed=seed), np.random.default_rng(seed)
+    sky = rng.uniform(size=(side, side)) < 0.5
+    reflectivity = rng.uniform(0.3, 1.0, (side, side))
+    return replace(scene, range_m=np.where(sky, np.nan, scene.range_m), reflectivity=reflectivity)
+
+
+def _hot(side: int, seed: int = 0) -> Scene:
+    hot_hz = np.where(np.random.default_rng(seed).uniform(size=(side, side)) < 0.02, 5e7, 0.0)
+    return replace(
+        random_depths(side, seed=seed),
+        faulty_pixels=FaultyPixels(hot_hz, np.zeros((side, side), bool)),
+    )
+
+
+def _mean_light_of(scene: Scene, flux: Flux) -> tuple[float, float, float]:
+    """Signal, background and their ratio of a scene's ordinary pixels."""
+    reflectivity = 1.0 if scene.reflectivity is None else scene.reflectivity
+    ordinary = np.ones(np.shape(scene.range_m), bool)
+    if scene.faulty_pixels is not None:
+        ordinary = scene.faulty_pixels.dark_count_hz == 0
+    signal = np.where(np.isfinite(scene.range_m), flux.signal * reflectivity, 0.0)[ordinary].mean()
+    return float(signal), flux.background, float(signal) / flux.background
+
+
+def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
+    """All photons of so many pulses as `capture` was sent, which are not known."""
+    fires = Flux(flux.signal / 1000, flux.sbr)
+    many = replace(capture.acquisition, n_pulses=1000 * (capture.armed_pulses or 0))
+    # Of so dim a light next to no photon hides another.
+    dim = simulate(scene, many, fires, seed=seed)
+    unknown = replace(many, n_pulses=None)
+    return replace(dim, acquisition=unknown, detection="all", signal=None, background=None)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    ("scene", "flux", "n_pulses", "counting"),
+    [
+        (random_depths, Flux(0.2, 0.1), 400, False),
+        (random_depths, Flux(0.3, 2.0), 100, False),
+        (_reflecting, Flux(0.3, 0.5), 200, False),
+        (_hot, Flux(0.3, 0.5), 200, False),
+        (_reflecting, Flux(0.3, 0.5), 50, True),
+    ],
+    ids=["dim", "clear", "half sky", "hot pixels", "unknown pulses"],
+)
+def test_the_interval_of_a_captures_light_covers_it(
+    scene: Callable[..., Scene], flux: Flux, n_pulses: int, counting: bool
+) -> None:
+    acquisition, trials = replace(ACQUISITION, n_pulses=n_pulses), 24
+    hits, off = np.zeros(3, int), np.zeros(3)
+    for seed in range(trials):
+        seen = scene(10, seed=seed)
+        capture = simulate(seen, acquisition, flux, seed=seed)
+        truth = np.array(_mean_light_of(seen, flux))
+        if counting:
+            capture = _photons(seen, flux, capture, seed)
+            truth[:2] *= n_pulses
+        for number, each in enumerate(inspection.mean_light(capture)):
+            assert each.low <= each.value <= each.high
+            hits[number] += covers(each, truth[number])
+            off[number] += (each.value - truth[number]) / (each.high - each.low) * 2 * 1.96
+    assert all(is_covered_often_enough(each, trials) for each in hits), hits
+    # No bias that as many captures show: each lies off by a standard deviation of 1 at most.
+    assert (np.abs(off) / math.sqrt(trials) < stats.norm.isf(SIGNIFICANCE / 2)).all(), off
+
+
+def _counts(shape: tuple[int, int, int], kind: str, n_pulses: int | None) -> np.ndarray:
+    cube = np.zeros(shape, np.uint32)
+    if kind == "full":
+        cube[..., 0] = n_pulses or 20
+    if kind == "one":
+        cube[0, 0, shape[2] // 2] = 1
+    return cube
+
+
+@pytest.mark.parametrize("kind", ["empty", "full", "one"])
+@pytest.mark.parametrize("n_pulses", [1, 1000, None])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 30), (5, 5, 1), (5, 6, 30)])
+def test_the_extremes_have_an_answer(
+    shape: tuple[int, int, int], n_pulses: int | None, kind: str
+) -> None:
+    acquisition = Acquisition(n_bins=shape[2], n_pulses=n_pulses)
+    capture = Capture(_counts(shape, kind, n_pulses), acquisition)
+    image = estimate(capture, "tracking")
+    whole = inspection.capture_report(capture)
+    pixel = inspection.pixel_report(capture, image, 0, 0)
+    region = inspection.region_report(capture, image, np.ones(shape[:2], bool))
+    for light in (whole.light, pixel.light, region.light, region.pixel.light):
+        for each in light:
+            assert each.low >= 0 and each.high >= each.low
+            assert covers(each, each.value) or math.isnan(each.value)
+        assert not math.isnan(light.signal.value) and not math.isnan(light.background.value)
+    first, end = whole.suggestion.gate
+    assert 0 <= first < end <= shape[2]
+    assert 0 <= whole.suggestion.t_n < shape[2]
+    for find in inspection.maps.values():
+        assert find(capture).shape == shape[:2]
+    if kind == "empty":
+        assert pixel.candidates == ()
+        assert whole.light.signal.low == whole.light.background.low == 0
+    if kind == "full" and n_pulses:
+        assert math.isinf(pixel.light.background.high)
+
+
+def test_maps_are_of_each_pixel() -> None:
+    capture = simulate(random_depths(10), ACQUISITION, Flux(0.5, 0.5), seed=7)
+    np.testing.assert_array_equal(inspection.maps["Peak"](capture), capture.cube.max(axis=2))
+    np.testing.assert_allclose(inspection.maps["Fired"](capture), capture.counts / 400)
+    assert np.median(inspection.maps["SBR"](capture)) == pytest.approx(0.5, rel=0.15)
+    photons = replace(capture, detection="all")
+    assert np.isnan(inspection.maps["Fired"](photons)).all()
+    assert inspection.maps["SBR"](capture) is inspection.maps["SBR"](capture)  # found once
+
+
+# -- fewer pulses ----------------------------------------------------------------------------------
+
+
+def test_accuracy_over_pulses_is_held_against_the_truth_or_all_pulses() -> None:
+    capture = simulate(random_depths(10), ACQUISITION, Flux(0.3, 0.2), seed=8)
+    few, more, every = inspection.accuracy_over_pulses(capture, [0.02, 0.3, 1.0])
+    assert (few.n_pulses, more.n_pulses, every.n_pulses) == (8, 120, 400)
+    assert few.against == "truth"
+    assert few.within.value < more.within.value <= every.within.value
+    assert every.rmse_m.low < every.rmse_m.value < every.rmse_m.high
+    assert every.rmse_m.value < few.rmse_m.value
+    unknown = replace(capture, truth_range_m=None, acquisition=replace(ACQUISITION, n_pulses=None))
+    part, whole = inspection.accuracy_over_pulses(unknown, [0.1, 1.0], "peak")
+    assert part.against == "all pulses" and part.n_pulses is None
+    assert whole.within.value == 1.0 and whole.rmse_m.value == 0.0
+    assert part.within.value < 1.0
+    steps = inspection.accuracy_over_pulses(capture, [0.5])
+    assert next(steps).share == 0.5  # one at a time
+    with pytest.raises(ValueError, match="share = 0"):
+        inspection.accuracy_over_pulses(capture, [0.5, 0])
