@@ -332,7 +332,7 @@ class Compare:
             cloud, _, wrong = cloud_of(session.answer, "Range", session.state.viewing)
             self._bounds = view_bounds(cloud, None if wrong is None else ~wrong)
         for picture in self._pictures:
-            picture.image.enter(*self._capture.shape)
+            picture.image.enter(*self._capture.shape, self._session.answer.grid)
 
     def _go_on(self) -> None:
         """Compute the next that is missing, unless something is under way or nothing is wanted."""
@@ -435,7 +435,7 @@ class Compare:
             picture = Picture(self._session.choose_pixel, self._session.pick, IMAGE_HEIGHT)
             self._pictures.append(picture)
             picture.image.join(self._pictures[0].image)
-            picture.image.enter(*self._capture.shape)
+            picture.image.enter(*self._capture.shape, self._session.answer.grid)
             self._paint_picture(picture)
         cards = [*(picture.card for picture in self._pictures[:count]), self._keys]
         if cards != self._grid.objects:

@@ -109,6 +109,7 @@ class LargeFile:
         with self._reading:
             if self._preview is None:
                 started = perf_counter()
+                self._reader.read_some()
                 while not self._reader.is_complete and perf_counter() - started < AT_ONCE_S:
                     self._reader.read_some()
                 self._preview = self._look()
