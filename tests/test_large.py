@@ -102,7 +102,7 @@ def test_a_format_without_windows_is_refused_with_a_remedy_that_works(building, 
     core.save_capture(building, tmp_path / "b.npz")
     with pytest.raises(ValueError, match=r"python -m core export b\.npz b\.zarr") as refused:
         file_source(tmp_path / "b.npz").load(Light(), Reading(), ())
-    assert f"{building.cube.nbytes:,}" in str(refused.value)
+    assert f"= {building.cube.nbytes} " in str(refused.value)
     core.save_capture(core.read_capture(tmp_path / "b.npz"), tmp_path / "b.zarr")
     assert file_source(tmp_path / "b.zarr").large(Reading()) is not None
 
@@ -261,6 +261,17 @@ def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
     control(looking, "The whole").clicks += 1
     settle(looking, lambda: session.answer.cutout.is_preview)
     assert session.state.window is None
+
+
+def test_reading_ends_when_something_else_is_looked_at(looking):
+    session = looking.session
+    control(looking, "Look closer").clicks += 1
+    session.state.param.update(source="car")
+    settle(looking, lambda: session.answer.request.source.is_scene)
+    settle(looking, lambda: control(looking, "Cancel").disabled)
+    while not looking.acts.empty():
+        next_answer(looking)
+    assert session.state.source == "car" and session.state.window is None
 
 
 def test_wrong_bounds_are_told_and_nothing_is_read(looking):
