@@ -30,7 +30,7 @@ PREVIEW_COUNTS = 2**23
 WINDOW_COUNTS = 2**24
 """Of a window's: a slider still answers at once."""
 
-AT_ONCE_S = 0.8
+AT_ONCE_S = 1.0
 """Spent reading before a preview is first shown, whatever it holds by then."""
 
 WHOLE_BYTES = 2**28  # of counts: ranged in some seconds
@@ -58,7 +58,7 @@ def require_small(path: Path, n_bytes: int) -> None:
         f"at most {most:,} to this page. A .zarr may be of any size, for it is read in parts: "
         f"python -m core export {path.name} {path.stem}.zarr"
     )
-    require(f"bytes of counts of {path.name}", f"{n_bytes:,}", n_bytes <= most, remedy)
+    require(f"bytes of counts of {path.name}", n_bytes, n_bytes <= most, remedy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +110,7 @@ class LargeFile:
         with self._reading:
             if self._preview is None:
                 started = perf_counter()
+                self._reader.read_some()
                 while not self._reader.is_complete and perf_counter() - started < AT_ONCE_S:
                     self._reader.read_some()
                 self._preview = self._look()

@@ -18,9 +18,6 @@ from app.studies import OnePiece, Work
 from core import Window
 from core.checks import require
 
-LOOK_CLOSER = "Look closer"
-BACK = "The whole"
-
 Bounds = tuple[int, int]
 """Of rows or columns: the first, and the one behind the last."""
 
@@ -57,11 +54,11 @@ class LargeView:
             self._reading,
             self._arrived,
             "parts read",
-            label=LOOK_CLOSER,
+            label="Look closer",
             help="Look closer: reads these rows and columns alone, as finely as they can be shown.",
         )
         whole = pmui.Button(
-            label=BACK,
+            label="The whole",
             description="The whole: all rows and columns; reads what is missing of them.",
             variant="outlined",
             size="small",
@@ -89,14 +86,15 @@ class LargeView:
 
     def follow(self, answer: Answer) -> None:
         """Show what of the file is looked at; read on where there is more of a preview."""
-        cutout = answer.cutout
-        is_new = cutout is None or self._cutout is None or cutout.window != self._cutout.window
+        cutout, previous = answer.cutout, self._cutout
         self._cutout = cutout
         self.layout.visible = cutout is not None
+        if previous is not None and (cutout is None or cutout.file is not previous.file):
+            self._stop()  # reading what nobody looks at any more
         if cutout is None:
             return
         self._sentence.text = told(cutout)
-        if is_new:
+        if previous is None or cutout.window != previous.window:
             self._show_bounds(cutout.window.rows, cutout.window.cols)
         self._begin()
 
@@ -106,8 +104,11 @@ class LargeView:
         if is_on_screen:
             self._begin()
         elif self._begun is not None:
-            self._begun = None
-            self._work.cancel()
+            self._stop()
+
+    def _stop(self) -> None:
+        self._begun = None
+        self._work.cancel()
 
     def _begin(self) -> None:
         """Read the rest of a preview, once for each file unless asked for again."""

@@ -166,7 +166,8 @@ def _limit_row(capture: Capture, measure: Yardstick | None) -> dict[str, Any]:
 def pixel_facts(answer: Answer, measure: Yardstick | None, row: int, col: int) -> list[Fact]:
     """Name, value and help of what is known of a pixel besides the answers."""
     capture = answer.capture
-    facts = [("Pixel", f"row {row}, col {col}", "Arrow keys on the pictures move it.")]
+    place = "row {}, col {}".format(*answer.grid.place(row, col))
+    facts = [("Pixel", place, "Arrow keys on the pictures move it.")]
     if capture.truth_range_m is not None:
         truth_m = float(capture.truth_range_m[row, col])
         has_target = math.isfinite(truth_m)

@@ -60,11 +60,11 @@ def _zstd(data: bytes, most: int, _: int) -> bytes:
 
     unpacked = _zstd_content_size(data)
     if unpacked is None:  # the library then wants to be told, exactly
-        room = bytearray(most - _ROOM_FOR_CHECKSUMS)
-        zstd.decompress(data, room)
-        return bytes(room)
+        unpacked = most - _ROOM_FOR_CHECKSUMS
     require("bytes unpacked", unpacked, unpacked <= most, f"at most {most:,}")
-    return bytes(zstd.decompress(data))  # which makes room for as many, and no more
+    room = bytearray(unpacked)
+    zstd.decompress(data, room)
+    return bytes(room)
 
 
 def _zstd_content_size(data: bytes) -> int | None:

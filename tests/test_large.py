@@ -1,0 +1,403 @@
+"""Captures larger than memory: a preview, then only what is looked at."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from queue import SimpleQueue
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+import core
+from app import large
+from app.large import LIMIT, Grid, most_whole_bytes
+from app.large_view import bounds_of
+from app.layout import Layout
+from app.looks import image_of
+from app.state import Less, Light, Reading
+from app.store import built_in_sources, compute, file_source
+from core import Window
+from core.experiments.tradeoff import Cancelled
+from core.posterior import lighting_of
+from core.readers.labelled import dataset
+from tests.browser import fact, serving
+from tests.test_app import ask, complaint, control, next_answer, told
+
+ROWS, COLS, CHUNK = 96, 128, 16
+PIECES = ROWS * COLS // CHUNK**2
+BINS = core.scenes["building"]().acquisition.n_bins
+
+
+@pytest.fixture(scope="module")
+def building():
+    """Of the size that a small test affords."""
+    scene = core.scenes["building"](COLS)
+    scene = core.Scene(scene.range_m[:ROWS])
+    acquisition = core.scenes["building"](COLS).acquisition
+    return core.simulate(scene, acquisition, core.Flux(sbr=0.5))
+
+
+def write(capture, path, chunk):
+    counts = dataset(capture)[["counts"]].chunk(row=chunk, col=chunk)
+    counts.to_zarr(path, consolidated=False)
+    return path
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Limits as small as the captures of these tests."""
+    monkeypatch.setenv(LIMIT, "100000")
+    monkeypatch.setattr(large, "PREVIEW_COUNTS", 24 * 32 * BINS)
+    monkeypatch.setattr(large, "WINDOW_COUNTS", 48 * 64 * BINS)
+    monkeypatch.setattr("core.readers.labelled.BLOCK_BYTES", 2 * CHUNK**2 * BINS)
+    monkeypatch.setattr("core.readers.sample.SAMPLE_COUNTS", 2 * 32 * 32 * BINS)
+
+
+@pytest.fixture
+def path(building, small, tmp_path):
+    return write(building, tmp_path / "b.zarr", CHUNK)
+
+
+@pytest.fixture
+def slow(monkeypatch):
+    """Nothing more than the first few pieces is read before a preview is shown."""
+    monkeypatch.setattr(large, "AT_ONCE_S", 0.0)
+    read_some = core.windows.WindowReader.read_some
+    steps = []
+
+    def counted(reader):
+        steps.append(reader.window)
+        read_some(reader)
+
+    monkeypatch.setattr(core.windows.WindowReader, "read_some", counted)
+    return steps
+
+
+def never():
+    return False
+
+
+# -- what is held as a whole -----------------------------------------------------------------------
+
+
+def test_size_decides_what_is_held_as_a_whole(path, building, monkeypatch):
+    reading = Reading()
+    assert file_source(path).large(reading) is not None
+    monkeypatch.setenv(LIMIT, str(building.cube.nbytes))
+    source = file_source(path)
+    assert source.large(reading) is None
+    np.testing.assert_array_equal(source.load(Light(), reading, ()).cube, building.cube)
+    monkeypatch.delenv(LIMIT)
+    assert 0 < most_whole_bytes() <= large.WHOLE_BYTES
+
+
+def test_a_format_without_windows_is_refused_with_a_remedy_that_works(building, small, tmp_path):
+    core.save_capture(building, tmp_path / "b.npz")
+    with pytest.raises(ValueError, match=r"python -m core export b\.npz b\.zarr") as refused:
+        file_source(tmp_path / "b.npz").load(Light(), Reading(), ())
+    assert f"= {building.cube.nbytes} " in str(refused.value)
+    core.save_capture(core.read_capture(tmp_path / "b.npz"), tmp_path / "b.zarr")
+    assert file_source(tmp_path / "b.zarr").large(Reading()) is not None
+
+
+# -- the preview -----------------------------------------------------------------------------------
+
+
+def test_a_preview_fills_up_and_then_rests(path, building, slow):
+    source = file_source(path)
+    answers = [compute(ask(source), None)]
+    file = answers[0].cutout.file
+    progress = []
+    while not file.read_on(lambda *done: progress.append(done), never):
+        answers.append(compute(ask(source), answers[-1]))
+    answers.append(compute(ask(source), answers[-1]))
+    shares = [answer.cutout.read for answer in answers]
+    assert shares[0] == pytest.approx(large_share(4)) and shares[-1] == 1.0
+    assert all(after <= 2.2 * before for before, after in pairwise(shares))
+    assert progress[-1] == (PIECES, PIECES + 1)
+    assert len(slow) == PIECES / 4  # each once
+    rows, cols = answers[-1].cutout.window.picked
+    np.testing.assert_array_equal(answers[-1].capture.cube, building.cube[np.ix_(rows, cols)])
+    assert compute(ask(source), answers[-1]).capture is answers[-1].capture
+
+
+def large_share(pieces):
+    return pieces / PIECES
+
+
+def test_what_is_not_read_yet_is_blank(path, slow):
+    answer = compute(ask(file_source(path)), None)
+    for kind in ("Counts", "Estimate", "Confidence"):
+        image, _ = image_of(answer, kind, 0.0)
+        assert np.isnan(image).mean() >= 1 - large_share(4)
+
+
+def test_reading_ends_when_it_is_cancelled(path, slow):
+    file = file_source(path).large(Reading())
+    first = file.preview
+    with pytest.raises(Cancelled):
+        file.read_on(lambda *_: None, lambda: True)
+    with pytest.raises(Cancelled):
+        file.cutout(Window((0, 20), (0, 20)), cancelled=lambda: True)
+    assert len(slow) == 1 and file.preview is first
+
+
+# -- windows ---------------------------------------------------------------------------------------
+
+
+def test_a_window_is_read_once_and_says_what_the_whole_says(path, building, slow):
+    source, window = file_source(path), Window((40, 70), (30, 62))
+    answer = compute(ask(source, window=window), None)
+    assert set(slow) == {window}
+    np.testing.assert_array_equal(answer.capture.cube, building.cube[40:70, 30:62])
+    light = core.light_of_whole(core.open_capture(path))
+    np.testing.assert_array_equal(lighting_of(answer.capture).depth, light.depth)
+    slow.clear()
+    other = compute(ask(source, window=window, tracking=core.PRESETS["as printed"]), answer)
+    assert other.capture is answer.capture and slow == []
+
+
+def test_a_window_beyond_its_limits_is_refused(path):
+    file = file_source(path).large(Reading())
+    with pytest.raises(ValueError, match=r"pixels of a window = 12288 .* at most 3,072"):
+        file.cutout(Window((0, ROWS), (0, COLS)))
+    with pytest.raises(ValueError, match=r"rows = \(90, 97\) .*some of 0 to 96"):
+        file.cutout(Window((90, 97), (0, 9)))
+    assert file.fitting((0, ROWS), (0, COLS)).step == 2
+
+
+def test_only_one_window_is_kept(path):
+    file = file_source(path).large(Reading())
+    one, other = (file.cutout(Window((0, 9), (0, end))) for end in (9, 10))
+    assert file.cutout(other.window) is other
+    assert file.cutout(one.window) is not one
+
+
+@pytest.mark.parametrize("less", [Less(), Less(skip=2), Less(pool=3), Less(skip=3, pool=2)])
+def test_pixels_know_their_places_in_the_file(path, less):
+    window = Window((8, 90), (5, 120), 3)
+    answer = compute(ask(file_source(path), window=window, less=less), None)
+    rows, cols = np.meshgrid(*window.picked, indexing="ij")
+    images = np.stack([rows, cols], axis=2).astype(np.uint32)
+    places = core.Capture(images, core.Acquisition(2), detection="all")
+    found = less.reduction(2).of(places).cube / less.pool**2
+    for row, col in ((0, 0), (2, 3)):
+        place = answer.grid.place(row, col)
+        np.testing.assert_allclose(place, found[row, col], atol=window.step)  # the middle of some
+        assert answer.grid.pixel(*place) == (row, col)
+
+
+def test_what_is_in_memory_as_a_whole_has_its_own_places():
+    assert compute(ask("sample"), None).grid == Grid()
+
+
+# -- typed bounds ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", ["3 to 9", " 3 - 9 ", "3–9", "3:9"])
+def test_bounds_are_typed_first_to_last(text):
+    assert bounds_of("rows", text, 96) == (3, 10)
+
+
+@pytest.mark.parametrize("text", ["", "9", "9 to 3", "0 to 96", "-1 to 4", "a to b", "1.5 to 3"])
+def test_other_bounds_are_refused(text):
+    with pytest.raises(ValueError, match=r"^rows = .*first to last, of 0 to 95"):
+        bounds_of("rows", text, 96)
+
+
+# -- the page, without a browser -------------------------------------------------------------------
+
+
+@pytest.fixture
+def looking(path, monkeypatch):
+    """A page on a large file; what is to be done on its thread waits for `next_answer`."""
+    acts = SimpleQueue()
+    monkeypatch.setattr("app.session.Session.on_page", lambda _, act: acts.put(act))
+    page = Layout({"file": file_source(path)} | built_in_sources())
+    page.acts, page.heard, tell = acts, [""], page.session.complain
+    page.session.complain = lambda sentence: (page.heard.append(sentence), tell(sentence))
+    return page
+
+
+def settle(page, holds):
+    while not holds():
+        next_answer(page)
+
+
+def fields(page):
+    return [control(page, name).value for name in ("Rows", "Columns")]
+
+
+def test_a_page_reads_on_until_the_preview_is_whole(looking):
+    settle(looking, lambda: looking.session.answer.cutout.is_final)
+    assert looking.session.answer.cutout.read == 1.0
+    assert fields(looking) == [f"0 to {ROWS - 1}", f"0 to {COLS - 1}"]
+    settle(looking, lambda: control(looking, "Cancel").disabled)
+
+
+def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
+    session = looking.session
+    settle(looking, lambda: session.answer.cutout.is_final and control(looking, "Cancel").disabled)
+    session.choose_pixel(10, 12)
+    place = session.answer.grid.place(10, 12)
+    histogram = session.answer.capture.cube[10, 12]
+    control(looking, "Rows").value, control(looking, "Columns").value = "30 to 69", "20 to 79"
+    control(looking, "Look closer").clicks += 1
+    assert not control(looking, "Cancel").disabled
+    settle(looking, lambda: not session.answer.cutout.is_preview)
+    assert session.state.window == session.answer.cutout.window == Window((30, 70), (20, 80))
+    assert session.answer.grid.place(*session.state.pixel) == place
+    np.testing.assert_array_equal(session.answer.capture.cube[session.state.pixel], histogram)
+    assert told(session.numbers)["Pixel"] == "row {}, col {}".format(*place)
+    picture = session.image._plot.source("picture").data
+    assert (picture["x"][0], picture["dw"][0]) == (19.5, 60)
+    control(looking, "The whole").clicks += 1
+    settle(looking, lambda: session.answer.cutout.is_preview)
+    assert session.state.window is None
+
+
+def test_reading_ends_when_something_else_is_looked_at(looking):
+    session = looking.session
+    control(looking, "Look closer").clicks += 1
+    session.state.param.update(source="car")
+    settle(looking, lambda: session.answer.request.source.is_scene)
+    settle(looking, lambda: control(looking, "Cancel").disabled)
+    while not looking.acts.empty():
+        next_answer(looking)
+    assert session.state.source == "car" and session.state.window is None
+
+
+def test_wrong_bounds_are_told_and_nothing_is_read(looking):
+    settle(looking, lambda: control(looking, "Cancel").disabled)
+    control(looking, "Rows").value = "90 to 200"
+    with pytest.raises(ValueError, match=r"rows = '90 to 200'"):  # Panel hands it to the page
+        control(looking, "Look closer").clicks += 1
+    assert looking.session.state.window is None
+
+
+def test_a_damaged_part_is_told_and_the_page_goes_on(looking, path):
+    session = looking.session
+    settle(looking, lambda: session.answer.cutout.is_final and control(looking, "Cancel").disabled)
+    before = session.answer
+    chunk = path / "counts" / "c" / "0" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:-9])
+    control(looking, "Rows").value, control(looking, "Columns").value = "0 to 9", "0 to 9"
+    control(looking, "Look closer").clicks += 1
+    settle(looking, lambda: complaint(looking))
+    assert "chunk (0, 0, 0)" in complaint(looking) and "damaged" in complaint(looking)
+    assert str(path.parent) not in complaint(looking)
+    assert session.answer is before and session.state.window is None
+    shutil.rmtree(path)
+    control(looking, "Look closer").clicks += 1
+    settle(looking, lambda: "has not gone" in complaint(looking))
+    control(looking, "l").value = 0.01
+    settle(looking, lambda: session.answer is not before)
+    assert session.answer.request.tracking.l == 0.01
+
+
+# -- in a browser ----------------------------------------------------------------------------------
+
+SIDE = 512
+"""Rows and columns of a capture that is just too large for a preview of every pixel."""
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """Path of a large capture, and where the app shows it."""
+    scene = core.scenes["car"]()
+    car = core.simulate(scene, scene.acquisition, core.Flux(sbr=1.0), seed=1)
+    times = SIDE // car.shape[0]
+    tiled = core.Capture(np.tile(car.cube, (times, times, 1)), car.acquisition, car.pulse)
+    path = write(tiled, tmp_path_factory.mktemp("served") / "cars.zarr", 128)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(LIMIT, str(2**20))
+        with serving(path) as address:
+            yield path, address, tiled
+
+
+def bounds(page: Page, rows: str, cols: str) -> None:
+    for name, text in (("Rows", rows), ("Columns", cols)):
+        page.get_by_label(name, exact=True).fill(text)
+        page.get_by_label(name, exact=True).press("Tab")
+
+
+def shows(page: Page, rows: str, cols: str) -> None:
+    for name, text in (("Rows", rows), ("Columns", cols)):
+        expect(page.get_by_label(name, exact=True)).to_have_value(text)
+
+
+def zoom(page: Page) -> None:
+    """Drag a box on the picture."""
+    box = page.locator("[data-part=image]").bounding_box()
+    left, top = box["x"] + 0.4 * box["width"], box["y"] + 0.4 * box["height"]
+    page.mouse.move(left, top)
+    page.mouse.down()
+    page.mouse.move(left + 40, top + 40, steps=4)
+    page.mouse.up()
+    for name in ("Rows", "Columns"):
+        expect(page.get_by_label(name, exact=True)).to_have_value(re.compile("^[1-9]"))
+
+
+@contextmanager
+def endless(chunk: Path) -> Iterator[None]:
+    """A chunk that takes for ever to be read, until this is over."""
+    kept = chunk.read_bytes()
+    chunk.unlink()
+    os.mkfifo(chunk)
+    yield
+    chunk.open("wb").close()  # who waits for it reads its end
+    chunk.unlink()
+    chunk.write_bytes(kept)
+
+
+@pytest.mark.browser
+def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
+    path, address, capture = served
+    opened = page(address)
+    closer = opened.get_by_role("button", name="Look closer")
+    cancel = opened.get_by_role("button", name="Cancel").filter(visible=True)
+    preview = opened.get_by_text(f"Preview of {SIDE} × {SIDE} pixels, 1 of each 2 × 2")
+    expect(preview).to_be_visible()
+    expect(cancel).to_be_disabled()  # all of the preview has been read
+    shows(opened, "0 to 511", "0 to 511")
+    zoom(opened)
+    closer.click()
+    told = opened.get_by_text(re.compile("^Seen: rows"))
+    expect(told).to_be_visible()
+    seen = re.fullmatch(r"Seen: rows (.*), columns (.*), of 512 × 512 pixels\.", told.inner_text())
+    shows(opened, *seen.groups())
+    first, last = map(int, seen[1].split(" to "))
+    assert 0 < first < last < SIDE - 1
+    # While something is read, the page can be used; and the reading can be cancelled.
+    chunk = path / "counts" / "c" / "0" / "0" / "0"
+    with endless(chunk):
+        bounds(opened, "0 to 63", "0 to 63")
+        closer.click()
+        expect(cancel).to_be_enabled()
+        before = fact(opened, "Pixel").inner_text()
+        opened.locator("[data-part=image]").focus()
+        opened.keyboard.press("ArrowLeft")
+        expect(fact(opened, "Pixel")).not_to_have_text(before)
+        row, col = map(int, re.findall(r"\d+", fact(opened, "Pixel").inner_text()))
+        expect(fact(opened, "Detections")).to_have_text(f"{capture.counts[row, col]:,}")
+        cancel.click()
+        expect(cancel).to_be_disabled()
+        expect(told).to_have_text(seen[0])
+    kept = chunk.read_bytes()
+    chunk.write_bytes(kept[:-9])
+    closer.click()
+    expect(opened.get_by_role("alert").filter(has_text="is damaged")).to_be_visible()
+    expect(told).to_have_text(seen[0])
+    chunk.write_bytes(kept)
+    closer.click()
+    expect(told).to_have_text("Seen: rows 0 to 63, columns 0 to 63, of 512 × 512 pixels.")
+    opened.get_by_role("button", name="The whole").click()
+    expect(preview).to_be_visible()
+    shows(opened, "0 to 511", "0 to 511")
