@@ -12,6 +12,7 @@ from bokeh.events import SelectionGeometry
 from bokeh.models import (
     BasicTicker,
     BoxSelectTool,
+    BoxZoomTool,
     ColumnDataSource,
     LassoSelectTool,
     Range1d,
@@ -61,7 +62,8 @@ class Navigator(ImageView):
         wheel = WheelZoomTool()
         drawing.add_tools(*by_hand.values(), wheel)
         drawing.toolbar.active_scroll = wheel
-        self._tools = {"box_zoom": drawing.toolbar.active_drag, **by_hand}
+        (zoom,) = (tool for tool in drawing.toolbar.tools if isinstance(tool, BoxZoomTool))
+        self._tools = {"box_zoom": zoom, **by_hand}
         for name, color, width in (("shadow", "#000000", 4), ("line", "#ffd000", 2)):
             drawing.patches(
                 "xs",
