@@ -21,6 +21,8 @@ from core.reductions import cut_gate
 from core.scene import Scene, scenes
 from core.simulate import simulate
 
+pytestmark = pytest.mark.compiled
+
 SIGNIFICANCE = 1e-4  # by chance, one fixed seed in ten thousand would fall below
 ACQUISITION = Acquisition(n_bins=60, n_pulses=400)
 
@@ -216,7 +218,6 @@ def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
     return replace(dim, acquisition=unknown, detection="all", signal=None, background=None)
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize(
     ("scene", "flux", "n_pulses", "counting"),
     [
@@ -297,7 +298,6 @@ def test_maps_are_of_each_pixel() -> None:
     assert inspection.maps["SBR"](capture) is inspection.maps["SBR"](capture)  # found once
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize("name", ["building", "staircase"])
 def test_what_a_capture_suggests_does_it_good(name: str) -> None:
     scene = scenes[name](32)

@@ -135,6 +135,7 @@ def test_pooled_truth_is_of_the_pixels_that_have_one() -> None:
     assert np.isnan(np.asarray(pool_pixels(sky, 2).truth_range_m)).all()
 
 
+@pytest.mark.compiled
 def test_fewer_pulses_have_the_moments_of_a_draw_without_replacement() -> None:
     side, n, sent = 60, 120, 200
     histogram = np.array([40, 0, 100, 7, 13])  # and 40 pulses that fired nowhere
@@ -159,6 +160,7 @@ def test_fewer_pulses_follow_the_law_of_as_many(wall: Capture) -> None:
     np.testing.assert_array_equal(first_pulses(wall, 500).cube, wall.cube)
 
 
+@pytest.mark.compiled
 def test_all_photons_are_kept_each_by_chance() -> None:
     cube = np.full((80, 80, 4), 50, np.uint16)
     capture = Capture(cube, Acquisition(n_bins=4, n_pulses=10), detection="all")
