@@ -154,18 +154,20 @@ def test_only_what_changed_is_computed_again(car):
 
 
 def test_less_of_a_capture_is_taken_from_the_whole_of_it(car):
-    less = Less(merge=2, gate_from=0.2, gate_to=0.9, pool=2)
+    less = Less(merge=2, gate_from=0.2, gate_to=0.9, pool=2, pulses=0.5)
     reduced = compute(replace(car.request, less=less), car)
     assert reduced.whole is car.whole is car.capture
     assert reduced.capture.cube.shape == (32, 32, 35)
     assert compute(car.request, reduced).whole is car.whole
     np.testing.assert_array_equal(
-        reduced.capture.cube, Reduction(merge=2, gate=(20, 90), pool=2).of(car.capture).cube
+        reduced.capture.cube,
+        Reduction(merge=2, gate=(20, 90), pool=2, pulses=0.5).of(car.capture).cube,
     )
 
 
 @pytest.mark.parametrize(
-    "reduction", [Reduction(), Reduction(4, (7, 33), skip=2), Reduction(gate=(0, 99), pool=3)]
+    "reduction",
+    [Reduction(), Reduction(4, (7, 33), skip=2), Reduction(gate=(0, 99), pool=3, pulses=0.1)],
 )
 def test_a_reduction_is_what_its_settings_say(reduction):
     for n_bins in (100, 334, 876):

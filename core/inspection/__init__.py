@@ -2,7 +2,7 @@
 
 from core.inspection.light import light_found
 from core.inspection.maps import maps
-from core.inspection.mean_light import mean_light
+from core.inspection.mixture import mean_light
 from core.inspection.pixel import Candidate, PixelReport, pixel_report
 from core.inspection.profile import LEVEL, LightFound
 from core.inspection.pulses import Accuracy, accuracy_over_pulses

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from core.capture import Capture, once_per_capture
 from core.faults import standing_out
 from core.inspection.maps import likeliest
-from core.inspection.mean_light import METHOD, mean_light
+from core.inspection.mixture import METHOD, mean_light
 from core.inspection.pixel import lag_bins, light_unit
 from core.inspection.profile import LightFound
 from core.posterior import TOLERANCE_BINS
@@ -24,7 +24,9 @@ class Suggestion:
     """Settings that the capture's own echoes suggest."""
 
     gate: tuple[int, int]
-    """First bin and end of the window that holds them, in bins of the capture."""
+    """First bin and end of the window that holds them, in bins of the capture. First photons are
+    not cut in front: that would cost pulses (`core.reductions.cut_gate`), and more than it gains.
+    """
     why_gate: str
     t_n: int
     """First bin in which the tracking residual may peak, in bins of the whole gate."""
@@ -73,7 +75,7 @@ def aggregate(capture: Capture) -> NDArray[np.int64]:
 
 _CONFIDENT = 0.9
 _FEWEST = 10  # confident answers
-_LEAD_BINS = 3 * START_BINS  # in front of the first echo, for the differentiators to settle
+_MARGIN_BINS = 3 * START_BINS
 
 
 class _Echoes(NamedTuple):
@@ -104,21 +106,28 @@ def _echoes(capture: Capture) -> _Echoes | None:
 def suggestion(capture: Capture) -> Suggestion:
     """Gate and T_n, with the reason in a sentence each."""
     n_bins, echoes = capture.acquisition.n_bins, _echoes(capture)
-    settings = TrackingParameters()
     if echoes is None:
         why = f"Fewer than {_FEWEST} answers are confident: where echoes lie is not known."
-        t_n = min(_LEAD_BINS, n_bins - 1)
+        t_n = min(_MARGIN_BINS, n_bins - 1)
         return Suggestion((0, n_bins), why, t_n, t_n, f"{why} The differentiators need {t_n} bins.")
-    lag = lag_bins(capture, "tracking", settings)
+    lag = lag_bins(capture, "tracking", TrackingParameters())
     echo, tap = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
-    first = max(math.floor(echoes.first) + min(tap, 0) - TOLERANCE_BINS - _LEAD_BINS, 0)
-    end = min(math.ceil(echoes.last) + tap + echo.size + _LEAD_BINS, n_bins)
-    t_n = max(math.floor(echoes.first + lag) - TOLERANCE_BINS, 0)
     between = f"in bins {echoes.first:.0f} to {echoes.last:.0f}"
     where = f"The {echoes.how_many:,} confident answers lie {between}"
+    end = min(math.ceil(echoes.last) + tap + echo.size + _MARGIN_BINS, n_bins)
+    if capture.armed_pulses is not None:
+        # What is cut in front takes pulses with it, of each pixel another number.
+        first, side = 0, "behind them; in front, a cut would cost the pulses that fired there"
+    else:
+        first = max(math.floor(echoes.first) + min(tap, 0) - TOLERANCE_BINS - _MARGIN_BINS, 0)
+        side = "on either side"
+    why = f"{where}; {_MARGIN_BINS} bins more let the differentiators settle {side}."
+    if (first, end) == (0, n_bins):
+        why = f"{where}; with a margin of {_MARGIN_BINS} bins that is the whole gate."
+    t_n = max(math.floor(echoes.first + lag) - TOLERANCE_BINS, 0)
     return Suggestion(
         (first, end),
-        f"{where}; {_LEAD_BINS} bins more on each side let the differentiators settle.",
+        why,
         t_n,
         max(t_n - first, 0),
         f"{where}: what peaks more than {TOLERANCE_BINS} bins before them is noise.",

@@ -85,6 +85,24 @@ def test_info_tells_what_is_known_and_guessed(
     assert "guessed: axes (row, col, bin), bin width 1 ns" in out
 
 
+def test_info_tells_what_pixels_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = scenes["staircase"](8)
+    capture = simulate(scene, Acquisition(n_pulses=200), Flux(0.3, sbr=1.0), seed=3)
+    path = tmp_path / "stairs.npz"
+    save_capture(capture, path)
+    told = facts(capsys, "info", path)
+    assert told["signal_low"] < 0.3 < told["signal_high"]
+    assert told["sbr_low"] <= told["sbr"] <= told["sbr_high"]
+    assert told["hot_pixels"] == told["dead_pixels"] == 0
+    assert told["suggested_gate_first_bin"] < told["suggested_gate_end_bin"] <= 100
+    of_pixel = facts(capsys, "info", path, "--pixel", 2, 3)
+    assert of_pixel["photons"] == capture.counts[2, 3]
+    assert of_pixel["candidate_1_range_m"] == of_pixel["range_m"]
+    assert of_pixel["verdict"] == "ordinary"
+    code, _, err = ran(capsys, "info", path, "--pixel", 8, 0)
+    assert code == 2 and "row, col = (8, 0)" in err
+
+
 @pytest.mark.parametrize("suffix", CAPTURE_SUFFIXES)
 def test_a_simulated_capture_is_written_and_read(
     suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

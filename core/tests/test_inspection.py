@@ -15,10 +15,13 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
 from core.inspection import light_found, pixels_in
-from core.metrics import Interval
+from core.metrics import Interval, restored
 from core.parts import FaultyPixels
-from core.scene import Scene
+from core.reductions import cut_gate
+from core.scene import Scene, scenes
 from core.simulate import simulate
+
+pytestmark = pytest.mark.compiled
 
 SIGNIFICANCE = 1e-4  # by chance, one fixed seed in ten thousand would fall below
 ACQUISITION = Acquisition(n_bins=60, n_pulses=400)
@@ -215,7 +218,6 @@ def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
     return replace(dim, acquisition=unknown, detection="all", signal=None, background=None)
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize(
     ("scene", "flux", "n_pulses", "counting"),
     [
@@ -230,7 +232,7 @@ def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
 def test_the_interval_of_a_captures_light_covers_it(
     scene: Callable[..., Scene], flux: Flux, n_pulses: int, counting: bool
 ) -> None:
-    acquisition, trials = replace(ACQUISITION, n_pulses=n_pulses), 24
+    acquisition, trials = replace(ACQUISITION, n_pulses=n_pulses), 16
     hits, off = np.zeros(3, int), np.zeros(3)
     for seed in range(trials):
         seen = scene(10, seed=seed)
@@ -294,6 +296,35 @@ def test_maps_are_of_each_pixel() -> None:
     photons = replace(capture, detection="all")
     assert np.isnan(inspection.maps["Fired"](photons)).all()
     assert inspection.maps["SBR"](capture) is inspection.maps["SBR"](capture)  # found once
+
+
+@pytest.mark.parametrize("name", ["building", "staircase"])
+def test_what_a_capture_suggests_does_it_good(name: str) -> None:
+    scene = scenes[name](32)
+    capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.05), seed=1)
+    suggested = inspection.capture_report(capture).suggestion
+    cut = cut_gate(capture, *suggested.gate)
+    before = estimate(capture, "tracking")
+    after = estimate(cut, "tracking", t_n=suggested.t_n_in_gate)
+    tolerance_m = 3 * scene.acquisition.bin_length_m
+    truth_m = np.asarray(capture.truth_range_m)
+    one, other = (restored(each.range_m, truth_m, tolerance_m)[0] for each in (before, after))
+    assert other > one
+    nearest = np.nanmin(scene.acquisition.range_m_to_bin(truth_m))
+    assert abs(suggested.t_n - nearest) <= 6 or suggested.t_n == 0
+
+
+def test_a_gate_is_cut_in_front_where_that_costs_no_pulse() -> None:
+    acquisition = Acquisition(n_bins=200, n_pulses=100)
+    wall = Scene(np.full((8, 8), acquisition.bin_to_range_m(90.0)), acquisition=acquisition)
+    capture = simulate(wall, acquisition, Flux(0.5, 5.0), seed=9)
+    first = inspection.capture_report(capture).suggestion
+    photons = inspection.capture_report(replace(capture, detection="all")).suggestion
+    assert first.gate[0] == 0 < photons.gate[0] < 90 - 3
+    assert 90 + 8 < first.gate[1] == photons.gate[1] < 200
+    assert photons.t_n_in_gate == photons.t_n - photons.gate[0]
+    assert first.t_n == photons.t_n <= 92
+    assert "64 confident answers lie in bins 8" in first.why_gate
 
 
 # -- fewer pulses ----------------------------------------------------------------------------------

@@ -20,10 +20,12 @@ from core.reductions import (
     first_pulses,
     merge_bins,
     pool_pixels,
+    share_of_pulses,
     skip_pixels,
 )
 from core.scene import Scene
 from core.simulate import simulate
+from core.streams import pixel_key, uniform_at
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
 SIDE = 12 if numba.config.DISABLE_JIT else 32  # rows and columns of 500 pulses each
@@ -133,6 +135,7 @@ def test_pooled_truth_is_of_the_pixels_that_have_one() -> None:
     assert np.isnan(np.asarray(pool_pixels(sky, 2).truth_range_m)).all()
 
 
+@pytest.mark.compiled
 def test_fewer_pulses_have_the_moments_of_a_draw_without_replacement() -> None:
     side, n, sent = 60, 120, 200
     histogram = np.array([40, 0, 100, 7, 13])  # and 40 pulses that fired nowhere
@@ -157,6 +160,7 @@ def test_fewer_pulses_follow_the_law_of_as_many(wall: Capture) -> None:
     np.testing.assert_array_equal(first_pulses(wall, 500).cube, wall.cube)
 
 
+@pytest.mark.compiled
 def test_all_photons_are_kept_each_by_chance() -> None:
     cube = np.full((80, 80, 4), 50, np.uint16)
     capture = Capture(cube, Acquisition(n_bins=4, n_pulses=10), detection="all")
@@ -166,6 +170,65 @@ def test_all_photons_are_kept_each_by_chance() -> None:
     tails = [law.cdf(8), *law.pmf(np.arange(9, 23)), law.sf(22)]
     found = [found[:9].sum(), *found[9:23], found[23:].sum()]
     assert stats.chisquare(found, np.array(tails) * cube.size).pvalue > SIGNIFICANCE
+
+
+def test_fewer_pulses_are_a_part_of_more(wall: Capture) -> None:
+    for capture in (wall, replace(wall, detection="all")):
+        more = capture
+        for n_pulses in (499, 250, 30, 1):
+            fewer = first_pulses(capture, n_pulses, seed=2)
+            assert (fewer.cube <= more.cube).all()
+            assert fewer.cube.sum() < more.cube.sum()
+            more = fewer
+
+
+def drawn_by_hand(
+    histogram: np.ndarray, sent: int, n_pulses: int, uniform: np.ndarray
+) -> list[int]:
+    """Pulses looked at one after another; each is taken as likely as those wanted of those left."""
+    taken, looked_at = [0] * len(histogram), 0
+    for k, fired in enumerate(histogram):
+        for _ in range(fired):
+            wanted = n_pulses - sum(taken)
+            taken[k] += bool(uniform[looked_at] < wanted / (sent - looked_at))
+            looked_at += 1
+    return taken
+
+
+def test_pulses_are_drawn_as_one_would_by_hand() -> None:
+    cube = np.array([[[3, 0, 9, 4], [0, 0, 20, 0]]], np.uint16)
+    capture = Capture(cube, Acquisition(n_bins=4, n_pulses=20))
+    for n_pulses in range(1, 21):
+        drawn = first_pulses(capture, n_pulses, seed=7).cube
+        for pixel in range(2):
+            key = np.uint64(pixel_key(np.uint64(7), pixel))
+            uniform = np.array([uniform_at(key, draw) for draw in range(20)])
+            by_hand = drawn_by_hand(cube[0, pixel], 20, n_pulses, uniform)
+            np.testing.assert_array_equal(drawn[0, pixel], by_hand)
+
+
+def test_counts_too_many_to_be_drawn_one_by_one_follow_the_same_law(
+    wall: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("core.reductions.DRAWN_ONE_BY_ONE", 0)
+    assert fits(first_pulses(wall, 40, seed=5), 40 * SIDE**2)
+    photons = replace(wall, detection="all")
+    kept = first_pulses(photons, 250, seed=5).cube.sum() / wall.cube.sum()
+    assert kept == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(wall.cube.sum()))
+
+
+def test_a_share_of_pulses_that_are_not_known_keeps_each_detection_by_chance(wall: Capture) -> None:
+    unknown = replace(wall, acquisition=replace(wall.acquisition, n_pulses=None))
+    some = share_of_pulses(unknown, 0.1, seed=4)
+    assert some.acquisition.n_pulses is None
+    # Pulses are taken by chance, so that their number is, too: counts are those of thinned ones.
+    expected = expected_share(wall)[:60] * PULSES * 0.1
+    found = some.cube.sum(axis=(0, 1))
+    assert stats.chi2.sf(((found - expected) ** 2 / expected).sum(), 60) > SIGNIFICANCE
+    np.testing.assert_allclose(some.signal, 0.1 * np.asarray(wall.signal))
+    assert share_of_pulses(wall, 0.1).acquisition.n_pulses == 50
+    assert share_of_pulses(wall, 1e-9).acquisition.n_pulses == 1
+    np.testing.assert_array_equal(share_of_pulses(unknown, 1.0).cube, wall.cube)
 
 
 @given(st.tuples(st.integers(1, 12), st.integers(1, 12)), st.integers(1, 4), st.integers(1, 3))
@@ -195,10 +258,15 @@ def test_what_is_left_out_takes_its_neighbours_answer(
 
 
 def test_reductions_add_up(wall: Capture) -> None:
-    both = Reduction(merge=2, gate=(10, 50), skip=2, pool=2)
+    both = Reduction(merge=2, gate=(10, 50), skip=2, pool=2, pulses=0.5)
     found = both.of(wall)
+    assert share_of_pulses(wall, 0.5).acquisition.n_pulses == 250
+    assert 4 * 250 > (found.acquisition.n_pulses or 0) > 2 * 250  # the gate opens later
     assert found.cube.shape == (SIDE // 4, SIDE // 4, 20)
-    assert str(both) == "1 pixel of 2 x 2, 2 x 2 pixels added, bins 10 to 49, 2 bins merged"
+    assert (
+        str(both)
+        == "0.5 of the pulses, 1 pixel of 2 x 2, 2 x 2 pixels added, bins 10 to 49, 2 bins merged"
+    )
     assert found.acquisition.pixel_angle_rad == pytest.approx(4 * 2e-3)
     assert Reduction().of(wall) is wall
     assert str(Reduction()) == "whole"
@@ -216,6 +284,9 @@ def test_reductions_add_up(wall: Capture) -> None:
         lambda c: pool_pixels(c, 1.5),
         lambda c: first_pulses(c, 501),
         lambda c: first_pulses(c, 0),
+        lambda c: share_of_pulses(c, 0.0),
+        lambda c: share_of_pulses(c, 1.1),
+        lambda c: Reduction(pulses=-1.0).of(c),
         lambda c: first_pulses(replace(c, acquisition=Acquisition(n_bins=60, n_pulses=None)), 5),
     ],
 )

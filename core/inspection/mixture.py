@@ -157,19 +157,21 @@ class _Mixture:
     def _of_signals(self, log_background: float, signal: Floats) -> Floats:
         log = np.tensordot(_lagrange(self._nodes, log_background), self._logs, axes=1)
         top = log.max(axis=1, keepdims=True)
-        likelihood = np.exp(log - top)
+        # A few pixels at a time: for larger products threads are started, that wait for each other.
+        parts = np.array_split(np.exp(log - top), math.ceil(len(log) / _PIXELS_AT_ONCE))
 
         def fit(share: Floats, shape: Floats) -> Floats:
             weights = _gamma_weights(self._levels, signal, share, shape)
-            mixture = np.maximum(likelihood @ weights.reshape(-1, self._levels.size).T, 1e-300)
-            return np.asarray(np.log(mixture).sum(axis=0).reshape(weights.shape[:-1]))
+            tried = np.swapaxes(weights.reshape(signal.size, -1, self._levels.size), 1, 2)
+            found = sum(np.log(np.maximum(part @ tried, 1e-300)).sum(axis=1) for part in parts)
+            return np.asarray(found).reshape(weights.shape[:-1])
 
-        return _largest(fit, np.clip(signal / self._levels[-1], _LEAST_SHARE, 1.0)) + float(
-            top.sum()
-        )
+        least_share = np.clip(signal / self._levels[-1], _LEAST_SHARE, 1.0)
+        return np.asarray(_largest(fit, least_share) + top.sum())
 
 
 _NODES = 4
+_PIXELS_AT_ONCE = 128
 _LEAST_SHARE = 1e-6  # of pixels that see an echo
 _STEPS = 2  # delays in a bin
 _SHAPES = (0.3, 3000.0)  # of gamma distributions, from most pixels faint to all alike
