@@ -20,6 +20,11 @@ ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-backgrou
 
 COMPUTING = "Computing …"
 
+NO_PAGE = (
+    "This page could not be built. Reload it; if it happens again, what the server has printed "
+    "tells whoever started it why."
+)
+
 EXPLANATION = """
 **What is seen.** Each pixel sends pulses and keeps only the *first* photon of each. In daylight
 most pulses are spent on background before the echo arrives: the histogram piles up at the front.
