@@ -1,32 +1,59 @@
-"""Serve the app: ``python -m app [capture files]``."""
+"""Serve the app: ``python -m app [capture files]``.
+
+Only this machine reaches it, unless --address says otherwise. Then --origin must name the host
+that browsers will show, and everyone needs the token in the link that is printed; to choose it
+yourself, set FIRSTPHOTON_TOKEN in the environment (a command line is seen by all who are on the
+machine). What is sent over a network is not encrypted: keep to your own, or go by ssh -L.
+"""
 
 from __future__ import annotations
 
 import argparse
+import logging
+import os
 import signal
 import sys
+import webbrowser
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import panel as pn
+from tornado.netutil import bind_sockets
 
 import core
-from app import latency
+from app import latency, words
 from app.connection import LINGER_S, serving_options
+from app.controls import Sentence
 from app.layout import build_page
+from app.serving import TOKEN_VARIABLE, Access, Headers, guard
 from app.state import Light, Reading
-from app.store import built_in_sources, file_source
+from app.store import Source, built_in_sources, file_source
 from app.uploads import MAX_UPLOAD_BYTES, Uploads
 from core.readers import READERS
+
+log = logging.getLogger(__name__)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Serve until interrupted; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m app", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m app",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument(
         "captures", nargs="*", type=Path, help=f"capture files to open ({', '.join(READERS)})"
     )
-    parser.add_argument("--port", type=int, default=5006, help="default: 5006")
+    parser.add_argument("--port", type=int, default=5006, help="default: 5006; 0 takes a free one")
     parser.add_argument("--address", default="127.0.0.1", help="default: this machine only")
+    parser.add_argument(
+        "--origin",
+        action="append",
+        default=[],
+        metavar="HOST[:PORT]",
+        help="how browsers reach an --address that others reach; more than one is possible",
+    )
     parser.add_argument("--show", action="store_true", help="open a browser")
     parser.add_argument(
         "--linger",
@@ -45,23 +72,60 @@ def main(arguments: list[str] | None = None) -> int:
             parser.error(str(error))
     sources, uploads = given | built_in_sources(), Uploads()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # uploads are removed then, too
+    pn.extension("vtk")
+    try:
+        port = chosen.port or free_port(chosen.address)
+        token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
+        access = Access.of(chosen.address, port, chosen.origin, token)
+        server = pn.serve(
+            {"/": lambda: page_for(sources, uploads)},
+            port=port,
+            address=chosen.address,
+            websocket_origin=sorted(access.hosts),
+            websocket_max_message_size=2 * MAX_UPLOAD_BYTES,
+            transforms=[Headers],
+            title="firstphoton",
+            verbose=False,
+            show=False,
+            start=False,
+            **serving_options(chosen.linger),
+        )
+    except ValueError as error:
+        parser.error(str(error))
+    except OSError as error:
+        print(f"Cannot serve at {chosen.address}, port {chosen.port}: {error.strerror}.")
+        print("Give another --port, or --port 0 for any that is free.")
+        return 1
+    guard(server._tornado, access)
     print("Compiling what is not compiled yet ...", flush=True)
     core.warm_up()
     latency.tune()
-    pn.extension("vtk")
-    print(f"Open http://{chosen.address}:{chosen.port} in a browser; Ctrl+C stops.", flush=True)
-    pn.serve(
-        {"/": lambda: build_page(sources, uploads)},
-        port=chosen.port,
-        address=chosen.address,
-        websocket_origin=[f"{host}:{chosen.port}" for host in {chosen.address, "localhost"}],
-        websocket_max_message_size=2 * MAX_UPLOAD_BYTES,
-        show=chosen.show,
-        title="firstphoton",
-        verbose=False,
-        **serving_options(chosen.linger),
-    )
+    link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
+    print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
+    if chosen.show:
+        server.io_loop.add_callback(webbrowser.open, link)
+    server.start()
+    server.io_loop.start()  # until Ctrl+C
+    server.stop()
     return 0
+
+
+def free_port(address: str) -> int:
+    """A port that nobody uses at present."""
+    first, *others = bind_sockets(0, address)
+    port: int = first.getsockname()[1]
+    for each in (first, *others):
+        each.close()
+    return port
+
+
+def page_for(sources: Mapping[str, Source], uploads: Uploads) -> Any:
+    """The page of a new session, or a sentence where it cannot be built."""
+    try:
+        return build_page(sources, uploads)
+    except Exception:
+        log.exception("a page could not be built")
+        return Sentence(text=words.NO_PAGE, warning=True)
 
 
 if __name__ == "__main__":

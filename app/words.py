@@ -23,6 +23,11 @@ COMPUTING = "Computing …"
 
 UNIT_HELP = "What axes and read-outs along the gate count in: bins, nanoseconds or metres."
 
+NO_PAGE = (
+    "This page could not be built. Reload it; if it happens again, what the server has printed "
+    "tells whoever started it why."
+)
+
 EXPLANATION = """
 **What is seen.** Each pixel sends pulses and keeps only the *first* photon of each. In daylight
 most pulses are spent on background before the echo arrives: the histogram piles up at the front.

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
+from urllib.error import HTTPError
 from urllib.request import urlopen
 
 from playwright.sync_api import Browser, Locator, Page, sync_playwright
@@ -48,14 +49,20 @@ def chromium() -> Iterator[Browser]:
 
 
 @contextmanager
-def serving(*arguments: str | Path) -> Iterator[str]:
+def serving(*arguments: str | Path, **environment: str) -> Iterator[str]:
     """The app in a process of its own, at the address that is yielded."""
     port = _free_port()
     command = [sys.executable, "-m", "app", "--port", str(port), *map(str, arguments)]
     # Into a file: a pipe that nobody reads would stop the server once it is full.
     with (
         TemporaryFile("w+") as log,
-        subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT) as server,
+        subprocess.Popen(
+            command,
+            cwd=ROOT,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=os.environ | environment,
+        ) as server,
     ):
         try:
             yield _when_up(f"http://127.0.0.1:{port}/", server, log)
@@ -117,6 +124,9 @@ def _when_up(
             raise RuntimeError(f"the app stopped at once:\n{log.read()}")
         try:
             urlopen(f"{address}favicon.ico", timeout=5).close()
+        except HTTPError as refusal:  # it answers, if only to ask for a token
+            refusal.close()
+            return address
         except OSError:
             time.sleep(0.2)
         else:

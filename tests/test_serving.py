@@ -1,0 +1,262 @@
+"""Who is served and who is not, by plain HTTP and websocket clients."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from http.client import HTTPConnection
+from urllib.parse import urlencode
+
+import pytest
+from playwright.sync_api import expect
+
+from app.serving import TOKEN_VARIABLE, Access
+from tests.browser import ROOT, serving
+from tests.wire import token_in
+
+TOKEN = "a token <b>of</b> ours"
+NAME = "lab.example.org"
+STATIC = "/static/js/bokeh.min.js"
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec_WebSocket_Version": "13",
+    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}
+PARTS = ("/", "/favicon.ico", STATIC, "/ws", "/metadata", "/no/such/page")
+
+
+class Site:
+    """A server as plain clients see it, which may say any host."""
+
+    def __init__(self, address):
+        self.address = address
+        self.port = int(address.rstrip("/").rpartition(":")[2])
+
+    def ask(self, path="/", method="GET", body=None, **headers):
+        """Status, headers and text of an answer."""
+        headers = {name.replace("_", "-"): value for name, value in headers.items()}
+        link = HTTPConnection("127.0.0.1", self.port, timeout=120)
+        try:
+            link.request(method, path, body, headers)
+            answer = link.getresponse()
+            return answer.status, answer.headers, answer.read().decode(errors="replace")
+        finally:
+            link.close()
+
+    def socket(self, token, **headers):
+        """What comes of asking for a session's socket: 101, or the status of the refusal."""
+        return self.ask("/ws", **UPGRADE, Sec_WebSocket_Protocol=f"bokeh, {token}", **headers)[0]
+
+
+@pytest.fixture(scope="module")
+def here(address):
+    """The app as it is served unless told otherwise."""
+    return Site(address)
+
+
+@pytest.fixture(scope="module")
+def away():
+    """The app as it is served to others."""
+    options = ("--address", "0.0.0.0", "--origin", NAME)
+    with serving(*options, **{TOKEN_VARIABLE: TOKEN}) as running_at:
+        yield Site(running_at)
+
+
+@pytest.fixture(scope="module")
+def cookie(away):
+    """What a browser keeps that has come by the link."""
+    status, headers, _ = away.ask(f"/?{urlencode({'token': TOKEN})}", Host=NAME)
+    assert status == 303
+    return headers["Set-Cookie"].partition(";")[0]
+
+
+# -- this machine only -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
+def test_this_machine_needs_no_token(here, host):
+    status, _, page = here.ask(Host=f"{host}:{here.port}")
+    assert status == 200
+    own = {"Host": f"{host}:{here.port}", "Origin": f"http://{host}:{here.port}"}
+    assert here.socket(token_in(page), **own) == 101
+
+
+@pytest.mark.parametrize("path", PARTS)
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"Host": "rebound.example.com"},
+        {"Host": "127.0.0.1:1"},
+        {"Origin": "http://evil.example.com"},
+        {"Origin": "null"},
+        {"Origin": "http://localhost:1"},
+    ],
+)
+def test_a_foreign_page_and_a_name_led_here_are_refused(here, path, said):
+    status, _, text = here.ask(path, **said)
+    assert status == 403
+    assert "--origin" in text
+    assert "Traceback" not in text
+
+
+def test_a_foreign_page_gets_no_socket_whatever_token_it_has(here):
+    token = token_in(here.ask()[2])
+    assert here.socket(token, Origin="http://evil.example.com") == 403
+    assert here.socket(token, Host="rebound.example.com") == 403
+
+
+def test_browsers_are_told_to_lend_answers_to_nobody(here):
+    for path in PARTS:
+        headers = here.ask(path)[1]
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+        assert headers["Referrer-Policy"] == "same-origin"
+
+
+# -- others ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", PARTS)
+def test_without_the_token_nothing_is_served(away, path):
+    status, headers, text = away.ask(path, Host=NAME)
+    assert status == 403
+    assert "Set-Cookie" not in headers
+    assert 'type="password"' in text
+    assert TOKEN not in text
+
+
+def test_without_the_token_there_is_no_socket(away, here, cookie):
+    token = token_in(here.ask()[2])
+    assert away.socket(token, Host=NAME) == 403
+    assert away.socket(token, Host=NAME, Cookie="firstphoton=1") == 403
+    forged = cookie.partition("=")[0] + "=" + cookie.partition("=")[2][::-1]
+    assert away.socket(token, Host=NAME, Cookie=forged) == 403
+
+
+def test_the_link_lets_a_browser_in_and_leaves_the_address(away):
+    query = urlencode({"token": TOKEN, "sbr": "0.05", "scene": "a b"})
+    status, headers, _ = away.ask(f"/?{query}", Host=NAME)
+    assert status == 303
+    assert headers["Location"] == "/?sbr=0.05&scene=a+b"
+    assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Lax" in headers["Set-Cookie"]
+
+
+def test_who_is_in_gets_all_there_is(away, cookie):
+    known = {"Host": NAME, "Cookie": cookie, "Origin": f"http://{NAME}"}
+    status, _, page = away.ask(**known)
+    assert status == 200
+    assert away.ask(STATIC, **known)[0] == 200
+    assert away.socket(token_in(page), **known) == 101
+    foreign = known | {"Origin": "http://evil.example.com"}
+    assert away.ask(**foreign)[0] == 403
+    assert away.socket(token_in(page), **foreign) == 403
+    assert away.ask(**(known | {"Host": f"localhost:{away.port}"}))[0] == 403
+
+
+@pytest.mark.parametrize("wrong", ["", "a", TOKEN[:-1], TOKEN.upper(), "ü"])
+def test_a_wrong_token_is_refused(away, wrong):
+    asked = away.ask(f"/?{urlencode({'token': wrong})}", Host=NAME)
+    form = {"Content-Type": "application/x-www-form-urlencoded"}
+    typed = away.ask("/", "POST", urlencode({"token": wrong}), Host=NAME, **form)
+    for status, headers, text in (asked, typed):
+        assert status == 403
+        assert "Set-Cookie" not in headers
+        assert "not the token" in text
+
+
+def test_a_typed_token_lets_in_and_leads_nowhere_else(away):
+    form = {"Content-Type": "application/x-www-form-urlencoded", "Host": NAME}
+    status, headers, _ = away.ask(
+        "//evil.example.com/", "POST", urlencode({"token": TOKEN}), **form
+    )
+    assert status == 303
+    assert headers["Location"].startswith("/evil.example.com")
+    assert "firstphoton-" in headers["Set-Cookie"]
+    foreign = form | {"Origin": "http://evil.example.com"}
+    assert away.ask("/", "POST", urlencode({"token": TOKEN}), **foreign)[0] == 403
+
+
+# -- how it is started -----------------------------------------------------------------------------
+
+
+def test_names_and_tokens_are_asked_for_where_others_reach_the_server():
+    assert Access.of("127.0.0.1", 5006, [], None).token is None
+    made = Access.of("0.0.0.0", 5006, ["lab:80", "lab.example.org"], None)
+    assert len(made.token) >= 32
+    assert made.token != Access.of("0.0.0.0", 5006, ["lab"], None).token
+    assert made.hosts == {"lab:80", "lab.example.org", "lab.example.org:5006"}
+    assert Access.of("::1", 5006, [], None).hosts == {"[::1]:5006", "localhost:5006"}
+    assert Access.of("127.0.0.1", 5006, [], "long enough").token == "long enough"
+    for address, origins, token, told in (
+        ("0.0.0.0", [], None, "--origin"),
+        ("192.0.2.1", [], "long enough", "--origin"),
+        ("0.0.0.0", ["*"], None, "--origin"),
+        ("0.0.0.0", ["http://lab"], None, "--origin"),
+        ("127.0.0.1", ["lab/x"], None, "--origin"),
+        ("127.0.0.1", [], "short", TOKEN_VARIABLE),
+    ):
+        with pytest.raises(ValueError, match=told) as refusal:
+            Access.of(address, 5006, origins, token)
+        assert "short" not in str(refusal.value)
+
+
+def start(*options, **environment):
+    return subprocess.Popen(
+        [sys.executable, "-m", "app", *options],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | environment,
+    )
+
+
+def test_a_port_in_use_is_a_sentence(here):
+    with start("--port", str(here.port)) as second:
+        told = second.communicate(timeout=120)[0]
+    assert second.returncode == 1
+    assert "in use" in told and "--port" in told
+    assert "Traceback" not in told
+
+
+def test_others_are_not_served_before_the_origin_is_named():
+    with start("--address", "0.0.0.0", "--port", "0") as refused:
+        told = refused.communicate(timeout=120)[0]
+    assert refused.returncode == 2
+    assert "--origin" in told and "Traceback" not in told
+
+
+def test_the_link_is_printed_with_a_token_of_its_own_and_ctrl_c_stops():
+    with start("--address", "0.0.0.0", "--origin", "127.0.0.1", "--port", "0") as server:
+        line = next(line for line in server.stdout if line.startswith("Open"))
+        link = re.search(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{20,})", line)
+        site = Site(f"http://127.0.0.1:{link[1]}/")
+        assert site.ask()[0] == 403
+        assert site.ask(f"/?token={link[2]}")[0] == 303
+        server.send_signal(signal.SIGINT)
+        rest = server.communicate(timeout=60)[0]
+    assert server.returncode == 0
+    assert "Traceback" not in rest
+
+
+# -- in a browser ----------------------------------------------------------------------------------
+
+
+@pytest.mark.browser
+def test_the_door_opens_to_the_token_alone(browser):
+    with serving("--origin", "localhost", **{TOKEN_VARIABLE: TOKEN}) as running_at:
+        context = browser.new_context()
+        page = context.new_page()
+        page.goto(f"{running_at}?unit=ns")
+        page.get_by_label("Token").fill("something else")
+        page.get_by_role("button", name="Enter").click()
+        expect(page.get_by_role("alert")).to_contain_text("not the token")
+        page.get_by_label("Token").fill(TOKEN)
+        page.get_by_role("button", name="Enter").click()
+        page.locator(".stage[data-camera]").wait_for()
+        assert page.url == f"{running_at}?unit=ns"
+        context.close()
