@@ -224,6 +224,31 @@ def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(session, kind
     )
 
 
+@pytest.mark.parametrize("kind", ["Range", "Error", "Confidence", "3D clouds"])
+def test_a_methods_picture_leaves_as_its_answer(layout, kind):
+    compare = layout._compare
+    compare.view.show(True)
+    limit = time.monotonic() + 60
+    while "peak" not in compare._answers():
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+    compare._kind.value = kind
+    place = compare._pictured().index("peak")
+    found = compare._picture_shown(place)
+    compare.view.show(False)
+    image = compare._answers()["peak"].run.image
+    assert (found.heading, found.subject.estimator) == ("Peak of the histogram", "peak")
+    if kind == "3D clouds":
+        points = laspy.read(io.BytesIO(written(found.files["las"])))
+        assert len(points.x) == image.valid.sum()
+    else:
+        arrays = np.load(io.BytesIO(written(found.files["npz"])))
+        np.testing.assert_array_equal(arrays["range_m"], image.range_m)
+        values = columns_of(written(found.files["csv"]))[found.scale.legend]
+        if kind == "Range":
+            np.testing.assert_array_equal(values, image.range_m.ravel())
+
+
 def test_tables_leave_with_every_digit_and_without_units_in_their_cells():
     item = Table("t", "T", ("method", "RD"), (("peak", 1 / 3), ("tracking", float("nan"))))
     assert written(table_file(item)).decode() == (f"method,RD\r\npeak,{1 / 3!r}\r\ntracking,\r\n")
