@@ -437,12 +437,12 @@ class Compare:
         if answer is None:
             raise ValueError(NOTHING_DRAWN)
         kind, viewing = self._kind.value, self._chosen.viewing
-        least = viewing.least_confidence
-        _, look = image_of(self._session.answer, KINDS[kind], least)
+        least, look_name = viewing.least_confidence, LOOKS.get(kind, kind)
+        _, look = image_of(self._session.answer, look_name, least)
         if kind == CLOUDS:
             what, files = "cloud", cloud_files(answer, "Range", viewing)
         else:
-            values, _ = image_of(answer, KINDS[kind], least)
+            values, _ = image_of(answer, look_name, least)
             figure = self._pictures[place].image.figure
             what, files = f"{kind} image", image_files(answer, least, values, look, figure)
         subject = ranged(self._session, answer, method, self._tasks[method].settings)

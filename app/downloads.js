@@ -218,8 +218,12 @@ export function render({ model, view }) {
     button.popoverTargetElement = menu;
     status.textContent = text;
   };
-  const ask = (suffix) => {
+  const close = () => {
     menu.hidePopover();
+    button.focus();
+  };
+  const ask = (suffix) => {
+    close();
     button.setAttribute("aria-busy", "true");
     button.popoverTargetElement = null; // not disabled: it keeps the keyboard
     status.textContent = `Preparing ${suffix.toUpperCase()} …`;
@@ -265,7 +269,7 @@ export function render({ model, view }) {
     const last = items.length - 1;
     const moves = { ArrowDown: place + 1, ArrowUp: place - 1, Home: 0, End: last };
     event.stopPropagation(); // arrow keys move pixels elsewhere
-    if (event.key === "Tab") menu.hidePopover();
+    if (event.key === "Tab" || event.key === "Escape") close();
     if (!(event.key in moves)) return;
     event.preventDefault();
     items[(moves[event.key] + items.length) % items.length].focus();

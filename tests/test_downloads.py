@@ -6,14 +6,19 @@ import errno
 import io
 import re
 import time
+from base64 import b64encode
 from csv import DictReader
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import laspy
 import numpy as np
+import psutil
 import pytest
 import tifffile
 import trimesh
+from PIL import Image
+from playwright.sync_api import expect
 
 from app import downloads
 from app.downloads import Download, Shown, Subject
@@ -22,6 +27,7 @@ from app.layout import Layout
 from app.looks import image_of, shown
 from app.state import Less, Light
 from app.store import built_in_sources, inspect
+from app.theme import RANGE_COLORS
 from core import TrackingParameters
 from core.experiments.items import Table
 
@@ -218,6 +224,31 @@ def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(session, kind
     )
 
 
+@pytest.mark.parametrize("kind", ["Range", "Error", "Confidence", "3D clouds"])
+def test_a_methods_picture_leaves_as_its_answer(layout, kind):
+    compare = layout._compare
+    compare.view.show(True)
+    limit = time.monotonic() + 60
+    while "peak" not in compare._answers():
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+    compare._kind.value = kind
+    place = compare._pictured().index("peak")
+    found = compare._picture_shown(place)
+    compare.view.show(False)
+    image = compare._answers()["peak"].run.image
+    assert (found.heading, found.subject.estimator) == ("Peak of the histogram", "peak")
+    if kind == "3D clouds":
+        points = laspy.read(io.BytesIO(written(found.files["las"])))
+        assert len(points.x) == image.valid.sum()
+    else:
+        arrays = np.load(io.BytesIO(written(found.files["npz"])))
+        np.testing.assert_array_equal(arrays["range_m"], image.range_m)
+        values = columns_of(written(found.files["csv"]))[found.scale.legend]
+        if kind == "Range":
+            np.testing.assert_array_equal(values, image.range_m.ravel())
+
+
 def test_tables_leave_with_every_digit_and_without_units_in_their_cells():
     item = Table("t", "T", ("method", "RD"), (("peak", 1 / 3), ("tracking", float("nan"))))
     assert written(table_file(item)).decode() == (f"method,RD\r\npeak,{1 / 3!r}\r\ntracking,\r\n")
@@ -331,3 +362,191 @@ def test_what_no_page_asks_for_does_no_harm(session, message):
     assert all(set(told) == {"failed"} for told in button.messages)
     button.messages.clear()
     assert button.ask(suffix="csv")["piece"] == b"all"
+
+
+# -- in a browser ----------------------------------------------------------------------------------
+
+
+def button(page, what):
+    named = page.get_by_role("button", name=f"Download: {what}", exact=True)
+    return named.filter(visible=True).first
+
+
+def download(page, what, suffix):
+    """Name and content of a file that the page gives."""
+    button(page, what).click()
+    with page.expect_download(timeout=60_000) as asked:
+        page.get_by_role("menuitem", name=suffix.upper()).filter(visible=True).click()
+    return asked.value.suggested_filename, asked.value.path().read_bytes()
+
+
+def size_of(page, what):
+    """Width and height in pixels of the plot beside a button."""
+    return page.evaluate(
+        """what => {
+          const views = [];
+          const walk = (view) => { views.push(view); (view.child_views ?? []).forEach(walk); };
+          [...Bokeh.index.roots].forEach(walk);
+          const own = views.find((view) => view.model.data?.what === what);
+          const beside = [];
+          (function search(view) { beside.push(view); (view.child_views ?? []).forEach(search); })(
+            own.parent);
+          const {width, height} = beside.find(({model}) => model.type === "Figure").bbox;
+          return [Math.round(width), Math.round(height)];
+        }""",
+        what,
+    )
+
+
+def as_seen(browser, content):
+    """A picture as the browser draws it."""
+    page = browser.new_page()
+    kind = "svg+xml" if content.startswith(b"<svg") else "png"
+    data = b64encode(content).decode()
+    page.set_content(f'<body style="margin:0"><img src="data:image/{kind};base64,{data}">')
+    shot = page.locator("img").screenshot()
+    page.close()
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(
+    ("what", "title"), [("histogram", "Histogram of the pixel"), ("image", "Estimated range")]
+)
+def test_a_plots_pictures_are_what_is_on_screen(one_page, browser, what, title):
+    name, png = download(one_page, what, "png")
+    assert name.startswith("car_tracking_")
+    picture = Image.open(io.BytesIO(png))
+    assert list(picture.size) == size_of(one_page, what)
+    assert "simulated, seed 0" in picture.text["Description"]
+    svg_name, svg = download(one_page, what, "svg")
+    assert svg_name == name.replace(".png", ".svg")
+    root = ElementTree.fromstring(svg)
+    texts = {each.text for each in root.iter("{http://www.w3.org/2000/svg}text")}
+    assert any(text.startswith(title) for text in texts)
+    axes = {"histogram": {"Bin", "Counts", "Range (m)", "truth"}, "image": {"Column", "Row", "m"}}
+    assert axes[what] <= texts
+    one, other = as_seen(browser, png), as_seen(browser, svg)
+    assert one.shape == other.shape
+    assert np.ptp(one) > 200  # something is drawn
+    assert np.abs(one - other).mean() < 6  # letters may be of another font
+
+
+LOOK_AT = """([start, end, visible]) => {
+  const models = [...Bokeh.documents[0]._all_models.values()];
+  const figure = models.find(
+    ({type, title}) => type === "Figure" && title?.text?.startsWith("Histogram of the pixel"));
+  figure.x_range.setv({start, end});
+  const legend = figure.center.find(({type}) => type === "Legend");
+  const item = legend.items.find(({label}) => label.value === "small scale");
+  item.renderers[0].visible = visible;
+}"""
+"""Zoom the histogram, and let its legend hide a curve or show it again."""
+
+
+@pytest.mark.browser
+def test_a_plot_leaves_as_it_is_zoomed_and_without_what_the_legend_hides(one_page):
+    one_page.evaluate(LOOK_AT, [20.2, 30.9, False])
+    try:
+        _, content = download(one_page, "histogram", "csv")
+    finally:
+        one_page.evaluate(LOOK_AT, [0, 100, True])
+    found = columns_of(content)
+    assert (found["Bin"].min(), found["Bin"].max()) == (20.5, 30.5)
+    assert "large scale (counts)" in found
+    assert "small scale (counts)" not in found
+
+
+@pytest.mark.browser
+def test_a_cloud_leaves_as_a_picture_and_as_its_points(one_page):
+    shown_points = int(one_page.locator(".stage").first.get_attribute("data-points"))
+    box = one_page.locator(".stage").first.bounding_box()
+    name, png = download(one_page, "3D cloud", "png")
+    assert name == "car_tracking_cloud.png"
+    picture = Image.open(io.BytesIO(png)).convert("RGB")
+    assert picture.width == round(box["width"])
+    assert picture.height > box["height"]  # with heading and colour scale
+    colors = {f"#{r:02x}{g:02x}{b:02x}" for _, (r, g, b) in picture.getcolors(2**24)}
+    assert len(colors & set(RANGE_COLORS)) > 100
+    for suffix, count in (
+        ("ply", lambda content: len(trimesh.load(io.BytesIO(content), file_type="ply").vertices)),
+        ("las", lambda content: len(laspy.read(io.BytesIO(content)).x)),
+        ("csv", lambda content: len(columns_of(content)["x_m"])),
+    ):
+        name, content = download(one_page, "3D cloud", suffix)
+        assert name == f"car_tracking_cloud.{suffix}"
+        assert count(content) == shown_points
+
+
+@pytest.mark.browser
+def test_the_menu_works_by_keyboard_alone(one_page):
+    opener = button(one_page, "residual")
+    opener.focus()
+    one_page.keyboard.press("Enter")
+    items = one_page.get_by_role("menuitem").filter(visible=True)
+    expect(items).to_have_count(3)
+    expect(items.first).to_be_focused()
+    expect(opener).to_have_attribute("aria-expanded", "true")
+    one_page.keyboard.press("Escape")
+    expect(items).to_have_count(0)
+    expect(opener).to_be_focused()
+    one_page.keyboard.press("ArrowDown")
+    expect(items.first).to_be_focused()
+    one_page.keyboard.press("ArrowUp")
+    expect(items.last).to_be_focused()
+    with one_page.expect_download() as asked:
+        one_page.keyboard.press("Enter")
+    assert asked.value.suggested_filename.endswith(".csv")
+
+
+@pytest.mark.browser
+def test_a_failure_is_told_and_the_page_goes_on(one_page, troubles):
+    alert = one_page.get_by_role("alert").filter(has_text="Nothing was saved")
+    server = next(
+        each for each in psutil.Process().children(recursive=True) if "--port" in each.cmdline()
+    )
+    _, hard = server.rlimit(psutil.RLIMIT_FSIZE)
+    server.rlimit(psutil.RLIMIT_FSIZE, (0, hard))  # as if the disk were full
+    try:
+        button(one_page, "image").click()
+        one_page.get_by_role("menuitem", name="NPZ").filter(visible=True).click()
+        expect(alert).to_contain_text("temporary files is full. Make room there")
+    finally:
+        server.rlimit(psutil.RLIMIT_FSIZE, (hard, hard))
+    one_page.evaluate("""() => {
+      const canvas = HTMLCanvasElement.prototype;
+      [window.kept, canvas.toBlob] = [canvas.toBlob, (done) => done(null)];
+    }""")
+    button(one_page, "residual").click()
+    one_page.get_by_role("menuitem", name="PNG").filter(visible=True).click()
+    expect(alert).to_contain_text("the picture could not be made (it is too large)")
+    one_page.evaluate("() => { HTMLCanvasElement.prototype.toBlob = window.kept; }")
+    assert download(one_page, "residual", "png")[1].startswith(b"\x89PNG")
+    assert np.load(io.BytesIO(download(one_page, "image", "npz")[1]))["range_m"].shape == (64, 64)
+
+
+@pytest.mark.browser
+def test_every_page_gives_what_it_shows(one_page):
+    def go(name):
+        one_page.get_by_role("button", name=name, exact=True).click()
+
+    go("Inspect")
+    expect(one_page.get_by_role("rowheader", name="1", exact=True)).to_be_visible()
+    for what, suffix, name in (
+        ("map", "tif", "car_tracking_map-Estimate.tif"),
+        ("counts", "csv", "car_tracking_counts-row32-col32.csv"),
+        ("rate", "svg", "car_tracking_rate-row32-col32.svg"),
+        ("table", "csv", "car_tracking_candidates-row32-col32.csv"),
+    ):
+        assert download(one_page, what, suffix)[0] == name
+    go("Compare")
+    expect(one_page.get_by_text("% sure").nth(1)).to_be_visible()
+    name, png = download(one_page, "Peak of the histogram", "png")
+    assert name == "car_peak_range-image.png"
+    assert Image.open(io.BytesIO(png)).height > 216  # with heading and colour scale
+    name, table = download(one_page, "table", "csv")
+    assert name == "car_methods.csv"
+    assert b"Physics" in table
+    go("Paper")
+    assert download(one_page, "curves", "csv")[0] == "paper_figure_1.csv"
+    go("Explore")

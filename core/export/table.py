@@ -17,8 +17,8 @@ from core.capture import Capture
 from core.export.product import Product
 from core.tracking import TrackingParameters, tracking_signals
 
-ROWS_AT_ONCE = 2**16
-"""Turned into text together: memory stays bounded, however long the columns are."""
+ROWS_AT_ONCE = 2**11
+"""Turned into text together: memory stays bounded, and other threads wait for milliseconds only."""
 
 
 def write(product: Product, file: BinaryIO) -> None:

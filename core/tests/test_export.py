@@ -520,6 +520,22 @@ def test_las_coordinates_are_far_finer_than_a_bin_wherever_they_are(
     np.testing.assert_allclose(np.asarray(las.xyz), expected, rtol=0, atol=0.5 * step_m + 1e-11)
 
 
+def test_points_keep_the_colours_that_they_are_given(tmp_path: Path) -> None:
+    rgb = np.random.default_rng(3).integers(0, 256, (ROWS, COLS, 3), np.uint8)
+    for suffix in (".las", ".laz"):
+        path = tmp_path / f"cloud{suffix}"
+        save_image(CAPTURE, image_of(CAPTURE, VALID), path, rgb=rgb)
+        las = laspy.read(path)
+        colors = np.stack([las.red, las.green, las.blue], axis=-1)
+        np.testing.assert_array_equal(colors, rgb[VALID].astype(np.uint16) * 257)
+        assert "range_m" in las.point_format.dimension_names
+    save_image(CAPTURE, image_of(CAPTURE, VALID), tmp_path / "cloud.ply", rgb=rgb)
+    ply = trimesh.load(tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(ply.colors[:, :3], rgb[VALID])
+    with pytest.raises(ValueError, match=r"rgb = .*float64.* is not accepted: .*uint8 of shape"):
+        save_image(CAPTURE, image_of(CAPTURE, VALID), tmp_path / "no.ply", rgb=rgb / 255)
+
+
 def test_a_cloud_too_wide_for_fine_steps_gets_coarser_ones(tmp_path: Path) -> None:
     capture = Capture(CAPTURE.cube, Acquisition(100, 1e-12, 3e-7, 900, 0.3))
     image = image_of(capture, VALID)
