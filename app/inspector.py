@@ -222,7 +222,7 @@ class Inspector:
             place = list(here)
             name = self._place[axis].label.lower()
             place[axis] = _whole(name, typed, *self._ends(axis))
-            state.pixel = grid.pixel(*place)
+            self._session.choose_pixel(*grid.pixel(*place))
 
         grid = self._session.answer.grid
         here = grid.place(*state.pixel)

@@ -308,7 +308,8 @@ class Session:
     def choose_pixel(self, row: int, col: int) -> None:
         """Show another pixel; one outside the image means the nearest inside."""
         rows, cols = self.answer.capture.shape
-        self.state.pixel = (min(max(row, 0), rows - 1), min(max(col, 0), cols - 1))
+        with pn.io.hold(self.page):  # all that follows it arrives at once
+            self.state.pixel = (min(max(row, 0), rows - 1), min(max(col, 0), cols - 1))
 
     def pick(self, index: int) -> None:
         """Show the pixel of this place in the flattened image; -1 is none."""

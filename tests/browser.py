@@ -88,7 +88,9 @@ def open_page(
     page.add_init_script(prepare)
     page.goto(address)
     # Explore's cloud or, where a capture is opened, the pins of Inspect.
-    page.locator(".stage[data-camera], .chips").first.wait_for(state="attached")
+    page.locator(".stage[data-camera], [aria-label='Pinned pixels']").first.wait_for(
+        state="attached"
+    )
     page.wait_for_function("Bokeh.documents[0].is_idle")
     return page
 
