@@ -31,7 +31,8 @@ function tellReturn(root, made) {
 }
 
 function lose(root, model) {
-  if (root.querySelector("dialog")) return;
+  // A page may draw this component anew: what it drew before must not speak.
+  if (!root.isConnected || root.querySelector("dialog")) return;
   const dialog = document.createElement("dialog");
   const title = document.createElement("h2");
   const text = document.createElement("p");

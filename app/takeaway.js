@@ -11,7 +11,7 @@ export function render({ model }) {
     model.asked += 1;
   });
   link.addEventListener("click", () => copy(location.href, told, "The link"));
-  model.on("answer", () => show(root, model.answer[1]));
+  model.on("answer", () => root.isConnected && show(root, model.answer[1]));
   return root;
 }
 

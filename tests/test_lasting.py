@@ -24,9 +24,15 @@ window.WebSocket = class extends WebSocket {
 """
 
 
+def here(page: Page) -> str:
+    """The address; Playwright's own hears of changes in place only while it is asked something."""
+    found: str = page.evaluate("location.href")
+    return found
+
+
 def rests(page: Page, *told: str) -> None:
     """Wait until the address says all of this."""
-    eventually(lambda: all(each in page.url for each in told))
+    eventually(lambda: all(each in here(page) for each in told))
 
 
 def same_pictures(page: Page, other: Page) -> Callable[[], bool]:
@@ -38,30 +44,29 @@ def same_pictures(page: Page, other: Page) -> Callable[[], bool]:
 
 
 def test_the_facade_comes_back_after_a_reload_and_in_another_tab(page, address):
-    first = page(f"{address}?source=building&tracking.l=0.006&image=Error")
+    first = page(f"{address}?source=building&tracking.l=0.006&less.merge=2&image=Error")
     expect(chosen(first, "Scene or capture")).to_have_text("Building at 830–860 m")
     image(first).press("Shift+ArrowRight")
     slider(first, "SBR").press("ArrowRight")
-    slider(first, "Bins merged").press("ArrowRight")
-    rests(first, "pixel=[", "light.sbr=", "less.merge=2")
+    rests(first, "pixel=[", "light.sbr=")
     length, rmse = first.evaluate("history.length"), fact(first, "RMSE").inner_text()
     place = pixel_on_show(first)
     first.reload()
     expect(fact(first, "RMSE")).to_have_text(rmse)
     assert pixel_on_show(first) == place
     assert first.evaluate("history.length") == length
-    other = page(first.url)
+    other = page(here(first))
     expect(fact(other, "RMSE")).to_have_text(rmse)
     eventually(same_pictures(first, other))
     slider(other, "SBR").press("ArrowRight")
-    eventually(lambda: other.url != first.url)
+    eventually(lambda: here(other) != here(first))
     expect(fact(first, "RMSE")).to_have_text(rmse)
     assert pixel_on_show(first) == place
     expect(warning(first)).to_be_hidden()
 
 
 def test_nonsense_in_an_address_is_told_and_the_rest_is_there(page, address):
-    trap = "<img src=x onerror='window.trapped = 1'>"
+    trap = "<img src=x onerror=window.trapped=1>"
     new = page(f"{address}?source={trap}&light.sbr=-1&light.seed=1&page={trap}&{trap}=1")
     told = new.get_by_role("alert").filter(has_text="The address asks for what cannot be had")
     for said in ("sbr = -1", "no scene or capture '<img", "page = '<img", "nothing called <img"):
@@ -87,7 +92,6 @@ def mend(page: Page, said: str) -> None:
         said
     )
     expect(page.get_by_role("alertdialog")).to_have_count(0)
-    page.locator(".stage[data-camera]").wait_for()
 
 
 def test_an_uploaded_capture_outlasts_reload_and_lost_connection(browser, address, real_capture):
@@ -96,7 +100,9 @@ def test_an_uploaded_capture_outlasts_reload_and_lost_connection(browser, addres
     upload(page, path.name, path.read_bytes())
     read = page.get_by_text("256 × 256 pixels, 200 bins of 1 ns")
     expect(read).to_be_visible()
-    image(page).press("Shift+ArrowDown")
+    page.get_by_role("button", name="Explore", exact=True).click()
+    eventually(lambda: "page=" not in here(page))  # what it leaves is on its way out until then
+    page.get_by_label("Range image. Arrow keys move").press("Shift+ArrowDown")
     rests(page, "source=", "pixel=[")
     estimate, place = fact(page, "Estimate").inner_text(), pixel_on_show(page)
 
@@ -128,10 +134,12 @@ def test_a_session_that_is_gone_begins_anew_and_its_file_is_removed(
     def held() -> list[Path]:
         return list(tmp_path.glob("firstphoton-*/*"))
 
-    with serving("--linger", "1") as address:
+    # As long as a page may take to connect for the first time, and no longer.
+    with serving("--linger", "8") as address:
         page = open_page(browser, f"{address}?tracking.l=0.006", prepare=CUT)
         upload(page, "../face.mat", real_capture("data_face.mat").read_bytes())
         expect(chosen(page, "Scene or capture")).to_have_text("face.mat")
+        expect(page.get_by_text("face.mat, variable")).to_be_visible()
         rests(page, "source=")
         assert [path.name for path in held()] == ["face.mat"]
         cut(page)
@@ -141,13 +149,8 @@ def test_a_session_that_is_gone_begins_anew_and_its_file_is_removed(
         rests(page, "?tracking.l=0.006")
         upload(page, "again.mat", real_capture("data_face.mat").read_bytes())
         eventually(held)
-        page.context.close()
-        eventually(lambda: not held())
-        other = open_page(browser, address)
-        upload(other, "last.mat", real_capture("data_face.mat").read_bytes())
-        eventually(held)
-    eventually(lambda: not list(tmp_path.glob("firstphoton-*")))
-    other.context.close()
+    eventually(lambda: not list(tmp_path.glob("firstphoton-*")))  # with the server
+    page.context.close()
 
 
 def test_the_script_and_the_link_are_taken_away(page, address, tmp_path):
@@ -155,7 +158,7 @@ def test_the_script_and_the_link_are_taken_away(page, address, tmp_path):
     new.context.grant_permissions(["clipboard-read", "clipboard-write"])
     new.get_by_role("button", name="Link", exact=True).click()
     expect(new.get_by_role("status").filter(has_text="The link is copied.")).to_be_visible()
-    assert new.evaluate("navigator.clipboard.readText()") == new.url
+    assert new.evaluate("navigator.clipboard.readText()") == here(new)
     new.get_by_role("button", name="Python script").click()
     dialog = new.get_by_role("dialog", name="What is on the screen, as Python")
     with new.expect_download() as saved:
