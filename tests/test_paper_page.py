@@ -317,7 +317,7 @@ def few(session, monkeypatch):
 
 
 def shown_table(view):
-    title, table, note = view.main
+    title, table, note, _ = view.main
     return title.object, table.rows, note.text
 
 
