@@ -5,7 +5,7 @@ PORT ?= 5006
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: app test bench speed tradeoff stability requires paper table2 uniform calibration field large fuzz clean
+.PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration field large fuzz clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
@@ -21,6 +21,9 @@ test: $(VENV)/.test ## everything that CI checks
 
 bench: $(VENV)/.test ## slider to changed pixels, through a real browser
 	$(BIN)/python -m tests.latency
+
+load: $(VENV)/.test ## twenty sessions at once, and ten thousand interactions in one
+	$(BIN)/python -m tests.load
 
 speed: $(VENV)/.app ## the kernels beside plain ones and the machine's floors; fails where a ratio is lost
 	$(BIN)/python -m core speed
