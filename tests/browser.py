@@ -49,10 +49,12 @@ def chromium() -> Iterator[Browser]:
 
 
 @contextmanager
-def serving(*captures: Path, options: Sequence[str] = (), **environment: str) -> Iterator[str]:
+def serving(
+    *captures: Path, options: Sequence[str] = (), module: str = "app", **environment: str
+) -> Iterator[str]:
     """The app in a process of its own, at the address that is yielded."""
     port = _free_port()
-    command = [sys.executable, "-m", "app", "--port", str(port), *options, *map(str, captures)]
+    command = [sys.executable, "-m", module, "--port", str(port), *options, *map(str, captures)]
     # Into a file: a pipe that nobody reads would stop the server once it is full.
     with (
         TemporaryFile("w+") as log,
