@@ -26,7 +26,7 @@ from app import latency, words
 from app.connection import LINGER_S, serving_options
 from app.controls import Sentence
 from app.layout import build_page
-from app.serving import TOKEN_VARIABLE, Access, Headers, guard
+from app.serving import TOKEN_VARIABLE, Access, Headers, guard, keep_tracebacks
 from app.state import Light, Reading
 from app.store import Source, built_in_sources, file_source
 from app.uploads import MAX_UPLOAD_BYTES, Uploads
@@ -100,6 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
     print("Compiling what is not compiled yet ...", flush=True)
     core.warm_up()
     latency.tune()
+    keep_tracebacks()
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
     if chosen.show:

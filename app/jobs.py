@@ -56,14 +56,22 @@ class LatestWins(Generic[Result]):
                 outcome = partial(done, work())
             except Exception as error:  # whatever it is, the page must tell it
                 outcome = partial(failed, error)
+            except BaseException as error:  # as a library may raise that ends the program
+                outcome = partial(failed, RuntimeError(f"{type(error).__name__}: {error}"))
             self._on_page(partial(self._finish, outcome, failed))
+
+        def begin() -> None:
+            try:
+                self._workers.submit(attempt)
+            except Exception as error:  # no thread, or no worker is left
+                self._on_page(partial(self._finish, partial(failed, error), failed))
 
         with self._lock:
             if self._busy:
-                self._waiting = attempt
+                self._waiting = begin
                 return
             self._busy = True
-        self._workers.submit(attempt)
+        begin()
 
     @property
     def has_more(self) -> bool:
@@ -80,7 +88,7 @@ class LatestWins(Generic[Result]):
                 following, self._waiting = self._waiting, None
                 self._busy = following is not None
             if following is not None:
-                self._workers.submit(following)
+                following()
 
 
 @dataclass(frozen=True)

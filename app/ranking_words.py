@@ -10,7 +10,7 @@ import numpy as np
 
 from app.ranking import TOLERANCES_BINS, Result, Task, Yardstick, agreement
 from app.store import Answer
-from app.words import Fact, number, share
+from app.words import Fact, number, share, without_folders
 from core import ESTIMATORS, Capture
 
 Column = tuple[str, str, int]
@@ -208,7 +208,8 @@ def progress(done: int, total: int, method: str | None) -> str:
 
 def problem(error: Exception) -> str:
     """Why a method has no answer."""
-    reason = error if isinstance(error, ValueError) else type(error).__name__
+    is_told = isinstance(error, ValueError)
+    reason = without_folders(str(error)) if is_told else type(error).__name__
     return f"Not possible here: {reason}"
 
 

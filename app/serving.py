@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import hmac
 import secrets
+import sys
 from dataclasses import dataclass
 from html import escape
 from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
+from bokeh.protocol.message import Message
+from bokeh.server.connection import ServerConnection
+from panel.io.state import set_curdoc, state
 from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.routing import Matcher, Rule
 from tornado.web import (
@@ -261,3 +265,21 @@ class Headers(OutputTransform):
         for name, value in HEADERS.items():
             headers[name] = value
         return status_code, headers, chunk
+
+
+def keep_tracebacks() -> None:
+    """Tell what goes wrong in a callback of a Bokeh model by its page, as Panel does of its own.
+
+    Bokeh sends the traceback to the browser, which shows it to nobody but the curious.
+    """
+    ServerConnection.error = _told
+
+
+def _told(connection: ServerConnection, message: Message[Any], text: str) -> Message[Any]:
+    failure = sys.exception()
+    if failure is not None:
+        with set_curdoc(connection.session.document):
+            state._handle_exception(failure)
+    answer = connection.protocol.create("ERROR", message.header["msgid"], "It is told by the page.")
+    answer.content["traceback"] = None
+    return answer

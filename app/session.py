@@ -231,12 +231,17 @@ class Session:
 
         def begin() -> None:
             if self.is_served:  # else the page is gone, and nobody left to see it
-                self.page.add_next_tick_callback(act)
+                self.page.add_next_tick_callback(self._told(act))
 
         self._loop.add_callback(TURNS.ask, begin)
 
     def later(self, act: Callable[[], None], after_ms: int) -> None:
         """Do something on the page's thread, after a while; its failure is told like any other."""
+        if self.is_served:
+            self.page.add_timeout_callback(self._told(act), after_ms)
+
+    def _told(self, act: Callable[[], None]) -> Callable[[], None]:
+        """The same, its failure told by the page."""
 
         def attempt() -> None:
             try:
@@ -244,8 +249,7 @@ class Session:
             except Exception as error:  # whatever it is, the page must tell it
                 self.fail(error)
 
-        if self.is_served:
-            self.page.add_timeout_callback(attempt, after_ms)
+        return attempt
 
     def _failed(self, request: Request, error: Exception) -> None:
         """Return to what the picture shows, unless the user has moved on."""

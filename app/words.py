@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 
@@ -151,11 +152,22 @@ def lack(answer: Answer) -> str:
 def failure(error: Exception) -> str:
     """What happened and what to do, without a traceback."""
     if isinstance(error, ValueError):
-        return f"{error} The picture still shows the last settings that worked."
+        return (
+            f"{without_folders(str(error))} The picture still shows the last settings that worked."
+        )
     return (
         f"This could not be computed ({type(error).__name__}). The picture still shows the last "
         "settings that worked: change them back, or choose another scene."
     )
+
+
+def without_folders(text: str) -> str:
+    """A text in which files have their names only: where they lie on the server is its own affair.
+
+    Names in quotes may hold spaces; others end at one.
+    """
+    text = re.sub(r"(['\"])/[^'\"\n]*/([^'\"/\n]*)\1", r"\1\2\1", text)
+    return re.sub(r"(?<![\w.:/])/(?:[^\s/'\"]+/)+", "", text)
 
 
 def number(value: float, unit: str, sign: bool = False) -> str:

@@ -49,10 +49,10 @@ def chromium() -> Iterator[Browser]:
 
 
 @contextmanager
-def serving(*arguments: str | Path, **environment: str) -> Iterator[str]:
+def serving(*arguments: str | Path, module: str = "app", **environment: str) -> Iterator[str]:
     """The app in a process of its own, at the address that is yielded."""
     port = _free_port()
-    command = [sys.executable, "-m", "app", "--port", str(port), *map(str, arguments)]
+    command = [sys.executable, "-m", module, "--port", str(port), *map(str, arguments)]
     # Into a file: a pipe that nobody reads would stop the server once it is full.
     with (
         TemporaryFile("w+") as log,

@@ -69,8 +69,12 @@ class Wire:
             self.models[model["id"]] = model
             for name, value in model["attributes"].items():
                 self._keep(model["id"], name, value, buffers)
-        self._reading = asyncio.ensure_future(self._read())
+        # Two ways there and back: what the server does at the first it has done by the second.
         await self._send("PATCH-DOC", {"events": [READY]})
+        await self._send("SERVER-INFO-REQ", {})
+        while await self._take() != "SERVER-INFO-REPLY":
+            pass
+        self._reading = asyncio.ensure_future(self._read())
 
     def close(self) -> None:
         """Go away as a closed tab does."""
@@ -117,11 +121,7 @@ class Wire:
     async def _read(self) -> None:
         try:
             while True:
-                kind, content, buffers = await self._receive()
-                if kind == "ERROR":
-                    self.troubles.append(content["text"])
-                for event in content.get("events", ()) if kind == "PATCH-DOC" else ():
-                    self._follow(event, buffers)
+                await self._take()
                 async with self.news:
                     self.news.notify_all()
         except ConnectionError as error:
@@ -129,6 +129,15 @@ class Wire:
             self.is_closed = True
             async with self.news:
                 self.news.notify_all()
+
+    async def _take(self) -> str:
+        """Take in the next message, and tell its kind."""
+        kind, content, buffers = await self._receive()
+        if kind == "ERROR":
+            self.troubles.append(json.dumps(content))
+        for event in content.get("events", ()) if kind == "PATCH-DOC" else ():
+            self._follow(event, buffers)
+        return kind
 
     def _follow(self, event: Any, buffers: dict[str, bytes]) -> None:
         if event["kind"] == "ModelChanged":
