@@ -9,13 +9,27 @@ from typing import Any, ClassVar
 import param
 from panel.custom import JSComponent
 
+from core.checks import require
+
 LINGER_S = 180
 """A session is kept for so long when no page is connected to it: while a page is loaded anew, or a
 connection is lost for a minute."""
 
 
+LEAST_LINGER_S, MOST_LINGER_S = 5.0, 86_400.0
+"""A page that takes longer to connect for the first time than its session is kept is no page."""
+
+
 def serving_options(linger_s: float = LINGER_S) -> dict[str, Any]:
-    """What ``panel.serve`` must be told for that."""
+    """What ``panel.serve`` must be told for that.
+
+    Raises
+    ------
+    ValueError
+        If that is too short for a page to connect, or longer than a day.
+    """
+    accepted = LEAST_LINGER_S <= linger_s <= MOST_LINGER_S
+    require("--linger", linger_s, accepted, f"{LEAST_LINGER_S:g} to {MOST_LINGER_S:g} seconds")
     return {
         "unused_session_lifetime_milliseconds": round(1000 * linger_s),
         # A quarter more at most is waited for the next look.

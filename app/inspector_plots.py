@@ -9,7 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bokeh.models import ColumnDataSource, HoverTool, LinearAxis, PrintfTickFormatter, Range1d
+from bokeh.models import (
+    ColumnDataSource,
+    HoverTool,
+    LinearAxis,
+    NumeralTickFormatter,
+    PrintfTickFormatter,
+    Range1d,
+)
 from bokeh.plotting import figure
 
 MARKS = "marks"
@@ -75,6 +82,7 @@ def overlay(bins: Range1d, title: str, unit: str) -> Any:
 def aggregate(bins: Range1d) -> Any:
     """Counts of all pixels together, the gate that is suggested, and T_n."""
     drawing = _over_the_gate("Counts of all pixels along the gate", "Counts", bins)
+    drawing.yaxis.formatter = NumeralTickFormatter(format="0,0")  # of millions, too
     _bars(drawing, empty("bin", "raw"), "raw", "counts")
     drawing.quad(
         "left",

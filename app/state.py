@@ -109,7 +109,16 @@ class Less:
     )
     pulses: float = parameter(
         1.0,
-        Number("Pulses accumulated", 1e-3, 1.0, log=True, least=0.0, most=1.0, open_below=True),
+        Number(
+            "Pulses accumulated",
+            1e-3,
+            1.0,
+            log=True,
+            unit="of all",
+            least=0.0,
+            most=1.0,
+            open_below=True,
+        ),
         "Share of the pulses whose detections are kept, as if recording had ended sooner: fewer "
         "are a part of more.",
     )

@@ -10,9 +10,11 @@ import sys
 from http.client import HTTPConnection
 from urllib.parse import urlencode
 
+import numpy as np
 import pytest
 from playwright.sync_api import expect
 
+from app.connection import serving_options
 from app.serving import TOKEN_VARIABLE, Access
 from tests.browser import ROOT, serving
 from tests.wire import token_in
@@ -221,6 +223,12 @@ def test_a_port_in_use_is_a_sentence(here):
     assert second.returncode == 1
     assert "in use" in told and "--port" in told
     assert "Traceback" not in told
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 0.0, 1.0, np.nan, np.inf])
+def test_a_session_is_kept_for_as_long_as_a_page_takes_to_connect(seconds):
+    with pytest.raises(ValueError, match="--linger"):
+        serving_options(seconds)
 
 
 def test_others_are_not_served_before_the_origin_is_named():
