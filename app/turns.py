@@ -6,9 +6,10 @@ import asyncio
 from collections import deque
 from collections.abc import Callable
 
-MESSAGES_FIRST = 6
-"""Times the loop goes round between two turns. A message takes some three: what hands move in the
-meantime arrives before the next page is drawn, and what it overtakes need not be drawn at all."""
+MESSAGES_FIRST = 40
+"""Times the loop goes round between two turns, which cost next to nothing where there is nothing to
+do. A message takes some ten: what hands move in the meantime arrives before the next page is drawn,
+and what it overtakes need not be drawn at all."""
 
 
 class Turns:
