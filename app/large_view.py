@@ -47,7 +47,7 @@ class LargeView:
                 sizing_mode="stretch_width",
                 margin=(6, 4, 2, 8),
             )
-            for name, label in (("rows", "Rows"), ("cols", "Columns"))
+            for name, label in (("rows", "Rows shown"), ("cols", "Columns shown"))
         }
         self._work = OnePiece(
             session,
