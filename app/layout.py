@@ -200,6 +200,7 @@ class Layout:
         )
         self._unit = unit
         self._announced: Source | None = None
+        self._uploaded = ""
         self._address = AddressBar()
         self._takeaway = TakeAway(
             lambda: script_of(session.answer, state), sizing_mode="stretch_width", margin=8
@@ -268,6 +269,8 @@ class Layout:
 
     def _announce(self, answer: Answer) -> None:
         is_scene = answer.request.source.is_scene
+        if self.session.state.source == self._uploaded:  # it could be read: look into it
+            self._uploaded, self.session.state.page = "", "Inspect"
         self._source.value = self.session.state.source
         if answer.request.source is not self._announced:
             self._announced = answer.request.source
@@ -335,8 +338,7 @@ class Layout:
             return
         self.session.sources = self._with_upload(self.session.sources, key)
         self._source.options = self._titles()
-        self._source.value = key
-        self.session.state.page = "Inspect"
+        self._uploaded = self._source.value = key
 
     def _read_again(self) -> None:
         try:
