@@ -241,11 +241,14 @@ class Session:
             self.page.add_timeout_callback(self._told(act), after_ms)
 
     def _told(self, act: Callable[[], None]) -> Callable[[], None]:
-        """The same, its failure told by the page."""
+        """The same, to be done once, its failure told by the page."""
+        # Bokeh's callbacks hold themselves in a circle. An answer that stayed in there would live
+        # until the collector of garbage comes by, which is seldom.
+        once = [act]
 
         def attempt() -> None:
             try:
-                act()
+                once.pop()()
             except Exception as error:  # whatever it is, the page must tell it
                 self.fail(error)
 
