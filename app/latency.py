@@ -15,29 +15,26 @@ from typing import Any
 
 from bokeh.protocol.message import Message
 from bokeh.server.views.ws import WSHandler
+from bokeh.settings import settings
 from panel.reactive import Syncable
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
-
-from app.turns import TURNS
 
 DEBOUNCE_MS = 4
 """Panel collects property changes for 50 ms. So short a time suits callbacks as short as ours,
 which hand the work to `app.jobs`; under slow ones it would build a backlog."""
 
-CROWDED_MS = 50
-"""Panel's own time, for when pages wait for each other: what a drag overtakes meanwhile costs
-nothing more."""
-
-SWITCH_S = 5e-4
+SWITCH_S = 1e-4
 """A thread that computes keeps the others waiting for 5 ms whenever they have let go of the
 interpreter, as the page's thread does for every message it sends."""
 
 
 def tune() -> None:
     """Apply the changes to this process."""
-    Syncable._debounce = property(lambda _: CROWDED_MS if TURNS.is_crowded else DEBOUNCE_MS)
+    Syncable._debounce = DEBOUNCE_MS
     WSHandler.open = _open_without_delay(WSHandler.open)
     WSHandler.send_message = _send_at_once
+    # Else each array that is sent has them look for it in the environment.
+    settings.simple_ids.set_value(True)
     sys.setswitchinterval(SWITCH_S)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import panel as pn
@@ -19,7 +20,7 @@ from app.controls import Sentence, SettingsPanel, Viewport
 from app.downloads import CLOUD, IMAGE, PLOT, cloud_on_show, downloadable, pixel_plot, range_image
 from app.inspector import Inspector
 from app.large_view import LargeView
-from app.pages import Pages, View, let_pages_come
+from app.pages import Pages, View
 from app.paper import Paper
 from app.parts import card, choice, part, select
 from app.script import script_of
@@ -104,6 +105,13 @@ COLUMN = """
 :host { display: flex !important; flex-direction: column; gap: 8px; height: 100%; min-height: 0; }
 @media (max-width: 900px) { :host { height: auto !important; flex: none !important; } }
 """
+
+
+TEMPLATE = (
+    '{% extends "base.html" %}{% block postamble %}{{ super() }}<script>{% raw %}'
+    + Path(__file__).with_name("bokeh.js").read_text(encoding="utf-8")
+    + "{% endraw %}</script>{% endblock %}"
+)
 
 
 class Page(pmui.Page):
@@ -236,7 +244,6 @@ class Layout:
         session.state.param.watch(lambda event: self._show_tracking(event.new), "tracking")
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if session.is_served:
-            let_pages_come(session.page)
             # On a phone the controls would cover what they control.
             pn.state.onload(lambda: self.page.param.update(sidebar_open=not self._viewport.narrow))
             pn.state.on_session_destroyed(lambda _: self._forget())
@@ -367,6 +374,7 @@ class Layout:
         )
         return Page(
             title="firstphoton",
+            template=TEMPLATE,
             sidebar=self._sidebar(),
             # In the bar, where it costs the plots no height.
             header=[self.pages.choice],

@@ -8,9 +8,6 @@ from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
-from bokeh.document import Document
-from bokeh.events import DocumentReady
-from bokeh.models import CustomJS
 
 from app.store import Answer
 
@@ -18,20 +15,6 @@ from app.store import Answer
 HOLDER = """
 :host { flex: none !important; height: auto !important; min-width: 0 !important; }
 """
-
-# While a page is being built, Bokeh may measure plots of it that have no layout yet, and fail.
-PATIENCE = """
-const view = Bokeh.Models.get("Figure").prototype.default_view.prototype;
-for (const name of ["_measure_layout", "_after_layout"]) {
-  const act = view[name];
-  view[name] = function () { if (this.layout) act.call(this); };
-}
-"""
-
-
-def let_pages_come(document: Document) -> None:
-    """Prepare a document for pages that are built after it has been drawn."""
-    document.js_on_event(DocumentReady, CustomJS(code=PATIENCE))
 
 
 def _nothing(_told: Any) -> None:

@@ -218,10 +218,11 @@ class Session:
 
     def _settle(self, answer: Answer) -> None:
         self._asked_s = None
-        self.waiting(False)
-        self.announce(answer)
         if self._jobs.has_more:
             self._await()
+        else:
+            self.waiting(False)
+        self.announce(answer)
 
     def on_page(self, act: Callable[[], None]) -> None:
         """Do something on the page's thread, in turn with other pages, if it is still there."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable
+from contextvars import Context, copy_context
 
-MESSAGES_FIRST = 40
+MESSAGES_FIRST = 10
 """Times the loop goes round between two turns, which cost next to nothing where there is nothing to
 do. A message takes some ten: what hands move in the meantime arrives before the next page is drawn,
 and what it overtakes need not be drawn at all."""
@@ -21,7 +22,7 @@ class Turns:
     """
 
     def __init__(self) -> None:
-        self._waiting: deque[Callable[[], None]] = deque()
+        self._waiting: deque[tuple[Callable[[], None], Context]] = deque()
         self._is_going_round = False
 
     @property
@@ -30,8 +31,11 @@ class Turns:
         return bool(self._waiting)
 
     def ask(self, begin: Callable[[], None]) -> None:
-        """Have something begun when its turn comes; from the loop's own thread."""
-        self._waiting.append(begin)
+        """Have something begun when its turn comes; from the loop's own thread.
+
+        It begins in the context of who asked: Panel's has the document that is worked on.
+        """
+        self._waiting.append((begin, copy_context()))
         if not self._is_going_round:
             self._is_going_round = True
             self._task = asyncio.ensure_future(self._go_round())
@@ -39,7 +43,8 @@ class Turns:
     async def _go_round(self) -> None:
         loop = asyncio.get_running_loop()
         while self._waiting:
-            loop.call_soon(self._waiting.popleft())  # which logs a failure, and goes on
+            begin, context = self._waiting.popleft()
+            loop.call_soon(begin, context=context)  # which logs a failure, and goes on
             for _ in range(MESSAGES_FIRST):
                 await asyncio.sleep(0)
         self._is_going_round = False

@@ -367,6 +367,28 @@ def test_a_quick_drag_leaves_no_queue_and_ends_at_the_last_value(car_page):
     assert car_page.evaluate("answers") - before_release <= 12
 
 
+MOVE_AT_ONCE = """track => {
+  const send = WebSocket.prototype.send;
+  window.told = 0;
+  WebSocket.prototype.send = function (data) {
+    if (String(data).includes('"attr":"value"')) told++;
+    return send.call(this, data);
+  };
+  for (const position of Array(200).keys()) {
+    track.value = 100 + position;
+    track.dispatchEvent(new Event("input"));
+  }
+}"""
+
+
+def test_values_that_a_hand_has_overtaken_are_not_sent(car_page):
+    slider(car_page, "SBR").evaluate(MOVE_AT_ONCE)
+    sbr = float(field(car_page, "SBR").input_value())
+    assert sbr != Light().sbr
+    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Light(sbr=sbr))))
+    assert car_page.evaluate("told") == 2  # the first and the last
+
+
 def test_typed_values_are_taken_or_refused_with_a_sentence(car_page):
     enter(car_page, "SBR", "99")
     refusal = car_page.get_by_role("alert").filter(has_text="99 is not possible here")

@@ -224,7 +224,7 @@ def test_pixel_pins_and_region_stay_while_the_capture_keeps_its_pixels(page, fie
         assert (field.state.pixel, field.state.pins, field.state.region) == kept
     field.state.less = Less(pool=2)
     eventually(lambda: field.answer.capture.shape == (128, 128))
-    assert (field.state.pins, field.state.region) == ((), ())
+    eventually(lambda: (field.state.pins, field.state.region) == ((), ()))
 
 
 # -- pixel -----------------------------------------------------------------------------------------

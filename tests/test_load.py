@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextvars import ContextVar
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +73,20 @@ def test_turns_are_taken_in_order_and_messages_come_in_between():
         return "".join(done)
 
     assert asyncio.run(queue()).split() == ["a", "b", "c"]
+
+
+def test_each_turn_begins_in_the_context_of_who_asked():
+    who = ContextVar("who")
+
+    async def queue():
+        turns, done = Turns(), []
+        for name in "abc":
+            who.set(name)
+            turns.ask(lambda: done.append(who.get()))
+        await when_all_had_their_turn(turns)
+        return done
+
+    assert asyncio.run(queue()) == ["a", "b", "c"]
 
 
 def test_a_turn_that_fails_does_not_hold_up_the_next():

@@ -30,6 +30,9 @@ READY = {
 }
 """What a page says once it is drawn; until then the server keeps what it has to tell."""
 
+LONGEST_PAUSE_S = 0.25
+"""As in `app/bokeh.js`."""
+
 Model = dict[str, Any]
 
 
@@ -57,11 +60,14 @@ class Wire:
         self.troubles: list[str] = []
         self.is_closed = False
         self._numbers: defaultdict[str, int] = defaultdict(int)
+        self._waiting: dict[tuple[str, str], Any] = {}
+        self._pause: asyncio.Future[None] | None = None
 
     async def open(self, address: str, **headers: str) -> None:
         """Fetch the page, connect its session and take over its document."""
         page = await AsyncHTTPClient().fetch(address, request_timeout=120, headers=headers)
         self._socket = await connected(address, token_in(page.body.decode()), **headers)
+        self._socket.protocol.stream.set_nodelay(True)  # as in a browser
         await self._receive()
         await self._send("PULL-DOC-REQ", {})
         _, content, buffers = await self._receive()
@@ -91,9 +97,27 @@ class Wire:
         )
 
     async def set(self, model: str, attribute: str, value: Any) -> None:
-        """Change a model as the page does."""
-        event = {"kind": "ModelChanged", "model": {"id": model}, "attr": attribute, "new": value}
-        await self._send("PATCH-DOC", {"events": [event]})
+        """Change a model as the page does: what is overtaken before it could be sent never is."""
+        self._waiting.pop((model, attribute), None)
+        self._waiting[model, attribute] = value
+        if self._pause is None:
+            await self._send_waiting()
+
+    async def _send_waiting(self) -> None:
+        events = [
+            {"kind": "ModelChanged", "model": {"id": model}, "attr": attribute, "new": value}
+            for (model, attribute), value in self._waiting.items()
+        ]
+        self._waiting.clear()
+        self._pause = asyncio.ensure_future(asyncio.sleep(LONGEST_PAUSE_S))
+        self._pause.add_done_callback(self._go_on)
+        await self._send("PATCH-DOC", {"events": events})
+
+    def _go_on(self, _pause: Any) -> None:
+        """What waits may be sent: the server has answered, or takes long."""
+        self._pause = None
+        if self._waiting and not self.is_closed:
+            self._sending = asyncio.ensure_future(self._send_waiting())
 
     async def _send(self, kind: str, content: Any) -> None:
         self._numbers[kind] += 1
@@ -135,6 +159,8 @@ class Wire:
         kind, content, buffers = await self._receive()
         if kind == "ERROR":
             self.troubles.append(json.dumps(content))
+        if kind == "PATCH-DOC" and self._pause is not None:
+            self._pause.cancel()
         for event in content.get("events", ()) if kind == "PATCH-DOC" else ():
             self._follow(event, buffers)
         return kind

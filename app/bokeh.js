@@ -1,0 +1,69 @@
+// Where Bokeh does more in a browser than this app needs. It runs once Bokeh is loaded, before
+// anything is drawn.
+
+// A change is sent once the server has answered the last one, or has taken this long.
+const LONGEST_PAUSE_MS = 250;
+
+{
+  // A plot writes the style sheet of each of its parts at every stroke, mostly as it was. For the
+  // browser it is another one each time, and all that hangs on it has to be looked up again.
+  const sheet = Bokeh.require("core/dom").InlineStyleSheet.prototype;
+  const write = sheet._update;
+  sheet._update = function (css) {
+    if (css !== this.css) write.call(this, css);
+  };
+
+  // Each line and each text asks the page for a style of its own, which none has here.
+  Bokeh.require("core/visuals/visual").VisualProperties.prototype._get_css_value = () => "";
+}
+
+{
+  // While a page is being built, Bokeh may measure plots of it that have no layout yet, and fail.
+  const view = Bokeh.Models.get("Figure").prototype.default_view.prototype;
+  for (const name of ["_measure_layout", "_after_layout"]) {
+    const act = view[name];
+    view[name] = function () {
+      if (this.layout) act.call(this);
+    };
+  }
+}
+
+{
+  // A hand moves a slider sixty times a second, whether or not the server is done with the last
+  // value. Of those that it overtakes in the meantime none is sent.
+  const { DocumentEventBatch } = Bokeh.require("document/events");
+  const session = Bokeh.require("client/session").ClientSession.prototype;
+  const send = session._document_changed;
+  const take = session._handle_patch;
+
+  const sendWaiting = (session) => {
+    const events = [...session.waiting.values()];
+    session.waiting.clear();
+    clearTimeout(session.pause);
+    session.pause = setTimeout(() => goOn(session), LONGEST_PAUSE_MS);
+    send.call(session, new DocumentEventBatch(session.document, events));
+  };
+  const goOn = (session) => {
+    clearTimeout(session.pause);
+    session.pause = undefined;
+    if (session.waiting?.size) sendWaiting(session);
+  };
+
+  session._document_changed = function (event) {
+    if (!event.sync) return;
+    this.waiting ??= new Map();
+    let isUrgent = this.pause === undefined;
+    for (const each of (event.events ?? [event]).filter((each) => each.sync)) {
+      // A click or the like may ask for what was set before it: all of it is sent, in order.
+      isUrgent ||= each.kind !== "ModelChanged";
+      const what = each.kind === "ModelChanged" ? `${each.model.id} ${each.attr}` : each;
+      this.waiting.delete(what);
+      this.waiting.set(what, each);
+    }
+    if (isUrgent && this.waiting.size) sendWaiting(this);
+  };
+  session._handle_patch = function (message) {
+    take.call(this, message);
+    goOn(this);
+  };
+}
