@@ -16,39 +16,25 @@ from app.downloads import CORNER_PX, IMAGE, Shown, downloadable, explored
 from app.exports import image_files
 from app.inspector_capture import Whole
 from app.inspector_pins import Pins, pin_colors
-from app.inspector_pixel import Sight, framed
+from app.inspector_pixel import BREAK_PX, COLUMN, FILLING, Sight, framed
 from app.inspector_views import MODES, Corners, Navigator, rectangle
 from app.jobs import LatestWins
 from app.large_view import LargeView
 from app.looks import Look, map_of
 from app.pages import Pages, View
-from app.parts import part
+from app.parts import board, button, part
 from app.session import REST_MS, Session
 from app.state import MOST_PINS
 from app.store import Answer
 from app.theme import palette
 from core.checks import require
 
-# One screen on a laptop: the navigator with a table below on the left, plots on the right.
-BOARD = """
-:host { display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
-  gap: 10px; flex: none !important; height: max(600px, calc(100vh - 92px)) !important; }
-@media (max-width: 1100px) {
-  :host { display: flex !important; flex-direction: column; height: auto !important; }
-}
-"""
-COLUMN = """
-:host { display: flex !important; flex-direction: column; gap: 6px; height: 100%; min-height: 0;
-  min-width: 0; }
-@media (max-width: 1100px) { :host { height: auto !important; flex: none !important; } }
-"""
-STAGES = """
-:host { flex: 1 1 0 !important; min-height: 0; min-width: 0; }
-@media (max-width: 1100px) { :host { height: auto !important; flex: none !important; } }
-"""
-TABLES = """
-:host { flex: 0 1 auto !important; min-height: 0; min-width: 0; max-height: 34%; overflow-y: auto; }
-@media (max-width: 1100px) { :host { max-height: none } }
+# The navigator with a table below on the left, plots on the right.
+BOARD = board(600, 92, BREAK_PX)
+TABLES = f"""
+:host {{ flex: 0 1 auto !important; min-height: 0; min-width: 0; max-height: 34%;
+  overflow-y: auto; }}
+@media (max-width: {BREAK_PX}px) {{ :host {{ max-height: none }} }}
 """
 ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 4px 6px; }"
 
@@ -80,6 +66,8 @@ class Inspector:
         self._refusal = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
         self._chips = Chips(label="Pinned pixels", sizing_mode="stretch_width", margin=0)
         self._make_controls()
+        # What shows each part of the state on the picture.
+        self._marks = {"pixel": self._mark, "pins": self._frame_pins, "region": self._outline}
         self._subjects = Pages(
             {
                 "Pixel": lambda: Sight(session, "pixel").view,
@@ -128,14 +116,13 @@ class Inspector:
         )
         self._place = [_field(name, "0") for name in ("Row", "Column")]
         self._span = [_field(name, "10-20") for name in ("Rows", "Columns")]
-        self._pin = _button("Pin this pixel", inspector_words.PIN_HELP, self._pin_pixel)
-        self._add = _button(
-            "Select region",
-            "Select region: the rectangle of these rows and columns.",
-            self._select_rectangle,
-        )
-        self._clear = _button(
-            "Clear region", "Clear region: there is none then.", lambda: self._select(())
+        self._pin, self._add, self._clear = (
+            button(label, help, act, margin=(6, 0, 0, 0))
+            for label, help, act in (
+                ("Pin this pixel", inspector_words.PIN_HELP, self._pin_pixel),
+                ("Select region", inspector_words.SELECT_HELP, self._select_rectangle),
+                ("Clear region", inspector_words.CLEAR_HELP, lambda: self._select(())),
+            )
         )
 
     def _listen(self) -> None:
@@ -154,7 +141,7 @@ class Inspector:
     def _board(self) -> pn.Column:
         subjects = self._subjects
         for main, below in zip(subjects.mains.values(), subjects.asides.values(), strict=True):
-            main.param.update(stylesheets=[STAGES], sizing_mode="stretch_both", margin=0)
+            main.param.update(stylesheets=[FILLING], sizing_mode="stretch_both", margin=0)
             below.param.update(stylesheets=[TABLES], sizing_mode="stretch_width", margin=0)
         left = pn.Column(
             _row(self._map, self._mode, self._clear),
@@ -288,11 +275,6 @@ class Inspector:
         last = answer.grid.place(*(size - 1 for size in answer.capture.shape))
         return answer.grid.first[axis], last[axis]
 
-    @property
-    def _marks(self) -> dict[str, Callable[[], None]]:
-        """What shows each part of the state on the picture."""
-        return {"pixel": self._mark, "pins": self._frame_pins, "region": self._outline}
-
     def _draw_mark(self, draw: Callable[[], None]) -> None:
         if self._is_on_screen:
             with pn.io.hold(self._session.page):
@@ -332,14 +314,6 @@ class Inspector:
 
 def _row(*content: Any) -> pn.Row:
     return pn.Row(*content, stylesheets=[ROW], sizing_mode="stretch_width", margin=0)
-
-
-def _button(label: str, help: str, act: Callable[[], None]) -> pmui.Button:
-    made = pmui.Button(
-        label=label, description=help, variant="outlined", size="small", margin=(6, 0, 0, 0)
-    )
-    made.on_click(lambda _: act())
-    return made
 
 
 def _field(label: str, example: str) -> pmui.TextInput:

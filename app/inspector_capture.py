@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import numpy as np
 import panel as pn
-import panel_material_ui as pmui
 from bokeh.models import FixedTicker, Range1d
 
 from app import inspector_plots, inspector_words, plots
@@ -21,12 +20,13 @@ from app.inspector_pixel import FACTS, framed, stage
 from app.inspector_views import GatePlot, Marked
 from app.jobs import LatestWins, Step
 from app.pages import View
+from app.parts import button
 from app.session import Session
 from app.state import Less
 from app.store import Answer
 from app.studies import Study
 from app.theme import palette
-from app.views import pane_of
+from app.views import cover, pane_of
 from app.words import COMPUTING
 from core import inspection
 from core.inspection import Accuracy, CaptureReport
@@ -67,8 +67,8 @@ class Whole:
         self._pulses.param.watch(lambda event: self._take(event.new), "value")
         self._advice = [Sentence(sizing_mode="stretch_width", margin=(2, 0)) for _ in range(2)]
         self._apply = [
-            _button("Apply the gate", inspector_words.GATE_HELP, self._apply_gate),
-            _button("Apply T_n", inspector_words.T_N_HELP, self._apply_t_n),
+            button("Apply the gate", inspector_words.GATE_HELP, self._apply_gate),
+            button("Apply T_n", inspector_words.T_N_HELP, self._apply_t_n),
         ]
         session.state.param.watch(lambda *_: self._draw(), "unit")
 
@@ -196,10 +196,8 @@ class Whole:
         if answer is not self._session.answer:
             return  # the user has moved on
         acquisition = answer.capture.acquisition
-        n_bins = acquisition.n_bins
         with pn.io.hold(self._session.page):
-            if n_bins != self._bins.reset_end:
-                self._bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
+            cover(self._bins, acquisition.n_bins)
             self._counts.follow(self._session.state.unit, acquisition)
             self._counts.show_curves(raw=counts)
             self._counts.frame(counts)
@@ -229,9 +227,3 @@ class Whole:
             self._advice[1].text = inspector_words.t_n_advice(report)
             self._apply[0].disabled = advice.gate == (0, acquisition.n_bins)
             self._apply[1].disabled = advice.t_n == answer.request.tracking.t_n
-
-
-def _button(label: str, help: str, act: Any) -> pmui.Button:
-    made = pmui.Button(label=label, description=help, variant="outlined", size="small", margin=0)
-    made.on_click(lambda _: act())
-    return made

@@ -21,7 +21,7 @@ from app.pages import View
 from app.session import Session
 from app.state import MOST_PINS
 from app.theme import palette
-from app.views import pane_of
+from app.views import cover, pane_of
 
 
 class Pins:
@@ -111,8 +111,7 @@ class Pins:
         scales = inspector_words.both_scales(unit, answer)
         with pn.io.hold(session.page):
             n_bins = acquisition.n_bins
-            if n_bins != self._bins.reset_end:
-                self._bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
+            cover(self._bins, n_bins)
             for plot, curves in (
                 (self._counts, [each.pixel.signals.raw for each in found]),
                 (self._enhanced, [each.pixel.signals.enhanced for each in found]),

@@ -15,21 +15,19 @@ from app.inspector_answers import Seen, pixel_seen, region_seen
 from app.inspector_views import PixelPlots
 from app.jobs import LatestWins
 from app.pages import View
-from app.parts import card
+from app.parts import card, column, unrolled
 from app.session import Session
 from app.store import Answer
 from app.theme import palette
 from app.words import COMPUTING
 
+BREAK_PX = 1100
+"""As `app.parts.BREAK_PX`, of this page."""
+
 FACTS = ".fact-list { grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)) !important; }"
-STAGE = """
-:host { display: flex !important; flex-direction: column; gap: 6px; flex: 1 1 0 !important;
-  min-height: 0; min-width: 0; }
-@media (max-width: 1100px) { :host { height: auto !important; flex: none !important; } }
-"""
-FRAME = """
-@media (max-width: 1100px) { :host { flex: none !important; height: 330px !important; } }
-"""
+FILLING = ":host { flex: 1 1 0 !important; min-height: 0; min-width: 0; }" + unrolled(BREAK_PX)
+COLUMN = column(6, BREAK_PX)
+FRAME = unrolled(BREAK_PX, "330px")
 NARROW = """
 th, td { padding: 3px 6px !important; }
 tbody th { min-width: 40px !important; }
@@ -49,7 +47,7 @@ def framed(*content: Any) -> pn.Column:
 
 def stage(*content: Any) -> pn.Column:
     """What stands beside the navigator, from top to bottom."""
-    return pn.Column(*content, stylesheets=[STAGE], sizing_mode="stretch_both", margin=0)
+    return pn.Column(*content, stylesheets=[COLUMN, FILLING], sizing_mode="stretch_both", margin=0)
 
 
 class Sight:

@@ -97,32 +97,19 @@ def aggregate(bins: Range1d) -> Any:
         legend_label="suggested gate",
     )
     for name, label, dash in (("t_n", "T_n", "solid"), ("suggested", "suggested T_n", "dashed")):
-        drawing.line(
-            "x",
-            "y",
-            source=empty("x", "y"),
-            y_range_name=MARKS,
-            line_width=1.8,
-            line_dash=dash,
-            name=name,
-            legend_label=label,
-        )
+        _upright(drawing, empty("x", "y"), name, label, line_dash=dash)
     return _with_legend(drawing)
 
 
 def accuracy() -> Any:
     """Share of pixels that are right against the pulses that are taken, with 95 % intervals."""
-    drawing = figure(
+    drawing = _with_marks(
         x_axis_type="log",
         x_axis_label="Pulses",
         y_axis_label="Within 3 bins",
         x_range=Range1d(1, 1000),
         y_range=Range1d(0, 1.05),
-        sizing_mode="stretch_both",
-        min_height=110,
         tools="",
-        toolbar_location=None,
-        outline_line_color=None,
     )
     source = empty("pulses", "value", "low", "high", "rmse_m")
     drawing.segment(
@@ -151,36 +138,34 @@ def accuracy() -> Any:
         )
     )
     drawing.xaxis.formatter = PrintfTickFormatter(format="%.3g")
-    drawing.extra_y_ranges = {MARKS: Range1d(0, 1)}
-    drawing.line(
-        "x",
-        "y",
-        source=empty("x", "y"),
-        y_range_name=MARKS,
-        line_width=1.8,
-        name="answer",
-        legend_label="taken at present",
-    )
-    drawing.min_border_left, drawing.min_border_right = 52, 52
+    _upright(drawing, empty("x", "y"), "answer", "taken at present")
     return _with_legend(drawing, "bottom_right")
 
 
 def _over_the_gate(title: str, unit: str, bins: Range1d) -> Any:
-    drawing = figure(
+    drawing = _with_marks(
         title=title,
         x_range=bins,
         y_range=Range1d(0, 1),
         y_axis_label=unit,
-        sizing_mode="stretch_both",
-        min_height=110,
         tools="xbox_zoom,xwheel_zoom",
         active_scroll="xwheel_zoom",
+    )
+    drawing.min_border_top = drawing.min_border_bottom = 2
+    return drawing
+
+
+def _with_marks(**options: Any) -> Any:
+    """A figure as wide and high as there is room, with the range ``marks``."""
+    drawing = figure(
+        sizing_mode="stretch_both",
+        min_height=110,
         toolbar_location=None,
         outline_line_color=None,
+        **options,
     )
     drawing.extra_y_ranges = {MARKS: Range1d(0, 1)}
     drawing.min_border_left, drawing.min_border_right = 52, 52
-    drawing.min_border_top = drawing.min_border_bottom = 2
     return drawing
 
 
@@ -198,15 +183,30 @@ def _line(
     )
 
 
+def _upright(
+    drawing: Any,
+    source: ColumnDataSource,
+    name: str,
+    label: str,
+    width: float = 1.8,
+    **style: Any,
+) -> None:
+    drawing.line(
+        "x",
+        "y",
+        source=source,
+        y_range_name=MARKS,
+        line_width=width,
+        name=name,
+        legend_label=label,
+        **style,
+    )
+
+
 def _marked(drawing: Any, marks: Mapping[str, ColumnDataSource], with_ranks: bool = False) -> Any:
     """Truth, answer and candidates, from sources that figures share."""
-    for name, style in (
-        ("truth", {"line_width": 2.5, "line_dash": "4 2"}),
-        ("answer", {"line_width": 1.5}),
-    ):
-        drawing.line(
-            "x", "y", source=marks[name], y_range_name=MARKS, name=name, legend_label=name, **style
-        )
+    _upright(drawing, marks["truth"], "truth", "truth", 2.5, line_dash="4 2")
+    _upright(drawing, marks["answer"], "answer", "answer", 1.5)
     places = {"source": marks["candidates"], "y_range_name": MARKS}
     drawing.scatter("x", "y", marker="triangle", size=8, **places, name="candidates")
     if with_ranks:

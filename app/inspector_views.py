@@ -24,7 +24,7 @@ from app import inspector_plots, plots
 from app.gate import GateAxes, GateReadOut
 from app.items import layers_of
 from app.theme import Palette
-from app.views import ImageView, Layers, paint_frame, pane_of, round_up
+from app.views import ImageView, Layers, cover, paint_frame, pane_of, round_up
 from core import Acquisition
 
 Array = NDArray[Any]
@@ -274,8 +274,7 @@ class PixelPlots:
     def update(self, shown: Curves, unit: str, acquisition: Acquisition) -> None:
         """Show a pixel or a region, positions in a unit."""
         n_bins = acquisition.n_bins
-        if n_bins != self._bins.reset_end:
-            self._bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
+        cover(self._bins, n_bins)
         expected = np.full(n_bins, np.nan) if shown.expected is None else shown.expected
         for plot in self._plots:
             plot.follow(unit, acquisition)

@@ -12,6 +12,7 @@ import panel_material_ui as pmui
 
 from app.controls import Sentence
 from app.large import Cutout, LargeFile
+from app.parts import button
 from app.session import Session
 from app.store import Answer
 from app.studies import OnePiece, Work
@@ -57,16 +58,9 @@ class LargeView:
             label="Look closer",
             help="Look closer: reads these rows and columns alone, as finely as they can be shown.",
         )
-        whole = pmui.Button(
-            label="The whole",
-            description="The whole: all rows and columns; reads what is missing of them.",
-            variant="outlined",
-            size="small",
-            margin=(6, 4),
-        )
-        whole.on_click(lambda _: self._go_back())
+        whole = "The whole: all rows and columns; reads what is missing of them."
         buttons, *rest = self._work.controls
-        buttons.append(whole)
+        buttons.append(button("The whole", whole, self._go_back, margin=(6, 4)))
         self.layout = pn.Column(
             self._sentence,
             pn.Row(*self._bounds.values(), sizing_mode="stretch_width", margin=0),

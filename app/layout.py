@@ -22,7 +22,7 @@ from app.inspector import Inspector
 from app.large_view import LargeView
 from app.pages import Pages, View
 from app.paper import Paper
-from app.parts import card, choice, part, select
+from app.parts import BREAK_PX, board, card, choice, column, part, select
 from app.script import script_of
 from app.session import Session
 from app.state import Less, Light, Reading, Viewing
@@ -92,19 +92,9 @@ IN_THE_BAR = {
     },
 }
 
-# One screen on a laptop: image over cloud on the left, the pixel's plots on the right. Below
-# 900 px the parts follow each other.
-BOARD = """
-:host { display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
-  gap: 10px; flex: none !important; height: max(560px, calc(100vh - 125px)) !important; }
-@media (max-width: 900px) {
-  :host { display: flex !important; flex-direction: column; height: auto !important; }
-}
-"""
-COLUMN = """
-:host { display: flex !important; flex-direction: column; gap: 8px; height: 100%; min-height: 0; }
-@media (max-width: 900px) { :host { height: auto !important; flex: none !important; } }
-"""
+# Image over cloud on the left, the pixel's plots on the right.
+BOARD = board(560, 125, BREAK_PX)
+COLUMN = column(8, BREAK_PX)
 
 
 TEMPLATE = (

@@ -2,17 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
 
+BREAK_PX = 900
+"""Of a page: less, and its parts follow each other. A page of more parts has another."""
+
+
+def unrolled(break_px: int, height: str = "auto") -> str:
+    """Style of a part that keeps a height of its own where parts follow each other."""
+    kept = f"height: {height} !important; flex: none !important;"
+    return f"@media (max-width: {break_px}px) {{ :host {{ {kept} }} }}"
+
+
+def board(least_px: int, rest_px: int, break_px: int) -> str:
+    """Style of two columns that fill a laptop's screen, but for what stands around them."""
+    return f"""
+:host {{ display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
+  gap: 10px; flex: none !important; height: max({least_px}px, calc(100vh - {rest_px}px)) !important;
+}}
+@media (max-width: {break_px}px) {{
+  :host {{ display: flex !important; flex-direction: column; height: auto !important; }}
+}}
+"""
+
+
+def column(gap_px: int, break_px: int) -> str:
+    """Style of one of these columns."""
+    return f"""
+:host {{ display: flex !important; flex-direction: column; gap: {gap_px}px; height: 100%;
+  min-height: 0; min-width: 0; }}
+{unrolled(break_px)}
+"""
+
+
 CARD = """
 :host { flex: 1 1 0 !important; min-height: 0; overflow: hidden; border-radius: 8px;
   border: 1px solid var(--mui-palette-divider, #d5dbe2);
   background: var(--mui-palette-background-paper, #fff); }
-@media (max-width: 900px) { :host { flex: none !important; height: 330px !important; } }
-"""
+""" + unrolled(BREAK_PX, "330px")
 
 
 def select(label: str, options: Any, value: str, help: str) -> pmui.Select:
@@ -33,6 +64,17 @@ def choice(help: str, parameter: Any) -> pmui.RadioButtonGroup:
     return pmui.RadioButtonGroup.from_param(
         parameter, label="", description=help, size="small", margin=(4, 6, 0, 6)
     )
+
+
+def button(
+    label: str, help: str, act: Callable[[], None], margin: int | tuple[int, ...] = 0
+) -> pmui.Button:
+    """A small button."""
+    made = pmui.Button(
+        label=label, description=help, variant="outlined", size="small", margin=margin
+    )
+    made.on_click(lambda _: act())
+    return made
 
 
 def part(title: str, *content: Any, is_open: bool = True) -> pmui.Card:

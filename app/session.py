@@ -163,7 +163,7 @@ class Session:
 
     def _watch(self) -> None:
         watch = self.state.param.watch
-        watch(lambda *_: self._ask(), list(COMPUTED_FROM))
+        watch(lambda *_: self.renew(), list(COMPUTED_FROM))
         watch(lambda *_: self._ask_pixel(), ["pixel", "difference", "unit"])
         watch(lambda *_: self.on_page(self._draw_rest), ["image", "cloud_color", "viewing"])
         self.cloud.param.watch(lambda event: self.pick(event.new), "selected")
@@ -197,10 +197,7 @@ class Session:
         )
 
     def renew(self) -> None:
-        """Answer again: more has been read of what is looked at."""
-        self._ask()
-
-    def _ask(self) -> None:
+        """Answer anew: something else is asked for, or more has been read of what is looked at."""
         request = self._request()
         work = partial(compute, request, self.answer)
         self._jobs.submit(work, self._show, partial(self._failed, request))

@@ -168,8 +168,8 @@ class SignalPlots:
             axes.follow(unit, acquisition)
         for read_out in self._read_outs:
             read_out.follow(acquisition)
-        if acquisition.n_bins != self._bins.reset_end:
-            self._follow(acquisition.n_bins)
+        if cover(self._bins, acquisition.n_bins):
+            self._lay_out(acquisition.n_bins)
         signals, nothing = pixel.signals, np.full(acquisition.n_bins, np.nan)
         expected = nothing if pixel.expected is None else pixel.expected
         self.histogram.write("raw", top=signals.raw)
@@ -192,9 +192,8 @@ class SignalPlots:
         self.enhanced.write("weight", enhanced=weight)
         self._frame(self.enhanced, pixel, 0.0, signals.enhanced, weight)
 
-    def _follow(self, n_bins: int) -> None:
+    def _lay_out(self, n_bins: int) -> None:
         """Lay out the plots for another number of bins."""
-        self._bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
         edges, centres = plots.edges(n_bins), plots.centres(n_bins)
         empty = np.zeros(n_bins)
         bars = {"left": edges[:-1], "right": edges[1:], "top": empty, "bottom": empty}
@@ -229,6 +228,14 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
             if isinstance(model, getattr(bokeh.models, kind)):
                 model.update(**sizes)
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
+
+
+def cover(bins: Range1d, n_bins: int) -> bool:
+    """Let an axis show a whole gate, whatever it was zoomed to; whether that was another gate."""
+    if n_bins == bins.reset_end:
+        return False
+    bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
+    return True
 
 
 def round_up(value: float) -> float:
