@@ -19,7 +19,7 @@ from app.parts import card
 from app.session import Session
 from app.store import Answer
 from app.theme import palette
-from app.words import COMPUTING
+from app.words import COMPUTING, reason
 
 FACTS = ".fact-list { grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)) !important; }"
 STAGE = """
@@ -133,9 +133,8 @@ class Sight:
         self._jobs.submit(work, partial(self._draw, answer), self._failed)
 
     def _failed(self, error: Exception) -> None:
-        if isinstance(error, ValueError):
-            self._lack(str(error))
-        else:
+        self._lack(reason(error))
+        if not isinstance(error, ValueError):
             self._session.fail(error)
 
     def _lack(self, why: str) -> None:
