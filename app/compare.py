@@ -302,6 +302,12 @@ class Compare:
 
     def _picked(self) -> None:
         self._choose(methods=tuple(each for each in ESTIMATORS if each in self._picks.value))
+        picked = self._tasks.values()
+        self._results = {  # what failed is tried again once it is picked anew
+            task: found
+            for task, found in self._results.items()
+            if isinstance(found, Result) or task in picked
+        }
         self._is_stopped = False
         self._refresh()
 
@@ -398,7 +404,8 @@ class Compare:
         if capture is self._capture:
             if task is None:
                 failed = isinstance(outcome, Exception)
-                self._measure = Yardstick(None, None) if failed else outcome
+                why = ranking_words.no_yardstick(outcome) if failed else ""
+                self._measure = Yardstick(None, None, why) if failed else outcome
             elif isinstance(outcome, Exception):
                 self._results[task] = ranking_words.problem(outcome)
             else:
@@ -567,6 +574,7 @@ class Compare:
     def _draw_curves(
         self, answers: dict[str, Answer], pixel: tuple[int, int], curves: dict[str, Any]
     ) -> None:
+        self._session.recover()
         tasks = self._tasks
         answers = {method: each for method, each in answers.items() if method in tasks}
         if pixel != self._session.state.pixel or not answers:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 
+from app.words import cause
+
 FORMATS = {
     "png": "picture, as on screen",
     "svg": "picture, as on screen, to enlarge and edit",
@@ -39,7 +41,7 @@ def not_saved(error: Exception) -> str:
             f"choose another format, then try again. {_GOES_ON}"
         )
     if isinstance(error, ValueError):
-        return str(error)
+        return cause(error)
     return (
         f"Nothing was saved: the file could not be written ({type(error).__name__}). Try again, or "
         f"choose another format. {_GOES_ON}"

@@ -19,7 +19,7 @@ from app.parts import card, column, unrolled
 from app.session import Session
 from app.store import Answer
 from app.theme import palette
-from app.words import COMPUTING
+from app.words import COMPUTING, reason
 
 BREAK_PX = 1100
 """As `app.parts.BREAK_PX`, of this page."""
@@ -131,9 +131,8 @@ class Sight:
         self._jobs.submit(work, partial(self._draw, answer), self._failed)
 
     def _failed(self, error: Exception) -> None:
-        if isinstance(error, ValueError):
-            self._lack(str(error))
-        else:
+        self._lack(reason(error))
+        if not isinstance(error, ValueError):
             self._session.fail(error)
 
     def _lack(self, why: str) -> None:

@@ -31,7 +31,7 @@ from app.parts import card
 from app.session import Session
 from app.theme import LIGHT, RANGE_COLORS, Palette
 from app.views import Layers, paint_frame, pane_of, round_up
-from app.words import COMPUTING, number
+from app.words import NOT_COMPUTED, number
 from core.experiments import items
 from core.parameters import Number
 
@@ -140,7 +140,7 @@ def _names(item: items.Plot) -> list[str]:
 class TableCard:
     """A table with its title above and its note below."""
 
-    def __init__(self, waiting: str = COMPUTING) -> None:
+    def __init__(self, waiting: str = NOT_COMPUTED) -> None:
         self._title = pmui.Typography(waiting, variant="subtitle2", margin=(6, 8))
         self._table = Table(sizing_mode="stretch_width", margin=0)
         self._note = Sentence(sizing_mode="stretch_width", margin=(6, 8, 12, 8))
@@ -184,7 +184,7 @@ class Gallery:
             knob.param.watch(lambda _: self._mark(), "value")
         self._scale = ScaleBar()
         self._scale.pane.visible = False
-        self._note = Sentence(text=COMPUTING, sizing_mode="stretch_width", margin=(4, 0))
+        self._note = Sentence(text=NOT_COMPUTED, sizing_mode="stretch_width", margin=(4, 0))
         self.layout = pn.Column(
             self._grid, self._scale.pane, self._note, sizing_mode="stretch_width", margin=0
         )

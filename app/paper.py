@@ -20,7 +20,7 @@ from app.pages import Pages, View
 from app.session import Session
 from app.studies import Study, aside
 from app.theme import palette
-from app.words import COMPUTING
+from app.words import NOT_COMPUTED
 from core import PRESETS, Flux
 from core.experiments import items, paper
 from core.experiments.trials import Condition, Method, Results, trials
@@ -271,7 +271,7 @@ class Sliders(Generic[Settings]):
         self._words = words
         self._jobs: LatestWins[Sequence[items.Plot]] = LatestWins(session.on_page)
         across = Range1d(-0.5, 100)
-        self._cards = [CurveCard(across, COMPUTING) for _ in range(count)]
+        self._cards = [CurveCard(across, NOT_COMPUTED) for _ in range(count)]
         self._settings = settings
         self._panel = SettingsPanel(settings, self._ask)
         for card in self._cards:
@@ -288,6 +288,7 @@ class Sliders(Generic[Settings]):
         self._jobs.submit(partial(self._compute, settings), self._draw, self._session.fail)
 
     def _draw(self, plots: Sequence[items.Plot]) -> None:
+        self._session.recover()
         with pn.io.hold(self._session.page):
             for card, plot in zip(self._cards, plots, strict=True):
                 card.show(plot)
@@ -411,7 +412,7 @@ class LeftUnsaid:
         self._panel = SettingsPanel(self._settings, self._choose)
         self._study = Study(session, self._steps, "steps")
         across = Range1d(0, 100)
-        self._no_echo, self._by_place = (CurveCard(across, COMPUTING) for _ in range(2))
+        self._no_echo, self._by_place = (CurveCard(across, NOT_COMPUTED) for _ in range(2))
         self._limits, self._arithmetic = TableCard(), TableCard()
         for each in (self._no_echo, self._by_place, self._limits, self._arithmetic):
             each.offer(session, lambda: Subject(PAPER, "", (self._settings,)))

@@ -80,6 +80,8 @@ class Yardstick:
     """What physics allows; None where truth, light or number of pulses is not known."""
     likelihood: RangeImage | None
     """What answers are compared with where there is no truth."""
+    failed: str = ""
+    """Why neither could be found, where that has failed."""
 
 
 def run_task(task: Task, explored: Answer) -> Result:

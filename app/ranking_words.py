@@ -10,7 +10,7 @@ import numpy as np
 
 from app.ranking import TOLERANCES_BINS, Result, Task, Yardstick, agreement
 from app.store import Answer
-from app.words import Fact, number, share, without_folders
+from app.words import NOT_COMPUTED, Fact, cause, number, reason, share
 from core import ESTIMATORS, Capture
 
 Column = tuple[str, str, int]
@@ -114,7 +114,7 @@ def rows(
         if isinstance(result, Result):
             row["cells"] = _cells(result, measure)
         else:
-            row["message"] = result or "Not computed yet."
+            row["message"] = result or NOT_COMPUTED
         found.append(row)
     return [*found, {"name": "Physics’ limit", "last": True, **_limit_row(capture, measure)}]
 
@@ -149,9 +149,9 @@ def _cells(result: Result, measure: Yardstick | None) -> list[Cell]:
 
 def _limit_row(capture: Capture, measure: Yardstick | None) -> dict[str, Any]:
     if measure is None:
-        return {"message": "Not computed yet."}
+        return {"message": NOT_COMPUTED}
     if measure.limit is None:
-        return {"message": LIMIT_UNKNOWN}
+        return {"message": measure.failed or LIMIT_UNKNOWN}
     right, spread = measure.limit.right_bin_probability, measure.limit.cramer_rao_m
     finite = spread[np.isfinite(spread)]
     floor = math.sqrt(float(np.mean(finite**2))) if finite.size else math.nan
@@ -208,9 +208,14 @@ def progress(done: int, total: int, method: str | None) -> str:
 
 def problem(error: Exception) -> str:
     """Why a method has no answer."""
-    is_told = isinstance(error, ValueError)
-    reason = without_folders(str(error)) if is_told else type(error).__name__
-    return f"Not possible here: {reason}"
+    if isinstance(error, ValueError):
+        return f"Not possible here: {cause(error)}"
+    return f"Failed: {cause(error)}. To try again, pick the method anew."
+
+
+def no_yardstick(error: Exception) -> str:
+    """Why it is not known what all methods are measured by."""
+    return f"{reason(error)} It is tried anew with the next capture."
 
 
 def remarks(capture: Capture, answered: int, pictured: int) -> str:

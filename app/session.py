@@ -86,7 +86,7 @@ class Session:
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._loop = IOLoop.current() if self._served else None
-        self._rest_is_due = self._pixel_is_due = False
+        self._rest_is_due = self._pixel_is_due = self._has_failed = False
         self._rest_asked_s = 0.0
         self._asked_s: float | None = None
         self.answer = self._first_answer(wanted)
@@ -267,10 +267,17 @@ class Session:
         self._settle(self.answer)
         self.fail(error)
 
-    def fail(self, error: Exception) -> None:
+    def fail(self, error: Exception, told: Callable[[Exception], str] = words.failure) -> None:
         """Tell the page of an error, and stay usable."""
         log.warning("a request failed", exc_info=error)
-        self.complain(words.failure(error))
+        self._has_failed = True
+        self.complain(told(error))
+
+    def recover(self) -> None:
+        """Take back what the page was told of an error: what failed works again, or is retried."""
+        if self._has_failed:
+            self._has_failed = False
+            self.complain("")
 
     def key(self, source: Source) -> str:
         """Of a source in the catalogue."""
@@ -280,6 +287,7 @@ class Session:
         previous, self.answer = self.answer, answer
         if first or not same_view(answer.request, previous.request):
             self._enter(answer, previous)
+        self._has_failed = False
         self.complain(words.lack(answer))
         self._draw_pixel()
         if first or not self.is_served:

@@ -13,7 +13,7 @@ import panel_material_ui as pmui
 from app.controls import Sentence
 from app.jobs import LONG, InSteps, LatestWins, Step
 from app.session import Session
-from app.words import progress
+from app.words import progress, unfinished
 
 Result = TypeVar("Result")
 
@@ -80,8 +80,9 @@ class Study:
     def __init__(
         self, session: Session, steps: Callable[[], Sequence[Step[Any]]], noun: str
     ) -> None:
+        self._session = session
         self._steps = steps
-        self._work = InSteps(session.on_page, self._tell, session.fail)
+        self._work = InSteps(session.on_page, self._tell, partial(session.fail, told=unfinished))
         self._controls = WorkControls(self.start, self._work.cancel, noun)
 
     @property
@@ -91,6 +92,7 @@ class Study:
 
     def start(self) -> None:
         """Begin anew."""
+        self._session.recover()
         self._work.start(self._steps())
 
     def show(self, is_on_screen: bool) -> None:
@@ -146,6 +148,7 @@ class OnePiece(Generic[Result]):
         """Begin anew, with other work than the button's if told; what is under way ends."""
         work, page = work or self._work(), self._session
         self.cancel()
+        page.recover()
         run = self._run = _Run(is_running=True)
 
         def told(done: int, of: int) -> None:
@@ -181,7 +184,7 @@ class OnePiece(Generic[Result]):
     def _ended(self, run: _Run, error: Exception) -> None:
         if run.is_running:  # else this is what it was asked for
             self.cancel()
-            self._session.fail(error)
+            self._session.fail(error, unfinished)
 
 
 @dataclass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from concurrent.futures import BrokenExecutor
 
 import numpy as np
 
@@ -21,6 +22,8 @@ FIELD_OF_VIEW_UNKNOWN = (
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
 
 COMPUTING = "Computing …"
+
+NOT_COMPUTED = "Not computed yet."
 
 UNIT_HELP = "What axes and read-outs along the gate count in: bins, nanoseconds or metres."
 
@@ -151,14 +154,30 @@ def lack(answer: Answer) -> str:
 
 def failure(error: Exception) -> str:
     """What happened and what to do, without a traceback."""
+    shown = f"{reason(error)} The picture still shows the last settings that worked"
     if isinstance(error, ValueError):
-        return (
-            f"{without_folders(str(error))} The picture still shows the last settings that worked."
-        )
+        return f"{shown}."
+    return f"{shown}: change them back, or choose another scene."
+
+
+def unfinished(error: Exception) -> str:
+    """Why long work has ended, and what to do."""
     return (
-        f"This could not be computed ({type(error).__name__}). The picture still shows the last "
-        "settings that worked: change them back, or choose another scene."
+        f"{reason(error)} What this part shows was computed before that. Compute begins anew; if "
+        "it fails again, ask for less, or choose another scene."
     )
+
+
+def cause(error: Exception) -> str:
+    """What has gone wrong: what an error says that is meant to be read, or which kind it is."""
+    if isinstance(error, ValueError):
+        return without_folders(str(error))
+    kind = type(error).__name__
+    if isinstance(error, MemoryError):
+        return f"the server's memory does not suffice ({kind})"
+    if isinstance(error, BrokenExecutor):
+        return f"a worker of the server has ended ({kind})"
+    return kind
 
 
 def without_folders(text: str) -> str:
@@ -202,7 +221,7 @@ def progress(done: int, of: int, noun: str, is_running: bool) -> str:
 def reason(error: Exception) -> str:
     """Why something could not be computed, without a traceback."""
     named = isinstance(error, ValueError)
-    return str(error) if named else f"This could not be computed ({type(error).__name__})."
+    return cause(error) if named else f"This could not be computed: {cause(error)}."
 
 
 def source_is_gone(key: str) -> str:

@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from pkgutil import resolve_name
 
 import pytest
 
-from app import ranking_words, words
+from app import __main__ as started
+from app import download_words, ranking_words, words
+from app.address import Wanted
+from app.compare import Compare
 from app.jobs import LatestWins
-from core import CaptureError
+from app.layout import Layout, Page
+from app.paper import Jump, RangeImages, Repeated, Sliders, Trials, jump
+from app.requires import Judged, Requires
+from app.session import Session
+from app.state import Light
+from app.store import built_in_sources, scene_source
+from app.tradeoff import Acquisition, Effort, Ways
+from app.trust import Trust
+from app.uploads import Uploads
+from core import ESTIMATORS, CaptureError
+from core.experiments import paper
+from core.experiments.trials import Condition
 from tests.broken import AT_SEED, WHEN_DRAWN, WHEN_INSPECTED, WHEN_TAPPED
-from tests.browser import ROOT, serving
+from tests.browser import ROOT, eventually, serving
 from tests.load import opened
 
 
@@ -90,6 +107,203 @@ def test_where_no_worker_is_left_the_page_is_told_of_each_request():
     assert [type(each) for each in told] == [BrokenExecutor] * 3
 
 
+# -- parts of the pages, without a browser ---------------------------------------------------------
+
+FOLDER = "/srv/data/secret"
+
+RAISED = (
+    CaptureError(f"face.mat: cannot be read (OSError: [Errno 5] '{FOLDER}/face.mat'): copy it."),
+    OSError(28, "No space left on device", f"{FOLDER}/x"),
+    MemoryError(),
+    BrokenExecutor("a worker has died"),
+)
+
+
+def breaking(monkeypatch, where):
+    """What a function raises from now on, where there is something; else it works."""
+    works, raised = resolve_name(where), []
+
+    def work(*arguments, **options):
+        if raised:
+            raise raised[0]
+        return works(*arguments, **options)
+
+    monkeypatch.setattr(where, work)
+    return raised
+
+
+def check_told(sentence, error):
+    assert FOLDER not in sentence and "Traceback" not in sentence
+    told = "cannot be read (OSError: [Errno 5] 'face.mat')", type(error).__name__
+    assert any(each in sentence for each in told)
+
+
+def started_by_compute(make):
+    def build(session):
+        study = make(session)._study
+        is_under_way = re.compile(r"Done|[1-9]\d* of")
+        return study.start, lambda: is_under_way.match(study.controls[-1].text)
+
+    return build
+
+
+def moved(session):
+    part, places = Sliders(session, Jump(), "", jump, count=2), iter(range(20, 99))
+    return lambda: part._ask(Jump(onset_bin=next(places))), lambda: part._cards[1].figure
+
+
+def repeated(session):
+    plan, table = {Condition("car", 0.06): paper.COMPARED[:1]}, paper.arithmetic()
+    return Trials(session, Repeated(repetitions=2), "", lambda _: plan, lambda *_: table)
+
+
+def ways(session):
+    part = Ways(session, lambda *_: None)
+    part._effort = Effort(repetitions=2, repeats=6, merges="none")
+    return part
+
+
+def trust(session):
+    part = Trust(session)
+    part._swept = type(part._swept)(ESTIMATORS["kde"].title)
+    return part
+
+
+def requires(session):
+    part = Requires(session)
+    part._judged = Judged(repetitions=2)
+    return part
+
+
+PARTS = {
+    "core.experiments.paper.figure_1": moved,
+    "app.paper.trials": started_by_compute(repeated),
+    "core.experiments.paper.figure_8": started_by_compute(RangeImages),
+    "app.tradeoff.study": started_by_compute(ways),
+    "app.tradeoff.acquired": started_by_compute(Acquisition),
+    "app.requires.requirements": started_by_compute(requires),
+    "app.trust.setting_sweep": started_by_compute(trust),
+}
+
+
+def few_pixels():
+    return {"uniform": scene_source("Few pixels", "uniform", size=8)}
+
+
+@pytest.fixture
+def session():
+    return Session(few_pixels())
+
+
+@pytest.mark.parametrize("where", PARTS)
+def test_work_of_a_page_that_fails_is_told_and_the_next_works(where, monkeypatch, session):
+    raised, told = breaking(monkeypatch, where), []
+    session.complain = told.append
+    raised[:] = [RAISED[0]]
+    act, goes_on = PARTS[where](session)
+    for error in RAISED:
+        raised[:], before = [error], len(told)
+        act()
+        eventually(lambda before=before: len(told) > before and told[-1])
+        check_told(told[-1], error)
+        assert "Compute" in told[-1] or "The picture still shows" in told[-1]
+        assert not goes_on()
+    raised.clear()
+    act()
+    eventually(goes_on)
+    eventually(lambda: told[-1] == "")
+
+
+def messages(page):
+    return {row["name"]: row.get("message", "") for row in page._table.rows}
+
+
+@pytest.mark.parametrize("error", RAISED, ids=lambda error: type(error).__name__)
+def test_a_method_that_fails_is_told_and_works_once_it_is_picked_anew(error, monkeypatch, session):
+    raised, name = breaking(monkeypatch, "app.compare.run_task"), ESTIMATORS["peak"].title
+    raised[:] = [error]
+    session.state.comparison = replace(session.state.comparison, methods=("peak",))
+    page = Compare(session)
+    page.view.show(True)
+    eventually(lambda: page._measure is not None)
+    check_told(messages(page)[name], error)
+    raised.clear()
+    page._picks.value = []
+    page._picks.value = ["peak"]
+    eventually(lambda: len(page._answers()) == 1)
+    eventually(lambda: messages(page)[name] == "")
+
+
+def test_a_limit_that_fails_is_told_and_is_not_called_unknown(monkeypatch, session):
+    raised = breaking(monkeypatch, "app.compare.yardstick")
+    raised[:] = RAISED[2:]
+    session.state.comparison = replace(session.state.comparison, methods=("peak",))
+    page = Compare(session)
+    session.announce = page.view.follow
+    page.view.show(True)
+    eventually(lambda: page._measure is not None)
+    check_told(messages(page)["Physics’ limit"], raised[0])
+    raised.clear()
+    session.state.light = Light(seed=1)
+    eventually(lambda: page._measure is not None and page._measure.limit is not None)
+    eventually(lambda: messages(page)["Physics’ limit"] == "")
+
+
+def test_curves_that_fail_are_told_and_those_of_the_next_pixel_are_drawn(monkeypatch, session):
+    raised, told = breaking(monkeypatch, "app.compare.score_curves"), []
+    session.complain = told.append
+    session.state.comparison = replace(session.state.comparison, methods=("peak",))
+    page = Compare(session)
+    page.view.show(True)
+    eventually(lambda: page._measure is not None)
+    for error in RAISED:
+        raised[:], before = [error], len(told)
+        page._ask_curves()
+        eventually(lambda before=before: len(told) > before and told[-1])
+        check_told(told[-1], error)
+    raised.clear()
+    session.choose_pixel(1, 2)
+    eventually(lambda: told[-1] == "")
+
+
+def test_what_is_typed_in_vain_is_told_and_the_next_reading_works():
+    layout = Layout({"sample": built_in_sources()["sample"]})
+    width, alert = layout._reading["bin_width_s"], layout._alert
+    width.value = "<b>wide</b>"
+    layout._read_again()
+    assert "bin_width_s = '<b>wide</b>' is not accepted: give" in alert.text
+    width.value = "-2e-9"
+    layout._read_again()
+    eventually(lambda: "bin_width_s = -2e-09" in alert.text)
+    width.value = "2e-9"
+    layout._read_again()
+    eventually(lambda: alert.text == "")
+    assert layout.session.answer.capture.acquisition.bin_width_s == 2e-9
+
+
+def test_an_address_that_asks_for_an_unreadable_file_names_no_folder(monkeypatch):
+    raised, wanted = breaking(monkeypatch, "app.session.compute"), Wanted({"seed": "3"})
+    for error in RAISED:
+        raised[:] = [error]
+        with pytest.raises(type(error)):
+            Session(few_pixels(), wanted)
+        check_told(wanted.refused.pop(), error)
+
+
+# -- a page that cannot be built -------------------------------------------------------------------
+
+
+def test_a_page_that_cannot_be_built_says_so_and_the_log_says_why(monkeypatch, caplog):
+    raised = breaking(monkeypatch, "app.__main__.build_page")
+    for error in RAISED:
+        raised[:] = [error]
+        page = started.page_for(few_pixels(), Uploads())
+        assert (page.text, page.warning) == (words.NO_PAGE, True)
+        assert caplog.records[-1].exc_info[1] is error
+    raised.clear()
+    assert isinstance(started.page_for(few_pixels(), Uploads()), Page)
+
+
 def test_files_have_names_and_no_folders():
     for path, name in (
         ("/srv/data/secret/face.mat", "face.mat"),
@@ -99,6 +313,13 @@ def test_files_have_names_and_no_folders():
         told = f"it.mat: cannot be read ({path}: 3.5 counts/s, 1/2/3, m/s): give another"
         kept = f"it.mat: cannot be read ({name}: 3.5 counts/s, 1/2/3, m/s): give another"
         assert words.without_folders(told) == kept
-        for say in (words.failure, ranking_words.problem):
+        for say in (
+            words.failure,
+            words.reason,
+            words.unfinished,
+            ranking_words.problem,
+            ranking_words.no_yardstick,
+            download_words.not_saved,
+        ):
             assert "/srv" not in say(CaptureError(told))
             assert "/srv" not in say(OSError(told))

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from playwright.sync_api import expect
 
 from app.state import Light, Reading
 from app.uploads import Bounds, Uploads, harmless
 from core import Acquisition, Capture, save_capture
+from tests.browser import serving
 
 
 class Session:
@@ -32,10 +34,13 @@ def held(folder: Path) -> list[str]:
 
 @pytest.fixture
 def content(tmp_path_factory):
-    path = tmp_path_factory.mktemp("made") / "small.npz"
+    return saved(tmp_path_factory.mktemp("made") / "small.npz").read_bytes()
+
+
+def saved(path: Path, source: str = "made") -> Path:
     cube = np.random.default_rng(3).poisson(5, (4, 6, 37)).astype(np.uint16)
-    save_capture(Capture(cube, Acquisition(37, 2e-9, 1e-6, None, 1e-3), source="made"), path)
-    return path.read_bytes()
+    save_capture(Capture(cube, Acquisition(37, 2e-9, 1e-6, None, 1e-3), source=source), path)
+    return path
 
 
 def test_a_file_is_there_for_who_has_its_key_until_the_last_one_leaves(folder, content):
@@ -138,3 +143,46 @@ def test_a_full_disk_leaves_nothing_behind(folder, content, monkeypatch):
 )
 def test_a_name_from_outside_keeps_only_harmless_letters(name, kept):
     assert harmless(name) == kept
+
+
+# -- in a browser ----------------------------------------------------------------------------------
+
+GIVEN = """<img src=x onerror=window.broken=1>"'.. &lt;b&gt;*.npz"""
+UPLOADED = """..<svg onload=window.broken=1>"'.npz"""
+TOLD = "<img src=x onerror=window.broken=1>*_told_*"
+
+
+def check_harmless(page):
+    assert page.evaluate("window.broken") is None
+    assert page.locator("img[src=x], [onload], [onerror]").count() == 0
+    assert page.title() == "firstphoton"
+
+
+@pytest.mark.browser
+def test_the_names_of_files_are_text_on_every_page(page, tmp_path):
+    path = saved(tmp_path / GIVEN, source=TOLD)
+    with serving(path) as address:
+        new = page(address)
+        source = new.get_by_role("combobox", name=re.compile("^Scene or capture"))
+        for shown in ("Explore", "Compare", "Trade-off", "Paper", "Inspect"):
+            button = new.get_by_role("button", name=shown, exact=True)
+            button.click()
+            expect(button).to_have_attribute("aria-pressed", "true")
+            new.wait_for_function("Bokeh.documents[0].is_idle")
+            check_harmless(new)
+        expect(source).to_have_text(GIVEN)
+        expect(new.get_by_text("4 × 6 pixels, 37 bins")).to_contain_text(TOLD)
+        source.click()
+        expect(new.get_by_role("menuitem", name=GIVEN, exact=True)).to_be_visible()
+        check_harmless(new)
+        new.keyboard.press("Escape")
+        for content, names in (
+            (path.read_bytes(), source),
+            (b"no capture", new.get_by_role("alert")),
+        ):
+            file = {"name": UPLOADED, "mimeType": "application/octet-stream", "buffer": content}
+            new.locator("input[type=file]").set_input_files(file)
+            expect(new.get_by_role("button", name=UPLOADED, exact=True)).to_be_visible()
+            expect(names.filter(has_text=harmless(UPLOADED))).to_be_visible()
+            check_harmless(new)
+        new.context.close()  # before it misses its server
