@@ -7,8 +7,8 @@ BIN := $(VENV)/bin
 
 # Tests of what has kernels run as plain Python, too: there their lines count as covered, and an index
 # out of bounds is an error.
-KERNELS := blocks capture commands detection estimators inspection matlab more_estimators posterior \
-	reductions simulate spatial speed tracking windows
+KERNELS := blocks capture detection estimators inspection matlab more_estimators posterior \
+	reductions simulate spatial speed tracking
 
 .PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration field large fuzz clean
 

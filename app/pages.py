@@ -99,20 +99,26 @@ class Pages:
 
     def _go(self, old: str, new: str) -> None:
         with pn.io.hold(pn.state.curdoc):
-            self._built[old].show(False)
-            self.mains[old].visible = self.asides[old].visible = False
-            self._open(new)
+            if old in self._built:
+                self._built[old].show(False)
+                self.mains[old].visible = self.asides[old].visible = False
+            try:
+                self._open(new)
+            except Exception:
+                self.choice.value = old  # which is opened again
+                raise
 
     def _open(self, name: str) -> None:
-        if name not in self._built:
-            view = self._built[name] = self._builders[name]()
+        if name in self._built:
+            self._built[name].show(True)
+        else:
+            view = self._builders[name]()
             view.paint(self._dark)
             # First what is shown, then where: the browser gets the page in one piece.
             view.show(True)
             self.mains[name].extend(_several(view.main))
             self.asides[name].extend(_several(view.aside))
-        else:
-            self._built[name].show(True)
+            self._built[name] = view
         self.mains[name].visible = self.asides[name].visible = True
 
 

@@ -8,6 +8,7 @@ from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from pkgutil import resolve_name
 
+import panel as pn
 import pytest
 
 from app import __main__ as started
@@ -16,6 +17,7 @@ from app.address import Wanted
 from app.compare import Compare
 from app.jobs import LatestWins
 from app.layout import Layout, Page
+from app.pages import Pages, View
 from app.paper import Jump, RangeImages, Repeated, Sliders, Trials, jump
 from app.requires import Judged, Requires
 from app.session import Session
@@ -323,3 +325,22 @@ def test_files_have_names_and_no_folders():
         ):
             assert "/srv" not in say(CaptureError(told))
             assert "/srv" not in say(OSError(told))
+
+
+def test_a_page_that_cannot_be_built_leaves_the_one_that_is_open():
+    broken = True
+
+    def build():
+        if broken:
+            raise OSError(28, "No space left on device")
+        return View(pn.pane.Str("there"), [])
+
+    pages = Pages({"first": lambda: View([], []), "second": build})
+    with pytest.raises(OSError, match="No space"):
+        pages.choice.value = "second"
+    assert pages.choice.value == "first"
+    assert [pages.mains[name].visible for name in ("first", "second")] == [True, False]
+    broken = False
+    pages.choice.value = "second"
+    assert [pages.mains[name].visible for name in ("first", "second")] == [False, True]
+    assert len(pages.mains["second"]) == 1
