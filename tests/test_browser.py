@@ -389,6 +389,34 @@ def test_values_that_a_hand_has_overtaken_are_not_sent(car_page):
     assert car_page.evaluate("told") == 2  # the first and the last
 
 
+COUNT_LOOKUPS = """() => {
+  window.lookups = { same: 0, other: 0, ofPlots: 0 };
+  const text = Object.getOwnPropertyDescriptor(Node.prototype, "textContent");
+  Object.defineProperty(Node.prototype, "textContent", {
+    ...text,
+    set(value) {
+      const isSheet = this.localName === "style";
+      if (isSheet) lookups[text.get.call(this) === value ? "same" : "other"]++;
+      text.set.call(this, value);
+    },
+  });
+  const look = CSSStyleDeclaration.prototype.getPropertyValue;
+  CSSStyleDeclaration.prototype.getPropertyValue = function (name) {
+    if (name.startsWith("--bk-")) lookups.ofPlots++;
+    return look.call(this, name);
+  };
+}"""
+
+
+def test_a_stroke_makes_the_browser_look_up_no_style_anew(car_page):
+    before = look(car_page)
+    car_page.evaluate(COUNT_LOOKUPS)
+    slider(car_page, "SBR").press("ArrowRight")
+    eventually(changed(car_page, before))
+    lookups = car_page.evaluate("lookups")
+    assert lookups["same"] == lookups["ofPlots"] == 0
+
+
 def test_typed_values_are_taken_or_refused_with_a_sentence(car_page):
     enter(car_page, "SBR", "99")
     refusal = car_page.get_by_role("alert").filter(has_text="99 is not possible here")

@@ -17,6 +17,8 @@ import numpy as np
 from tornado.httpclient import AsyncHTTPClient, HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
+from tests.browser import ROOT
+
 LARGEST_MESSAGE = 2**30
 
 READY = {
@@ -30,8 +32,9 @@ READY = {
 }
 """What a page says once it is drawn; until then the server keeps what it has to tell."""
 
-LONGEST_PAUSE_S = 0.25
-"""As in `app/bokeh.js`."""
+RULES = (ROOT / "app" / "bokeh.js").read_text("utf-8")
+LONGEST_PAUSE_S = int(re.findall(r"const LONGEST_PAUSE_MS = (\d+);", RULES)[0]) / 1000
+"""The browser's own."""
 
 Model = dict[str, Any]
 
