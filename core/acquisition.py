@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from numbers import Integral
 from typing import Literal
 
@@ -175,12 +175,7 @@ class Pulse:
 
     def quantile_s(self, share: float) -> float:
         """Time after time zero by which `share` of the photons, in (0, 1), have arrived."""
-        high = len(self.samples) + 40.0
-        low = -high
-        for _ in range(64):  # halvings: less is left than between two floats
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if self.cdf(middle * self.tau_s) > share else (middle, high)
-        return self.tau_s * high
+        return self.tau_s * _quantile(replace(self, tau_s=1.0), share)
 
     def taps(
         self, n_bins: int, bin_width_s: float, delay_bin: ArrayLike = 0.0
@@ -242,6 +237,17 @@ class Pulse:
             Sums to at most 1: what falls outside the gate is missing.
         """
         return np.diff(self.cumulative(onset_bin, n_bins, bin_width_s), axis=-1)
+
+
+@lru_cache(maxsize=256)
+def _quantile(pulse: Pulse, share: float) -> float:
+    """`Pulse.quantile_s` in time constants; every capture of a session asks for the same few."""
+    high = len(pulse.samples) + 40.0
+    low = -high
+    for _ in range(64):  # halvings: less is left than between two floats
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if pulse.cdf(middle) > share else (middle, high)
+    return high
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,6 @@ _SPREAD = 200.0  # the strongest level over the faintest
 _SAMPLE = 512  # pixels from which the light is estimated
 _STEPS = 100  # of expectation and maximisation
 _DEPTH_STEPS = 30
-_SMOOTHING_BINS = 2.0
 _ALIKE = 0.1  # share of the surfaces of which nothing is learned
 _MISSED = 2.0  # log likelihood that faint levels must be worth to be kept
 _TOO_FEW = 3  # unfired pulses, of which the logarithm is chance
@@ -377,7 +376,7 @@ def _shares(evidence: Floats) -> Floats:
     likelihood = np.exp(evidence - evidence.max(axis=1, keepdims=True))
     share = np.full(n_levels, 1 / n_levels)
     for _ in range(_STEPS):  # expectation and maximisation (Laird 1978)
-        share = share * (likelihood / (likelihood @ share)[:, np.newaxis]).sum(axis=0)
+        share = share * ((1 / (likelihood @ share)) @ likelihood)
         share[0] += 1.0
         share /= n_pixels + 1.0
     least = np.log(likelihood @ share).sum() - _MISSED
@@ -417,13 +416,23 @@ def _shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Flo
 
 
 def _smoothed(density: Floats) -> Floats:
-    """Convolved with a Gaussian of `_SMOOTHING_BINS`; beyond its ends a density stays as it is.
+    """Convolved with a Gaussian of `_SMOOTHING`; beyond its ends a density stays as it is.
 
     (As `scipy.ndimage.gaussian_filter1d` does it, which takes a quarter of a second to load.)
     """
-    reach = round(4 * _SMOOTHING_BINS)
-    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING_BINS) ** 2)
-    return np.convolve(np.pad(density, reach, mode="edge"), weight / weight.sum(), mode="valid")
+    reach, last = _SMOOTHING.size // 2, density.size - 1
+    within = np.clip(np.arange(-reach, last + reach + 1), 0, last)
+    return np.convolve(density[within], _SMOOTHING, mode="valid")
+
+
+def _gaussian(sigma: float) -> Floats:
+    """Samples up to four sigmas from the centre, which add up to 1."""
+    reach = round(4 * sigma)
+    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return np.asarray(weight / weight.sum())
+
+
+_SMOOTHING = _gaussian(2.0)  # bins
 
 
 @once_per_capture
