@@ -23,6 +23,7 @@ from tornado.netutil import bind_sockets
 
 import core
 from app import latency, words
+from app.collector import COLLECTOR
 from app.connection import LINGER_S, serving_options
 from app.controls import Sentence
 from app.layout import build_page
@@ -101,6 +102,7 @@ def main(arguments: list[str] | None = None) -> int:
     core.warm_up()
     latency.tune()
     keep_tracebacks()
+    COLLECTOR.spare()
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
     if chosen.show:

@@ -16,8 +16,8 @@ from typing import Any
 from urllib.parse import urlencode
 
 import param
-from panel.custom import JSComponent
 
+from app.component import Component
 from app.state import Reading, State
 from core.checks import require
 
@@ -35,7 +35,7 @@ REST_MS = 250
 """The address follows when nothing has changed for so long: a slider under way has better to do."""
 
 
-class AddressBar(JSComponent):
+class AddressBar(Component):
     """Keeps the address of the page, in place: nothing is loaded anew, no history grows."""
 
     query = param.String(default="", doc="What follows the question mark.")

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import panel as pn
 import param
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
+from app.component import Component
 from app.theme import WRONG_COLOR, palette
 from core.cloud import points_m
 
@@ -129,7 +129,7 @@ def _dense_ranges(ranges: Floats) -> tuple[float, float]:
     return float(edges[dense[0]]), float(edges[dense[-1] + 1])
 
 
-class PointCloud(pn.custom.JSComponent):
+class PointCloud(Component):
     """Draw a point cloud in the browser.
 
     Call `draw` to show a cloud; all of it travels in one message and is painted in one frame. The

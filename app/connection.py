@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import param
-from panel.custom import JSComponent
 
+from app.component import Component
 from core.checks import require
 
 LINGER_S = 180
@@ -37,7 +37,7 @@ def serving_options(linger_s: float = LINGER_S) -> dict[str, Any]:
     }
 
 
-class Connection(JSComponent):
+class Connection(Component):
     """Watches the connection of a page.
 
     While it is lost a dialog covers the page, for what would be chosen meanwhile would be lost.

@@ -10,14 +10,15 @@ from typing import Any, ClassVar, Generic, TypeVar
 import panel as pn
 import panel_material_ui as pmui
 import param
-from panel.custom import Child, JSComponent
+from panel.custom import Child
 
+from app.component import Component
 from core.parameters import Number, joint_doubts, spec_of
 
 Settings = TypeVar("Settings")
 
 
-class Knob(JSComponent):
+class Knob(Component):
     """A number with a slider, a field to type in, its unit, a line of help and a reset.
 
     Values with which answers are in doubt are marked on the slider; while one of them is set, a
@@ -117,7 +118,9 @@ class SettingsPanel(Generic[Settings]):
         self._silent = True
         try:
             for name, control in self.controls.items():
-                control.value = getattr(settings, name)
+                value = getattr(settings, name)
+                if control.value != value:  # which costs less than to set it in vain
+                    control.value = value
         finally:
             self._silent = False
         self._settle(settings)
@@ -136,7 +139,7 @@ class SettingsPanel(Generic[Settings]):
         self.doubts.text = " ".join(joint_doubts(settings))
 
 
-class Facts(JSComponent):
+class Facts(Component):
     """A list of named values; updating it costs the page no new layout."""
 
     facts = param.List(default=[], doc="Name, value and one line of help, each a string.")
@@ -146,7 +149,7 @@ class Facts(JSComponent):
     _stylesheets: ClassVar = [Path(__file__).with_name("facts.css")]
 
 
-class Table(JSComponent):
+class Table(Component):
     """A table of numbers; its column headers are buttons that sort the rows."""
 
     title = param.String(default="", doc="What a screen reader says of the table.")
@@ -164,7 +167,7 @@ class Table(JSComponent):
     _stylesheets: ClassVar = [Path(__file__).with_name("table.css")]
 
 
-class Sentence(JSComponent):
+class Sentence(Component):
     """Text, shown letter by letter: nothing of it, a file's name say, becomes part of the page."""
 
     text = param.String(default="")
@@ -199,7 +202,7 @@ class Sentence(JSComponent):
     ]
 
 
-class Viewport(JSComponent):
+class Viewport(Component):
     """How wide the page is; nothing is to be seen of it."""
 
     narrow = param.Boolean(default=False, doc="Whether that is as narrow as a phone.")
@@ -212,7 +215,7 @@ class Viewport(JSComponent):
     """
 
 
-class Chips(JSComponent):
+class Chips(Component):
     """Small labels, each with a colour, a button of its text, and one that removes it."""
 
     label = param.String(default="", doc="What a screen reader says of them.")
@@ -224,7 +227,7 @@ class Chips(JSComponent):
     _stylesheets: ClassVar = [Path(__file__).with_name("chips.css")]
 
 
-class PixelKeys(JSComponent):
+class PixelKeys(Component):
     """Holds a picture that takes the keyboard: arrow keys move the pixel, with Shift by eight.
 
     Without a picture it gives the keyboard to the column in which it stands. Plots that come to a

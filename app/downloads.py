@@ -11,7 +11,6 @@ import logging
 import re
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -20,11 +19,11 @@ from typing import IO, Any, BinaryIO, cast
 
 import panel as pn
 import param
-from panel.custom import JSComponent
 
 from app import download_words as words
+from app.component import Component
 from app.exports import Write, cloud_files, image_files, plot_file
-from app.jobs import LatestWins
+from app.jobs import LatestWins, Places
 from app.looks import Look, color_values, image_of
 from app.session import Session
 from app.store import Answer, Request
@@ -33,7 +32,7 @@ from core.parameters import spec_of
 log = logging.getLogger(__name__)
 
 # Few at a time, for all sessions together: a large file takes much memory, and waits for no slider.
-_WRITERS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="firstphoton-files")
+_WRITERS = Places(2, "firstphoton-files")
 
 PIECE_BYTES = 2**20
 """What travels at once: other messages of the page pass in between."""
@@ -153,7 +152,7 @@ class Shown:
     scale: Look | None = None
 
 
-class Download(JSComponent):
+class Download(Component):
     """The button of a card; see `downloadable`."""
 
     what = param.String(doc="What a screen reader says the card shows.")

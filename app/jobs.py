@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from threading import Lock
@@ -11,12 +12,60 @@ from typing import Any, Generic, TypeVar
 
 Result = TypeVar("Result")
 
+Act = Callable[[], None]
+Failed = Callable[[Exception], None]
+
+
+class Places:
+    """Threads, each taken from the beginning of a request until its answer is about to be drawn.
+
+    Were a thread free again while its answer waits for the page's thread, answers to all sessions
+    would queue up there, each of them older when it is drawn than what its session asks by then.
+
+    Parameters
+    ----------
+    number : int
+    name : str
+        Of the threads.
+    """
+
+    def __init__(self, number: int, name: str) -> None:
+        self._threads = ThreadPoolExecutor(number, name)
+        self._lock = Lock()
+        self._free = number
+        self._waiting: deque[tuple[Act, Failed]] = deque()
+
+    def ask(self, begin: Act, failed: Failed) -> None:
+        """Have `begin` run on a thread once there is a place, or `failed` where it cannot."""
+        with self._lock:
+            if self._free == 0:
+                self._waiting.append((begin, failed))
+                return
+            self._free -= 1
+        self._begin(begin, failed)
+
+    def leave(self) -> None:
+        """Give up a place that was taken, to whoever has waited longest."""
+        with self._lock:
+            if not self._waiting:
+                self._free += 1
+                return
+            following = self._waiting.popleft()
+        self._begin(*following)
+
+    def _begin(self, begin: Act, failed: Failed) -> None:
+        try:
+            self._threads.submit(begin)
+        except Exception as error:  # no thread can be had
+            failed(error)
+
+
 # A session has one request under way; a file being read does not hold up the others. Kernels that
 # use all cores take turns by a lock of their own.
-_WORKERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="firstphoton")
+_PLACES = Places(4, "firstphoton")
 
 # Where studies wait for each other, and nobody's slider for them.
-LONG = ThreadPoolExecutor(max_workers=2, thread_name_prefix="firstphoton-long")
+LONG = Places(2, "firstphoton-long")
 
 
 class LatestWins(Generic[Result]):
@@ -25,70 +74,69 @@ class LatestWins(Generic[Result]):
     Parameters
     ----------
     on_page : callable
-        Runs a function on the session's page thread, soon.
-    workers : Executor
+        Runs its first argument on the session's page thread, soon, unless the page is gone. When it
+        comes to that it first runs its second argument, in any case and on whatever thread.
+    places : Places
         Shared with all sessions.
     """
 
-    def __init__(
-        self, on_page: Callable[[Callable[[], None]], None], workers: Executor = _WORKERS
-    ) -> None:
+    def __init__(self, on_page: Callable[[Act, Act], None], places: Places = _PLACES) -> None:
         self._on_page = on_page
-        self._workers = workers
+        self._places = places
         self._lock = Lock()
-        self._waiting: Callable[[], None] | None = None
-        self._busy = False
+        self._newest: tuple[Callable[[], Any], Callable[[Any], None], Failed] | None = None
+        self._is_busy = False
 
     def submit(
-        self,
-        work: Callable[[], Result],
-        done: Callable[[Result], None],
-        failed: Callable[[Exception], None],
+        self, work: Callable[[], Result], done: Callable[[Result], None], failed: Failed
     ) -> None:
-        """Run `work` on the worker, then `done` or `failed` on the page.
+        """Run `work` on a thread, then `done` or `failed` on the page.
 
         A request that has not started when the next one comes is dropped. The next one starts after
         `done` has drawn the last: neither computed nor drawn answers queue up.
         """
-
-        def attempt() -> None:
-            try:
-                outcome = partial(done, work())
-            except Exception as error:  # whatever it is, the page must tell it
-                outcome = partial(failed, error)
-            except BaseException as error:  # as a library may raise that ends the program
-                outcome = partial(failed, RuntimeError(f"{type(error).__name__}: {error}"))
-            self._on_page(partial(self._finish, outcome, failed))
-
-        def begin() -> None:
-            try:
-                self._workers.submit(attempt)
-            except Exception as error:  # no thread, or no worker is left
-                self._on_page(partial(self._finish, partial(failed, error), failed))
-
         with self._lock:
-            if self._busy:
-                self._waiting = begin
+            self._newest = work, done, failed
+            if self._is_busy:
                 return
-            self._busy = True
-        begin()
+            self._is_busy = True
+        self._places.ask(self._attempt, self._refuse)
 
     @property
     def has_more(self) -> bool:
         """Whether another request waits for its turn."""
-        return self._waiting is not None
+        return self._newest is not None
 
-    def _finish(self, draw: Callable[[], None], failed: Callable[[Exception], None]) -> None:
+    def _take(self) -> tuple[Callable[[], Any], Callable[[Any], None], Failed]:
+        with self._lock:
+            newest, self._newest = self._newest, None
+        assert newest is not None
+        return newest
+
+    def _attempt(self) -> None:
+        work, done, failed = self._take()
+        try:
+            outcome = partial(done, work())
+        except Exception as error:  # whatever it is, the page must tell it
+            outcome = partial(failed, error)
+        except BaseException as error:  # as a library may raise that ends the program
+            outcome = partial(failed, RuntimeError(f"{type(error).__name__}: {error}"))
+        self._on_page(partial(self._finish, outcome, failed), self._places.leave)
+
+    def _refuse(self, error: Exception) -> None:
+        *_, failed = self._take()
+        self._on_page(partial(self._finish, partial(failed, error), failed), self._places.leave)
+
+    def _finish(self, draw: Act, failed: Failed) -> None:
         try:
             draw()
         except Exception as error:  # an answer that cannot be drawn is told like one that is none
             failed(error)
         finally:
             with self._lock:
-                following, self._waiting = self._waiting, None
-                self._busy = following is not None
-            if following is not None:
-                following()
+                self._is_busy = self._newest is not None
+            if self._is_busy:
+                self._places.ask(self._attempt, self._refuse)
 
 
 @dataclass(frozen=True)
@@ -109,7 +157,7 @@ class InSteps:
     Parameters
     ----------
     on_page : callable
-        Runs a function on the session's page thread, soon.
+        As for `LatestWins`.
     told : callable
         Called when something of the following has changed.
     failed : callable
@@ -125,9 +173,9 @@ class InSteps:
 
     def __init__(
         self,
-        on_page: Callable[[Callable[[], None]], None],
-        told: Callable[[], None],
-        failed: Callable[[Exception], None],
+        on_page: Callable[[Act, Act], None],
+        told: Act,
+        failed: Failed,
     ) -> None:
         self._jobs: LatestWins[Any] = LatestWins(on_page, LONG)
         self._told = told

@@ -10,9 +10,12 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from collections.abc import Collection, Sequence
 from contextlib import suppress
+from importlib import import_module
 from typing import Any
 
+from bokeh.core.serialization import Deserializer, Serializer
 from bokeh.protocol.message import Message
 from bokeh.server.views.ws import WSHandler
 from bokeh.settings import settings
@@ -36,6 +39,52 @@ def tune() -> None:
     # Else each array that is sent has them look for it in the environment.
     settings.simple_ids.set_value(True)
     sys.setswitchinterval(SWITCH_S)
+    # The modules themselves: of their names the packages speak as of what is in them.
+    vars(import_module("bokeh.protocol.messages.patch_doc"))["Serializer"] = QuickSerializer
+    vars(import_module("bokeh.document.document"))["Deserializer"] = QuickDeserializer
+
+
+class QuickSerializer(Serializer):
+    """Asks a model for its reference when it is needed: a page has hundreds."""
+
+    def __init__(self, *, references: Collection[Any] = (), **options: Any) -> None:
+        super().__init__(**options)
+        self._known = dict(zip(map(id, references), references, strict=True))
+
+    def has_ref(self, obj: Any) -> bool:
+        """Whether the page knows a model, or is told of it in this message."""
+        return id(obj) in self._known or super().has_ref(obj)
+
+    def get_ref(self, obj: Any) -> Any:
+        """What names a model, or None."""
+        known = self._known.get(id(obj))
+        return super().get_ref(obj) if known is None else known.ref
+
+
+class QuickDeserializer(Deserializer):
+    """Looks for a model when a message names it: a page has hundreds."""
+
+    def __init__(self, references: Sequence[Any] = (), **options: Any) -> None:
+        super().__init__((), **options)
+        self._before = references
+        if references:
+            self._references = _Named(references[0].document.models)
+
+    def has_ref(self, obj: Any) -> bool:
+        """Whether a model was there before, or was made by this message."""
+        return obj in self._before or super().has_ref(obj)
+
+
+class _Named(dict[str, Any]):
+    """Models by their names: those that are put in here, and all of a document."""
+
+    def __init__(self, models: Any) -> None:
+        super().__init__()
+        self._models = models
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The model of a name; of a document's if there is none in here."""
+        return self[name] if name in self else self._models.get_by_id(name)
 
 
 def _open_without_delay(open_: Any) -> Any:

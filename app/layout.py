@@ -14,6 +14,7 @@ from panel_material_ui.template.base import Meta
 
 from app import words
 from app.address import AddressBar, Wanted
+from app.collector import COLLECTOR
 from app.compare import Compare
 from app.connection import Connection
 from app.controls import Sentence, SettingsPanel, Viewport
@@ -168,12 +169,10 @@ class Layout:
             sizing_mode="stretch_width",
             margin=(4, 8),
         )
-        self._light = SettingsPanel(Light(), lambda new: state.param.update(light=new))
-        self._viewing = SettingsPanel(Viewing(), lambda new: state.param.update(viewing=new))
-        self._tracking = SettingsPanel(
-            TrackingParameters(), lambda new: state.param.update(tracking=new)
-        )
-        self._less = SettingsPanel(Less(), lambda new: state.param.update(less=new))
+        self._light = SettingsPanel(Light(), partial(setattr, state, "light"))
+        self._viewing = SettingsPanel(Viewing(), partial(setattr, state, "viewing"))
+        self._tracking = SettingsPanel(TrackingParameters(), partial(setattr, state, "tracking"))
+        self._less = SettingsPanel(Less(), partial(setattr, state, "less"))
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
@@ -227,7 +226,7 @@ class Layout:
         session = self.session
         self._address.follow(session.state, session.query, session.later)
         session.announce, session.complain = self._announce, self._complain
-        session.waiting = lambda is_waiting: self._progress.param.update(visible=is_waiting)
+        session.waiting = partial(setattr, self._progress, "visible")
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._file.param.watch(lambda event: self._upload(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
@@ -236,6 +235,7 @@ class Layout:
         if session.is_served:
             # On a phone the controls would cover what they control.
             pn.state.onload(lambda: self.page.param.update(sidebar_open=not self._viewport.narrow))
+            pn.state.onload(COLLECTOR.spare)
             pn.state.on_session_destroyed(lambda _: self._forget())
             pn.config.exception_handler = session.fail  # of this session alone
 
@@ -349,6 +349,7 @@ class Layout:
         """Let go of what a closed page would leave behind."""
         pn.config._session_config.pop(self.session.page, None)
         self._uploads.leave(self)
+        COLLECTOR.page_is_gone()
 
     # Where everything stands
 

@@ -86,7 +86,7 @@ class Session:
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._loop = IOLoop.current() if self._served else None
-        self._rest_is_due = self._pixel_is_due = self._has_failed = False
+        self._rest_is_due = self._pixel_is_due = self._has_failed = self._is_waiting = False
         self._rest_asked_s = 0.0
         self._asked_s: float | None = None
         self.answer = self._first_answer(wanted)
@@ -211,27 +211,41 @@ class Session:
     def _admit_waiting(self) -> None:
         """Show that an answer is under way, if the oldest open request is that old."""
         if self._asked_s is not None and perf_counter() - self._asked_s >= 0.9e-3 * WAIT_MS:
+            self._is_waiting = True
             self.waiting(True)
+
+    def _end_waiting(self) -> None:
+        """Show no more that an answer is under way, unless the next one is asked for already."""
+        if self._asked_s is None and self._is_waiting:
+            self._is_waiting = False
+            self.waiting(False)
 
     def _settle(self, answer: Answer) -> None:
         self._asked_s = None
         if self._jobs.has_more:
             self._await()
-        else:
-            self.waiting(False)
+        elif self._is_waiting:
+            self.later(self._end_waiting, WAIT_MS)
         self.announce(answer)
 
-    def on_page(self, act: Callable[[], None]) -> None:
-        """Do something on the page's thread, in turn with other pages, if it is still there."""
+    def on_page(self, act: Callable[[], None], due: Callable[[], None] | None = None) -> None:
+        """Do something on the page's thread, in turn with other pages, if it is still there.
+
+        What was computed gives up its place by `due`, which is called when its turn has come, even
+        if the page is gone.
+        """
+        give_up = due or (lambda: None)
         if self._loop is None:
+            give_up()
             act()
             return
 
         def begin() -> None:
+            give_up()
             if self.is_served:  # else the page is gone, and nobody left to see it
                 self.page.add_next_tick_callback(self._told(act))
 
-        self._loop.add_callback(TURNS.ask, begin)
+        self._loop.add_callback(TURNS.ask, begin, is_computed=due is not None)
 
     def later(self, act: Callable[[], None], after_ms: int) -> None:
         """Do something on the page's thread, after a while; its failure is told like any other."""
@@ -288,15 +302,16 @@ class Session:
         if first or not same_view(answer.request, previous.request):
             self._enter(answer, previous)
         self._has_failed = False
-        self.complain(words.lack(answer))
-        self._draw_pixel()
+        with pn.io.hold(self.page):  # all that follows from it arrives at once
+            self.complain(words.lack(answer))
+            self._draw_pixel()
+            self._settle(answer)
         if first or not self.is_served:
             self._draw_rest()
         elif not self._rest_is_due:
             self._rest_is_due = True
             self._rest_asked_s = perf_counter()
             self.later(self._ask_rest, REST_MS)
-        self._settle(answer)
 
     def _enter(self, answer: Answer, previous: Answer) -> None:
         """Come to a capture of another kind: its own field of view, camera and, maybe, pixel."""

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import param
-from panel.custom import JSComponent
+
+from app.component import Component
 
 
-class TakeAway(JSComponent):
+class TakeAway(Component):
     """Buttons for a script, which a dialog shows, and for the link of the page.
 
     Parameters

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from dataclasses import asdict, fields, replace
 from queue import SimpleQueue
 
@@ -23,16 +21,9 @@ from app.views import ImageView, Plot, SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
+from tests.threads import queued
 
 NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
-
-
-def until(condition):
-    """Wait for the worker's thread."""
-    limit = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.005)
 
 
 def ask(source="car", **chosen):
@@ -250,86 +241,6 @@ def test_every_built_in_source_gives_an_answer(key):
 def test_sources_have_names_of_their_own():
     titles = [source.title for source in built_in_sources().values()]
     assert len(set(titles)) == len(titles)
-
-
-# -- off the page's thread -------------------------------------------------------------------------
-
-
-class Desk:
-    """Requests that wait for a word, and what became of them."""
-
-    def __init__(self, on_page=lambda act: act()):
-        self.jobs = LatestWins(on_page)
-        self.ran, self.done, self.failed = [], [], []
-        self.go = threading.Event()
-
-    def submit(self, name):
-        def work():
-            self.ran.append(name)
-            assert self.go.wait(20)
-            return name
-
-        self.jobs.submit(work, self.done.append, self.failed.append)
-
-
-def test_the_latest_request_wins_and_the_overtaken_never_run():
-    desk = Desk()
-    for name in range(5):
-        desk.submit(name)
-    desk.go.set()
-    until(lambda: 4 in desk.done)
-    assert desk.ran == desk.done == [0, 4]
-
-
-def test_nothing_is_computed_ahead_of_a_page_that_is_still_drawing():
-    waiting_to_be_drawn = []
-    desk = Desk(on_page=waiting_to_be_drawn.append)
-    desk.go.set()
-    desk.submit("first")
-    until(lambda: waiting_to_be_drawn)
-    for name in ("second", "third"):
-        desk.submit(name)
-    time.sleep(0.05)
-    assert desk.ran == ["first"]
-    waiting_to_be_drawn.pop()()
-    until(lambda: waiting_to_be_drawn)
-    waiting_to_be_drawn.pop()()
-    assert desk.ran == desk.done == ["first", "third"]
-
-
-def test_a_failure_is_told_and_the_next_request_runs():
-    desk = Desk()
-    desk.go.set()
-    desk.jobs.submit(lambda: 1 / 0, desk.done.append, desk.failed.append)
-    until(lambda: desk.failed)
-    assert isinstance(desk.failed[0], ZeroDivisionError)
-    desk.submit("next")
-    until(lambda: desk.done == ["next"])
-
-
-def test_an_answer_that_cannot_be_drawn_is_told_and_does_not_stop_the_next():
-    drawings = []
-    desk = Desk(on_page=drawings.append)
-    desk.go.set()
-    desk.jobs.submit(lambda: 0, lambda _: 1 / 0, desk.failed.append)
-    desk.submit("next")
-    until(lambda: drawings)
-    drawings.pop()()
-    assert isinstance(desk.failed[0], ZeroDivisionError)
-    until(lambda: drawings)
-    drawings.pop()()
-    assert desk.done == ["next"]
-
-
-def test_a_slow_request_of_one_session_holds_up_no_other():
-    slow, quick = Desk(), Desk()
-    slow.submit("slow")
-    quick.go.set()
-    quick.submit("quick")
-    until(lambda: quick.done)
-    assert not slow.done
-    slow.go.set()
-    until(lambda: slow.done)
 
 
 # -- colours ---------------------------------------------------------------------------------------
@@ -666,7 +577,7 @@ def test_showing_settings_reports_nothing():
 def layout(monkeypatch):
     """A page; what is to be done on its thread waits for `next_answer`."""
     acts = SimpleQueue()
-    monkeypatch.setattr("app.session.LatestWins", lambda on_page: LatestWins(acts.put))
+    monkeypatch.setattr("app.session.LatestWins", lambda on_page: LatestWins(queued(acts.put)))
     page = Layout(built_in_sources())
     page.acts, page.heard, tell = acts, [""], page.session.complain
     page.session.complain = lambda sentence: (page.heard.append(sentence), tell(sentence))

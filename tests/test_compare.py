@@ -22,6 +22,7 @@ from app.store import Request, built_in_sources, compute
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
 from tests.browser import eventually, fact
+from tests.threads import queued
 
 # -- what is computed ------------------------------------------------------------------------------
 
@@ -142,7 +143,9 @@ class Stage:
     def __init__(self, monkeypatch):
         self.acts = SimpleQueue()
         for room in ("session", "compare"):
-            monkeypatch.setattr(f"app.{room}.LatestWins", lambda _: LatestWins(self.acts.put))
+            monkeypatch.setattr(
+                f"app.{room}.LatestWins", lambda _: LatestWins(queued(self.acts.put))
+            )
         self.layout = Layout(built_in_sources())
         self.session = self.layout.session
         self.page = Compare(self.session)

@@ -15,7 +15,7 @@ from app import __main__ as started
 from app import download_words, ranking_words, words
 from app.address import Wanted
 from app.compare import Compare
-from app.jobs import LatestWins
+from app.jobs import LatestWins, Places
 from app.layout import Layout, Page
 from app.pages import Pages, View
 from app.paper import Jump, RangeImages, Repeated, Sliders, Trials, jump
@@ -32,6 +32,7 @@ from core.experiments.trials import Condition
 from tests.broken import AT_SEED, WHEN_DRAWN, WHEN_INSPECTED, WHEN_TAPPED
 from tests.browser import ROOT, eventually, serving
 from tests.load import opened
+from tests.threads import at_once
 
 
 @pytest.fixture(scope="module")
@@ -94,16 +95,13 @@ def test_a_callback_that_fails_is_told_and_the_next_works(broken):
         assert str(ROOT) not in said
 
 
-class Dead(ThreadPoolExecutor):
-    """Workers of which none is left."""
+def test_where_no_thread_can_be_had_the_page_is_told_of_each_request(monkeypatch):
+    def refuse(*_):
+        raise BrokenExecutor("no thread can be had")
 
-    def submit(self, *_):
-        raise BrokenExecutor("no worker is left")
-
-
-def test_where_no_worker_is_left_the_page_is_told_of_each_request():
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", refuse)
     told = []
-    jobs = LatestWins(lambda act: act(), Dead())
+    jobs = LatestWins(at_once, Places(1, "dead"))
     for _ in range(3):
         jobs.submit(lambda: 1, told.append, told.append)
     assert [type(each) for each in told] == [BrokenExecutor] * 3

@@ -30,6 +30,7 @@ from core.posterior import lighting_of
 from core.readers.labelled import dataset
 from tests.browser import fact, serving
 from tests.test_app import ask, complaint, control, next_answer, told
+from tests.threads import queued
 
 ROWS, COLS, CHUNK = 96, 128, 16
 PIECES = ROWS * COLS // CHUNK**2
@@ -220,7 +221,10 @@ def test_other_bounds_are_refused(text):
 def looking(path, monkeypatch):
     """A page on a large file; what is to be done on its thread waits for `next_answer`."""
     acts = SimpleQueue()
-    monkeypatch.setattr("app.session.Session.on_page", lambda _, act: acts.put(act))
+    put = queued(acts.put)
+    monkeypatch.setattr(
+        "app.session.Session.on_page", lambda _, act, due=lambda: None: put(act, due)
+    )
     on_explore = Wanted({"page": "Explore"})
     page = Layout({"file": file_source(path)} | built_in_sources(), on_explore)
     page.acts, page.heard, tell = acts, [""], page.session.complain

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from contextvars import ContextVar
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from app.turns import MESSAGES_FIRST, Turns
 from tests.browser import serving
 from tests.load import Bounds, Growth, Load, as_markdown, growth, load, server_mb, verdicts
 
@@ -48,58 +46,3 @@ def test_a_bound_that_is_missed_is_told():
         found = verdicts(*broken, bounds)
         assert sum(not reached for *_, reached in found) == 1
         assert as_markdown(found).count("missed") == 1
-
-
-async def when_all_had_their_turn(turns):
-    while turns.is_crowded:
-        await asyncio.sleep(0)
-    await asyncio.sleep(0)
-
-
-def test_turns_are_taken_in_order_and_messages_come_in_between():
-    async def queue():
-        turns, done = Turns(), []
-
-        async def message():
-            while len(done) < 4 * MESSAGES_FIRST:
-                done.append(" ")
-                await asyncio.sleep(0)
-
-        messages = asyncio.ensure_future(message())
-        for name in "abc":
-            turns.ask(lambda name=name: done.append(name))
-        assert turns.is_crowded
-        await messages
-        return "".join(done)
-
-    assert asyncio.run(queue()).split() == ["a", "b", "c"]
-
-
-def test_each_turn_begins_in_the_context_of_who_asked():
-    who = ContextVar("who")
-
-    async def queue():
-        turns, done = Turns(), []
-        for name in "abc":
-            who.set(name)
-            turns.ask(lambda: done.append(who.get()))
-        await when_all_had_their_turn(turns)
-        return done
-
-    assert asyncio.run(queue()) == ["a", "b", "c"]
-
-
-def test_a_turn_that_fails_does_not_hold_up_the_next():
-    async def queue():
-        turns, done = Turns(), []
-        asyncio.get_running_loop().set_exception_handler(lambda _, told: done.append(told))
-        turns.ask(lambda: 1 / 0)
-        turns.ask(lambda: done.append("second"))
-        await when_all_had_their_turn(turns)
-        turns.ask(lambda: done.append("third"))
-        await when_all_had_their_turn(turns)
-        return done
-
-    told, *done = asyncio.run(queue())
-    assert isinstance(told["exception"], ZeroDivisionError)
-    assert done == ["second", "third"]

@@ -25,6 +25,7 @@ from core import PRESETS, Flux
 from core.experiments import items, paper
 from core.experiments.trials import Condition, trials
 from tests.browser import eventually
+from tests.threads import at_once
 
 SOON_MS = 20_000
 
@@ -38,7 +39,7 @@ class Told:
     def __init__(self, count=3, fails_at=None):
         self.gate, self.drawn, self.failures = threading.Semaphore(0), [], []
         self.begun = 0
-        self.work = InSteps(lambda act: act(), lambda: None, self.failures.append)
+        self.work = InSteps(at_once, lambda: None, self.failures.append)
         self.steps = [
             Step(lambda k=k: self._do(k, fails_at), self.drawn.append) for k in range(count)
         ]

@@ -1,0 +1,120 @@
+"""What is done in the place of Panel and Bokeh gives what they give."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from bokeh.core.serialization import Deserializer, Serializer
+from bokeh.document import Document
+from bokeh.models import ColumnDataSource, Range1d
+from bokeh.plotting import figure
+
+from app.component import Component
+from app.controls import Knob, PixelKeys
+from app.latency import QuickDeserializer, QuickSerializer
+
+# -- components ------------------------------------------------------------------------------------
+
+
+def shown(component):
+    """A component's model in a page of its own."""
+    component.server_doc(Document())
+    ((model, _),) = component._models.values()
+    return model
+
+
+@pytest.fixture
+def knob():
+    return Knob(label="l", value=0.5, low=0.0, high=1.0)
+
+
+def test_a_value_goes_to_the_page_and_no_other_does(knob):
+    model = shown(knob)
+    before = model.data.properties_with_values()
+    knob.value = 0.25
+    knob.param.update(high=2.0, label="L")
+    after = model.data.properties_with_values()
+    changed = {name: after[name] for name in after if after[name] != before[name]}
+    assert changed == {"value": 0.25, "high": 2.0, "label": "L"}
+
+
+def test_a_value_comes_from_the_page_and_is_not_sent_back(knob):
+    model, heard, changes = shown(knob), [], []
+    knob.param.watch(lambda event: heard.append(event.new), "value")
+    model.data.on_change("value", lambda _name, _old, new: changes.append(new))
+    model.data.value = 0.75
+    assert knob.value == 0.75
+    assert heard == changes == [0.75]
+
+
+def test_what_is_made_of_a_value_from_the_page_is_sent(knob):
+    model = shown(knob)
+    knob.param.watch(lambda event: setattr(knob, "value", round(event.new, 1)), "value")
+    model.data.value = 0.777
+    assert knob.value == model.data.value == 0.8
+
+
+def test_what_is_no_value_of_its_own_goes_as_panel_has_it(knob):
+    model = shown(knob)
+    knob.param.update(visible=False, value=0.1)
+    assert not model.visible
+    assert model.data.value == 0.1
+
+
+def test_a_child_is_no_plain_value():
+    assert PixelKeys._are_plain({"pixel": [1, 2], "shape": [3, 3]})
+    assert not PixelKeys._are_plain({"child": None})
+    assert not Component._are_plain({"visible": True})
+
+
+# -- messages --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def document():
+    made = Document()
+    plot = figure()
+    plot.line("x", "y", source=ColumnDataSource({"x": np.arange(3.0), "y": np.ones(3)}))
+    made.add_root(plot)
+    return made
+
+
+def test_a_message_names_known_models_and_spells_out_new_ones(document):
+    (plot,) = document.roots
+    known, new = plot.x_range, Range1d(0, 5)
+    told = [known, new, [known, {"a": plot.y_range}], np.arange(2.0)]
+    written = []
+    for serializer in (Serializer, QuickSerializer):
+        made = serializer(references=set(document.models))
+        written.append(made.encode(told))
+        assert made.has_ref(known)
+        assert made.has_ref(new)
+        assert not made.has_ref(Range1d())
+        assert len(made.buffers) == 1
+    theirs, ours = (json.dumps(each, default=lambda _: "buffer") for each in written)
+    assert ours == theirs
+    assert written[1][0] == known.ref
+
+
+def test_a_message_finds_known_models_and_makes_new_ones(document):
+    (plot,) = document.roots
+    new = Range1d(0, 5)
+    told = json.loads(json.dumps(Serializer(references={plot}).encode([plot, new, new])))
+    for deserializer in (Deserializer, QuickDeserializer):
+        made = deserializer(list(document.models), setter=None)
+        found, range_, again = made.decode(told)
+        assert found is plot
+        assert range_ is again
+        assert (range_.start, range_.end) == (0, 5)
+        assert made.has_ref(plot)
+        assert made.has_ref(range_)
+        assert not made.has_ref(Range1d())
+
+
+def test_a_model_that_comes_to_the_document_later_was_not_known(document):
+    made = QuickDeserializer(list(document.models))
+    later = Range1d()
+    document.add_root(later)
+    assert not made.has_ref(later)
