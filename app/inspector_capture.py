@@ -120,7 +120,7 @@ class Whole:
         counts = partial(answer.capture.cube.sum, axis=(0, 1))
         self._count_jobs.submit(counts, partial(self._draw_counts, answer), fail)
         report = partial(inspection.capture_report, answer.capture)
-        self._jobs.submit(report, partial(self._arrived, answer), fail)
+        self._jobs.submit(report, partial(self._arrived, answer), self._unknown)
         request = answer.request
         studied = (answer.whole, replace(request.less, pulses=1.0), request.tracking)
         if self._studied is not None and studied != self._studied:
@@ -206,6 +206,19 @@ class Whole:
         if answer is self._session.answer:
             self._report, self._reported = report, answer
             self._draw()
+
+    def _unknown(self, error: Exception) -> None:
+        """Say no longer what was known of another capture, and tell why."""
+        self._report = self._reported = None
+        with pn.io.hold(self._session.page):
+            self._facts.facts = []
+            for sentence in (self._light, *self._advice):
+                sentence.text = ""
+            for each in self._apply:
+                each.disabled = True
+            self._counts.source("window").data = {"left": [], "right": []}
+            self._counts.source("suggested").data = {"x": [], "y": []}
+        self._session.fail(error)
 
     def _draw(self) -> None:
         answer, report = self._reported, self._report

@@ -373,12 +373,10 @@ def main(arguments: list[str] | None = None) -> int:
     )
     chosen = parser.parse_args(arguments)
 
-    async def measure(address: str) -> tuple[Load, Growth]:
-        used = await load(address, server_mb(), chosen.sessions, chosen.seconds)
-        return used, await growth(address, server_mb(), chosen.interactions)
-
     with serving() as address:
-        used, grown = asyncio.run(measure(address))
+        used = asyncio.run(load(address, server_mb(), chosen.sessions, chosen.seconds))
+    with serving() as address:  # another: what many sessions left would hide what one adds
+        grown = asyncio.run(growth(address, server_mb(), chosen.interactions))
     found = verdicts(used, grown, Bounds())
     print(as_markdown(found))
     for trouble in sorted({*used.troubles, *grown.troubles}):

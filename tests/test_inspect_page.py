@@ -373,6 +373,29 @@ def test_the_capture_is_reported_and_suggestions_apply(facade):
     assert facade.state.tracking.t_n == part._report.suggestion.t_n
 
 
+def test_what_is_no_longer_known_of_a_capture_is_taken_back(facade, monkeypatch):
+    part, told = Whole(facade), []
+    facade.complain = told.append
+    part.view.show(True)
+    part._study._work.cancel()
+    eventually(lambda: part._facts.facts)
+
+    def fail(_capture):
+        raise MemoryError("no more")
+
+    monkeypatch.setattr("core.inspection.capture_report", fail)
+    facade.state.less = Less(merge=2)
+    eventually(lambda: facade.answer.request.less.merge == 2)
+    part._follow()
+    eventually(lambda: any(told))
+    assert "MemoryError" in " ".join(told)
+    assert part._facts.facts == []
+    assert {sentence.text for sentence in (part._light, *part._advice)} == {""}
+    assert all(each.disabled for each in part._apply)
+    part._apply_gate()
+    assert facade.answer.request.less == Less(merge=2)
+
+
 def test_a_gate_is_applied_to_what_is_left_of_the_whole(facade):
     facade.state.less = Less(merge=2, gate_from=0.1)
     eventually(lambda: facade.answer.request.less.merge == 2)

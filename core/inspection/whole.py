@@ -30,8 +30,6 @@ class Suggestion:
     why_gate: str
     t_n: int
     """First bin in which the tracking residual may peak, in bins of the whole gate."""
-    t_n_in_gate: int
-    """The same once the gate is cut, in bins of the window."""
     why_t_n: str
 
 
@@ -109,7 +107,7 @@ def suggestion(capture: Capture) -> Suggestion:
     if echoes is None:
         why = f"Fewer than {_FEWEST} answers are confident: where echoes lie is not known."
         t_n = min(_MARGIN_BINS, n_bins - 1)
-        return Suggestion((0, n_bins), why, t_n, t_n, f"{why} The differentiators need {t_n} bins.")
+        return Suggestion((0, n_bins), why, t_n, f"{why} The differentiators need {t_n} bins.")
     lag = lag_bins(capture, "tracking", TrackingParameters())
     echo, tap = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
     between = f"in bins {echoes.first:.0f} to {echoes.last:.0f}"
@@ -129,6 +127,5 @@ def suggestion(capture: Capture) -> Suggestion:
         (first, end),
         why,
         t_n,
-        max(t_n - first, 0),
         f"{where}: what peaks more than {TOLERANCE_BINS} bins before them is noise.",
     )
