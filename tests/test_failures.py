@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
+import signal
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from pkgutil import resolve_name
@@ -342,3 +344,21 @@ def test_a_page_that_cannot_be_built_leaves_the_one_that_is_open():
     pages.choice.value = "second"
     assert [pages.mains[name].visible for name in ("first", "second")] == [False, True]
     assert len(pages.mains["second"]) == 1
+
+
+def killed(_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_is_killed_is_told_and_the_next_works(monkeypatch, session):
+    told = []
+    session.complain = told.append
+    start, goes_on = started_by_compute(ways)(session)
+    with monkeypatch.context() as patched:
+        patched.setattr("core.experiments.tradeoff.held_bytes", killed)
+        start()
+        eventually(lambda: told and "BrokenProcessPool" in told[-1])
+    assert "Compute begins anew" in told[-1]
+    start()
+    eventually(lambda: goes_on() and goes_on()[0] == "Done")
+    assert told[-1] == ""

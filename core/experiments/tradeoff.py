@@ -35,6 +35,7 @@ from core.experiments.trials import (
     Method,
     Score,
     Summary,
+    apart,
     as_they_come,
     compared,
     computed,
@@ -184,8 +185,8 @@ class Point:
     light_s : tuple of float
         To find that light in the reduced capture, which is done once for each capture.
     peak_bytes : int
-        Most that numpy held at once to reduce and range, beyond the capture itself. What kernels
-        hold within is not seen: some kilobytes a thread.
+        Most that was held at once to reduce and range, beyond the capture itself, in a process of
+        one thread.
     note : str
         What to know of these errors.
     """
@@ -324,7 +325,9 @@ def study(
         Rounds of timing, at least `FEWEST_REPEATS`, in each of which every candidate of a source
         has its turn.
     processes : int
-        That share the scoring. Times are taken afterwards, in this one alone.
+        That share the scoring. Memory is measured in a process of its own in any case, so a script
+        that calls this needs its ``if __name__ == "__main__"``. Times are taken afterwards, in this
+        process alone.
     progress : callable
         ``(images ranged, images in all)``.
     cancelled : callable
@@ -366,13 +369,18 @@ def study(
     for piece, found in computed(scored, pieces, processes):
         scores[piece.place, piece.seed] = found
         told(len(piece.candidates))
+    peaks: dict[int, list[int]] = {}
+    firsts = [piece for piece in pieces if piece.seed == seeds[0]]
+    for piece, held in apart(held_bytes, firsts):
+        peaks[piece.place] = held
+        told(len(piece.candidates))
     points = []
     for place, (source, ways) in enumerate(known):
         per_seed = [found for (at, _), found in sorted(scores.items()) if at == place]
-        costs = _costs(_drawn(source, seeds[0]), ways, repeats, told)
-        for i, (candidate, cost) in enumerate(zip(ways, costs, strict=True)):
+        times = _times(_Untouched(_drawn(source, seeds[0]), ways), ways, repeats, told)
+        for i, (candidate, taken) in enumerate(zip(ways, times, strict=True)):
             each = tuple(score for found in per_seed for score in found[i])
-            points.append(_point(source, candidate, each, cost))
+            points.append(_point(source, candidate, each, taken, peaks[place][i]))
     return points
 
 
@@ -460,48 +468,74 @@ def scored(piece: Piece) -> list[list[Score]]:
     return scores
 
 
-class _Cost(NamedTuple):
-    """What a candidate takes."""
+class _Untouched:
+    """A capture of which nothing has been found but its light, however it is reduced."""
+
+    def __init__(self, capture: Capture, ways: Sequence[Candidate]) -> None:
+        self._capture = replace(capture)
+        self._reduced = {
+            each.reduction: each.reduction.of(copy.copy(self._capture)) for each in ways
+        }
+        self._lights = {way: light_of(copy.copy(less)) for way, less in self._reduced.items()}
+
+    def range(self, candidate: Candidate) -> None:
+        """Reduce and range it."""
+        less = candidate.reduction.of(copy.copy(self._capture))
+        light_of.tell(less, self._lights[candidate.reduction])
+        candidate.answer(less, self._capture.shape)
+
+    def light(self, reduction: Reduction) -> None:
+        """Find the light of the reduced capture again."""
+        light_of(copy.copy(self._reduced[reduction]))
+
+
+def held_bytes(piece: Piece) -> list[int]:
+    """Most bytes that each candidate holds at once; for a process in which nothing else goes on.
+
+    The trace is that of a whole process, and stopping it can crash one in which kernels allocate
+    meanwhile (python/cpython#128679).
+    """
+    untouched = _Untouched(_drawn(piece.source, piece.seed), piece.candidates)
+    held = []
+    for each in piece.candidates:
+        untouched.range(each)  # what is loaded or compiled for it is not its own
+        tracemalloc.start()
+        untouched.range(each)
+        held.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    return held
+
+
+class _Times(NamedTuple):
+    """What a candidate takes, round by round."""
 
     seconds: Floats
     light_s: Floats
-    peak_bytes: int
 
 
-def _costs(
-    capture: Capture, ways: Sequence[Candidate], repeats: int, told: Callable[[int], None]
-) -> list[_Cost]:
-    """Time candidates in turn, each on a capture of which nothing has been found but its light."""
-    untouched = replace(capture)
-    reduced = {each.reduction: each.reduction.of(copy.copy(untouched)) for each in ways}
-    lights = {reduction: light_of(copy.copy(less)) for reduction, less in reduced.items()}
-
-    def ranged(candidate: Candidate) -> None:
-        less = candidate.reduction.of(copy.copy(untouched))
-        light_of.tell(less, lights[candidate.reduction])
-        candidate.answer(less, capture.shape)
-
-    def lit(reduction: Reduction) -> None:
-        light_of(copy.copy(reduced[reduction]))
-
+def _times(
+    untouched: _Untouched, ways: Sequence[Candidate], repeats: int, told: Callable[[int], None]
+) -> list[_Times]:
+    """Time candidates in turn."""
+    lights = dict.fromkeys(each.reduction for each in ways)
     calls: dict[str, Callable[[], object]] = {
         "told": partial(told, len(ways)),  # once a round, within nobody's time
-        **{f"light, {reduction}": partial(lit, reduction) for reduction in lights},
-        **{f"{i}": partial(ranged, each) for i, each in enumerate(ways)},
+        **{f"light, {reduction}": partial(untouched.light, reduction) for reduction in lights},
+        **{f"{i}": partial(untouched.range, each) for i, each in enumerate(ways)},
     }
     seconds = interleaved(calls, repeats)
-    costs = []
-    for i, each in enumerate(ways):
-        told(1)
-        tracemalloc.start()
-        ranged(each)
-        peak_bytes = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        costs.append(_Cost(seconds[f"{i}"], seconds[f"light, {each.reduction}"], peak_bytes))
-    return costs
+    return [
+        _Times(seconds[f"{i}"], seconds[f"light, {each.reduction}"]) for i, each in enumerate(ways)
+    ]
 
 
-def _point(source: Source, candidate: Candidate, scores: tuple[Score, ...], cost: _Cost) -> Point:
+def _point(
+    source: Source,
+    candidate: Candidate,
+    scores: tuple[Score, ...],
+    times: _Times,
+    peak_bytes: int,
+) -> Point:
     if isinstance(source, Simulation):
         name, rows_cols, note = source.name, np.shape(source.scene.range_m), source.note
         sbr, signal = source.flux.sbr, source.flux.signal
@@ -516,8 +550,8 @@ def _point(source: Source, candidate: Candidate, scores: tuple[Score, ...], cost
         (rows_cols[0], rows_cols[1], source.acquisition.n_bins),
         candidate,
         scores,
-        tuple(cost.seconds.tolist()),
-        tuple(cost.light_s.tolist()),
-        cost.peak_bytes,
+        tuple(times.seconds.tolist()),
+        tuple(times.light_s.tolist()),
+        peak_bytes,
         note,
     )

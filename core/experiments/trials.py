@@ -223,8 +223,14 @@ def computed(
 ) -> Iterator[tuple[Piece, Found]]:
     """Do pieces of work, each as soon as a process is free; `work` is a module's own function."""
     if processes == 1:
-        yield from ((piece, work(piece)) for piece in pieces)
-        return
+        return ((piece, work(piece)) for piece in pieces)
+    return apart(work, pieces, processes)
+
+
+def apart(
+    work: Callable[[Piece], Found], pieces: Sequence[Piece], processes: int = 1
+) -> Iterator[tuple[Piece, Found]]:
+    """The same in processes of their own in any case, of one thread each."""
     # Forked processes would inherit the state of kernels' threads without the threads.
     pool = ProcessPoolExecutor(
         processes,

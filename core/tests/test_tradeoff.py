@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import pickle
+import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -222,6 +223,15 @@ def test_a_study_measures_what_it_is_given(stairs: Simulation) -> None:
     # Every fourth pixel of 2 x 2 tiles answers for all four.
     assert points[5].rd().value > 0.9
     assert pickle.loads(pickle.dumps(points))[2].rd() == points[2].rd()
+
+
+@pytest.mark.compiled
+def test_memory_is_not_measured_where_others_compute(
+    stairs: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tracemalloc, "start", lambda: pytest.fail("traced in this process"))
+    first, second = study([(stairs, WAYS[:2])], seeds=(5, 6), repeats=6)
+    assert min(first.peak_bytes, second.peak_bytes) > 16**2 * 8
 
 
 @pytest.mark.compiled
