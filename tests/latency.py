@@ -66,6 +66,7 @@ observe(CanvasRenderingContext2D.prototype, strokes);
 observe(WebGL2RenderingContext.prototype, ["drawArrays", "drawElements"]);
 """
 
+ANSWERED = "watch.paints.some(([, part]) => part === 'plots')"
 PAINTED = "watch.paints.length ? watch.paints.at(-1)[0] : null"
 
 
@@ -110,7 +111,8 @@ def _moves(page: Page, control: Locator, count: int) -> list[Move]:
     taken = []
     for n in range(count):
         control.press("ArrowRight" if n // 10 % 2 else "ArrowLeft")
-        page.wait_for_timeout(500)
+        page.wait_for_function(ANSWERED)
+        page.wait_for_timeout(500)  # for what is drawn after them
         watch = page.evaluate("watch")
         plots = max(at for at, part in watch["paints"] if part == "plots")
         everything = max(at for at, _ in watch["paints"])
