@@ -22,8 +22,7 @@ import panel as pn
 from tornado.netutil import bind_sockets
 
 import core
-from app import latency, words
-from app.collector import COLLECTOR
+from app import collector, latency, words
 from app.connection import LINGER_S, serving_options
 from app.controls import Sentence
 from app.layout import build_page
@@ -102,7 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
     core.warm_up()
     latency.tune()
     keep_tracebacks()
-    COLLECTOR.spare()
+    collector.spare()
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
     if chosen.show:

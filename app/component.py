@@ -8,8 +8,6 @@ from typing import Any
 import param
 from panel.custom import Child, JSComponent
 from panel.io import hold
-from panel.io.state import state
-from param.parameterized import _syncing
 
 
 class Component(JSComponent):
@@ -22,32 +20,23 @@ class Component(JSComponent):
 
     def _update_properties(self, *events: Any, doc: Any) -> dict[str, Any]:
         values = {event.name: event.new for event in events}
-        if not self._are_plain(values):
-            return super()._update_properties(*events, doc=doc)
-        told = self._in_process__events.get(doc, {})  # by the page itself
-        return {n: value for n, value in values.items() if n not in told or value != told[n]}
+        return values if self._are_plain(values) else super()._update_properties(*events, doc=doc)
 
     def _update_model(
         self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any
     ) -> None:
         if self._are_plain(msg):
             with hold(doc):
-                model.data.update(**msg)
+                model.data.update(**msg)  # what comes from there is no news to it
         else:
             super()._update_model(events, msg, root, model, doc, comm)
 
     def _process_events(self, events: dict[str, Any]) -> None:
-        if not self._are_plain(events):
+        if self._are_plain(events):
+            for name, value in events.items():
+                setattr(self, name, value)  # `param.update` would copy all other values first
+        else:
             super()._process_events(events)
-            return
-        page = state.curdoc
-        self._in_process__events[page] = events
-        try:
-            with _syncing(self, list(events)):
-                for name, value in events.items():
-                    setattr(self, name, value)  # `param.update` would copy all other values first
-        finally:
-            self._in_process__events.pop(page, None)
 
     @classmethod
     def _are_plain(cls, values: dict[str, Any]) -> bool:

@@ -14,6 +14,8 @@ Result = TypeVar("Result")
 
 Act = Callable[[], None]
 Failed = Callable[[Exception], None]
+Asked = tuple[Callable[[], Any], Callable[[Any], None], Failed]
+"""Work, what draws its outcome, and what tells of a failure."""
 
 
 class Places:
@@ -84,7 +86,7 @@ class LatestWins(Generic[Result]):
         self._on_page = on_page
         self._places = places
         self._lock = Lock()
-        self._newest: tuple[Callable[[], Any], Callable[[Any], None], Failed] | None = None
+        self._newest: Asked | None = None
         self._is_busy = False
 
     def submit(
@@ -107,7 +109,7 @@ class LatestWins(Generic[Result]):
         """Whether another request waits for its turn."""
         return self._newest is not None
 
-    def _take(self) -> tuple[Callable[[], Any], Callable[[Any], None], Failed]:
+    def _take(self) -> Asked:
         with self._lock:
             newest, self._newest = self._newest, None
         assert newest is not None

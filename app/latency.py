@@ -22,6 +22,8 @@ from bokeh.settings import settings
 from panel.reactive import Syncable
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
+from app.collector import collect_all
+
 DEBOUNCE_MS = 4
 """Panel collects property changes for 50 ms. So short a time suits callbacks as short as ours,
 which hand the work to `app.jobs`; under slow ones it would build a backlog."""
@@ -39,9 +41,9 @@ def tune() -> None:
     # Else each array that is sent has them look for it in the environment.
     settings.simple_ids.set_value(True)
     sys.setswitchinterval(SWITCH_S)
-    # The modules themselves: of their names the packages speak as of what is in them.
-    vars(import_module("bokeh.protocol.messages.patch_doc"))["Serializer"] = QuickSerializer
-    vars(import_module("bokeh.document.document"))["Deserializer"] = QuickDeserializer
+    for (module, name), ours in REPLACED.items():
+        # Not as an attribute: of some modules' names their packages speak as of what is in them.
+        vars(import_module(module))[name] = ours
 
 
 class QuickSerializer(Serializer):
@@ -85,6 +87,15 @@ class _Named(dict[str, Any]):
     def get(self, name: str, default: Any = None) -> Any:
         """The model of a name; of a document's if there is none in here."""
         return self[name] if name in self else self._models.get_by_id(name)
+
+
+REPLACED: dict[tuple[str, str], Any] = {
+    ("bokeh.protocol.messages.patch_doc", "Serializer"): QuickSerializer,
+    ("bokeh.document.document", "Deserializer"): QuickDeserializer,
+    # What Panel calls a while after pages are gone.
+    ("panel.io.document", "_garbage_collect"): collect_all,
+}
+"""What stands in the place of which name of which module."""
 
 
 def _open_without_delay(open_: Any) -> Any:

@@ -12,9 +12,8 @@ import panel_material_ui as pmui
 from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
-from app import words
+from app import collector, words
 from app.address import AddressBar, Wanted
-from app.collector import COLLECTOR
 from app.compare import Compare
 from app.connection import Connection
 from app.controls import Sentence, SettingsPanel, Viewport
@@ -235,7 +234,7 @@ class Layout:
         if session.is_served:
             # On a phone the controls would cover what they control.
             pn.state.onload(lambda: self.page.param.update(sidebar_open=not self._viewport.narrow))
-            pn.state.onload(COLLECTOR.spare)
+            pn.state.onload(collector.spare)
             pn.state.on_session_destroyed(lambda _: self._forget())
             pn.config.exception_handler = session.fail  # of this session alone
 
@@ -349,7 +348,6 @@ class Layout:
         """Let go of what a closed page would leave behind."""
         pn.config._session_config.pop(self.session.page, None)
         self._uploads.leave(self)
-        COLLECTOR.page_is_gone()
 
     # Where everything stands
 

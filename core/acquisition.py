@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from numbers import Integral
 from typing import Literal
@@ -175,7 +175,7 @@ class Pulse:
 
     def quantile_s(self, share: float) -> float:
         """Time after time zero by which `share` of the photons, in (0, 1), have arrived."""
-        return self.tau_s * _quantile(replace(self, tau_s=1.0), share)
+        return _quantile_s(self, share)
 
     def taps(
         self, n_bins: int, bin_width_s: float, delay_bin: ArrayLike = 0.0
@@ -240,14 +240,14 @@ class Pulse:
 
 
 @lru_cache(maxsize=256)
-def _quantile(pulse: Pulse, share: float) -> float:
-    """`Pulse.quantile_s` in time constants; every capture of a session asks for the same few."""
+def _quantile_s(pulse: Pulse, share: float) -> float:
+    """As `Pulse.quantile_s`, found once: every capture of a session asks for the same few."""
     high = len(pulse.samples) + 40.0
     low = -high
     for _ in range(64):  # halvings: less is left than between two floats
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if pulse.cdf(middle) > share else (middle, high)
-    return high
+        low, high = (low, middle) if pulse.cdf(middle * pulse.tau_s) > share else (middle, high)
+    return pulse.tau_s * high
 
 
 @dataclass(frozen=True)

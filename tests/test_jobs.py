@@ -7,6 +7,8 @@ import threading
 import time
 from contextvars import ContextVar
 
+import pytest
+
 from app.jobs import LatestWins, Places
 from app.turns import MESSAGES_FIRST, Turns
 from tests.browser import eventually
@@ -18,8 +20,8 @@ from tests.threads import at_once, queued
 class Desk:
     """Requests that wait for a word, and what became of them."""
 
-    def __init__(self, on_page=at_once, places=None):
-        self.jobs = LatestWins(on_page, places or Places(1, "desk"))
+    def __init__(self, on_page=at_once, **shared):
+        self.jobs = LatestWins(on_page, **shared)
         self.ran, self.done, self.failed = [], [], []
         self.go = threading.Event()
 
@@ -34,7 +36,9 @@ class Desk:
 
 def test_the_latest_request_wins_and_the_overtaken_never_run():
     desk = Desk()
-    for name in range(5):
+    desk.submit(0)
+    eventually(lambda: desk.ran)
+    for name in range(1, 5):
         desk.submit(name)
     desk.go.set()
     eventually(lambda: 4 in desk.done)
@@ -72,8 +76,8 @@ def test_an_answer_that_cannot_be_drawn_is_told_and_does_not_stop_the_next():
     desk = Desk(on_page=queued(drawings.append))
     desk.go.set()
     desk.jobs.submit(lambda: 0, lambda _: 1 / 0, desk.failed.append)
-    desk.submit("next")
     eventually(lambda: drawings)
+    desk.submit("next")
     drawings.pop()()
     assert isinstance(desk.failed[0], ZeroDivisionError)
     eventually(lambda: drawings)
@@ -107,7 +111,7 @@ def test_who_waits_for_a_place_begins_with_the_newest_of_its_requests():
 
 def test_a_place_is_kept_until_its_answer_is_about_to_be_drawn():
     places, turns = Places(1, "one"), []
-    first = Desk(lambda act, due: turns.append((act, due)), places)
+    first = Desk(lambda act, due: turns.append((act, due)), places=places)
     second = Desk(places=places)
     first.go.set()
     second.go.set()
@@ -121,23 +125,23 @@ def test_a_place_is_kept_until_its_answer_is_about_to_be_drawn():
     eventually(lambda: second.done)
 
 
-def test_places_are_had_in_the_order_in_which_they_were_asked_for():
-    places, ran, go = Places(2, "two"), [], threading.Semaphore(0)
+@pytest.mark.parametrize("number", [1, 3])
+def test_places_are_had_in_the_order_in_which_they_were_asked_for(number):
+    places, ran, go = Places(number, "few"), [], threading.Semaphore(0)
 
     def begin(name):
         ran.append(name)
-        go.acquire()
+        assert go.acquire(timeout=20)
         places.leave()
 
     for name in range(6):
         places.ask(lambda name=name: begin(name), ran.append)
-    eventually(lambda: len(ran) == 2)
-    time.sleep(0.05)
-    assert sorted(ran) == [0, 1]
-    go.release(6)
-    eventually(lambda: len(ran) == 6)
-    assert sorted(ran[2:4]) == [2, 3]
-    assert sorted(ran[4:]) == [4, 5]
+    for done in range(6):
+        there = min(done + number, 6)
+        eventually(lambda there=there: len(ran) == there)
+        time.sleep(0.01)
+        assert sorted(ran) == [*range(there)]  # no other, and no more
+        go.release()
 
 
 # -- on the page's thread, which all pages share ---------------------------------------------------

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import weakref
+from importlib import import_module
 
 import numpy as np
+import panel as pn
 import pytest
 from bokeh.core.serialization import Deserializer, Serializer
 from bokeh.document import Document
+from bokeh.document.events import ModelChangedEvent
 from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
+from bokeh.protocol import Protocol
+from panel.io.document import _destroy_document
 
+from app.collector import collect_all, spare
 from app.component import Component
 from app.controls import Knob, PixelKeys
-from app.latency import QuickDeserializer, QuickSerializer
+from app.latency import REPLACED, QuickDeserializer, QuickSerializer
 
 # -- components ------------------------------------------------------------------------------------
 
@@ -43,10 +51,10 @@ def test_a_value_goes_to_the_page_and_no_other_does(knob):
 def test_a_value_comes_from_the_page_and_is_not_sent_back(knob):
     model, heard, changes = shown(knob), [], []
     knob.param.watch(lambda event: heard.append(event.new), "value")
-    model.data.on_change("value", lambda _name, _old, new: changes.append(new))
+    model.document.on_change(lambda event: changes.append((event.attr, event.new)))
     model.data.value = 0.75
-    assert knob.value == 0.75
-    assert heard == changes == [0.75]
+    assert heard == [knob.value] == [0.75]
+    assert changes == [("value", 0.75)]  # the page's own
 
 
 def test_what_is_made_of_a_value_from_the_page_is_sent(knob):
@@ -118,3 +126,51 @@ def test_a_model_that_comes_to_the_document_later_was_not_known(document):
     later = Range1d()
     document.add_root(later)
     assert not made.has_ref(later)
+
+
+# -- where it is put -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("place", REPLACED, ids=" ".join)
+def test_what_is_replaced_is_what_the_libraries_use(place, document, monkeypatch):
+    """Under another name it would stand there in vain."""
+    used, (module, name) = [], place
+
+    def standing_in(*arguments, **options):
+        used.append(place)
+        return REPLACED[place](*arguments, **options)
+
+    assert name in vars(import_module(module))
+    monkeypatch.setitem(vars(import_module(module)), name, standing_in)
+    (plot,) = document.roots
+    event = ModelChangedEvent(document, plot, "width", 300)
+    message = Protocol().create("PATCH-DOC", [event])
+    document.apply_json_patch(message.payload)
+    assert plot.width == 300
+    scheduled = []
+    monkeypatch.setattr(pn.state, "schedule_task", lambda _, act, **_at: scheduled.append(act))
+    document.destroy = None
+    _destroy_document(document, None)
+    for act in scheduled:
+        act()
+    assert used == [place]
+
+
+def test_all_in_use_is_passed_over_and_all_is_looked_through():
+    class Loop:
+        def __init__(self):
+            self.itself = self
+
+    left = Loop()
+    gone = weakref.ref(left)
+    spare()
+    try:
+        assert gc.get_freeze_count() > 0
+        del left
+        gc.collect()
+        assert gone() is not None
+        collect_all()
+        assert gone() is None
+        assert gc.get_freeze_count() > 0
+    finally:
+        gc.unfreeze()

@@ -12,7 +12,7 @@ from tests.browser import serving
 from tests.load import Bounds, Growth, Load, as_markdown, growth, load, server_mb, verdicts
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def address():
     """A server of its own: what it holds is measured."""
     with serving() as running_at:
