@@ -18,6 +18,29 @@ const LONGEST_PAUSE_MS = 250;
 }
 
 {
+  // A legend builds its items anew whenever anything below them changes, such as the data of a line.
+  // The browser then lays out the page, in the middle of a stroke.
+  const legend = Bokeh.Models.get("Legend").prototype.default_view.prototype;
+  const { render, _render_items: build } = legend;
+  legend.render = function () {
+    this.built = undefined;
+    render.call(this);
+  };
+  legend._render_items = function () {
+    const items = this.model.items.map((item) => [
+      item.id,
+      item.get_labels_list_from_label_prop(),
+      item.visible,
+      item.renderers.map(({ visible, muted }) => [visible, muted]),
+    ]);
+    const wanted = JSON.stringify(items);
+    if (wanted === this.built) return;
+    this.built = wanted;
+    build.call(this);
+  };
+}
+
+{
   // While a page is being built, Bokeh may measure plots of it that have no layout yet, and fail.
   const view = Bokeh.Models.get("Figure").prototype.default_view.prototype;
   for (const name of ["_measure_layout", "_after_layout"]) {
