@@ -40,6 +40,9 @@ def tune() -> None:
     WSHandler.send_message = _send_at_once
     # Else each array that is sent has them look for it in the environment.
     settings.simple_ids.set_value(True)
+    # Else each new page is searched for slips that only a change of the code could make.
+    settings.perform_document_validation.set_value(False)
+    settings.perform_error_diagnostics.set_value(False)
     sys.setswitchinterval(SWITCH_S)
     for (module, name), ours in REPLACED.items():
         # Not as an attribute: of some modules' names their packages speak as of what is in them.

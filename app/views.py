@@ -107,8 +107,13 @@ def paint_frame(figure: Any, colors: Palette) -> None:
     for legend in figure.legend:
         legend.label_text_color = colors.text
         legend.background_fill_color = legend.inactive_fill_color = colors.paper
-    for bar in figure.select(ColorBar):
+    for bar in color_bars(figure):
         bar.title_text_color = bar.major_label_text_color = colors.muted
+
+
+def color_bars(figure: Any) -> list[ColorBar]:
+    """Of a figure, below it or at its right side."""
+    return [each for each in (*figure.below, *figure.right) if isinstance(each, ColorBar)]
 
 
 class SignalPlots:
@@ -223,7 +228,10 @@ class SignalPlots:
 
 def pane_of(figure: Any) -> pn.pane.Bokeh:
     """A place that the figure fills."""
-    for model in figure.references():
+    for renderer in figure.renderers:
+        # How a line would look if it were chosen, or others were: nothing is chosen in a plot.
+        renderer.update(selection_glyph=None, nonselection_glyph=None, muted_glyph=None)
+    for model in (figure.title, *figure.axis, *figure.legend, *color_bars(figure)):
         for kind, sizes in SIZES.items():
             if isinstance(model, getattr(bokeh.models, kind)):
                 model.update(**sizes)
@@ -274,7 +282,7 @@ class ImageView:
         for ranges in (self.figure.x_range, self.figure.y_range):
             ranges.renderers = [picture["glyph_renderer"]]
         self._mapper = picture["color_mapper"]
-        (self._bar,) = self.figure.select(ColorBar)
+        (self._bar,) = color_bars(self.figure)
         (zoom,) = self.figure.select(BoxZoomTool)
         zoom.match_aspect = True
         # HoloViews adds others, of which Bokeh takes the first.
