@@ -358,8 +358,8 @@ def as_markdown(found: Sequence[tuple[str, str, str, bool]]) -> str:
 
 
 def server_mb() -> Callable[[], float]:
-    """Tells the resident memory of the server, which is the only process started from here."""
-    (server,) = psutil.Process().children()
+    """Tells the resident memory of the server that this process has started."""
+    (server,) = (each for each in psutil.Process().children() if "app" in each.cmdline())
     return lambda: server.memory_info().rss / MEGA
 
 
