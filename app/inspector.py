@@ -22,7 +22,7 @@ from app.jobs import LatestWins
 from app.large_view import LargeView
 from app.looks import Look, map_of
 from app.pages import Pages, View
-from app.parts import board, button, part
+from app.parts import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part
 from app.session import REST_MS, Session
 from app.state import MOST_PINS
 from app.store import Answer
@@ -104,6 +104,7 @@ class Inspector:
             description=inspector_words.MAP_HELP,
             size="small",
             width=118,
+            min_height=SELECT_PX,
             margin=(6, 0, 0, 0),
         )
         self._mode = pmui.RadioButtonGroup(
@@ -112,6 +113,7 @@ class Inspector:
             label="",
             description=inspector_words.MODE_HELP,
             size="small",
+            min_height=CHOICE_PX,
             margin=0,
         )
         self._place = [_field(name, "0") for name in ("Row", "Column")]
@@ -318,7 +320,12 @@ def _row(*content: Any) -> pn.Row:
 
 def _field(label: str, example: str) -> pmui.TextInput:
     return pmui.TextInput(
-        label=label, placeholder=example, size="small", width=86, margin=(6, 0, 0, 0)
+        label=label,
+        placeholder=example,
+        size="small",
+        width=86,
+        min_height=FIELD_PX,
+        margin=(6, 0, 0, 0),
     )
 
 

@@ -33,6 +33,9 @@ th, td { padding: 3px 6px !important; }
 tbody th { min-width: 40px !important; }
 """
 
+# Kept free from the start: two rows of facts, a line, a table of the most candidates.
+FACTS_PX, LINE_PX, TABLE_PX = 62, 17, 217
+
 AT_ONCE_BINS = 1000
 """Of a gate, up to which a pixel is looked at in less time than a worker's turn would cost: 6 ms at
 200 bins, 13 ms at 1000."""
@@ -72,11 +75,16 @@ class Sight:
                 self._plots.panes, ("counts", "rate", "residual and enhanced"), strict=True
             )
         ]
-        self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width", margin=0)
-        self._remark = Sentence(live=True, sizing_mode="stretch_width", margin=0)
+        self._facts = Facts(
+            stylesheets=[FACTS], min_height=FACTS_PX, sizing_mode="stretch_width", margin=0
+        )
+        self._remark = Sentence(
+            live=True, min_height=LINE_PX, sizing_mode="stretch_width", margin=0
+        )
         self._table = Table(
             title=inspector_words.CANDIDATES,
             stylesheets=[NARROW],
+            min_height=TABLE_PX,
             sizing_mode="stretch_width",
             margin=0,
         )

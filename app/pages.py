@@ -9,6 +9,7 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 
+from app.parts import CHOICE_PX
 from app.store import Answer
 
 # As high as its parts, and not as wide as all of them side by side: that is more than a phone.
@@ -77,6 +78,7 @@ class Pages:
             description=help,
             orientation=orientation,
             size="small",
+            min_height=CHOICE_PX,
             margin=(2, 0),
         )
         self.choice.param.watch(lambda event: self._go(event.old, event.new), "value")

@@ -7,6 +7,7 @@ from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
+import param
 
 BREAK_PX = 900
 """Of a page: less, and its parts follow each other. A page of more parts has another."""
@@ -39,6 +40,10 @@ def column(gap_px: int, break_px: int) -> str:
 """
 
 
+# Heights of small widgets, kept free from the start: the browser draws them one by one after the
+# plots, which would make room, and be painted anew, for each.
+FIELD_PX, SELECT_PX, BUTTON_PX, CHOICE_PX = 37, 32, 34, 36
+
 CARD = """
 :host { flex: 1 1 0 !important; min-height: 0; overflow: hidden; border-radius: 8px;
   border: 1px solid var(--mui-palette-divider, #d5dbe2);
@@ -54,6 +59,7 @@ def select(label: str, options: Any, value: str, help: str) -> pmui.Select:
         value=value,
         description=help,
         size="small",
+        min_height=SELECT_PX,
         sizing_mode="stretch_width",
         margin=(8, 8, 4, 8),
     )
@@ -62,7 +68,12 @@ def select(label: str, options: Any, value: str, help: str) -> pmui.Select:
 def choice(help: str, parameter: Any) -> pmui.RadioButtonGroup:
     """A row of buttons of which one is pressed."""
     return pmui.RadioButtonGroup.from_param(
-        parameter, label="", description=help, size="small", margin=(4, 6, 0, 6)
+        parameter,
+        label="",
+        description=help,
+        size="small",
+        min_height=CHOICE_PX,
+        margin=(4, 6, 0, 6),
     )
 
 
@@ -71,23 +82,44 @@ def button(
 ) -> pmui.Button:
     """A small button."""
     made = pmui.Button(
-        label=label, description=help, variant="outlined", size="small", margin=margin
+        label=label,
+        description=help,
+        variant="outlined",
+        size="small",
+        min_height=BUTTON_PX,
+        margin=margin,
     )
     made.on_click(lambda _: act())
     return made
 
 
-def part(title: str, *content: Any, is_open: bool = True) -> pmui.Card:
+class Part(pmui.Card):
     """A part of the sidebar that folds."""
-    return pmui.Card(
-        *content,
+
+    # Headers of what is in it: there are none, but of each Panel would ask all kinds of panes
+    # whether they can show it. To answer, one loads the whole of VTK.
+    _headers = param.List(default=[], item_type=object)
+
+
+def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True) -> Part:
+    """A part of the sidebar that folds; the browser gets its content once it is to be seen."""
+    made = Part(
         title=title,
         title_variant="subtitle2",
         collapsed=not is_open,
+        visible=is_shown,
         variant="outlined",
         sizing_mode="stretch_width",
         margin=(4, 6),
     )
+
+    def fill(*_: Any) -> None:
+        if made.visible and not made.collapsed and not made.objects:
+            made.extend(content)
+
+    made.param.watch(fill, ["collapsed", "visible"])
+    fill()
+    return made
 
 
 def card(*content: Any) -> pn.Column:

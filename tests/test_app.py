@@ -698,7 +698,21 @@ def test_a_weight_that_needs_pulses_is_refused_where_they_are_not_known(layout, 
     assert complaint(layout) == ""
 
 
+def test_what_is_folded_away_is_built_when_it_is_first_opened(layout):
+    (part,) = layout.page.select(lambda each: getattr(each, "title", "") == "Less data, faster")
+    fields = list(layout._less.controls.values())
+
+    def on_page():
+        return [each for each in layout.page.select(lambda each: True) if each in fields]
+
+    assert on_page() == []
+    for collapsed in (False, True, False):
+        part.collapsed = collapsed
+        assert on_page() == fields
+
+
 def test_typed_text_changes_how_a_file_is_read(layout, small_file):
+    layout._reading_card.collapsed = False
     open_file(layout, small_file)
     before = next_answer(layout)
     control(layout, "Bin width (s)").value = "wide"

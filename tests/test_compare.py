@@ -217,9 +217,10 @@ def test_only_what_is_missing_is_computed(stage, monkeypatch):
     stage.page._picks.value = [*stage.page._picks.value, "matched_filter"]
     stage.settle()
     assert ran == ["matched_filter"]
-    stage.page._panels["likelihood"].select(lambda each: getattr(each, "label", "") == "Depths")[
-        0
-    ].value = "learned"
+    panel = stage.page._panels["likelihood"]
+    panel.collapsed = False
+    (depths,) = panel.select(lambda each: getattr(each, "label", "") == "Depths")
+    depths.value = "learned"
     stage.settle()
     assert ran == ["matched_filter", "likelihood"]
     stage.view.show(False)
