@@ -139,6 +139,10 @@ class SettingsPanel(Generic[Settings]):
         self.doubts.text = " ".join(joint_doubts(settings))
 
 
+HEADLINE_PX, FACTS_PX, LINE_PX = 37, 32, 17
+"""Heights of timed facts, of a row of others, and of a sentence; kept free from the start."""
+
+
 class Facts(Component):
     """A list of named values; updating it costs the page no new layout."""
 

@@ -8,7 +8,7 @@ from typing import Any
 import panel as pn
 
 from app import inspector_words
-from app.controls import Facts, Sentence, Table
+from app.controls import FACTS_PX, LINE_PX, Facts, Sentence, Table
 from app.downloads import PLOT, TABLE, Shown, below, downloadable, explored, over_the_gate
 from app.exports import shown_table_file
 from app.inspector_answers import Seen, pixel_seen, region_seen
@@ -33,8 +33,11 @@ th, td { padding: 3px 6px !important; }
 tbody th { min-width: 40px !important; }
 """
 
-# Kept free from the start: two rows of facts, a line, a table of the most candidates.
-FACTS_PX, LINE_PX, TABLE_PX = 62, 17, 217
+FACTS_ACROSS = 4
+"""Beside each other on a laptop."""
+
+TABLE_PX = 217
+"""Height of a table of the most candidates, kept free from the start."""
 
 AT_ONCE_BINS = 1000
 """Of a gate, up to which a pixel is looked at in less time than a worker's turn would cost: 6 ms at
@@ -75,9 +78,7 @@ class Sight:
                 self._plots.panes, ("counts", "rate", "residual and enhanced"), strict=True
             )
         ]
-        self._facts = Facts(
-            stylesheets=[FACTS], min_height=FACTS_PX, sizing_mode="stretch_width", margin=0
-        )
+        self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width", margin=0)
         self._remark = Sentence(
             live=True, min_height=LINE_PX, sizing_mode="stretch_width", margin=0
         )
@@ -159,7 +160,9 @@ class Sight:
             self._plots.update(found.curves, unit, answer.capture.acquisition)
             for each in self._cards:
                 each.visible = True
-            self._facts.facts = inspector_words.facts(answer, found, unit)
+            facts = inspector_words.facts(answer, found, unit)
+            rows = -(-len(facts) // FACTS_ACROSS)
+            self._facts.param.update(facts=facts, min_height=rows * FACTS_PX)
             self._remark.text = inspector_words.remark(found)
             self._table.param.update(
                 columns=inspector_words.candidate_columns(unit),

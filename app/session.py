@@ -17,7 +17,7 @@ from tornado.ioloop import IOLoop
 from app import words
 from app.address import Wanted, defaults, query_of
 from app.cloud import PointCloud
-from app.controls import Facts, PixelKeys
+from app.controls import FACTS_PX, HEADLINE_PX, Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
 from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State, Viewing
@@ -77,8 +77,8 @@ class Session:
         self._own = {"source": key, "page": "Explore" if first.is_scene else "Inspect"}
         self.state = State(**self._own)
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
-        self.figures = Facts(timed=True, sizing_mode="stretch_width")
-        self.numbers = Facts(sizing_mode="stretch_width", margin=0)
+        self.figures = Facts(timed=True, min_height=HEADLINE_PX, sizing_mode="stretch_width")
+        self.numbers = Facts(min_height=2 * FACTS_PX, sizing_mode="stretch_width", margin=0)
         self.announce: Callable[[Answer], None] = lambda answer: None
         self.complain: Callable[[str], None] = lambda sentence: None
         self.waiting: Callable[[bool], None] = lambda is_waiting: None

@@ -417,6 +417,48 @@ def test_a_stroke_makes_the_browser_look_up_no_style_anew(car_page):
     assert lookups["same"] == lookups["ofPlots"] == 0
 
 
+def test_a_legend_is_built_anew_for_what_it_shows_alone(car_page):
+    items = car_page.locator(".bk-Legend .bk-item")
+    first = items.first
+    count = items.evaluate_all("(all) => all.map((each) => (each.dataset.seen = 'yes')).length")
+    assert count > 1
+    before = look(car_page)
+    slider(car_page, "SBR").press("ArrowRight")
+    eventually(changed(car_page, before))
+    assert items.evaluate_all("(all) => all.every((each) => each.dataset.seen)")
+    first.click()
+    expect(first).to_have_class(re.compile("bk-inactive"))
+    first.click()
+    expect(first).not_to_have_class(re.compile("bk-inactive"))
+
+
+NOTE_SIZES = """
+window.sizes = new Map();
+const stroke = CanvasRenderingContext2D.prototype.stroke;
+CanvasRenderingContext2D.prototype.stroke = function (...values) {
+  const { width, height } = this.canvas;
+  if (width > 100) {
+    if (!sizes.has(this.canvas)) sizes.set(this.canvas, new Set());
+    sizes.get(this.canvas).add(`${width} x ${height}`);
+  }
+  return stroke.apply(this, values);
+};
+"""
+
+
+@pytest.mark.parametrize("name", ["Explore", "Inspect"])
+def test_plots_keep_the_size_they_are_first_painted_at(page, name):
+    new = page(prepare=NOTE_SIZES)
+    if name != "Explore":
+        new.evaluate("sizes.clear()")
+        new.get_by_role("button", name=name, exact=True).click()
+        expect(new.get_by_role("button", name="Pins", exact=True)).to_be_visible()
+    new.wait_for_timeout(2000)
+    sizes = new.evaluate("[...sizes.values()].map((each) => [...each])")
+    assert len(sizes) >= 4
+    assert all(len(each) == 1 for each in sizes), sizes
+
+
 def test_typed_values_are_taken_or_refused_with_a_sentence(car_page):
     enter(car_page, "SBR", "99")
     refusal = car_page.get_by_role("alert").filter(has_text="99 is not possible here")
