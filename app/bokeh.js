@@ -31,7 +31,7 @@ const LONGEST_PAUSE_MS = 250;
       item.id,
       item.get_labels_list_from_label_prop(),
       item.visible,
-      item.renderers.map(({ visible, muted }) => [visible, muted]),
+      item.renderers.map(({ visible }) => visible),
     ]);
     const wanted = JSON.stringify(items);
     if (wanted === this.built) return;

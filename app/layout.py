@@ -376,16 +376,14 @@ class Layout:
     def _sidebar(self) -> list[Any]:
         read_again = pmui.Button(label="Read again", size="small", margin=(6, 8))
         read_again.on_click(lambda _: self._read_again())
-        request = self.session.answer.request
-        self._light_card = part(
-            "Light and recording", self._light.layout, is_shown=request.source.is_scene
-        )
+        # `_announce` shows the one that suits the source.
+        self._light_card = part("Light and recording", self._light.layout, is_shown=False)
         self._reading_card = part(
             "How to read the file",
             *self._reading.values(),
             read_again,
-            is_open=request.reading != Reading(),
-            is_shown=not request.source.is_scene,
+            is_open=self.session.answer.request.reading != Reading(),
+            is_shown=False,
         )
         first, *others = self.pages.asides.values()
         return [
