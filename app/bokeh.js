@@ -90,3 +90,59 @@ const LONGEST_PAUSE_MS = 250;
     goOn(this);
   };
 }
+
+{
+  const layer = Bokeh.Models.get("GlyphRenderer").prototype.default_view.prototype;
+
+  // Of each layer Bokeh keeps five more pictures: how it would look if it were chosen, or others
+  // were. Nothing is ever chosen in a plot: unless one is asked for, the layer's own is shown.
+  const { build_glyph_view: build } = layer;
+  const kept = ["set_data", "set_visuals", "after_visuals", "after_lazy_visuals", "map_data"];
+  const own = Object.fromEntries([...kept, "remove"].map((name) => [name, { value() {} }]));
+  layer.build_glyph_view = async function (glyph) {
+    const isAsked = Object.values(this.model.attributes).includes(glyph);
+    if (this.glyph && !isAsked) return Object.create(this.glyph, own);
+    const view = await build.call(this, glyph);
+    view._mask_data = undefined; // to look for what lies outside the window costs more than it saves
+    return view;
+  };
+
+  // A layer above the others, which is painted without them, reached out of the window else.
+  Object.defineProperty(layer, "needs_clip", { value: true });
+
+  // On the page nothing stands where a layer is.
+  layer.update_position = function () {
+    this.position.replace(":host { display: none; }");
+  };
+}
+
+{
+  // What the server changes is painted as soon as all plots have taken it in. Bokeh would wait for
+  // the next frame to begin, and what it then paints would be shown no earlier.
+  const session = Bokeh.require("client/session").ClientSession.prototype;
+  const layer = Bokeh.Models.get("GlyphRenderer").prototype.default_view.prototype;
+  const plot = Bokeh.Models.get("Figure").prototype.default_view.prototype;
+  const { _handle_patch: take } = session;
+  const { update_data: update } = layer;
+  const { schedule_paint: schedule } = plot;
+  let updates, outdated; // unless a message is being taken in
+
+  session._handle_patch = function (message) {
+    [updates, outdated] = [[], new Set()];
+    take.call(this, message);
+    Promise.allSettled(updates).then(() => {
+      const plots = outdated;
+      [updates, outdated] = [];
+      for (const plot of plots) if (!plot.is_destroyed) plot.repaint();
+    });
+  };
+  layer.update_data = function (indices) {
+    const updated = update.call(this, indices);
+    updates?.push(updated);
+    return updated;
+  };
+  plot.schedule_paint = function () {
+    if (outdated) outdated.add(this);
+    else schedule.call(this);
+  };
+}

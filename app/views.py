@@ -55,10 +55,10 @@ class Layers:
     def write(self, layer: str, **columns: ArrayLike) -> None:
         """Replace columns of a layer; only what changed travels, as float32."""
         data = self.source(layer).data
-        for name, values in columns.items():
-            new = np.asarray(values, np.float32)
-            if not np.array_equal(data[name], new, equal_nan=True):
-                data[name] = new
+        new = {name: np.asarray(values, np.float32) for name, values in columns.items()}
+        new = {n: v for n, v in new.items() if not np.array_equal(data[n], v, equal_nan=True)}
+        if new:
+            data.update(new)
 
     def show(self, layer: str, visible: bool) -> None:
         """Draw a layer, and its line in the legend, or leave them out."""
@@ -281,6 +281,8 @@ class ImageView:
         picture = self._plot.layers["picture"]
         for ranges in (self.figure.x_range, self.figure.y_range):
             ranges.renderers = [picture["glyph_renderer"]]
+        for layer in ("shadow", "frame"):  # which move more often than the picture below changes
+            self._plot.layers[layer]["glyph_renderer"].level = "overlay"
         self._mapper = picture["color_mapper"]
         (self._bar,) = color_bars(self.figure)
         (zoom,) = self.figure.select(BoxZoomTool)
