@@ -8,14 +8,18 @@ once, see ``python -m tests.load``.
 from __future__ import annotations
 
 import asyncio
+import gzip
 import json
 import sys
+from base64 import b64encode
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from importlib import import_module
 from typing import Any
 
-from bokeh.core.serialization import Deserializer, Serializer
+from bokeh.core.has_props import HasProps
+from bokeh.core.property.descriptors import PropertyDescriptor
+from bokeh.core.serialization import BytesRep, Deserializer, Serializer
 from bokeh.protocol.message import Message
 from bokeh.server.views.ws import WSHandler
 from bokeh.settings import settings
@@ -24,13 +28,17 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from app.collector import collect_all
 
-DEBOUNCE_MS = 4
+DEBOUNCE_MS = 0
 """Panel collects property changes for 50 ms. So short a time suits callbacks as short as ours,
 which hand the work to `app.jobs`; under slow ones it would build a backlog."""
 
 SWITCH_S = 1e-4
 """A thread that computes keeps the others waiting for 5 ms whenever they have let go of the
 interpreter, as the page's thread does for every message it sends."""
+
+
+FEW_BYTES = 8192
+"""Of an array, up to which it travels within the message that it belongs to."""
 
 
 def tune() -> None:
@@ -44,6 +52,7 @@ def tune() -> None:
     settings.perform_document_validation.set_value(False)
     settings.perform_error_diagnostics.set_value(False)
     sys.setswitchinterval(SWITCH_S)
+    PropertyDescriptor._get_default = _kept(PropertyDescriptor._get_default)
     for (module, name), ours in REPLACED.items():
         # Not as an attribute: of some modules' names their packages speak as of what is in them.
         vars(import_module(module))[name] = ours
@@ -55,6 +64,12 @@ class QuickSerializer(Serializer):
     def __init__(self, *, references: Collection[Any] = (), **options: Any) -> None:
         super().__init__(**options)
         self._known = dict(zip(map(id, references), references, strict=True))
+
+    def _encode_bytes(self, obj: bytes | memoryview) -> Any:
+        # Each array would travel as two messages of its own.
+        if memoryview(obj).nbytes > FEW_BYTES:
+            return super()._encode_bytes(obj)
+        return BytesRep(type="bytes", data=b64encode(gzip.compress(bytes(obj), 0)).decode())
 
     def has_ref(self, obj: Any) -> bool:
         """Whether the page knows a model, or is told of it in this message."""
@@ -99,6 +114,24 @@ REPLACED: dict[tuple[str, str], Any] = {
     ("panel.io.document", "_garbage_collect"): collect_all,
 }
 """What stands in the place of which name of which module."""
+
+
+def _kept(get_default: Any) -> Any:
+    """Finds a default that is the same for all models of a kind only once, and checks it then."""
+    known: dict[tuple[type, str], Any] = {}
+
+    def get(descriptor: PropertyDescriptor[Any], model: HasProps) -> Any:
+        key = type(model), descriptor.name
+        if vars(model).get("__themed_values__") is not None:
+            return get_default(descriptor, model)
+        if key not in known:
+            default = get_default(descriptor, model)
+            if descriptor.has_unstable_default(model):
+                return default
+            known[key] = default
+        return known[key]
+
+    return get
 
 
 def _open_without_delay(open_: Any) -> Any:

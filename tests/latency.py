@@ -39,7 +39,8 @@ const listen = Object.getOwnPropertyDescriptor(WebSocket.prototype, "onmessage")
 Object.defineProperty(WebSocket.prototype, "onmessage", {
   set(handler) {
     listen.set.call(this, (event) => {
-      if (event.data instanceof ArrayBuffer && !watch.received) watch.received = performance.now();
+      const isPatch = String(event.data).includes('"PATCH-DOC"');
+      if (isPatch && !watch.received) watch.received = performance.now();
       return handler(event);
     });
   },

@@ -10,6 +10,7 @@ from importlib import import_module
 import numpy as np
 import panel as pn
 import pytest
+from bokeh.core.property.descriptors import PropertyDescriptor
 from bokeh.core.serialization import Deserializer, Serializer
 from bokeh.document import Document
 from bokeh.document.events import ModelChangedEvent
@@ -21,7 +22,7 @@ from panel.io.document import _destroy_document
 from app.collector import collect_all, spare
 from app.component import Component
 from app.controls import Knob, PixelKeys
-from app.latency import REPLACED, QuickDeserializer, QuickSerializer
+from app.latency import FEW_BYTES, REPLACED, QuickDeserializer, QuickSerializer, _kept
 
 # -- components ------------------------------------------------------------------------------------
 
@@ -92,7 +93,7 @@ def document():
 def test_a_message_names_known_models_and_spells_out_new_ones(document):
     (plot,) = document.roots
     known, new = plot.x_range, Range1d(0, 5)
-    told = [known, new, [known, {"a": plot.y_range}], np.arange(2.0)]
+    told = [known, new, [known, {"a": plot.y_range}], np.zeros(FEW_BYTES)]
     written = []
     for serializer in (Serializer, QuickSerializer):
         made = serializer(references=set(document.models))
@@ -104,6 +105,35 @@ def test_a_message_names_known_models_and_spells_out_new_ones(document):
     theirs, ours = (json.dumps(each, default=lambda _: "buffer") for each in written)
     assert ours == theirs
     assert written[1][0] == known.ref
+
+
+def test_few_numbers_travel_within_the_message():
+    few, many = np.arange(5, dtype=np.float32), np.zeros(FEW_BYTES + 1, np.uint8)
+    serializer = QuickSerializer()
+    message = json.loads(json.dumps(serializer.encode(few)))
+    assert serializer.buffers == []
+    assert np.array_equal(Deserializer().decode(message), few)
+    serializer.encode(many)
+    assert [each.data.nbytes for each in serializer.buffers] == [many.nbytes]
+
+
+def test_defaults_that_are_kept_are_the_models_own(document):
+    kept = _kept(PropertyDescriptor._get_default)
+    for model in document.models:
+        for name in model.properties():
+            descriptor = model.lookup(name)
+            if name in model._property_values:
+                continue
+            for _ in range(2):
+                own = PropertyDescriptor._get_default(descriptor, model)
+                assert own is kept(descriptor, model) or own == kept(descriptor, model)
+
+
+def test_defaults_that_may_be_changed_in_place_are_each_models_own():
+    kept = _kept(PropertyDescriptor._get_default)
+    one, other = (kept(each.lookup("tags"), each) for each in (Range1d(), Range1d()))
+    one.append("x")
+    assert other == []
 
 
 def test_a_message_finds_known_models_and_makes_new_ones(document):

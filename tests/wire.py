@@ -7,8 +7,10 @@ real models, as `bokeh.client` has it, would cost more than the server's answer.
 from __future__ import annotations
 
 import asyncio
+import gzip
 import json
 import re
+from base64 import b64decode
 from collections import defaultdict
 from collections.abc import Iterator
 from typing import Any
@@ -151,8 +153,8 @@ class Wire:
                 await self._take()
                 async with self.news:
                     self.news.notify_all()
-        except ConnectionError as error:
-            self.troubles.append(str(error))
+        except Exception as error:  # whatever it is: nothing is read any more
+            self.troubles.append(f"{type(error).__name__}: {error}")
             self.is_closed = True
             async with self.news:
                 self.news.notify_all()
@@ -179,8 +181,11 @@ class Wire:
             for column, values in value["entries"]:
                 self._keep(model, column, values, buffers)
         elif isinstance(value, dict) and value.get("type") == "ndarray":
-            buffer = buffers[value["array"]["data"]["id"]]
-            self.values[model, name] = np.frombuffer(buffer, value["dtype"])
+            held = value["array"]["data"]
+            array = (
+                gzip.decompress(b64decode(held)) if isinstance(held, str) else buffers[held["id"]]
+            )
+            self.values[model, name] = np.frombuffer(array, value["dtype"])
         else:
             self.values[model, name] = value
 
