@@ -56,32 +56,45 @@ class AddressBar(Component):
         self,
         state: State,
         query: Callable[[], str],
-        later: Callable[[Callable[[], None], int], None],
+        wait: Callable[[int, Callable[[], None]], None],
+        tell: Callable[[Callable[[], None]], None],
     ) -> None:
-        """Say what the state is, whenever it has come to rest; `later` acts after so many ms."""
-        self.query = query()
+        """Say what the state is, whenever it has come to rest.
+
+        Parameters
+        ----------
+        state : State
+        query : callable
+            Tells what the address should say now.
+        wait, tell : callable
+            Of the `app.session.Session`.
+        """
         changes = 0
         is_waiting = False
+
+        def write() -> None:
+            self.query = query()
 
         def changed(*_events: Any) -> None:
             nonlocal changes
             changes += 1
             if not is_waiting:
-                wait()
+                look_later()
 
-        def wait() -> None:
+        def look_later() -> None:
             nonlocal is_waiting
             is_waiting = True
-            later(partial(rest, changes), REST_MS)
+            wait(REST_MS, partial(look, changes))
 
-        def rest(seen: int) -> None:
+        def look(seen: int) -> None:
             nonlocal is_waiting
             if seen != changes:
-                wait()
+                look_later()
             else:
                 is_waiting = False
-                self.query = query()
+                tell(write)
 
+        write()
         state.param.watch(changed, list(defaults()))
 
 

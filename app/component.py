@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from functools import cache
 from typing import Any
 
@@ -26,7 +27,8 @@ class Component(JSComponent):
         self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any
     ) -> None:
         if self._are_plain(msg):
-            with hold(doc):
+            # Whoever holds the document sends it all; each hold looks through what is held so far.
+            with nullcontext() if doc and doc.callbacks.hold_value else hold(doc):
                 model.data.update(**msg)  # what comes from there is no news to it
         else:
             super()._update_model(events, msg, root, model, doc, comm)

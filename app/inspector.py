@@ -27,6 +27,7 @@ from app.session import REST_MS, Session
 from app.state import MOST_PINS
 from app.store import Answer
 from app.theme import palette
+from app.turns import Soon
 from core.checks import require
 
 # The navigator with a table below on the left, plots on the right.
@@ -50,6 +51,7 @@ class Inspector:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._jobs: LatestWins[tuple[Any, Look]] = LatestWins(session.on_page)
+        self._name_place_soon = Soon(session.on_page, self._name_place)
         self._is_on_screen = self._dark = False
         self._navigator = Navigator(session.choose_pixel, self._select)
         self._navigator.figure.min_border_top = CORNER_PX  # else the button hides a number
@@ -185,7 +187,7 @@ class Inspector:
             self._enter()
             self._subjects.follow(answer)
             # As on Explore: the eye follows the plots.
-            self._session.later(self._ask_map, REST_MS)
+            self._session.wait(REST_MS, partial(self._session.on_page, self._ask_map))
 
     def _paint(self, dark: bool) -> None:
         self._dark = dark
@@ -283,11 +285,16 @@ class Inspector:
                 draw()
 
     def _mark(self) -> None:
-        pixel, grid = self._session.state.pixel, self._session.answer.grid
+        pixel = self._session.state.pixel
         self._navigator.mark(*pixel)
         self._keys.pixel = list(pixel)
-        for field, at in zip(self._place, grid.place(*pixel), strict=True):
-            field.value = str(at)
+        self._name_place_soon()
+
+    def _name_place(self) -> None:
+        pixel, grid = self._session.state.pixel, self._session.answer.grid
+        with pn.io.hold(self._session.page):
+            for field, at in zip(self._place, grid.place(*pixel), strict=True):
+                field.value = str(at)
 
     def _frame_pins(self) -> None:
         pins, colors = self._session.state.pins, pin_colors(self._dark)

@@ -19,6 +19,7 @@ from app.parts import card, column, unrolled
 from app.session import Session
 from app.store import Answer
 from app.theme import palette
+from app.turns import Soon
 from app.words import COMPUTING, reason
 
 BREAK_PX = 1100
@@ -70,7 +71,9 @@ class Sight:
         self._session = session
         self._watched = watched
         self._jobs: LatestWins[Seen] = LatestWins(session.on_page)
+        self._tell_soon = Soon(session.on_page, self._tell)
         self._is_on_screen = False
+        self._drawn: tuple[Answer, Seen] | None = None
         self._plots = PixelPlots()
         self._cards = [
             downloadable(framed(pane), session, what, partial(self._shown, pane.object, what), PLOT)
@@ -146,6 +149,7 @@ class Sight:
 
     def _lack(self, why: str) -> None:
         """Say why there is nothing to see."""
+        self._drawn = None
         with pn.io.hold(self._session.page):
             self._facts.facts, self._remark.text, self._table.rows = [], why, []
             for each in self._cards:
@@ -155,13 +159,22 @@ class Sight:
         if not self._is_on_screen or answer is not self._session.answer:
             return  # the user has moved on
         unit = self._session.state.unit
-        scales = inspector_words.both_scales(unit, answer)
         with pn.io.hold(self._session.page):
             self._plots.update(found.curves, unit, answer.capture.acquisition)
             for each in self._cards:
                 each.visible = True
-            facts = inspector_words.facts(answer, found, unit)
-            rows = -(-len(facts) // FACTS_ACROSS)
+        self._drawn = answer, found
+        self._tell_soon()
+
+    def _tell(self) -> None:
+        """All that is read, once the plots have gone: it would hold up what the eye follows."""
+        if self._drawn is None:
+            return
+        (answer, found), unit = self._drawn, self._session.state.unit
+        facts = inspector_words.facts(answer, found, unit)
+        rows = -(-len(facts) // FACTS_ACROSS)
+        scales = inspector_words.both_scales(unit, answer)
+        with pn.io.hold(self._session.page):
             self._facts.param.update(facts=facts, min_height=rows * FACTS_PX)
             self._remark.text = inspector_words.remark(found)
             self._table.param.update(

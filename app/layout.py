@@ -223,7 +223,7 @@ class Layout:
 
     def _listen(self) -> None:
         session = self.session
-        self._address.follow(session.state, session.query, session.later)
+        self._address.follow(session.state, session.query, session.wait, session.tell)
         session.announce, session.complain = self._announce, self._complain
         session.waiting = partial(setattr, self._progress, "visible")
         self._source.param.watch(lambda event: self._go_to(event.new), "value")

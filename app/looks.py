@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -44,13 +45,18 @@ class Look:
 
     def rgb(self, values: Array) -> NDArray[np.uint8]:
         """Colours of values (n,), as uint8 (n, 3)."""
-        table = np.array([_rgb(color) for color in self.colors], np.uint8)
+        table = _table(tuple(self.colors))
         place = (values - self.low) / (self.high - self.low)
         index = np.clip(np.nan_to_num(place) * len(table), 0, len(table) - 1).astype(int)
         colors = table[index]
         if self.outside is not None:
             colors[(place < 0) | (place > 1)] = _rgb(self.outside)
         return colors
+
+
+@cache
+def _table(colors: tuple[str, ...]) -> NDArray[np.uint8]:
+    return np.array([_rgb(color) for color in colors], np.uint8)
 
 
 def _rgb(color: str) -> tuple[int, int, int]:

@@ -23,7 +23,7 @@ from app.looks import cloud_of, image_of
 from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State, Viewing
 from app.store import Answer, Request, Source, compute, inspect, same_pixels, same_view
 from app.theme import WRONG_COLOR, palette
-from app.turns import TURNS
+from app.turns import TURNS, Soon
 from app.views import ImageView, SignalPlots
 from core.inspection import pixels_in
 
@@ -86,7 +86,8 @@ class Session:
         self._served = self.is_served
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._loop = IOLoop.current() if self._served else None
-        self._rest_is_due = self._pixel_is_due = self._has_failed = self._is_waiting = False
+        self._ask_pixel = Soon(self.on_page, self._draw_pixel)
+        self._rest_is_due = self._has_failed = self._is_waiting = False
         self._rest_asked_s = 0.0
         self._asked_s: float | None = None
         self.answer = self._first_answer(wanted)
@@ -206,13 +207,13 @@ class Session:
 
     def _await(self) -> None:
         self._asked_s = perf_counter()
-        self.later(self._admit_waiting, WAIT_MS)
+        self.wait(WAIT_MS, self._admit_waiting)
 
     def _admit_waiting(self) -> None:
         """Show that an answer is under way, if the oldest open request is that old."""
         if self._asked_s is not None and perf_counter() - self._asked_s >= 0.9e-3 * WAIT_MS:
             self._is_waiting = True
-            self.waiting(True)
+            self.tell(partial(self.waiting, True))
 
     def _end_waiting(self) -> None:
         """Show no more that an answer is under way, unless the next one is asked for already."""
@@ -225,7 +226,7 @@ class Session:
         if self._jobs.has_more:
             self._await()
         elif self._is_waiting:
-            self.later(self._end_waiting, WAIT_MS)
+            self.wait(WAIT_MS, partial(self.tell, self._end_waiting))
         self.announce(answer)
 
     def on_page(self, act: Callable[[], None], due: Callable[[], None] | None = None) -> None:
@@ -242,15 +243,22 @@ class Session:
 
         def begin() -> None:
             give_up()
-            if self.is_served:  # else the page is gone, and nobody left to see it
-                self.page.add_next_tick_callback(self._told(act))
+            self.tell(act)
 
         self._loop.add_callback(TURNS.ask, begin, is_computed=due is not None)
 
-    def later(self, act: Callable[[], None], after_ms: int) -> None:
-        """Do something on the page's thread, after a while; its failure is told like any other."""
-        if self.is_served:
-            self.page.add_timeout_callback(self._told(act), after_ms)
+    def tell(self, act: Callable[[], None]) -> None:
+        """Do something small on the page, on its thread, ahead of what waits for its turn."""
+        if self.is_served:  # else the page is gone, and nobody left to see it
+            self.page.add_next_tick_callback(self._told(act))
+
+    def wait(self, wait_ms: int, act: Callable[[], None]) -> None:
+        """Do something after a while, on the page's thread but not on the page: for `on_page`.
+
+        To come to the page costs a multiple of what most have to do that only look at the clock.
+        """
+        if self._loop is not None:
+            self._loop.call_later(1e-3 * wait_ms, act)
 
     def _told(self, act: Callable[[], None]) -> Callable[[], None]:
         """The same, to be done once, its failure told by the page."""
@@ -311,7 +319,7 @@ class Session:
         elif not self._rest_is_due:
             self._rest_is_due = True
             self._rest_asked_s = perf_counter()
-            self.later(self._ask_rest, REST_MS)
+            self.wait(REST_MS, self._ask_rest)
 
     def _enter(self, answer: Answer, previous: Answer) -> None:
         """Come to a capture of another kind: its own field of view, camera and, maybe, pixel."""
@@ -344,22 +352,15 @@ class Session:
         if index >= 0:
             self.choose_pixel(*divmod(index, self.answer.capture.shape[1]))
 
-    def _ask_pixel(self) -> None:
-        """Draw the pixel soon; once for all that is chosen until then."""
-        if not self._pixel_is_due:
-            self._pixel_is_due = True
-            self.on_page(self._draw_pixel)
-
     def _ask_rest(self) -> None:
         """Draw image and cloud, unless others wait for what comes first."""
         if TURNS.is_crowded and perf_counter() - self._rest_asked_s < REST_AT_MOST_S:
-            self.later(self._ask_rest, REST_MS)
+            self.wait(REST_MS, self._ask_rest)
         else:
             self.on_page(self._draw_rest)
 
     def _draw_pixel(self) -> None:
         """The pixel's plots and numbers, and the frames that mark it."""
-        self._pixel_is_due = False
         if self._is_hidden:
             self._is_outdated = True
             return
@@ -371,7 +372,8 @@ class Session:
             self.image.fit(*self.answer.capture.shape, self.answer.grid)
             self.signals.update(pixel, acquisition, state.difference, state.unit)
             self.image.mark(row, col)
-            self.image_keys.param.update(shape=list(self.answer.capture.shape), pixel=[row, col])
+            self.image_keys.shape = list(self.answer.capture.shape)
+            self.image_keys.pixel = [row, col]
             self.cloud.selected = row * self.answer.capture.shape[1] + col
             self.numbers.facts = numbers
             self.figures.facts = words.figure_strip(self.answer)

@@ -1,4 +1,4 @@
-"""Whose page is drawn next, where there are many: one after the other, and messages in between."""
+"""What is drawn next: many pages one after the other, and on a page what the eye follows first."""
 
 from __future__ import annotations
 
@@ -58,3 +58,29 @@ class Turns:
 
 
 TURNS = Turns()
+
+
+class Soon:
+    """Something to be done on a page, when called, soon: once for all calls until then.
+
+    Parameters
+    ----------
+    on_page : callable
+        As for `app.jobs.LatestWins`.
+    act : callable
+    """
+
+    def __init__(self, on_page: Callable[[Callable[[], None]], None], act: Callable[[], None]):
+        self._on_page = on_page
+        self._act = act
+        self._is_due = False
+
+    def __call__(self) -> None:
+        """Ask for it."""
+        if not self._is_due:
+            self._is_due = True
+            self._on_page(self._do)
+
+    def _do(self) -> None:
+        self._is_due = False
+        self._act()

@@ -216,8 +216,10 @@ class Pulse:
         ndarray, shape (..., n_bins + 1)
             From the gate's opening edge to its closing edge.
         """
-        since_onset = np.arange(n_bins + 1) - np.asarray(onset_bin, float)[..., np.newaxis]
-        return np.nan_to_num(self.cdf(since_onset * bin_width_s), nan=0.0)
+        onset = np.asarray(onset_bin, float)
+        before = self.cdf((np.arange(n_bins + 1) - onset[..., np.newaxis]) * bin_width_s)
+        before[~np.isfinite(onset)] = 0.0
+        return before
 
     def bin_probability(self, onset_bin: ArrayLike, n_bins: int, bin_width_s: float) -> Floats:
         """Share of the echo's photons in each bin (the pulse integrated over the bin).

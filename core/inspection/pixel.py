@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -60,15 +62,20 @@ class PixelReport:
     confidence: float
     candidates: tuple[Candidate, ...]
     """The best peaks of the score, best first; none where the pixel is empty."""
-    light: LightFound
-    """Signal, background and their ratio, with 95 % intervals, in photons per pulse where the
-    pulses are known."""
+    find_light: Callable[[], LightFound] = field(repr=False)
+    """Finds `light`."""
     light_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     light_method: str
     """How they are found."""
     verdict: Verdict
     """Whether the pixel is hot or dead."""
+
+    @cached_property
+    def light(self) -> LightFound:
+        """Signal, background and their ratio, with 95 % intervals, in photons per pulse where the
+        pulses are known. Found when first asked for: it takes longer than all else."""
+        return self.find_light()
 
 
 def pixel_report(
@@ -104,7 +111,11 @@ def pixel_report(
     counts = capture.cube[row, col].astype(float)
     curve = ESTIMATORS[method].curves(capture, row, col, settings)
     lag = lag_bins(capture, method, settings)
-    found = light_found(counts, capture.acquisition, capture.pulse, capture.armed_pulses)
+
+    def find_light() -> LightFound:
+        found = light_found(counts, capture.acquisition, capture.pulse, capture.armed_pulses)
+        return found.of(capture)
+
     return PixelReport(
         row=row,
         col=col,
@@ -118,7 +129,7 @@ def pixel_report(
         answer_m=float(image.range_m[row, col]),
         confidence=float(image.confidence[row, col]),
         candidates=_candidates(capture, row, col, curve, lag),
-        light=found.of(capture),
+        find_light=find_light,
         light_unit=light_unit(capture),
         light_method=METHOD,
         verdict=verdict(capture, row, col),
