@@ -51,6 +51,13 @@ def pixel_seen(answer: Answer, row: int, col: int) -> Seen:
     return Seen(inspect(answer, row, col), report)
 
 
+def pixel_lit(answer: Answer, row: int, col: int) -> Seen:
+    """The same, its light found: on a worker, where to find it would hold up the page."""
+    seen = pixel_seen(answer, row, col)
+    _ = seen.report.light
+    return seen
+
+
 def region_seen(answer: Answer, region: Corners) -> Seen:
     """All that is known of a region of an answer's pixels."""
     mask = inspection.pixels_in(region, answer.capture.shape)

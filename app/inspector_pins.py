@@ -13,7 +13,7 @@ from app import inspector_plots, inspector_words, plots
 from app.controls import Sentence, Table
 from app.downloads import PLOT, TABLE, Shown, below, downloadable, explored, over_the_gate
 from app.exports import shown_table_file
-from app.inspector_answers import Seen, pixel_seen
+from app.inspector_answers import Seen, pixel_lit
 from app.inspector_pixel import NARROW, framed, stage
 from app.inspector_views import GatePlot
 from app.jobs import LatestWins
@@ -96,7 +96,7 @@ class Pins:
             session = self._session
             answer, pins = session.answer, session.state.pins
             self._jobs.submit(
-                lambda: [pixel_seen(answer, *pin) for pin in pins],
+                lambda: [pixel_lit(answer, *pin) for pin in pins],
                 partial(self._draw, answer, pins),
                 session.fail,
             )

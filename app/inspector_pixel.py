@@ -11,7 +11,7 @@ from app import inspector_words
 from app.controls import FACTS_PX, LINE_PX, Facts, Sentence, Table
 from app.downloads import PLOT, TABLE, Shown, below, downloadable, explored, over_the_gate
 from app.exports import shown_table_file
-from app.inspector_answers import Seen, pixel_seen, region_seen
+from app.inspector_answers import Seen, pixel_lit, pixel_seen, region_seen
 from app.inspector_views import PixelPlots
 from app.jobs import LatestWins
 from app.pages import View
@@ -130,10 +130,10 @@ class Sight:
             return
         answer, state = session.answer, session.state
         if self._watched == "pixel":
-            work = partial(pixel_seen, answer, *state.pixel)
             if answer.capture.acquisition.n_bins <= AT_ONCE_BINS:
-                self._draw(answer, work())
+                self._draw(answer, pixel_seen(answer, *state.pixel))
                 return
+            work = partial(pixel_lit, answer, *state.pixel)
         elif state.region:
             work = partial(region_seen, answer, state.region)
             self._remark.text = COMPUTING
@@ -170,7 +170,8 @@ class Sight:
         """All that is read, once the plots have gone: it would hold up what the eye follows."""
         if self._drawn is None:
             return
-        (answer, found), unit = self._drawn, self._session.state.unit
+        (answer, found), self._drawn = self._drawn, None
+        unit = self._session.state.unit
         facts = inspector_words.facts(answer, found, unit)
         rows = -(-len(facts) // FACTS_ACROSS)
         scales = inspector_words.both_scales(unit, answer)

@@ -519,6 +519,29 @@ def test_keys_taps_and_fields_move_the_pixel(here):
 
 
 @pytest.mark.browser
+def test_a_move_paints_each_plot_once_and_then_tells_the_numbers(here):
+    go_to(here, 100, 190)
+    here.evaluate("""() => {
+      const plot = Bokeh.Models.get("Figure").prototype.default_view.prototype;
+      const paint = plot._actual_paint;
+      window.seen = [];
+      plot._actual_paint = function () {
+        seen.push(this.model.id);
+        paint.call(this);
+      };
+      window.forget = () => (plot._actual_paint = paint);
+    }""")
+    fact(here, "Pixel").locator("xpath=ancestor::dl").evaluate(
+        "list => new MutationObserver(() => seen.push('told')).observe(list, { childList: true })"
+    )
+    here.keyboard.press("ArrowRight")
+    expect(fact(here, "Pixel")).to_have_text("100, 191")
+    *painted, told = here.evaluate("forget(), seen")
+    assert told == "told"
+    assert len(painted) == len(set(painted)) == 4  # the picture, and three plots
+
+
+@pytest.mark.browser
 def test_zoom_stays_when_map_and_pixel_change(here):
     spans = "[found.x_range, found.y_range].flatMap(({start, end}) => [start, end])"
     whole, middle = of_picture(here, spans), within(here, 0.5, 0.4)
