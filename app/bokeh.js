@@ -94,14 +94,14 @@ const LONGEST_PAUSE_MS = 250;
 {
   const layer = Bokeh.Models.get("GlyphRenderer").prototype.default_view.prototype;
 
-  // Of each layer Bokeh keeps five more pictures: how it would look if it were chosen, or others
-  // were. Nothing is ever chosen in a plot: unless one is asked for, the layer's own is shown.
+  // Of each layer Bokeh keeps four more pictures: how it would look if it were chosen, or others
+  // were. Those that nobody asked for, which it makes itself and which are in no document, are the
+  // layer's own picture: nothing is ever chosen in a plot.
   const { build_glyph_view: build } = layer;
   const kept = ["set_data", "set_visuals", "after_visuals", "after_lazy_visuals", "map_data"];
   const own = Object.fromEntries([...kept, "remove"].map((name) => [name, { value() {} }]));
   layer.build_glyph_view = async function (glyph) {
-    const isAsked = Object.values(this.model.attributes).includes(glyph);
-    if (this.glyph && !isAsked) return Object.create(this.glyph, own);
+    if (!glyph.document) return Object.create(this.glyph, own);
     const view = await build.call(this, glyph);
     view._mask_data = undefined; // to look for what lies outside the window costs more than it saves
     return view;
@@ -125,16 +125,21 @@ const LONGEST_PAUSE_MS = 250;
   const { _handle_patch: take } = session;
   const { update_data: update } = layer;
   const { schedule_paint: schedule } = plot;
-  let updates, outdated; // unless a message is being taken in
+  let updates, outdated; // while messages are being taken in
 
+  const paint = () => {
+    const plots = outdated ?? [];
+    updates = outdated = undefined;
+    for (const plot of plots) queueMicrotask(() => plot.is_destroyed || plot.repaint());
+  };
   session._handle_patch = function (message) {
-    [updates, outdated] = [[], new Set()];
-    take.call(this, message);
-    Promise.allSettled(updates).then(() => {
-      const plots = outdated;
-      [updates, outdated] = [];
-      for (const plot of plots) if (!plot.is_destroyed) plot.repaint();
-    });
+    updates ??= [];
+    outdated ??= new Set();
+    try {
+      take.call(this, message);
+    } finally {
+      Promise.allSettled(updates).then(paint);
+    }
   };
   layer.update_data = function (indices) {
     const updated = update.call(this, indices);
@@ -142,7 +147,7 @@ const LONGEST_PAUSE_MS = 250;
     return updated;
   };
   plot.schedule_paint = function () {
-    if (outdated) outdated.add(this);
+    if (outdated && !this.is_paused) outdated.add(this);
     else schedule.call(this);
   };
 }

@@ -187,7 +187,7 @@ class Inspector:
             self._enter()
             self._subjects.follow(answer)
             # As on Explore: the eye follows the plots.
-            self._session.wait(REST_MS, partial(self._session.on_page, self._ask_map))
+            self._session.wait(REST_MS, partial(self._session.tell, self._ask_map))
 
     def _paint(self, dark: bool) -> None:
         self._dark = dark

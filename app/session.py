@@ -253,7 +253,7 @@ class Session:
             self.page.add_next_tick_callback(self._told(act))
 
     def wait(self, wait_ms: int, act: Callable[[], None]) -> None:
-        """Do something after a while, on the page's thread but not on the page: for `on_page`.
+        """Do something after a while, on the page's thread but not on the page: that is for `tell`.
 
         To come to the page costs a multiple of what most have to do that only look at the clock.
         """

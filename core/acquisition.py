@@ -209,7 +209,7 @@ class Pulse:
         Parameters
         ----------
         onset_bin : array_like, any shape
-            Delay of the echo in fractional bins; NaN means no echo.
+            Delay of the echo in fractional bins; one that is not finite means no echo.
 
         Returns
         -------

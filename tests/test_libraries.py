@@ -14,7 +14,7 @@ from bokeh.core.property.descriptors import PropertyDescriptor
 from bokeh.core.serialization import Deserializer, Serializer
 from bokeh.document import Document
 from bokeh.document.events import ModelChangedEvent
-from bokeh.models import ColumnDataSource, Range1d
+from bokeh.models import ColumnDataSource, Line, Range1d
 from bokeh.plotting import figure
 from bokeh.protocol import Protocol
 from panel.io.document import _destroy_document
@@ -117,16 +117,22 @@ def test_few_numbers_travel_within_the_message():
     assert [each.data.nbytes for each in serializer.buffers] == [many.nbytes]
 
 
-def test_defaults_that_are_kept_are_the_models_own(document):
-    kept = _kept(PropertyDescriptor._get_default)
+def test_defaults_are_found_once_for_all_models_of_a_kind(document):
+    found, get = [], PropertyDescriptor._get_default
+
+    def counting(descriptor, model):
+        found.append((type(model), descriptor.name))
+        return get(descriptor, model)
+
+    kept = _kept(counting)
     for model in document.models:
-        for name in model.properties():
+        for name in model.properties() - model._property_values.keys():
             descriptor = model.lookup(name)
-            if name in model._property_values:
-                continue
-            for _ in range(2):
-                own = PropertyDescriptor._get_default(descriptor, model)
-                assert own is kept(descriptor, model) or own == kept(descriptor, model)
+            theirs = [get(descriptor, model), kept(descriptor, model), kept(descriptor, model)]
+            assert len({repr(each) for each in theirs}) == 1  # NaN is not itself
+    lines = [each for each in document.models if isinstance(each, Line)]
+    assert len(lines) > 1
+    assert found.count((Line, "tags")) > found.count((Line, "line_width")) == 1
 
 
 def test_defaults_that_may_be_changed_in_place_are_each_models_own():
