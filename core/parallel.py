@@ -17,6 +17,8 @@ COMPILED: dict[str, Any] = {
     "error_model": "numpy",  # a division by zero gives infinity or NaN, as in numpy
 }
 PARALLEL: dict[str, Any] = {**COMPILED, "parallel": True}
+# Sums may be added up in any order, and so several numbers at a time.
+SUMMING: dict[str, Any] = {**COMPILED, "fastmath": {"contract", "reassoc"}}
 
 # Where OpenMP is missing numba falls back to a threading layer that aborts the process when two
 # Python threads enter parallel kernels at once.

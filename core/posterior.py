@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from core.acquisition import Acquisition, Floats, Pulse
 from core.blocks import LANES, lane_rows, to_blocks
 from core.capture import Capture, once_per_capture
-from core.parallel import COMPILED, PARALLEL, entering
+from core.parallel import COMPILED, PARALLEL, SUMMING, entering
 from core.resolution import FEW, Difference, difference, pile_up
 from core.spatial import weighted_median
 from core.trigger import rate_per_bin, trigger_probability
@@ -372,13 +372,10 @@ def _shares(evidence: Floats) -> Floats:
     The faintest levels cannot be told from no echo, and sharing pixels out among them is arbitrary:
     these are counted as having no echo, as long as the likelihood does not miss the others.
     """
-    n_pixels, n_levels = evidence.shape
+    n_levels = evidence.shape[1]
     likelihood = np.exp(evidence - evidence.max(axis=1, keepdims=True))
     share = np.full(n_levels, 1 / n_levels)
-    for _ in range(_STEPS):  # expectation and maximisation (Laird 1978)
-        share = share * ((1 / (likelihood @ share)) @ likelihood)
-        share[0] += 1.0
-        share /= n_pixels + 1.0
+    _learn_shares(likelihood, share)
     least = np.log(likelihood @ share).sum() - _MISSED
     for faintest in range(1, n_levels - 1):
         simpler = share.copy()
@@ -397,32 +394,10 @@ def _shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Flo
     all alike and smoothed each time, and a part of the pixels that stays so: pixels are too few to
     tell a share for each bin.
     """
-    n_pixels, _, n_bins = density.shape
-    none, some = density[:, 0, 0].astype(float), density[:, 1:].reshape(-1, n_bins)
-    depth = np.full(n_bins, 1 / n_bins)
-    for _ in range(_DEPTH_STEPS):
-        mass = (some @ depth.astype(np.float32)).reshape(n_pixels, -1) * share[1:]
-        total = none * share[0] + mass.sum(axis=1)
-        found = depth * ((share[1:] / total[:, np.newaxis]).ravel().astype(np.float32) @ some)
-        share = np.concatenate(
-            [[1 + (none * share[0] / total).sum()], (mass.T / total).sum(axis=1)]
-        )
-        share = np.maximum(share / share.sum(), 1e-12)  # never quite impossible
-        found = _smoothed(found)
-        if not found.any():  # all pixels are beyond doubt without an echo
-            break
-        depth = (1 - _ALIKE) * found / found.sum() + _ALIKE / n_bins
+    n_bins = density.shape[2]
+    share, depth = share.copy(), np.full(n_bins, 1 / n_bins)
+    _learn_shares_and_depths(density, share, depth)
     return share, depth * n_bins
-
-
-def _smoothed(density: Floats) -> Floats:
-    """Convolved with a Gaussian of `_SMOOTHING`; beyond its ends a density stays as it is.
-
-    (As `scipy.ndimage.gaussian_filter1d` does it, which takes a quarter of a second to load.)
-    """
-    reach, last = _SMOOTHING.size // 2, density.size - 1
-    within = np.clip(np.arange(-reach, last + reach + 1), 0, last)
-    return np.convolve(density[within], _SMOOTHING, mode="valid")
 
 
 def _gaussian(sigma: float) -> Floats:
@@ -433,6 +408,70 @@ def _gaussian(sigma: float) -> Floats:
 
 
 _SMOOTHING = _gaussian(2.0)  # bins
+
+
+# All steps in one: between numpy's the interpreter would go from thread to thread a thousand times.
+
+
+@njit(**SUMMING)
+def _learn_shares(likelihood, share):  # type: ignore[no-untyped-def]
+    """Expectation and maximisation (Laird 1978) of the shares of levels, in place."""
+    n_pixels, n_levels = likelihood.shape
+    for _ in range(_STEPS):
+        found = np.zeros(n_levels)
+        found[0] = 1.0
+        for pixel in range(n_pixels):
+            mixture = 0.0
+            for level in range(n_levels):
+                mixture += share[level] * likelihood[pixel, level]
+            for level in range(n_levels):
+                found[level] += share[level] * likelihood[pixel, level] / mixture
+        for level in range(n_levels):
+            share[level] = found[level] / (n_pixels + 1)
+
+
+@njit(**SUMMING)
+def _learn_shares_and_depths(density, share, depth):  # type: ignore[no-untyped-def]
+    """The same of the shares of levels and of the delays' probabilities, in place."""
+    n_pixels, n_levels, n_bins = density.shape
+    mass = np.empty(n_levels)
+    for _ in range(_DEPTH_STEPS):
+        likely = depth.astype(np.float32)
+        found, reweighted = np.zeros(n_levels), np.zeros(n_bins, np.float32)
+        found[0] = 1.0
+        for pixel in range(n_pixels):
+            mass[0] = share[0] * density[pixel, 0, 0]
+            for level in range(1, n_levels):
+                near = np.float32(0.0)
+                for k in range(n_bins):
+                    near += density[pixel, level, k] * likely[k]
+                mass[level] = share[level] * near
+            total = mass.sum()
+            for level in range(n_levels):
+                found[level] += mass[level] / total
+            for level in range(1, n_levels):
+                weight = np.float32(share[level] / total)
+                for k in range(n_bins):
+                    reweighted[k] += weight * density[pixel, level, k]
+        for level in range(n_levels):
+            share[level] = max(found[level] / (n_pixels + 1), 1e-12)  # never quite impossible
+        smooth = _smoothed(depth * reweighted)
+        whole = smooth.sum()
+        if whole == 0:  # all pixels are beyond doubt without an echo
+            break
+        for k in range(n_bins):
+            depth[k] = (1 - _ALIKE) * smooth[k] / whole + _ALIKE / n_bins
+
+
+@njit(**COMPILED)
+def _smoothed(density):  # type: ignore[no-untyped-def]
+    """Convolved with a Gaussian of `_SMOOTHING`; beyond its ends a density stays as it is."""
+    reach, last = _SMOOTHING.size // 2, density.size - 1
+    smooth = np.zeros(density.size)
+    for k in range(density.size):
+        for j in range(_SMOOTHING.size):
+            smooth[k] += _SMOOTHING[j] * density[min(max(k + j - reach, 0), last)]
+    return smooth
 
 
 @once_per_capture
@@ -736,7 +775,9 @@ def _fill_level(b, level, prepared, fired, reach, gain, ratio):  # type: ignore[
         signal = prepared.signal[level, b, i]
         background = prepared.background[level, b, i] / n_bins
         if i > 0 and signal == previous_signal and background == previous_background:
-            gain[:, :, i] = gain[:, :, i - 1]  # logarithms are what costs, and neighbours are alike
+            for step in range(n_steps):  # logarithms are what costs, and neighbours are alike
+                for tap in range(n_taps):
+                    gain[step, tap, i] = gain[step, tap, i - 1]
             continue
         previous_signal, previous_background = signal, background
         bare = -math.expm1(-background)

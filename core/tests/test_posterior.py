@@ -796,3 +796,53 @@ def test_depths_are_smoothed_by_a_gaussian(n_bins: int) -> None:
     density = np.random.default_rng(n_bins).random(n_bins)
     expected = ndimage.gaussian_filter1d(density, 2.0, mode="nearest")
     np.testing.assert_allclose(posterior._smoothed(density), expected, rtol=1e-13)
+
+
+# --- Shares, step by step, in float64. ---
+
+
+def any_densities(n_levels: int, n_bins: int) -> np.ndarray:
+    """Shape (pixel, level, bin): each pixel likes one delay, and the first level likes none."""
+    rng = np.random.default_rng(n_bins)
+    near = np.abs(np.arange(n_bins) - rng.uniform(0, n_bins, (24, 1, 1)))
+    likely = np.exp(-near / np.linspace(1, 4, n_levels)[:, np.newaxis]) + 1e-3
+    likely[:, 0] = rng.uniform(0.01, 1.0, (24, 1))
+    return likely.astype(np.float32)
+
+
+@pytest.mark.parametrize("n_levels", [2, 5])
+@pytest.mark.parametrize("n_bins", [1, 7, 40])
+def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None:
+    density, told = any_densities(n_levels, n_bins), np.full(n_levels, 1 / n_levels)
+    share, depth = told, np.full(n_bins, 1 / n_bins)
+    for _ in range(30):
+        joint = density * share[:, np.newaxis] * depth
+        joint /= joint.sum(axis=(1, 2), keepdims=True)
+        share = (np.eye(n_levels)[0] + joint.sum(axis=(0, 2))) / (len(density) + 1)
+        share = np.maximum(share, 1e-12)
+        learned = ndimage.gaussian_filter1d(joint[:, 1:].sum(axis=(0, 1)), 2.0, mode="nearest")
+        depth = 0.9 * learned / learned.sum() + 0.1 / n_bins
+    found = posterior._shares_and_depths(density, told)
+    np.testing.assert_allclose(found[0], share, rtol=1e-4)
+    np.testing.assert_allclose(found[1], depth * n_bins, rtol=1e-4)
+    assert (told == 1 / n_levels).all()
+
+
+def test_no_echo_at_all_leaves_depths_alike() -> None:
+    density = any_densities(3, 9)
+    density[:, 1:] = 0.0
+    share, depth = posterior._shares_and_depths(density, np.full(3, 1 / 3))
+    np.testing.assert_allclose(share, [1, 1e-12, 1e-12])
+    np.testing.assert_array_equal(depth, np.ones(9))
+
+
+def test_shares_are_the_equations() -> None:
+    evidence = np.log(any_densities(5, 40)[:, :, 20])
+    share = np.full(5, 0.2)
+    for _ in range(100):
+        joint = np.exp(evidence) * share
+        joint /= joint.sum(axis=1, keepdims=True)
+        share = (np.eye(5)[0] + joint.sum(axis=0)) / (len(evidence) + 1)
+    learned = np.full(5, 0.2)
+    posterior._learn_shares(np.exp(evidence), learned)
+    np.testing.assert_allclose(learned, share, rtol=1e-9)
