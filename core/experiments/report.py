@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from core.experiments.items import Item, Pictures, Plot, Scatter, Table, as_csv, as_text
@@ -123,8 +124,12 @@ def _cell(tag: str, text: str, is_word: bool) -> str:
 
 def _draw(item: Plot | Scatter | Pictures) -> Figure:
     if isinstance(item, Plot):
-        return _plotted(item)
-    return _scattered(item) if isinstance(item, Scatter) else _pictured(item)
+        figure = _plotted(item)
+    else:
+        figure = _scattered(item) if isinstance(item, Scatter) else _pictured(item)
+    ConstrainedLayoutEngine().execute(figure)  # here, or each format would do it again
+    figure.set_layout_engine("none")
+    return figure
 
 
 def _saved(figure: Figure, format: str) -> bytes:

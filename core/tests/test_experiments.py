@@ -28,7 +28,8 @@ from core.limits import right_bin_probability
 from core.scene import Scene, scenes
 from core.tracking import PRESETS, TrackingParameters
 
-pytestmark = pytest.mark.compiled
+# What they share is made once.
+pytestmark = [pytest.mark.compiled, pytest.mark.xdist_group("experiments")]
 
 CAR = Condition("car", 0.06)
 SIZE = 24  # rows and columns that tell of places in the gate

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import tracemalloc
 from collections.abc import Callable
 
@@ -136,21 +135,17 @@ def test_pairs_are_those_counted_one_by_one(monkeypatch: pytest.MonkeyPatch) -> 
     np.testing.assert_allclose(pairs.sum(axis=0), expected, atol=1e-3)
 
 
-def test_large_cubes_take_little_time_and_memory() -> None:
+def test_large_cubes_take_little_memory() -> None:
     """As large as a published capture: 101 million bins."""
     cube = np.zeros((340, 340, 876), np.uint16)
     cube[:, :, 300:310] = 1
-    guessed_sigma_bins(cube)
-    begin = time.perf_counter()
-    guessed_sigma_bins(cube)
-    took_s = time.perf_counter() - begin
+    guessed_sigma_bins(cube)  # compiles
     tracemalloc.start()
     try:
         guessed_sigma_bins(cube)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert took_s < 1.0  # a tenth of it on a machine of one's own
     assert peak < 2**25
 
 

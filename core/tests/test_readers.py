@@ -12,6 +12,7 @@ import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from hypothesis.extra import numpy as hnp
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
 from core.export import save_capture
-from core.readers import MAX_CUBE_BYTES, READERS, guards, read_capture
+from core.readers import MAX_CUBE_BYTES, READERS, guards, hdf5, read_capture
 from core.tests.formats import FORMATS, Format, damaged, put
 from core.tests.refusing import assert_refused
 from core.tests.samples import (
@@ -60,8 +61,9 @@ def test_every_reader_is_under_the_contract() -> None:
 
 
 @pytest.fixture
-def saved(tmp_path: Path) -> Callable[[Format], Path]:
-    """Path of a file of a format, written anew."""
+def saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Format], Path]:
+    """Path of a file of a format, which no longer changes: what is in it is looked up once."""
+    monkeypatch.setattr(hdf5, "isolated", cache(guards.isolated))
     return lambda kept: put(tmp_path / kept.name, kept.build())
 
 

@@ -160,7 +160,7 @@ def test_threads_are_given_back() -> None:
 
 def test_a_start_is_told_stage_by_stage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     script = "import os, time; open(os.environ['NUMBA_CACHE_DIR'] + '/x', 'w')\n"
-    script += f"print([time.time() + i for i in range({len(start.STAGES)})])"
+    script += f"now = time.time(); print([now + i for i in range({len(start.STAGES)})])"
     monkeypatch.setattr(start, "_FIRST_IMAGE", script)
     seconds = start.first_image(tmp_path)
     assert seconds[0] > 0
