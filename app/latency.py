@@ -144,8 +144,8 @@ def _open_without_delay(open_: Any) -> Any:
 
 
 async def _send_at_once(socket: WSHandler, message: Message[Any]) -> None:
-    # Bokeh lets all other sessions have their turn after each of the parts, and Panel keeps what
-    # it has to say until the last of them is sent.
+    # Bokeh lets all other sessions have their turn after each of the parts, under a lock: Panel
+    # then keeps what it has to say, and what is said of models in there would come before them.
     parts: list[tuple[str | bytes, bool]] = [
         (message.header_json, False),
         (message.metadata_json, False),
@@ -153,7 +153,7 @@ async def _send_at_once(socket: WSHandler, message: Message[Any]) -> None:
     ]
     for buffer in message.buffers:
         parts += [(json.dumps(buffer.ref), False), (buffer.to_bytes(), True)]
-    with await socket.write_lock.acquire(), suppress(WebSocketClosedError):  # the page is gone
+    with suppress(WebSocketClosedError):  # the page is gone
         await asyncio.gather(
             *(WebSocketHandler.write_message(socket, part, binary) for part, binary in parts)
         )
