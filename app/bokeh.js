@@ -52,6 +52,21 @@ const LONGEST_PAUSE_MS = 250;
 }
 
 {
+  // A part that folds is called "show more", whatever it is, and its title does nothing.
+  const view = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype.default_view.prototype;
+  const { after_rendered: rendered } = view;
+  view.after_rendered = function () {
+    rendered.call(this);
+    const header = this.shadow_el.querySelector(".MuiCardHeader-root");
+    const button = header?.querySelector("[aria-expanded]");
+    if (!button) return;
+    button.ariaLabel = header.textContent;
+    header.style.cursor = "pointer";
+    header.onclick = ({ target }) => button.contains(target) || button.click();
+  };
+}
+
+{
   // A hand moves a slider sixty times a second, whether or not the server is done with the last
   // value. Of those that it overtakes in the meantime none is sent.
   const { DocumentEventBatch } = Bokeh.require("document/events");

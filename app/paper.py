@@ -37,11 +37,11 @@ TABLE_2_METHODS = sorted(paper.TABLE_2_METHODS, key=lambda method: method.estima
 # The parts' buttons and controls on the left of what they control; above it on a phone.
 BOARD = """
 :host { display: grid !important; gap: 14px; align-items: start;
-  grid-template-columns: 270px minmax(0, 1fr); }
+  grid-template-columns: 270px minmax(0, 1fr); flex: none !important; height: auto !important; }
+.bk-panel-models-layout-Column { flex: none !important; height: auto !important; }
 @media (max-width: 900px) {
-  :host { display: flex !important; flex: none !important; flex-direction: column;
-    height: auto !important; }
-  .bk-panel-models-layout-Column { flex: none !important; height: auto !important; width: 100%; }
+  :host { display: flex !important; flex-direction: column; }
+  .bk-panel-models-layout-Column { width: 100%; }
 }
 """
 STACK = """
@@ -420,13 +420,12 @@ class LeftUnsaid:
     @property
     def view(self) -> View:
         """Plots and tables, and their controls."""
-        content = (
+        main = [
             _stack(self._no_echo, self._by_place),
             self._limits.layout,
             self._arithmetic.layout,
-        )
+        ]
         controls = aside(paper_words.UNSAID, self._panel.layout, *self._study.controls)
-        main = pn.Column(*content, sizing_mode="stretch_both", margin=0)
         return View(main, controls, self._study.show, paint=self._paint)
 
     def _choose(self, settings: Unsaid) -> None:

@@ -237,6 +237,19 @@ def marks(page: Page, before: dict[str, np.ndarray]) -> np.ndarray:
     return np.argwhere(differs)
 
 
+def test_a_part_of_the_sidebar_folds_by_its_title_and_is_called_by_it(car_page):
+    view = car_page.get_by_role("button", name="View", exact=True)
+    expect(view).to_have_attribute("aria-expanded", "true")
+    title = car_page.locator(".MuiCardHeader-root", has_text=re.compile("^View$"))
+    for is_open in ("false", "true"):
+        title.click(position={"x": 20, "y": 20})
+        expect(view).to_have_attribute("aria-expanded", is_open)
+    view.click()
+    expect(view).to_have_attribute("aria-expanded", "false")
+    view.press("Enter")
+    expect(view).to_have_attribute("aria-expanded", "true")
+
+
 def test_a_tap_on_the_image_chooses_the_pixel(car_page):
     run, before, start = car(), look(car_page), fact(car_page, "Pixel").inner_text()
     place = tap(car_page)
@@ -526,8 +539,7 @@ def test_a_real_capture_is_ranged_and_its_guesses_are_told(page, real_capture):
     expect(inspect).to_have_attribute("aria-pressed", "true")
     new.get_by_role("button", name="Explore", exact=True).click()
     expect_the_building_at_21_km(new)
-    header = new.locator(".MuiCardHeader-root", has_text="How to read the file")
-    header.get_by_role("button", name="show more").click()
+    new.get_by_role("button", name="How to read the file").click()
     field(new, "Bin width (s)").fill("2e-9")
     new.get_by_role("button", name="Read again").click()
     expect(new.get_by_text("256 × 256 pixels, 100 bins of 2 ns")).to_be_visible()

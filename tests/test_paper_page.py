@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -377,6 +378,11 @@ def figure(page: Page, line: str) -> Locator:
     return page.locator(".bk-Figure").filter(has_text=line).last
 
 
+def bottom(locator: Locator) -> float:
+    box = locator.bounding_box()
+    return box["y"] + box["height"]
+
+
 def titles(page: Page) -> dict[str, str]:
     """Colour of each plot's title, by the title: they are drawn, and no text to the browser."""
     return page.evaluate(
@@ -408,6 +414,27 @@ def test_the_slider_of_figure_5_moves_the_curves(paper_page):
         paper_page.keyboard.press("ArrowRight")
     eventually(lambda: "Both scales, echo at bin 70, SBR 0.08" in titles(paper_page))
     eventually(lambda: pixel.screenshot() != before[0] and curve.screenshot() != before[1])
+
+
+@pytest.mark.browser
+def test_what_a_part_shows_is_below_each_other(paper_page):
+    go(paper_page, "Figures 8, 9, 12")
+    go(paper_page, "What is left unsaid")
+    limit, *others = (
+        paper_page.locator("table").filter(has_text=text) for text in ("Cramér-Rao", "statement")
+    )
+    chart = figure(paper_page, "limit: probability")
+    for above, below in pairwise((chart, limit, *others)):
+        eventually(lambda above=above, below=below: bottom(above) < below.bounding_box()["y"])
+    go(paper_page, "Figures 8, 9, 12")
+    note = paper_page.get_by_text(paper_words.OUTSIDE_NOTE)
+    expect(note).to_be_visible(timeout=SOON_MS)
+    drawn = paper_page.locator(".bk-Figure:visible")
+    eventually(lambda: drawn.count() == len(paper.NEAR) + 2)  # truth and scale, too
+    *pictures, scale = sorted(drawn.all(), key=lambda each: each.bounding_box()["y"])
+    for each in pictures:
+        assert bottom(each) <= scale.bounding_box()["y"]
+    assert bottom(scale) <= note.bounding_box()["y"]
 
 
 @pytest.mark.browser
