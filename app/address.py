@@ -31,9 +31,8 @@ NOT_OURS = ("bokeh-session-id", "bokeh-token", "theme", "token")
 """Entries of an address that the server reads."""
 
 
-REST_MS = 600
-"""The address follows when nothing has changed for so long: a slider under way has better to do. Of
-one on a busy server values come a quarter of a second apart (`bokeh.js`)."""
+REST_MS = 250
+"""The address follows when nothing has changed for so long: a slider under way has better to do."""
 
 
 class AddressBar(Component):
