@@ -92,6 +92,8 @@ const LONGEST_PAUSE_MS = 250;
     this.waiting ??= new Map();
     let isUrgent = this.pause === undefined;
     for (const each of (event.events ?? [event]).filter((each) => each.sync)) {
+      // Each change of the page's theme gives it one more style, which the server has no use for.
+      if (each.model?.type === "Toolbar") continue;
       // A click or the like may ask for what was set before it: all of it is sent, in order.
       isUrgent ||= each.kind !== "ModelChanged";
       const what = each.kind === "ModelChanged" ? `${each.model.id} ${each.attr}` : each;

@@ -161,7 +161,6 @@ def _with_marks(**options: Any) -> Any:
         sizing_mode="stretch_both",
         min_height=110,
         toolbar_location=None,
-        outline_line_color=None,
         **options,
     )
     drawing.extra_y_ranges = {MARKS: Range1d(0, 1)}

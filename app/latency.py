@@ -19,7 +19,13 @@ from typing import Any
 
 from bokeh.core.has_props import HasProps
 from bokeh.core.property.descriptors import PropertyDescriptor
-from bokeh.core.serialization import BytesRep, Deserializer, Serializer
+from bokeh.core.serialization import (
+    BytesRep,
+    Deserializer,
+    Serialized,
+    Serializer,
+    UnknownReferenceError,
+)
 from bokeh.protocol.message import Message
 from bokeh.server.views.ws import WSHandler
 from bokeh.settings import settings
@@ -88,7 +94,27 @@ class QuickDeserializer(Deserializer):
         super().__init__((), **options)
         self._before = references
         if references:
-            self._references = _Named(references[0].document.models)
+            self._models = references[0].document.models
+            self._references = _Named(self._models)
+
+    def deserialize(self, obj: Any) -> Any:
+        """What the page says, but for what it says of models that are gone.
+
+        Bokeh would drop all of such a message, whatever else a hand has done in the meantime.
+        """
+        content, buffers = (
+            (obj.content, obj.buffers) if isinstance(obj, Serialized) else (obj, None)
+        )
+        if not self._before:
+            return self.decode(content, buffers)
+        events = []
+        for event in content["events"]:
+            try:
+                events.append(self.decode(event, buffers))
+            except UnknownReferenceError as error:
+                if not self._models.seen(error.id):
+                    raise
+        return {"events": events}
 
     def has_ref(self, obj: Any) -> bool:
         """Whether a model was there before, or was made by this message."""

@@ -28,7 +28,7 @@ from app.session import Session
 from app.state import Less, Light, Reading, Viewing
 from app.store import Answer, Request, Source
 from app.takeaway import TakeAway
-from app.theme import DARK, LIGHT, SIZES
+from app.theme import DARK, LIGHT, STYLES
 from app.tradeoff import Tradeoff
 from app.uploads import MAX_UPLOAD_BYTES, Uploads
 from core import PRESETS, TrackingParameters
@@ -123,7 +123,7 @@ class Page(pmui.Page):
     def get_root(self, doc: Any = None, comm: Any = None, preprocess: bool = True) -> Any:
         """The page's model, told which parts of Bokeh's plots not to restyle."""
         root = super().get_root(doc, comm, preprocess)
-        root.data._custom_theme = list(SIZES)
+        root.data._custom_theme = list(STYLES)
         return root
 
 

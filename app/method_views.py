@@ -115,7 +115,6 @@ class ScaleBar:
             height=52,
             sizing_mode="stretch_width",
             toolbar_location=None,
-            outline_line_color=None,
             x_range=Range1d(0, 1),
             y_range=Range1d(0, 1),
         )

@@ -250,7 +250,6 @@ def curves(item: items.Plot, colors: Palette) -> Any:
         min_height=120,
         tools="xbox_zoom",
         toolbar_location=None,
-        outline_line_color=None,
     )
     lines = {name: (item.x, values) for name, values in item.curves.items()}
     lines |= {name: marker_line(place, 1.0) for name, place in item.marks.items()}
@@ -317,7 +316,6 @@ def pictures(item: items.Pictures) -> list[Any]:
             match_aspect=True,
             tools="box_zoom,tap",
             toolbar_location=None,
-            outline_line_color=None,
         )
         place = {"x": -0.5, "y": -0.5, "dw": cols, "dh": rows}
         shown.append(drawing.image([image], **place, color_mapper=mapper, name="picture"))
@@ -356,7 +354,6 @@ def tradeoff(colors: Palette) -> Any:
         min_height=240,
         tools="box_zoom,tap",
         toolbar_location=None,
-        outline_line_color=None,
     )
     for name, dimension in _ASKED.items():
         drawing.add_layout(Span(name=name, dimension=dimension, line_dash=[6, 3]))

@@ -87,8 +87,14 @@ def method_style(place: int, colors: Palette) -> tuple[str, list[int]]:
     return colors.methods[hue], DASHES[again % len(DASHES)]
 
 
-# Sizes of all plots, by Bokeh model.
-SIZES: dict[str, dict[str, object]] = {
+STYLES: dict[str, dict[str, object]] = {
+    # The card shows through: it goes dark at once.
+    "Plot": {
+        "background_fill_color": None,
+        "border_fill_color": None,
+        "outline_line_color": None,
+    },
+    "Grid": {},
     "Title": {"text_font_size": "12px", "text_font": FONT, "standoff": 2},
     "Axis": {
         "axis_label_text_font": FONT,
@@ -121,3 +127,4 @@ SIZES: dict[str, dict[str, object]] = {
         "major_label_text_font_size": "11px",
     },
 }
+"""What all plots have in common, by Bokeh's model; a mode's colours are from `paint_frame`."""

@@ -26,7 +26,7 @@ from app.gate import GateAxes, GateReadOut
 from app.large import Grid
 from app.looks import Look
 from app.store import Pixel
-from app.theme import LIGHT, SIZES, Palette
+from app.theme import LIGHT, STYLES, Palette
 from core import Acquisition
 
 Array = NDArray[Any]
@@ -231,8 +231,8 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
     for renderer in figure.renderers:
         # How a line would look if it were chosen, or others were: nothing is chosen in a plot.
         renderer.update(selection_glyph=None, nonselection_glyph=None, muted_glyph=None)
-    for model in (figure.title, *figure.axis, *figure.legend, *color_bars(figure)):
-        for kind, sizes in SIZES.items():
+    for model in (figure, figure.title, *figure.axis, *figure.legend, *color_bars(figure)):
+        for kind, sizes in STYLES.items():
             if isinstance(model, getattr(bokeh.models, kind)):
                 model.update(**sizes)
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)

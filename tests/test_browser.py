@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -608,8 +609,19 @@ def test_two_sessions_do_not_see_each_other(page):
     expect(other.get_by_role("menuitem")).to_have_text(titles)
 
 
+NOTE_SENT = """
+window.sent = [];
+const send = WebSocket.prototype.send;
+WebSocket.prototype.send = function (part) {
+  sent.push(part);
+  send.call(this, part);
+};
+"""
+
+
 def test_plots_and_cloud_follow_the_page_into_the_dark(page):
-    new = page()
+    new = page(prepare=NOTE_SENT)
+    new.evaluate("sent.length = 0")
 
     def all_drawn_in(palette) -> bool:
         drawn = [colors(picture) for picture in look(new).values()]
@@ -621,6 +633,9 @@ def test_plots_and_cloud_follow_the_page_into_the_dark(page):
     assert pixels(new.screenshot()).mean() < 60
     new.get_by_role("button", name="Toggle theme").click()
     eventually(lambda: all_drawn_in(LIGHT))
+    told = [event for part in new.evaluate("sent") for event in json.loads(part).get("events", ())]
+    # The server paints the plots: it need not hear of each line what the browser made of it.
+    assert {event["attr"] for event in told} == {"dark_theme"}
 
 
 def test_a_phone_shows_everything_below_each_other(page):

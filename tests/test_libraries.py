@@ -11,7 +11,7 @@ import numpy as np
 import panel as pn
 import pytest
 from bokeh.core.property.descriptors import PropertyDescriptor
-from bokeh.core.serialization import Deserializer, Serializer
+from bokeh.core.serialization import Deserializer, Serializer, UnknownReferenceError
 from bokeh.document import Document
 from bokeh.document.events import ModelChangedEvent
 from bokeh.models import ColumnDataSource, Line, Range1d
@@ -162,6 +162,32 @@ def test_a_model_that_comes_to_the_document_later_was_not_known(document):
     later = Range1d()
     document.add_root(later)
     assert not made.has_ref(later)
+
+
+def patch(**changed):
+    """What a page would say of a model's attribute, by the model's id."""
+    events = [
+        {"kind": "ModelChanged", "model": {"id": model}, "attr": "start", "new": value}
+        for model, value in changed.items()
+    ]
+    return {"events": events}
+
+
+def test_what_is_said_of_others_than_of_a_model_that_is_gone_is_heard(document, monkeypatch):
+    monkeypatch.setattr("bokeh.document.document.Deserializer", QuickDeserializer)
+    there, gone = Range1d(), Range1d()
+    document.add_root(there)
+    document.add_root(gone)
+    document.remove_root(gone)
+    heard = []
+    there.on_change("start", lambda attr, old, new: heard.append(new))
+    document.apply_json_patch(patch(**{gone.id: 1}))
+    document.apply_json_patch(patch(**{gone.id: 2, there.id: 3}))
+    document.apply_json_patch(patch(**{there.id: 4, gone.id: 5}))
+    assert heard == [3, 4]
+    with pytest.raises(UnknownReferenceError, match="never-there"):
+        document.apply_json_patch(patch(**{there.id: 6, "never-there": 7}))
+    assert there.start == 4
 
 
 # -- where it is put -------------------------------------------------------------------------------
