@@ -26,6 +26,7 @@ from app import collector, latency, words
 from app.connection import LINGER_S, serving_options
 from app.controls import Sentence
 from app.layout import build_page
+from app.opening import Answers, send_heads_first
 from app.serving import TOKEN_VARIABLE, Access, Headers, guard, keep_tracebacks
 from app.state import Light, Reading
 from app.store import Source, built_in_sources, file_source
@@ -73,6 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
     sources, uploads = given | built_in_sources(), Uploads()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # uploads are removed then, too
     pn.extension("vtk")
+    send_heads_first()
     try:
         port = chosen.port or free_port(chosen.address)
         token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
@@ -83,7 +85,7 @@ def main(arguments: list[str] | None = None) -> int:
             address=chosen.address,
             websocket_origin=sorted(access.hosts),
             websocket_max_message_size=2 * MAX_UPLOAD_BYTES,
-            transforms=[Headers],
+            transforms=[Headers, Answers],
             title="firstphoton",
             verbose=False,
             show=False,

@@ -100,7 +100,10 @@ COLUMN = column(8, BREAK_PX)
 TEMPLATE = (
     '{% extends "base.html" %}{% block postamble %}{{ super() }}<script>{% raw %}'
     + Path(__file__).with_name("bokeh.js").read_text(encoding="utf-8")
-    + "{% endraw %}</script>{% endblock %}"
+    + "{% endraw %}"
+    # The widgets' module, which would be asked for when the page is there.
+    + f'importShim("{pmui.Button._render_esm(server=True)}");'
+    + "</script>{% endblock %}"
 )
 
 
