@@ -102,15 +102,13 @@ class QuickDeserializer(Deserializer):
 
         Bokeh would drop all of such a message, whatever else a hand has done in the meantime.
         """
-        content, buffers = (
-            (obj.content, obj.buffers) if isinstance(obj, Serialized) else (obj, None)
-        )
         if not self._before:
-            return self.decode(content, buffers)
+            return super().deserialize(obj)
+        message = obj if isinstance(obj, Serialized) else Serialized(obj)
         events = []
-        for event in content["events"]:
+        for event in message.content["events"]:
             try:
-                events.append(self.decode(event, buffers))
+                events.append(self.decode(event, message.buffers))
             except UnknownReferenceError as error:
                 if not self._models.seen(error.id):
                     raise

@@ -94,7 +94,7 @@ STYLES: dict[str, dict[str, object]] = {
         "border_fill_color": None,
         "outline_line_color": None,
     },
-    "Grid": {},
+    "Grid": {},  # named, so that the page's theme leaves its colour alone
     "Title": {"text_font_size": "12px", "text_font": FONT, "standoff": 2},
     "Axis": {
         "axis_label_text_font": FONT,
