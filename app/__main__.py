@@ -25,6 +25,7 @@ import core
 from app import collector, latency, words
 from app.connection import LINGER_S, serving_options
 from app.controls import Sentence
+from app.jobs import LONG
 from app.layout import build_page
 from app.opening import Answers, send_heads_first
 from app.serving import TOKEN_VARIABLE, Access, Headers, guard, keep_tracebacks
@@ -72,7 +73,6 @@ def main(arguments: list[str] | None = None) -> int:
         except core.CaptureError as error:
             parser.error(str(error))
     sources, uploads = given | built_in_sources(), Uploads()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # uploads are removed then, too
     pn.extension("vtk")
     send_heads_first()
     try:
@@ -98,6 +98,9 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"Cannot serve at {chosen.address}, port {chosen.port}: {error.strerror}.")
         print("Give another --port, or --port 0 for any that is free.")
         return 1
+    # An exit that is raised wherever the thread happens to be can be lost there: like Ctrl+C, by
+    # Panel, this ends the loop below.
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     guard(server._tornado, access)
     print("Compiling what is not compiled yet ...", flush=True)
     core.warm_up()
@@ -110,7 +113,9 @@ def main(arguments: list[str] | None = None) -> int:
         server.io_loop.add_callback(webbrowser.open, link)
     server.start()
     server.io_loop.start()  # until Ctrl+C
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # the next waits for nothing
     server.stop()
+    LONG.close()
     return 0
 
 

@@ -158,7 +158,7 @@ class OnePiece(Generic[Result]):
                 page.on_page(partial(self._tell, run))
 
         def cancelled() -> bool:
-            return not run.is_running or page.is_gone
+            return not run.is_running or page.is_gone or LONG.is_closed
 
         self._tell(run)
         self._jobs.submit(

@@ -68,6 +68,7 @@ def serving(*arguments: str | Path, module: str = "app", **environment: str) -> 
             yield _when_up(f"http://127.0.0.1:{port}/", server, log)
         finally:
             server.terminate()
+            _gone(server, log)
 
 
 def open_page(
@@ -113,6 +114,16 @@ def _free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def _gone(server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 60.0) -> None:
+    """Wait until it has ended; where it does not, it is ended, and that is an error."""
+    try:
+        server.wait(limit_s)
+    except subprocess.TimeoutExpired:
+        server.kill()
+        log.seek(0)
+        raise RuntimeError(f"the app was asked to stop, and went on:\n{log.read()}") from None
 
 
 def _when_up(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from http.client import HTTPConnection
 from urllib.parse import urlencode
 
@@ -206,15 +206,23 @@ def test_names_and_tokens_are_asked_for_where_others_reach_the_server():
         assert "short" not in str(refusal.value)
 
 
-def start(*options, **environment):
-    return subprocess.Popen(
-        [sys.executable, "-m", "app", *options],
+@contextmanager
+def run(*arguments):
+    with subprocess.Popen(
+        [sys.executable, *arguments],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env=os.environ | environment,
-    )
+    ) as started:
+        try:
+            yield started
+        finally:
+            started.kill()  # whatever failed
+
+
+def start(*options):
+    return run("-m", "app", *options)
 
 
 def test_a_port_in_use_is_a_sentence(here):
@@ -249,6 +257,34 @@ def test_the_link_is_printed_with_a_token_of_its_own_and_ctrl_c_stops():
         rest = server.communicate(timeout=60)[0]
     assert server.returncode == 0
     assert "Traceback" not in rest
+
+
+STOPPED_AT_A_BAD_MOMENT = """
+import os, signal, sys, time
+from app import __main__ as started
+from app.jobs import LONG
+
+class Last:
+    def __del__(self):  # Python loses whatever is raised in here
+        print("now", flush=True)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+def page_for(*_):
+    LONG.ask(lambda: [time.sleep(0.01) for _ in iter(lambda: LONG.is_closed, True)], print)
+    Last()
+
+started.page_for = page_for
+sys.exit(started.main(["--port", "0"]))
+"""
+
+
+def test_a_stop_is_heard_at_any_moment_and_waits_for_no_long_work():
+    with run("-c", STOPPED_AT_A_BAD_MOMENT) as server:
+        line = next(line for line in server.stdout if line.startswith("Open"))
+        Site(line.split()[1]).ask()
+        rest = server.communicate(timeout=60)[0]
+    assert rest.startswith("now")
+    assert server.returncode == 0
 
 
 # -- in a browser ----------------------------------------------------------------------------------
