@@ -4,6 +4,9 @@
 // A change is sent once the server has answered the last one, or has taken this long.
 const LONGEST_PAUSE_MS = 250;
 
+// A page less wide begins without its sidebar, which would cover what it controls.
+const NARROW_PX = 900;
+
 {
   // A plot writes the style sheet of each of its parts at every stroke, mostly as it was. For the
   // browser it is another one each time, and all that hangs on it has to be looked up again.
@@ -52,9 +55,16 @@ const LONGEST_PAUSE_MS = 250;
 }
 
 {
-  // A part that folds is called "show more", whatever it is, and its title does nothing.
   const view = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype.default_view.prototype;
-  const { after_rendered: rendered } = view;
+  const { after_rendered: rendered, initialize } = view;
+  view.initialize = function () {
+    const { data } = this.model;
+    if ("is_narrow" in data.attributes && window.innerWidth < NARROW_PX)
+      data.setv({ sidebar_open: false, is_narrow: true });
+    initialize.call(this);
+  };
+
+  // A part that folds is called "show more", whatever it is, and its title does nothing.
   view.after_rendered = function () {
     rendered.call(this);
     const header = this.shadow_el.querySelector(".MuiCardHeader-root");

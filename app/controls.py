@@ -206,19 +206,6 @@ class Sentence(Component):
     ]
 
 
-class Viewport(Component):
-    """How wide the page is; nothing is to be seen of it."""
-
-    narrow = param.Boolean(default=False, doc="Whether that is as narrow as a phone.")
-
-    _esm = """
-    export function render({ model }) {
-      model.narrow = window.innerWidth < 900;
-      return document.createElement("div");
-    }
-    """
-
-
 class Chips(Component):
     """Small labels, each with a colour, a button of its text, and one that removes it."""
 

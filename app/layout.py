@@ -9,6 +9,7 @@ from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
+import param
 from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
@@ -16,7 +17,7 @@ from app import collector, words
 from app.address import AddressBar, Wanted
 from app.compare import Compare
 from app.connection import Connection
-from app.controls import Sentence, SettingsPanel, Viewport
+from app.controls import Sentence, SettingsPanel
 from app.downloads import CLOUD, IMAGE, PLOT, cloud_on_show, downloadable, pixel_plot, range_image
 from app.inspector import Inspector
 from app.large_view import LargeView
@@ -114,6 +115,11 @@ class Page(pmui.Page):
     itself anew twice for every message, to show for a moment that the server is busy.
     """
 
+    is_narrow = param.Boolean(
+        default=False,
+        doc="Whether the sidebar would cover the page, as on a phone; told by ``bokeh.js``.",
+    )
+
     def __init__(self, **params: Any) -> None:
         super().__init__(**params)
         # Params keep this watcher of the whole server's state, and with it the page, for ever.
@@ -150,7 +156,6 @@ class Layout:
         wanted, self._uploads = wanted or Wanted({}), uploads or Uploads()
         session = self.session = Session(self._with_upload(sources, wanted.source), wanted)
         state = session.state
-        self._viewport = Viewport(margin=0)
         self._alert = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
         self._provenance = Sentence(sizing_mode="stretch_width", margin=(4, 12))
         self._progress = pmui.LinearProgress(
@@ -235,8 +240,6 @@ class Layout:
         session.state.param.watch(lambda event: self._show_tracking(event.new), "tracking")
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if session.is_served:
-            # On a phone the controls would cover what they control.
-            pn.state.onload(lambda: self.page.param.update(sidebar_open=not self._viewport.narrow))
             pn.state.onload(collector.spare)
             pn.state.on_session_destroyed(lambda _: self._forget())
             pn.config.exception_handler = session.fail  # of this session alone
@@ -287,7 +290,7 @@ class Layout:
     def _put_away(self, is_away: bool) -> None:
         """Put away what belongs to the session's capture, or bring it back."""
         self._provenance.visible = not is_away
-        self.page.sidebar_open = not (is_away or self._viewport.narrow)
+        self.page.sidebar_open = not (is_away or self.page.is_narrow)
 
     # What the user does
 
@@ -358,7 +361,6 @@ class Layout:
         head = pn.Column(
             self._address,
             self._connection,
-            self._viewport,
             self._progress,
             self._alert,
             sizing_mode="stretch_width",

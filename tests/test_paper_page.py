@@ -289,6 +289,10 @@ def test_the_page_puts_the_sidebar_away_and_brings_it_back():
     assert not layout.page.sidebar_open
     layout.pages.choice.value = "Explore"
     assert layout.page.sidebar_open
+    layout.page.is_narrow = True
+    layout.pages.choice.value = "Paper"
+    layout.pages.choice.value = "Explore"
+    assert not layout.page.sidebar_open
 
 
 def test_only_the_part_on_screen_works(session):
