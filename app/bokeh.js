@@ -4,6 +4,9 @@
 // A change is sent once the server has answered the last one, or has taken this long.
 const LONGEST_PAUSE_MS = 250;
 
+// By then a widget has drawn what the server said.
+const DRAWN_MS = 500;
+
 // A page less wide begins without its sidebar, which would cover what it controls.
 const NARROW_PX = 900;
 
@@ -54,11 +57,33 @@ const NARROW_PX = 900;
   }
 }
 
+// Panel's widgets tell their model what they show each time that they have been drawn. If the server
+// has said something else by then, they would undo it: what it said before that is not taken.
+const keepNewest = (data) => {
+  const { setv: set } = data;
+  let said = {};
+  let pause;
+  data.setv = function (values, options) {
+    let taken = Object.entries(values);
+    if (options?.sync === false) {
+      for (const [name, value] of taken) (said[name] ??= []).push(value);
+      clearTimeout(pause);
+      pause = setTimeout(() => (said = {}), DRAWN_MS);
+    } else {
+      taken = taken.filter(
+        ([name, value]) => !said[name]?.includes(value) || value === said[name].at(-1),
+      );
+    }
+    return set.call(this, Object.fromEntries(taken), options);
+  };
+};
+
 {
   const view = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype.default_view.prototype;
   const { after_rendered: rendered, initialize } = view;
   view.initialize = function () {
     const { data } = this.model;
+    keepNewest(data);
     if ("is_narrow" in data.attributes && window.innerWidth < NARROW_PX)
       data.setv({ sidebar_open: false, is_narrow: true });
     initialize.call(this);

@@ -473,6 +473,28 @@ def test_plots_keep_the_size_they_are_first_painted_at(page, name):
     assert all(len(each) == 1 for each in sizes), sizes
 
 
+SAID_IN_HASTE = """async () => {
+  const models = [...Bokeh.documents[0]._all_models.values()];
+  const { data } = models.find(({ class_name: name }) => name === "Select");
+  const wait = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+  const before = data.label;
+  const shown = [];
+  for (let pause_ms = 0; pause_ms < 20; pause_ms++) {
+    for (const text of ["once", `${pause_ms}`]) {
+      data.setv({ label: text }, { sync: false });  // as Bokeh does what the server says
+      await wait(text === "once" ? pause_ms : 100);
+    }
+    shown.push(Number(data.label));
+  }
+  data.setv({ label: before }, { sync: false });
+  return shown;
+}"""
+
+
+def test_what_the_server_says_twice_at_once_is_what_it_said_last(car_page):
+    assert car_page.evaluate(SAID_IN_HASTE) == list(range(20))
+
+
 def test_typed_values_are_taken_or_refused_with_a_sentence(car_page):
     enter(car_page, "SBR", "99")
     refusal = car_page.get_by_role("alert").filter(has_text="99 is not possible here")
