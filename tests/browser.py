@@ -41,9 +41,13 @@ def browser_path() -> str | None:
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A running browser without a window; fails, and says so, where there is none."""
+    """A running browser without a window; fails, and says so, where there is none.
+
+    Its first context is that of `open_page`.
+    """
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=browser_path(), args=ARGUMENTS)
+        browser.new_context()
         yield browser
         browser.close()
 
@@ -79,12 +83,12 @@ def open_page(
     prepare: str = "",
     watch: Callable[[Page], None] = lambda page: None,
 ) -> Page:
-    """A page of its own session, drawn and ready for input.
+    """A page of its own session, drawn and ready for input: a tab beside the other ones.
 
     `prepare` is a script to run first, `watch` is shown the page before it loads anything.
     """
-    context = browser.new_context(viewport={"width": width, "height": height})
-    page = context.new_page()
+    page = browser.contexts[0].new_page()  # which knows the scripts from other pages
+    page.set_viewport_size({"width": width, "height": height})
     watch(page)
     page.add_init_script(prepare)
     page.goto(address)

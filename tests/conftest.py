@@ -80,7 +80,7 @@ def page(open_watched: Callable[..., Page], troubles: list[str]) -> Iterator[Cal
     yield open_
     found, troubles[:] = list(troubles), []
     for each in opened:
-        each.context.close()
+        each.close()
     assert found == []
 
 
@@ -89,7 +89,7 @@ def lasting_page(open_watched: Callable[..., Page]) -> Iterator[Page]:
     """The page that a module's tests share, because a page costs seconds; see `one_page`."""
     opened = open_watched()
     yield opened
-    opened.context.close()
+    opened.close()
 
 
 @pytest.fixture

@@ -158,7 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
         page.wait_for_timeout(3000)
         sliders = ("l", "T_n in bins", "SBR")
         taken = {label: moves(page, label, chosen.moves) for label in sliders}
-        page.context.close()
+        page.close()
     capture = CAPTURES / "21km_K11_night.mat"
     opened = ""
     if capture.exists():

@@ -18,7 +18,7 @@ def photograph(browser: Browser, address: str, name: str) -> None:
     page = open_page(browser, address)
     page.wait_for_timeout(FIRST_DRAWING_MS)
     page.screenshot(path=ROOT / "assets" / name)
-    page.context.close()
+    page.close()
 
 
 def main() -> None:

@@ -583,7 +583,7 @@ def test_a_capture_of_the_command_line_is_opened_first(page, real_capture):
     with serving(real_capture("21km_K11_night.mat")) as address:
         new = page(f"{address}?page=Explore")
         expect_the_building_at_21_km(new)
-        new.context.close()  # before it misses its server
+        new.close()  # before it misses its server
 
 
 def test_a_file_that_is_no_capture_is_told_and_the_page_goes_on(page):

@@ -443,7 +443,7 @@ def inspect_page(open_watched):
     with serving(real_capture_path(CAPTURE)) as address:
         opened = open_watched(address)
         yield opened
-        opened.context.close()
+        opened.close()
 
 
 @pytest.fixture

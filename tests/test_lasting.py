@@ -54,7 +54,9 @@ def test_the_facade_comes_back_after_a_reload_and_in_another_tab(page, address):
     first = page(f"{address}?source=building&tracking.l=0.006&less.merge=2&image=Error")
     expect(chosen(first, "Scene or capture")).to_have_text("Building at 830–860 m")
     image(first).press("Shift+ArrowRight")
+    before = fact(first, "RMSE").inner_text()
     slider(first, "SBR").press("ArrowRight")
+    expect(fact(first, "RMSE")).not_to_have_text(before)
     rests(first, "pixel=[", "light.sbr=")
     length, rmse = first.evaluate("history.length"), fact(first, "RMSE").inner_text()
     place = pixel_on_show(first)
@@ -88,14 +90,14 @@ def test_nonsense_in_an_address_is_told_and_the_rest_is_there(page, address):
 def cut(page: Page) -> None:
     """Let the page lose its server."""
     # Not `set_offline`: the browser would hold back the end of the socket, too, at times for ever.
-    page.context.route("**/*", lambda route: route.abort())
+    page.route("**/*", lambda route: route.abort())
     page.evaluate("sockets.at(-1).close()")
     expect(page.get_by_role("alertdialog")).to_contain_text("connection to the server is lost")
 
 
 def mend(page: Page, said: str) -> None:
     """Let it find its server again."""
-    page.context.unroute("**/*")
+    page.unroute("**/*")
     expect(page.get_by_role("status").filter(has_text="The connection is back")).to_contain_text(
         said
     )
@@ -131,7 +133,7 @@ def test_an_uploaded_capture_outlasts_reload_and_lost_connection(browser, addres
     expect_all_there(page)
     slider(page, "l").press("ArrowRight")
     rests(page, "tracking.l=")
-    page.context.close()
+    page.close()
 
 
 def test_a_session_that_is_gone_begins_anew_and_its_file_is_removed(
@@ -158,7 +160,7 @@ def test_a_session_that_is_gone_begins_anew_and_its_file_is_removed(
         upload(page, "again.mat", real_capture("21km_K11_night.mat").read_bytes())
         eventually(held)
     eventually(lambda: not list(tmp_path.glob("firstphoton-*")))  # with the server
-    page.context.close()
+    page.close()
 
 
 def test_the_script_and_the_link_are_taken_away(page, address, tmp_path):

@@ -185,4 +185,4 @@ def test_the_names_of_files_are_text_on_every_page(page, tmp_path):
             expect(new.get_by_role("button", name=UPLOADED, exact=True)).to_be_visible()
             expect(names.filter(has_text=harmless(UPLOADED))).to_be_visible()
             check_harmless(new)
-        new.context.close()  # before it misses its server
+        new.close()  # before it misses its server
