@@ -17,7 +17,7 @@ from app.exports import image_files
 from app.inspector_capture import Whole
 from app.inspector_pins import Pins, pin_colors
 from app.inspector_pixel import BREAK_PX, COLUMN, FILLING, Sight, framed
-from app.inspector_views import MODES, Corners, Navigator, rectangle
+from app.inspector_views import Corners, Navigator, rectangle
 from app.jobs import LatestWins
 from app.large_view import LargeView
 from app.looks import Look, map_of
@@ -110,8 +110,8 @@ class Inspector:
             margin=(6, 0, 0, 0),
         )
         self._mode = pmui.RadioButtonGroup(
-            options=list(MODES),
-            value=next(iter(MODES)),
+            options=list(self._navigator.drags),
+            value=next(iter(self._navigator.drags)),
             label="",
             description=inspector_words.MODE_HELP,
             size="small",
@@ -133,7 +133,9 @@ class Inspector:
         state = self._session.state
         self._keys.param.watch(lambda event: self._session.choose_pixel(*event.new), "pixel")
         self._keys.param.watch(lambda _: self._pin_pixel(), "pressed")
-        self._mode.param.watch(lambda event: self._navigator.drag(event.new), "value")
+        drags = {"toolbar": self._navigator.figure.toolbar, "drags": self._navigator.drags}
+        # In the browser, where a hand drags before the server has heard of it.
+        self._mode.jscallback(value="toolbar.active_drag = drags[source.value]", args=drags)
         for axis, field in enumerate(self._place):
             field.param.watch(lambda event, at=axis: self._go_to_typed(at, event.new), "value")
         self._chips.param.watch(lambda event: self._session.choose_pixel(*event.new[0]), "chosen")

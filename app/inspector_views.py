@@ -34,9 +34,6 @@ Corners = tuple[tuple[float, float], ...]
 ENOUGH_CORNERS = 60
 """Of a region that was drawn by hand: enough for its shape, and short enough for an address."""
 
-MODES = {"Zoom": "box_zoom", "Rectangle": "box_select", "Lasso": "lasso_select"}
-"""What dragging on the picture does."""
-
 
 class Navigator(ImageView):
     """The picture to navigate by, with a region outlined and pins framed.
@@ -47,6 +44,11 @@ class Navigator(ImageView):
         Called with the row and column of a tapped pixel.
     selected : callable
         Called with the corners of a region that was drawn.
+
+    Attributes
+    ----------
+    drags : dict of str to bokeh.models.Tool
+        What dragging on the picture can do.
     """
 
     def __init__(
@@ -56,14 +58,14 @@ class Navigator(ImageView):
         drawing = self.figure
         # Nothing is selected in the picture itself: what was drawn is outlined by a layer.
         by_hand = {
-            "box_select": BoxSelectTool(renderers=[]),
-            "lasso_select": LassoSelectTool(renderers=[], continuous=False),
+            "Rectangle": BoxSelectTool(renderers=[]),
+            "Lasso": LassoSelectTool(renderers=[], continuous=False),
         }
         wheel = WheelZoomTool()
         drawing.add_tools(*by_hand.values(), wheel)
         drawing.toolbar.active_scroll = wheel
         (zoom,) = (tool for tool in drawing.toolbar.tools if isinstance(tool, BoxZoomTool))
-        self._tools = {"box_zoom": zoom, **by_hand}
+        self.drags = {"Zoom": zoom, **by_hand}
         for name, color, width in (("shadow", "#000000", 4), ("line", "#ffd000", 2)):
             drawing.patches(
                 "xs",
@@ -95,10 +97,6 @@ class Navigator(ImageView):
                 selected(tuple(_rounded(self._grid.index(*each)) for each in drawn))
 
         drawing.on_event(SelectionGeometry, select)
-
-    def drag(self, mode: str) -> None:
-        """Choose of `MODES` what dragging does."""
-        self.figure.toolbar.active_drag = self._tools[MODES[mode]]
 
     def outline(self, region: Corners) -> None:
         """Draw a region's outline; none if it is empty."""
