@@ -115,7 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
     server.io_loop.start()  # until Ctrl+C
     signal.signal(signal.SIGINT, signal.default_int_handler)  # the next waits for nothing
     server.stop()
-    LONG.close()
+    LONG.is_closed = True
     return 0
 
 

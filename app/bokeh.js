@@ -79,11 +79,17 @@ const keepNewest = (data) => {
 };
 
 {
-  const view = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype.default_view.prototype;
+  const widget = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype;
+  const { initialize: begin } = widget;
+  widget.initialize = function () {
+    begin.call(this);
+    keepNewest(this.data);
+  };
+
+  const view = widget.default_view.prototype;
   const { after_rendered: rendered, initialize } = view;
   view.initialize = function () {
     const { data } = this.model;
-    keepNewest(data);
     if ("is_narrow" in data.attributes && window.innerWidth < NARROW_PX)
       data.setv({ sidebar_open: false, is_narrow: true });
     initialize.call(this);

@@ -33,7 +33,7 @@ class Places:
     Attributes
     ----------
     is_closed : bool
-        Whether the program ends, and with it whatever runs here and asks now and then.
+        Whether the program ends, and waits for its threads: what runs here asks now and then.
     """
 
     def __init__(self, number: int, name: str) -> None:
@@ -42,11 +42,6 @@ class Places:
         self._free = number
         self._waiting: deque[tuple[Act, Failed]] = deque()
         self.is_closed = False
-
-    def close(self) -> None:
-        """Begin nothing more, and have long work end: Python waits for all threads at its end."""
-        self.is_closed = True
-        self._threads.shutdown(wait=False, cancel_futures=True)
 
     def ask(self, begin: Act, failed: Failed) -> None:
         """Have `begin` run on a thread once there is a place, or `failed` where it cannot."""

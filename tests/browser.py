@@ -124,10 +124,10 @@ def _gone(server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 60.0) 
     """Wait until it has ended; where it does not, it is ended, and that is an error."""
     try:
         server.wait(limit_s)
-    except subprocess.TimeoutExpired:
+    except subprocess.TimeoutExpired as late:
         server.kill()
         log.seek(0)
-        raise RuntimeError(f"the app was asked to stop, and went on:\n{log.read()}") from None
+        raise RuntimeError(f"the app was asked to stop, and went on:\n{log.read()}") from late
 
 
 def _when_up(

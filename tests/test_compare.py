@@ -462,3 +462,7 @@ def test_pages_fit_a_phone(page):
     expect(figure).to_be_visible()
     last = here.get_by_role("slider", name="SBR", exact=True).bounding_box()
     assert figure.bounding_box()["y"] >= last["y"] + last["height"]
+    here.get_by_role("button", name="Explore", exact=True).click()
+    expect(here.get_by_text(re.compile("^simulated, seed 0"))).to_be_visible()
+    eventually(lambda: here.evaluate("Bokeh.documents[0].is_idle"))
+    expect(here.get_by_role("button", name="Open drawer")).to_be_visible()  # it is not open
