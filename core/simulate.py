@@ -13,6 +13,7 @@ scene and not the dice.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from numbers import Integral
@@ -199,28 +200,24 @@ def triggered_by_each_edge(
     if scene.motion is not None:
         shifts_bins = scene.motion.shifts_bins(pulse, acquisition, pulses_sent(acquisition))
     echoes = [
-        (np.ravel(acquisition.range_m_to_bin(range_m)), signal.reshape(-1, 1))
+        (np.ravel(acquisition.range_m_to_bin(range_m)), np.ravel(signal))
         for range_m, signal in _echoes(scene, flux)
     ]
     faulty = scene.faulty_pixels
     dark = None if faulty is None else faulty.photons(acquisition).reshape(-1, 1)
     triggered = np.empty((np.size(scene.range_m), n_edges))
-    # Some pixels at a time: temporaries of the whole cube cost ten times their arithmetic.
-    pixels_at_once = max(1, 2**15 // n_edges)
-    for first in range(0, len(triggered), pixels_at_once):
-        some = slice(first, first + pixels_at_once)
-        for group, shift_bins in enumerate(shifts_bins):
-            before = _echo_before(echoes[0], some, shift_bins, pulse, acquisition)
-            for other in echoes[1:]:
-                before += _echo_before(other, some, shift_bins, pulse, acquisition)
-            before += everywhere
-            if dark is not None:
-                before += dark[some] * share_of_gate
-            np.expm1(np.negative(before, out=before), out=before)
-            if group == 0:
-                np.negative(before, out=triggered[some])
-            else:
-                triggered[some] -= before
+    before = triggered if shifts_bins.size == 1 else np.empty_like(triggered)
+    for group, shift_bins in enumerate(shifts_bins):
+        before[:] = everywhere
+        if dark is not None:
+            before += dark * share_of_gate
+        for onset_bin, signal in echoes:
+            add_echo(onset_bin + shift_bins, signal, pulse, acquisition.bin_width_s, before)
+        np.expm1(np.negative(before, out=before), out=before)
+        if group == 0:
+            np.negative(before, out=triggered)
+        else:
+            triggered -= before
     if shifts_bins.size > 1:
         triggered /= shifts_bins.size
     if faulty is not None:
@@ -242,19 +239,26 @@ def _echoes(scene: Scene, flux: Flux) -> Iterator[tuple[Floats, Floats]]:
         yield range_m, dimmed
 
 
-def _echo_before(
-    echo: tuple[Floats, Floats],
-    some: slice,
-    shift_bins: float,
-    pulse: Pulse,
-    acquisition: Acquisition,
-) -> Floats:
-    """Photons of an echo before each edge, within the gate; shape (pixel, n_bins + 1)."""
-    onset_bin, signal = echo[0][some] + shift_bins, echo[1][some]
-    before = pulse.cumulative(onset_bin, acquisition.n_bins, acquisition.bin_width_s)
-    before -= before[:, :1].copy()  # the part that came before the gate opened
-    before *= signal
-    return before
+def add_echo(
+    onset_bin: Floats, signal: Floats, pulse: Pulse, bin_width_s: float, before: Floats
+) -> None:
+    """Add the photons of an echo before each edge, within the gate, to those of other light.
+
+    Parameters
+    ----------
+    onset_bin : ndarray, shape (pixel,)
+        Delay in fractional bins; one that is not finite means no echo.
+    signal : ndarray, shape (pixel,)
+        Photons per pulse.
+    pulse : Pulse
+    bin_width_s : float
+    before : ndarray, shape (pixel, n_bins + 1)
+        Added to in place.
+    """
+    samples = np.cumsum((0.0, *pulse.samples))
+    share = samples / (samples[-1] or 1.0)
+    shape = _SHAPES.index(pulse.shape)
+    _add_echo(onset_bin, signal, bin_width_s / pulse.tau_s, shape, share, before)
 
 
 def _draw_multinomial(
@@ -262,6 +266,40 @@ def _draw_multinomial(
 ) -> None:
     probability = np.diff(triggered, axis=-1, append=1.0)
     cube[:] = np.random.default_rng(seed).multinomial(n_pulses, probability)[:, :-1]
+
+
+_SHAPES = "gamma", "gaussian", "measured"
+_SQRT_HALF = math.sqrt(0.5)
+
+
+@njit(**COMPILED)
+def _arrived(t, shape, share):  # type: ignore[no-untyped-def]
+    """`Pulse.cdf` at `t` time constants; of a measured pulse `share` is that at its samples."""
+    if shape == 1:
+        return 0.5 * math.erfc(-t * _SQRT_HALF)
+    if t <= 0.0:
+        return 0.0
+    if shape == 0:
+        return 1.0 - (1.0 + t) * math.exp(-t)
+    if t >= share.size - 1:
+        return 1.0
+    below = int(t)
+    return share[below] + (t - below) * (share[below + 1] - share[below])
+
+
+@njit(**COMPILED)
+def _add_echo(onset_bin, signal, bin_taus, shape, share, before):  # type: ignore[no-untyped-def]
+    n_pixels, n_edges = before.shape
+    for pixel in range(n_pixels):
+        onset = onset_bin[pixel]
+        if not math.isfinite(onset):
+            continue
+        early = _arrived(-onset * bin_taus, shape, share)  # before the gate opened
+        arrived = early
+        for edge in range(n_edges):
+            # Photons never leave again, as rounding would have it where bins are tiny.
+            arrived = max(arrived, _arrived((edge - onset) * bin_taus, shape, share))
+            before[pixel, edge] += signal[pixel] * (arrived - early)
 
 
 @njit(**COMPILED)

@@ -320,9 +320,12 @@ def track(
     position = np.empty((n_blocks, LANES), np.float32)
     score = np.empty_like(position)
     lanes = _Lanes(sigma, blocks.largest, position, score)
-    kernel = _track_parallel if blocks.counts.size > SERIAL_BELOW else _track_serial
-    with KERNEL_LOCK:
-        kernel(blocks.counts, lanes, (weight / top).astype(np.float32), settings)
+    given = blocks.counts, lanes, (weight / top).astype(np.float32), settings
+    if blocks.counts.size > SERIAL_BELOW:
+        with KERNEL_LOCK:
+            _track_parallel(*given)
+    else:
+        _track_serial(*given)
     pixels = slice(blocks.n_pixels)
     return position.ravel()[pixels], score.ravel()[pixels] * top
 

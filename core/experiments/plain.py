@@ -13,26 +13,18 @@ from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.experiments.corrections import time_ratio
 from core.experiments.items import Table
 from core.scene import PARTS, Scene, without
-from core.simulate import triggered_by_each_edge
+from core.simulate import add_echo, triggered_by_each_edge
 
 
 def plain_triggered(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse) -> Floats:
     """Probability to have fired before each bin edge, shape (pixel, n_bins + 1)."""
     onset_bin = np.ravel(acquisition.range_m_to_bin(scene.range_m))
-    signal = np.where(np.isfinite(onset_bin), flux.signal, 0.0)[:, np.newaxis]
-    n_edges = acquisition.n_bins + 1
-    uniform = flux.background * np.linspace(0.0, 1.0, n_edges)
-    triggered = np.empty((onset_bin.size, n_edges))
-    pixels_at_once = max(1, 2**15 // n_edges)
-    for first in range(0, onset_bin.size, pixels_at_once):
-        some = slice(first, first + pixels_at_once)
-        before = pulse.cumulative(onset_bin[some], acquisition.n_bins, acquisition.bin_width_s)
-        before -= before[:, :1].copy()
-        before *= signal[some]
-        before += uniform
-        np.expm1(np.negative(before, out=before), out=before)
-        np.negative(before, out=triggered[some])
-    return triggered
+    signal = np.where(np.isfinite(onset_bin), flux.signal, 0.0)
+    before = np.empty((onset_bin.size, acquisition.n_bins + 1))
+    before[:] = flux.background * np.linspace(0.0, 1.0, acquisition.n_bins + 1)
+    add_echo(onset_bin, signal, pulse, acquisition.bin_width_s, before)
+    np.expm1(np.negative(before, out=before), out=before)
+    return np.negative(before, out=before)
 
 
 def bare(scene: Scene) -> Scene:

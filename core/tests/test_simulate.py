@@ -14,7 +14,7 @@ from scipy import stats
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.scene import Scene
-from core.simulate import first_photons, simulate, triggered_by_each_edge
+from core.simulate import add_echo, first_photons, simulate, triggered_by_each_edge
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
 module = import_module("core.simulate")  # the package's attribute of that name is the function
@@ -186,6 +186,29 @@ def test_draws_equal_a_plain_twin_bit_for_bit(
     capture = simulate(scene, acquisition, flux, seed=seed)
     triggered = triggered_by_each_edge(scene, acquisition, flux, Pulse())
     np.testing.assert_array_equal(capture.cube[0], twin_cube(triggered, n_pulses, seed))
+
+
+@pytest.mark.parametrize(
+    "pulse",
+    [Pulse(), Pulse.gaussian(2e-9), Pulse.measured([1, 2, 5, 2], 1.3e-9)],
+    ids=["gamma", "gaussian", "measured"],
+)
+def test_an_echo_is_added_as_its_pulse_arrives(pulse: Pulse) -> None:
+    onset_bin = np.array([-3.4, -1.0, 0.0, 17.3, 59.9, 75.0, np.nan, np.inf])
+    signal = np.linspace(0.5, 3.0, onset_bin.size)
+    before = np.full((onset_bin.size, ACQUISITION.n_bins + 1), 0.25)
+    add_echo(onset_bin, signal, pulse, ACQUISITION.bin_width_s, before)
+    arrived = pulse.cumulative(onset_bin, ACQUISITION.n_bins, ACQUISITION.bin_width_s)
+    expected = 0.25 + signal[:, np.newaxis] * (arrived - arrived[:, :1])
+    np.testing.assert_allclose(before, expected, rtol=0, atol=20 * np.finfo(float).eps)
+
+
+@pytest.mark.parametrize("tau_bins", [1e-3, 1.0, 1e3, 1e6, 1e9])
+def test_photons_that_have_arrived_stay(tau_bins: float) -> None:
+    before = np.zeros((1, ACQUISITION.n_bins + 1))
+    pulse = Pulse(tau_bins * ACQUISITION.bin_width_s)
+    add_echo(np.array([0.3]), np.array([1.0]), pulse, ACQUISITION.bin_width_s, before)
+    assert (np.diff(before) >= 0).all()
 
 
 def test_distribution_of_the_first_photon_is_equation_1_summed() -> None:
