@@ -6,16 +6,39 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from enum import Enum, auto
 from functools import partial
 from threading import Lock
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 Result = TypeVar("Result")
 
+
+class Effort(Enum):
+    """What a request takes, which decides where it is computed."""
+
+    QUICK = auto()
+    """Less than to draw its outcome: on the page, in turn. A thread would have to take turns with
+    the page's at the interpreter, which costs both of them a multiple of that."""
+    SHORT = auto()
+    """Some tens of milliseconds: on a thread, one of all sessions after the other, since several at
+    once would only slow each other down, and the page."""
+    ANY = auto()
+    """Who knows: on one of some threads."""
+
+
 Act = Callable[[], None]
 Failed = Callable[[Exception], None]
-Asked = tuple[Callable[[], Any], Callable[[Any], None], Failed]
-"""Work, what draws its outcome, and what tells of a failure."""
+OnPage = Callable[[Act, Act | None], None]
+
+
+class Asked(NamedTuple):
+    """A request."""
+
+    work: Callable[[], Any]
+    done: Callable[[Any], None]
+    failed: Failed
+    effort: Effort
 
 
 class Places:
@@ -71,6 +94,7 @@ class Places:
 # A session has one request under way; a file being read does not hold up the others. Kernels that
 # use all cores take turns by a lock of their own.
 _PLACES = Places(4, "firstphoton")
+_SHORT = Places(1, "firstphoton-short")
 
 # Where studies wait for each other, and nobody's slider for them.
 LONG = Places(2, "firstphoton-long")
@@ -83,12 +107,13 @@ class LatestWins(Generic[Result]):
     ----------
     on_page : callable
         Runs its first argument on the session's page thread, soon, unless the page is gone. When it
-        comes to that it first runs its second argument, in any case and on whatever thread.
+        comes to that it first runs its second argument, if there is one, in any case and on
+        whatever thread.
     places : Places
         Shared with all sessions.
     """
 
-    def __init__(self, on_page: Callable[[Act, Act], None], places: Places = _PLACES) -> None:
+    def __init__(self, on_page: OnPage, places: Places = _PLACES) -> None:
         self._on_page = on_page
         self._places = places
         self._lock = Lock()
@@ -96,24 +121,39 @@ class LatestWins(Generic[Result]):
         self._is_busy = False
 
     def submit(
-        self, work: Callable[[], Result], done: Callable[[Result], None], failed: Failed
+        self,
+        work: Callable[[], Result],
+        done: Callable[[Result], None],
+        failed: Failed,
+        effort: Effort = Effort.ANY,
     ) -> None:
-        """Run `work` on a thread, then `done` or `failed` on the page.
+        """Run `work`, on a thread unless it is quick, then `done` or `failed` on the page.
 
         A request that has not started when the next one comes is dropped. The next one starts after
         `done` has drawn the last: neither computed nor drawn answers queue up.
         """
         with self._lock:
-            self._newest = work, done, failed
+            self._newest = Asked(work, done, failed, effort)
             if self._is_busy:
                 return
             self._is_busy = True
-        self._places.ask(self._attempt, self._refuse)
+        self._go_on()
 
     @property
     def has_more(self) -> bool:
         """Whether another request waits for its turn."""
         return self._newest is not None
+
+    def _places_for(self, effort: Effort) -> Places | None:
+        return {Effort.QUICK: None, Effort.SHORT: _SHORT, Effort.ANY: self._places}[effort]
+
+    def _go_on(self) -> None:
+        assert self._newest is not None
+        places = self._places_for(self._newest.effort)
+        if places is None:
+            self._on_page(partial(self._attempt, None), None)
+        else:
+            places.ask(partial(self._attempt, places), partial(self._refuse, places))
 
     def _take(self) -> Asked:
         with self._lock:
@@ -121,19 +161,23 @@ class LatestWins(Generic[Result]):
         assert newest is not None
         return newest
 
-    def _attempt(self) -> None:
-        work, done, failed = self._take()
-        try:
-            outcome = partial(done, work())
-        except Exception as error:  # whatever it is, the page must tell it
-            outcome = partial(failed, error)
-        except BaseException as error:  # as a library may raise that ends the program
-            outcome = partial(failed, RuntimeError(f"{type(error).__name__}: {error}"))
-        self._on_page(partial(self._finish, outcome, failed), self._places.leave)
+    def _attempt(self, places: Places | None) -> None:
+        assert self._newest is not None
+        if self._places_for(self._newest.effort) is not places:  # another kind has overtaken it
+            if places is not None:
+                places.leave()
+            self._go_on()
+            return
+        asked = self._take()
+        draw = partial(self._finish, _outcome(asked), asked.failed)
+        if places is None:
+            draw()
+        else:
+            self._on_page(draw, places.leave)
 
-    def _refuse(self, error: Exception) -> None:
-        *_, failed = self._take()
-        self._on_page(partial(self._finish, partial(failed, error), failed), self._places.leave)
+    def _refuse(self, places: Places, error: Exception) -> None:
+        failed = self._take().failed
+        self._on_page(partial(self._finish, partial(failed, error), failed), places.leave)
 
     def _finish(self, draw: Act, failed: Failed) -> None:
         try:
@@ -144,7 +188,17 @@ class LatestWins(Generic[Result]):
             with self._lock:
                 self._is_busy = self._newest is not None
             if self._is_busy:
-                self._places.ask(self._attempt, self._refuse)
+                self._go_on()
+
+
+def _outcome(asked: Asked) -> Act:
+    """What draws the outcome of a request, or tells of its failure."""
+    try:
+        return partial(asked.done, asked.work())
+    except Exception as error:  # whatever it is, the page must tell it
+        return partial(asked.failed, error)
+    except BaseException as error:  # as a library may raise that ends the program
+        return partial(asked.failed, RuntimeError(f"{type(error).__name__}: {error}"))
 
 
 @dataclass(frozen=True)
@@ -181,7 +235,7 @@ class InSteps:
 
     def __init__(
         self,
-        on_page: Callable[[Act, Act], None],
+        on_page: OnPage,
         told: Act,
         failed: Failed,
     ) -> None:

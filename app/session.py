@@ -21,7 +21,16 @@ from app.controls import FACTS_PX, HEADLINE_PX, Facts, PixelKeys
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
 from app.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State, Viewing
-from app.store import Answer, Request, Source, compute, inspect, same_pixels, same_view
+from app.store import (
+    Answer,
+    Request,
+    Source,
+    compute,
+    effort_of,
+    inspect,
+    same_pixels,
+    same_view,
+)
 from app.theme import WRONG_COLOR, palette
 from app.turns import TURNS, Soon
 from app.views import ImageView, SignalPlots
@@ -201,7 +210,8 @@ class Session:
         """Answer anew: something else is asked for, or more has been read of what is looked at."""
         request = self._request()
         work = partial(compute, request, self.answer)
-        self._jobs.submit(work, self._show, partial(self._failed, request))
+        failed = partial(self._failed, request)
+        self._jobs.submit(work, self._show, failed, effort_of(request, self.answer))
         if self._asked_s is None:
             self._await()
 

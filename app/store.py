@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from app.jobs import Effort
 from app.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.state import Less, Light, Reading
 from core import (
@@ -32,6 +33,9 @@ from core import (
 from core.corrections import CORRECTIONS, without_correction
 from core.posterior import posterior_of
 from core.scene import PARTS, without
+
+FEW_COUNTS = 2**20
+"""Of a capture, up to which it is ranged in less time than its picture is drawn."""
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
 
@@ -178,6 +182,17 @@ def compute(request: Request, previous: Answer | None) -> Answer:
         posterior_of(capture)  # what every answer's confidence rests on, whatever the method
         capture_s = perf_counter() - started
     return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole, cutout)
+
+
+def effort_of(request: Request, previous: Answer) -> Effort:
+    """What `compute` takes."""
+    seen = previous.request
+    if previous.cutout is not None or previous.whole.cube.size > FEW_COUNTS:
+        return Effort.ANY
+    if request == replace(seen, tracking=request.tracking):
+        return Effort.QUICK
+    is_drawn_again = request.source.is_scene and _same(request, seen, "source", "absent")
+    return Effort.SHORT if is_drawn_again else Effort.ANY
 
 
 def _cutout(request: Request, previous: Answer | None) -> Cutout | None:

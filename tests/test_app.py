@@ -12,10 +12,10 @@ from bokeh.document import Document
 import core
 from app import looks, plots, words
 from app.controls import Knob, SettingsPanel
-from app.jobs import LatestWins
+from app.jobs import Effort, LatestWins
 from app.layout import CUSTOM, Layout
 from app.state import Less, Light, Reading, Viewing
-from app.store import Request, built_in_sources, compute, file_source, inspect, is_wrong
+from app.store import Request, built_in_sources, compute, effort_of, file_source, inspect, is_wrong
 from app.theme import DARK, LIGHT, OUTSIDE_COLOR
 from app.views import ImageView, Plot, SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
@@ -142,6 +142,21 @@ def test_only_what_changed_is_computed_again(car):
     assert not np.array_equal(other_settings.run.image.bin, car.run.image.bin)
     for change in ({"light": Light(seed=1)}, {"source": built_in_sources()["staircase"]}):
         assert compute(replace(car.request, **change), car).capture is not car.capture
+
+
+def test_the_page_computes_what_takes_less_than_to_draw_it(car):
+    other = {"tracking": PRESETS["as printed"]}
+    assert effort_of(replace(car.request, **other), car) is Effort.QUICK
+    for again in ({"light": Light(seed=1)}, {"less": Less(skip=2)}):
+        assert effort_of(replace(car.request, **again, **other), car) is Effort.SHORT
+    for new in ({"source": built_in_sources()["staircase"]}, {"absent": frozenset(["jitter"])}):
+        assert effort_of(replace(car.request, **new, **other), car) is Effort.ANY
+    large = compute(ask("car_256"), None)
+    for change in (other, {"light": Light(seed=1)}):
+        assert effort_of(replace(large.request, **change), large) is Effort.ANY
+    file = compute(ask("sample"), None)
+    assert effort_of(replace(file.request, **other), file) is Effort.QUICK
+    assert effort_of(replace(file.request, less=Less(skip=2)), file) is Effort.ANY
 
 
 def test_less_of_a_capture_is_taken_from_the_whole_of_it(car):

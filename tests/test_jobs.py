@@ -9,7 +9,7 @@ from contextvars import ContextVar
 
 import pytest
 
-from app.jobs import LatestWins, Places
+from app.jobs import Effort, LatestWins, Places
 from app.turns import MESSAGES_FIRST, Turns
 from tests.browser import eventually
 from tests.threads import at_once, queued
@@ -22,16 +22,17 @@ class Desk:
 
     def __init__(self, on_page=at_once, **shared):
         self.jobs = LatestWins(on_page, **shared)
-        self.ran, self.done, self.failed = [], [], []
+        self.ran, self.threads, self.done, self.failed = [], [], [], []
         self.go = threading.Event()
 
-    def submit(self, name):
+    def submit(self, name, effort=Effort.ANY):
         def work():
             self.ran.append(name)
+            self.threads.append(threading.current_thread())
             assert self.go.wait(20)
             return name
 
-        self.jobs.submit(work, self.done.append, self.failed.append)
+        self.jobs.submit(work, self.done.append, self.failed.append, effort)
 
 
 def test_the_latest_request_wins_and_the_overtaken_never_run():
@@ -94,6 +95,54 @@ def test_a_slow_request_of_one_session_holds_up_no_other():
     assert not slow.done
     slow.go.set()
     eventually(lambda: slow.done)
+
+
+def test_quick_work_is_done_on_the_page_in_its_turn_the_newest_alone():
+    turns = []
+    desk = Desk(on_page=queued(turns.append))
+    desk.go.set()
+    for name in ("first", "second", "third"):
+        desk.submit(name, Effort.QUICK)
+    assert desk.ran == []
+    (turn,) = turns
+    turn()
+    assert desk.ran == desk.done == ["third"]
+    assert desk.threads == [threading.current_thread()]
+    desk.jobs.submit(lambda: 1 / 0, desk.done.append, desk.failed.append, Effort.QUICK)
+    turns.pop()()
+    assert isinstance(desk.failed[0], ZeroDivisionError)
+    assert not desk.jobs.has_more
+
+
+@pytest.mark.parametrize("effort", [Effort.SHORT, Effort.ANY])
+def test_what_overtakes_quick_work_is_no_work_of_the_page(effort):
+    turns = []
+    desk = Desk(on_page=queued(turns.append))
+    desk.go.set()
+    desk.submit("quick", Effort.QUICK)
+    desk.submit("longer", effort)
+    turns.pop()()
+    eventually(lambda: turns)
+    turns.pop()()
+    assert desk.done == ["longer"]
+    assert desk.threads != [threading.current_thread()]
+
+
+def test_short_work_is_done_one_at_a_time_and_waits_for_no_other():
+    first, second, third, other = (Desk() for _ in range(4))
+    other.submit("long")
+    for desk in (first, second, third):
+        desk.submit("short", Effort.SHORT)
+    eventually(lambda: first.ran)
+    time.sleep(0.05)
+    assert second.ran == []
+    second.submit("long", Effort.ANY)  # which is not done in a place for what is short
+    first.go.set()
+    eventually(lambda: third.ran and second.ran)
+    for desk in (second, third, other):
+        desk.go.set()
+    eventually(lambda: second.done == ["long"] and third.done == ["short"])
+    eventually(lambda: other.done)
 
 
 def test_who_waits_for_a_place_begins_with_the_newest_of_its_requests():

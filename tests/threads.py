@@ -7,9 +7,10 @@ from collections.abc import Callable
 Act = Callable[[], None]
 
 
-def at_once(act: Act, due: Act) -> None:
+def at_once(act: Act, due: Act | None = None) -> None:
     """The page's turn comes at once."""
-    due()
+    if due:
+        due()
     act()
 
 
