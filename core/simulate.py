@@ -193,9 +193,9 @@ def triggered_by_each_edge(
     """
     n_edges = acquisition.n_bins + 1
     share_of_gate = np.linspace(0.0, 1.0, n_edges)
-    everywhere = flux.background * share_of_gate
+    steady = flux.background * share_of_gate
     if scene.backscatter is not None:
-        everywhere += scene.backscatter.photons_before(flux.signal, pulse, acquisition)
+        steady += scene.backscatter.photons_before(flux.signal, pulse, acquisition)
     shifts_bins = np.zeros(1)
     if scene.motion is not None:
         shifts_bins = scene.motion.shifts_bins(pulse, acquisition, pulses_sent(acquisition))
@@ -204,13 +204,12 @@ def triggered_by_each_edge(
         for range_m, signal in _echoes(scene, flux)
     ]
     faulty = scene.faulty_pixels
-    dark = None if faulty is None else faulty.photons(acquisition).reshape(-1, 1)
+    if faulty is not None:
+        steady = steady + faulty.photons(acquisition).reshape(-1, 1) * share_of_gate
     triggered = np.empty((np.size(scene.range_m), n_edges))
     before = triggered if shifts_bins.size == 1 else np.empty_like(triggered)
     for group, shift_bins in enumerate(shifts_bins):
-        before[:] = everywhere
-        if dark is not None:
-            before += dark * share_of_gate
+        before[:] = steady
         for onset_bin, signal in echoes:
             add_echo(onset_bin + shift_bins, signal, pulse, acquisition.bin_width_s, before)
         np.expm1(np.negative(before, out=before), out=before)
@@ -257,8 +256,8 @@ def add_echo(
     """
     samples = np.cumsum((0.0, *pulse.samples))
     share = samples / (samples[-1] or 1.0)
-    shape = _SHAPES.index(pulse.shape)
-    _add_echo(onset_bin, signal, bin_width_s / pulse.tau_s, shape, share, before)
+    bin_taus = bin_width_s / pulse.tau_s
+    _add_echo(onset_bin, signal, bin_taus, _SHAPES[pulse.shape], share, before)
 
 
 def _draw_multinomial(
@@ -268,18 +267,19 @@ def _draw_multinomial(
     cube[:] = np.random.default_rng(seed).multinomial(n_pulses, probability)[:, :-1]
 
 
-_SHAPES = "gamma", "gaussian", "measured"
+_GAMMA, _GAUSSIAN, _MEASURED = range(3)
+_SHAPES = {"gamma": _GAMMA, "gaussian": _GAUSSIAN, "measured": _MEASURED}
 _SQRT_HALF = math.sqrt(0.5)
 
 
 @njit(**COMPILED)
 def _arrived(t, shape, share):  # type: ignore[no-untyped-def]
     """`Pulse.cdf` at `t` time constants; of a measured pulse `share` is that at its samples."""
-    if shape == 1:
+    if shape == _GAUSSIAN:
         return 0.5 * math.erfc(-t * _SQRT_HALF)
     if t <= 0.0:
         return 0.0
-    if shape == 0:
+    if shape == _GAMMA:
         return 1.0 - (1.0 + t) * math.exp(-t)
     if t >= share.size - 1:
         return 1.0

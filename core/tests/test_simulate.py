@@ -200,6 +200,7 @@ def test_an_echo_is_added_as_its_pulse_arrives(pulse: Pulse) -> None:
     add_echo(onset_bin, signal, pulse, ACQUISITION.bin_width_s, before)
     arrived = pulse.cumulative(onset_bin, ACQUISITION.n_bins, ACQUISITION.bin_width_s)
     expected = 0.25 + signal[:, np.newaxis] * (arrived - arrived[:, :1])
+    # Some ten roundings on either side, of which the last are of numbers up to 3.25.
     np.testing.assert_allclose(before, expected, rtol=0, atol=20 * np.finfo(float).eps)
 
 
