@@ -7,6 +7,9 @@ const LONGEST_PAUSE_MS = 250;
 // By then a widget has drawn what the server said.
 const DRAWN_MS = 500;
 
+// By then a browser that gives back one canvas has given back all.
+const RESTORED_MS = 200;
+
 // A page less wide begins without its sidebar, which would cover what it controls.
 const NARROW_PX = 900;
 
@@ -146,6 +149,26 @@ const keepNewest = (data) => {
   session._handle_patch = function (message) {
     take.call(this, message);
     goOn(this);
+  };
+}
+
+{
+  // A browser that loses its graphics, as when a laptop wakes up, empties every canvas, those of
+  // images and colour bars among them, and gives them back one after the other.
+  const { ColorMapper } = Bokeh.require("models/mappers/color_mapper");
+  const canvas = Bokeh.Models.get("Canvas").prototype.default_view.prototype;
+  const { initialize } = canvas;
+
+  const paintAnew = (plot) => {
+    for (const model of plot.model.references())
+      if (model instanceof ColorMapper) model.change.emit();
+    plot.request_repaint();
+  };
+  canvas.initialize = function () {
+    initialize.call(this);
+    this.primary.canvas.addEventListener("contextrestored", () =>
+      setTimeout(() => this.plot_views.forEach(paintAnew), RESTORED_MS),
+    );
   };
 }
 

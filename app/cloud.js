@@ -404,14 +404,17 @@ class CloudView {
   }
 
   ready() {
-    if (this.window || this.problem.textContent) return Boolean(this.window)
+    if (this.window) return true
     const {vtk} = window
     try {
       if (!vtk) throw new Error("vtk.js is not on this page: the app must call pn.extension('vtk')")
       this.build(vtk)
+      this.problem.textContent = ""
       return true
     } catch (error) {
-      this.problem.textContent = `The 3D cloud cannot be drawn: ${error.message}.`
+      // A browser that has just lost its graphics offers none for a while.
+      this.problem.textContent =
+        `The 3D cloud cannot be drawn: ${error.message}. Its next change tries again.`
       return false
     }
   }

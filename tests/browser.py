@@ -17,7 +17,7 @@ from typing import IO
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
-from playwright.sync_api import Browser, Locator, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserType, Locator, Page, sync_playwright
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -41,15 +41,18 @@ def browser_path() -> str | None:
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A running browser without a window; fails, and says so, where there is none.
-
-    Its first context is that of `open_page`.
-    """
+    """A running browser without a window; fails, and says so, where there is none."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=browser_path(), args=ARGUMENTS)
-        browser.new_context()
+        browser = launch(playwright.chromium)
         yield browser
         browser.close()
+
+
+def launch(kind: BrowserType) -> Browser:
+    """A browser whose first context is that of `open_page`."""
+    browser = kind.launch(executable_path=browser_path(), args=ARGUMENTS)
+    browser.new_context()
+    return browser
 
 
 @contextmanager

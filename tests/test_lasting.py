@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser import ROOT, eventually, fact, open_page, serving
+from tests.browser import ROOT, eventually, fact, launch, open_page, serving
 from tests.test_browser import chosen, image, look, pixel_on_show, slider, upload, warning
 
 pytestmark = pytest.mark.browser
@@ -50,6 +51,12 @@ def same_pictures(page: Page, other: Page) -> Callable[[], bool]:
     return compare
 
 
+def share_changed(page: Page, before: dict[str, np.ndarray], *names: str) -> float:
+    """Share of a picture's pixels that look different from before, of the one with the most."""
+    now = look(page)
+    return max(float((now[name] != before[name]).any(axis=2).mean()) for name in names or now)
+
+
 def test_the_facade_comes_back_after_a_reload_and_in_another_tab(page, address):
     first = page(f"{address}?source=building&tracking.l=0.006&less.merge=2&image=Error")
     expect(chosen(first, "Scene or capture")).to_have_text("Building at 830–860 m")
@@ -85,6 +92,44 @@ def test_nonsense_in_an_address_is_told_and_the_rest_is_there(page, address):
     slider(new, "Seed").press("ArrowRight")
     rests(new, "?light.seed=2")
     expect(told).to_be_hidden()
+
+
+REFUSING = """
+const ask = HTMLCanvasElement.prototype.getContext;
+const asked = new WeakSet();
+HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+  if (window.refused === kind && !asked.has(this)) return null;
+  asked.add(this);
+  return ask.call(this, kind, ...more);
+};
+"""
+
+LOSE_AND_REFUSE = """(canvas) => {
+  const graphics = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
+  refused = "webgl2";
+  graphics.loseContext();
+}"""
+
+
+def test_plots_and_cloud_come_back_where_the_browser_lost_its_graphics(browser, address):
+    own = launch(browser.browser_type)
+    page = open_page(own, address, prepare=REFUSING)
+    eventually(lambda: share_changed(page, look(page)) == 0)
+    before = look(page)
+    own.new_browser_cdp_session().send("Browser.crashGpuProcess")
+    eventually(lambda: share_changed(page, before) > 0.05)
+    # The symbols of legends are smoothed another way.
+    eventually(lambda: share_changed(page, before) < 0.001)
+
+    page.locator(".stage canvas").evaluate(LOSE_AND_REFUSE)
+    told = page.get_by_text("The 3D cloud cannot be drawn")
+    expect(told).to_have_text(re.compile("offers no WebGL 2. Its next change tries again."))
+    page.evaluate("refused = undefined")
+    slider(page, "Seed").press("ArrowRight")
+    expect(told).to_have_count(0)
+    slider(page, "Seed").press("ArrowLeft")
+    eventually(lambda: share_changed(page, before, "cloud") == 0)
+    own.close()
 
 
 def cut(page: Page) -> None:
