@@ -70,7 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
     for source in given.values():
         try:
             print(source.load(Light(), Reading(), ()).source, flush=True)
-        except core.CaptureError as error:
+        except ValueError as error:  # unreadable, or more than is held as a whole
             parser.error(str(error))
     sources, uploads = given | built_in_sources(), Uploads()
     pn.extension("vtk")

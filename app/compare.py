@@ -28,6 +28,7 @@ from app.downloads import (
     below,
     downloadable,
     looked_at,
+    pixel_on_show,
     ranged,
 )
 from app.exports import cloud_files, image_files, plot_file, shown_table_file
@@ -451,14 +452,14 @@ class Compare:
         else:
             values, _ = image_of(answer, look_name, least)
             figure = self._pictures[place].image.figure
-            what, files = f"{kind} image", image_files(answer, least, values, look, figure)
+            files = image_files(answer, look_name, least, values, look, figure)
+            what = f"{kind} image"
         subject = ranged(self._session, answer, method, self._tasks[method].settings)
         return Shown(subject, what.lower(), files, title_of(method), look)
 
     def _curves_shown(self) -> Shown:
-        row, col = self._session.state.pixel
         table = plot_file(self._curves.pane.object, self._capture.acquisition)
-        return Shown(self._subject, f"scores row{row} col{col}", {"csv": table})
+        return Shown(self._subject, f"scores {pixel_on_show(self._session)}", {"csv": table})
 
     def _reliability_shown(self) -> Shown:
         table = plot_file(self._reliability.pane.object)

@@ -10,8 +10,8 @@ FORMATS = {
     "png": "picture, as on screen",
     "svg": "picture, as on screen, to enlarge and edit",
     "csv": "the numbers on screen, as text",
-    "npz": "the answer's arrays, for NumPy",
-    "tif": "range, confidence and counts, for GIS",
+    "npz": "what is shown, and the answer's arrays, for NumPy",
+    "tif": "what is shown, then range, confidence and counts, for GIS",
     "ply": "the points on screen, with colours",
     "las": "the points on screen, for survey software",
 }

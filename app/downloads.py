@@ -69,12 +69,15 @@ class Subject:
         Settings as controls are made of; only those that are not the default are told.
     told : str
         Where the capture came from.
+    part : str
+        Which rows and columns of the capture, if not all.
     """
 
     capture: str
     estimator: str = ""
     settings: Sequence[Any] = ()
     told: str = ""
+    part: str = ""
 
     @property
     def chosen(self) -> list[str]:
@@ -97,13 +100,14 @@ class Subject:
             Of the format, without the point.
         """
         capture, what = _plain(self.capture)[:40].strip("-._") or "capture", _plain(what)[:40]
-        room = MOST_LETTERS - len(f"{capture}_{self.estimator}_{what}.{suffix}")
+        part = f"_{self.part}" if self.part else ""
+        room = MOST_LETTERS - len(f"{capture}{part}_{self.estimator}_{what}.{suffix}")
         told = ""
         for each in self.chosen:
             if len(told) + len(each) < room:
                 told += f"_{each}"
         method = f"_{self.estimator}" if self.estimator else ""
-        return f"{capture}{method}{told}_{what}.{suffix}"
+        return f"{capture}{part}{method}{told}_{what}.{suffix}"
 
     def about(self, what: str) -> str:
         """What a picture's file says of itself."""
@@ -291,7 +295,11 @@ def looked_at(session: Session, request: Request) -> Subject:
     capture = session.key(source) if source.is_scene else Path(source.title).stem
     absent = "".join(f" without {name}" for name in sorted(request.absent))
     lit = (request.light,) if source.is_scene else ()
-    return Subject(capture + absent, "", (*lit, request.less))
+    window, part = request.window, ""
+    if window is not None:
+        ends = [f"{first}-{behind - 1}" for first, behind in (window.rows, window.cols)]
+        part = "rows{}_cols{}".format(*ends)
+    return Subject(capture + absent, "", (*lit, request.less), part=part)
 
 
 def ranged(session: Session, answer: Answer, estimator: str, settings: Any) -> Subject:
@@ -314,8 +322,13 @@ def over_the_gate(session: Session, figure: Any, what: str) -> Shown:
 
 def pixel_plot(session: Session, figure: Any, what: str) -> Shown:
     """A plot of the session's pixel."""
-    row, col = session.state.pixel
-    return over_the_gate(session, figure, f"{what} row{row} col{col}")
+    return over_the_gate(session, figure, f"{what} {pixel_on_show(session)}")
+
+
+def pixel_on_show(session: Session) -> str:
+    """Row and column of the session's pixel, in its file."""
+    row, col = session.answer.grid.place(*session.state.pixel)
+    return f"row{row} col{col}"
 
 
 def range_image(session: Session) -> Shown:
@@ -323,7 +336,7 @@ def range_image(session: Session) -> Shown:
     answer, state = session.answer, session.state
     least = state.viewing.least_confidence
     values, look = image_of(answer, state.image, least)
-    files = image_files(answer, least, values, look, session.image.figure)
+    files = image_files(answer, state.image, least, values, look, session.image.figure)
     what = "range image" if state.image == "Estimate" else f"{state.image} image"
     return Shown(explored(session), what.lower(), files)
 

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from app.download_words import NO_POINTS, NOTHING_DRAWN
 from app.gate import TITLES, scale
+from app.large import Grid
 from app.looks import Look, cloud_of, shown
 from app.state import UNITS, Viewing
 from app.store import Answer
 from app.theme import WRONG_COLOR
 from core import Acquisition
 from core.experiments.items import Table, as_csv
-from core.export import WRITERS, Product, write_columns
+from core.export import WRITERS, Plane, Product, write_columns
 
 Array = NDArray[Any]
 
@@ -157,13 +158,15 @@ def _view(of: Any) -> tuple[float, float]:
 
 
 def image_files(
-    answer: Answer, least_confidence: float, values: Array, look: Look, figure: Any
+    answer: Answer, kind: str, least_confidence: float, values: Array, look: Look, figure: Any
 ) -> dict[str, Write]:
     """An image (row, col) as shown, and the answer behind it.
 
     Parameters
     ----------
     answer : Answer
+    kind : str
+        What is shown of it: one of `app.state.MAPS`.
     least_confidence : float
         Answers below are left out.
     values : ndarray, shape (row, col)
@@ -173,30 +176,39 @@ def image_files(
     figure : bokeh.plotting.figure
         Where it is drawn; a CSV file holds the pixels in view.
     """
-    product = _product(answer, least_confidence)
+    name = "range_m" if kind == "Estimate" else kind.lower()
+    plane = Plane(values, look.unit if look.unit == "m" else "1", look.legend)
+    product = _product(answer, least_confidence, shown={name: plane})
     files = {suffix: partial(WRITERS[f".{suffix}"], product) for suffix in ("npz", "tif")}
-    return {"csv": image_file(values, look, figure), **files}
+    return {"csv": image_file(values, look, figure, answer.grid), **files}
 
 
-def image_file(values: Array, look: Look, figure: Any) -> Write:
-    """The pixels in view of an image (row, col), one line each, as CSV."""
-    rows, cols = (
-        _in_view(ends, n)
-        for ends, n in zip((figure.y_range, figure.x_range), values.shape, strict=True)
-    )
+def image_file(values: Array, look: Look, figure: Any, grid: Grid) -> Write:
+    """The pixels in view of an image (row, col), one line each, as CSV.
+
+    Rows and columns are those of the file, as on the axes; `grid` tells them.
+    """
+    places = [
+        first + grid.step * np.arange(size)
+        for first, size in zip(grid.first, values.shape, strict=True)
+    ]
+    in_view = [
+        _in_view(ends, place, grid.step / 2)
+        for ends, place in zip((figure.y_range, figure.x_range), places, strict=True)
+    ]
 
     def write(file: BinaryIO) -> None:
-        row, col = np.meshgrid(rows, cols, indexing="ij")
-        write_columns({"row": row, "col": col, look.legend: values[np.ix_(rows, cols)]}, file)
+        seen = (place[each] for place, each in zip(places, in_view, strict=True))
+        row, col = np.meshgrid(*seen, indexing="ij")
+        write_columns({"row": row, "col": col, look.legend: values[np.ix_(*in_view)]}, file)
 
     return write
 
 
-def _in_view(of: Any, size: int) -> Array:
-    """Indices of an image's rows or columns that are at least partly in view."""
+def _in_view(of: Any, place: Array, half: float) -> NDArray[np.bool_]:
+    """Which of an image's rows or columns are at least partly in view."""
     low, high = _view(of)
-    index = np.arange(size)
-    return index[(index + 0.5 > low) & (index - 0.5 < high)]
+    return np.asarray((place + half > low) & (place - half < high))
 
 
 def _product(answer: Answer, least_confidence: float, **more: Any) -> Product:

@@ -262,7 +262,8 @@ class Inspector:
         session, state = self._session, self._session.state
         least = state.viewing.least_confidence
         values, look = map_of(session.answer, state.map, least)
-        files = image_files(session.answer, least, values, look, self._navigator.figure)
+        figure = self._navigator.figure
+        files = image_files(session.answer, state.map, least, values, look, figure)
         return Shown(explored(session), f"map {state.map}", files)
 
     # What is drawn

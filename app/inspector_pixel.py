@@ -9,7 +9,16 @@ import panel as pn
 
 from app import inspector_words
 from app.controls import FACTS_PX, LINE_PX, Facts, Sentence, Table
-from app.downloads import PLOT, TABLE, Shown, below, downloadable, explored, over_the_gate
+from app.downloads import (
+    PLOT,
+    TABLE,
+    Shown,
+    below,
+    downloadable,
+    explored,
+    over_the_gate,
+    pixel_on_show,
+)
 from app.exports import shown_table_file
 from app.inspector_answers import Seen, pixel_lit, pixel_seen, region_seen
 from app.inspector_views import PixelPlots
@@ -114,8 +123,7 @@ class Sight:
 
     @property
     def _place(self) -> str:
-        row, col = self._session.state.pixel
-        return f"row{row} col{col}" if self._watched == "pixel" else "region"
+        return pixel_on_show(self._session) if self._watched == "pixel" else "region"
 
     def _shown(self, figure: Any, what: str) -> Shown:
         return over_the_gate(self._session, figure, f"{what} {self._place}")

@@ -18,6 +18,7 @@ from app.controls import Knob, Sentence, Table
 from app.download_words import NOTHING_DRAWN
 from app.downloads import PLOT, TABLE, Shown, Subject, downloadable
 from app.exports import image_file, plot_file, table_file
+from app.large import Grid
 from app.looks import Look
 from app.method_views import TITLES, ScaleBar
 from app.paper_words import (
@@ -201,7 +202,7 @@ class Gallery:
             if item is None:
                 raise ValueError(NOTHING_DRAWN)
             look = _look(item)
-            files = {"csv": image_file(item.images[name], look, pane.object)}
+            files = {"csv": image_file(item.images[name], look, pane.object, Grid())}
             return Shown(subject(), f"{item.key} {name}", files, scale=look)
 
         holder = pn.Column(pane, sizing_mode="stretch_width", height=PICTURE_HEIGHT, margin=0)

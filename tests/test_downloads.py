@@ -22,10 +22,10 @@ from playwright.sync_api import expect
 
 from app import downloads
 from app.downloads import Download, Shown, Subject
-from app.exports import drawn, shown_table_file, table_file
+from app.exports import drawn, image_files, shown_table_file, table_file
 from app.layout import Layout
-from app.looks import image_of, shown
-from app.state import Less, Light
+from app.looks import image_of, map_of, shown
+from app.state import MAPS, Less, Light
 from app.store import built_in_sources, inspect
 from app.theme import RANGE_COLORS
 from core import TrackingParameters
@@ -185,6 +185,23 @@ def test_the_answers_arrays_leave_without_what_is_hidden(session):
     assert str(arrays["source"]) == session.answer.capture.source
     pages = tifffile.imread(io.BytesIO(written(files["tif"])))
     np.testing.assert_array_equal(pages[0], range_m.astype(np.float32))
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_arrays_and_pages_hold_the_map_that_is_shown(session, kind):
+    least = 0.9
+    values, look = map_of(session.answer, kind, least)
+    files = image_files(session.answer, kind, least, values, look, session.image.figure)
+    arrays = np.load(io.BytesIO(written(files["npz"])))
+    name = "range_m" if kind == "Estimate" else kind.lower()
+    np.testing.assert_array_equal(arrays[name], values)
+    with tifffile.TiffFile(io.BytesIO(written(files["tif"]))) as tif:
+        first = tif.pages[0]
+        np.testing.assert_array_equal(first.asarray(), values.astype(np.float32))
+        assert first.description.startswith(f"{name} [{look.unit if look.unit == 'm' else 1}]: ")
+        assert look.legend in first.description
+        told = [page.description.split(" ")[0] for page in tif.pages]
+    assert set(told) == {name, "range_m", "confidence", "counts"}
 
 
 def points_on_screen(session):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shutil
@@ -16,7 +17,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 import core
-from app import large
+from app import downloads, large
+from app.__main__ import main
 from app.address import Wanted
 from app.large import LIMIT, Grid, most_whole_bytes
 from app.large_view import bounds_of
@@ -28,7 +30,7 @@ from core import Window
 from core.experiments.tradeoff import Cancelled
 from core.posterior import lighting_of
 from core.readers.labelled import dataset
-from tests.browser import fact, serving
+from tests.browser import ROOT, fact, serving
 from tests.test_app import ask, complaint, control, next_answer, told
 from tests.threads import queued
 
@@ -200,6 +202,17 @@ def test_what_is_in_memory_as_a_whole_has_its_own_places():
     assert compute(ask("sample"), None).grid == Grid()
 
 
+def test_a_file_that_cannot_be_held_is_refused_in_words_before_anything_is_served(
+    monkeypatch, capsys
+):
+    monkeypatch.setenv(LIMIT, "1000")
+    with pytest.raises(SystemExit):
+        main([str(ROOT / "assets" / "sample_capture.npz")])
+    said = capsys.readouterr().err
+    assert "bytes of counts of sample_capture.npz" in said
+    assert "python -m core export sample_capture.npz sample_capture.zarr" in said
+
+
 # -- typed bounds ----------------------------------------------------------------------------------
 
 
@@ -237,6 +250,29 @@ def settle(page, holds):
         next_answer(page)
 
 
+def taken_away(session):
+    """First and last row and column of the image's table, and how many pixels it holds."""
+    file = io.BytesIO()
+    downloads.range_image(session).files["csv"](file)
+    table = np.genfromtxt(io.BytesIO(file.getvalue()), delimiter=",", skip_header=1)
+    rows, cols, shown = table.T
+    values, _ = image_of(session.answer, "Estimate", session.state.viewing.least_confidence)
+    at = [session.answer.grid.pixel(*each) for each in zip(rows, cols, strict=True)]
+    np.testing.assert_array_equal(shown, [values[each] for each in at])
+    return (rows.min(), rows.max()), (cols.min(), cols.max()), len(table)
+
+
+def test_the_table_of_a_preview_holds_the_pixels_in_view(looking):
+    session = looking.session
+    settle(looking, lambda: session.answer.cutout.is_final)
+    step = session.answer.grid.step
+    assert step > 1
+    session.image.figure.x_range.update(start=60.2, end=90.1)
+    _, (first, last), _ = taken_away(session)
+    assert 60.2 - step / 2 < first <= 60.2 + step / 2
+    assert 90.1 - step / 2 <= last < 90.1 + step / 2
+
+
 def fields(page):
     return [control(page, name).value for name in ("Rows shown", "Columns shown")]
 
@@ -267,6 +303,11 @@ def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
     assert told(session.numbers)["Pixel"] == "row {}, col {}".format(*place)
     picture = session.image._plot.source("picture").data
     assert (picture["x"][0], picture["dw"][0]) == (19.5, 60)
+    assert taken_away(session) == ((30, 69), (20, 79), 40 * 60)
+    name = downloads.explored(session).file_name("range image", "csv")
+    assert "_rows30-69_cols20-79_" in name
+    at = "row{} col{}".format(*place)
+    assert downloads.pixel_plot(session, session.signals.histogram.figure, "h").what == f"h {at}"
     control(looking, "The whole").clicks += 1
     settle(looking, lambda: session.answer.cutout.is_preview)
     assert session.state.window is None

@@ -19,7 +19,7 @@ from core.capture import Capture, Seen
 from core.checks import require
 from core.estimators import RangeImage
 from core.export import las, netcdf, npz, pcd, picture, ply, table, tiff
-from core.export.product import Product
+from core.export.product import Plane, Product
 from core.export.table import write_columns
 from core.export.whole import whole_file, whole_folder
 from core.readers.labelled import dataset
@@ -31,6 +31,7 @@ __all__ = [
     "CLOUD_SUFFIXES",
     "FOLDER_WRITERS",
     "WRITERS",
+    "Plane",
     "Product",
     "save_capture",
     "save_image",

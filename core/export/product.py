@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +42,8 @@ class Product:
         For people; see `heading`.
     rgb : ndarray of uint8, shape (row, col, 3), optional
         Colours of the points of a cloud.
+    shown : mapping of str to Plane
+        What else, or instead, is shown of the capture; comes first among `planes`.
 
     Raises
     ------
@@ -54,6 +57,7 @@ class Product:
     pixel_angle_rad: float | None = None
     title: str = ""
     rgb: NDArray[np.uint8] | None = None
+    shown: Mapping[str, Plane] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         shape, angle_rad = self.image.range_m.shape, self.pixel_angle_rad
@@ -74,8 +78,8 @@ class Product:
     @property
     def planes(self) -> dict[str, Plane]:
         """The images, by name."""
-        image = self.image
-        return {
+        image, shown = self.image, dict(self.shown)
+        known = {
             "range_m": Plane(image.range_m, "m", "range of the surface, NaN without an answer"),
             "confidence": Plane(
                 image.confidence, "1", "probability that the surface is within 3 bins of the answer"
@@ -85,6 +89,7 @@ class Product:
             "score": Plane(image.score, "1", "score at the answer, of the estimator's own scale"),
             "valid": Plane(image.valid, "1", "whether there is an answer"),
         }
+        return shown | {name: plane for name, plane in known.items() if name not in shown}
 
     @property
     def facts(self) -> dict[str, str | int | float]:

@@ -1,4 +1,4 @@
-"""TIFF: three pages of 32-bit floats, ``range_m``, ``confidence`` and ``counts``.
+"""TIFF: pages of 32-bit floats, ``range_m``, ``confidence`` and ``counts``.
 
 Ranges are exact to 6e-8 of themselves, counts up to 2**24. Each page tells its name (the tag
 PageName), its meaning and unit (ImageDescription, and for GIS the tags of GDAL), and the
@@ -26,10 +26,10 @@ def write(product: Product, file: BinaryIO) -> None:
 
     planes = product.planes
     with TiffWriter(file) as pages:
-        for name in PAGES:
+        for name in dict.fromkeys((*product.shown, *PAGES)):
             plane = planes[name]
             tags = {_PAGE_NAME: name, _GDAL_METADATA: _gdal_metadata(name, plane, product)}
-            if name == "range_m":
+            if np.isnan(plane.values).any() or name == "range_m":
                 tags[_GDAL_NODATA] = "nan"
             pages.write(
                 plane.values.astype(np.float32),
