@@ -25,6 +25,7 @@ MAP_TITLES = {
     "Fired": "Share of the pulses that fired",
     "SBR": "Signal over background, as the counts tell",
 }
+FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,8 @@ def image_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array,
             counts[counts == 0] = np.nan  # not read yet
         return counts, _count_look(capture.counts)
     if kind == "Confidence":
-        sure = np.where(shown(answer, least_confidence), image.confidence, np.nan)
+        # All of it: what is hidden elsewhere is hidden for want of it.
+        sure = np.where(image.valid, image.confidence, np.nan)
         return sure, Look("Confidence: probability of being right", "", 0.0, 1.0, COUNT_COLORS)
     if kind == "Error" and truth_m is not None:
         reach_m = ERROR_SCALE_BINS * capture.acquisition.bin_length_m
@@ -104,7 +106,9 @@ def map_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array, L
     values = inspection.maps[kind](answer.capture)
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, [1, 99]).tolist() if known.size else (0.0, 1.0)
-    return values, Look(MAP_TITLES[kind], "", low, max(high, low + 1e-6), COUNT_COLORS)
+    is_unknown = kind == "Fired" and answer.capture.armed_pulses is None
+    title = FIRED_UNKNOWN if is_unknown else MAP_TITLES[kind]
+    return values, Look(title, "", low, max(high, low + 1e-6), COUNT_COLORS)
 
 
 def color_values(answer: Answer, kind: str) -> tuple[Array, Look]:

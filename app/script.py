@@ -22,7 +22,7 @@ PICTURES = {
     "Estimate": "shown.range_m",
     "Truth": "capture.truth_range_m",
     "Error": "shown.range_m - capture.truth_range_m",
-    "Confidence": "np.where(shown.valid, image.confidence, np.nan)",
+    "Confidence": "np.where(image.valid, image.confidence, np.nan)",
     "Counts": "capture.counts",
     **{name: f'core.inspection.maps["{name}"](capture)' for name in inspection.maps},
 }
@@ -214,8 +214,7 @@ def _comparison(answer: Answer, state: State) -> Lines:
     yield "pictures = {}"
     yield "for method, image in images.items():"
     error = " - capture.truth_range_m" if chosen.kind == "Error" else ""
-    confidence = "np.where(sure, image.confidence, np.nan)"
-    picture = confidence if chosen.kind == "Confidence" else f"shown.range_m{error}"
+    picture = PICTURES["Confidence"] if chosen.kind == "Confidence" else f"shown.range_m{error}"
     of_each = [
         *_shown(chosen.viewing.least_confidence),
         f"pictures[method] = {picture}",

@@ -143,7 +143,11 @@ def test_every_map_is_offered_where_it_can_be_and_drawn(field, facade):
     counts, _ = map_of(facade.answer, "Counts", 0.0)
     fired, _ = map_of(facade.answer, "Fired", 0.0)
     np.testing.assert_allclose(fired * facade.answer.capture.armed_pulses, counts)
-    assert np.isnan(map_of(field.answer, "Fired", 0.0)[0]).all()  # its pulses are not known
+    fired, look = map_of(field.answer, "Fired", 0.0)
+    assert np.isnan(fired).all()
+    assert "pulses not known" in look.title
+    sure, _ = map_of(facade.answer, "Confidence", 0.9)
+    assert np.nanmin(sure) < 0.5  # what is doubtful is what one looks for
 
 
 @pytest.fixture
