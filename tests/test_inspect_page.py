@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import re
+from csv import DictReader
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from app import inspector_words
+from app.downloads import Download
 from app.gate import scale
 from app.inspector import Inspector
 from app.inspector_answers import accuracy_steps, pixel_seen, region_seen, with_gate
@@ -334,6 +337,56 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
     page._chips.chosen = [[100, 132], 1]
     assert field.state.pixel == (100, 132)
     eventually(lambda: len(part._table.rows) == 3)
+
+
+# -- what is taken away ----------------------------------------------------------------------------
+
+
+def tables_of(view):
+    """The numbers of each card of a part of the page, by what its button says it shows."""
+    tables = {}
+    main = view.main if isinstance(view.main, list | tuple) else [view.main]
+    for button in (each for card in main for each in card.select(Download)):
+        file = io.BytesIO()
+        button._show().files["csv"](file)
+        lines = list(DictReader(io.StringIO(file.getvalue().decode())))
+        tables[button.what] = {name: [line[name] for line in lines] for name in lines[0]}
+    return tables
+
+
+def counts_of(table, name, n_bins):
+    return np.array(table[name][:n_bins], float)
+
+
+@pytest.mark.parametrize("name", ["field", "facade"])
+def test_region_pins_and_capture_are_taken_away_as_shown(name, request):
+    session = request.getfixturevalue(name)
+    pins, region = ((100, 30), (61, 62)), rectangle((40, 44), (30, 33))
+    if name == "facade":
+        pins = ((10, 30), (61, 62))
+    session.state.param.update(pins=pins, region=region)
+    cube, n_bins = session.answer.capture.cube, session.answer.capture.acquisition.n_bins
+    parts = Sight(session, "region"), Pins(session), Whole(session)
+    for part in parts:
+        part.view.paint(False)
+        part.view.show(True)
+    of_region, of_pins, whole = parts
+    eventually(lambda: of_region._facts.facts and len(of_pins._table.rows) == 2)
+    eventually(lambda: column(whole._counts, "raw", "raw").size == n_bins)
+
+    seen = tables_of(of_region.view)
+    summed = cube[40:45, 30:34].sum(axis=(0, 1))
+    np.testing.assert_array_equal(counts_of(seen["counts"], "counts", n_bins), summed)
+    assert {"counts", "rate", "residual and enhanced"} <= seen.keys()
+
+    for pin in pins:
+        told = counts_of(tables_of(of_pins.view)["counts"], f"{pin[0]}, {pin[1]} (counts)", n_bins)
+        np.testing.assert_array_equal(told, cube[pin])
+
+    told = counts_of(tables_of(whole.view)["counts"], "counts", n_bins)
+    np.testing.assert_array_equal(told, cube.sum(axis=(0, 1)))
+    for part in parts:
+        part.view.show(False)
 
 
 # -- the capture as a whole ------------------------------------------------------------------------
