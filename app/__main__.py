@@ -28,7 +28,7 @@ from app.controls import Sentence
 from app.jobs import LONG
 from app.layout import build_page
 from app.opening import Answers, send_heads_first
-from app.serving import TOKEN_VARIABLE, Access, Headers, guard, keep_tracebacks
+from app.serving import TOKEN_VARIABLE, Access, Headers, guard, keep_tracebacks, send_early_changes
 from app.state import Light, Reading
 from app.store import Source, built_in_sources, file_source
 from app.uploads import MAX_UPLOAD_BYTES, Uploads
@@ -106,6 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
     core.warm_up()
     latency.tune()
     keep_tracebacks()
+    send_early_changes()
     collector.spare()
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)

@@ -17,6 +17,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from bokeh.protocol.message import Message
 from bokeh.server.connection import ServerConnection
+from bokeh.server.session import ServerSession
 from panel.io.state import set_curdoc, state
 from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.routing import Matcher, Rule
@@ -283,3 +284,20 @@ def _told(connection: ServerConnection, message: Message[Any], text: str) -> Mes
     answer = connection.protocol.create("ERROR", message.header["msgid"], "It is told by the page.")
     answer.content["traceback"] = None
     return answer
+
+
+def send_early_changes() -> None:
+    """Send what changes on a page between its first picture and the moment it is all drawn.
+
+    The browser has then pulled the document, but Panel takes it for not connected before it says
+    that it has drawn it, and drops what changes until then.
+    """
+    ServerSession._handle_pull = _connecting(ServerSession._handle_pull)
+
+
+def _connecting(pull: Any) -> Any:
+    def pull_now(session: ServerSession, *arguments: Any) -> Any:
+        state._connected[session.document] = True
+        return pull(session, *arguments)
+
+    return pull_now

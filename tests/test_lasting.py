@@ -81,6 +81,14 @@ def test_the_facade_comes_back_after_a_reload_and_in_another_tab(page, address):
     expect(warning(first)).to_be_hidden()
 
 
+def test_what_is_computed_before_the_browser_has_drawn_the_page_is_shown(page, address):
+    region = "[[20,20],[20,40],[40,40],[40,20]]"
+    for _ in range(2):  # the second time nothing is left to compile
+        new = page(f"{address}?source=building&page=Inspect&subject=Region&region={region}")
+        expect(fact(new, "Pixels")).to_have_text("441")
+        expect(new.get_by_text("Computing")).to_have_count(0)
+
+
 def test_nonsense_in_an_address_is_told_and_the_rest_is_there(page, address):
     trap = "<img src=x onerror=window.trapped=1>"
     new = page(f"{address}?source={trap}&light.sbr=-1&light.seed=1&page={trap}&{trap}=1")
