@@ -209,9 +209,9 @@ def _marked(drawing: Any, marks: Mapping[str, ColumnDataSource], with_ranks: boo
     places = {"source": marks["candidates"], "y_range_name": MARKS}
     drawing.scatter("x", "y", marker="triangle", size=8, **places, name="candidates")
     if with_ranks:
-        drawing.text(
-            "x", "y", "rank", **places, x_offset=6, y_offset=3, text_font_size="11px", name="ranks"
-        )
+        # Above their marks: beside them they would meet the next one, or the end of the gate.
+        above = {"y_offset": -4, "text_align": "center", "text_baseline": "bottom"}
+        drawing.text("x", "y", "rank", **places, **above, text_font_size="11px", name="ranks")
     return _with_legend(drawing)
 
 
