@@ -296,8 +296,9 @@ def send_early_changes() -> None:
 
 
 def _connecting(pull: Any) -> Any:
-    def pull_now(session: ServerSession, *arguments: Any) -> Any:
-        state._connected[session.document] = True
-        return pull(session, *arguments)
+    async def pull_now(session: ServerSession, *arguments: Any) -> Any:
+        document = await pull(session, *arguments)
+        state._connected[session.document] = True  # no sooner: the document goes first
+        return document
 
     return pull_now
