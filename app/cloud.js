@@ -409,14 +409,18 @@ class CloudView {
     try {
       if (!vtk) throw new Error("vtk.js is not on this page: the app must call pn.extension('vtk')")
       this.build(vtk)
-      this.problem.textContent = ""
+      this.say("")
       return true
     } catch (error) {
       // A browser that has just lost its graphics offers none for a while.
-      this.problem.textContent =
-        `The 3D cloud cannot be drawn: ${error.message}. Its next change tries again.`
+      this.say(`The 3D cloud cannot be drawn: ${error.message}. Its next change tries again.`)
       return false
     }
+  }
+
+  say(text) {
+    // Written anew, the same text would be read out again.
+    if (this.problem.textContent !== text) this.problem.textContent = text
   }
 
   draw() {

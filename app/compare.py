@@ -450,9 +450,8 @@ class Compare:
         if kind == CLOUDS:
             what, files = "cloud", cloud_files(answer, "Range", viewing)
         else:
-            values, _ = image_of(answer, look_name, least)
             figure = self._pictures[place].image.figure
-            files = image_files(answer, look_name, least, values, look, figure)
+            files = image_files(answer, look_name, least, figure)
             what = f"{kind} image"
         subject = ranged(self._session, answer, method, self._tasks[method].settings)
         return Shown(subject, what.lower(), files, title_of(method), look)

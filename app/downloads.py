@@ -24,7 +24,7 @@ from app import download_words as words
 from app.component import Component
 from app.exports import Write, cloud_files, image_files, plot_file
 from app.jobs import LatestWins, Places
-from app.looks import Look, color_values, image_of
+from app.looks import Look, color_values
 from app.session import Session
 from app.store import Answer, Request
 from core.parameters import spec_of
@@ -335,8 +335,7 @@ def range_image(session: Session) -> Shown:
     """The session's image, whatever it shows."""
     answer, state = session.answer, session.state
     least = state.viewing.least_confidence
-    values, look = image_of(answer, state.image, least)
-    files = image_files(answer, state.image, least, values, look, session.image.figure)
+    files = image_files(answer, state.image, least, session.image.figure)
     what = "range image" if state.image == "Estimate" else f"{state.image} image"
     return Shown(explored(session), what.lower(), files)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from app.download_words import NO_POINTS, NOTHING_DRAWN
 from app.gate import TITLES, scale
 from app.large import Grid
-from app.looks import Look, cloud_of, shown
+from app.looks import Look, cloud_of, map_of, shown
 from app.state import UNITS, Viewing
 from app.store import Answer
 from app.theme import WRONG_COLOR
@@ -158,7 +158,7 @@ def _view(of: Any) -> tuple[float, float]:
 
 
 def image_files(
-    answer: Answer, kind: str, least_confidence: float, values: Array, look: Look, figure: Any
+    answer: Answer, kind: str, least_confidence: float, figure: Any
 ) -> dict[str, Write]:
     """An image (row, col) as shown, and the answer behind it.
 
@@ -166,16 +166,13 @@ def image_files(
     ----------
     answer : Answer
     kind : str
-        What is shown of it: one of `app.state.MAPS`.
+        What is shown of it, as `app.looks.map_of` takes it.
     least_confidence : float
         Answers below are left out.
-    values : ndarray, shape (row, col)
-        What the image shows.
-    look : Look
-        What it is called.
     figure : bokeh.plotting.figure
         Where it is drawn; a CSV file holds the pixels in view.
     """
+    values, look = map_of(answer, kind, least_confidence)
     name = "range_m" if kind == "Estimate" else kind.lower()
     plane = Plane(values, look.unit if look.unit == "m" else "1", look.legend)
     product = _product(answer, least_confidence, shown={name: plane})
@@ -188,10 +185,7 @@ def image_file(values: Array, look: Look, figure: Any, grid: Grid) -> Write:
 
     Rows and columns are those of the file, as on the axes; `grid` tells them.
     """
-    places = [
-        first + grid.step * np.arange(size)
-        for first, size in zip(grid.first, values.shape, strict=True)
-    ]
+    places = grid.place(*map(np.arange, values.shape))
     in_view = [
         _in_view(ends, place, grid.step / 2)
         for ends, place in zip((figure.y_range, figure.x_range), places, strict=True)

@@ -261,9 +261,7 @@ class Inspector:
         """The map, as it is taken away."""
         session, state = self._session, self._session.state
         least = state.viewing.least_confidence
-        values, look = map_of(session.answer, state.map, least)
-        figure = self._navigator.figure
-        files = image_files(session.answer, state.map, least, values, look, figure)
+        files = image_files(session.answer, state.map, least, self._navigator.figure)
         return Shown(explored(session), f"map {state.map}", files)
 
     # What is drawn

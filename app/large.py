@@ -12,7 +12,9 @@ from threading import Lock
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 import psutil
+from numpy.typing import NDArray
 
 from core import Capture, Window, light_of_whole, open_capture
 from core.checks import require
@@ -41,7 +43,7 @@ LIMIT = "FIRSTPHOTON_WHOLE_BYTES"
 """Variable of the environment that overrides both."""
 
 Progress = Callable[[int, int], None]
-At = TypeVar("At", int, float)
+At = TypeVar("At", int, float, NDArray[np.int_])
 
 
 def most_whole_bytes() -> int:

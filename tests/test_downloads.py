@@ -191,7 +191,7 @@ def test_the_answers_arrays_leave_without_what_is_hidden(session):
 def test_arrays_and_pages_hold_the_map_that_is_shown(session, kind):
     least = 0.9
     values, look = map_of(session.answer, kind, least)
-    files = image_files(session.answer, kind, least, values, look, session.image.figure)
+    files = image_files(session.answer, kind, least, session.image.figure)
     arrays = np.load(io.BytesIO(written(files["npz"])))
     name = "range_m" if kind == "Estimate" else kind.lower()
     np.testing.assert_array_equal(arrays[name], values)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import re
-from csv import DictReader
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +27,7 @@ from app.theme import DARK
 from core import Acquisition, coates_rate, inspection, tracking_signals
 from core.tests.captures import real_capture_path
 from tests.browser import eventually, fact, serving
+from tests.test_downloads import columns_of, written
 
 CAPTURE = "21km_K11_night.mat"
 
@@ -344,18 +343,10 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
 
 def tables_of(view):
     """The numbers of each card of a part of the page, by what its button says it shows."""
-    tables = {}
-    main = view.main if isinstance(view.main, list | tuple) else [view.main]
-    for button in (each for card in main for each in card.select(Download)):
-        file = io.BytesIO()
-        button._show().files["csv"](file)
-        lines = list(DictReader(io.StringIO(file.getvalue().decode())))
-        tables[button.what] = {name: [line[name] for line in lines] for name in lines[0]}
-    return tables
-
-
-def counts_of(table, name, n_bins):
-    return np.array(table[name][:n_bins], float)
+    return {
+        button.what: columns_of(written(button._show().files["csv"]))
+        for button in view.main.select(Download)
+    }
 
 
 @pytest.mark.parametrize("name", ["field", "facade"])
@@ -376,14 +367,14 @@ def test_region_pins_and_capture_are_taken_away_as_shown(name, request):
 
     seen = tables_of(of_region.view)
     summed = cube[40:45, 30:34].sum(axis=(0, 1))
-    np.testing.assert_array_equal(counts_of(seen["counts"], "counts", n_bins), summed)
+    np.testing.assert_array_equal(seen["counts"]["counts"][:n_bins], summed)
     assert {"counts", "rate", "residual and enhanced"} <= seen.keys()
 
     for pin in pins:
-        told = counts_of(tables_of(of_pins.view)["counts"], f"{pin[0]}, {pin[1]} (counts)", n_bins)
+        told = tables_of(of_pins.view)["counts"][f"{pin[0]}, {pin[1]} (counts)"][:n_bins]
         np.testing.assert_array_equal(told, cube[pin])
 
-    told = counts_of(tables_of(whole.view)["counts"], "counts", n_bins)
+    told = tables_of(whole.view)["counts"]["counts"][:n_bins]
     np.testing.assert_array_equal(told, cube.sum(axis=(0, 1)))
     for part in parts:
         part.view.show(False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 import shutil
@@ -32,6 +31,7 @@ from core.posterior import lighting_of
 from core.readers.labelled import dataset
 from tests.browser import ROOT, fact, serving
 from tests.test_app import ask, complaint, control, next_answer, told
+from tests.test_downloads import columns_of, written
 from tests.threads import queued
 
 ROWS, COLS, CHUNK = 96, 128, 16
@@ -252,14 +252,11 @@ def settle(page, holds):
 
 def taken_away(session):
     """First and last row and column of the image's table, and how many pixels it holds."""
-    file = io.BytesIO()
-    downloads.range_image(session).files["csv"](file)
-    table = np.genfromtxt(io.BytesIO(file.getvalue()), delimiter=",", skip_header=1)
-    rows, cols, shown = table.T
+    rows, cols, shown = columns_of(written(downloads.range_image(session).files["csv"])).values()
     values, _ = image_of(session.answer, "Estimate", session.state.viewing.least_confidence)
     at = [session.answer.grid.pixel(*each) for each in zip(rows, cols, strict=True)]
     np.testing.assert_array_equal(shown, [values[each] for each in at])
-    return (rows.min(), rows.max()), (cols.min(), cols.max()), len(table)
+    return (rows.min(), rows.max()), (cols.min(), cols.max()), rows.size
 
 
 def test_the_table_of_a_preview_holds_the_pixels_in_view(looking):

@@ -48,8 +48,8 @@ class Product:
     Raises
     ------
     ValueError
-        If image and capture, or image and colours, differ in shape, or the angle is not between 0
-        and π/2.
+        If image and capture, image and colours, or image and what is shown differ in shape, or the
+        angle is not between 0 and π/2.
     """
 
     capture: Seen
@@ -67,6 +67,9 @@ class Product:
             of, dtype = self.rgb.shape, self.rgb.dtype
             fits = of == (*shape, 3) and dtype == np.uint8
             require("rgb", f"{dtype} of shape {of}", fits, f"uint8 of shape {(*shape, 3)}")
+        for name, plane in self.shown.items():
+            of = plane.values.shape
+            require(f"shown {name!r}", f"shape {of}", of == shape, f"shape {shape}, the image's")
         possible = angle_rad is None or 0 < angle_rad < np.pi / 2
         require("pixel_angle_rad", angle_rad, possible, "an angle between 0 and π/2 radians")
 

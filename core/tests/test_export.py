@@ -33,7 +33,7 @@ from core.capture import Capture
 from core.cloud import sight_lines
 from core.estimators import RangeImage
 from core.export import WRITERS, save_capture, save_image, save_pixel
-from core.export.product import Product
+from core.export.product import Plane, Product
 from core.tracking import TrackingParameters, tracking_signals
 
 pytestmark = pytest.mark.files
@@ -482,6 +482,29 @@ def test_tiff_names_its_pages_and_units(tmp_path: Path) -> None:
         "unittype": "m",
         **{name: str(fact) for name, fact in FACTS.items()},
     }
+
+
+@pytest.mark.parametrize("name", ["sbr", "counts"])
+def test_what_else_is_shown_comes_first(name: str) -> None:
+    plane = Plane(np.where(VALID, 0.25, np.nan), "1", "signal over background")
+    product = Product(CAPTURE, IMAGE, shown={name: plane})
+    arrays, pages = io.BytesIO(), io.BytesIO()
+    WRITERS[".npz"](product, arrays)
+    WRITERS[".tif"](product, pages)
+    arrays.seek(0)
+    pages.seek(0)
+    with np.load(arrays, allow_pickle=False) as archive:
+        assert next(each for each in archive if archive[each].ndim == 2) == name
+        np.testing.assert_array_equal(archive[name], plane.values)
+        np.testing.assert_array_equal(archive["range_m"], IMAGE.range_m)
+    with tifffile.TiffFile(pages) as file:
+        named = [page.tags["PageName"].value for page in file.pages]
+        assert np.isnan(float(file.pages[0].tags["GDAL_NODATA"].value))
+        np.testing.assert_array_equal(file.pages[0].asarray(), plane.values)
+    assert named == list(dict.fromkeys([name, "range_m", "confidence", "counts"]))
+    odd = Plane(plane.values[1:], "1", "signal over background")
+    with pytest.raises(ValueError, match=rf"shown '{name}' = .*\(6, 9\).*the image's"):
+        Product(CAPTURE, IMAGE, shown={name: odd})
 
 
 @pytest.mark.parametrize(("suffix", "compressed"), [(".las", 0), (".laz", 0x80)])
