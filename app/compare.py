@@ -30,6 +30,7 @@ from app.downloads import (
     looked_at,
     pixel_on_show,
     ranged,
+    viewed,
 )
 from app.exports import cloud_files, image_files, plot_file, shown_table_file
 from app.jobs import LatestWins
@@ -454,7 +455,7 @@ class Compare:
             files = image_files(answer, look_name, least, figure)
             what = f"{kind} image"
         subject = ranged(self._session, answer, method, self._tasks[method].settings)
-        return Shown(subject, what.lower(), files, title_of(method), look)
+        return Shown(viewed(subject, viewing), what.lower(), files, title_of(method), look)
 
     def _curves_shown(self) -> Shown:
         table = plot_file(self._curves.pane.object, self._capture.acquisition)

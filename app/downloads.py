@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import IO, Any, BinaryIO, cast
 
+import numpy as np
 import panel as pn
 import param
 
@@ -26,7 +27,9 @@ from app.exports import Write, cloud_files, image_files, plot_file
 from app.jobs import LatestWins, Places
 from app.looks import Look, color_values
 from app.session import Session
+from app.state import Viewing
 from app.store import Answer, Request
+from core import inspection
 from core.parameters import spec_of
 
 log = logging.getLogger(__name__)
@@ -297,9 +300,14 @@ def looked_at(session: Session, request: Request) -> Subject:
     lit = (request.light,) if source.is_scene else ()
     window, part = request.window, ""
     if window is not None:
-        ends = [f"{first}-{behind - 1}" for first, behind in (window.rows, window.cols)]
-        part = "rows{}_cols{}".format(*ends)
+        part = _part(range(*window.rows), range(*window.cols))
     return Subject(capture + absent, "", (*lit, request.less), part=part)
+
+
+def _part(rows: Iterable[int], cols: Iterable[int]) -> str:
+    """The rows and columns of a part, as `Subject` takes them."""
+    ends = [f"{min(each)}-{max(each)}" for each in (rows, cols)]
+    return "rows{}_cols{}".format(*ends)
 
 
 def ranged(session: Session, answer: Answer, estimator: str, settings: Any) -> Subject:
@@ -312,6 +320,13 @@ def ranged(session: Session, answer: Answer, estimator: str, settings: Any) -> S
 def explored(session: Session) -> Subject:
     """The session's own answer."""
     return ranged(session, session.answer, "tracking", session.answer.request.tracking)
+
+
+def viewed(subject: Subject, viewing: Viewing) -> Subject:
+    """An answer's image or cloud, told from which confidence it is shown."""
+    # How wide it is seen says nothing new: each capture has its own default.
+    sure = Viewing(viewing.least_confidence)
+    return replace(subject, settings=(*subject.settings, sure))
 
 
 def over_the_gate(session: Session, figure: Any, what: str) -> Shown:
@@ -331,13 +346,20 @@ def pixel_on_show(session: Session) -> str:
     return f"row{row} col{col}"
 
 
+def region_on_show(session: Session) -> str:
+    """First and last row and column of the session's region, in its file."""
+    answer = session.answer
+    inside = inspection.pixels_in(session.state.region, answer.capture.shape)
+    return _part(*(np.unique(each) for each in answer.grid.place(*np.nonzero(inside))))
+
+
 def range_image(session: Session) -> Shown:
     """The session's image, whatever it shows."""
     answer, state = session.answer, session.state
     least = state.viewing.least_confidence
     files = image_files(answer, state.image, least, session.image.figure)
     what = "range image" if state.image == "Estimate" else f"{state.image} image"
-    return Shown(explored(session), what.lower(), files)
+    return Shown(viewed(explored(session), state.viewing), what.lower(), files)
 
 
 def cloud_on_show(session: Session) -> Shown:
@@ -346,4 +368,5 @@ def cloud_on_show(session: Session) -> Shown:
     _, look = color_values(answer, state.cloud_color)
     files = cloud_files(answer, state.cloud_color, state.viewing)
     heading = f"3D cloud, coloured by {state.cloud_color.lower()}"
-    return Shown(explored(session), "cloud", files, heading, look)
+    subject = viewed(explored(session), state.viewing)
+    return Shown(subject, "cloud", files, heading, look)

@@ -12,7 +12,7 @@ import panel_material_ui as pmui
 
 from app import inspector_words
 from app.controls import Chips, PixelKeys, Sentence
-from app.downloads import CORNER_PX, IMAGE, Shown, downloadable, explored
+from app.downloads import CORNER_PX, IMAGE, Shown, downloadable, explored, viewed
 from app.exports import image_files
 from app.inspector_capture import Whole
 from app.inspector_pins import Pins, pin_colors
@@ -262,7 +262,7 @@ class Inspector:
         session, state = self._session, self._session.state
         least = state.viewing.least_confidence
         files = image_files(session.answer, state.map, least, self._navigator.figure)
-        return Shown(explored(session), f"map {state.map}", files)
+        return Shown(viewed(explored(session), state.viewing), f"map {state.map}", files)
 
     # What is drawn
 

@@ -71,6 +71,7 @@ class Whole:
             button("Apply T_n", inspector_words.T_N_HELP, self._apply_t_n),
         ]
         session.state.param.watch(lambda *_: self._draw(), "unit")
+        session.state.param.watch(lambda *_: self._show_pulses(), "less")
 
     @property
     def view(self) -> View:
@@ -106,6 +107,7 @@ class Whole:
     def _show(self, is_on_screen: bool) -> None:
         self._is_on_screen = is_on_screen
         if is_on_screen:
+            self._show_pulses()
             self._follow()
         self._study.show(is_on_screen)
 
@@ -113,7 +115,6 @@ class Whole:
         if not self._is_on_screen:
             return
         answer, fail = self._session.answer, self._session.fail
-        self._pulses.value = answer.request.less.pulses
         if self._reported is None or answer.capture is not self._reported.capture:
             self._light.text = COMPUTING
         # Counts at once: to find the light takes a while.
@@ -126,6 +127,10 @@ class Whole:
         if self._studied is not None and studied != self._studied:
             self._study.start()
         self._mark_present()
+
+    def _show_pulses(self) -> None:
+        # Of what was chosen last: an answer may be to something that was chosen before.
+        self._pulses.value = self._session.state.less.pulses
 
     def _paint(self, dark: bool) -> None:
         for plot in (self._counts, self._accuracy):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,6 +19,7 @@ from app.downloads import (
     explored,
     over_the_gate,
     pixel_on_show,
+    region_on_show,
 )
 from app.exports import shown_table_file
 from app.inspector_answers import Seen, pixel_lit, pixel_seen, region_seen
@@ -121,16 +123,20 @@ class Sight:
     def _paint(self, dark: bool) -> None:
         self._plots.paint(palette(dark))
 
-    @property
-    def _place(self) -> str:
-        return pixel_on_show(self._session) if self._watched == "pixel" else "region"
-
     def _shown(self, figure: Any, what: str) -> Shown:
-        return over_the_gate(self._session, figure, f"{what} {self._place}")
+        return self._named(over_the_gate(self._session, figure, what))
 
     def _table_shown(self) -> Shown:
         table = shown_table_file(self._table.columns, self._table.rows)
-        return Shown(explored(self._session), f"candidates {self._place}", {"csv": table})
+        return self._named(Shown(explored(self._session), "candidates", {"csv": table}))
+
+    def _named(self, shown: Shown) -> Shown:
+        """The same, told which pixel or which region it is of."""
+        session = self._session
+        if self._watched == "pixel":
+            return replace(shown, what=f"{shown.what} {pixel_on_show(session)}")
+        subject = replace(shown.subject, part=region_on_show(session))
+        return replace(shown, what=f"{shown.what} region", subject=subject)
 
     def _ask(self) -> None:
         session = self._session

@@ -210,7 +210,10 @@ PULSES_HELP = (
     "Share of the pulses that are taken, as if recording had ended sooner; what is taken with "
     "fewer is a part of what is taken with more."
 )
-GATE_HELP = "Apply the gate: bins outside are left out; T_n stays at its place."
+GATE_HELP = (
+    "Apply the gate: bins outside are left out; T_n stays at its place. “Less data, faster” tells "
+    "the gate, and takes it back."
+)
 T_N_HELP = "Apply T_n: bins before are noise to the tracking differentiator."
 
 

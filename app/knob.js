@@ -74,7 +74,7 @@ export function render({ model }) {
       `${model.help} ${text(low)} to ${text(high)}${unit ? " " + unit : ""}.` + inDoubt.join("");
     mark();
     doubt.textContent = doubts(value).join(" ");
-    track.setAttribute("aria-label", unit ? `${label} in ${unit}` : label);
+    track.setAttribute("aria-label", unit ? `${label} (${unit})` : label);
     track.setAttribute("aria-valuetext", `${text(value)} ${unit}`);
     track.setAttribute("aria-describedby", "help doubt");
     track.title = model.help;

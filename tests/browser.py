@@ -19,6 +19,13 @@ from urllib.request import urlopen
 
 from playwright.sync_api import Browser, BrowserType, Locator, Page, sync_playwright
 
+VIEWS = """
+const views = [];
+const walk = (view) => { views.push(view); (view.child_views ?? []).forEach(walk); };
+[...Bokeh.index.roots].forEach(walk);
+"""
+"""In the browser: all that Bokeh has drawn, or keeps ready, on the page."""
+
 ROOT = Path(__file__).resolve().parent.parent
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

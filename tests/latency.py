@@ -156,7 +156,7 @@ def main(arguments: list[str] | None = None) -> int:
     with serving() as address, chromium() as browser:
         page = open_page(browser, address, prepare=STOPWATCH)
         page.wait_for_timeout(3000)
-        sliders = ("l", "T_n in bins", "SBR")
+        sliders = ("l", "T_n (bins)", "SBR")
         taken = {label: moves(page, label, chosen.moves) for label in sliders}
         page.close()
     capture = CAPTURES / "21km_K11_night.mat"

@@ -25,11 +25,12 @@ from app.downloads import Download, Shown, Subject
 from app.exports import drawn, image_files, shown_table_file, table_file
 from app.layout import Layout
 from app.looks import image_of, map_of, shown
-from app.state import MAPS, Less, Light
+from app.state import MAPS, Less, Light, Viewing
 from app.store import built_in_sources, inspect
 from app.theme import RANGE_COLORS
 from core import TrackingParameters
 from core.experiments.items import Table
+from tests.browser import VIEWS
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +105,14 @@ def test_a_name_follows_the_page(session):
     row, col = session.state.pixel
     shown_now = downloads.pixel_plot(session, session.signals.histogram.figure, "histogram")
     assert f"row{row} col{col}" in shown_now.what
+    session.state.viewing = Viewing(0.5)
+    for show, told in (
+        (downloads.range_image, "car_tracking_least-confidence0.5_range-image.csv"),
+        (downloads.cloud_on_show, "car_tracking_least-confidence0.5_cloud.csv"),
+    ):
+        found = show(session)
+        assert found.subject.file_name(found.what, "csv") == told
+    session.state.viewing = Viewing()
 
 
 # -- contents --------------------------------------------------------------------------------------
@@ -400,10 +409,9 @@ def download(page, what, suffix):
 def size_of(page, what):
     """Width and height in pixels of the plot beside a button."""
     return page.evaluate(
-        """what => {
-          const views = [];
-          const walk = (view) => { views.push(view); (view.child_views ?? []).forEach(walk); };
-          [...Bokeh.index.roots].forEach(walk);
+        """what => {"""
+        + VIEWS
+        + """
           const own = views.find((view) => view.model.data?.what === what);
           const beside = [];
           (function search(view) { beside.push(view); (view.child_views ?? []).forEach(search); })(
@@ -559,7 +567,7 @@ def test_every_page_gives_what_it_shows(one_page):
     go("Compare")
     expect(one_page.get_by_text("% sure").nth(1)).to_be_visible()
     name, png = download(one_page, "Peak of the histogram", "png")
-    assert name == "car_peak_range-image.png"
+    assert name == "car_peak_least-confidence0_range-image.png"
     assert Image.open(io.BytesIO(png)).height > 216  # with heading and colour scale
     name, table = download(one_page, "table", "csv")
     assert name == "car_methods.csv"

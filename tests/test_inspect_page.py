@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from playwright.sync_api import Locator, Page, expect
 
 from app import inspector_words
 from app.downloads import Download
@@ -26,7 +24,7 @@ from app.store import built_in_sources, file_source
 from app.theme import DARK
 from core import Acquisition, coates_rate, inspection, tracking_signals
 from core.tests.captures import real_capture_path
-from tests.browser import eventually, fact, serving
+from tests.browser import eventually
 from tests.test_downloads import columns_of, written
 
 CAPTURE = "21km_K11_night.mat"
@@ -366,6 +364,8 @@ def test_region_pins_and_capture_are_taken_away_as_shown(name, request):
     eventually(lambda: column(whole._counts, "raw", "raw").size == n_bins)
 
     seen = tables_of(of_region.view)
+    for button in of_region.view.main.select(Download):
+        assert button._show().subject.part == "rows40-44_cols30-33"
     summed = cube[40:45, 30:34].sum(axis=(0, 1))
     np.testing.assert_array_equal(seen["counts"]["counts"][:n_bins], summed)
     assert {"counts", "rate", "residual and enhanced"} <= seen.keys()
@@ -466,213 +466,25 @@ def test_accuracy_over_pulses_is_found_step_by_step_and_says_where_one_is(facade
     np.testing.assert_allclose(column(part._accuracy, "answer", "x"), 250)
 
 
+def test_an_answer_to_pulses_chosen_before_takes_nothing_back(facade):
+    part = Whole(facade)
+    part.view.show(True)
+    before = facade.answer
+    for share in (0.5, 0.25):
+        part._pulses.value = share
+    eventually(lambda: facade.answer is not before)
+    facade.answer = replace(
+        facade.answer, request=replace(facade.answer.request, less=Less(pulses=0.5))
+    )
+    part._follow()
+    assert (part._pulses.value, facade.state.less.pulses) == (0.25, 0.25)
+    facade.state.less = Less(pulses=0.75)
+    assert part._pulses.value == 0.75
+    part.view.show(False)
+
+
 def test_without_truth_accuracy_is_called_agreement(field):
     (work, *_) = accuracy_steps(field.answer)
     title, across, _ = inspector_words.accuracy_titles(work())
     assert "not accuracy" in title
     assert across == "Share of the pulses"
-
-
-# -- in a browser ----------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def inspect_page(open_watched):
-    """A page on the 21 km capture, as ``make app CAPTURE=path`` opens it."""
-    with serving(real_capture_path(CAPTURE)) as address:
-        opened = open_watched(address)
-        yield opened
-        opened.close()
-
-
-@pytest.fixture
-def here(inspect_page, troubles):
-    yield inspect_page
-    found, troubles[:] = list(troubles), []
-    assert found == []
-
-
-def button(page: Page, name: str) -> Locator:
-    return page.get_by_role("button", name=re.compile(f"^{re.escape(name)}")).filter(visible=True)
-
-
-def picture(page: Page) -> Locator:
-    return page.locator("[data-part=image]").filter(visible=True)
-
-
-def within(page: Page, across: float, down: float, figure: int = 0) -> tuple[float, float]:
-    """Where on the page a place in one of its figures is, in shares of its width and height."""
-    box = page.locator(".bk-Figure").filter(visible=True).nth(figure).bounding_box()
-    return box["x"] + across * box["width"], box["y"] + down * box["height"]
-
-
-def of_picture(page: Page, values: str):
-    """What the browser knows of the picture to navigate by, its model being ``found``."""
-    return page.evaluate(f"""() => {{
-      const figures = Bokeh.documents[0]._all_models.values();
-      const [found] = [...figures].filter((m) => m.type === "Figure" && m.match_aspect);
-      return {values};
-    }}""")
-
-
-def typed(page: Page, name: str, text: str) -> None:
-    box = page.get_by_role("textbox", name=name, exact=True)
-    box.fill(text)
-    box.press("Enter")
-
-
-def go_to(page: Page, row: int, col: int) -> None:
-    """Choose a pixel, the keyboard being at the picture then."""
-    typed(page, "Row", str(row))
-    typed(page, "Column", str(col))
-    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
-    picture(page).focus()
-
-
-@pytest.mark.browser
-def test_a_file_opens_on_inspect_with_its_pixel_drawn(here):
-    expect(page_button(here, "Inspect")).to_have_attribute("aria-pressed", "true")
-    expect(fact(here, "Pixel")).to_have_text(re.compile(r"^\d+, \d+$"))
-    expect(fact(here, "SBR")).to_have_text(re.compile(r"\[.*\]"))
-    expect(here.get_by_text(re.compile("^Verdict: "))).to_be_visible()
-    for title in ("Rank", "Bin", "Score", "Probability"):
-        expect(here.get_by_role("columnheader", name=title).filter(visible=True)).to_be_visible()
-
-
-def page_button(page: Page, name: str) -> Locator:
-    return page.get_by_role("button", name=name, exact=True)
-
-
-@pytest.mark.browser
-def test_keys_taps_and_fields_move_the_pixel(here):
-    go_to(here, 100, 190)
-    here.keyboard.press("ArrowRight")
-    here.keyboard.press("Shift+ArrowDown")
-    expect(fact(here, "Pixel")).to_have_text("108, 191")
-    here.mouse.click(*within(here, 0.5, 0.4))
-    expect(fact(here, "Pixel")).not_to_have_text("108, 191")
-    typed(here, "Row", "256")
-    expect(here.get_by_role("alert").filter(has_text="0 to 255")).to_be_visible()
-    typed(here, "Row", "100")
-    expect(fact(here, "Pixel")).to_have_text(re.compile("^100, "))
-
-
-@pytest.mark.browser
-def test_a_move_paints_each_plot_once_and_then_tells_the_numbers(here):
-    go_to(here, 100, 190)
-    here.evaluate("""() => {
-      const plot = Bokeh.Models.get("Figure").prototype.default_view.prototype;
-      const paint = plot._actual_paint;
-      window.seen = [];
-      plot._actual_paint = function () {
-        seen.push(this.model.id);
-        paint.call(this);
-      };
-      window.forget = () => (plot._actual_paint = paint);
-    }""")
-    fact(here, "Pixel").locator("xpath=ancestor::dl").evaluate(
-        "list => new MutationObserver(() => seen.push('told')).observe(list, { childList: true })"
-    )
-    here.keyboard.press("ArrowRight")
-    expect(fact(here, "Pixel")).to_have_text("100, 191")
-    *painted, told = here.evaluate("forget(), seen")
-    assert told == "told"
-    assert len(painted) == len(set(painted)) == 4  # the picture, and three plots
-
-
-@pytest.mark.browser
-def test_zoom_stays_when_map_and_pixel_change(here):
-    spans = "[found.x_range, found.y_range].flatMap(({start, end}) => [start, end])"
-    whole, middle = of_picture(here, spans), within(here, 0.5, 0.4)
-    here.mouse.move(*middle)
-    here.mouse.wheel(0, -200)
-    eventually(lambda: of_picture(here, spans) != whole)
-    zoomed = of_picture(here, spans)
-    here.get_by_role("combobox", name=re.compile("^Map")).click()
-    here.get_by_role("menuitem", name="Confidence", exact=True).click()
-    typed(here, "Column", "150")
-    expect(fact(here, "Pixel")).to_have_text(re.compile(", 150$"))
-    np.testing.assert_allclose(of_picture(here, spans), zoomed)
-    here.mouse.dblclick(*middle)
-
-    def shows_all():
-        left, right, top, bottom = of_picture(here, spans)
-        return min(left, bottom, top) <= -0.5 and min(right, max(top, bottom)) >= 255.5
-
-    eventually(shows_all)
-
-
-@pytest.mark.browser
-def test_what_a_drag_does_is_chosen_before_the_server_hears_of_it(here):
-    here.evaluate("""() => {
-      const { send } = WebSocket.prototype;
-      WebSocket.prototype.send = () => {};
-      window.tell = () => { WebSocket.prototype.send = send; };
-    }""")
-    tools = {"Rectangle": "BoxSelectTool", "Lasso": "LassoSelectTool", "Zoom": "BoxZoomTool"}
-    for mode, tool in tools.items():
-        page_button(here, mode).click()
-        eventually(lambda t=tool: of_picture(here, "found.toolbar.active_drag.type") == t)
-    here.evaluate("tell()")
-
-
-@pytest.mark.browser
-def test_a_rectangle_is_dragged_and_its_sum_shown(here):
-    page_button(here, "Rectangle").click()
-    here.mouse.move(*within(here, 0.4, 0.4))
-    here.mouse.down()
-    here.mouse.move(*within(here, 0.5, 0.5), steps=5)
-    here.mouse.up()
-    expect(fact(here, "Pixels")).to_have_text(re.compile(r"^[\d,]+$"))
-    expect(page_button(here, "Region")).to_have_attribute("aria-pressed", "true")
-    button(here, "Clear region").click()
-    expect(page_button(here, "Pixel")).to_have_attribute("aria-pressed", "true")
-    page_button(here, "Zoom").click()
-
-
-@pytest.mark.browser
-def test_a_pixel_is_pinned_by_key_and_unpinned_by_its_chip(here):
-    go_to(here, 100, 190)
-    here.keyboard.press("p")
-    chip = here.get_by_role("button", name="Remove 100, 190", exact=True)
-    expect(chip).to_be_visible()
-    page_button(here, "Pins").click()
-    expect(here.get_by_role("rowheader", name="100, 190").filter(visible=True)).to_be_visible()
-    chip.press("Enter")
-    expect(here.get_by_text(inspector_words.NO_PINS)).to_be_visible()
-    page_button(here, "Pixel").click()
-
-
-@pytest.mark.browser
-def test_units_change_axes_and_tables_and_the_pointer_reads_all(here):
-    page_button(here, "ns").click()
-    header = here.get_by_role("columnheader", name="Time (ns)").filter(visible=True)
-    expect(header).to_be_visible()
-    here.mouse.move(*within(here, 0.5, 0.6, figure=1))
-    tip = here.locator(".bk-Tooltip").filter(visible=True)
-    expect(tip).to_contain_text("Large scale")
-    expect(tip).to_contain_text(re.compile(r"\d ns"))
-    expect(tip).to_contain_text(re.compile(r"\d m"))
-    here.mouse.move(5, 5)
-    page_button(here, "bins").click()
-    expect(header).to_have_count(0)
-
-
-@pytest.mark.browser
-def test_the_capture_is_reported_with_progress(here):
-    page_button(here, "Capture").click()
-    expect(fact(here, "Signal (PPP)")).to_have_text(re.compile(r"\[.*\]"))
-    expect(here.get_by_text(re.compile("^Suggested T_n: "))).to_be_visible()
-    expect(
-        here.get_by_text(re.compile(r"^\d of 8 shares of the pulses\.|^Done: 8"))
-    ).to_be_visible()
-    page_button(here, "Pixel").click()
-
-
-@pytest.mark.browser
-def test_the_facade_is_inspected_beside_its_truth(here):
-    here.get_by_role("combobox", name=re.compile("^Scene or capture")).click()
-    here.get_by_role("menuitem", name="Building at 830–860 m", exact=True).click()
-    expect(fact(here, "Error")).to_have_text(re.compile(r" m$"))
-    expect(fact(here, "Detections")).to_have_text(re.compile("%"))
-    expect(here.locator(".bk-Figure").filter(visible=True)).to_have_count(4)

@@ -1,0 +1,519 @@
+"""The Inspect page in a real browser: what its user does, on the 21 km capture and on the façade.
+
+What is to be seen then is computed here by `core` alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Locator, Page, expect
+
+import core
+from app import inspector_words
+from app.inspector_answers import SHARES
+from app.state import Light
+from core import Capture, RangeImage, inspection
+from core.tests.captures import real_capture_path
+from tests.browser import VIEWS, eventually, fact, serving
+from tests.test_browser import chosen, slider
+from tests.test_downloads import columns_of, download
+from tests.test_lasting import here as address_of
+from tests.test_lasting import rests
+
+pytestmark = pytest.mark.browser
+
+CAPTURE = "21km_K11_night.mat"
+
+
+@dataclass(frozen=True, eq=False)
+class Inspected:
+    """A page, and what it shows."""
+
+    page: Page
+    capture: Capture
+    image: RangeImage
+    name: str
+    """Of the capture in files' names."""
+    pixel: tuple[int, int]
+    """One with a surface, and others to its right."""
+
+
+@pytest.fixture(scope="module", params=["21 km", "facade"])
+def opened(request, open_watched) -> Iterator[Inspected]:
+    """A page that the module's tests share, because a page costs seconds."""
+    if request.param == "21 km":  # as ``make app CAPTURE=path`` opens it
+        path = real_capture_path(CAPTURE)
+        capture = core.read_capture(path)
+        with serving(path) as address:
+            page = open_watched(address)
+            yield Inspected(page, capture, ranged(capture), path.stem, (100, 190))
+            page.close()
+    else:
+        scene, light = core.scenes["building"](), Light()
+        acquisition = light.acquisition(scene.acquisition)
+        capture = core.simulate(scene, acquisition, light.flux, seed=light.seed)
+        address = request.getfixturevalue("address")
+        page = open_watched(f"{address}?source=building&page=Inspect")
+        yield Inspected(page, capture, ranged(capture), "building", (30, 20))
+        page.close()
+
+
+def ranged(capture: Capture) -> RangeImage:
+    return core.run(capture, "tracking", core.TrackingParameters()).image
+
+
+@pytest.fixture
+def here(opened, troubles) -> Iterator[Inspected]:
+    """The shared page, which may have had no trouble in this test."""
+    yield opened
+    found, troubles[:] = list(troubles), []
+    assert found == []
+
+
+@pytest.fixture
+def page(here) -> Page:
+    return here.page
+
+
+# -- parts of the page -----------------------------------------------------------------------------
+
+
+def button(page: Page, name: str) -> Locator:
+    return page.get_by_role("button", name=name, exact=True).filter(visible=True)
+
+
+def told_button(page: Page, name: str) -> Locator:
+    """One whose accessible name is a sentence that begins with what stands on it."""
+    named = re.compile(f"^{re.escape(name)}:")
+    return page.get_by_role("button", name=named).filter(visible=True)
+
+
+def picture(page: Page) -> Locator:
+    return page.locator("[data-part=image]").filter(visible=True)
+
+
+def within(page: Page, across: float, down: float, figure: int = 0) -> tuple[float, float]:
+    """Where on the page a place in one of its figures is, in shares of its width and height."""
+    box = page.locator(".bk-Figure").filter(visible=True).nth(figure).bounding_box()
+    return box["x"] + across * box["width"], box["y"] + down * box["height"]
+
+
+def in_figure(page: Page, title: str, values: str) -> Any:
+    """What the browser knows of the ``figure`` on show whose title begins so."""
+    found = page.wait_for_function(
+        f"""(title) => {{
+          {VIEWS}
+          const figure = views.find(({{model, el}}) => model.type === "Figure" &&
+            (model.title?.text ?? "").startsWith(title) && el.checkVisibility())?.model;
+          const layer = (name) =>
+            figure.renderers.find((each) => each.name === name).data_source;
+          const plain = (x) =>
+            x?.[Symbol.iterator] && typeof x !== "string" ? [...x].map(plain) : x;
+          return figure && {{found: plain({values})}};
+        }}""",
+        arg=title,
+    )
+    return found.json_value()["found"]
+
+
+def drawn(page: Page, title: str, layer: str, column: str) -> np.ndarray:
+    """Values of a layer of the figure on show whose title begins so."""
+    return np.array(in_figure(page, title, f"layer('{layer}').get_array('{column}')"), float)
+
+
+def of_picture(page: Page, values: str) -> Any:
+    """What the browser knows of the picture to navigate by, its model being ``found``."""
+    return page.evaluate(f"""() => {{
+      const figures = Bokeh.documents[0]._all_models.values();
+      const [found] = [...figures].filter((m) => m.type === "Figure" && m.match_aspect);
+      return {values};
+    }}""")
+
+
+COUNTS, RATE, STAGES = "Counts, and the two scales", "Rate", "Residual, and enhanced"
+
+
+# -- what a user does ------------------------------------------------------------------------------
+
+
+def typed(page: Page, name: str, text: str) -> None:
+    box = page.get_by_role("textbox", name=name, exact=True)
+    box.fill(text)
+    box.press("Enter")
+
+
+def go_to(page: Page, row: int, col: int) -> None:
+    """Choose a pixel, the keyboard being at the picture then."""
+    typed(page, "Row", str(row))
+    typed(page, "Column", str(col))
+    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
+    picture(page).focus()
+
+
+def choose_map(page: Page, name: str) -> None:
+    chosen(page, "Map").click()
+    page.get_by_role("menuitem", name=name, exact=True).click()
+    expect(page.locator(".MuiMenu-root")).to_have_count(0)  # it takes all clicks until it has faded
+
+
+def drag(page: Page, mode: str, *places: tuple[float, float]) -> None:
+    """Drag on the picture from one place to the others, in shares of its width and height."""
+    button(page, mode).click()
+    first, *others = (within(page, *each) for each in places)
+    page.mouse.move(*first)
+    page.mouse.down()
+    for each in others:
+        page.mouse.move(*each, steps=5)
+    page.mouse.up()
+    button(page, "Zoom").click()
+
+
+def region_in(page: Page) -> tuple[tuple[float, float], ...]:
+    """Corners of the region that the address tells, none where it tells none."""
+    found = re.search(r"region=(\[\[.*?\]\])", address_of(page))
+    numbers = re.findall(r"[-\d.]+", found[1]) if found else []
+    return tuple(zip(map(float, numbers[::2]), map(float, numbers[1::2]), strict=True))
+
+
+# -- the pixel -------------------------------------------------------------------------------------
+
+
+def test_a_pixel_is_shown_with_all_that_is_known_of_it(here):
+    page, (row, col) = here.page, here.pixel
+    expect(button(page, "Inspect")).to_have_attribute("aria-pressed", "true")
+    go_to(page, row, col)
+    tracking = core.TrackingParameters()
+    report = inspection.pixel_report(here.capture, here.image, row, col, "tracking", tracking)
+    for name, found in zip(("Signal S", "Background B", "SBR"), report.light, strict=True):
+        expect(fact(page, name)).to_have_text(inspector_words.interval(found))
+    told = fact(page, "Detections")
+    expect(told).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
+    verdict = f"Verdict: {report.verdict.health}. {report.verdict.why}"
+    expect(page.get_by_text(verdict)).to_be_visible()
+    for title in ("Rank", "Bin", "Score", "Probability"):
+        expect(page.get_by_role("columnheader", name=title).filter(visible=True)).to_be_visible()
+    ranks = page.get_by_role("rowheader").filter(visible=True)
+    expect(ranks).to_have_text([str(n + 1) for n in range(len(report.candidates))])
+    signals = core.tracking_signals(
+        here.capture.cube[row, col], tracking, here.capture.armed_pulses
+    )
+    for title, layer, column, expected in (
+        (COUNTS, "raw", "raw", signals.raw),
+        (COUNTS, "raw", "small", signals.small),
+        (COUNTS, "raw", "large", signals.large),
+        (COUNTS, "candidates", "x", [each.bin for each in report.candidates]),
+        (RATE, "rate", "rate", report.rate),
+        (STAGES, "residual", "residual", signals.residual),
+        (STAGES, "residual", "enhanced", signals.enhanced),
+    ):
+        seen = drawn(page, title, layer, column)
+        np.testing.assert_allclose(seen, expected, rtol=1e-5, atol=1e-5, err_msg=column)
+
+
+def test_keys_taps_and_fields_move_the_pixel(here):
+    page, (row, col) = here.page, here.pixel
+    go_to(page, row, col)
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Shift+ArrowDown")
+    expect(fact(page, "Pixel")).to_have_text(f"{row + 8}, {col + 1}")
+    page.mouse.click(*within(page, 0.5, 0.4))
+    expect(fact(page, "Pixel")).not_to_have_text(f"{row + 8}, {col + 1}")
+    rows, _ = here.capture.shape
+    typed(page, "Row", str(rows))
+    refused = page.get_by_role("alert").filter(has_text=f"0 to {rows - 1}")
+    expect(refused).to_be_visible()
+    typed(page, "Row", str(row))
+    expect(fact(page, "Pixel")).to_have_text(re.compile(f"^{row}, "))
+    expect(refused).to_be_hidden()
+
+
+def test_a_move_paints_each_plot_once_and_then_tells_the_numbers(here):
+    page, (row, col) = here.page, here.pixel
+    go_to(page, row, col)
+    page.evaluate("""() => {
+      const plot = Bokeh.Models.get("Figure").prototype.default_view.prototype;
+      const paint = plot._actual_paint;
+      window.seen = [];
+      plot._actual_paint = function () {
+        seen.push(this.model.id);
+        paint.call(this);
+      };
+      window.forget = () => (plot._actual_paint = paint);
+    }""")
+    fact(page, "Pixel").locator("xpath=ancestor::dl").evaluate(
+        "list => new MutationObserver(() => seen.push('told')).observe(list, { childList: true })"
+    )
+    page.keyboard.press("ArrowRight")
+    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 1}")
+    *painted, told = page.evaluate("forget(), seen")
+    assert told == "told"
+    assert len(painted) == len(set(painted)) == 4  # the picture, and three plots
+
+
+# -- the picture to navigate by --------------------------------------------------------------------
+
+
+def test_every_map_is_shown(here):
+    page, capture, image = here.page, here.capture, here.image
+    visible = image.valid & (image.confidence >= 0.9)
+    expected = {
+        "Counts": capture.counts,
+        "Confidence": np.where(image.valid, image.confidence, np.nan),
+        **{name: find(capture) for name, find in inspection.maps.items()},
+        "Estimate": np.where(visible, image.range_m, np.nan),
+    }
+    if capture.truth_range_m is not None:
+        error_m = np.where(visible, image.range_m - capture.truth_range_m, np.nan)
+        expected = {"Truth": capture.truth_range_m, "Error": error_m, **expected}
+    for name, values in expected.items():
+        choose_map(page, name)
+
+        def is_shown(values: np.ndarray = values) -> bool:
+            seen = of_picture(
+                page,
+                "[...found.renderers.find((r) => r.glyph.type === 'Image')"
+                ".data_source.get_array('image')[0]]",
+            )
+            shown = np.array(seen, float).reshape(capture.shape)
+            return np.allclose(shown, values, rtol=1e-5, atol=1e-3, equal_nan=True)
+
+        eventually(is_shown)
+    _, content = download(page, "map", "csv")
+    *_, range_m = columns_of(content).values()
+    np.testing.assert_allclose(range_m, expected["Estimate"].ravel())
+
+
+def test_zoom_stays_when_map_and_pixel_change(here):
+    page, (row, col) = here.page, here.pixel
+    go_to(page, row, col)
+    spans = "[found.x_range, found.y_range].flatMap(({start, end}) => [start, end])"
+    whole, middle = of_picture(page, spans), within(page, 0.5, 0.4)
+    page.mouse.move(*middle)
+    page.mouse.wheel(0, -200)
+    eventually(lambda: of_picture(page, spans) != whole)
+    zoomed = of_picture(page, spans)
+    choose_map(page, "Confidence")
+    typed(page, "Column", str(col + 7))
+    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 7}")
+    np.testing.assert_allclose(of_picture(page, spans), zoomed)
+    page.mouse.dblclick(*middle)
+    last = here.capture.shape[0] - 0.5
+
+    def shows_all() -> bool:
+        left, right, top, bottom = of_picture(page, spans)
+        return min(left, bottom, top) <= -0.5 and min(right, max(top, bottom)) >= last
+
+    eventually(shows_all)
+
+
+def test_what_a_drag_does_is_chosen_before_the_server_hears_of_it(page):
+    page.evaluate("""() => {
+      const { send } = WebSocket.prototype;
+      WebSocket.prototype.send = () => {};
+      window.tell = () => { WebSocket.prototype.send = send; };
+    }""")
+    tools = {"Rectangle": "BoxSelectTool", "Lasso": "LassoSelectTool", "Zoom": "BoxZoomTool"}
+    for mode, tool in tools.items():
+        button(page, mode).click()
+        eventually(lambda t=tool: of_picture(page, "found.toolbar.active_drag.type") == t)
+    page.evaluate("tell()")
+
+
+# -- regions and pins ------------------------------------------------------------------------------
+
+
+DRAGS = {
+    "Rectangle": [(0.4, 0.4), (0.5, 0.5)],
+    "Lasso": [(0.4, 0.4), (0.6, 0.45), (0.5, 0.6), (0.4, 0.4)],
+}
+
+
+@pytest.mark.parametrize("mode", DRAGS)
+def test_a_region_is_dragged_outlined_and_its_sum_shown(here, mode):
+    page, capture = here.page, here.capture
+    drag(page, mode, *DRAGS[mode])
+    expect(button(page, "Region")).to_have_attribute("aria-pressed", "true")
+    rests(page, "region=[")
+    region = region_in(page)
+    inside = inspection.pixels_in(region, capture.shape)
+    assert (len(region) == 4) == (mode == "Rectangle")
+    expect(fact(page, "Pixels")).to_have_text(f"{inside.sum():,}")
+    sum_of_all = capture.cube[inside].sum(axis=0)
+    np.testing.assert_array_equal(drawn(page, COUNTS, "raw", "raw"), sum_of_all)
+    signals = core.tracking_signals(sum_of_all, core.TrackingParameters(), None)
+    if capture.armed_pulses is None:
+        np.testing.assert_allclose(
+            drawn(page, STAGES, "residual", "residual"), signals.residual, rtol=1e-4, atol=0.1
+        )
+    outline = of_picture(
+        page,
+        "found.renderers.find((r) => r.name === 'region line').data_source"
+        ".get_array('ys').map((ys) => [...ys])",
+    )
+    np.testing.assert_allclose(outline, [[row for row, _ in region]], atol=0.01)
+    name, content = download(page, "counts", "csv")
+    rows, cols = np.nonzero(inside)
+    place = f"rows{rows.min()}-{rows.max()}_cols{cols.min()}-{cols.max()}"
+    assert name == f"{here.name}_{place}_tracking_counts-region.csv"
+    np.testing.assert_array_equal(columns_of(content)["counts"][: sum_of_all.size], sum_of_all)
+    page.reload()
+    expect(fact(page, "Pixels")).to_have_text(f"{inside.sum():,}")
+    told_button(page, "Clear region").click()
+    expect(button(page, "Pixel")).to_have_attribute("aria-pressed", "true")
+    eventually(lambda: not region_in(page))
+
+
+def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
+    page, (row, col) = here.page, here.pixel
+    go_to(page, row, col)
+    pins = [(row, col + n) for n in range(4)]
+    names = [f"{row}, {col}" for row, col in pins]
+    chips = page.get_by_role("button", name=re.compile(r"^Remove \d+, \d+$"))
+    for name in names:
+        page.keyboard.press("p")
+        expect(button(page, f"Remove {name}")).to_be_visible()
+        page.keyboard.press("ArrowRight")
+    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 4}")
+    page.keyboard.press("p")
+    expect(page.get_by_text(inspector_words.TOO_MANY_PINS)).to_be_visible()
+    button(page, "Pins").click()
+    headers = page.get_by_role("rowheader").filter(visible=True)
+    expect(headers).to_have_text(names)
+    np.testing.assert_array_equal(
+        drawn(page, "Counts of the pinned", "lines", "ys"), [here.capture.cube[pin] for pin in pins]
+    )
+    button(page, f"Remove {names[1]}").press("Enter")
+    expect(headers).to_have_text([names[0], *names[2:]])
+    left = ",".join(f"[{row},{col}]" for row, col in (pins[0], *pins[2:]))
+    rests(page, f"pins=[{left}]")
+    page.reload()
+    expect(headers).to_have_text([names[0], *names[2:]])
+    while chips.count():
+        left = chips.count()
+        chips.first.press("Enter")
+        expect(chips).to_have_count(left - 1)
+    expect(page.get_by_text(inspector_words.NO_PINS)).to_be_visible()
+    button(page, "Pixel").click()
+
+
+# -- units -----------------------------------------------------------------------------------------
+
+
+def test_units_change_axes_and_tables_and_the_pointer_reads_all(page):
+    for unit, title, other in (
+        ("ns", "Time (ns)", "Range (m)"),
+        ("m", "Range (m)", "Bin"),
+        ("bins", "Bin", "Range (m)"),
+    ):
+        button(page, unit).click()
+        header = page.get_by_role("columnheader", name=title).filter(visible=True)
+        expect(header).to_be_visible()
+        axes = "[...figure.below, ...figure.above].map((each) => each.axis_label)"
+        assert in_figure(page, COUNTS, axes) == [title, other]
+        for each in (RATE, STAGES):
+            assert in_figure(page, each, axes) == [title]
+    page.mouse.move(*within(page, 0.5, 0.6, figure=1))
+    tip = page.locator(".bk-Tooltip").filter(visible=True)
+    expect(tip).to_contain_text("Large scale")
+    expect(tip).to_contain_text(re.compile(r"\d ns"))
+    expect(tip).to_contain_text(re.compile(r"\d m"))
+    page.mouse.move(5, 5)
+
+
+# -- the capture as a whole ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def whole(here) -> Iterator[Inspected]:
+    """The shared page on its capture, all of which it looks at again afterwards."""
+    page = here.page
+    button(page, "Capture").click()
+    yield here
+    fold = button(page, "Less data, faster")
+    fold.click()
+    for name in ("Gate from", "Gate to", "Pulses accumulated", "T_n"):
+        reset = page.get_by_role("button", name=re.compile(f"^Reset {name} ")).filter(visible=True)
+        if reset.count():
+            reset.first.click()
+        expect(reset).to_have_count(0)
+    fold.click()
+    button(page, "Pixel").click()
+    expect(bins_told(here)).to_be_visible()
+
+
+def bins_told(here: Inspected, n_bins: int | None = None) -> Locator:
+    """The sentence on what is looked at, where it tells so many bins; all if not given."""
+    rows, cols = here.capture.shape
+    bins = n_bins or here.capture.acquisition.n_bins
+    return here.page.get_by_text(f"{rows} × {cols} pixels, {bins} bins")
+
+
+def test_the_capture_is_reported(whole):
+    report = inspection.capture_report(whole.capture)
+    for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.light, strict=True):
+        expect(fact(whole.page, name)).to_have_text(inspector_words.interval(found))
+    told = whole.page.get_by_text(f"Signal, background and SBR: {report.light_method}")
+    expect(told).to_be_visible()
+    counts = drawn(whole.page, "Counts of all pixels", "raw", "raw")
+    np.testing.assert_array_equal(counts, report.histogram)
+
+
+def test_accuracy_is_studied_and_a_bar_tells_how_far(whole):
+    page, has_truth = whole.page, whole.capture.truth_range_m is not None
+    done = page.get_by_text(re.compile("^Done: 8"))
+    expect(done).to_be_visible()
+    *_, bar = page.get_by_role("progressbar").filter(visible=True).all()
+    bar.evaluate("""(bar) => {
+      window.told = [];
+      new MutationObserver(() => told.push(Number(bar.ariaValueNow)))
+        .observe(bar, { attributes: true });
+    }""")
+    told_button(page, "Compute").click()
+    eventually(lambda: page.evaluate("told.at(-1)") == 100)
+    told = page.evaluate("told")
+    assert told == sorted(told)
+    assert any(0 < each < 100 for each in told)
+    expect(done).to_be_visible()
+    title = "Accuracy against pulses" if has_truth else "Agreement with the answers to all pulses"
+    near, taken = (drawn(page, title, "points", column) for column in ("value", "pulses"))
+    expected = inspection.accuracy_over_pulses(
+        whole.capture, (SHARES[4], 1.0), "tracking", core.TrackingParameters()
+    )
+    np.testing.assert_allclose(near[[4, 7]], [each.within.value for each in expected])
+    np.testing.assert_allclose(taken, np.multiply(SHARES, whole.capture.acquisition.n_pulses or 1))
+
+
+def test_fewer_pulses_are_taken_live(whole):
+    page, slide = whole.page, slider(whole.page, "Pulses accumulated (of all)").filter(visible=True)
+    for _ in range(3):
+        slide.press("PageDown")
+    share = float(slide.get_attribute("aria-valuetext").split()[0])
+    assert 0.001 < share < 0.9
+    fewer = core.reductions.share_of_pulses(whole.capture, share)
+    expect(fact(page, "Detections")).to_have_text(f"{fewer.counts.mean():.4g}")
+    counts = inspection.capture_report(fewer).histogram
+    eventually(lambda: np.array_equal(drawn(page, "Counts of all pixels", "raw", "raw"), counts))
+
+
+def test_what_is_suggested_is_told_with_its_reason_and_taken(whole):
+    page, suggested = whole.page, inspection.capture_report(whole.capture).suggestion
+    first, end = suggested.gate
+    for told in (
+        f"Suggested gate, in bins: {first} to {end}. {suggested.why_gate}",
+        f"Suggested T_n: {suggested.t_n}. {suggested.why_t_n}",
+    ):
+        expect(page.get_by_text(told)).to_be_visible()
+    apply_t_n, apply_gate = (told_button(page, f"Apply {name}") for name in ("T_n", "the gate"))
+    if apply_t_n.is_enabled():  # else it is taken already
+        apply_t_n.click()
+    expect(slider(page, "T_n (bins)")).to_have_attribute("aria-valuetext", f"{suggested.t_n} bins")
+    expect(apply_t_n).to_be_disabled()
+    apply_gate.click()
+    expect(bins_told(whole, end - first)).to_be_visible()
+    expect(fact(page, "Hot pixels")).to_be_visible()
