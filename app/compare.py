@@ -28,11 +28,12 @@ from app.downloads import (
     below,
     downloadable,
     looked_at,
+    numbers,
     pixel_on_show,
     ranged,
     viewed,
 )
-from app.exports import cloud_files, image_files, plot_file, shown_table_file
+from app.exports import cloud_files, facts_file, image_files, plot_file, shown_table_file
 from app.jobs import LatestWins
 from app.looks import cloud_of, image_of
 from app.method_views import (
@@ -255,7 +256,7 @@ class Compare:
             self._grid,
             self._scale.pane,
             self._remarks,
-            self._facts,
+            numbers(self._facts, self._session, self._facts_shown),
             plots,
             downloadable(below(self._table), self._session, "table", self._table_shown, TABLE),
         ]
@@ -460,6 +461,10 @@ class Compare:
     def _curves_shown(self) -> Shown:
         table = plot_file(self._curves.pane.object, self._capture.acquisition)
         return Shown(self._subject, f"scores {pixel_on_show(self._session)}", {"csv": table})
+
+    def _facts_shown(self) -> Shown:
+        what = f"numbers {pixel_on_show(self._session)}"
+        return Shown(self._subject, what, {"csv": facts_file(self._facts.facts)})
 
     def _reliability_shown(self) -> Shown:
         table = plot_file(self._reliability.pane.object)

@@ -23,7 +23,7 @@ import param
 
 from app import download_words as words
 from app.component import Component
-from app.exports import Write, cloud_files, image_files, plot_file
+from app.exports import Write, cloud_files, facts_file, image_files, plot_file
 from app.jobs import LatestWins, Places
 from app.looks import Look, color_values
 from app.session import Session
@@ -289,6 +289,12 @@ def below(table: Any) -> pn.Column:
     return pn.Column(table, sizing_mode="stretch_width", margin=0)
 
 
+def numbers(facts: Any, session: Session, show: Callable[[], Shown]) -> pn.Column:
+    """Named values with a download button."""
+    holder = pn.Column(facts, sizing_mode="stretch_width", margin=0)
+    return downloadable(holder, session, "numbers", show, TABLE)
+
+
 # What cards show
 
 
@@ -351,6 +357,12 @@ def region_on_show(session: Session) -> str:
     answer = session.answer
     inside = inspection.pixels_in(session.state.region, answer.capture.shape)
     return _part(*(np.unique(each) for each in answer.grid.place(*np.nonzero(inside))))
+
+
+def numbers_on_show(session: Session) -> Shown:
+    """What is told of the session's image and pixel."""
+    table = facts_file([*session.figures.facts, *session.numbers.facts])
+    return Shown(explored(session), f"numbers {pixel_on_show(session)}", {"csv": table})
 
 
 def range_image(session: Session) -> Shown:

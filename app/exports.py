@@ -23,6 +23,7 @@ from app.looks import Look, cloud_of, map_of, shown
 from app.state import UNITS, Viewing
 from app.store import Answer
 from app.theme import WRONG_COLOR
+from app.words import Fact
 from core import Acquisition
 from core.experiments.items import Table, as_csv
 from core.export import WRITERS, Plane, Product, write_columns
@@ -282,6 +283,16 @@ def shown_table_file(columns: Sequence[Sequence[Any]], rows: Sequence[Mapping[st
                 line.append(cell[2])
     notes = [row.get("message") or row.get("note") or "" for row in rows]
     return _text([*heads, "note"], [[*line, note] for line, note in zip(body, notes, strict=True)])
+
+
+def facts_file(facts: Sequence[Fact]) -> Write:
+    """Named values as they stand there, as CSV; an interval's ends have columns of their own."""
+    rows = []
+    for name, text, help in facts:
+        interval = re.fullmatch(r"(\S+) \[(\S+), (\S+)\]", text)
+        told = interval.groups() if interval else ("" if text == "–" else text, "", "")
+        rows.append([name, *told, help])
+    return _text(("quantity", "value", "low", "high", "meaning"), rows)
 
 
 def _text(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Write:

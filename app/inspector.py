@@ -317,6 +317,7 @@ class Inspector:
             self._jobs.submit(work, partial(self._draw_map, session.answer), session.fail)
 
     def _draw_map(self, answer: Answer, drawn: tuple[Any, Look]) -> None:
+        self._session.recover()
         if answer is self._session.answer:
             with pn.io.hold(self._session.page):
                 self._navigator.update(*drawn)

@@ -12,8 +12,8 @@ from bokeh.models import FixedTicker, Range1d
 
 from app import inspector_plots, inspector_words, plots
 from app.controls import Facts, Knob, Sentence
-from app.downloads import PLOT, Shown, downloadable, explored, over_the_gate
-from app.exports import plot_file
+from app.downloads import PLOT, Shown, downloadable, explored, numbers, over_the_gate
+from app.exports import facts_file, plot_file
 from app.gate import scale
 from app.inspector_answers import SHARES, accuracy_steps, with_gate
 from app.inspector_pixel import FACTS, framed, stage
@@ -91,12 +91,16 @@ class Whole:
             self._pulses, *self._study.controls, sizing_mode="stretch_width", margin=0
         )
         return View(
-            stage(self._facts, self._light, *advice, *drawn),
+            stage(numbers(self._facts, session, self._numbers_shown), self._light, *advice, *drawn),
             below,
             show=self._show,
             follow=lambda _: self._follow(),
             paint=self._paint,
         )
+
+    def _numbers_shown(self) -> Shown:
+        table = facts_file(self._facts.facts)
+        return Shown(explored(self._session), "numbers of the capture", {"csv": table})
 
     def _accuracy_shown(self) -> Shown:
         table = plot_file(self._accuracy.figure)
@@ -208,6 +212,7 @@ class Whole:
             self._counts.frame(counts)
 
     def _arrived(self, answer: Answer, report: CaptureReport) -> None:
+        self._session.recover()
         if answer is self._session.answer:
             self._report, self._reported = report, answer
             self._draw()

@@ -103,6 +103,7 @@ class Pins:
 
     def _draw(self, answer: Any, pins: Any, found: list[Seen]) -> None:
         session = self._session
+        session.recover()
         if answer is not session.answer or pins != session.state.pins:
             return  # the user has moved on
         unit, acquisition = session.state.unit, answer.capture.acquisition

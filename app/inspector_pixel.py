@@ -17,11 +17,12 @@ from app.downloads import (
     below,
     downloadable,
     explored,
+    numbers,
     over_the_gate,
     pixel_on_show,
     region_on_show,
 )
-from app.exports import shown_table_file
+from app.exports import facts_file, shown_table_file
 from app.inspector_answers import Seen, pixel_lit, pixel_seen, region_seen
 from app.inspector_views import PixelPlots
 from app.jobs import LatestWins
@@ -109,7 +110,11 @@ class Sight:
     def view(self) -> View:
         """The part, for the navigation."""
         return View(
-            stage(self._facts, self._remark, *self._cards),
+            stage(
+                numbers(self._facts, self._session, self._numbers_shown),
+                self._remark,
+                *self._cards,
+            ),
             downloadable(below(self._table), self._session, "table", self._table_shown, TABLE),
             show=self._show,
             follow=lambda _: self._ask(),
@@ -129,6 +134,10 @@ class Sight:
     def _table_shown(self) -> Shown:
         table = shown_table_file(self._table.columns, self._table.rows)
         return self._named(Shown(explored(self._session), "candidates", {"csv": table}))
+
+    def _numbers_shown(self) -> Shown:
+        table = facts_file(self._facts.facts)
+        return self._named(Shown(explored(self._session), "numbers", {"csv": table}))
 
     def _named(self, shown: Shown) -> Shown:
         """The same, told which pixel or which region it is of."""
@@ -170,6 +179,7 @@ class Sight:
                 each.visible = False
 
     def _draw(self, answer: Answer, found: Seen) -> None:
+        self._session.recover()
         if not self._is_on_screen or answer is not self._session.answer:
             return  # the user has moved on
         unit = self._session.state.unit

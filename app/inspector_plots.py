@@ -57,7 +57,7 @@ def stages(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     drawing = _over_the_gate("Residual, and enhanced by the weight", "Residual (counts)", bins)
     source = empty("bin", "residual", "enhanced")
     drawing.extra_y_ranges["enhanced"] = Range1d(0, 1)
-    axis = LinearAxis(y_range_name="enhanced", axis_label="Enhanced (counts × weight)")
+    axis = LinearAxis(y_range_name="enhanced", axis_label="Counts × weight")
     drawing.add_layout(axis, "right")
     _line(drawing, source, "residual", "residual")
     _line(drawing, source, "enhanced", "enhanced", y_range_name="enhanced", line_dash=[6, 3])

@@ -18,7 +18,17 @@ from app.address import AddressBar, Wanted
 from app.compare import Compare
 from app.connection import Connection
 from app.controls import Sentence, SettingsPanel
-from app.downloads import CLOUD, IMAGE, PLOT, cloud_on_show, downloadable, pixel_plot, range_image
+from app.downloads import (
+    CLOUD,
+    IMAGE,
+    PLOT,
+    cloud_on_show,
+    downloadable,
+    numbers,
+    numbers_on_show,
+    pixel_plot,
+    range_image,
+)
 from app.inspector import Inspector
 from app.large_view import LargeView
 from app.pages import Pages, View
@@ -443,7 +453,7 @@ class Layout:
                 session.signals.panes, ("histogram", "residual", "enhanced"), strict=True
             )
         )
-        right = (session.numbers, *plots)
+        right = (numbers(session.numbers, session, partial(numbers_on_show, session)), *plots)
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
             for content in (left, right)

@@ -22,7 +22,7 @@ from playwright.sync_api import expect
 
 from app import downloads
 from app.downloads import Download, Shown, Subject
-from app.exports import drawn, image_files, shown_table_file, table_file
+from app.exports import drawn, facts_file, image_files, shown_table_file, table_file
 from app.layout import Layout
 from app.looks import image_of, map_of, shown
 from app.state import MAPS, Less, Light, Viewing
@@ -30,7 +30,7 @@ from app.store import built_in_sources, inspect
 from app.theme import RANGE_COLORS
 from core import TrackingParameters
 from core.experiments.items import Table
-from tests.browser import VIEWS
+from tests.browser import VIEWS, fact
 
 
 @pytest.fixture(scope="module")
@@ -326,6 +326,23 @@ def offering(write):
     return lambda: Shown(Subject("car"), "test", {"csv": write})
 
 
+def test_numbers_leave_with_the_ends_of_their_intervals():
+    facts = [
+        ("Pixel", "129, 131", "Row, and column."),
+        ("SBR", "0.732 [0.291, ∞]", "Interval."),
+        ("Estimate", "–", ""),
+    ]
+    table = list(DictReader(io.StringIO(written(facts_file(facts)).decode())))
+    columns = ("quantity", "value", "low", "high", "meaning")
+    assert [tuple(line[name] for name in columns) for line in table] == [
+        ("Pixel", "129, 131", "", "", "Row, and column."),
+        ("SBR", "0.732", "0.291", "∞", "Interval."),
+        ("Estimate", "", "", "", ""),
+    ]
+    with pytest.raises(ValueError, match="nothing is drawn here yet"):
+        facts_file([])
+
+
 def test_a_file_travels_in_pieces_and_is_gone_afterwards(session, monkeypatch):
     monkeypatch.setattr(downloads, "PIECE_BYTES", 1000)
     content = np.random.default_rng(0).bytes(3456)
@@ -555,10 +572,15 @@ def test_every_page_gives_what_it_shows(one_page):
     def go(name):
         one_page.get_by_role("button", name=name, exact=True).click()
 
+    name, table = download(one_page, "numbers", "csv")
+    assert name == "car_tracking_numbers-row32-col32.csv"
+    for each in ("RMSE", "Confidence"):
+        assert f"\n{each},{fact(one_page, each).inner_text()},".encode() in table
     go("Inspect")
     expect(one_page.get_by_role("rowheader", name="1", exact=True)).to_be_visible()
     for what, suffix, name in (
         ("map", "tif", "car_tracking_map-Estimate.tif"),
+        ("numbers", "csv", "car_tracking_numbers-row32-col32.csv"),
         ("counts", "csv", "car_tracking_counts-row32-col32.csv"),
         ("rate", "svg", "car_tracking_rate-row32-col32.svg"),
         ("table", "csv", "car_tracking_candidates-row32-col32.csv"),

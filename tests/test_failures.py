@@ -8,6 +8,7 @@ import re
 import signal
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from itertools import cycle
 from pkgutil import resolve_name
 
 import panel as pn
@@ -17,6 +18,11 @@ from app import __main__ as started
 from app import download_words, ranking_words, words
 from app.address import Wanted
 from app.compare import Compare
+from app.inspector import Inspector
+from app.inspector_capture import Whole
+from app.inspector_pins import Pins
+from app.inspector_pixel import Sight
+from app.inspector_views import rectangle
 from app.jobs import LatestWins, Places
 from app.layout import Layout, Page
 from app.pages import Pages, View
@@ -177,7 +183,41 @@ def requires(session):
     return part
 
 
+def navigated(session):
+    page, maps = Inspector(session), cycle(["Peak", "Counts"])
+    nothing = page._navigator.figure.title.text
+    page.view.show(True)
+    return (
+        lambda: session.state.param.update(map=next(maps)),
+        lambda: page._navigator.figure.title.text != nothing,
+    )
+
+
+def pinned(session):
+    part, places = Pins(session), cycle([(0, 0), (1, 1)])
+    part.view.show(True)
+    return lambda: session.state.param.update(pins=(next(places),)), lambda: part._table.rows
+
+
+def added(session):
+    part, rows = Sight(session, "region"), cycle([1, 2])
+    part.view.show(True)
+    region = (rectangle((0, row), (0, 1)) for row in rows)
+    return lambda: session.state.param.update(region=next(region)), lambda: part._facts.facts
+
+
+def reported(session):
+    part = Whole(session)
+    part._is_on_screen = True
+    return part._follow, lambda: part._facts.facts
+
+
 PARTS = {
+    "app.inspector.map_of": navigated,
+    "app.inspector_pins.pixel_lit": pinned,
+    "core.inspection.region_report": added,
+    "core.inspection.capture_report": reported,
+    "core.inspection.accuracy_over_pulses": started_by_compute(Whole),
     "core.experiments.paper.figure_1": moved,
     "app.paper.trials": started_by_compute(repeated),
     "core.experiments.paper.figure_8": started_by_compute(RangeImages),
@@ -186,6 +226,10 @@ PARTS = {
     "app.requires.requirements": started_by_compute(requires),
     "app.trust.setting_sweep": started_by_compute(trust),
 }
+
+
+REFUSE = ("core.inspection.region_report",)
+"""What may refuse its input: a ``ValueError`` of theirs stands where the picture would be."""
 
 
 def few_pixels():
@@ -201,9 +245,10 @@ def session():
 def test_work_of_a_page_that_fails_is_told_and_the_next_works(where, monkeypatch, session):
     raised, told = breaking(monkeypatch, where), []
     session.complain = told.append
-    raised[:] = [RAISED[0]]
+    errors = RAISED[1:] if where in REFUSE else RAISED
+    raised[:] = errors[:1]
     act, goes_on = PARTS[where](session)
-    for error in RAISED:
+    for error in errors:
         raised[:], before = [error], len(told)
         act()
         eventually(lambda before=before: len(told) > before and told[-1])

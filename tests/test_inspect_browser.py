@@ -192,6 +192,10 @@ def test_a_pixel_is_shown_with_all_that_is_known_of_it(here):
     report = inspection.pixel_report(here.capture, here.image, row, col, "tracking", tracking)
     for name, found in zip(("Signal S", "Background B", "SBR"), report.light, strict=True):
         expect(fact(page, name)).to_have_text(inspector_words.interval(found))
+    name, table = download(page, "numbers", "csv")
+    assert name == f"{here.name}_tracking_numbers-row{row}-col{col}.csv"
+    sbr = report.light.sbr
+    assert f"\nSBR,{sbr.value:.3g},{sbr.low:.3g},{sbr.high:.3g},".encode() in table
     told = fact(page, "Detections")
     expect(told).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
     verdict = f"Verdict: {report.verdict.health}. {report.verdict.why}"
@@ -259,6 +263,10 @@ def test_a_move_paints_each_plot_once_and_then_tells_the_numbers(here):
 # -- the picture to navigate by --------------------------------------------------------------------
 
 
+EACH = 17
+"""Of a map's pixels, that is read back: all take a browser a second."""
+
+
 def test_every_map_is_shown(here):
     page, capture, image = here.page, here.capture, here.image
     visible = image.valid & (image.confidence >= 0.9)
@@ -278,10 +286,10 @@ def test_every_map_is_shown(here):
             seen = of_picture(
                 page,
                 "[...found.renderers.find((r) => r.glyph.type === 'Image')"
-                ".data_source.get_array('image')[0]]",
+                f".data_source.get_array('image')[0]].filter((_, at) => at % {EACH} === 0)",
             )
-            shown = np.array(seen, float).reshape(capture.shape)
-            return np.allclose(shown, values, rtol=1e-5, atol=1e-3, equal_nan=True)
+            shown = np.array(seen, float)
+            return np.allclose(shown, values.flat[::EACH], rtol=1e-5, atol=1e-3, equal_nan=True)
 
         eventually(is_shown)
     _, content = download(page, "map", "csv")
@@ -346,11 +354,10 @@ def test_a_region_is_dragged_outlined_and_its_sum_shown(here, mode):
     expect(fact(page, "Pixels")).to_have_text(f"{inside.sum():,}")
     sum_of_all = capture.cube[inside].sum(axis=0)
     np.testing.assert_array_equal(drawn(page, COUNTS, "raw", "raw"), sum_of_all)
-    signals = core.tracking_signals(sum_of_all, core.TrackingParameters(), None)
-    if capture.armed_pulses is None:
-        np.testing.assert_allclose(
-            drawn(page, STAGES, "residual", "residual"), signals.residual, rtol=1e-4, atol=0.1
-        )
+    armed_pulses = capture.armed_pulses and capture.armed_pulses * int(inside.sum())
+    signals = core.tracking_signals(sum_of_all, core.TrackingParameters(), armed_pulses)
+    residual = drawn(page, STAGES, "residual", "residual")
+    np.testing.assert_allclose(residual, signals.residual, rtol=1e-4, atol=1e-3)
     outline = of_picture(
         page,
         "found.renderers.find((r) => r.name === 'region line').data_source"
@@ -362,8 +369,21 @@ def test_a_region_is_dragged_outlined_and_its_sum_shown(here, mode):
     place = f"rows{rows.min()}-{rows.max()}_cols{cols.min()}-{cols.max()}"
     assert name == f"{here.name}_{place}_tracking_counts-region.csv"
     np.testing.assert_array_equal(columns_of(content)["counts"][: sum_of_all.size], sum_of_all)
+    told_button(page, "Clear region").click()
+    expect(button(page, "Pixel")).to_have_attribute("aria-pressed", "true")
+    eventually(lambda: not region_in(page))
+
+
+def test_region_and_pins_outlast_a_reload(here):
+    page, (row, col) = here.page, here.pixel
+    go_to(page, row, col)
+    page.keyboard.press("p")
+    drag(page, "Lasso", *DRAGS["Lasso"])
+    n_pixels = fact(page, "Pixels").inner_text()
+    rests(page, "region=[", f"pins=[[{row},{col}]]", "subject=Region")
     page.reload()
-    expect(fact(page, "Pixels")).to_have_text(f"{inside.sum():,}")
+    expect(fact(page, "Pixels")).to_have_text(n_pixels)
+    button(page, f"Remove {row}, {col}").press("Enter")
     told_button(page, "Clear region").click()
     expect(button(page, "Pixel")).to_have_attribute("aria-pressed", "true")
     eventually(lambda: not region_in(page))
@@ -374,7 +394,6 @@ def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
     go_to(page, row, col)
     pins = [(row, col + n) for n in range(4)]
     names = [f"{row}, {col}" for row, col in pins]
-    chips = page.get_by_role("button", name=re.compile(r"^Remove \d+, \d+$"))
     for name in names:
         page.keyboard.press("p")
         expect(button(page, f"Remove {name}")).to_be_visible()
@@ -388,16 +407,9 @@ def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
     np.testing.assert_array_equal(
         drawn(page, "Counts of the pinned", "lines", "ys"), [here.capture.cube[pin] for pin in pins]
     )
-    button(page, f"Remove {names[1]}").press("Enter")
-    expect(headers).to_have_text([names[0], *names[2:]])
-    left = ",".join(f"[{row},{col}]" for row, col in (pins[0], *pins[2:]))
-    rests(page, f"pins=[{left}]")
-    page.reload()
-    expect(headers).to_have_text([names[0], *names[2:]])
-    while chips.count():
-        left = chips.count()
-        chips.first.press("Enter")
-        expect(chips).to_have_count(left - 1)
+    while names:
+        button(page, f"Remove {names.pop()}").press("Enter")
+        expect(headers).to_have_text(names)
     expect(page.get_by_text(inspector_words.NO_PINS)).to_be_visible()
     button(page, "Pixel").click()
 

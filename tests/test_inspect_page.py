@@ -344,6 +344,7 @@ def tables_of(view):
     return {
         button.what: columns_of(written(button._show().files["csv"]))
         for button in view.main.select(Download)
+        if button.what != "numbers"
     }
 
 
