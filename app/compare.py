@@ -27,8 +27,8 @@ from app.downloads import (
     Subject,
     below,
     downloadable,
+    downloadable_facts,
     looked_at,
-    numbers,
     pixel_on_show,
     ranged,
     viewed,
@@ -256,7 +256,7 @@ class Compare:
             self._grid,
             self._scale.pane,
             self._remarks,
-            numbers(self._facts, self._session, self._facts_shown),
+            downloadable_facts(self._facts, self._session, self._numbers_shown),
             plots,
             downloadable(below(self._table), self._session, "table", self._table_shown, TABLE),
         ]
@@ -431,7 +431,7 @@ class Compare:
         self._curve_jobs.submit(
             partial(score_curves, self._capture, tasks, *pixel),
             partial(self._draw_curves, answers, pixel),
-            self._session.fail,
+            partial(self._session.fail, of=self),
         )
 
     # What is taken away
@@ -456,13 +456,14 @@ class Compare:
             files = image_files(answer, look_name, least, figure)
             what = f"{kind} image"
         subject = ranged(self._session, answer, method, self._tasks[method].settings)
-        return Shown(viewed(subject, viewing), what.lower(), files, title_of(method), look)
+        subject = viewed(self._session, subject, viewing)
+        return Shown(subject, what.lower(), files, title_of(method), look)
 
     def _curves_shown(self) -> Shown:
         table = plot_file(self._curves.pane.object, self._capture.acquisition)
         return Shown(self._subject, f"scores {pixel_on_show(self._session)}", {"csv": table})
 
-    def _facts_shown(self) -> Shown:
+    def _numbers_shown(self) -> Shown:
         what = f"numbers {pixel_on_show(self._session)}"
         return Shown(self._subject, what, {"csv": facts_file(self._facts.facts)})
 
@@ -580,7 +581,7 @@ class Compare:
     def _draw_curves(
         self, answers: dict[str, Answer], pixel: tuple[int, int], curves: dict[str, Any]
     ) -> None:
-        self._session.recover()
+        self._session.recover(self)
         tasks = self._tasks
         answers = {method: each for method, each in answers.items() if method in tasks}
         if pixel != self._session.state.pixel or not answers:

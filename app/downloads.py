@@ -17,7 +17,6 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import IO, Any, BinaryIO, cast
 
-import numpy as np
 import panel as pn
 import param
 
@@ -289,8 +288,9 @@ def below(table: Any) -> pn.Column:
     return pn.Column(table, sizing_mode="stretch_width", margin=0)
 
 
-def numbers(facts: Any, session: Session, show: Callable[[], Shown]) -> pn.Column:
-    """Named values with a download button."""
+def downloadable_facts(facts: Any, session: Session, show: Callable[[], Shown]) -> pn.Column:
+    """Named values that leave the corner beside them to a download button."""
+    facts.margin = (0, CORNER_PX, 0, 0)
     holder = pn.Column(facts, sizing_mode="stretch_width", margin=0)
     return downloadable(holder, session, "numbers", show, TABLE)
 
@@ -306,14 +306,13 @@ def looked_at(session: Session, request: Request) -> Subject:
     lit = (request.light,) if source.is_scene else ()
     window, part = request.window, ""
     if window is not None:
-        part = _part(range(*window.rows), range(*window.cols))
+        part = _part(*((first, behind - 1) for first, behind in (window.rows, window.cols)))
     return Subject(capture + absent, "", (*lit, request.less), part=part)
 
 
-def _part(rows: Iterable[int], cols: Iterable[int]) -> str:
-    """The rows and columns of a part, as `Subject` takes them."""
-    ends = [f"{min(each)}-{max(each)}" for each in (rows, cols)]
-    return "rows{}_cols{}".format(*ends)
+def _part(rows: tuple[int, int], cols: tuple[int, int]) -> str:
+    """First and last row and column of a part, as `Subject` takes them."""
+    return "rows{}-{}_cols{}-{}".format(*rows, *cols)
 
 
 def ranged(session: Session, answer: Answer, estimator: str, settings: Any) -> Subject:
@@ -328,11 +327,14 @@ def explored(session: Session) -> Subject:
     return ranged(session, session.answer, "tracking", session.answer.request.tracking)
 
 
-def viewed(subject: Subject, viewing: Viewing) -> Subject:
-    """An answer's image or cloud, told from which confidence it is shown."""
-    # How wide it is seen says nothing new: each capture has its own default.
-    sure = Viewing(viewing.least_confidence)
-    return replace(subject, settings=(*subject.settings, sure))
+def viewed(session: Session, subject: Subject, viewing: Viewing) -> Subject:
+    """An answer's image or cloud, told from which confidence it is shown, and how wide it is seen.
+
+    As wide as suits the capture is not told.
+    """
+    if viewing.field_of_view_deg == session.own_field_of_view_deg:
+        viewing = Viewing(viewing.least_confidence)
+    return replace(subject, settings=(*subject.settings, viewing))
 
 
 def over_the_gate(session: Session, figure: Any, what: str) -> Shown:
@@ -353,10 +355,10 @@ def pixel_on_show(session: Session) -> str:
 
 
 def region_on_show(session: Session) -> str:
-    """First and last row and column of the session's region, in its file."""
+    """First and last row and column with pixels of the session's region, in its file."""
     answer = session.answer
     inside = inspection.pixels_in(session.state.region, answer.capture.shape)
-    return _part(*(np.unique(each) for each in answer.grid.place(*np.nonzero(inside))))
+    return _part(*((each.min(), each.max()) for each in answer.grid.place(*inside.nonzero())))
 
 
 def numbers_on_show(session: Session) -> Shown:
@@ -371,7 +373,8 @@ def range_image(session: Session) -> Shown:
     least = state.viewing.least_confidence
     files = image_files(answer, state.image, least, session.image.figure)
     what = "range image" if state.image == "Estimate" else f"{state.image} image"
-    return Shown(viewed(explored(session), state.viewing), what.lower(), files)
+    subject = viewed(session, explored(session), state.viewing)
+    return Shown(subject, what.lower(), files)
 
 
 def cloud_on_show(session: Session) -> Shown:
@@ -380,5 +383,5 @@ def cloud_on_show(session: Session) -> Shown:
     _, look = color_values(answer, state.cloud_color)
     files = cloud_files(answer, state.cloud_color, state.viewing)
     heading = f"3D cloud, coloured by {state.cloud_color.lower()}"
-    subject = viewed(explored(session), state.viewing)
+    subject = viewed(session, explored(session), state.viewing)
     return Shown(subject, "cloud", files, heading, look)

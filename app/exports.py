@@ -285,14 +285,21 @@ def shown_table_file(columns: Sequence[Sequence[Any]], rows: Sequence[Mapping[st
     return _text([*heads, "note"], [[*line, note] for line, note in zip(body, notes, strict=True)])
 
 
+_A_NUMBER = r"([+-]?[\d,.]+(?:e[+-]\d+)?|∞)"
+_A_FACT = re.compile(
+    rf"{_A_NUMBER}(?: \[{_A_NUMBER}, {_A_NUMBER}\])?(?: (%|[^\W\d]+))?(?: \((.+)\))?"
+)
+
+
 def facts_file(facts: Sequence[Fact]) -> Write:
-    """Named values as they stand there, as CSV; an interval's ends have columns of their own."""
+    """Named values as CSV; what else stands beside a number has columns of its own."""
     rows = []
     for name, text, help in facts:
-        interval = re.fullmatch(r"(\S+) \[(\S+), (\S+)\]", text)
-        told = interval.groups() if interval else ("" if text == "–" else text, "", "")
-        rows.append([name, *told, help])
-    return _text(("quantity", "value", "low", "high", "meaning"), rows)
+        parts = _A_FACT.fullmatch(text)
+        told = parts.groups("") if parts else ("" if text == "–" else text, *[""] * 4)
+        plain = [each.replace("∞", "inf").replace(",", "") for each in told] if parts else told
+        rows.append([name, *plain, help])
+    return _text(("quantity", "value", "low", "high", "unit", "more", "meaning"), rows)
 
 
 def _text(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Write:

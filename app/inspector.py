@@ -262,7 +262,8 @@ class Inspector:
         session, state = self._session, self._session.state
         least = state.viewing.least_confidence
         files = image_files(session.answer, state.map, least, self._navigator.figure)
-        return Shown(viewed(explored(session), state.viewing), f"map {state.map}", files)
+        subject = viewed(session, explored(session), state.viewing)
+        return Shown(subject, f"map {state.map}", files)
 
     # What is drawn
 
@@ -314,10 +315,11 @@ class Inspector:
         if self._is_on_screen:
             session, state = self._session, self._session.state
             work = partial(map_of, session.answer, state.map, state.viewing.least_confidence)
-            self._jobs.submit(work, partial(self._draw_map, session.answer), session.fail)
+            fail = partial(session.fail, of=self)
+            self._jobs.submit(work, partial(self._draw_map, session.answer), fail)
 
     def _draw_map(self, answer: Answer, drawn: tuple[Any, Look]) -> None:
-        self._session.recover()
+        self._session.recover(self)
         if answer is self._session.answer:
             with pn.io.hold(self._session.page):
                 self._navigator.update(*drawn)

@@ -12,7 +12,8 @@ from bokeh.models import FixedTicker, Range1d
 
 from app import inspector_plots, inspector_words, plots
 from app.controls import Facts, Knob, Sentence
-from app.downloads import PLOT, Shown, downloadable, explored, numbers, over_the_gate
+from app.download_words import NOTHING_DRAWN
+from app.downloads import PLOT, Shown, downloadable, downloadable_facts, explored, over_the_gate
 from app.exports import facts_file, plot_file
 from app.gate import scale
 from app.inspector_answers import SHARES, accuracy_steps, with_gate
@@ -71,7 +72,6 @@ class Whole:
             button("Apply T_n", inspector_words.T_N_HELP, self._apply_t_n),
         ]
         session.state.param.watch(lambda *_: self._draw(), "unit")
-        session.state.param.watch(lambda *_: self._show_pulses(), "less")
 
     @property
     def view(self) -> View:
@@ -91,7 +91,12 @@ class Whole:
             self._pulses, *self._study.controls, sizing_mode="stretch_width", margin=0
         )
         return View(
-            stage(numbers(self._facts, session, self._numbers_shown), self._light, *advice, *drawn),
+            stage(
+                downloadable_facts(self._facts, session, self._numbers_shown),
+                self._light,
+                *advice,
+                *drawn,
+            ),
             below,
             show=self._show,
             follow=lambda _: self._follow(),
@@ -99,6 +104,8 @@ class Whole:
         )
 
     def _numbers_shown(self) -> Shown:
+        if self._reported is not self._session.answer:
+            raise ValueError(NOTHING_DRAWN)
         table = facts_file(self._facts.facts)
         return Shown(explored(self._session), "numbers of the capture", {"csv": table})
 
@@ -111,14 +118,15 @@ class Whole:
     def _show(self, is_on_screen: bool) -> None:
         self._is_on_screen = is_on_screen
         if is_on_screen:
-            self._show_pulses()
             self._follow()
         self._study.show(is_on_screen)
 
     def _follow(self) -> None:
         if not self._is_on_screen:
             return
-        answer, fail = self._session.answer, self._session.fail
+        answer, fail = self._session.answer, partial(self._session.fail, of=self)
+        # Not the answer's, which may be to what was chosen before.
+        self._pulses.value = self._session.state.less.pulses
         if self._reported is None or answer.capture is not self._reported.capture:
             self._light.text = COMPUTING
         # Counts at once: to find the light takes a while.
@@ -131,10 +139,6 @@ class Whole:
         if self._studied is not None and studied != self._studied:
             self._study.start()
         self._mark_present()
-
-    def _show_pulses(self) -> None:
-        # Of what was chosen last: an answer may be to something that was chosen before.
-        self._pulses.value = self._session.state.less.pulses
 
     def _paint(self, dark: bool) -> None:
         for plot in (self._counts, self._accuracy):
@@ -212,7 +216,7 @@ class Whole:
             self._counts.frame(counts)
 
     def _arrived(self, answer: Answer, report: CaptureReport) -> None:
-        self._session.recover()
+        self._session.recover(self)
         if answer is self._session.answer:
             self._report, self._reported = report, answer
             self._draw()
@@ -228,7 +232,7 @@ class Whole:
                 each.disabled = True
             self._counts.source("window").data = {"left": [], "right": []}
             self._counts.source("suggested").data = {"x": [], "y": []}
-        self._session.fail(error)
+        self._session.fail(error, of=self)
 
     def _draw(self) -> None:
         answer, report = self._reported, self._report

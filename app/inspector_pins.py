@@ -98,12 +98,12 @@ class Pins:
             self._jobs.submit(
                 lambda: [pixel_lit(answer, *pin) for pin in pins],
                 partial(self._draw, answer, pins),
-                session.fail,
+                partial(session.fail, of=self),
             )
 
     def _draw(self, answer: Any, pins: Any, found: list[Seen]) -> None:
         session = self._session
-        session.recover()
+        session.recover(self)
         if answer is not session.answer or pins != session.state.pins:
             return  # the user has moved on
         unit, acquisition = session.state.unit, answer.capture.acquisition

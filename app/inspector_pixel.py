@@ -10,14 +10,15 @@ import panel as pn
 
 from app import inspector_words
 from app.controls import FACTS_PX, LINE_PX, Facts, Sentence, Table
+from app.download_words import NOTHING_DRAWN
 from app.downloads import (
     PLOT,
     TABLE,
     Shown,
     below,
     downloadable,
+    downloadable_facts,
     explored,
-    numbers,
     over_the_gate,
     pixel_on_show,
     region_on_show,
@@ -37,7 +38,7 @@ from app.words import COMPUTING, reason
 BREAK_PX = 1100
 """As `app.parts.BREAK_PX`, of this page."""
 
-FACTS = ".fact-list { grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)) !important; }"
+FACTS = ".fact-list { grid-template-columns: repeat(auto-fill, minmax(140px, 1fr)) !important; }"
 FILLING = ":host { flex: 1 1 0 !important; min-height: 0; min-width: 0; }" + unrolled(BREAK_PX)
 COLUMN = column(6, BREAK_PX)
 FRAME = unrolled(BREAK_PX, "330px")
@@ -84,7 +85,7 @@ class Sight:
         self._watched = watched
         self._jobs: LatestWins[Seen] = LatestWins(session.on_page)
         self._tell_soon = Soon(session.on_page, self._tell)
-        self._is_on_screen = False
+        self._is_on_screen = self._is_behind = False
         self._drawn: tuple[Answer, Seen] | None = None
         self._plots = PixelPlots()
         self._cards = [
@@ -111,7 +112,7 @@ class Sight:
         """The part, for the navigation."""
         return View(
             stage(
-                numbers(self._facts, self._session, self._numbers_shown),
+                downloadable_facts(self._facts, self._session, self._numbers_shown),
                 self._remark,
                 *self._cards,
             ),
@@ -140,7 +141,9 @@ class Sight:
         return self._named(Shown(explored(self._session), "numbers", {"csv": table}))
 
     def _named(self, shown: Shown) -> Shown:
-        """The same, told which pixel or which region it is of."""
+        """The same, told which pixel or which region it is of, once that is drawn."""
+        if self._is_behind:
+            raise ValueError(NOTHING_DRAWN)
         session = self._session
         if self._watched == "pixel":
             return replace(shown, what=f"{shown.what} {pixel_on_show(session)}")
@@ -163,12 +166,13 @@ class Sight:
         else:
             self._lack(inspector_words.NO_REGION)
             return
+        self._is_behind = True
         self._jobs.submit(work, partial(self._draw, answer), self._failed)
 
     def _failed(self, error: Exception) -> None:
         self._lack(reason(error))
         if not isinstance(error, ValueError):
-            self._session.fail(error)
+            self._session.fail(error, of=self)
 
     def _lack(self, why: str) -> None:
         """Say why there is nothing to see."""
@@ -179,7 +183,8 @@ class Sight:
                 each.visible = False
 
     def _draw(self, answer: Answer, found: Seen) -> None:
-        self._session.recover()
+        self._session.recover(self)
+        self._is_behind = False
         if not self._is_on_screen or answer is not self._session.answer:
             return  # the user has moved on
         unit = self._session.state.unit

@@ -227,10 +227,10 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
         ("Pixels", f"{rows} × {cols}", "Rows and columns."),
         ("Pulses", "not known" if n_pulses is None else f"{n_pulses:,}", "Sent for each pixel."),
         ("Detections", f"{answer.capture.counts.mean():.4g}", "Mean of a pixel."),
-        ("Hot pixels", narrow or f"{report.n_hot:,}", "More detections than all neighbours."),
         ("Signal (PPP)", interval(light.signal), f"Photons of the echo, mean of all pixels{per}"),
         ("Background", interval(light.background), f"Over the whole gate, mean of all pixels{per}"),
         ("SBR", interval(light.sbr), "Signal over background, with 95 % interval."),
+        ("Hot pixels", narrow or f"{report.n_hot:,}", "More detections than all neighbours."),
         ("Dead pixels", narrow or f"{report.n_dead:,}", "Fewer detections than all neighbours."),
     ]
 

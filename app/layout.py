@@ -24,7 +24,7 @@ from app.downloads import (
     PLOT,
     cloud_on_show,
     downloadable,
-    numbers,
+    downloadable_facts,
     numbers_on_show,
     pixel_plot,
     range_image,
@@ -453,7 +453,8 @@ class Layout:
                 session.signals.panes, ("histogram", "residual", "enhanced"), strict=True
             )
         )
-        right = (numbers(session.numbers, session, partial(numbers_on_show, session)), *plots)
+        told = downloadable_facts(session.numbers, session, partial(numbers_on_show, session))
+        right = (told, *plots)
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
             for content in (left, right)

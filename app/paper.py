@@ -285,10 +285,11 @@ class Sliders(Generic[Settings]):
 
     def _ask(self, settings: Settings) -> None:
         self._settings = settings
-        self._jobs.submit(partial(self._compute, settings), self._draw, self._session.fail)
+        fail = partial(self._session.fail, of=self)
+        self._jobs.submit(partial(self._compute, settings), self._draw, fail)
 
     def _draw(self, plots: Sequence[items.Plot]) -> None:
-        self._session.recover()
+        self._session.recover(self)
         with pn.io.hold(self._session.page):
             for card, plot in zip(self._cards, plots, strict=True):
                 card.show(plot)

@@ -28,7 +28,10 @@ PICTURES = {
 }
 """How the pictures of Explore and Inspect are found."""
 
-HEAD = '''"""What firstphoton shows, found again."""
+ELSEWHERE = {"Trade-off": "python -m core tradeoff", "Paper": "python -m core paper"}
+"""Pages whose numbers a command finds, which takes longer than a script should."""
+
+HEAD = '''"""What firstphoton shows{where}, found again."""
 
 {math}from dataclasses import replace
 
@@ -55,7 +58,11 @@ def script_of(answer: Answer, state: State) -> str:
     has_clouds = not compares or state.comparison.kind == CLOUDS
     body = _comparison if compares else _tracking
     lines = [*_capture(answer), *_less(answer), *body(answer, state)]
-    return HEAD.format(math="import math\n" if has_clouds else "") + "\n".join(lines) + "\n"
+    where = ""
+    if state.page in ELSEWHERE:
+        where = f" on Explore ({state.page}: {ELSEWHERE[state.page]})"
+    head = HEAD.format(where=where, math="import math\n" if has_clouds else "")
+    return head + "\n".join(lines) + "\n"
 
 
 # The capture

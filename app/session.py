@@ -96,7 +96,8 @@ class Session:
         self._jobs: LatestWins[Answer] = LatestWins(self.on_page)
         self._loop = IOLoop.current() if self._served else None
         self._ask_pixel = Soon(self.on_page, self._draw_pixel)
-        self._rest_is_due = self._has_failed = self._is_waiting = False
+        self._failures: dict[object, str] = {}
+        self._rest_is_due = self._is_waiting = False
         self._rest_asked_s = 0.0
         self._asked_s: float | None = None
         self.answer = self._first_answer(wanted)
@@ -299,17 +300,23 @@ class Session:
         self._settle(self.answer)
         self.fail(error)
 
-    def fail(self, error: Exception, told: Callable[[Exception], str] = words.failure) -> None:
-        """Tell the page of an error, and stay usable."""
+    def fail(
+        self,
+        error: Exception,
+        told: Callable[[Exception], str] = words.failure,
+        of: object = None,
+    ) -> None:
+        """Tell the page of an error, and stay usable; `of` which part of the page, if of one."""
         log.warning("a request failed", exc_info=error)
-        self._has_failed = True
-        self.complain(told(error))
+        self._failures.pop(of, None)
+        self._failures[of] = told(error)
+        self.complain(self._failures[of])
 
-    def recover(self) -> None:
-        """Take back what the page was told of an error: what failed works again, or is retried."""
-        if self._has_failed:
-            self._has_failed = False
-            self.complain("")
+    def recover(self, of: object) -> None:
+        """Take back what the page was told of a part: it works again, or is retried."""
+        if self._failures.pop(of, None) is not None:
+            latest = next(reversed(self._failures.values()), None)
+            self.complain(words.lack(self.answer) if latest is None else latest)
 
     def key(self, source: Source) -> str:
         """Of a source in the catalogue."""
@@ -319,7 +326,7 @@ class Session:
         previous, self.answer = self.answer, answer
         if first or not same_view(answer.request, previous.request):
             self._enter(answer, previous)
-        self._has_failed = False
+        self._failures.clear()
         with pn.io.hold(self.page):  # all that follows from it arrives at once
             self.complain(words.lack(answer))
             self._draw_pixel()

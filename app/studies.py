@@ -82,7 +82,8 @@ class Study:
     ) -> None:
         self._session = session
         self._steps = steps
-        self._work = InSteps(session.on_page, self._tell, partial(session.fail, told=unfinished))
+        fail = partial(session.fail, told=unfinished, of=self)
+        self._work = InSteps(session.on_page, self._tell, fail)
         self._controls = WorkControls(self.start, self._work.cancel, noun)
 
     @property
@@ -92,7 +93,7 @@ class Study:
 
     def start(self) -> None:
         """Begin anew."""
-        self._session.recover()
+        self._session.recover(self)
         self._work.start(self._steps())
 
     def show(self, is_on_screen: bool) -> None:
@@ -148,7 +149,7 @@ class OnePiece(Generic[Result]):
         """Begin anew, with other work than the button's if told; what is under way ends."""
         work, page = work or self._work(), self._session
         self.cancel()
-        page.recover()
+        page.recover(self)
         run = self._run = _Run(is_running=True)
 
         def told(done: int, of: int) -> None:
@@ -184,7 +185,7 @@ class OnePiece(Generic[Result]):
     def _ended(self, run: _Run, error: Exception) -> None:
         if run.is_running:  # else this is what it was asked for
             self.cancel()
-            self._session.fail(error, unfinished)
+            self._session.fail(error, unfinished, self)
 
 
 @dataclass

@@ -24,7 +24,7 @@ const views = [];
 const walk = (view) => { views.push(view); (view.child_views ?? []).forEach(walk); };
 [...Bokeh.index.roots].forEach(walk);
 """
-"""In the browser: all that Bokeh has drawn, or keeps ready, on the page."""
+"""JavaScript that sets ``views``: all that Bokeh has drawn, or keeps ready, on the page."""
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -25,7 +25,7 @@ from app.downloads import Download, Shown, Subject
 from app.exports import drawn, facts_file, image_files, shown_table_file, table_file
 from app.layout import Layout
 from app.looks import image_of, map_of, shown
-from app.state import MAPS, Less, Light, Viewing
+from app.state import MAPS, Less, Light
 from app.store import built_in_sources, inspect
 from app.theme import RANGE_COLORS
 from core import TrackingParameters
@@ -105,14 +105,26 @@ def test_a_name_follows_the_page(session):
     row, col = session.state.pixel
     shown_now = downloads.pixel_plot(session, session.signals.histogram.figure, "histogram")
     assert f"row{row} col{col}" in shown_now.what
-    session.state.viewing = Viewing(0.5)
-    for show, told in (
-        (downloads.range_image, "car_tracking_least-confidence0.5_range-image.csv"),
-        (downloads.cloud_on_show, "car_tracking_least-confidence0.5_cloud.csv"),
-    ):
-        found = show(session)
-        assert found.subject.file_name(found.what, "csv") == told
-    session.state.viewing = Viewing()
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({}, ""),
+        ({"least_confidence": 0.5}, "_least-confidence0.5"),
+        ({"field_of_view_deg": 7.0}, "_field-of-view-deg7"),
+    ],
+)
+def test_names_of_image_and_cloud_tell_how_they_are_seen(session, changed, told):
+    before = session.state.viewing
+    session.state.viewing = replace(before, **changed)
+    try:
+        shown = downloads.range_image(session), downloads.cloud_on_show(session)
+    finally:
+        session.state.viewing = before
+    image, cloud = (each.subject.file_name(each.what, "csv") for each in shown)
+    assert image == f"car_tracking{told}_range-image.csv"
+    assert cloud == f"car_tracking{told}_cloud.csv"
 
 
 # -- contents --------------------------------------------------------------------------------------
@@ -331,13 +343,19 @@ def test_numbers_leave_with_the_ends_of_their_intervals():
         ("Pixel", "129, 131", "Row, and column."),
         ("SBR", "0.732 [0.291, ∞]", "Interval."),
         ("Estimate", "–", ""),
+        ("Error", "-0.0123 m", ""),
+        ("Detections", "1,234 (12.3 %)", ""),
+        ("r small", "1.2e-05", ""),
     ]
     table = list(DictReader(io.StringIO(written(facts_file(facts)).decode())))
-    columns = ("quantity", "value", "low", "high", "meaning")
+    columns = ("quantity", "value", "low", "high", "unit", "more", "meaning")
     assert [tuple(line[name] for name in columns) for line in table] == [
-        ("Pixel", "129, 131", "", "", "Row, and column."),
-        ("SBR", "0.732", "0.291", "∞", "Interval."),
-        ("Estimate", "", "", "", ""),
+        ("Pixel", "129, 131", "", "", "", "", "Row, and column."),
+        ("SBR", "0.732", "0.291", "inf", "", "", "Interval."),
+        ("Estimate", "", "", "", "", "", ""),
+        ("Error", "-0.0123", "", "", "m", "", ""),
+        ("Detections", "1234", "", "", "", "12.3 %", ""),
+        ("r small", "1.2e-05", "", "", "", "", ""),
     ]
     with pytest.raises(ValueError, match="nothing is drawn here yet"):
         facts_file([])
@@ -575,7 +593,8 @@ def test_every_page_gives_what_it_shows(one_page):
     name, table = download(one_page, "numbers", "csv")
     assert name == "car_tracking_numbers-row32-col32.csv"
     for each in ("RMSE", "Confidence"):
-        assert f"\n{each},{fact(one_page, each).inner_text()},".encode() in table
+        value, unit = fact(one_page, each).inner_text().split()
+        assert f"\n{each},{value},,,{unit},".encode() in table
     go("Inspect")
     expect(one_page.get_by_role("rowheader", name="1", exact=True)).to_be_visible()
     for what, suffix, name in (

@@ -229,7 +229,7 @@ PARTS = {
 
 
 REFUSE = ("core.inspection.region_report",)
-"""What may refuse its input: a ``ValueError`` of theirs stands where the picture would be."""
+"""Parts that may refuse their input: their ``ValueError`` stands where the picture would be."""
 
 
 def few_pixels():
@@ -259,6 +259,37 @@ def test_work_of_a_page_that_fails_is_told_and_the_next_works(where, monkeypatch
     act()
     eventually(goes_on)
     eventually(lambda: told[-1] == "")
+
+
+def test_a_failure_is_told_until_its_own_part_works_again(session):
+    told = []
+    session.complain = told.append
+    map_, pins = object(), object()
+    session.fail(MemoryError(), of=map_)
+    session.fail(OSError(28, "full"), of=pins)
+    of_map, of_pins = told
+    session.recover(session)
+    session.recover(map_)  # the latest is told all along
+    assert told[-1] == of_pins
+    session.fail(MemoryError(), of=map_)
+    session.recover(map_)
+    assert told[2:] == [of_pins, of_map, of_pins]
+    session.recover(pins)
+    assert told[-1] == ""
+
+
+def test_another_pixel_does_not_silence_a_map_that_failed(monkeypatch, session):
+    raised, told = breaking(monkeypatch, "app.inspector.map_of"), []
+    session.complain = told.append
+    raised.append(MemoryError())
+    change_map, _ = navigated(session)
+    sight = Sight(session, "pixel")
+    sight.view.show(True)
+    change_map()
+    eventually(lambda: told)
+    session.choose_pixel(1, 1)
+    eventually(lambda: sight._facts.facts[0][1] == "1, 1")
+    assert told[-1]
 
 
 def messages(page):

@@ -20,7 +20,7 @@ from app.layout import Layout
 from app.looks import map_of
 from app.session import Session
 from app.state import MAPS, NEED_TRUTH, Less
-from app.store import built_in_sources, file_source
+from app.store import built_in_sources, compute, file_source
 from app.theme import DARK
 from core import Acquisition, coates_rate, inspection, tracking_signals
 from core.tests.captures import real_capture_path
@@ -479,8 +479,24 @@ def test_an_answer_to_pulses_chosen_before_takes_nothing_back(facade):
     )
     part._follow()
     assert (part._pulses.value, facade.state.less.pulses) == (0.25, 0.25)
-    facade.state.less = Less(pulses=0.75)
-    assert part._pulses.value == 0.75
+    part.view.show(False)
+
+
+def test_pulses_that_cannot_be_had_are_taken_back(facade, monkeypatch):
+    works = compute
+
+    def fails(request, *more):
+        if request.less.pulses < 1:
+            raise MemoryError
+        return works(request, *more)
+
+    monkeypatch.setattr("app.session.compute", fails)
+    part = Whole(facade)
+    part.view.show(True)
+    facade.announce = lambda answer: part._follow()
+    part._pulses.value = 0.5
+    eventually(lambda: part._pulses.value == 1.0)
+    assert facade.state.less == Less()
     part.view.show(False)
 
 

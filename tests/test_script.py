@@ -16,12 +16,14 @@ import pytest
 
 import core
 from app.address import Wanted, defaults, query_of
+from app.large import LIMIT
 from app.looks import image_of
 from app.ranking import run_task, tasks_of
-from app.script import script_of
+from app.script import ELSEWHERE, script_of
 from app.session import Session
 from app.state import PAGES, State
 from app.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
+from core.readers.labelled import dataset
 from tests.browser import ROOT
 from tests.states import another, random_state
 
@@ -62,7 +64,8 @@ def run(folder: Path, sessions: dict[str, Session], *files: Path) -> dict[str, d
         (folder / name).mkdir()
         (folder / name / "script.py").write_text(script_of(session.answer, session.state), "utf-8")
         for file in files:
-            shutil.copy(file, folder / name)
+            copy = shutil.copytree if file.is_dir() else shutil.copy
+            copy(file, folder / name / file.name)
     check_style(folder)
     command = [sys.executable, "-c", RUN_EACH, *(str(folder / name) for name in sessions)]
     env = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -150,6 +153,21 @@ def test_a_real_capture_is_found_again(tmp_path, real_capture):
     assert str(path.parent) not in script_of(session.answer, session.state)
 
 
+def test_a_part_of_a_large_capture_is_found_again(tmp_path, monkeypatch):
+    """In the light of the whole, and so with the same confidence."""
+    scene = core.scenes["building"]()
+    whole = core.simulate(scene, scene.acquisition, core.Flux(sbr=0.5))
+    path = tmp_path / "large.zarr"
+    dataset(whole)[["counts"]].chunk(row=16, col=16).to_zarr(path, consolidated=False)
+    monkeypatch.setenv(LIMIT, "1")
+    query = "source=it&page=Inspect&map=Confidence&pixel=[3,4]&less.pool=2"
+    session = opened(f"{query}&window.rows=[8,40]&window.cols=[20,60]", it=path)
+    found = run(tmp_path, {"it": session}, path)["it"]
+    same(found, "image", session.answer.run.image)
+    same(found, "signals", inspect(session.answer, 3, 4).signals)
+    assert session.answer.capture.shape == (16, 20)
+
+
 def test_methods_are_compared_by_a_script_alike(tmp_path):
     query = (
         "page=Compare&comparison.methods=[%22peak%22,%22kde%22,%22tracking%22,%22oracle%22]"
@@ -179,6 +197,14 @@ def test_methods_are_compared_by_a_script_alike(tmp_path):
 @pytest.fixture(scope="module")
 def car() -> Answer:
     return opened("").answer
+
+
+@pytest.mark.parametrize(("page", "command"), ELSEWHERE.items())
+def test_pages_of_commands_name_them(page, command, car):
+    script, usual = (script_of(car, State(page=each)) for each in (page, "Explore"))
+    first, *rest = script.splitlines()
+    assert first == f'"""What firstphoton shows on Explore ({page}: {command}), found again."""'
+    assert rest == usual.splitlines()[1:]
 
 
 @pytest.mark.parametrize("name", sorted(defaults().keys() - NOT_CODE))
