@@ -21,8 +21,8 @@ from bokeh.plotting import figure
 
 MARKS = "marks"
 RATE_TITLES = {
-    "photons per pulse": "Rate, with undone what early photons hid (Coates)",
-    "photons": "Rate: as counted, since no pile-up is known to be undone",
+    "photons per pulse": "Rate, pile-up undone (Coates)",
+    "photons": "Rate, as counted: no pile-up to undo",
 }
 CANDIDATE_HEIGHT = 0.05
 """Of the candidates' marks within a plot: near the bottom, where no legend hides them."""

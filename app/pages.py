@@ -14,7 +14,8 @@ from app.store import Answer
 
 # As high as its parts, and not as wide as all of them side by side: that is more than a phone.
 HOLDER = """
-:host { flex: none !important; height: auto !important; min-width: 0 !important; }
+:host { flex: none !important; height: auto !important; max-height: none !important;
+  min-width: 0 !important; }
 """
 
 

@@ -15,7 +15,7 @@ BREAK_PX = 900
 
 def unrolled(break_px: int, height: str = "auto") -> str:
     """Style of a part that keeps a height of its own where parts follow each other."""
-    kept = f"height: {height} !important; flex: none !important;"
+    kept = f"height: {height} !important; max-height: none !important; flex: none !important;"
     return f"@media (max-width: {break_px}px) {{ :host {{ {kept} }} }}"
 
 
@@ -26,7 +26,8 @@ def board(least_px: int, rest_px: int, break_px: int) -> str:
   gap: 10px; flex: none !important; height: max({least_px}px, calc(100vh - {rest_px}px)) !important;
 }}
 @media (max-width: {break_px}px) {{
-  :host {{ display: flex !important; flex-direction: column; height: auto !important; }}
+  :host {{ display: flex !important; flex-direction: column; height: auto !important;
+    max-height: none !important; }}
 }}
 """
 

@@ -450,6 +450,25 @@ def test_units_change_axes_and_tables_and_the_pointer_reads_all(page):
     page.mouse.move(5, 5)
 
 
+# -- a phone ---------------------------------------------------------------------------------------
+
+
+def test_a_phone_shows_all_parts_below_each_other(open_watched, address, troubles):
+    page = open_watched(f"{address}?source=building&page=Inspect", width=390, height=844)
+    told = page.get_by_text("64 × 64 pixels, 334 bins")
+    for subject, n_plots in (("Capture", 3), ("Region", 1), ("Pins", 3), ("Pixel", 4)):
+        button(page, subject).click()
+        plots = page.locator(".bk-Figure").filter(visible=True)
+        expect(plots).to_have_count(n_plots)
+        bottom = 0.0
+        for box in [*(plot.bounding_box() for plot in plots.all()), told.bounding_box()]:
+            assert 0 <= box["x"] < box["x"] + box["width"] <= 390
+            assert box["y"] >= bottom
+            bottom = box["y"] + box["height"]
+    page.close()
+    assert troubles == []
+
+
 # -- the capture as a whole ------------------------------------------------------------------------
 
 
