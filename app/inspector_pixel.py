@@ -184,7 +184,6 @@ class Sight:
 
     def _draw(self, answer: Answer, found: Seen) -> None:
         self._session.recover(self)
-        self._is_behind = False
         if not self._is_on_screen or answer is not self._session.answer:
             return  # the user has moved on
         unit = self._session.state.unit
@@ -193,6 +192,7 @@ class Sight:
             for each in self._cards:
                 each.visible = True
         self._drawn = answer, found
+        self._is_behind = False
         self._tell_soon()
 
     def _tell(self) -> None:

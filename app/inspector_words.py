@@ -256,7 +256,7 @@ def accuracy_titles(found: Accuracy) -> tuple[str, str, str]:
     if found.against == "truth":
         title, unit = "Accuracy against pulses taken", "Within 3 bins of the truth"
     else:
-        title = "Agreement with the answers to all pulses, against pulses taken: not accuracy"
+        title = "Agreement with all pulses: not accuracy"
         unit = "Within 3 bins of them"
     across = "Share of the pulses" if found.n_pulses is None else "Pulses"
     return title, across, unit

@@ -524,7 +524,7 @@ def test_accuracy_is_studied_and_a_bar_tells_how_far(whole):
     assert told == sorted(told)
     assert any(0 < each < 100 for each in told)
     expect(done).to_be_visible()
-    title = "Accuracy against pulses" if has_truth else "Agreement with the answers to all pulses"
+    title = "Accuracy against pulses" if has_truth else "Agreement with all pulses"
     near, taken = (drawn(page, title, "points", column) for column in ("value", "pulses"))
     expected = inspection.accuracy_over_pulses(
         whole.capture, (SHARES[4], 1.0), "tracking", core.TrackingParameters()

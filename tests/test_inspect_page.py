@@ -381,6 +381,20 @@ def test_region_pins_and_capture_are_taken_away_as_shown(name, request):
         part.view.show(False)
 
 
+def test_a_region_that_is_not_drawn_yet_is_not_taken_away_as_if_it_were(facade, monkeypatch):
+    part = Sight(facade, "region")
+    part.view.show(True)
+    facade.state.region = rectangle((40, 44), (30, 33))
+    eventually(lambda: part._facts.facts)
+    buttons = part.view.main.select(Download)
+    assert {each._show().subject.part for each in buttons} == {"rows40-44_cols30-33"}
+    monkeypatch.setattr(part._jobs, "submit", lambda *_: None)  # it takes long
+    facade.state.region = rectangle((1, 2), (3, 4))
+    for each in buttons:
+        with pytest.raises(ValueError, match="nothing is drawn here yet"):
+            each._show()
+
+
 # -- the capture as a whole ------------------------------------------------------------------------
 
 
