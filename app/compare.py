@@ -221,7 +221,7 @@ class Compare:
         self._scale = ScaleBar()
         self._remarks = Sentence(sizing_mode="stretch_width", margin=(2, 0))
         self._curves = CurvePlot()
-        self._facts = Facts(sizing_mode="stretch_width", margin=(2, 0))
+        self._facts = Facts(sizing_mode="stretch_width")
         self._reliability = ReliabilityPlot()
         self._reliability.pane.object.min_border_top = CORNER_PX
         self._no_reliability = Sentence(text=ranking_words.RELIABILITY_UNKNOWN, margin=12)

@@ -369,12 +369,16 @@ def numbers_on_show(session: Session) -> Shown:
 
 def range_image(session: Session) -> Shown:
     """The session's image, whatever it shows."""
-    answer, state = session.answer, session.state
-    least = state.viewing.least_confidence
-    files = image_files(answer, state.image, least, session.image.figure)
-    what = "range image" if state.image == "Estimate" else f"{state.image} image"
-    subject = viewed(session, explored(session), state.viewing)
-    return Shown(subject, what.lower(), files)
+    kind = session.state.image
+    what = "range image" if kind == "Estimate" else f"{kind} image".lower()
+    return image_on_show(session, kind, session.image.figure, what)
+
+
+def image_on_show(session: Session, kind: str, figure: Any, what: str) -> Shown:
+    """An image of the session's answer, as `app.exports.image_files` takes it."""
+    viewing = session.state.viewing
+    files = image_files(session.answer, kind, viewing.least_confidence, figure)
+    return Shown(viewed(session, explored(session), viewing), what, files)
 
 
 def cloud_on_show(session: Session) -> Shown:

@@ -12,8 +12,7 @@ import panel_material_ui as pmui
 
 from app import inspector_words
 from app.controls import Chips, PixelKeys, Sentence
-from app.downloads import CORNER_PX, IMAGE, Shown, downloadable, explored, viewed
-from app.exports import image_files
+from app.downloads import CORNER_PX, IMAGE, Shown, downloadable, image_on_show
 from app.inspector_capture import Whole
 from app.inspector_pins import Pins, pin_colors
 from app.inspector_pixel import BREAK_PX, COLUMN, FILLING, Sight, framed
@@ -259,11 +258,8 @@ class Inspector:
 
     def _shown(self) -> Shown:
         """The map, as it is taken away."""
-        session, state = self._session, self._session.state
-        least = state.viewing.least_confidence
-        files = image_files(session.answer, state.map, least, self._navigator.figure)
-        subject = viewed(session, explored(session), state.viewing)
-        return Shown(subject, f"map {state.map}", files)
+        kind = self._session.state.map
+        return image_on_show(self._session, kind, self._navigator.figure, f"map {kind}")
 
     # What is drawn
 

@@ -61,7 +61,7 @@ class Whole:
         )
         self._accuracy = Marked(inspector_plots.accuracy())
         self._study = Study(session, self._steps, "shares of the pulses")
-        self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width", margin=0)
+        self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")
         self._light = Sentence(sizing_mode="stretch_width", margin=0)
         (pulses,) = (each for each in fields(Less) if each.name == "pulses")
         self._pulses = Knob.of(cast(Number, spec_of(pulses)), 1.0, inspector_words.PULSES_HELP)

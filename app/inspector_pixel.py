@@ -94,7 +94,7 @@ class Sight:
                 self._plots.panes, ("counts", "rate", "residual and enhanced"), strict=True
             )
         ]
-        self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width", margin=0)
+        self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")
         self._remark = Sentence(
             live=True, min_height=LINE_PX, sizing_mode="stretch_width", margin=0
         )

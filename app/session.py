@@ -87,7 +87,7 @@ class Session:
         self.state = State(**self._own)
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
         self.figures = Facts(timed=True, min_height=HEADLINE_PX, sizing_mode="stretch_width")
-        self.numbers = Facts(min_height=2 * FACTS_PX, sizing_mode="stretch_width", margin=0)
+        self.numbers = Facts(min_height=2 * FACTS_PX, sizing_mode="stretch_width")
         self.announce: Callable[[Answer], None] = lambda answer: None
         self.complain: Callable[[str], None] = lambda sentence: None
         self.waiting: Callable[[bool], None] = lambda is_waiting: None
@@ -308,7 +308,7 @@ class Session:
     ) -> None:
         """Tell the page of an error, and stay usable; `of` which part of the page, if of one."""
         log.warning("a request failed", exc_info=error)
-        self._failures.pop(of, None)
+        self._failures.pop(of, None)  # it is the latest again
         self._failures[of] = told(error)
         self.complain(self._failures[of])
 

@@ -208,7 +208,7 @@ def added(session):
 
 def reported(session):
     part = Whole(session)
-    part._is_on_screen = True
+    part.view.show(True)
     return part._follow, lambda: part._facts.facts
 
 

@@ -154,18 +154,20 @@ def test_a_real_capture_is_found_again(tmp_path, real_capture):
 
 
 def test_a_part_of_a_large_capture_is_found_again(tmp_path, monkeypatch):
-    """In the light of the whole, and so with the same confidence."""
+    """In the light of the whole, which tells another confidence than the part's own would."""
     scene = core.scenes["building"]()
     whole = core.simulate(scene, scene.acquisition, core.Flux(sbr=0.5))
     path = tmp_path / "large.zarr"
     dataset(whole)[["counts"]].chunk(row=16, col=16).to_zarr(path, consolidated=False)
     monkeypatch.setenv(LIMIT, "1")
-    query = "source=it&page=Inspect&map=Confidence&pixel=[3,4]&less.pool=2"
+    query = "source=it&page=Inspect&map=Confidence&pixel=[3,4]"
     session = opened(f"{query}&window.rows=[8,40]&window.cols=[20,60]", it=path)
     found = run(tmp_path, {"it": session}, path)["it"]
     same(found, "image", session.answer.run.image)
     same(found, "signals", inspect(session.answer, 3, 4).signals)
-    assert session.answer.capture.shape == (16, 20)
+    assert session.answer.capture.shape == (32, 40)
+    alone = core.estimate(replace(session.answer.capture), "tracking")
+    assert not np.array_equal(alone.confidence, found["image confidence"])
 
 
 def test_methods_are_compared_by_a_script_alike(tmp_path):
