@@ -27,8 +27,15 @@ from app.connection import LINGER_S, serving_options
 from app.controls import Sentence
 from app.jobs import LONG
 from app.layout import build_page
-from app.opening import Answers, send_heads_first
-from app.serving import TOKEN_VARIABLE, Access, Headers, guard, keep_tracebacks, send_early_changes
+from app.server.access import (
+    TOKEN_VARIABLE,
+    Access,
+    Headers,
+    guard,
+    keep_tracebacks,
+    send_early_changes,
+)
+from app.server.opening import Answers, send_heads_first
 from app.state import Light, Reading
 from app.store import Source, built_in_sources, file_source
 from app.uploads import MAX_UPLOAD_BYTES, Uploads

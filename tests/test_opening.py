@@ -10,10 +10,11 @@ import panel_material_ui as pmui
 import pytest
 from tornado.httpclient import AsyncHTTPClient
 
-from app import opening, words
+from app import words
 from app.controls import Sentence
-from app.opening import Answers, PageHandler, send_heads_first
-from app.serving import Headers
+from app.server import opening
+from app.server.access import Headers
+from app.server.opening import Answers, PageHandler, send_heads_first
 
 
 @pytest.fixture(autouse=True)

@@ -15,7 +15,7 @@ import pytest
 from playwright.sync_api import expect
 
 from app.connection import serving_options
-from app.serving import TOKEN_VARIABLE, Access
+from app.server.access import TOKEN_VARIABLE, Access
 from tests.browser import ROOT, serving
 from tests.wire import token_in
 

@@ -1,0 +1,1 @@
+"""The server: who is served, what, and how much of it."""
