@@ -23,22 +23,16 @@ from tornado.netutil import bind_sockets
 
 import core
 from app import collector, latency, words
-from app.connection import LINGER_S, serving_options
+from app.connection import LINGER_S
 from app.controls import Sentence
 from app.jobs import LONG
 from app.layout import build_page
-from app.server.access import (
-    TOKEN_VARIABLE,
-    Access,
-    Headers,
-    guard,
-    keep_tracebacks,
-    send_early_changes,
-)
-from app.server.opening import Answers, send_heads_first
+from app.server.access import TOKEN_VARIABLE, Access
+from app.server.documents import keep_tracebacks, send_early_changes
+from app.server.serve import server_of
 from app.state import Light, Reading
 from app.store import Source, built_in_sources, file_source
-from app.uploads import MAX_UPLOAD_BYTES, Uploads
+from app.uploads import Uploads
 from core.readers import READERS
 
 log = logging.getLogger(__name__)
@@ -54,7 +48,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "captures", nargs="*", type=Path, help=f"capture files to open ({', '.join(READERS)})"
     )
-    parser.add_argument("--port", type=int, default=5006, help="default: 5006; 0 takes a free one")
+    parser.add_argument(
+        "--port", type=port_number, default=5006, help="default: 5006; 0 takes a free one"
+    )
     parser.add_argument("--address", default="127.0.0.1", help="default: this machine only")
     parser.add_argument(
         "--origin",
@@ -81,23 +77,12 @@ def main(arguments: list[str] | None = None) -> int:
             parser.error(str(error))
     sources, uploads = given | built_in_sources(), Uploads()
     pn.extension("vtk")
-    send_heads_first()
     try:
         port = chosen.port or free_port(chosen.address)
         token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
         access = Access.of(chosen.address, port, chosen.origin, token)
-        server = pn.serve(
-            {"/": lambda: page_for(sources, uploads)},
-            port=port,
-            address=chosen.address,
-            websocket_origin=sorted(access.hosts),
-            websocket_max_message_size=2 * MAX_UPLOAD_BYTES,
-            transforms=[Headers, Answers],
-            title="firstphoton",
-            verbose=False,
-            show=False,
-            start=False,
-            **serving_options(chosen.linger),
+        server = server_of(
+            lambda: page_for(sources, uploads), access, chosen.address, port, chosen.linger
         )
     except ValueError as error:
         parser.error(str(error))
@@ -108,7 +93,6 @@ def main(arguments: list[str] | None = None) -> int:
     # An exit that is raised wherever the thread happens to be can be lost there: like Ctrl+C, by
     # Panel, this ends the loop below.
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
-    guard(server._tornado, access)
     print("Compiling what is not compiled yet ...", flush=True)
     core.warm_up()
     latency.tune()
@@ -125,6 +109,13 @@ def main(arguments: list[str] | None = None) -> int:
     server.stop()
     LONG.is_closed = True
     return 0
+
+
+def port_number(text: str) -> int:
+    """A port as the command line names it."""
+    if not (text.isdecimal() and int(text) < 2**16):
+        raise argparse.ArgumentTypeError(f"{text!r} is not accepted: give 0 to {2**16 - 1}.")
+    return int(text)
 
 
 def free_port(address: str) -> int:

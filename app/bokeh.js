@@ -10,6 +10,9 @@ const DRAWN_MS = 500;
 // By then a browser that gives back one canvas has given back all.
 const RESTORED_MS = 200;
 
+// The server refuses a page's connection by this code if the page's session has ended (RFC 6455).
+const SESSION_ENDED = 1008;
+
 // A page less wide begins without its sidebar, which would cover what it controls.
 const NARROW_PX = 900;
 
@@ -149,6 +152,20 @@ const keepNewest = (data) => {
   session._handle_patch = function (message) {
     take.call(this, message);
     goOn(this);
+  };
+}
+
+{
+  // A session ends if its page takes long to connect, on a very slow line for example. The page then
+  // has nothing to show: load it again.
+  const connection = Bokeh.require("client/connection").ClientConnection.prototype;
+  const { connect } = connection;
+  connection.connect = function () {
+    const connected = connect.call(this);
+    connected.catch(({ message }) => {
+      if (message.includes(` ${SESSION_ENDED} `)) location.reload();
+    });
+    return connected;
   };
 }
 

@@ -32,8 +32,7 @@ def serving_options(linger_s: float = LINGER_S) -> dict[str, Any]:
     require("--linger", linger_s, accepted, f"{LEAST_LINGER_S:g} to {MOST_LINGER_S:g} seconds")
     return {
         "unused_session_lifetime_milliseconds": round(1000 * linger_s),
-        # A quarter more at most is waited for the next look.
-        "check_unused_sessions_milliseconds": max(100, round(250 * linger_s)),
+        "check_unused_sessions_milliseconds": 1000,
     }
 
 

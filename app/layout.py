@@ -42,6 +42,7 @@ from app.takeaway import TakeAway
 from app.theme import DARK, LIGHT, STYLES
 from app.tradeoff import Tradeoff
 from app.uploads import MAX_UPLOAD_BYTES, Uploads
+from app.widgets.file_input import FileInput
 from core import PRESETS, TrackingParameters
 from core.experiments.tradeoff import Point
 from core.readers import READERS
@@ -177,7 +178,8 @@ class Layout:
             state.source,
             "A built-in scene to simulate, or a capture from a file.",
         )
-        self._file = pmui.FileInput(
+        self._file = FileInput(
+            lambda reason: self._complain(words.not_uploaded(reason, MAX_UPLOAD_BYTES)),
             label="Open a capture file",
             accept=",".join(READERS),
             max_file_size=MAX_UPLOAD_BYTES,

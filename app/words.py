@@ -244,6 +244,14 @@ def not_restored(refused: list[str]) -> str:
     return f"The address asks for what cannot be had: {' '.join(refused)} The rest is as it says."
 
 
+def not_uploaded(reason: str, most_bytes: int) -> str:
+    """Why a file did not arrive, and what to do."""
+    return (
+        f"Could not upload the file: {reason.rstrip('.')}. Files of up to {most_bytes >> 20} MiB "
+        "can be uploaded; a larger one opens by its path, when the server is started with it."
+    )
+
+
 def not_kept(error: ValueError | OSError) -> str:
     """Why a file could not be opened here, and what to do."""
     if isinstance(error, ValueError):

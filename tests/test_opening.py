@@ -21,7 +21,7 @@ from app.server.opening import Answers, PageHandler, send_heads_first
 def as_before(monkeypatch):
     """No head is known yet, and other tests' servers are as they would be."""
     kept = list(opening.per_app_patterns)
-    monkeypatch.setattr(PageHandler, "head", "")
+    monkeypatch.setattr(PageHandler, "known_head", "")
     send_heads_first()
     yield
     opening.per_app_patterns[:] = kept

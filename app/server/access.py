@@ -7,18 +7,13 @@ serves beside them. Bokeh and Panel know of users too, but their static files ar
 from __future__ import annotations
 
 import hmac
+import math
 import secrets
-import sys
 from dataclasses import dataclass
-from html import escape
 from ipaddress import ip_address
 from typing import Any
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import parse_qsl, unquote, urlencode, urlsplit
 
-from bokeh.protocol.message import Message
-from bokeh.server.connection import ServerConnection
-from bokeh.server.session import ServerSession
-from panel.io.state import set_curdoc, state
 from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.routing import Matcher, Rule
 from tornado.web import (
@@ -29,6 +24,16 @@ from tornado.web import (
     decode_signed_value,
 )
 
+from app.server.limits import Connections, WrongTokens
+from app.server.messages import (
+    ASK,
+    FOREIGN,
+    MALFORMED,
+    WRONG,
+    refusal,
+    token_form,
+    too_many_tokens,
+)
 from core.checks import require
 
 TOKEN_VARIABLE = "FIRSTPHOTON_TOKEN"
@@ -57,31 +62,6 @@ HEADERS = {
     ),
 }
 
-PAGE = """<!DOCTYPE html>
-<html lang="en"><meta charset="utf-8"><title>firstphoton</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>
-:root {{ color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif }}
-body {{ max-width: 26em; margin: 15vh auto; padding: 0 1em }}
-input, button {{ font: inherit; padding: .3em .6em }}
-</style>
-<h1>firstphoton</h1>
-<p role="{role}">{sentence}</p>{form}
-</html>"""
-
-FORM = """
-<form method="post">
-<label>Token <input name="token" type="password" autocomplete="current-password" autofocus required>
-</label> <button>Enter</button>
-</form>"""
-
-ASK = "This server asks for its token. It is in the link that was printed where it was started."
-WRONG = "That is not the token of this server. It was printed where the server was started."
-FOREIGN = (
-    "This server answers under the addresses alone that it was told. Where it was started, "
-    "--origin names others."
-)
-
 
 def is_loopback(address: str) -> bool:
     """Whether only this machine reaches an address."""
@@ -89,6 +69,22 @@ def is_loopback(address: str) -> bool:
         return address == "localhost" or ip_address(address).is_loopback
     except ValueError:
         return False
+
+
+def is_cross_site(request: HTTPServerRequest) -> bool:
+    """Whether a page of another site sends a request, other than by a link that opens this one.
+
+    An image or a script of a foreign page brings no Origin; browsers say so in other headers (W3C,
+    Fetch Metadata Request Headers), which a page cannot change.
+    """
+    said = request.headers.get
+    is_link = said("Sec-Fetch-Mode") == "navigate" and said("Sec-Fetch-Dest") == "document"
+    return said("Sec-Fetch-Site", "none") not in ("same-origin", "none") and not is_link
+
+
+def is_well_formed(request: HTTPServerRequest) -> bool:
+    """Whether a path has printable characters only, as the name of each file here has."""
+    return unquote(request.path, errors="replace").isprintable()
 
 
 @dataclass(frozen=True)
@@ -154,9 +150,8 @@ class Access:
     def is_from_here(self, request: HTTPServerRequest) -> bool:
         """Whether a request is for this server, and comes from its own pages or from no page."""
         origin = request.headers.get("Origin")
-        return request.host.lower() in self.hosts and (
-            origin is None or urlsplit(origin).netloc.lower() in self.hosts
-        )
+        is_ours = origin is None or urlsplit(origin).netloc.lower() in self.hosts
+        return request.host.lower() in self.hosts and is_ours and not is_cross_site(request)
 
     def accepts(self, token: str) -> bool:
         """Whether this is the token."""
@@ -172,19 +167,27 @@ def _place(host: str, port: int) -> str:
 class Guard(Matcher):
     """Matches the requests that `Gate` is to answer, instead of whatever they ask for."""
 
-    def __init__(self, access: Access) -> None:
-        self._access = access
+    def __init__(self, access: Access, connections: Connections) -> None:
+        self._access, self._connections = access, connections
+        self.wrong_tokens = WrongTokens()
         # A cookie is valid for one run of the server. Browsers share cookies between ports.
         self._secret = secrets.token_bytes(32)
         self._cookie = f"firstphoton-{secrets.token_hex(4)}"
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
         """None for a request that is welcome."""
-        is_welcome = self._access.is_from_here(request) and (
+        self._connections.completed(request)
+        is_welcome = self.refusal(request) is None and (
             self._access.token is None
             or (self._is_known(request) and "token" not in request.query_arguments)
         )
         return None if is_welcome else {}
+
+    def refusal(self, request: HTTPServerRequest) -> tuple[int, str] | None:
+        """Status and sentence for a request that no token helps; None for others."""
+        if not self._access.is_from_here(request):
+            return 403, FOREIGN
+        return None if is_well_formed(request) else (400, MALFORMED)
 
     def _is_known(self, request: HTTPServerRequest) -> bool:
         kept = request.cookies.get(self._cookie)
@@ -212,15 +215,17 @@ class Gate(RequestHandler):
         self._access, self._guard = access, guard
 
     def prepare(self) -> None:
-        """Refuse whoever is not from here."""
-        if not self._access.is_from_here(self.request):
-            self._answer(FOREIGN, "")
+        """Refuse what no token helps."""
+        refused = self._guard.refusal(self.request)
+        if refused is not None:
+            status, sentence = refused
+            self._answer(refusal(sentence), status)
 
     def get(self) -> None:
         """Take the token out of the address, or ask for it."""
         token = self.get_query_argument("token", None)
         if token is None:
-            self._answer(ASK, FORM)
+            self._answer(token_form(ASK))
         else:
             self._try(token)
 
@@ -229,9 +234,17 @@ class Gate(RequestHandler):
         self._try(self.get_body_argument("token", ""))
 
     def _try(self, token: str) -> None:
-        if not self._access.accepts(token):
-            self._answer(WRONG, FORM)
+        address, wrong = str(self.request.remote_ip), self._guard.wrong_tokens
+        delay_s = wrong.delay_s(address)
+        if delay_s > 0:
+            self.set_header("Retry-After", str(math.ceil(delay_s)))
+            self._answer(refusal(too_many_tokens(math.ceil(delay_s))), 429)
             return
+        if not self._access.accepts(token):
+            wrong.add(address)
+            self._answer(token_form(WRONG))
+            return
+        wrong.forgive(address)
         self._guard.admit(self)
         others = [
             pair
@@ -242,16 +255,15 @@ class Gate(RequestHandler):
         path = "/" + self.request.path.lstrip("/\\")
         self.redirect(path + (f"?{urlencode(others)}" if others else ""), status=303)
 
-    def _answer(self, sentence: str, form: str) -> None:
-        self.set_status(403)
+    def _answer(self, page: str, status: int = 403) -> None:
+        self.set_status(status)
         self.set_header("Cache-Control", "no-store")
-        role = "alert" if sentence != ASK else "note"
-        self.finish(PAGE.format(sentence=escape(sentence), form=form, role=role))
+        self.finish(page)
 
 
-def guard(application: Application, access: Access) -> None:
+def guard(application: Application, access: Access, connections: Connections) -> None:
     """Put the rule before all others of an application."""
-    rule = Guard(access)
+    rule = Guard(access, connections)
     known = {"access": access, "guard": rule}
     application.default_router.rules.insert(0, Rule(rule, Gate, known))
 
@@ -266,39 +278,3 @@ class Headers(OutputTransform):
         for name, value in HEADERS.items():
             headers[name] = value
         return status_code, headers, chunk
-
-
-def keep_tracebacks() -> None:
-    """Tell what goes wrong in a callback of a Bokeh model by its page, as Panel does of its own.
-
-    Bokeh sends the traceback to the browser, which shows it to nobody but the curious.
-    """
-    ServerConnection.error = _told
-
-
-def _told(connection: ServerConnection, message: Message[Any], text: str) -> Message[Any]:
-    failure = sys.exception()
-    if failure is not None:
-        with set_curdoc(connection.session.document):
-            state._handle_exception(failure)
-    answer = connection.protocol.create("ERROR", message.header["msgid"], "It is told by the page.")
-    answer.content["traceback"] = None
-    return answer
-
-
-def send_early_changes() -> None:
-    """Send what changes on a page between its first picture and the moment it is all drawn.
-
-    The browser has then pulled the document, but Panel takes it for not connected before it says
-    that it has drawn it, and drops what changes until then.
-    """
-    ServerSession._handle_pull = _connecting(ServerSession._handle_pull)
-
-
-def _connecting(pull: Any) -> Any:
-    async def pull_now(session: ServerSession, *arguments: Any) -> Any:
-        document = await pull(session, *arguments)
-        state._connected[session.document] = True  # no sooner: the document goes first
-        return document
-
-    return pull_now

@@ -1,0 +1,69 @@
+"""A server of one page, with everything in place that bounds and guards it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import panel as pn
+from bokeh.server.server import Server
+
+from app.connection import LINGER_S, serving_options
+from app.server.access import Access, Headers, guard
+from app.server.limits import HTTP_LIMITS, Connections
+from app.server.opening import Answers
+from app.server.routes import MOST_MESSAGE_BYTES, restrict
+from app.server.sessions import Bounds, Sessions
+
+
+def server_of(
+    build_page: Callable[[], Any],
+    access: Access,
+    address: str,
+    port: int,
+    linger_s: float = LINGER_S,
+    bounds: Bounds | None = None,
+) -> Server:
+    """A server that is not started yet.
+
+    Parameters
+    ----------
+    build_page : callable
+        Called once for each session.
+    access : Access
+    address : str
+        Where to listen.
+    port : int
+    linger_s : float
+        Seconds for which a session is kept after its page was closed or cut off.
+    bounds : Bounds, optional
+        On all sessions together.
+
+    Raises
+    ------
+    ValueError
+        If `linger_s` is out of bounds.
+    OSError
+        If the port cannot be had.
+    """
+    server = pn.serve(
+        {"/": build_page},
+        port=port,
+        address=address,
+        websocket_origin=sorted(access.hosts),
+        websocket_max_message_size=MOST_MESSAGE_BYTES,
+        http_server_kwargs=dict(HTTP_LIMITS),
+        transforms=[Headers, Answers],
+        title="firstphoton",
+        verbose=False,
+        show=False,
+        start=False,
+        **serving_options(linger_s),
+    )
+    connections, (context,) = Connections(), server._tornado.applications.values()
+    sessions = Sessions(context, bounds)
+    connections.bound(server._http)
+    restrict(server._tornado, sessions)
+    guard(server._tornado, access, connections)
+    sessions.start()
+    return server

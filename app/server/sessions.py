@@ -1,0 +1,142 @@
+"""Bounds on the sessions of a server: how many, how much memory, and for how long unconnected.
+
+Panel builds a session for each request of a page, whether or not a browser connects to it
+afterwards. A connected session lasts as long as its connection, and for `app.connection.LINGER_S`
+longer, so that a page can be reloaded; one that no browser ever connected to ends much sooner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import monotonic
+from weakref import WeakSet
+
+import psutil
+from bokeh.server.contexts import ApplicationContext
+from bokeh.server.session import ServerSession
+from tornado.ioloop import PeriodicCallback
+
+LOOK_S = 2.0
+"""Time between two looks at the sessions."""
+
+RETRY_S = 10
+"""Time after which a browser that found no room asks again."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the sessions of a server may take.
+
+    Parameters
+    ----------
+    sessions : int
+        Sessions at once.
+    unconnected : int
+        Of them, those that no browser has connected to yet.
+    unconnected_s : float
+        Seconds for which a session waits for its browser.
+    memory_bytes : int
+        Resident memory of the server beyond which it opens no further session. By default half of
+        the machine's.
+    """
+
+    sessions: int = 100
+    unconnected: int = 32
+    unconnected_s: float = 20.0
+    memory_bytes: int = field(default_factory=lambda: psutil.virtual_memory().total // 2)
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process."""
+    return int(psutil.Process().memory_info().rss)
+
+
+class Sessions:
+    """The sessions of one application, within bounds.
+
+    Parameters
+    ----------
+    context : ApplicationContext
+        Where Bokeh keeps them.
+    bounds : Bounds, optional
+    memory : callable
+        Bytes in use.
+    clock : callable
+        Time in seconds.
+    """
+
+    def __init__(
+        self,
+        context: ApplicationContext,
+        bounds: Bounds | None = None,
+        memory: Callable[[], int] = resident_bytes,
+        clock: Callable[[], float] = monotonic,
+    ) -> None:
+        self._context = context
+        self._bounds = bounds or Bounds()
+        self._memory, self._clock = memory, clock
+        self._connected: WeakSet[ServerSession] = WeakSet()
+        self._n_opening = 0
+        self._looked_s = clock()
+        self._looks = PeriodicCallback(self.look, 1000 * LOOK_S)
+
+    def start(self) -> None:
+        """Begin to end sessions that no browser connects to."""
+        self._looks.start()
+
+    def has(self, session_id: str) -> bool:
+        """Whether there is a session of this name."""
+        return any(session.id == session_id for session in self._context.sessions)
+
+    def connected(self, session: ServerSession) -> None:
+        """Note that a browser has connected."""
+        self._connected.add(session)
+
+    @contextmanager
+    def opening(self, session_id: str | None) -> Iterator[bool]:
+        """Reserve room for a session while its page is built; yields whether there is any.
+
+        A session that exists already takes no further room.
+        """
+        if session_id is not None and self.has(session_id):
+            yield True
+            return
+        has_room = self._has_room()
+        self._n_opening += has_room
+        try:
+            yield has_room
+        finally:
+            self._n_opening -= has_room
+
+    def look(self) -> None:
+        """End the sessions that have waited too long for their browser."""
+        now_s = self._clock()
+        is_late = now_s - self._looked_s > 2 * LOOK_S
+        self._looked_s = now_s
+        if is_late:  # the server was busy: connections may wait that it has not accepted yet
+            return
+        for session in self._unconnected():
+            if session.milliseconds_since_last_unsubscribe > 1000 * self._bounds.unconnected_s:
+                session.request_expiration()
+
+    def _unconnected(self) -> list[ServerSession]:
+        return [each for each in self._context.sessions if each not in self._connected]
+
+    def _has_room(self) -> bool:
+        """Whether one more session fits; sessions whose page was closed make room for it."""
+        bounds, n_unconnected = self._bounds, len(self._unconnected()) + self._n_opening
+        closed = [
+            each
+            for each in self._context.sessions
+            if each in self._connected and each.connection_count == 0
+        ]
+        closed.sort(key=lambda each: each.milliseconds_since_last_unsubscribe, reverse=True)
+        surplus = len(list(self._context.sessions)) + self._n_opening + 1 - bounds.sessions
+        is_out_of_memory = self._memory() > bounds.memory_bytes
+        for each in closed[: None if is_out_of_memory else max(surplus, 0)]:
+            each.request_expiration()
+        return (
+            not is_out_of_memory and surplus <= len(closed) and n_unconnected < bounds.unconnected
+        )

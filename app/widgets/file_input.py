@@ -1,0 +1,67 @@
+"""A file input whose uploads are bounded on the server, too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import panel_material_ui as pmui
+
+from core.checks import require
+
+PART_BYTES = 4 * 2**20
+"""A file arrives in parts of this size, each in a message of its own."""
+
+_LONGEST_NAME = 1024
+
+
+class FileInput(pmui.FileInput):
+    """Takes one file at a time, of at most `max_file_size` bytes.
+
+    The browser checks the size first, but what arrives is whatever a client sends.
+
+    Parameters
+    ----------
+    complain : callable
+        Called with the reason where a file cannot be taken.
+    """
+
+    def __init__(self, complain: Callable[[str], None], **params: Any) -> None:
+        super().__init__(chunk_size=PART_BYTES, **params)
+        self._complain = complain
+
+    def _handle_msg(self, msg: Mapping[str, Any]) -> None:
+        try:
+            status = msg.get("status")
+            if status == "error":  # the browser has refused the file, or cannot read it
+                raise ValueError(str(msg.get("error"))[:_LONGEST_NAME])
+            if status == "initializing":
+                self._discard()
+            elif status == "upload_event":
+                self._require_part(msg)
+            super()._handle_msg(msg)
+        except Exception as error:  # a part may be malformed in many ways
+            self._discard()
+            self._send_msg({"status": "error", "error": str(error)})
+            self._complain(str(error))
+
+    def _require_part(self, part: Mapping[str, Any]) -> None:
+        """Raise ``ValueError`` unless this is a part of the one file that is being uploaded."""
+        name, data = part["name"], part["data"]
+        number, total = part["chunk"], part["total_chunks"]
+        is_name = isinstance(name, str) and len(name) <= _LONGEST_NAME
+        require("file name", str(name)[:80], is_name, f"up to {_LONGEST_NAME} characters")
+        most = math.ceil(self.max_file_size / PART_BYTES)
+        fits = isinstance(total, int) and 1 <= total <= most
+        require("parts of the file", total, fits, f"1 to {most}, each of {PART_BYTES:,} bytes")
+        fits = isinstance(number, int) and 1 <= number <= total
+        require("number of a part", number, fits, f"1 to {total}")
+        fits = isinstance(data, bytes) and len(data) <= PART_BYTES
+        require("content of a part", type(data).__name__, fits, f"at most {PART_BYTES:,} bytes")
+        is_one = not self._buffer and all(kept == name for kept in self._file_buffer)
+        require("file name", name, is_one, "one file at a time")
+
+    def _discard(self) -> None:
+        self._file_buffer.clear()
+        self._buffer.clear()

@@ -1,0 +1,16 @@
+"""The app with room for a few sessions only, and little patience: ``python -m tests.crowded``."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+
+from app import __main__ as started
+from app.server.serve import server_of
+from app.server.sessions import Bounds
+
+BOUNDS = Bounds(sessions=4, unconnected=3, unconnected_s=4.0)
+
+if __name__ == "__main__":
+    started.server_of = partial(server_of, bounds=BOUNDS)
+    sys.exit(started.main())
