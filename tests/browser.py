@@ -63,13 +63,18 @@ def launch(kind: BrowserType) -> Browser:
 
 
 @contextmanager
-def serving(*arguments: str | Path, module: str = "app", **environment: str) -> Iterator[str]:
-    """The app in a process of its own, at the address that is yielded."""
+def serving(
+    *arguments: str | Path, module: str = "app", log_path: Path | None = None, **environment: str
+) -> Iterator[str]:
+    """The app in a process of its own, at the address that is yielded.
+
+    What it prints goes to `log_path`, where one is given.
+    """
     port = _free_port()
     command = [sys.executable, "-m", module, "--port", str(port), *map(str, arguments)]
     # Into a file: a pipe that nobody reads would stop the server once it is full.
     with (
-        TemporaryFile("w+") as log,
+        TemporaryFile("w+") if log_path is None else log_path.open("w+") as log,
         subprocess.Popen(
             command,
             cwd=ROOT,

@@ -5,26 +5,23 @@ from __future__ import annotations
 import asyncio
 import re
 
-import panel as pn
 import panel_material_ui as pmui
 import pytest
 from tornado.httpclient import AsyncHTTPClient
 
 from app import words
+from app.__main__ import free_port
 from app.controls import Sentence
 from app.server import opening
-from app.server.access import Headers
-from app.server.opening import Answers, PageHandler, send_heads_first
+from app.server.access import Access
+from app.server.opening import Answers, PageHandler
+from app.server.serve import server_of
 
 
 @pytest.fixture(autouse=True)
 def as_before(monkeypatch):
-    """No head is known yet, and other tests' servers are as they would be."""
-    kept = list(opening.per_app_patterns)
+    """No head is known yet."""
     monkeypatch.setattr(PageHandler, "known_head", "")
-    send_heads_first()
-    yield
-    opening.per_app_patterns[:] = kept
 
 
 def asked(build, *queries):
@@ -36,8 +33,8 @@ def asked(build, *queries):
         return build(len(built))
 
     async def ask():
-        options = {"port": 0, "show": False, "start": False, "verbose": False, "title": "a page"}
-        server = pn.serve({"/": page}, transforms=[Headers, Answers], **options)
+        port = free_port("127.0.0.1")
+        server = server_of(page, Access.of("127.0.0.1", port, [], None), "127.0.0.1", port)
         server.start()
         pages = []
         for number, query in enumerate(queries, 1):
@@ -46,7 +43,7 @@ def asked(build, *queries):
             def take(part, parts=parts, number=number):
                 parts[len(built) == number] += part.decode()
 
-            at = f"http://localhost:{server.port}/{query}"
+            at = f"http://127.0.0.1:{port}/{query}"
             await AsyncHTTPClient().fetch(at, streaming_callback=take)
             pages.append((parts[False], parts[False] + parts[True]))
         server.stop()
@@ -67,7 +64,7 @@ def of_material(_number):
 def test_a_head_comes_before_its_page_is_built():
     (nothing, first), (head, second), (again, third) = asked(of_material, "", "", "?l=0.1")
     assert nothing == ""
-    assert "<title>a page</title>" in head
+    assert "<title>firstphoton</title>" in head
     assert "<script" in head
     assert "<body" not in head
     assert head == again

@@ -167,7 +167,7 @@ def test_a_wrong_token_is_refused(away, wrong):
     for status, headers, text in (asked, typed):
         assert status == 403
         assert "Set-Cookie" not in headers
-        assert "not the token" in text
+        assert "Wrong token" in text
 
 
 def test_a_typed_token_lets_in_and_leads_nowhere_else(away):

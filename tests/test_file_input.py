@@ -1,0 +1,94 @@
+"""A file arrives in parts: they are checked by the server, whatever the browser checks."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import expect
+
+from app.uploads import MAX_UPLOAD_BYTES
+from app.widgets.file_input import PART_BYTES, FileInput
+
+PART = {
+    "status": "upload_event",
+    "name": "a.npz",
+    "chunk": 1,
+    "total_chunks": 2,
+    "mime_type": "",
+    "data": b"one",
+}
+
+
+@pytest.fixture
+def complaints():
+    return []
+
+
+@pytest.fixture
+def given(complaints):
+    """A file input, whose messages come as from a browser."""
+    return FileInput(complaints.append, max_file_size=MAX_UPLOAD_BYTES)
+
+
+def send(given, **changes):
+    given._handle_msg(PART | changes)
+
+
+def test_a_file_in_parts_arrives_whole(given, complaints):
+    given._handle_msg({"status": "initializing"})
+    send(given)
+    send(given, chunk=2, data=b" two")
+    given._handle_msg({"status": "finished"})
+    assert (given.filename, given.value) == ("a.npz", b"one two")
+    assert complaints == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"total_chunks": MAX_UPLOAD_BYTES // PART_BYTES + 1}, "parts of the file = 26"),
+        ({"total_chunks": "2"}, "parts of the file"),
+        ({"total_chunks": 10**30}, "parts of the file"),
+        ({"chunk": 0}, "number of a part = 0"),
+        ({"chunk": 3}, "number of a part = 3"),
+        ({"data": bytes(PART_BYTES + 1)}, "content of a part"),
+        ({"data": 10**12}, "content of a part"),
+        ({"data": [1] * 10}, "content of a part"),
+        ({"name": "x" * 2000}, "file name"),
+        ({"name": 7}, "file name"),
+        ({"status": "unheard of"}, "unheard of"),
+        ({"status": "error", "error": "too large"}, "too large"),
+    ],
+)
+def test_what_no_browser_of_ours_sends_is_refused_and_the_next_file_arrives(
+    given, complaints, changes, said
+):
+    send(given)
+    send(given, **changes)
+    assert len(complaints) == 1
+    assert said in complaints[0]
+    assert not given.value
+    given._handle_msg({"status": "initializing"})
+    send(given, total_chunks=1, data=b"x")
+    given._handle_msg({"status": "finished"})
+    assert given.value == b"x"
+
+
+def test_files_that_are_begun_and_never_end_are_not_kept_side_by_side(given, complaints):
+    for n in range(50):
+        send(given, name=f"{n}.npz")
+    assert "one file at a time" in complaints[0]
+    assert len(complaints) == 25  # every second one is refused, and the one before it forgotten
+
+
+@pytest.mark.browser
+def test_a_file_that_is_too_large_is_refused_by_its_limit(page, tmp_path, troubles):
+    large = tmp_path / "large.npz"
+    with large.open("wb") as file:
+        file.truncate(MAX_UPLOAD_BYTES + 1)
+    opened = page()
+    opened.locator("input[type=file]").set_input_files(large)
+    said = opened.get_by_role("alert").filter(has_text="large.npz")
+    expect(said).to_contain_text("Files of up to 100 MiB can be uploaded")
+    (trouble,) = troubles
+    assert "exceeds maximum file size" in trouble  # the widget's own line in the console
+    troubles.clear()

@@ -1,0 +1,151 @@
+"""What is served, and that no request runs code, ends the server or leaves a traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+
+import panel as pn
+import pytest
+from tornado.routing import PathMatches
+
+from app.server.routes import SERVED
+from tests.browser import eventually, serving
+from tests.test_serving import Site
+
+REMOVED = {
+    ("/metadata$", "MetadataHandler"),
+    ("/autoload.js$", "AutoloadJsHandler"),  # lends a session to any page
+    ("/?$", "RootHandler"),
+    ("/static/(.*)$", "StaticHandler"),
+}
+RUN = "/components/{}/x/_css/y"
+MARKER = "from pathlib import Path\nPath({!r}).touch()\n"
+
+
+@pytest.fixture(scope="module")
+def marked(tmp_path_factory):
+    """A server on whose path lies a module that leaves a file when it is run.
+
+    Also that file, and the one into which the server prints.
+    """
+    folder = tmp_path_factory.mktemp("modules")
+    mark, log = folder / "mark", folder / "log"
+    (folder / "leaves_a_mark.py").write_text(MARKER.format(str(mark)))
+    with serving(PYTHONPATH=str(folder), log_path=log) as address:
+        yield Site(address), mark, log
+
+
+def routes(server) -> Iterator[tuple[str, type]]:
+    for rule in server._tornado.wildcard_router.rules:
+        assert isinstance(rule.matcher, PathMatches)
+        yield rule.matcher.regex.pattern, rule.target
+
+
+def test_every_route_of_the_libraries_is_known():
+    """A route that a later version adds is not served; here it is seen, and can be judged."""
+    options = {"port": 0, "show": False, "start": False, "verbose": False}
+    server = pn.serve({"/": pn.Column}, **options)
+    found = {(path, handler.__name__) for path, handler in routes(server)}
+    server.stop()
+    assert found == {(path, handler.__name__) for path, handler in SERVED} | REMOVED
+
+
+@pytest.mark.parametrize("module", ["unittest.__main__", "this", "leaves_a_mark", "..", "", "core"])
+@pytest.mark.parametrize("site", [None, "cross-site"])
+def test_no_module_is_run_that_an_address_names(marked, module, site):
+    server, mark, _ = marked
+    said = {} if site is None else {"Sec_Fetch_Site": site, "Sec_Fetch_Mode": "no-cors"}
+    status, _, text = server.ask(RUN.format(module), **said)
+    assert status == (404 if site is None else 403)
+    assert "Traceback" not in text
+    assert not mark.exists()
+    assert server.ask("/favicon.ico")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/components/app.server.routes/ComponentFiles/_css/x",
+        "/components/app.connection/Connection/_stylesheets/../__init__.py",
+        "/components/app.connection/Connection/__init__/x",
+        "/components/app.connection/Connection/_stylesheets",
+        "/components/app.connection/Connection/modifiers/",
+        "/components/app.connection/Nothing/_stylesheets/connection.css",
+    ],
+)
+def test_of_a_component_nothing_is_served_but_its_files(address, path):
+    site = Site(address)
+    assert site.ask("/components/app.connection/Connection/_stylesheets/connection.css")[0] == 200
+    status, _, text = site.ask(path)
+    assert 400 <= status < 500
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("HEAD", "/"),
+        ("PUT", "/"),
+        ("POST", "/"),
+        ("GET", "/static/%00"),
+        ("GET", "/static/js/bokeh.min.js%00"),
+        ("GET", "/static/extensions/panel/%0a"),
+        ("GET", "/components/.."),
+        ("GET", "/components/../../x/y"),
+        ("GET", "/autoload.js?bokeh-autoload-element=1"),
+        ("GET", "/metadata"),
+        ("GET", "/ws"),
+        ("GET", "/?bokeh-session-id="),
+        ("GET", "/?bokeh-session-id=a%20b"),
+        ("GET", "/?bokeh-token=abc"),
+    ],
+)
+def test_what_is_not_served_is_refused_and_leaves_no_traceback(marked, method, path):
+    server, _, log = marked
+    status = server.ask(path, method)[0]
+    assert 400 <= status < 500
+    assert server.ask("/favicon.ico")[0] == 200
+    printed = log.read_text()
+    assert f"{status} {method} {path}" in printed
+    assert "Traceback" not in printed
+
+
+@pytest.mark.browser
+def test_a_foreign_page_can_neither_load_from_here_nor_connect(browser, marked):
+    """A real page on another origin: an image, a script, a stylesheet and a socket."""
+    server, mark, log = marked
+    port = server.port
+    path = RUN.format("leaves_a_mark")
+    asked, before = f"http://127.0.0.1:{port}{path}", log.read_text().count(f"403 GET {path}")
+    content = f"""<!DOCTYPE html><img src="{asked}"><script src="{asked}"></script>
+    <link rel="stylesheet" href="{asked}"><a id="here" href="http://127.0.0.1:{port}/">here</a>
+    <script>
+      const socket = new WebSocket("ws://127.0.0.1:{port}/ws", ["bokeh", "x"]);
+      socket.onopen = () => document.title = "open";
+      socket.onerror = () => document.title = "refused";
+    </script>"""
+
+    class Foreign(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(content.encode())
+
+        def log_message(self, *_):
+            pass
+
+    foreign = ThreadingHTTPServer(("127.0.0.1", 0), Foreign)
+    Thread(target=foreign.serve_forever, daemon=True).start()
+    page = browser.contexts[0].new_page()
+    page.goto(f"http://localhost:{foreign.server_port}/")
+    eventually(lambda: page.title() == "refused")
+    eventually(lambda: log.read_text().count(f"403 GET {path}") == before + 3)
+    assert not mark.exists()
+    page.click("#here")  # a link is welcome
+    page.locator(".stage[data-camera]").first.wait_for(state="attached")
+    page.close()
+    foreign.shutdown()
+    foreign.server_close()
