@@ -30,6 +30,9 @@ _TYPES_2 = re.compile(r"[<>|]([iu][1248]|f[248])")
 _TYPES_3 = re.compile(r"u?int(8|16|32|64)|float(16|32|64)")
 _CODECS = {"zlib": "deflate", "gzip": "deflate", "zstd": "zstd", "blosc": "blosc"}
 _CODECS |= {"shuffle": "shuffle", "fletcher32": "fletcher32", "crc32c": "crc32c"}
+_MOST_CODECS = 32  # of one array, as in HDF5
+_MOST_AXES = 32
+_MOST_ELEMENT_BYTES = 16  # the largest number that NumPy has
 _NOT_FINITE = {"NaN": np.nan, "Infinity": np.inf, "-Infinity": -np.inf}
 
 
@@ -139,6 +142,7 @@ def _array_2(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
     require("order", about["order"], about["order"] in ("C", "F"), "'C' or 'F'")
     # Written through the filters, then the compressor; read the other way.
     packed = [*(about.get("filters") or []), *filter(None, [about.get("compressor")])]
+    _require_few("filters", packed, _MOST_CODECS)
     filters = tuple(_filter(one["id"], one, np.dtype(kind)) for one in reversed(packed))
     shape, chunk = _sizes(about["shape"]), _sizes(about["chunks"])
     return Chunked(
@@ -167,6 +171,7 @@ def _array_3(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
     require("storage_transformers", extras, not extras, "none")
     filters: list[Filter] = []
     dtype, order = np.dtype(kind), None
+    _require_few("codecs", about["codecs"], _MOST_CODECS)
     for codec in about["codecs"]:
         told = codec.get("configuration", {})
         if codec["name"] == "bytes":
@@ -209,14 +214,26 @@ def _missing(
 def _filter(name: Any, told: Mapping[str, Any], dtype: np.dtype[Any]) -> Filter:
     known = isinstance(name, str) and name in _CODECS
     require("codec", name, known, "one of " + ", ".join(_CODECS))
-    (element,) = _sizes([told.get("elementsize", dtype.itemsize)])
+    element = told.get("elementsize", dtype.itemsize)
+    fits = type(element) is int and 1 <= element <= _MOST_ELEMENT_BYTES
+    require("elementsize", element, fits, f"a whole number from 1 to {_MOST_ELEMENT_BYTES}")
     return Filter(_CODECS[name], element)
 
 
 def _sizes(values: Any) -> tuple[int, ...]:
-    whole = isinstance(values, list) and all(type(n) is int and n > 0 for n in values)
-    require("sizes", values, whole, "whole numbers, at least 1")
+    _require_few("sizes", values, _MOST_AXES)
+    whole = all(type(n) is int and 0 < n < 2**63 for n in values)
+    require("sizes", values, whole, "whole numbers from 1 to 2**63 - 1")
     return tuple(values)
+
+
+def _require_few(name: str, values: Any, most: int) -> None:
+    """Raise ``ValueError`` unless something is a list of no more than so many."""
+    found = (
+        f"{len(values):,} of them" if isinstance(values, list) and len(values) > most else values
+    )
+    few = isinstance(values, list) and len(values) <= most
+    require(name, found, few, f"a list of at most {most}")
 
 
 def _fill(value: Any) -> float:
