@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Integral
 from pathlib import Path
+from typing import Any
 
 
 def require(name: str, value: object, accepted: bool, what: str) -> None:
@@ -14,6 +16,22 @@ def require(name: str, value: object, accepted: bool, what: str) -> None:
     """
     if not accepted:
         raise ValueError(f"{name} = {value!r} is not accepted: give {what}.")
+
+
+def require_whole(name: str, value: Any, most: int, also: str = "") -> None:
+    """Raise ``ValueError`` unless a value is a whole number from 1 to `most`.
+
+    Parameters
+    ----------
+    name, value
+        As `require` takes them.
+    most : int
+        Largest number accepted.
+    also : str
+        What else would be accepted, for the message.
+    """
+    accepted = isinstance(value, Integral) and 1 <= int(value) <= most
+    require(name, value, accepted, f"a whole number from 1 to {most:,}{also}")
 
 
 @contextmanager
