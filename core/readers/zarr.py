@@ -12,8 +12,9 @@ import base64
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 
 from core.checks import require
 from core.readers.chunks import Chunked, Filter, Part, read_stretch
-from core.readers.guards import decoding
+from core.readers.guards import FileVersion, decoding
 from core.readers.stored import Stored
 
 _MOST_JSON_BYTES = 2**24  # of a whole directory
@@ -48,21 +49,28 @@ class ChunkFiles:
         Of a file's name: before the first index, and between one and the next.
     filters : tuple of Filter
         What every chunk went through, the last one first.
+    metadata : FileVersion
+        Of the array; no chunk is read once it has changed.
+    folders : dict
+        Folders as they were when they were listed, by their paths; no chunk is read from one in
+        which a file has come or gone since.
     """
 
     folder: Path
     prefix: str
     separator: str
     filters: tuple[Filter, ...]
+    metadata: FileVersion
+    folders: Mapping[Path, FileVersion]
 
     def __call__(self, index: tuple[int, ...]) -> Part | None:
         """The bytes of a chunk, None where it was never written."""
         path = self.folder / (self.prefix + self.separator.join(map(str, index)))
-        if not path.exists():
-            there = self.folder.is_dir()
-            require("folder of the array", self.folder.name, there, "one that has not gone")
-            return None
-        return Part(read_stretch(path, 0, path.stat().st_size), self.filters)
+        listed = self.folders.get(path.parent, self.folders[self.folder])
+        with self.metadata.unchanged(), listed.unchanged():
+            if not path.exists():
+                return None
+            return Part(read_stretch(path, 0, path.stat().st_size), self.filters)
 
 
 def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
@@ -70,7 +78,8 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     found: list[Stored] = []
     groups: dict[str, dict[str, Any]] = {}
     n_bytes = 0
-    for folder, files in _folders(path):
+    folders: dict[Path, FileVersion] = {}
+    for folder, files in _folders(path, folders):
         n_bytes += sum((folder / name).stat().st_size for name in files.intersection(_METADATA))
         most = f"up to {_MOST_JSON_BYTES:,}"
         require("bytes of metadata", n_bytes, n_bytes <= _MOST_JSON_BYTES, most)
@@ -82,6 +91,10 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
             not all(files & own for own in versions),
             "one of them",
         )
+        described = [name for name in _METADATA if name in files]
+        if not described:
+            continue
+        version = FileVersion.of(folder / described[0])
         if "zarr.json" in files:
             about = _json(folder / "zarr.json")
             known = _plain(about.get("attributes"))
@@ -101,7 +114,8 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
             continue
         title = name or path.name
         try:
-            numbers, axes = describe(title, folder, about), about.get("dimension_names")
+            kept = partial(ChunkFiles, folder, metadata=version, folders=folders)
+            numbers, axes = describe(title, kept, about), about.get("dimension_names")
             known = known | _missing(about, known, numbers)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             found.append(
@@ -115,11 +129,15 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     return found, groups
 
 
-def _folders(path: Path) -> Iterator[tuple[Path, set[str]]]:
-    """Every directory with the names of its files, none of them a link or no file at all."""
+def _folders(path: Path, versions: dict[Path, FileVersion]) -> Iterator[tuple[Path, set[str]]]:
+    """Every directory with the names of its files, none of them a link or no file at all.
+
+    Adds the version of each to `versions`.
+    """
     waiting = [path]
     while waiting:
         folder = waiting.pop(0)
+        versions[folder] = FileVersion.of(folder)
         files = set()
         with os.scandir(folder) as entries:
             for entry in sorted(entries, key=lambda entry: entry.name):
@@ -133,7 +151,7 @@ def _folders(path: Path) -> Iterator[tuple[Path, set[str]]]:
         yield folder, files
 
 
-def _array_2(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
+def _array_2(name: str, kept: Callable[..., ChunkFiles], about: Mapping[str, Any]) -> Chunked:
     require("zarr_format", about["zarr_format"], about["zarr_format"] == 2, "2 in .zarray")
     kind, separator = about["dtype"], about.get("dimension_separator", ".")
     plain = isinstance(kind, str) and _TYPES_2.fullmatch(kind) is not None
@@ -150,13 +168,13 @@ def _array_2(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
         shape,
         np.dtype(kind),
         chunk,
-        ChunkFiles(folder, "", separator, filters),
+        kept("", separator, filters),
         _fill(about.get("fill_value")),
         order=tuple(reversed(range(len(shape)))) if about["order"] == "F" else None,
     )
 
 
-def _array_3(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
+def _array_3(name: str, kept: Callable[..., ChunkFiles], about: Mapping[str, Any]) -> Chunked:
     require("zarr_format", about["zarr_format"], about["zarr_format"] == 3, "3 in zarr.json")
     kind, grid, keys = about["data_type"], about["chunk_grid"], about["chunk_key_encoding"]
     plain = isinstance(kind, str) and _TYPES_3.fullmatch(kind) is not None
@@ -188,7 +206,7 @@ def _array_3(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
         _sizes(about["shape"]),
         dtype,
         _sizes(grid["configuration"]["chunk_shape"]),
-        ChunkFiles(folder, prefix + separator * bool(prefix), separator, tuple(filters)),
+        kept(prefix + separator * bool(prefix), separator, tuple(filters)),
         _fill(about.get("fill_value")),
         order=order,
     )
