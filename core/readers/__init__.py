@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from core.acquisition import Pulse
 from core.capture import Capture, CaptureError, Detection
-from core.checks import refusing, require
+from core.checks import refusing, require, shown
 from core.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820
 from core.readers.guards import MAX_CUBE_BYTES, FileVersion
 from core.readers.request import Request
@@ -191,6 +191,6 @@ def _suffix(path: Path) -> str:
     """The suffix of a file that exists, in small letters, if it is known."""
     suffix = path.suffix.lower()
     there = path.is_file() or (suffix == ".zarr" and path.is_dir())
-    require("path", str(path), there, "an existing file")
+    require("path", shown(path), there, "an existing file")
     require("suffix", path.suffix, suffix in READERS, "one of " + ", ".join(READERS))
     return suffix

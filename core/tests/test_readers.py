@@ -693,6 +693,26 @@ def test_no_file(tmp_path: Path) -> None:
         read_capture(tmp_path)
 
 
+def test_a_name_that_is_too_long_is_shortened(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match=r"^a+\.\.\.a+\.npz: .*File name too long") as caught:
+        read_capture(tmp_path / ("a" * 300 + ".npz"))
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".nc"])
+def test_names_that_are_no_text_are_kept_as_text(suffix: str, tmp_path: Path) -> None:
+    """Bytes of a name that are no UTF-8 come as surrogates, which no file could hold as text."""
+    name = "n\udcff\udcc3\udcb6.npz"
+    (tmp_path / name).write_bytes(npz_bytes(cube=CUBE))
+    capture = read_capture(tmp_path / name)
+    assert capture.source.startswith("n\\xff\u00f6.npz, variable cube")
+    save_capture(capture, tmp_path / f"kept{suffix}")
+    assert read_capture(tmp_path / f"kept{suffix}").source.startswith(capture.source)
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(CaptureError, match=r"^n\\xff\u00f6\.npz: "):
+        read_capture(tmp_path / name)
+
+
 def test_what_unpacks_beyond_the_limit_is_refused(
     write: Callable[[str, bytes], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
