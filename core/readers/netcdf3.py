@@ -48,10 +48,9 @@ def _stored(path: Path, begin: int, name: str, variable: Any) -> Stored:
         return Stored(name, attributes=known, refused="no numbers with 1 to 3 axes")
     first, end = byte_bounds(values)
     data = read_stretch(path, first - begin, end - first)
-    # The values of variables that grow with the file lie among those of others.
-    copy = np.ndarray(values.shape, values.dtype, data, strides=values.strides)
-    whole = Whole(copy.tobytes())
-    numbers = Chunked(name, values.shape, values.dtype, values.shape, whole)
+    if len(data) != values.nbytes:  # a variable that grows with the file lies among others
+        data = np.ndarray(values.shape, values.dtype, data, strides=values.strides).tobytes()
+    numbers = Chunked(name, values.shape, values.dtype, values.shape, Whole(data))
     return Stored(name, numbers, tuple(variable.dimensions), known)
 
 

@@ -17,6 +17,7 @@ import h5py
 import numcodecs
 import numpy as np
 import pytest
+import scipy
 import xarray as xr
 from scipy.constants import speed_of_light
 
@@ -161,6 +162,17 @@ def test_what_was_never_written_is_its_fill(tmp_path: Path) -> None:
     cube = read_capture(path, variable="some").cube
     assert cube[0, 0, 0] == 9 and cube.sum() == 9 + 3 * (cube.size - 1)
     np.testing.assert_array_equal(read_capture(path, variable="compact").cube, CUBE[:1, :2, :50])
+
+
+def test_variables_that_grow_lie_among_each_other(tmp_path: Path) -> None:
+    """Classic netCDF keeps the rows of all variables of an unlimited dimension in turn."""
+    path = tmp_path / "r.nc"
+    with scipy.io.netcdf_file(path, "w") as file:
+        for name, size in (("row", None), ("col", 4), ("bin", 100)):
+            file.createDimension(name, size)
+        file.createVariable("counts", "i4", ("row", "col", "bin"))[:] = CUBE.astype("i4")
+        file.createVariable("time", "f8", ("row",))[:] = np.arange(3.0)
+    np.testing.assert_array_equal(read_capture(path).cube, CUBE)
 
 
 def test_compact_arrays(tmp_path: Path) -> None:
