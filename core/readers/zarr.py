@@ -52,8 +52,8 @@ class ChunkFiles:
     metadata : FileVersion
         Of the array; no chunk is read once it has changed.
     folders : dict
-        Folders as they were when they were listed, by their paths; no chunk is read from one in
-        which a file has come or gone since.
+        Folders as they were when they were listed, by their paths; a chunk that is missing from one
+        in which files have come or gone since is refused.
     """
 
     folder: Path
@@ -66,11 +66,12 @@ class ChunkFiles:
     def __call__(self, index: tuple[int, ...]) -> Part | None:
         """The bytes of a chunk, None where it was never written."""
         path = self.folder / (self.prefix + self.separator.join(map(str, index)))
-        listed = self.folders.get(path.parent, self.folders[self.folder])
-        with self.metadata.unchanged(), listed.unchanged():
-            if not path.exists():
-                return None
-            return Part(read_stretch(path, 0, path.stat().st_size), self.filters)
+        with self.metadata.unchanged():
+            if path.exists():
+                return Part(read_stretch(path, 0, path.stat().st_size), self.filters)
+            if path.parent in self.folders:
+                self.folders[path.parent].require()  # else it may have been there
+            return None
 
 
 def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
