@@ -5,18 +5,37 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from numbers import Integral
 from typing import Literal
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
 from numpy.typing import ArrayLike, NDArray
 
-from core.checks import require
+from core.checks import require, require_whole
 
 Floats = NDArray[np.float64]
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0  # exactly: this is what a metre is
+
+LONGEST_S = 10.0
+"""Longest time that any part of an acquisition may take: light needs 2.6 s to the Moon and back."""
+
+SHORTEST_BIN_S, SHORTEST_PULSE_S = 1e-18, 1e-21
+"""Smallest bin width and pulse time constant: far below what any detector resolves."""
+
+MOST_BINS = 2**24
+"""Largest number of bins in a gate."""
+
+_MOST_SHOWN = 10  # samples in a message
+
+MOST_PULSES = 2**53
+"""Largest number of pulses: every whole number up to here is exact as a float."""
+
+
+def require_time(name: str, value_s: float, least_s: float) -> None:
+    """Raise ``ValueError`` unless a time lies between `least_s` and `LONGEST_S` seconds."""
+    accepted = f"a time from {least_s:g} to {LONGEST_S:g} s"
+    require(name, value_s, least_s <= value_s <= LONGEST_S, accepted)
 
 
 @dataclass(frozen=True)
@@ -28,13 +47,15 @@ class Acquisition:
     Parameters
     ----------
     n_bins : int
-        Bins in the gate, at least 1.
+        Bins in the gate, from 1 to `MOST_BINS`.
     bin_width_s : float
-        Width of one bin in seconds, positive.
+        Width of one bin in seconds, from `SHORTEST_BIN_S` to `LONGEST_S`; the whole gate lasts at
+        most `LONGEST_S`.
     gate_delay_s : float
-        Time from the pulse to the opening of the gate in seconds.
+        Time from the pulse to the opening of the gate in seconds, at most `LONGEST_S` in either
+        direction.
     n_pulses : int or None
-        Pulses sent for each pixel; None where a file does not say.
+        Pulses sent for each pixel, from 1 to `MOST_PULSES`; None where a file does not say.
     pixel_angle_rad : float or None
         Angle between the lines of sight of neighbouring pixels, in radians; None where a file does
         not say.
@@ -52,21 +73,15 @@ class Acquisition:
     pixel_angle_rad: float | None = 2e-3
 
     def __post_init__(self) -> None:
-        whole = isinstance(self.n_bins, Integral)
-        require("n_bins", self.n_bins, whole and self.n_bins >= 1, "an integer, at least 1")
+        require_whole("n_bins", self.n_bins, MOST_BINS)
+        require_time("bin_width_s", self.bin_width_s, SHORTEST_BIN_S)
+        gate_s = self.n_bins * self.bin_width_s
         require(
-            "bin_width_s",
-            self.bin_width_s,
-            0 < self.bin_width_s < np.inf,
-            "positive, in seconds",
+            "gate, n_bins * bin_width_s,", gate_s, gate_s <= LONGEST_S, f"at most {LONGEST_S} s"
         )
-        require("gate_delay_s", self.gate_delay_s, np.isfinite(self.gate_delay_s), "finite")
-        require(
-            "n_pulses",
-            self.n_pulses,
-            self.n_pulses is None or (isinstance(self.n_pulses, Integral) and self.n_pulses >= 1),
-            "an integer, at least 1, or None where it is not known",
-        )
+        require_time("gate_delay_s", self.gate_delay_s, -LONGEST_S)
+        if self.n_pulses is not None:
+            require_whole("n_pulses", self.n_pulses, MOST_PULSES, ", or None where it is not known")
         require(
             "pixel_angle_rad",
             self.pixel_angle_rad,
@@ -104,9 +119,15 @@ class Pulse:
     Parameters
     ----------
     tau_s : float
-        Time constant in seconds: the peak comes ``tau`` after the onset, the full width at half
-        maximum is 2.446 ``tau``. (Standard deviation of a Gaussian, sample spacing of a measured
-        pulse.)
+        Time constant in seconds, from `SHORTEST_PULSE_S` to `LONGEST_S`: the peak comes ``tau``
+        after the onset, the full width at half maximum is 2.446 ``tau``. (Standard deviation of a
+        Gaussian, sample spacing of a measured pulse.)
+
+    Raises
+    ------
+    ValueError
+        If the time constant is out of its range, the shape is unknown, or the samples are negative,
+        all zero, or together longer than `LONGEST_S`.
     """
 
     tau_s: float = 1e-9
@@ -114,13 +135,17 @@ class Pulse:
     samples: tuple[float, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        require("tau_s", self.tau_s, 0 < self.tau_s < np.inf, "positive, in seconds")
+        require_time("tau_s", self.tau_s, SHORTEST_PULSE_S)
         shapes = ("gamma", "gaussian", "measured")
         require("shape", self.shape, self.shape in shapes, " or ".join(shapes))
         if self.shape == "measured":
             samples = np.asarray(self.samples, float)
             usable = samples.ndim == 1 and bool(np.all(samples >= 0)) and 0 < samples.sum() < np.inf
-            require("samples", self.samples, usable, "a list of non-negative numbers, not all zero")
+            shown = self.samples if samples.size < _MOST_SHOWN else f"{samples.size:,} of them"
+            require("samples", shown, usable, "a list of non-negative numbers, not all zero")
+            length_s = samples.size * self.tau_s
+            allowed = f"at most {LONGEST_S} s"
+            require("length of the samples", length_s, length_s <= LONGEST_S, allowed)
 
     @classmethod
     def gaussian(cls, sigma_s: float) -> Pulse:
@@ -142,8 +167,7 @@ class Pulse:
         if self.shape == "gaussian":
             return np.asarray(scipy.special.ndtr(t))
         if self.shape == "measured":
-            share = np.concatenate([[0.0], np.cumsum(self.samples)])
-            return np.asarray(np.interp(t, np.arange(share.size), share / share[-1]))
+            return np.asarray(np.interp(t, *self._measured_cdf))
         # In place: a fresh array for each step costs more, in page faults, than the exponential.
         t = np.maximum(t, 0.0, out=t) if isinstance(t, np.ndarray) else np.maximum(t, 0.0)
         decay = np.exp(-t)
@@ -160,13 +184,25 @@ class Pulse:
         if self.shape == "gaussian":
             share = np.exp(-0.5 * t * t) / math.sqrt(2 * math.pi)
         elif self.shape == "measured":
-            samples = np.concatenate([[0.0], self.samples, [0.0]])
+            samples, total = self._measured_density
             at = np.clip(np.ceil(t), 0, samples.size - 1).astype(np.intp)
-            share = samples[at] / samples.sum()
+            share = samples[at] / total
         else:
             t = np.maximum(t, 0.0)
             share = t * np.exp(-t)
         return np.asarray(share / self.tau_s)
+
+    @cached_property
+    def _measured_cdf(self) -> tuple[Floats, Floats]:
+        """Edges of the samples and the share of the photons before each; shape (sample + 1,)."""
+        share = np.concatenate([[0.0], np.cumsum(self.samples)])
+        return np.arange(share.size, dtype=float), share / share[-1]
+
+    @cached_property
+    def _measured_density(self) -> tuple[Floats, float]:
+        """The samples between two zeros, shape (sample + 2,), and their sum."""
+        samples = np.concatenate([[0.0], self.samples, [0.0]])
+        return samples, samples.sum()
 
     @cached_property
     def span_s(self) -> tuple[float, float]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from core.acquisition import Acquisition
 from core.capture import Capture, Seen
-from core.checks import require
+from core.checks import printable, require, shown
 from core.commands.options import (
     LIGHT_NAMES,
     READING_NAMES,
@@ -36,6 +36,7 @@ from core.export import (
     save_image,
     save_pixel,
 )
+from core.export.whole import writing
 from core.inspection import LightFound, capture_report, pixel_report
 from core.parameters import Number, doubts, spec_of
 from core.pipeline import run
@@ -313,7 +314,7 @@ def _simulate(chosen: argparse.Namespace) -> None:
     capture = _simulated(scene, acquisition, chosen)
     told = {"unit": chosen.unit_m, "distance": chosen.distance_m, "SBR": chosen.sbr}
     seen = [f"{name} {value:g}" for name, value in told.items() if value is not None]
-    source = ", ".join((chosen.scene, capture.source, *seen))
+    source = ", ".join((printable(chosen.scene), capture.source, *seen))
     _save_captures(replace(capture, source=source), chosen)
 
 
@@ -400,10 +401,11 @@ def _require_free(chosen: argparse.Namespace) -> None:
     for path in chosen.out:
         known = path.suffix.lower() in chosen.suffixes
         require("suffix", path.suffix, known, "one of " + ", ".join(chosen.suffixes))
-        if path.exists() and not chosen.overwrite:
-            raise FileExistsError(f"{path} exists: give another name, or --overwrite.")
+        with writing(path):
+            if path.exists() and not chosen.overwrite:
+                raise FileExistsError(f"{path} exists: give another name, or --overwrite.")
         if not path.absolute().parent.is_dir():
-            raise FileNotFoundError(f"{path.parent} is no folder: make it first.")
+            raise FileNotFoundError(f"{shown(path.parent)} is no folder: make it first.")
 
 
 def _capture(chosen: argparse.Namespace) -> Capture:

@@ -161,7 +161,7 @@ def show_progress(done: int, of: int, what: str = "pieces") -> None:
 def show(facts: Mapping[str, Any], as_json: bool) -> None:
     """Print facts, one a line or as one JSON object; what is no number there is null."""
     if as_json:
-        print(json.dumps(_plain(facts), ensure_ascii=False))
+        print(json.dumps(_plain(facts)))
         return
     width = max(map(len, facts))
     for name, value in facts.items():

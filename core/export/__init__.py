@@ -92,7 +92,7 @@ def save_capture(
     require("suffix", path.suffix, suffix in CAPTURE_SUFFIXES, accepted)
     if suffix == ".zarr":
         with whole_folder(path, overwrite=overwrite) as folder:
-            dataset(capture).to_zarr(folder, consolidated=False)
+            netcdf.write_folder(dataset(capture), folder)
         return
     with whole_file(path, overwrite=overwrite) as file:
         if suffix == ".npz":

@@ -27,7 +27,22 @@ def write(product: Product, file: BinaryIO) -> None:
 
 def write_zarr(product: Product, folder: Path) -> None:
     """Write a dataset into a folder, as Zarr."""
-    _dataset(product).to_zarr(folder, consolidated=False)
+    write_folder(_dataset(product), folder)
+
+
+def write_folder(data: xr.Dataset, folder: Path) -> None:
+    """Write a dataset as Zarr.
+
+    It is packed in memory before: of files, Zarr's own threads write more after one has failed.
+    """
+    from zarr.storage import MemoryStore  # noqa: PLC0415
+
+    packed: dict[str, Any] = {}
+    data.to_zarr(MemoryStore(packed), consolidated=False)
+    for name, content in packed.items():
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(content.to_bytes())
 
 
 def _dataset(product: Product) -> xr.Dataset:

@@ -2,13 +2,58 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from core.checks import reason, shown
+
+_REMEDIES = {errno.ENAMETOOLONG: "give a shorter name"}
+_REMEDIES |= dict.fromkeys(
+    (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "free some space, or give another folder"
+)
+
+
+class _Watched(io.FileIO):
+    """A file that keeps the first failure to write to it: some libraries report it as their own."""
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write bytes."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.failure = self.failure or error
+            raise
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Report the system's failures to write a file: its name, what happened, what to do.
+
+    Raises
+    ------
+    OSError
+        Of the failure's own type and number.
+    """
+    try:
+        yield
+    except FileExistsError:
+        raise  # says what to do already
+    except OSError as error:
+        remedy = _REMEDIES.get(error.errno or 0, "free some space, or give a folder to write to")
+        told = type(error)(f"{shown(path)} cannot be written ({reason(error)}): {remedy}.")
+        told.errno = error.errno
+        for note in getattr(error, "__notes__", ()):
+            told.add_note(note)
+        raise told from error
 
 
 @contextmanager
@@ -34,20 +79,34 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     OSError
         If the folder cannot be written; an older file is then left as it was.
     """
-    if path.exists() and not overwrite:
-        raise _refusal(path)
-    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
+    with writing(path):
+        if path.exists() and not overwrite:
+            raise _refusal(path)
+        unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
+        try:
+            with _opened(unfinished) as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            if overwrite:
+                os.replace(unfinished, path)
+            else:
+                _take_free_name(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """A new file to write and read, which reports its own failure before that of a library."""
+    raw = _Watched(path, "x+")
     try:
-        with unfinished.open("x+b") as file:
+        with io.BufferedRandom(raw) as file:
             yield file
-            file.flush()
-            os.fsync(file.fileno())
-        if overwrite:
-            os.replace(unfinished, path)
-        else:
-            _take_free_name(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    except Exception as error:
+        if raw.failure is not None and not isinstance(error, OSError):
+            raise raw.failure from error
+        raise
 
 
 @contextmanager
@@ -59,22 +118,23 @@ def whole_folder(path: Path, *, overwrite: bool) -> Iterator[Path]:
     Path
         Where to write.
     """
-    if path.exists() and not overwrite:
-        raise _refusal(path)
-    unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
-    older = path.with_name(f".{secrets.token_hex(8)}.older")
-    try:
-        yield unfinished
-        if overwrite and path.exists():
-            path.rename(older)
+    with writing(path):
+        if path.exists() and not overwrite:
+            raise _refusal(path)
+        unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
+        older = path.with_name(f".{secrets.token_hex(8)}.older")
         try:
-            unfinished.rename(path)  # fails where something full of that name came meanwhile
-        except BaseException as error:
-            _put_back(older, path, error)
-            raise
-        _remove(older)
-    finally:
-        _remove(unfinished)
+            yield unfinished
+            if overwrite and path.exists():
+                path.rename(older)
+            try:
+                unfinished.rename(path)  # fails where something full of that name came meanwhile
+            except BaseException as error:
+                _put_back(older, path, error)
+                raise
+            _remove(older)
+        finally:
+            _remove(unfinished)
 
 
 def _put_back(older: Path, path: Path, error: BaseException) -> None:
@@ -96,7 +156,9 @@ def _remove(path: Path) -> None:
 
 
 def _refusal(path: Path) -> FileExistsError:
-    return FileExistsError(f"{path} exists: give another name, or overwrite=True to replace it.")
+    return FileExistsError(
+        f"{shown(path)} exists: give another name, or overwrite=True to replace it."
+    )
 
 
 def _take_free_name(unfinished: Path, path: Path) -> None:

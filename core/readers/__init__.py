@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from core.acquisition import Pulse
 from core.capture import Capture, CaptureError, Detection
-from core.checks import refusing, require
+from core.checks import refusing, require, shown
 from core.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820
-from core.readers.guards import MAX_CUBE_BYTES
+from core.readers.guards import MAX_CUBE_BYTES, FileVersion
 from core.readers.request import Request
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def read_capture(
             no_trigger=no_trigger,
             first_detections=first_detections,
         )
-        return READERS[_suffix(path)](path, request)
+        return _read(path, request)
 
 
 def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
@@ -163,7 +163,7 @@ def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
         request = Request(**options)
         if _suffix(path) in labelled.LAZY:
             return labelled.open_counts(path, request)
-        return labelled.dataset(READERS[_suffix(path)](path, request))["counts"]
+        return labelled.dataset(_read(path, request))["counts"]
 
 
 def bytes_of(path: str | os.PathLike[str], **options: Any) -> int | None:
@@ -180,10 +180,17 @@ def bytes_of(path: str | os.PathLike[str], **options: Any) -> int | None:
     return int(open_capture(path, **options | {"pulse": Pulse(), "detection": "all"}).nbytes)
 
 
+def _read(path: Path, request: Request) -> Capture:
+    """Read a file that does not change meanwhile."""
+    read = READERS[_suffix(path)]
+    with FileVersion.of(path).unchanged():
+        return read(path, request)
+
+
 def _suffix(path: Path) -> str:
     """The suffix of a file that exists, in small letters, if it is known."""
     suffix = path.suffix.lower()
     there = path.is_file() or (suffix == ".zarr" and path.is_dir())
-    require("path", str(path), there, "an existing file")
+    require("path", shown(path), there, "an existing file")
     require("suffix", path.suffix, suffix in READERS, "one of " + ", ".join(READERS))
     return suffix

@@ -4,13 +4,18 @@ The time unit. Whole numbers, the largest above 100,000: picoseconds. Fractions,
 seconds. Other whole numbers: bins of the instrument, 8 ps as in published captures. Other fractions
 are refused, since nothing tells microseconds from nanoseconds.
 
-The bin width. 1 ns (the nearest multiple of the unit) if that gives at least 100 bins from the
+The bin width. 1 ns (the nearest multiple of the unit) if that gives 100 to 65,536 bins from the
 gate's opening to the last photon; else the smallest power-of-two multiple of the unit that gives at
-most 1024. Where ``n_bins`` is given both must fit in it. A multiple of the unit, because any other
-width would hold more units in one bin than in the next. Times that are fractions have 1 ps for a
-unit here.
+most 1024 bins for a shorter gate, at most 65,536 for a longer one. Where ``n_bins`` is given both
+must fit in it. A multiple of the unit, because any other width would hold more units in one bin
+than in the next. Times that are fractions have 1 ps for a unit here.
 
-The gate. From the first photon, rounded down to a multiple of the bin width, to the last.
+The gate. From the first photon, rounded down to a multiple of the bin width, to the last. All
+photons count, however far from the others, as long as the gate has no more than 65,536 bins of
+1 ns, 10 km (of ``bin_width_s`` where that is longer; ``n_bins`` where that is more). If it would
+have more, the stretch of that length with the most photons is found. The gate covers only this
+stretch if it holds at least nine in ten of all photons; the others are dropped, and the source
+gives their number. Otherwise the gate covers all photons, in wider bins.
 
 The pulse. A Gaussian as wide as `core.readers.pulse_guess` finds the echoes, or of one bin width.
 The number of pulses stays unknown.
@@ -21,13 +26,13 @@ all of its unit, so the last one before the stop becomes the first after the pul
 
 from __future__ import annotations
 
-from math import floor, inf
+from math import floor
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.acquisition import Acquisition, Floats
+from core.acquisition import LONGEST_S, MOST_BINS, Acquisition, Floats
 from core.capture import Capture
 from core.checks import require
 from core.readers.dense import count_dtype, guess_detection
@@ -40,7 +45,10 @@ NATIVE_BIN_S = 8e-12
 PICOSECONDS_ABOVE = 100_000
 SECONDS_BELOW = 1e-3
 FEWEST_BINS_OF_1_NS = 100
-MOST_BINS = 1024
+MOST_SHORT_BINS = 1024
+MOST_BINS_OF_1_NS = 2**16
+MOST_DROPPED = 0.1
+"""Largest share of the photons that a guessed gate leaves out."""
 
 BYTES_A_PHOTON = 64  # of working memory: its time, pixel, bin and place, before and after sorting
 _LARGEST_TICK = 2**53  # beyond, a float skips whole numbers
@@ -90,6 +98,11 @@ def arrivals_capture(
         ticks = _from_stop(ticks, float(_snapped(request.stop_s / tick_s)), whole, tick_s)
 
     per_bin, opening, n_bins = _gate(ticks, tick_s, request)
+    remedy = f"up to {MOST_BINS:,}: a larger bin_width_s, or a gate_delay_s and n_bins"
+    require(f"bins of {name}", n_bins, n_bins <= MOST_BINS, remedy)
+    gate_s = n_bins * per_bin * tick_s
+    closer = f"times no more than {LONGEST_S:g} s apart, or another time_unit_s"
+    require(f"gate of {name}", time_text(gate_s), gate_s <= LONGEST_S, closer)
     bins = np.floor((ticks - opening) / per_bin)
     inside = (bins >= 0) & (bins < n_bins)
     _require_some_inside(inside, ticks * tick_s, name)
@@ -138,27 +151,64 @@ def guess_ticks_per_bin(
     def bins_of(per_bin: int) -> int:
         return floor((last - _opening(first, per_bin, delay)) / per_bin) + 1
 
-    nanosecond = max(1, round(1e-9 / tick_s))
-    if FEWEST_BINS_OF_1_NS <= bins_of(nanosecond) <= (n_bins or inf):
+    nanosecond = _nanosecond(tick_s)
+    in_nanoseconds = bins_of(nanosecond)
+    is_long = in_nanoseconds >= FEWEST_BINS_OF_1_NS
+    most = n_bins or (MOST_BINS_OF_1_NS if is_long else MOST_SHORT_BINS)
+    if is_long and in_nanoseconds <= most:
         return nanosecond
     per_bin = 1
-    while bins_of(per_bin) > (n_bins or MOST_BINS):
+    while bins_of(per_bin) > most:
         per_bin *= 2
     return per_bin
 
 
 def _gate(ticks: Floats, tick_s: float, request: Request) -> tuple[float, float, int]:
     """Width of a bin and opening of the gate, both in ticks, and the number of bins."""
-    first, last = float(ticks.min()), float(ticks.max())
     delay_s, width_s = request.gate_delay_s, request.bin_width_s
     delay = None if delay_s is None else float(_snapped(delay_s / tick_s))
+    width = None if width_s is None else float(_snapped(width_s / tick_s))
+    wider = f"a width that is not far below the unit of the times, {time_text(tick_s)}"
+    require("bin_width_s", width_s, width is None or width > 0, wider)
+    longest = max(MOST_BINS_OF_1_NS, request.n_bins or 0) * max(_nanosecond(tick_s), width or 0)
+    first, last = _bulk(ticks, delay, longest)
     per_bin = (
-        guess_ticks_per_bin(first, last, delay, tick_s, request.n_bins)
-        if width_s is None
-        else float(_snapped(width_s / tick_s))
+        guess_ticks_per_bin(first, last, delay, tick_s, request.n_bins) if width is None else width
     )
     opening = _opening(first, per_bin, delay)
     return per_bin, opening, request.n_bins or max(1, floor((last - opening) / per_bin) + 1)
+
+
+def _bulk(ticks: Floats, delay: float | None, longest: float) -> tuple[float, float]:
+    """First and last photon of the gate, without strays where they would make it too long.
+
+    Parameters
+    ----------
+    ticks : ndarray, shape (photon,)
+        Arrival times.
+    delay : float or None
+        Where the gate opens, if given: earlier photons are left out.
+    longest : float
+        Length of a gate that takes all photons, however far apart, in ticks.
+    """
+    first, last = float(ticks.min()), float(ticks.max())
+    if last - (first if delay is None else delay) < longest:
+        return first, last
+    ordered = np.sort(ticks if delay is None else ticks[ticks >= delay])
+    if not ordered.size:
+        return first, last
+    begins = np.arange(ordered.size)
+    ends = np.searchsorted(ordered, ordered + longest)
+    begin = int(np.argmax(ends - begins))
+    end = int(ends[begin])
+    if end - begin < (1 - MOST_DROPPED) * ordered.size:
+        begin, end = 0, ordered.size
+    return float(ordered[begin]), float(ordered[end - 1])
+
+
+def _nanosecond(tick_s: float) -> int:
+    """The whole number of ticks nearest to 1 ns, at least one."""
+    return max(1, round(1e-9 / tick_s))
 
 
 def _rank(pixel: NDArray[np.int64]) -> NDArray[np.int64]:

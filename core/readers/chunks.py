@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.checks import require
-from core.readers.guards import decoding, require_fits
+from core.readers.guards import FileVersion, decoding, require_fits
 
 _CHECKSUM_BYTES = 4
 _ROOM_FOR_CHECKSUMS = 4 * _CHECKSUM_BYTES  # packed along with the numbers
@@ -246,12 +246,13 @@ class Stretches:
 
     Parameters
     ----------
-    path : Path
+    file : FileVersion
+        Refused once it has changed.
     places : dict
         Offset and bytes of each chunk, by its index; and the filters that it went through.
     """
 
-    path: Path
+    file: FileVersion
     places: Mapping[tuple[int, ...], tuple[int, int, tuple[Filter, ...]]]
 
     def __call__(self, index: tuple[int, ...]) -> Part | None:
@@ -259,7 +260,8 @@ class Stretches:
         if index not in self.places:
             return None
         offset, n_bytes, filters = self.places[index]
-        return Part(read_stretch(self.path, offset, n_bytes), filters)
+        with self.file.unchanged():
+            return Part(read_stretch(self.file.path, offset, n_bytes), filters)
 
 
 @dataclass(frozen=True)
@@ -273,7 +275,8 @@ class Contiguous:
     shape : tuple of int
     dtype : dtype
         Of its numbers as they lie in the file.
-    path : Path
+    file : FileVersion
+        Refused once it has changed.
     offset : int
         Where it begins, in bytes.
     """
@@ -281,7 +284,7 @@ class Contiguous:
     name: str
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    path: Path
+    file: FileVersion
     offset: int
 
     @property
@@ -304,7 +307,7 @@ class Contiguous:
         strides = [self.dtype.itemsize * prod(self.shape[k + 1 :]) for k in range(len(shape))]
         runs = answer.reshape(prod(shape[:own]), -1) if answer.size else ()
         outer = product(*picked[:own])
-        with decoding(self.name), self.path.open("rb") as file:
+        with decoding(self.name), self.file.unchanged(), self.file.path.open("rb") as file:
             for index, run in zip(outer, runs, strict=True) if answer.size else ():
                 begin = (*index, *(places[0] for places in picked[own:]))
                 place = sum(k * step for k, step in zip(begin, strides, strict=True))

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.acquisition import Acquisition, Pulse
+from core.acquisition import MOST_BINS, SHORTEST_PULSE_S, Acquisition, Pulse, require_time
 from core.capture import COUNT_TYPES, Capture, Detection
 from core.checks import require
 from core.readers.guards import require_fits
 from core.readers.pulse_guess import guessed_pulse
 from core.readers.request import Request
-from core.readers.wording import guesses, sentence
+from core.readers.wording import guesses, sentence, time_text
 
 AXES = ("row", "col", "bin")
 
@@ -29,6 +29,7 @@ PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 
 LARGEST_COUNT = 2**32 - 1
 _MOST_SAMPLES = 2**20
+_MOST_SAMPLES_BEYOND_GATE = 2**16
 
 
 def whole_counts(
@@ -68,6 +69,7 @@ def require_cube(cube: NDArray[Any], name: str) -> None:
     fits = cube.ndim == 3 and cube.size > 0 and cube.dtype.kind in "biuf"
     wanted = "real numbers of shape (row, col, bin), none of them 0"
     require(name, f"{cube.dtype} array of shape {cube.shape}", fits, wanted)
+    require(f"bins of {name}", n_bins := cube.shape[2], n_bins <= MOST_BINS, f"up to {MOST_BINS:,}")
 
 
 def require_sums(shape: tuple[int, ...]) -> None:
@@ -90,9 +92,22 @@ def stored_pulse(tau_s: float | None, shape: str, samples: NDArray[Any]) -> Puls
     """
     if tau_s is None:
         raise ValueError("pulse_tau_s = None is not accepted: give a time beside the shape.")
+    require_time("pulse_tau_s", tau_s, SHORTEST_PULSE_S)
     fits = samples.size <= _MOST_SAMPLES
     require("pulse_samples", f"{samples.size:,} of them", fits, f"up to {_MOST_SAMPLES:,}")
     return Pulse(tau_s, shape=shape, samples=tuple(samples.astype(float).ravel().tolist()))  # type: ignore[arg-type]
+
+
+def require_pulse_in_gate(pulse: Pulse, acquisition: Acquisition) -> None:
+    """Raise ``ValueError`` if a file's pulse has many samples and lasts longer than the gate."""
+    n_samples = len(pulse.samples)
+    length_s, gate_s = n_samples * pulse.tau_s, acquisition.n_bins * acquisition.bin_width_s
+    require(
+        "pulse_samples",
+        f"{n_samples:,} of them, {time_text(length_s)}",
+        n_samples <= _MOST_SAMPLES_BEYOND_GATE or length_s <= gate_s,
+        f"up to {_MOST_SAMPLES_BEYOND_GATE:,}, or no more than last {time_text(gate_s)}, the gate",
+    )
 
 
 def count_dtype(highest: float) -> np.dtype[np.unsignedinteger]:

@@ -5,7 +5,8 @@ Frames are counted as they are read, a stretch of the file at a time. So only th
 number of bins is still being found, a stretch of `STRETCH` values takes some 40 bytes for each.
 
 Each frame is one pulse, and each pixel triggers once in it or never: these are first photons, as
-many pulses as frames. Without ``n_bins`` the gate ends with the last trigger.
+many pulses as frames. Without ``n_bins`` the gate ends with the last trigger, which may lie in one
+of the first 65,536 bins: a larger number more likely stands for no trigger.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from core.readers.request import Request
 
 AXES = ("pulse", "row", "col")
 STRETCH = 2**20
+MOST_GUESSED_BINS = 2**16
 
 Stretch = tuple[tuple[int, int, int], NDArray[Any]]
 """Frames (pulse, row, col), and the pulse, row and column of the first of them."""
@@ -102,7 +104,7 @@ def count_triggers(
     n_pulses, n_rows, n_cols = shape
     dtype = count_dtype(n_pulses)
     cube = _more_bins(np.zeros((n_rows, n_cols, 0), dtype), n_bins or 0, name)
-    end = np.inf if n_bins is None else first_bin + n_bins
+    end = first_bin + (n_bins or MOST_GUESSED_BINS)
     for start, frames in stretches:
         fired = frames != no_trigger
         numbers = frames[fired]
@@ -111,8 +113,8 @@ def count_triggers(
             place = np.argwhere(fired)[np.argmax(odd)]
             pulse, row, col = (int(first + k) for first, k in zip(start, place, strict=True))
             what = f"{name} in pulse {pulse}, pixel ({row}, {col})"
-            accepted = f"{first_bin} or more" if n_bins is None else f"{first_bin} to {end - 1}"
-            accepted += f" for n_bins = {n_bins}, or {no_trigger} where nothing fired"
+            limited = "(more with n_bins)" if n_bins is None else f"for n_bins = {n_bins}"
+            accepted = f"{first_bin} to {end - 1} {limited}, or {no_trigger} where nothing fired"
             require(what, numbers[odd][0].item(), False, accepted)
         if not numbers.size:
             continue

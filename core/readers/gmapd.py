@@ -43,7 +43,7 @@ def read(path: Path, request: Request) -> Capture:
     shape = (size // _FRAME_BYTES, SIZE, SIZE)
     told = replace(request, n_bins=request.n_bins or N_BINS)
     return frames_capture(
-        _stretches(path, order),
+        _stretches(path, order, shape[0]),
         shape,
         _NO_TRIGGER,
         "the frames",
@@ -54,12 +54,12 @@ def read(path: Path, request: Request) -> Capture:
     )
 
 
-def _stretches(path: Path, order: tuple[int, ...]) -> Iterator[Stretch]:
+def _stretches(path: Path, order: tuple[int, ...], n_pulses: int) -> Iterator[Stretch]:
     most = max(1, STRETCH // (_FRAME[0] * _FRAME[1]))
-    pulse = 0
     with path.open("rb") as file:
-        while data := file.read(most * _FRAME_BYTES):
+        for pulse in range(0, n_pulses, most):
+            n_frames = min(most, n_pulses - pulse)
             with decoding("a frame"):
-                frames = np.frombuffer(data, "<u2").reshape(-1, *_FRAME)[:, 1:]
+                data = np.frombuffer(file.read(n_frames * _FRAME_BYTES), "<u2")
+                frames = data.reshape(n_frames, *_FRAME)[:, 1:]
             yield (pulse, 0, 0), frames.transpose(order)
-            pulse += len(frames)

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -38,6 +39,49 @@ def require_fits(name: str, n_bytes: int, remedy: str = "a smaller file") -> Non
     require(f"bytes of {name}", n_bytes, 0 <= n_bytes <= MAX_CUBE_BYTES, allowed)
 
 
+@dataclass(frozen=True)
+class FileVersion:
+    """A file or folder as it was when it was opened.
+
+    Parameters
+    ----------
+    path : Path
+    stamp : tuple of int
+        Size in bytes, and when its content last changed in nanoseconds.
+    """
+
+    path: Path
+    stamp: tuple[int, int]
+
+    @classmethod
+    def of(cls, path: Path) -> FileVersion:
+        """The file as it is now."""
+        status = path.stat()
+        return cls(path, (status.st_size, status.st_mtime_ns))
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Raise `CaptureError` if the file has changed by the end, so that nothing is mixed."""
+        try:
+            yield
+        except Exception:
+            self.require()  # a change explains the failure
+            raise
+        self.require()
+
+    def require(self) -> None:
+        """Raise `CaptureError` if the file has changed or is gone."""
+        try:
+            found = "changed" if FileVersion.of(self.path) != self else ""
+        except OSError:
+            found = "gone"
+        if found:
+            raise CaptureError(
+                f"version of {self.path.name} = {found!r} is not accepted: give a file that has "
+                "not gone or changed since it was opened, or open it again."
+            )
+
+
 @contextmanager
 def decoding(what: str) -> Iterator[None]:
     """Turn whatever a library raises on a damaged file into one clear refusal.
@@ -46,6 +90,8 @@ def decoding(what: str) -> Iterator[None]:
     """
     try:
         yield
+    except CaptureError:
+        raise  # said already
     except Exception as error:
         reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise CaptureError(

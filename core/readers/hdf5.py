@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.readers.chunks import Chunked, Contiguous, Filter, Part, Stretches, Whole
-from core.readers.guards import decoding, isolated
+from core.readers.guards import FileVersion, decoding, isolated
 from core.readers.stored import Numbers, Stored
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -28,11 +28,12 @@ _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     """All arrays of a file, and the attributes of its groups by name; the file's own are ``""``."""
+    file = FileVersion.of(path)
     told, tables = isolated(_SURVEY, path, "the file", "survey")
     with decoding("the list of arrays"):
         groups = {name: _plain(known) for name, known in told["groups"].items()}
         found = [
-            _stored(path, one, tables.get(f"{k}"))
+            _stored(file, one, tables.get(f"{k}"))
             for k, one in enumerate(told["arrays"])
             if not str(one.get("attributes", {}).get("NAME", "")).startswith(_NO_VARIABLE)
         ]
@@ -45,7 +46,7 @@ def cells(path: Path, name: str, most_values: int) -> tuple[NDArray[Any], NDArra
     return found["values"], found["sizes"]
 
 
-def _stored(path: Path, one: Mapping[str, Any], table: NDArray[Any] | None) -> Stored:
+def _stored(file: FileVersion, one: Mapping[str, Any], table: NDArray[Any] | None) -> Stored:
     name, known = str(one["name"]), _plain(one.get("attributes", {}))
     if "refused" in one:
         shape = tuple(one["shape"]) if "references" in one else ()
@@ -55,14 +56,14 @@ def _stored(path: Path, one: Mapping[str, Any], table: NDArray[Any] | None) -> S
         return Stored(name, None, attributes=known, refused=f"an array of shape {shape}")
     axes = tuple(one["dimensions"])
     try:
-        numbers = _numbers(path, name, shape, one, table)
+        numbers = _numbers(file, name, shape, one, table)
     except ValueError as error:
         return Stored(name, None, axes, known, str(error))
     return Stored(name, numbers, axes, known)
 
 
 def _numbers(
-    path: Path,
+    file: FileVersion,
     name: str,
     shape: tuple[int, ...],
     one: Mapping[str, Any],
@@ -72,13 +73,13 @@ def _numbers(
     if "chunk" in one:
         filters = [Filter(packed, dtype.itemsize) for packed in one["filters"]]
         chunk = tuple(int(n) for n in one["chunk"])
-        places = Stretches(path, _places(table, len(shape), filters))
+        places = Stretches(file, _places(table, len(shape), filters))
         return Chunked(name, shape, dtype, chunk, places, fill)
     if table is not None:  # compact: within the array's header
         return Chunked(name, shape, dtype, shape, Whole(table.tobytes()))
     if one["offset"] is None:  # nothing was ever written
         return Chunked(name, shape, dtype, (1, *shape[1:]), _nothing, fill)
-    return Contiguous(name, shape, dtype, path, int(one["offset"]))
+    return Contiguous(name, shape, dtype, file, int(one["offset"]))
 
 
 def _nothing(_: tuple[int, ...]) -> Part | None:

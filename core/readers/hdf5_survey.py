@@ -166,7 +166,7 @@ def _storage(
     fill = np.zeros(1, dtype)
     if created.fill_value_defined() != h5d.FILL_VALUE_UNDEFINED:
         created.get_fill_value(fill)
-    told: dict[str, Any] = {"fill": fill[0].item(), "filters": _filters(created)}
+    told: dict[str, Any] = {"fill": fill[0].item(), "filters": _filters(created, dtype.itemsize)}
     layout = created.get_layout()
     if layout == h5d.COMPACT:
         values = np.empty(array.shape, dtype)
@@ -181,12 +181,15 @@ def _storage(
     return told
 
 
-def _filters(created: h5py.h5p.PropDCID) -> list[str]:
+def _filters(created: h5py.h5p.PropDCID, item_bytes: int) -> list[str]:
+    """Names of the filters of an array whose numbers take `item_bytes` each."""
     found = []
     for k in range(created.get_nfilters()):
-        code, _, _, name = created.get_filter(k)
+        code, _, values, name = created.get_filter(k)
         if code not in FILTERS:
             raise ValueError(f"packed by the filter {name.decode(errors='replace') or code}")
+        if code == h5z.FILTER_SHUFFLE and values and values[0] != item_bytes:
+            raise ValueError(f"shuffled in elements of {values[0]} bytes, not {item_bytes}")
         found.append(FILTERS[code])
     return found
 
@@ -267,8 +270,8 @@ class _Owner:
 def _vector(array: Any, types: list[h5t.TypeID], most: int) -> Any:
     """The numbers of one cell; `types` are those that proved fine before."""
     try:
-        _filters(_created(array))
-        kind = array.get_type()
+        created, kind = _created(array), array.get_type()
+        _filters(created, kind.get_size())
         if kind not in types:
             _number_type(kind)
             types.append(kind)

@@ -32,6 +32,7 @@ from core.readers.dense import (
     PULSE,
     guess_detection,
     require_image,
+    require_pulse_in_gate,
     require_sums,
     stored_counts,
     stored_pulse,
@@ -468,6 +469,8 @@ def describe(
         n_pulses=complete.n_pulses,
         pixel_angle_rad=complete.pixel_angle_rad,
     )
+    if pulse is not None and request.pulse is None:
+        require_pulse_in_gate(pulse, acquisition)
     if pulse is None or detection is None:
         sample = sample_of(counts.data)  # in memory or not: both ways in make the same guess
         pulse = pulse or guessed_pulse(sample, acquisition.bin_width_s)

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.array_utils import byte_bounds
 
-from core.readers.chunks import Chunked, Whole
-from core.readers.guards import decoding, require_fits
+from core.readers.chunks import Chunked, Whole, read_stretch
+from core.readers.guards import FileVersion, decoding, require_fits
 from core.readers.stored import Stored
 
 SIGNATURES = (b"CDF\x01", b"CDF\x02")
@@ -19,17 +20,19 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     """All arrays of a file, and its attributes under the name ``""``."""
     from scipy.io import netcdf_file  # noqa: PLC0415 - not for every file
 
+    version = FileVersion.of(path)
     # Mapped: SciPy would read every variable at once, and any number of them may share their bytes.
+    # The map itself is never read: that would end the process if the file became shorter meanwhile.
     with decoding("the file"):
         file = netcdf_file(path, mmap=True)
-    with file:
+    with file, version.unchanged():
         with decoding("the file"):
             n_bytes = sum(one.data.nbytes for one in file.variables.values() if _is_useful(one))
         require_fits("all variables", n_bytes)
         with decoding("the file"):
-            names = list(file.variables)
+            names, begin = list(file.variables), byte_bounds(file._mm_buf)[0]
             # None is left, or the map could not be closed.
-            found = [_stored(name, file.variables.pop(name)) for name in names]
+            found = [_stored(path, begin, name, file.variables.pop(name)) for name in names]
             return found, {"": _plain(file._attributes)}
 
 
@@ -38,13 +41,16 @@ def _is_useful(variable: Any) -> bool:
     return bool(1 <= values.ndim <= _LARGEST and values.dtype.kind in "iuf" and values.size)
 
 
-def _stored(name: str, variable: Any) -> Stored:
-    """A copy of a variable."""
+def _stored(path: Path, begin: int, name: str, variable: Any) -> Stored:
+    """A copy of a variable of a file that is mapped from an address on."""
     values, known = variable.data, _plain(variable._attributes)
     if not _is_useful(variable):
         return Stored(name, attributes=known, refused="no numbers with 1 to 3 axes")
-    whole = Whole(values.tobytes())
-    numbers = Chunked(name, values.shape, values.dtype, values.shape, whole)
+    first, end = byte_bounds(values)
+    data = read_stretch(path, first - begin, end - first)
+    if len(data) != values.nbytes:  # a variable that grows with the file lies among others
+        data = np.ndarray(values.shape, values.dtype, data, strides=values.strides).tobytes()
+    numbers = Chunked(name, values.shape, values.dtype, values.shape, Whole(data))
     return Stored(name, numbers, tuple(variable.dimensions), known)
 
 

@@ -50,6 +50,7 @@ from core.readers.dense import (
     cube_capture,
     dense_capture,
     require_image,
+    require_pulse_in_gate,
     stored_counts,
     stored_pulse,
 )
@@ -107,7 +108,7 @@ def read(path: Path, request: Request) -> Capture:
         origin = _text(stored, "source", origin)
         counts = stored_counts(cube, name)
         capture = dense_capture(counts, origin, _known(stored, request), Pulse())
-        return _with_truth(capture, archive, stored)
+        return _completed(capture, archive, stored, request)
 
 
 def _frames(
@@ -129,7 +130,7 @@ def _frames(
         capture = frames_in(
             file, info.file_size, name, origin, replace(known, no_trigger=no_trigger)
         )
-    return _with_truth(capture, archive, stored)
+    return _completed(capture, archive, stored, request)
 
 
 def _known(stored: Mapping[str, NDArray[Any]], request: Request) -> Request:
@@ -148,7 +149,12 @@ def _known(stored: Mapping[str, NDArray[Any]], request: Request) -> Request:
     return replace(request, **told)
 
 
-def _with_truth(capture: Capture, archive: ZipFile, stored: Mapping[str, NDArray[Any]]) -> Capture:
+def _completed(
+    capture: Capture, archive: ZipFile, stored: Mapping[str, NDArray[Any]], request: Request
+) -> Capture:
+    """A capture with the truth beside its counts, once its own pulse proved short enough."""
+    if request.pulse is None:
+        require_pulse_in_gate(capture.pulse, capture.acquisition)
     return replace(
         capture,
         truth_range_m=_image(archive, "truth_range_m", capture.shape),

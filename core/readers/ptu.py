@@ -54,14 +54,14 @@ def read(path: Path, request: Request) -> Capture:
     """Read the histograms of an image."""
     from ptufile import PtuFile  # noqa: PLC0415  (only who opens such a file waits for it)
 
-    size = path.stat().st_size
-    require_fits("the file", size)
+    require_fits("the file", path.stat().st_size)
+    data = path.read_bytes()
     with decoding("the header"):
         # From memory: a file's own reader asks for as many bytes as a tag claims.
-        file = PtuFile(BytesIO(path.read_bytes()), trimdims="T")
+        file = PtuFile(BytesIO(data), trimdims="T")
     with file:
         bin_width_s, n_bins = _bins(file.tags)
-        shape = _require_image(file, size, n_bins)
+        shape = _require_image(file, len(data), n_bins)
         with decoding("the records"):
             channels, n_frames = file.active_channels, file.shape[0]
             n_bins = min(n_bins, file.number_bins_max)

@@ -9,9 +9,20 @@ from typing import get_args
 
 import numpy as np
 
-from core.acquisition import Pulse
+from core.acquisition import (
+    LONGEST_S,
+    MOST_BINS,
+    MOST_PULSES,
+    SHORTEST_BIN_S,
+    Pulse,
+    require_time,
+)
 from core.capture import Detection
-from core.checks import require
+from core.checks import require, require_whole
+
+_LEAST_S = {"time_unit_s": SHORTEST_BIN_S, "bin_width_s": SHORTEST_BIN_S}
+_LEAST_S |= {"gate_delay_s": -LONGEST_S, "stop_s": -LONGEST_S}
+_MOST = {"n_bins": MOST_BINS, "n_pulses": MOST_PULSES, "first_detections": MOST_PULSES}
 
 
 @dataclass(frozen=True)
@@ -42,16 +53,12 @@ class Request:
     first_detections: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("time_unit_s", "bin_width_s"):
-            value = getattr(self, name)
-            require(name, value, value is None or 0 < value < np.inf, "positive, in seconds")
-        for name in ("n_bins", "n_pulses", "first_detections"):
-            value = getattr(self, name)
-            whole = isinstance(value, int | np.integer) and value >= 1
-            require(name, value, value is None or bool(whole), "a whole number, at least 1")
-        for name in ("gate_delay_s", "stop_s"):
-            value = getattr(self, name)
-            require(name, value, value is None or bool(np.isfinite(value)), "finite, in seconds")
+        for name, least_s in _LEAST_S.items():
+            if (value_s := getattr(self, name)) is not None:
+                require_time(name, value_s, least_s)
+        for name, most in _MOST.items():
+            if (value := getattr(self, name)) is not None:
+                require_whole(name, value, most)
         angle = self.pixel_angle_rad
         require("pixel_angle_rad", angle, angle is None or 0 < angle < 1, "between 0 and 1 radian")
         kinds = get_args(Detection)

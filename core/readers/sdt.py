@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
@@ -42,14 +43,20 @@ def read(path: Path, request: Request) -> Capture:
     from sdtfile import SdtFile  # noqa: PLC0415  (only who opens such a file waits for it)
 
     require_fits("the file", path.stat().st_size)
+    data = path.read_bytes()
     with decoding("the header"):
-        headers = list(_block_headers(path.read_bytes()))
-    _require_harmless(path.read_bytes(), headers)
+        headers = list(_block_headers(data))
+    _require_harmless(data, headers)
     block = _choose(headers, request.variable)
     name = f"block {block}"
-    with path.open("rb") as stream, decoding("the blocks"):
-        file = SdtFile(stream)
-        data, times = file.data[block], file.times[block]
+    with (
+        NamedTemporaryFile() as checked
+    ):  # a real file, as `sdtfile` wants, that nobody else changes
+        checked.write(data)
+        checked.seek(0)
+        with decoding("the blocks"):
+            file = SdtFile(checked)
+            histograms, times = file.data[block], file.times[block]
     # The format's numbers of 4 bytes: the shortest one in decimals is what was meant.
     bin_width_s = float(str(np.float32(times[1]))) if times.size > 1 else 0.0
     if request.bin_width_s is None:
@@ -60,7 +67,8 @@ def read(path: Path, request: Request) -> Capture:
         bin_width_s=request.bin_width_s or bin_width_s,
         detection=request.detection or "all",
     )
-    return cube_capture(_image(data, name), name, f"{path.name}, {name}", known, " ".join(AXES))
+    cube = _image(histograms, name)
+    return cube_capture(cube, name, f"{path.name}, {name}", known, " ".join(AXES))
 
 
 def _block_headers(data: bytes) -> Iterator[np.void]:

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from core.acquisition import Floats, Pulse
 from core.capture import Capture
 from core.checks import require
-from core.readers.dense import AXES, dense_capture, whole_counts
+from core.readers.dense import AXES, dense_capture, require_pulse_in_gate, whole_counts
 from core.readers.guards import decoding, require_fits
 from core.readers.request import Request
 from core.readers.wording import time_text
@@ -95,7 +95,10 @@ def _capture(
     guessed = [f"bin width {time_text(width_s)}"] * (request.bin_width_s is None)
     if known.gate_delay_s is not None and request.gate_delay_s is None:
         guessed.append(f"zero range {time_text(-known.gate_delay_s)} after the first bin")
-    return dense_capture(counts, origin, known, also_guessed=guessed)
+    capture = dense_capture(counts, origin, known, also_guessed=guessed)
+    if request.pulse is None:
+        require_pulse_in_gate(capture.pulse, capture.acquisition)
+    return capture
 
 
 def _peak_s(pulse: Pulse) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Detection
+from core.checks import printable
 from core.readers.request import Request
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15}
@@ -55,6 +56,7 @@ def guesses(
 
 
 def sentence(origin: str, guessed: Iterable[str], *remarks: str) -> str:
-    """Join the origin, the guesses and the remarks that are not empty."""
+    """Join the origin, the guesses and the remarks that are not empty; any encoding can hold it."""
     listed = ", ".join(guessed)
-    return "; ".join(filter(None, (origin, listed and f"guessed: {listed}", *remarks)))
+    parts = (origin, listed and f"guessed: {listed}", *remarks)
+    return printable("; ".join(filter(None, parts)))

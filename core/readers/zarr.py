@@ -12,8 +12,9 @@ import base64
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 
 from core.checks import require
 from core.readers.chunks import Chunked, Filter, Part, read_stretch
-from core.readers.guards import decoding
+from core.readers.guards import FileVersion, decoding
 from core.readers.stored import Stored
 
 _MOST_JSON_BYTES = 2**24  # of a whole directory
@@ -30,6 +31,9 @@ _TYPES_2 = re.compile(r"[<>|]([iu][1248]|f[248])")
 _TYPES_3 = re.compile(r"u?int(8|16|32|64)|float(16|32|64)")
 _CODECS = {"zlib": "deflate", "gzip": "deflate", "zstd": "zstd", "blosc": "blosc"}
 _CODECS |= {"shuffle": "shuffle", "fletcher32": "fletcher32", "crc32c": "crc32c"}
+_MOST_CODECS = 32  # of one array, as in HDF5
+_MOST_AXES = 32
+_MOST_ELEMENT_BYTES = 16  # the largest number that NumPy has
 _NOT_FINITE = {"NaN": np.nan, "Infinity": np.inf, "-Infinity": -np.inf}
 
 
@@ -45,21 +49,29 @@ class ChunkFiles:
         Of a file's name: before the first index, and between one and the next.
     filters : tuple of Filter
         What every chunk went through, the last one first.
+    metadata : FileVersion
+        Of the array; no chunk is read once it has changed.
+    folders : dict
+        Folders as they were when they were listed, by their paths; a chunk that is missing from one
+        in which files have come or gone since is refused.
     """
 
     folder: Path
     prefix: str
     separator: str
     filters: tuple[Filter, ...]
+    metadata: FileVersion
+    folders: Mapping[Path, FileVersion]
 
     def __call__(self, index: tuple[int, ...]) -> Part | None:
         """The bytes of a chunk, None where it was never written."""
         path = self.folder / (self.prefix + self.separator.join(map(str, index)))
-        if not path.exists():
-            there = self.folder.is_dir()
-            require("folder of the array", self.folder.name, there, "one that has not gone")
+        with self.metadata.unchanged():
+            if path.exists():
+                return Part(read_stretch(path, 0, path.stat().st_size), self.filters)
+            if path.parent in self.folders:
+                self.folders[path.parent].require()  # else it may have been there
             return None
-        return Part(read_stretch(path, 0, path.stat().st_size), self.filters)
 
 
 def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
@@ -67,7 +79,8 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     found: list[Stored] = []
     groups: dict[str, dict[str, Any]] = {}
     n_bytes = 0
-    for folder, files in _folders(path):
+    folders: dict[Path, FileVersion] = {}
+    for folder, files in _folders(path, folders):
         n_bytes += sum((folder / name).stat().st_size for name in files.intersection(_METADATA))
         most = f"up to {_MOST_JSON_BYTES:,}"
         require("bytes of metadata", n_bytes, n_bytes <= _MOST_JSON_BYTES, most)
@@ -79,6 +92,10 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
             not all(files & own for own in versions),
             "one of them",
         )
+        described = [name for name in _METADATA if name in files]
+        if not described:
+            continue
+        version = FileVersion.of(folder / described[0])
         if "zarr.json" in files:
             about = _json(folder / "zarr.json")
             known = _plain(about.get("attributes"))
@@ -98,7 +115,8 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
             continue
         title = name or path.name
         try:
-            numbers, axes = describe(title, folder, about), about.get("dimension_names")
+            kept = partial(ChunkFiles, folder, metadata=version, folders=folders)
+            numbers, axes = describe(title, kept, about), about.get("dimension_names")
             known = known | _missing(about, known, numbers)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             found.append(
@@ -112,11 +130,15 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     return found, groups
 
 
-def _folders(path: Path) -> Iterator[tuple[Path, set[str]]]:
-    """Every directory with the names of its files, none of them a link or no file at all."""
+def _folders(path: Path, versions: dict[Path, FileVersion]) -> Iterator[tuple[Path, set[str]]]:
+    """Every directory with the names of its files, none of them a link or no file at all.
+
+    Adds the version of each to `versions`.
+    """
     waiting = [path]
     while waiting:
         folder = waiting.pop(0)
+        versions[folder] = FileVersion.of(folder)
         files = set()
         with os.scandir(folder) as entries:
             for entry in sorted(entries, key=lambda entry: entry.name):
@@ -130,7 +152,7 @@ def _folders(path: Path) -> Iterator[tuple[Path, set[str]]]:
         yield folder, files
 
 
-def _array_2(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
+def _array_2(name: str, kept: Callable[..., ChunkFiles], about: Mapping[str, Any]) -> Chunked:
     require("zarr_format", about["zarr_format"], about["zarr_format"] == 2, "2 in .zarray")
     kind, separator = about["dtype"], about.get("dimension_separator", ".")
     plain = isinstance(kind, str) and _TYPES_2.fullmatch(kind) is not None
@@ -139,6 +161,7 @@ def _array_2(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
     require("order", about["order"], about["order"] in ("C", "F"), "'C' or 'F'")
     # Written through the filters, then the compressor; read the other way.
     packed = [*(about.get("filters") or []), *filter(None, [about.get("compressor")])]
+    _require_few("filters", packed, _MOST_CODECS)
     filters = tuple(_filter(one["id"], one, np.dtype(kind)) for one in reversed(packed))
     shape, chunk = _sizes(about["shape"]), _sizes(about["chunks"])
     return Chunked(
@@ -146,13 +169,13 @@ def _array_2(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
         shape,
         np.dtype(kind),
         chunk,
-        ChunkFiles(folder, "", separator, filters),
+        kept("", separator, filters),
         _fill(about.get("fill_value")),
         order=tuple(reversed(range(len(shape)))) if about["order"] == "F" else None,
     )
 
 
-def _array_3(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
+def _array_3(name: str, kept: Callable[..., ChunkFiles], about: Mapping[str, Any]) -> Chunked:
     require("zarr_format", about["zarr_format"], about["zarr_format"] == 3, "3 in zarr.json")
     kind, grid, keys = about["data_type"], about["chunk_grid"], about["chunk_key_encoding"]
     plain = isinstance(kind, str) and _TYPES_3.fullmatch(kind) is not None
@@ -167,6 +190,7 @@ def _array_3(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
     require("storage_transformers", extras, not extras, "none")
     filters: list[Filter] = []
     dtype, order = np.dtype(kind), None
+    _require_few("codecs", about["codecs"], _MOST_CODECS)
     for codec in about["codecs"]:
         told = codec.get("configuration", {})
         if codec["name"] == "bytes":
@@ -183,7 +207,7 @@ def _array_3(name: str, folder: Path, about: Mapping[str, Any]) -> Chunked:
         _sizes(about["shape"]),
         dtype,
         _sizes(grid["configuration"]["chunk_shape"]),
-        ChunkFiles(folder, prefix + separator * bool(prefix), separator, tuple(filters)),
+        kept(prefix + separator * bool(prefix), separator, tuple(filters)),
         _fill(about.get("fill_value")),
         order=order,
     )
@@ -209,14 +233,26 @@ def _missing(
 def _filter(name: Any, told: Mapping[str, Any], dtype: np.dtype[Any]) -> Filter:
     known = isinstance(name, str) and name in _CODECS
     require("codec", name, known, "one of " + ", ".join(_CODECS))
-    (element,) = _sizes([told.get("elementsize", dtype.itemsize)])
+    element = told.get("elementsize", dtype.itemsize)
+    fits = type(element) is int and 1 <= element <= _MOST_ELEMENT_BYTES
+    require("elementsize", element, fits, f"a whole number from 1 to {_MOST_ELEMENT_BYTES}")
     return Filter(_CODECS[name], element)
 
 
 def _sizes(values: Any) -> tuple[int, ...]:
-    whole = isinstance(values, list) and all(type(n) is int and n > 0 for n in values)
-    require("sizes", values, whole, "whole numbers, at least 1")
+    _require_few("sizes", values, _MOST_AXES)
+    whole = all(type(n) is int and 0 < n < 2**63 for n in values)
+    require("sizes", values, whole, "whole numbers from 1 to 2**63 - 1")
     return tuple(values)
+
+
+def _require_few(name: str, values: Any, most: int) -> None:
+    """Raise ``ValueError`` unless something is a list of no more than so many."""
+    found = (
+        f"{len(values):,} of them" if isinstance(values, list) and len(values) > most else values
+    )
+    few = isinstance(values, list) and len(values) <= most
+    require(name, found, few, f"a list of at most {most}")
 
 
 def _fill(value: Any) -> float:

@@ -67,6 +67,13 @@ def test_shape_and_nan_survive_conversion() -> None:
     ("name", "value"),
     [
         ("n_bins", 0),
+        ("n_bins", 2**24 + 1),
+        ("n_bins", 10**400),
+        ("bin_width_s", 5e-324),
+        ("bin_width_s", 10.1),
+        ("gate_delay_s", 10.1),
+        ("n_pulses", 2**63),
+        ("n_pulses", 2**53 + 1),
         ("bin_width_s", 0.0),
         ("bin_width_s", np.inf),
         ("bin_width_s", np.nan),
@@ -212,10 +219,28 @@ def test_pulses_are_values() -> None:
     assert len({Pulse(), Pulse(1e-9), Pulse.gaussian(1e-9)}) == 2
 
 
-@pytest.mark.parametrize("tau_s", [0.0, -1e-9, np.inf, np.nan])
+def test_a_gate_of_minutes_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"gate, n_bins \* bin_width_s, = 20.0 .*at most 10"):
+        Acquisition(n_bins=20, bin_width_s=1.0)
+
+
+def test_the_widest_acquisitions_have_finite_ranges() -> None:
+    widest = Acquisition(10, 1.0, 10.0, 2**53)
+    finest = Acquisition(2**24, 1e-18, -10.0)
+    for acquisition in (widest, finest):
+        edges = acquisition.bin_to_range_m([0, acquisition.n_bins])
+        assert np.isfinite(acquisition.range_m_to_bin(edges)).all()
+
+
+@pytest.mark.parametrize("tau_s", [0.0, 5e-324, -1e-9, 10.1, 1e300, np.inf, np.nan])
 def test_impossible_durations_are_refused(tau_s: float) -> None:
-    with pytest.raises(ValueError, match=r"tau_s = .* is not accepted: give positive, in seconds"):
+    with pytest.raises(ValueError, match=r"tau_s = .* give a time from 1e-21 to 10 s"):
         Pulse(tau_s)
+
+
+def test_a_measured_pulse_of_minutes_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"length of the samples = 20.0 .*at most 10"):
+        Pulse.measured(np.ones(20), 1.0)
 
 
 @pytest.mark.parametrize("samples", [[], [0, 0], [1, -1], [1, np.nan], [1, np.inf]])

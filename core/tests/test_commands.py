@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -285,6 +286,48 @@ def test_an_interrupt_is_told_as_shells_do(
     monkeypatch.setattr("core.commands.captures.open_capture", stopped)
     code, _, err = ran(capsys, "info", frames)
     assert code == 130 and "Interrupted" in err
+
+
+@pytest.mark.parametrize(
+    ("locale", "name"), [("C", "gr\u00f6\u00dfe".encode()), ("C.UTF-8", b"n\xff")]
+)
+def test_names_that_the_terminal_cannot_show(locale: str, name: bytes, frames: Path) -> None:
+    known = {key: value for key, value in os.environ.items() if not key.startswith("PYTHONIO")}
+    plain = {**known, "LC_ALL": locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    folder = os.fsencode(frames.parent)
+    path, out = (os.path.join(folder, name + suffix) for suffix in (b".npy", b"_out.tif"))
+    os.rename(frames, path)
+
+    def ran(*arguments: bytes | str) -> subprocess.CompletedProcess[bytes]:
+        command = [sys.executable, "-m", "core", *arguments]
+        return subprocess.run(command, cwd=ROOT, env=plain, capture_output=True, check=False)
+
+    for arguments in (
+        ("info", path),
+        ("info", path, "--json"),
+        ("estimate", "peak", "--capture", path, "--out", out),
+        ("export", path, os.path.join(folder, name + b".nc")),
+    ):
+        done = ran(*arguments)
+        assert done.returncode == 0, done.stderr
+        if "--json" in arguments:
+            assert json.loads(done.stdout)["source"].endswith("all photons of a pulse")
+    again = ran("estimate", "peak", "--capture", path, "--out", out)
+    assert again.returncode == 2 and b"exists" in again.stderr
+    absent = ran("info", path + b".npz")
+    assert absent.returncode == 2 and b"an existing file" in absent.stderr
+    assert b"Traceback" not in again.stderr + absent.stderr
+    assert os.path.exists(out)
+
+
+def test_names_that_are_too_long(
+    frames: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    long = frames.with_name("a" * 300 + ".npz")
+    for arguments in (("info", long), ("export", frames, long), ("simulate", "--out", long)):
+        code, _, err = ran(capsys, *arguments)
+        assert code == 1 and "File name too long" in err and "aaa...aaa" in err
+        assert len(err) < 500
 
 
 def test_a_pipe_that_closes_early_is_no_error(frames: Path) -> None:

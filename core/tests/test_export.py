@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 from xml.etree import ElementTree
@@ -32,8 +33,9 @@ from core.acquisition import Acquisition
 from core.capture import Capture
 from core.cloud import sight_lines
 from core.estimators import RangeImage
-from core.export import WRITERS, save_capture, save_image, save_pixel
+from core.export import CAPTURE_SUFFIXES, WRITERS, save_capture, save_image, save_pixel
 from core.export.product import Plane, Product
+from core.readers.labelled import dataset
 from core.tracking import TrackingParameters, tracking_signals
 
 pytestmark = pytest.mark.files
@@ -320,6 +322,77 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(OSError, match="No space"):
         save_image(CAPTURE, IMAGE, tmp_path / "wall.npz")
     assert os.listdir(tmp_path) == []
+
+
+def fails_in_its_own_words(product: Product, file: BinaryIO) -> None:
+    """As the library of LAZ does."""
+    try:
+        file.write(bytes(200))
+        file.flush()
+    except OSError:
+        raise RuntimeError("Failed to call write") from None
+
+
+WRITES_TOO_MUCH = """
+import resource, signal, sys
+from dataclasses import replace
+from pathlib import Path
+from core.export import CAPTURE_SUFFIXES, FOLDER_WRITERS, WRITERS, save_capture, save_image
+from core.tests.test_export import CAPTURE, IMAGE, fails_in_its_own_words
+
+kept = replace(CAPTURE, source="a wall")
+WRITERS[".own"] = fails_in_its_own_words
+folder = Path(sys.argv[1])
+saves = [(save_image, (CAPTURE, IMAGE), folder / f"image{s}") for s in (*WRITERS, *FOLDER_WRITERS)]
+saves += [(save_capture, (kept,), folder / f"capture{s}") for s in CAPTURE_SUFFIXES]
+for save, of, path in saves:
+    save(*of, path)  # loads its library
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+for save, of, path in saves:
+    try:
+        save(*of, path, overwrite=True)
+    except OSError as error:
+        print(error)
+"""
+
+
+def test_a_disk_that_is_full_is_reported_and_nothing_is_left(tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk: the system then refuses to write more."""
+    done = subprocess.run(
+        [sys.executable, "-c", WRITES_TOO_MUCH, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    names = [f"image{suffix}" for suffix in (*WRITERS, ".own", ".zarr")]
+    names += [f"capture{suffix}" for suffix in CAPTURE_SUFFIXES]
+    for name, line in zip(names, done.stdout.splitlines(), strict=True):
+        assert line.startswith(f"{tmp_path / name} cannot be written (")
+        assert "): free some space, or give " in line
+    assert sorted(os.listdir(tmp_path)) == sorted(names)  # the older ones
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".zarr"])
+def test_a_name_that_is_too_long_is_shortened_in_the_report(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / ("a" * 300 + suffix)
+    with pytest.raises(OSError, match=r"a\.\.\.a.*: give a shorter name") as caught:
+        save_image(CAPTURE, IMAGE, path)
+    assert caught.value.errno == errno.ENAMETOOLONG and len(str(caught.value)) < 300
+    assert os.listdir(tmp_path) == []
+
+
+def test_zarr_is_written_as_its_own_library_writes_it(tmp_path: Path) -> None:
+    capture = replace(CAPTURE, source="a wall")
+    dataset(capture).to_zarr(tmp_path / "theirs.zarr", consolidated=False)
+    save_capture(capture, tmp_path / "ours.zarr")
+
+    def content(folder: Path) -> dict[str, bytes]:
+        files = (file for file in folder.rglob("*") if file.is_file())
+        return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+    assert content(tmp_path / "ours.zarr") == content(tmp_path / "theirs.zarr")
 
 
 def stopped(*_: Any) -> None:

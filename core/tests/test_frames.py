@@ -145,7 +145,7 @@ REFUSED: dict[str, tuple[str, Any, dict[str, Any], str]] = {
         "f.npy",
         lambda: npy_bytes(changed(-2, np.int32)),
         {"no_trigger": -1},
-        r"in pulse 7, pixel \(2, 1\) = -2 .*0 or more",
+        r"in pulse 7, pixel \(2, 1\) = -2 .*0 to 65535",
     ),
     "half a bin": (
         "f.npy",
@@ -169,7 +169,13 @@ REFUSED: dict[str, tuple[str, Any, dict[str, Any], str]] = {
         "f.npy",
         lambda: npy_bytes(changed(1e300)),
         {"no_trigger": -1},
-        "the cube of the array, .*no_trigger",
+        r"= 1e\+300 .*0 to 65535 \(more with n_bins\), or -1 where nothing fired",
+    ),
+    "a number beyond the gates that are guessed": (
+        "f.npy",
+        lambda: npy_bytes(changed(2**16, np.int32)),
+        {"no_trigger": -1},
+        r"in pulse 7, pixel \(2, 1\) = 65536 .*0 to 65535",
     ),
     "another no_trigger": ("f.npy", lambda: npy_bytes(FRAMES), {"no_trigger": 255}, "= -1 .*255"),
     "nothing fired": (

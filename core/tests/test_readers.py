@@ -272,6 +272,104 @@ def test_photons_outside_a_given_gate_are_dropped(write: Callable[[str, bytes], 
         read_capture(path, gate_delay_s=1e-6)
 
 
+FEW = [4_430_100, 4_430_200, 4_629_900]
+ECHO = [*range(4_430_000, 4_630_000, 1000)]
+"""Picoseconds: 3 and 200 photons in a gate of 200 ns, 4.43 µs after the pulse."""
+
+
+def gate_of(capture: Capture) -> tuple[int, float, float]:
+    """Bins, their width in nanoseconds, and the opening of the gate in nanoseconds."""
+    found = capture.acquisition
+    return found.n_bins, round(found.bin_width_s * 1e9, 6), round(found.gate_delay_s * 1e9, 6)
+
+
+@pytest.mark.parametrize("stray", [10**9, 10**12, 4_430_000 + 2**16 * 1000, 2**52])
+def test_a_stray_photon_does_not_stretch_the_gate(
+    stray: int, write: Callable[[str, bytes], Path]
+) -> None:
+    capture = read_capture(write("s.mat", cell_bytes([*ECHO, stray])))
+    assert gate_of(capture) == (200, 1.0, 4430.0)
+    assert "; dropped: 1 of 201 photons, outside the gate" in capture.source
+    np.testing.assert_array_equal(
+        capture.cube[0, :-1], read_capture(write("e.mat", cell_bytes(ECHO))).cube[0]
+    )
+
+
+def test_a_stray_photon_before_the_others_does_not_open_the_gate(
+    write: Callable[[str, bytes], Path],
+) -> None:
+    late = [time + 10**9 for time in ECHO]
+    capture = read_capture(write("s.mat", cell_bytes([1, *late])))
+    assert gate_of(capture) == (200, 1.0, 1_004_430.0)
+    assert "dropped: 1 of 201" in capture.source
+    with_bins = read_capture(write("s.mat", cell_bytes([1, *late])), n_bins=100)
+    assert gate_of(with_bins)[:2] == (100, 2.048) and with_bins.cube.sum() == 200
+
+
+@pytest.mark.parametrize(
+    ("values", "n_bins"),
+    [
+        ([*ECHO * 5, 4_430_000 + 60_000_000], 60_001),  # one in a thousand, 9 km behind
+        ([*ECHO * 99, *[time + 30_000_000 for time in ECHO]], 30_200),  # one pixel in a hundred
+        ([*FEW, 4_430_000 + 60_000_000], 60_001),
+        ([0, 65_535_999], 65_536),
+    ],
+)
+def test_a_sparse_far_echo_stays_in_the_gate(
+    values: list[int], n_bins: int, write: Callable[[str, bytes], Path]
+) -> None:
+    capture = read_capture(write("f.mat", mat_bytes(Ts=cells_of([values], (1, 1)))))
+    assert gate_of(capture)[:2] == (n_bins, 1.0)
+    assert capture.cube.sum() == len(values) and "dropped" not in capture.source
+
+
+@pytest.mark.parametrize(
+    ("values", "told", "gate"),
+    [
+        # Half of the photons are no strays.
+        ([1e-3 - 1e-9, 1e-12], {}, (61_036, 16.384, 0.0)),
+        ([1e8, 1], {}, (48_829, 2.048, 0.0)),
+        # Everywhere in 100 µs.
+        (list(range(0, 10**8, 10**6)), {}, (48_340, 2.048, 0.0)),
+        # What is told is taken as it is.
+        ([1e8, 1], {"n_bins": 200_000}, (200_000, 1.0, 0.0)),
+        ([1e8, 1], {"bin_width_s": 1e-9}, (100_001, 1.0, 0.0)),
+        ([*ECHO, 10**9], {"bin_width_s": 1e-6}, (997, 1000.0, 4000.0)),
+        ([*ECHO, 10**9], {"gate_delay_s": 4e-6}, (630, 1.0, 4000.0)),
+        ([1, *ECHO], {"gate_delay_s": 4e-6}, (630, 1.0, 4000.0)),
+    ],
+)
+def test_wide_gates_have_wider_bins(
+    values: list[float],
+    told: dict[str, Any],
+    gate: tuple[int, float, float],
+    write: Callable[[str, bytes], Path],
+) -> None:
+    assert gate_of(read_capture(write("w.mat", cell_bytes(values)), **told)) == gate
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"n_bins": 10**9}, r"n_bins = 1000000000 .*1 to 16,777,216"),
+        ({"bin_width_s": 1e-15}, r"bins of Ts = 99999999001 .*larger bin_width_s"),
+        ({"time_unit_s": 1e-9, "bin_width_s": 1e-18}, r"bin_width_s = 1e-18 .*unit .* 1 ns"),
+        ({"time_unit_s": 1e-6}, r"gate of Ts = '100\.\d* s' .*another time_unit_s"),
+    ],
+)
+def test_gates_of_too_many_bins_are_refused(
+    told: dict[str, Any], message: str, write: Callable[[str, bytes], Path]
+) -> None:
+    path = write("g.mat", cell_bytes([10**8, 1]))
+    assert_refused(lambda path: read_capture(path, **told), path, message, CaptureError, 2**22)
+
+
+def test_a_cube_of_too_many_bins_is_refused(write: Callable[[str, bytes], Path]) -> None:
+    path = write("b.npy", npy_bytes(np.zeros((1, 1, 2**24 + 1), np.uint8)))
+    with pytest.raises(CaptureError, match=r"bins of the array = 16777217 .*16,777,216"):
+        read_capture(path)
+
+
 def test_axes_are_turned_as_told(write: Callable[[str, bytes], Path]) -> None:
     turned = read_capture(write("t.npy", npy_bytes(CUBE.transpose(2, 1, 0))), axes="bin, col row")
     np.testing.assert_array_equal(turned.cube, CUBE)
@@ -464,7 +562,11 @@ REFUSED: dict[str, tuple[str, Builder, str]] = {
     "no count in own layout": ("a.npz", own(cube=with_value(0.5)), "cube = 0.5"),
     "a later layout": ("a.npz", own(format="firstphoton-capture-2"), "format = .*-2.*-capture-1"),
     "layout of no text": ("a.npz", own(format=1), "format = .*int64.*unicode"),
-    "no bin width": ("a.npz", own(bin_width_s=0.0), "bin_width_s = 0.0 .*positive"),
+    "no bin width": (
+        "a.npz",
+        own(bin_width_s=0.0),
+        "bin_width_s = 0.0 .*a time from 1e-18 to 10 s",
+    ),
     "bin width of text": ("a.npz", own(bin_width_s="1 ns"), "bin_width_s = .*<U4.*real numbers"),
     "two bin widths": ("a.npz", own(bin_width_s=[1.0, 2.0]), r"bin_width_s .*\(2,\).*one number"),
     "gate nowhere": ("a.npz", own(gate_delay_s=np.nan), "gate_delay_s = nan"),
@@ -491,6 +593,13 @@ REFUSED: dict[str, tuple[str, Builder, str]] = {
     ),
     "a long text": ("a.npz", own(source="a" * 2**20), r"bytes of source = 4194\d+ .*65,536"),
     "truth pickled": ("a.npz", own(truth_range_m=PICKLED), "truth_range_m.*object"),
+    "pulses beyond all counts": ("a.npz", own(n_pulses=2.0**63), "n_pulses = 9223372036854775808"),
+    "a bin of no width": ("a.npz", own(bin_width_s=5e-324), "bin_width_s = 5e-324 .*1e-18 to 10"),
+    "a bin without end": ("a.npz", own(bin_width_s=1e300), r"bin_width_s = 1e\+300 .*1e-18 to 10"),
+    "a gate behind the Moon": ("a.npz", own(gate_delay_s=1e9), "gate_delay_s = 1000000000.0"),
+    "a gate of minutes": ("a.npz", own(bin_width_s=1.0), "gate, .* = 100.0 .*at most 10"),
+    "a pulse without end": ("a.npz", own(pulse_tau_s=1e300), r"pulse_tau_s = 1e\+300 .*to 10 s"),
+    "a pulse of no time": ("a.npz", own(pulse_tau_s=5e-324), "pulse_tau_s = 5e-324 .*1e-21"),
     "background of text": ("a.npz", own(background="low"), "background"),
     "no arrival time": ("a.mat", cells_with([np.nan]), r"Ts in pixel \(1, 0\) = nan"),
     "infinite arrival": ("a.mat", cells_with([np.inf]), r"pixel \(1, 0\) = inf"),
@@ -506,7 +615,11 @@ REFUSED: dict[str, tuple[str, Builder, str]] = {
         lambda: mat_bytes(SBR=1.0, D=np.ones((3, 3))),
         r"D \(double, 3 x 3\)",
     ),
-    "a span too wide": ("a.mat", lambda: cell_bytes([0, 1e15]), "bins = .*larger bin_width_s"),
+    "a span too wide": (
+        "a.mat",
+        lambda: cell_bytes([0, 1e15]),
+        "gate of Ts = '1000.*another time_unit_s",
+    ),
     "beyond whole floats": (
         "a.mat",
         lambda: cell_bytes([0, 1e300]),
@@ -561,11 +674,43 @@ def test_a_pulse_of_too_many_samples(write: Callable[[str, bytes], Path]) -> Non
         read_capture(write("a.npz", content))
 
 
+def test_long_pulses_need_a_long_gate(write: Callable[[str, bytes], Path]) -> None:
+    """Up to 2**16 samples may last longer than a gate that was cut; more must fit in it."""
+    for n_samples, spacing_s in ((2**16, 1e-9), (2**16 + 1, 1e-12)):
+        kept = own(pulse_samples=np.ones(n_samples), pulse_tau_s=spacing_s)()
+        capture = read_capture(write("a.npz", kept))
+        assert capture.pulse == Pulse.measured(np.ones(n_samples), spacing_s)
+    path = write("a.npz", own(pulse_samples=np.ones(2**16 + 1))())
+    with pytest.raises(CaptureError, match=r"pulse_samples = '65,537 of them, 65.537 µs' .*100 ns"):
+        read_capture(path)
+    assert read_capture(path, pulse=Pulse()).pulse == Pulse()
+
+
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"absent.mat: path = .*an existing file"):
         read_capture(tmp_path / "absent.mat")
     with pytest.raises(CaptureError, match="an existing file"):
         read_capture(tmp_path)
+
+
+def test_a_name_that_is_too_long_is_shortened(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match=r"^a+\.\.\.a+\.npz: .*File name too long") as caught:
+        read_capture(tmp_path / ("a" * 300 + ".npz"))
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".nc"])
+def test_names_that_are_no_text_are_kept_as_text(suffix: str, tmp_path: Path) -> None:
+    """Bytes of a name that are no UTF-8 come as surrogates, which no file could hold as text."""
+    name = "n\udcff\udcc3\udcb6.npz"
+    (tmp_path / name).write_bytes(npz_bytes(cube=CUBE))
+    capture = read_capture(tmp_path / name)
+    assert capture.source.startswith("n\\xff\u00f6.npz, variable cube")
+    save_capture(capture, tmp_path / f"kept{suffix}")
+    assert read_capture(tmp_path / f"kept{suffix}").source.startswith(capture.source)
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(CaptureError, match=r"^n\\xff\u00f6\.npz: "):
+        read_capture(tmp_path / name)
 
 
 def test_what_unpacks_beyond_the_limit_is_refused(

@@ -17,6 +17,7 @@ import h5py
 import numcodecs
 import numpy as np
 import pytest
+import scipy
 import xarray as xr
 from scipy.constants import speed_of_light
 
@@ -161,6 +162,17 @@ def test_what_was_never_written_is_its_fill(tmp_path: Path) -> None:
     cube = read_capture(path, variable="some").cube
     assert cube[0, 0, 0] == 9 and cube.sum() == 9 + 3 * (cube.size - 1)
     np.testing.assert_array_equal(read_capture(path, variable="compact").cube, CUBE[:1, :2, :50])
+
+
+def test_variables_that_grow_lie_among_each_other(tmp_path: Path) -> None:
+    """Classic netCDF keeps the rows of all variables of an unlimited dimension in turn."""
+    path = tmp_path / "r.nc"
+    with scipy.io.netcdf_file(path, "w") as file:
+        for name, size in (("row", None), ("col", 4), ("bin", 100)):
+            file.createDimension(name, size)
+        file.createVariable("counts", "i4", ("row", "col", "bin"))[:] = CUBE.astype("i4")
+        file.createVariable("time", "f8", ("row",))[:] = np.arange(3.0)
+    np.testing.assert_array_equal(read_capture(path).cube, CUBE)
 
 
 def test_compact_arrays(tmp_path: Path) -> None:
@@ -527,6 +539,18 @@ HDF5_REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
 }
 
 
+def test_a_shuffle_of_other_elements_is_refused(tmp_path: Path) -> None:
+    content = hdf5_bytes(c={"data": CUBE, "chunks": (2, 3, 64), "shuffle": True})
+    kept = b"shuffle\0" + (2).to_bytes(4, "little")
+    assert content.count(kept) == 1
+    path = put(tmp_path / "s.h5", content)
+    np.testing.assert_array_equal(read_capture(path).cube, CUBE)
+    for n_bytes in (0, 4, 10**9):
+        put(path, content.replace(kept, b"shuffle\0" + n_bytes.to_bytes(4, "little")))
+        with pytest.raises(CaptureError, match=f"shuffled in elements of {n_bytes} bytes, not 2"):
+            read_capture(path)
+
+
 @pytest.mark.parametrize("what", HDF5_REFUSED)
 def test_hdf5_refused(what: str, tmp_path: Path) -> None:
     build, message = HDF5_REFUSED[what]
@@ -699,7 +723,26 @@ ZARR_REFUSED: dict[str, tuple[Callable[[], Mapping[str, bytes]], str]] = {
     "too many chunks": (in_2(shape=[10**5] * 3), "chunks of counts = "),
     "a wild order": (in_2(order="X"), "order = 'X'"),
     "a wild fill": (in_2(fill_value="nothing"), "fill_value = 'nothing'"),
-    "an element of nothing": (in_2(filters=[{"id": "shuffle", "elementsize": 0}]), "sizes = .0"),
+    "an element of nothing": (
+        in_2(filters=[{"id": "shuffle", "elementsize": 0}]),
+        "elementsize = 0 .*1 to 16",
+    ),
+    "a huge element": (
+        in_2(filters=[{"id": "shuffle", "elementsize": 10**9}]),
+        "elementsize = 1000000000 .*1 to 16",
+    ),
+    "a huge element in version 3": (
+        codec_3(name="shuffle", configuration={"elementsize": 17}),
+        "elementsize = 17 .*1 to 16",
+    ),
+    "an element of text": (in_2(filters=[{"id": "shuffle", "elementsize": "2"}]), "elementsize"),
+    "many filters": (in_2(filters=[{"id": "shuffle"}] * 33), "filters = .*34 of them"),
+    "many codecs": (
+        in_3(codecs=[{"name": "bytes"}, *[{"name": "shuffle"}] * 10_000]),
+        "codecs = .*10,001 of them",
+    ),
+    "many axes": (in_2(shape=[3] * 10_000, chunks=[1] * 10_000), "sizes = .*10,000 of them"),
+    "an axis beyond all sizes": (in_2(shape=[3, 4, 2**63]), "sizes = .*9223372036854775808"),
     "a short chunk": (first_chunk(b"", compressor=None), "damaged.*bytes = 0"),
     "a long chunk": (first_chunk(bytes(SIZE + 1), compressor=None), f"bytes = {SIZE + 1}"),
     "a bomb": (
