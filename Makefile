@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 KERNELS := blocks capture detection estimators inspection matlab more_estimators posterior \
 	reductions simulate spatial speed tracking
 
-.PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration field large fuzz clean
+.PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration field large fuzz attack clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
@@ -62,6 +62,9 @@ large: $(VENV)/.app ## a generated capture of 8 GB on a small cluster of bounded
 
 fuzz: $(VENV)/.test ## 20,000 damaged files: each is read or refused, nothing else happens
 	$(BIN)/python -m core.tests.fuzz
+
+attack: $(VENV)/.test ## requests, files and stray photons that should not take a server down
+	$(BIN)/python -m tests.attack
 
 # Stamps: made again when what they depend on has changed.
 $(VENV)/.app: pyproject.toml constraints.txt
