@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from app.budget import spending
 from app.inspector_views import Corners, Curves
 from app.state import Less
 from app.store import Answer, Pixel, inspect, reduced
 from core import inspection
-from core.inspection import Accuracy, PixelReport, RegionReport, Suggestion
+from core.cost import predicted_light
+from core.inspection import Accuracy, CaptureReport, PixelReport, RegionReport, Suggestion
 
 SHARES = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)
 """Of the pulses, for which it is found how good answers are."""
@@ -53,19 +57,30 @@ def pixel_seen(answer: Answer, row: int, col: int) -> Seen:
 
 def pixel_lit(answer: Answer, row: int, col: int) -> Seen:
     """The same, its light found: on a worker, where to find it would hold up the page."""
-    seen = pixel_seen(answer, row, col)
-    _ = seen.report.light
-    return seen
+    n_bins = answer.capture.acquisition.n_bins
+    with spending((1, 1, n_bins), "light", predicted_light(1, n_bins)):
+        seen = pixel_seen(answer, row, col)
+        _ = seen.report.light
+        return seen
 
 
 def region_seen(answer: Answer, region: Corners) -> Seen:
     """All that is known of a region of an answer's pixels."""
     mask = inspection.pixels_in(region, answer.capture.shape)
-    report = inspection.region_report(
-        answer.capture, answer.run.image, mask, "tracking", answer.request.tracking
-    )
+    n_pixels, n_bins = int(np.count_nonzero(mask)), answer.capture.acquisition.n_bins
+    with spending((1, n_pixels, n_bins), "light", predicted_light(n_pixels, n_bins)):
+        report = inspection.region_report(
+            answer.capture, answer.run.image, mask, "tracking", answer.request.tracking
+        )
     of_sum = replace(answer, run=replace(answer.run, capture=report.summed, image=report.image))
     return Seen(inspect(of_sum, 0, 0), report.pixel, report)
+
+
+def capture_known(answer: Answer) -> CaptureReport:
+    """All that is known of the capture of an answer."""
+    rows, cols, n_bins = answer.capture.cube.shape
+    with spending((rows, cols, n_bins), "light", predicted_light(rows * cols, n_bins)):
+        return inspection.capture_report(answer.capture)
 
 
 def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:

@@ -16,7 +16,7 @@ from app.download_words import NOTHING_DRAWN
 from app.downloads import PLOT, Shown, downloadable, downloadable_facts, explored, over_the_gate
 from app.exports import facts_file, plot_file
 from app.gate import scale
-from app.inspector_answers import SHARES, accuracy_steps, with_gate
+from app.inspector_answers import SHARES, accuracy_steps, capture_known, with_gate
 from app.inspector_pixel import FACTS, framed, stage
 from app.inspector_views import GatePlot, Marked
 from app.jobs import LatestWins, Step
@@ -29,7 +29,6 @@ from app.studies import Study
 from app.theme import palette
 from app.views import cover, pane_of
 from app.words import COMPUTING
-from core import inspection
 from core.inspection import Accuracy, CaptureReport
 from core.parameters import Number, spec_of
 
@@ -132,7 +131,7 @@ class Whole:
         # Counts at once: to find the light takes a while.
         counts = partial(answer.capture.cube.sum, axis=(0, 1))
         self._count_jobs.submit(counts, partial(self._draw_counts, answer), fail)
-        report = partial(inspection.capture_report, answer.capture)
+        report = partial(capture_known, answer)
         self._jobs.submit(report, partial(self._arrived, answer), self._unknown)
         request = answer.request
         studied = (answer.whole, replace(request.less, pulses=1.0), request.tracking)

@@ -32,6 +32,9 @@ PREVIEW_COUNTS = 2**23
 WINDOW_COUNTS = 2**24
 """Of a window's: a slider still answers at once."""
 
+PREVIEW_PIXELS, WINDOW_PIXELS = 2**20, 2**21
+"""Of either: of few bins, images of a pixel take more than its counts."""
+
 AT_ONCE_S = 1.0
 """Spent reading before a preview is first shown, whatever it holds by then."""
 
@@ -93,14 +96,20 @@ class LargeFile:
     def __init__(self, counts: xr.DataArray) -> None:
         self._counts = counts
         rows, cols, self._n_bins = counts.shape
-        self.whole = Window.fitting((0, rows), (0, cols), PREVIEW_COUNTS // self._n_bins)
+        most = min(PREVIEW_COUNTS // self._n_bins, PREVIEW_PIXELS)
+        self.whole = Window.fitting((0, rows), (0, cols), most)
         self._preview: Cutout | None = None
         self._latest: Cutout | None = None
         self._reading, self._lighting_up = Lock(), Lock()
 
     def fitting(self, rows: tuple[int, int], cols: tuple[int, int]) -> Window:
         """The window of the finest step that may be read."""
-        return Window.fitting(rows, cols, WINDOW_COUNTS // self._n_bins)
+        return Window.fitting(rows, cols, self._most_pixels)
+
+    @property
+    def _most_pixels(self) -> int:
+        """Of a window."""
+        return min(WINDOW_COUNTS // self._n_bins, WINDOW_PIXELS)
 
     @cached_property
     def _reader(self) -> WindowReader:
@@ -166,7 +175,7 @@ class LargeFile:
         kept = self._latest
         if kept is not None and kept.window == window:
             return kept
-        most = WINDOW_COUNTS // self._n_bins
+        most = self._most_pixels
         n_pixels = math.prod(window.shape)
         require("pixels of a window", n_pixels, n_pixels <= max(most, 1), f"at most {most:,}")
         reader = WindowReader(self._counts, window)

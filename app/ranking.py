@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.budget import ranging
 from app.state import Comparison
 from app.store import Answer, is_wrong
 from core import (
@@ -90,7 +91,8 @@ def run_task(task: Task, explored: Answer) -> Result:
     if task == Task("tracking", request.tracking):
         answer = explored
     else:
-        ranked = run(capture, task.method, task.settings, task.false_alarm)
+        with ranging(capture, task.method, task.settings, task.false_alarm):
+            ranked = run(capture, task.method, task.settings, task.false_alarm)
         answer = replace(explored, run=ranked)
     return Result(answer, judge(answer))
 
@@ -126,10 +128,11 @@ def yardstick(capture: Capture) -> Yardstick:
     """Find what all methods of a capture are measured by."""
     known = (capture.truth_range_m, capture.signal, capture.background)
     has_limit = all(each is not None for each in known) and capture.acquisition.n_pulses is not None
-    return Yardstick(
-        limits.limit(capture) if has_limit else None,
-        estimate(capture, "likelihood") if capture.truth_range_m is None else None,
-    )
+    with ranging(capture, "likelihood"):
+        return Yardstick(
+            limits.limit(capture) if has_limit else None,
+            estimate(capture, "likelihood") if capture.truth_range_m is None else None,
+        )
 
 
 def agreement(image: RangeImage, other: RangeImage, tolerance_bins: float = 3.0) -> float:

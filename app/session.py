@@ -324,6 +324,9 @@ class Session:
 
     def _show(self, answer: Answer, first: bool = False) -> None:
         previous, self.answer = self.answer, answer
+        if self.state.less == answer.asked != answer.request.less:  # too much for one request
+            with param.discard_events(self.state):
+                self.state.less = answer.request.less
         if first or not same_view(answer.request, previous.request):
             self._enter(answer, previous)
         self._failures.clear()

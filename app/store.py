@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from app.budget import fits, fitting, ranging, require_fitting
 from app.jobs import Effort
 from app.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.state import Less, Light, Reading
@@ -31,11 +32,15 @@ from core import (
     trigger_probability,
 )
 from core.corrections import CORRECTIONS, without_correction
-from core.posterior import posterior_of
+from core.cost import Cost, cost_of, predicted
+from core.posterior import has_posterior, posterior_of
 from core.scene import PARTS, without
 
 FEW_COUNTS = 2**20
 """Of a capture, up to which it is ranged in less time than its picture is drawn."""
+
+FEW_S = 0.25
+"""Estimated time of what is ranged on the page's own thread at most; some times what it takes."""
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
 
@@ -145,6 +150,9 @@ class Answer:
     """What the capture that was ranged is a part of, or that capture itself."""
     cutout: Cutout | None = None
     """Of a file larger than memory, what is in memory."""
+    asked: Less = field(default_factory=Less)
+    """The reduction that was asked for; that of `request` leaves out more where this would take
+    more than the server gives to a request."""
 
     @property
     def capture(self) -> Capture:
@@ -162,7 +170,16 @@ class Answer:
 
 
 def compute(request: Request, previous: Answer | None) -> Answer:
-    """Answer a request; what the previous answer already holds is not computed again."""
+    """Answer a request; what the previous answer already holds is not computed again.
+
+    A capture that is opened, and takes more memory or time than one request may, is reduced until
+    it fits (`app.budget`).
+
+    Raises
+    ------
+    ValueError
+        If it takes more than one request may, and is not opened just now; as `Source.load`.
+    """
     started = perf_counter()
     cutout = _cutout(request, previous)
     if cutout is not None:
@@ -171,6 +188,9 @@ def compute(request: Request, previous: Answer | None) -> Answer:
         whole = request.source.load(request.light, request.reading, request.absent)
     else:
         whole = previous.whole
+    asked = request.less
+    if previous is None or not same_capture(request, previous.request):
+        request = replace(request, less=_fitting(whole, request))
     if (
         previous is not None
         and whole is previous.whole
@@ -178,16 +198,47 @@ def compute(request: Request, previous: Answer | None) -> Answer:
     ):
         capture, capture_s = previous.capture, previous.capture_s
     else:
+        require_fitting(_reduced_shape(whole, request), "tracking", _cost(whole, request))
         capture = reduced(whole, request)
-        posterior_of(capture)  # what every answer's confidence rests on, whatever the method
+        if request.less != asked:
+            fewer = f"{capture.source}; so reduced that it takes no more than this server allows"
+            capture = replace(capture, source=fewer)
         capture_s = perf_counter() - started
-    return Answer(request, run(capture, "tracking", request.tracking), capture_s, whole, cutout)
+    with ranging(capture, "tracking", request.tracking):
+        started = perf_counter()
+        if not has_posterior(capture):
+            posterior_of(capture)  # what every answer's confidence rests on, whatever the method
+            capture_s += perf_counter() - started
+        ranged = run(capture, "tracking", request.tracking)
+    return Answer(request, ranged, capture_s, whole, cutout, asked)
+
+
+def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:
+    rows, cols, n_bins = whole.cube.shape
+    reduction = request.less.reduction(n_bins)
+    fits = reduction.fits((rows, cols, n_bins))
+    return reduction.shape((rows, cols, n_bins)) if fits else (rows, cols, n_bins)
+
+
+def _cost(whole: Capture, request: Request) -> Cost:
+    return predicted(_reduced_shape(whole, request), "tracking", request.tracking)
+
+
+def _fitting(whole: Capture, request: Request) -> Less:
+    """The reduction asked for, or the least that is more of it and that one request may take."""
+    if fits(_cost(whole, request)):
+        return request.less
+    rows, cols, n_bins = whole.cube.shape
+    found = fitting((rows, cols, n_bins), "tracking", request.less.reduction(n_bins))
+    return request.less if found is None else replace(request.less, merge=found[0], skip=found[1])
 
 
 def effort_of(request: Request, previous: Answer) -> Effort:
     """What `compute` takes."""
     seen = previous.request
     if previous.cutout is not None or previous.whole.cube.size > FEW_COUNTS:
+        return Effort.ANY
+    if cost_of(previous.capture, "tracking", request.tracking).seconds > FEW_S:
         return Effort.ANY
     if request == replace(seen, tracking=request.tracking):
         return Effort.QUICK

@@ -11,6 +11,7 @@ import panel as pn
 from numpy.typing import NDArray
 
 from app import plots, trade_words
+from app.budget import fits, require_fitting
 from app.controls import Sentence, SettingsPanel, Table
 from app.download_words import NOTHING_DRAWN
 from app.downloads import PLOT, TABLE, Shown, Subject, below, downloadable, looked_at
@@ -26,9 +27,10 @@ from app.theme import LIGHT, method_style, palette
 from app.trust import Trust
 from app.views import paint_frame, pane_of
 from core import ESTIMATORS
+from core.cost import predicted
 from core.experiments.front import best_within, cheapest_reaching, front, with_light
 from core.experiments.likeness import Simulation, like
-from core.experiments.tradeoff import Cancelled, Point, Source, candidates, study
+from core.experiments.tradeoff import Cancelled, Candidate, Point, Source, candidates, study
 from core.experiments.tradeoff_page import acquired, acquiring_items, points_table
 from core.experiments.trials import Method, as_they_come
 from core.metrics import Interval
@@ -238,7 +240,7 @@ class Ways:
             progress: Callable[[int, int], None], cancelled: Callable[[], bool]
         ) -> list[Point]:
             return study(
-                [(source, ways)],
+                [(source, affordable(source, ways))],
                 seeds=range(effort.repetitions),
                 repeats=effort.repeats,
                 progress=progress,
@@ -390,6 +392,7 @@ class Acquisition:
                     raise Cancelled
                 progress(done, of)
 
+            affordable(source, ())
             simulation = source if isinstance(source, Simulation) else like(source, source.source)
             found = acquired([simulation], range(repetitions), progress=told)
             return simulation.note, list(acquiring_items(found))
@@ -425,6 +428,26 @@ def source_of(answer: Answer) -> Source:
     scene, light = bare(request.source.scene(), request.absent), request.light
     acquisition = light.acquisition(scene.acquisition)
     return Simulation(request.source.title, scene, acquisition, light.flux)
+
+
+def affordable(source: Source, ways: Sequence[Candidate]) -> list[Candidate]:
+    """The ways to range a capture that one request may take; all of them for a scene.
+
+    Raises
+    ------
+    ValueError
+        If not even the likelihood may, which a simulation like the capture rests on.
+    """
+    if isinstance(source, Simulation):
+        return list(ways)
+    rows, cols, n_bins = source.cube.shape
+    shape = (rows, cols, n_bins)
+    require_fitting(shape, "likelihood", predicted(shape, "likelihood"))
+    return [
+        way
+        for way in ways
+        if fits(predicted(way.reduction.shape(shape), way.method.estimator, way.settings))
+    ]
 
 
 def methods(answer: Answer) -> list[Method]:

@@ -36,19 +36,34 @@ def to_blocks(cube: NDArray[np.unsignedinteger]) -> Blocks:
 
     Counts that fit are uint16 there, whatever they come as: kernels are compiled for each type.
     """
+    counts = lane_counts(cube, LANES)
+    largest, sigma = lane_spread(counts, cube.shape[-1])
+    return Blocks(counts, largest, sigma, math.prod(cube.shape[:-1]))
+
+
+def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.unsignedinteger]:
+    """Counts (..., bin) as (block, bin, lane), as `to_blocks` lays them out.
+
+    Parameters
+    ----------
+    cube : ndarray, shape (..., bin)
+    lanes : int
+        Pixels in a block.
+    """
     if cube.dtype == np.uint8 or (cube.dtype == np.uint32 and cube.max(initial=0) < 2**16):
         cube = cube.astype(np.uint16)
     n_bins = cube.shape[-1]
     pixels = np.ascontiguousarray(cube).reshape(-1, n_bins)
     pixels.setflags(write=False)  # one kernel for both: whether writable is part of a type
-    n_pixels = pixels.shape[0]
-    filled, left = divmod(n_pixels, LANES)
-    counts = np.empty((filled + (left > 0), n_bins, LANES), cube.dtype)
-    _lay_out(pixels, counts[:filled])
+    filled, left = divmod(pixels.shape[0], lanes)
+    counts = np.empty((filled + (left > 0), n_bins, lanes), cube.dtype)
+    if lanes == LANES:
+        _lay_out(pixels, counts[:filled])
+    else:
+        counts[:filled] = pixels[: filled * lanes].reshape(-1, lanes, n_bins).transpose(0, 2, 1)
     counts[filled:] = 0
-    counts[filled:, :, :left] = pixels[filled * LANES :].T
-    largest, sigma = lane_spread(counts, n_bins)
-    return Blocks(counts, largest, sigma, n_pixels)
+    counts[filled:, :, :left] = pixels[filled * lanes :].T
+    return counts
 
 
 @njit(**COMPILED)
@@ -104,8 +119,8 @@ def _with(count, first, sums):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def lane_rows(n_rows):  # type: ignore[no-untyped-def]
-    """Scratch of `n_rows` rows of LANES float32, on a cache line's boundary."""
-    memory = np.empty(n_rows * LANES + 16, np.float32)
+def lane_rows(n_rows, lanes=LANES):  # type: ignore[no-untyped-def]
+    """Scratch of `n_rows` rows of `lanes` float32, on a cache line's boundary."""
+    memory = np.empty(n_rows * lanes + 16, np.float32)
     start = (-(memory.ctypes.data // 4)) % 16
-    return memory[start : start + n_rows * LANES]
+    return memory[start : start + n_rows * lanes]

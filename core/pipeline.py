@@ -8,7 +8,8 @@ from typing import Any
 
 from core import metrics
 from core.capture import Capture
-from core.estimators import RangeImage, estimate
+from core.cost import require_memory
+from core.estimators import RangeImage, estimate, settings_of
 from core.posterior import posterior_of
 
 
@@ -49,7 +50,14 @@ def run(
         The method's own settings; its defaults where None.
     false_alarm : float, optional
         As `core.estimate` takes it.
+
+    Raises
+    ------
+    ValueError
+        As `core.estimate`.
     """
+    settings = settings_of(method, settings)
+    require_memory(capture, method, settings, false_alarm)
     started = perf_counter()
     posterior_of(capture)
     lit = perf_counter()

@@ -24,14 +24,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
-from core.blocks import LANES, lane_rows, to_blocks
+from core.blocks import LANES, lane_counts, lane_rows
 from core.capture import Capture, once_per_capture
 from core.parallel import COMPILED, PARALLEL, SUMMING, entering
 from core.resolution import FEW, Difference, difference, pile_up
@@ -91,12 +91,12 @@ class Light:
         """Mean signal of the pixels that see an echo, shape (row, col)."""
         share = self.share[1:]
         share = share / share.sum() if share.sum() > 0 else np.full(share.size, 1 / share.size)
-        return np.asarray(np.tensordot(share, self.signal[1:], axes=1))
+        return _weighted_sum(share, self.signal[1:])
 
     @cached_property
     def typical_background(self) -> Floats:
         """Mean background, shape (row, col)."""
-        return np.asarray(np.tensordot(self.share, self.background, axes=1))
+        return _weighted_sum(self.share, self.background)
 
     @property
     def contrast(self) -> float:
@@ -144,17 +144,31 @@ class Lighting(NamedTuple):
 
     def light(self, total: Floats, least_background: float) -> Light:
         """The light of pixels of which the total rates are known, shape (row, col)."""
-        left = total - self.levels[:, np.newaxis, np.newaxis]
-        background = self.background + self.trust * (left - self.background)
-        signal = np.broadcast_to(self.levels[:, np.newaxis, np.newaxis], background.shape)
+        shape, levels = (self.levels.size, *total.shape), self.levels[:, np.newaxis, np.newaxis]
+        mean = np.broadcast_to(self.background, levels.shape)
+        if self.trust == 0:  # the same in all pixels: one number a level
+            background = np.broadcast_to(np.maximum(mean, least_background), shape)
+        else:
+            background = np.empty(shape)
+            for level, its_mean, filled in zip(levels, mean, background, strict=True):
+                own = its_mean + self.trust * (total - level - its_mean)
+                np.maximum(own, least_background, out=filled)
         return Light(
-            signal,
-            np.maximum(background, least_background),
+            np.broadcast_to(levels, shape),
+            background,
             self.share,
             self.depth,
             self.contrast,
             self.pile_up,
         )
+
+
+def _weighted_sum(weights: Floats, images: Floats) -> Floats:
+    """``Σ_i weights_i images_i``, added in this order: a BLAS product depends on the processor."""
+    total = np.zeros(images.shape[1:])
+    for weight, image in zip(weights, images, strict=True):
+        total += weight * image
+    return total
 
 
 class Posterior(NamedTuple):
@@ -168,14 +182,18 @@ class Posterior(NamedTuple):
 
 
 LEVELS = 12  # of signal, besides none
+SAMPLE = 512  # pixels from which the light is estimated
 _SPREAD = 200.0  # the strongest level over the faintest
-_SAMPLE = 512  # pixels from which the light is estimated
 _STEPS = 100  # of expectation and maximisation
 _DEPTH_STEPS = 30
 _ALIKE = 0.1  # share of the surfaces of which nothing is learned
 _MISSED = 2.0  # log likelihood that faint levels must be worth to be kept
 _TOO_FEW = 3  # unfired pulses, of which the logarithm is chance
 _RARE = 1e-3  # levels with a smaller share are left out
+_SAMPLE_NUMBERS = 2**25  # likelihoods of the sample's levels and delays that are held: 128 MiB
+_TABLE_NUMBERS = 2**22  # likelihoods of a block's levels and delays: 16 MiB
+_FEWEST_LANES = 2  # a single lane would be summed pairwise by numpy, which rounds differently
+_LIGHT_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
 
 
 @once_per_capture
@@ -232,12 +250,14 @@ def level_likelihoods(
     cube = capture.cube.reshape(-1, n_bins)[some]
     prepared = _prepare(capture, cube, light, steps_per_bin)
     evidence = _level_evidence(prepared, prepared.depth[:, np.newaxis])
-    b, counts = light.background[0, 0] / n_bins, cube[0].astype(float)
-    fires, unfired = b, np.ones_like(counts)
-    if n_pulses is not None:
-        fires, unfired = -np.expm1(-b), n_pulses - np.cumsum(counts, axis=1)
-    none = counts.sum(axis=1) * np.log(fires) - b * unfired.sum(axis=1)
-    return np.asarray(evidence + none[:, np.newaxis])
+    b = light.background[0, 0] / n_bins
+    fires = b if n_pulses is None else -np.expm1(-b)
+    fired, unfired = np.empty((2, pixels.size))
+    for rows in _some_rows(cube[0]):
+        counts = cube[0, rows].astype(float)
+        left = np.ones_like(counts) if n_pulses is None else n_pulses - np.cumsum(counts, axis=1)
+        fired[rows], unfired[rows] = counts.sum(axis=1), left.sum(axis=1)
+    return np.asarray(evidence + (fired * np.log(fires) - b * unfired)[:, np.newaxis])
 
 
 def level_differences(lighting: Lighting, capture: Capture) -> Difference:
@@ -270,8 +290,8 @@ def detailed_lighting_of(capture: Capture) -> Lighting:
     total, chance = _totals(capture)
     flat = capture.cube.reshape(total.size, -1)
     # At random: a regular step could miss what stands in columns.
-    pixels = np.sort(np.random.default_rng(0).permutation(total.size)[:_SAMPLE])[np.newaxis]
-    sample, least = total.ravel()[pixels], _least_background(capture)
+    drawn = np.random.default_rng(0).permutation(total.size)[:SAMPLE]
+    pixels, least = np.sort(drawn)[np.newaxis], _least_background(capture)
     levels = _levels(flat[pixels[0]], capture)
     # While nothing is known, each level is everyone's signal.
     guess = Lighting(
@@ -281,7 +301,7 @@ def detailed_lighting_of(capture: Capture) -> Lighting:
         background=total.mean() - levels[:, np.newaxis, np.newaxis],
         trust=_trust(total, chance),
     )
-    lit = guess.light(sample, least)
+    lit = guess.light(total.ravel()[pixels], least)
     share = _shares(_level_evidence(_prepare(capture, flat[pixels], lit, 1)))
     mean = np.asarray(share @ levels)
     variance = float(share @ (levels - mean) ** 2)
@@ -295,7 +315,12 @@ def detailed_lighting_of(capture: Capture) -> Lighting:
         background=total.mean() - mean,
         trust=_trust(total, chance + variance),
     )
-    prepared = _prepare(capture, flat[pixels], found.light(sample, least), 1)
+    # Delays take a table of all levels of the sample: in a long gate, of fewer pixels.
+    each = found.share.size * flat.shape[1]
+    most = sampled_numbers(found.share.size, flat.shape[1]) // each
+    pixels = np.sort(drawn[:most])[np.newaxis]
+    lit = found.light(total.ravel()[pixels], least)
+    prepared = _prepare(capture, flat[pixels], lit, 1)
     share, depth = _shares_and_depths(_level_densities(prepared), found.share)
     found = found._replace(share=share, depth=depth)
     return found._replace(contrast=found.light(total, least).contrast)
@@ -334,12 +359,17 @@ def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats
     gate would be an echo there, beyond all doubt.
     """
     median = np.empty(len(pixels))
-    at_once = max(1, _AT_ONCE // pixels.shape[1])
-    for first in range(0, len(pixels), at_once):
-        some = slice(first, first + at_once)
+    for some in _some_rows(pixels):
         rate, armed = rate_and_armed(pixels[some].astype(float), n_pulses)
         median[some] = weighted_median(rate.T, armed.T)
     return median * pixels.shape[1]
+
+
+def _some_rows(pixels: NDArray[Any]) -> Iterator[slice]:
+    """Pixels (pixel, bin) a few at a time, so that temporaries stay small."""
+    at_once = max(1, _AT_ONCE // pixels.shape[1])
+    for first in range(0, len(pixels), at_once):
+        yield slice(first, first + at_once)
 
 
 def _trust(total: Floats, unrelated: float) -> float:
@@ -357,11 +387,13 @@ def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture) -> Floats:
 
 def _strongest(pixels: NDArray[np.unsignedinteger], capture: Capture) -> float:
     """Signal of the strongest echoes among pixels (pixel, bin), at least one detection."""
-    rate, _ = rate_and_armed(pixels.astype(float), capture.armed_pulses)
-    width = min(capture.echo_bins, rate.shape[1])
-    until = np.pad(np.cumsum(rate, axis=1), ((0, 0), (1, 0)))
-    inside = (until[:, width:] - until[:, :-width]).max(axis=1)
-    excess = inside - until[:, -1] * width / rate.shape[1]
+    n_bins = pixels.shape[1]
+    excess, width = np.empty(len(pixels)), min(capture.echo_bins, n_bins)
+    for some in _some_rows(pixels):
+        rate, _ = rate_and_armed(pixels[some].astype(float), capture.armed_pulses)
+        until = np.pad(np.cumsum(rate, axis=1), ((0, 0), (1, 0)))
+        inside = (until[:, width:] - until[:, :-width]).max(axis=1)
+        excess[some] = inside - until[:, -1] * width / n_bins
     return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.armed_pulses or 1))
 
 
@@ -477,29 +509,32 @@ def _smoothed(density):  # type: ignore[no-untyped-def]
 @once_per_capture
 def posterior_of(capture: Capture) -> Posterior:
     """Where each pixel's surface may be, in the light of `light_of`."""
-    prepared = _prepare(capture, capture.cube, light_of(capture), 1)
-    n_blocks, n_bins, _ = prepared.counts.shape
-    near = np.empty((n_blocks, LANES, n_bins), np.float32)
-    surface = np.empty((n_blocks, LANES))
-    for some, density, top, _ in _densities(prepared):
-        # What lies before each delay, from so many bins before the gate to so many behind it.
-        before = np.zeros((len(top), n_bins + 2 * TOLERANCE_BINS + 1, LANES), np.float32)
-        behind = TOLERANCE_BINS + n_bins
-        np.cumsum(density, axis=1, out=before[:, TOLERANCE_BINS + 1 : behind + 1])
-        everything = before[:, behind]
-        before[:, behind + 1 :] = everything[:, np.newaxis]
-        # In units of the larger of the two, so that neither overflows.
-        unit = np.maximum(top, prepared.log_share[0])
-        seen = np.exp(top - unit) * everything / n_bins
-        surface[some] = seen / (seen + np.exp(prepared.log_share[0] - unit))
-        mass = before[:, 2 * TOLERANCE_BINS : -1] - before[:, :n_bins]
-        mass *= (surface[some] / everything)[:, np.newaxis].astype(np.float32)
-        near[some] = mass.transpose(0, 2, 1)
-    pixels = slice(capture.shape[0] * capture.shape[1])
-    return Posterior(
-        near.reshape(-1, n_bins)[pixels].reshape(capture.cube.shape),
-        surface.reshape(-1)[pixels].reshape(capture.shape),
-    )
+    n_pixels, n_bins = capture.counts.size, capture.cube.shape[2]
+    near, surface = np.empty((n_pixels, n_bins), np.float32), np.empty(n_pixels)
+    for pixels, prepared in _groups(capture, light_of(capture), 1):
+        for some, density, top, _ in _densities(prepared):
+            # What lies before each delay, from so many bins before the gate to so many behind it.
+            before = np.zeros((len(top), n_bins + 2 * TOLERANCE_BINS + 1, top.shape[1]), np.float32)
+            behind = TOLERANCE_BINS + n_bins
+            np.cumsum(density, axis=1, out=before[:, TOLERANCE_BINS + 1 : behind + 1])
+            everything = before[:, behind]
+            before[:, behind + 1 :] = everything[:, np.newaxis]
+            # In units of the larger of the two, so that neither overflows.
+            unit = np.maximum(top, prepared.log_share[0])
+            seen = np.exp(top - unit) * everything / n_bins
+            present = seen / (seen + np.exp(prepared.log_share[0] - unit))
+            mass = before[:, 2 * TOLERANCE_BINS : -1] - before[:, :n_bins]
+            mass *= (present / everything)[:, np.newaxis].astype(np.float32)
+            here = _pixels_of(some, prepared, pixels)
+            size = here.stop - here.start
+            near[here] = mass.transpose(0, 2, 1).reshape(-1, n_bins)[:size]
+            surface[here] = present.ravel()[:size]
+    return Posterior(near.reshape(capture.cube.shape), surface.reshape(capture.shape))
+
+
+def has_posterior(capture: Capture) -> bool:
+    """Whether `posterior_of` is known already."""
+    return "posterior_of" in vars(capture)  # where `once_per_capture` keeps it
 
 
 def near(capture: Capture, bins: Floats) -> Floats:
@@ -511,16 +546,20 @@ def near(capture: Capture, bins: Floats) -> Floats:
     bins : ndarray, shape (row, col)
         Delays in fractional bins, from 0 to n_bins; the probability is 0 where NaN.
     """
-    table = posterior_of(capture).near
+    table, found = posterior_of(capture).near, np.empty(bins.size)
     last = table.shape[2] - 1
-    at = np.clip(np.nan_to_num(bins), 0, last)
-    below = np.minimum(at.astype(np.intp), max(last - 1, 0))
-    above = np.minimum(below + 1, last)
-    # By flat indices: those of `numpy.take_along_axis` cost more than all the rest.
-    first = np.arange(at.size).reshape(at.shape) * table.shape[2]
-    low, high = table.take(first + below), table.take(first + above)
-    between = low + (at - below) * (high - low)
-    return np.where(np.isnan(bins), 0.0, np.clip(between, 0.0, 1.0))
+    for begin in range(0, bins.size, _AT_ONCE):
+        some = slice(begin, begin + _AT_ONCE)
+        delay = bins.ravel()[some]
+        at = np.clip(np.nan_to_num(delay), 0, last)
+        below = np.minimum(at.astype(np.intp), max(last - 1, 0))
+        above = np.minimum(below + 1, last)
+        # By flat indices: those of `numpy.take_along_axis` cost more than all the rest.
+        first = np.arange(begin, begin + at.size) * table.shape[2]
+        low, high = table.take(first + below), table.take(first + above)
+        between = low + (at - below) * (high - low)
+        found[some] = np.where(np.isnan(delay), 0.0, np.clip(between, 0.0, 1.0))
+    return found.reshape(bins.shape)
 
 
 def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Floats, Floats]:
@@ -533,23 +572,24 @@ def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Flo
     score : ndarray, shape (row, col)
         Logarithm of its likelihood over that of no echo.
     """
-    prepared = _prepare(capture, capture.cube, light, steps_per_bin)
-    delay, score = np.empty((2, prepared.counts.shape[0], LANES))
-    for some, curve, weighted in _curves(prepared):
-        at = curve.argmax(axis=1)[:, np.newaxis]
-        last = curve.shape[1] - 1
-        around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
-        # Not of the density: beside an echo of many photons that is 0, and has no logarithm.
-        log = np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float)
-        log = np.logaddexp.reduce(log, axis=1) + np.log(prepared.depth[around])
-        left, middle, right = log.transpose(1, 0, 2)
-        curvature = np.minimum(left - 2 * middle + right, -1e-9)
-        inside = (at[:, 0] > 0) & (at[:, 0] < last)
-        shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
-        delay[some] = (at[:, 0] + 0.5 + shift) / steps_per_bin
-        score[some] = middle
-    pixels, shape = slice(capture.shape[0] * capture.shape[1]), capture.shape
-    return delay.reshape(-1)[pixels].reshape(shape), score.reshape(-1)[pixels].reshape(shape)
+    delay, score = np.empty((2, capture.counts.size))
+    for pixels, prepared in _groups(capture, light, steps_per_bin):
+        for some, curve, weighted in _curves(prepared):
+            at = curve.argmax(axis=1)[:, np.newaxis]
+            last = curve.shape[1] - 1
+            around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
+            # Not of the density: beside an echo of many photons that is 0, and has no logarithm.
+            log = np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float)
+            log = np.logaddexp.reduce(log, axis=1) + np.log(prepared.depth[around])
+            left, middle, right = log.transpose(1, 0, 2)
+            curvature = np.minimum(left - 2 * middle + right, -1e-9)
+            inside = (at[:, 0] > 0) & (at[:, 0] < last)
+            shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
+            here = _pixels_of(some, prepared, pixels)
+            size = here.stop - here.start
+            delay[here] = ((at[:, 0] + 0.5 + shift) / steps_per_bin).ravel()[:size]
+            score[here] = middle.ravel()[:size]
+    return delay.reshape(capture.shape), score.reshape(capture.shape)
 
 
 def rate_and_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Floats]:
@@ -596,24 +636,29 @@ def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
     """
     acquisition, n_pulses = conditions.acquisition, conditions.n_pulses
     n_bins = acquisition.n_bins
-    echo = conditions.pulse.bin_probability(np.arange(n_bins), n_bins, acquisition.bin_width_s)
-    s = np.asarray(conditions.signal)[..., np.newaxis, np.newaxis] * echo
-    b = np.maximum(conditions.background, _DARKEST)[..., np.newaxis, np.newaxis] / n_bins
-    if n_pulses is None:
-        gain, unfired = np.log1p(s / b), np.ones_like(histogram)
-    else:
-        gain = np.log(np.expm1(-(b + s)) / np.expm1(-b))
+    # An echo at whole bins is one filter: its share in the bin that lies `step` behind the delay.
+    echo = conditions.pulse.bin_probability(n_bins - 1.0, 2 * n_bins - 1, acquisition.bin_width_s)
+    b = np.maximum(conditions.background, _DARKEST)[..., np.newaxis] / n_bins
+    unfired = np.ones_like(histogram)
+    if n_pulses is not None:
         unfired = n_pulses - np.cumsum(histogram, axis=-1)
-    return np.asarray((gain @ histogram[..., np.newaxis] - s @ unfired[..., np.newaxis])[..., 0])
+    ratio = np.zeros_like(histogram)
+    for at in np.flatnonzero(echo):
+        s, step = np.asarray(conditions.signal)[..., np.newaxis] * echo[at], int(at) - n_bins + 1
+        gain = np.log1p(s / b) if n_pulses is None else np.log(np.expm1(-(b + s)) / np.expm1(-b))
+        delay = slice(max(-step, 0), n_bins - max(step, 0))
+        met = slice(max(step, 0), n_bins - max(-step, 0))
+        ratio[..., delay] += gain * histogram[..., met] - s * unfired[..., met]
+    return ratio
 
 
 class _Prepared(NamedTuple):
     """A cube and its light, as the kernels take them."""
 
     counts: NDArray[np.unsignedinteger]
-    """Shape (block, bin, LANES)."""
+    """Shape (block, bin, lane): `LANES` lanes, fewer where a table of all delays would be large."""
     signal: Floats
-    """Shape (level, block, LANES)."""
+    """Shape (level, block, lane)."""
     background: Floats
     log_share: Floats
     depth: NDArray[np.float32]
@@ -625,35 +670,103 @@ class _Prepared(NamedTuple):
     n_pulses: int
     """0 where not known."""
     n_pixels: int
+    n_counts: int
+    """Of the whole cube that these pixels are a part of."""
 
 
 def _prepare(
     capture: Capture, cube: NDArray[np.unsignedinteger], light: Light, steps_per_bin: int
 ) -> _Prepared:
-    acquisition = capture.acquisition
+    """Pixels (row, col, bin) and their light, all at once."""
+    lanes = lanes_of(light.share.size, cube.shape[2] * steps_per_bin)
+    flat = cube.reshape(-1, cube.shape[2])
+    everyone = _Part(lane_counts(flat, lanes), slice(0, len(flat)), cube.size)
+    return _with_echo(capture, everyone, light, steps_per_bin)
+
+
+def _groups(
+    capture: Capture, light: Light, steps_per_bin: int
+) -> Iterator[tuple[slice, _Prepared]]:
+    """All pixels of a capture and their light, so many at a time as keep what is laid out small.
+
+    Yields
+    ------
+    pixels : slice
+        Flat indices.
+    prepared : _Prepared
+    """
+    n_levels, n_pixels, n_bins = light.share.size, capture.counts.size, capture.cube.shape[2]
+    lanes = lanes_of(n_levels, n_bins * steps_per_bin)
+    at_once = lanes * max(1, _LIGHT_NUMBERS // (n_levels * lanes))
+    if lanes < LANES:
+        at_once = lanes * max(1, _TABLE_NUMBERS // (n_bins * lanes))
+    flat = capture.cube.reshape(-1, n_bins)
+    for first in range(0, n_pixels, at_once):
+        some = slice(first, min(first + at_once, n_pixels))
+        if lanes < LANES:
+            counts = lane_counts(flat[some], lanes)
+        else:
+            counts = capture.blocks.counts[first // LANES : -(-some.stop // LANES)]
+        part = _Part(counts, some, capture.cube.size)
+        yield some, _with_echo(capture, part, light, steps_per_bin)
+
+
+def sampled_numbers(n_levels: int, n_bins: int) -> int:
+    """Largest table of levels and delays that is held of a sample of the pixels, in numbers."""
+    return max(_SAMPLE_NUMBERS, n_levels * n_bins)
+
+
+def lanes_of(n_levels: int, n_delays: int) -> int:
+    """Pixels treated together, so that a table of their levels and delays stays small."""
+    lanes = LANES
+    while lanes > _FEWEST_LANES and n_levels * n_delays * lanes > _TABLE_NUMBERS:
+        lanes //= 2
+    return lanes
+
+
+def _pixels_of(blocks: slice, prepared: _Prepared, pixels: slice) -> slice:
+    """Which of the image's pixels some blocks of a group hold."""
+    lanes, first = prepared.counts.shape[2], pixels.start
+    return slice(first + blocks.start * lanes, min(first + blocks.stop * lanes, pixels.stop))
+
+
+class _Part(NamedTuple):
+    """Some pixels of an image, laid out."""
+
+    counts: NDArray[np.unsignedinteger]
+    """As `_Prepared.counts`."""
+    pixels: slice
+    """Their flat indices in the image."""
+    of_counts: int
+    """Counts of the whole image."""
+
+
+def _with_echo(capture: Capture, part: _Part, light: Light, steps_per_bin: int) -> _Prepared:
+    """A part of an image with its light, that of the image being given."""
+    acquisition, lanes = capture.acquisition, part.counts.shape[2]
     # Delays stand for the step around them, so that whole steps fill the gate and any whole bins.
     delay = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
     echo, first = capture.pulse.taps(acquisition.n_bins, acquisition.bin_width_s, delay)
-    blocks = capture.blocks if cube is capture.cube else to_blocks(cube)
     log_share = np.log(np.maximum(light.share, np.finfo(float).tiny))
     return _Prepared(
-        blocks.counts,
-        _lanes(light.signal),
-        _lanes(light.background),
+        part.counts,
+        _in_lanes(light.signal, part.pixels, lanes),
+        _in_lanes(light.background, part.pixels, lanes),
         log_share,
         np.repeat(light.depth, steps_per_bin).astype(np.float32),
         echo.astype(np.float32),
         first,
         capture.armed_pulses or 0,
-        blocks.n_pixels,
+        part.pixels.stop - part.pixels.start,
+        part.of_counts,
     )
 
 
-def _lanes(image: Floats) -> Floats:
-    """(level, row, col) as (level, block, LANES); the last block is filled up with its last."""
-    flat = image.reshape(len(image), -1)
-    filled = np.pad(flat, ((0, 0), (0, -flat.shape[1] % LANES)), mode="edge")
-    return np.ascontiguousarray(filled.reshape(len(image), -1, LANES))
+def _in_lanes(image: Floats, pixels: slice, lanes: int) -> Floats:
+    """Some of (level, row, col) as (level, block, lane); the last block repeats its last pixel."""
+    flat = image.reshape(len(image), -1)[:, pixels]
+    filled = np.pad(flat, ((0, 0), (0, -flat.shape[1] % lanes)), mode="edge")
+    return np.ascontiguousarray(filled.reshape(len(image), -1, lanes))
 
 
 def _level_evidence(prepared: _Prepared, depth: NDArray[np.float32] | float = 1.0) -> Floats:
@@ -661,24 +774,42 @@ def _level_evidence(prepared: _Prepared, depth: NDArray[np.float32] | float = 1.
 
     How much more often a delay occurs than others is `depth`, of shape (delay, 1).
     """
-    n_levels, n_blocks, _ = prepared.signal.shape
-    evidence = np.empty((n_blocks, LANES, n_levels))
-    for some, log in _log_likelihoods(prepared):
-        top = log.max(axis=2)
-        np.subtract(log, top[:, :, np.newaxis], out=log)
-        density = np.exp(log, out=log)
-        density *= depth
-        mean = density.mean(axis=2)
-        evidence[some] = (top + np.log(mean)).transpose(0, 2, 1)
+    n_levels, n_blocks, lanes = prepared.signal.shape
+    evidence = np.empty((n_blocks, lanes, n_levels))
+    # Some levels at a time, each with the first one, which the others are compared with.
+    table = prepared.depth.size * lanes
+    at_once = max(1, _TABLE_NUMBERS // table - 1)
+    evidence[..., 0] = 0.0
+    for first in range(1, n_levels, at_once):
+        levels = [0, *range(first, min(first + at_once, n_levels))]
+        few = prepared
+        if len(levels) < n_levels:
+            few = prepared._replace(
+                signal=prepared.signal[levels], background=prepared.background[levels]
+            )
+        for some, log in _log_likelihoods(few):
+            top = log.max(axis=2)
+            np.subtract(log, top[:, :, np.newaxis], out=log)
+            density = np.exp(log, out=log)
+            density *= depth
+            mean = density.mean(axis=2)
+            evidence[some, :, levels] = (top + np.log(mean)).transpose(0, 2, 1)
     return evidence.reshape(-1, n_levels)[: prepared.n_pixels]
 
 
 def _level_densities(prepared: _Prepared) -> NDArray[np.float32]:
     """Likelihood of each level and delay over the pixel's largest; (pixel, level, delay)."""
-    log = np.concatenate([log for _, log in _log_likelihoods(prepared)])
-    log -= log.max(axis=(1, 2), keepdims=True)
-    density = np.exp(log, out=log).transpose(0, 3, 1, 2)
-    return density.reshape(-1, *log.shape[1:3])[: prepared.n_pixels]
+    n_levels, n_blocks, lanes = prepared.signal.shape
+    n_copied = n_blocks if n_blocks > 1 else 0
+    densities = np.empty((n_copied, lanes, n_levels, prepared.depth.size), np.float32)
+    for some, log in _log_likelihoods(prepared):
+        np.subtract(log, log.max(axis=(1, 2), keepdims=True), out=log)
+        density = np.exp(log, out=log).transpose(0, 3, 1, 2)
+        if n_blocks == 1:
+            densities = density  # as it lies: a copy would take as much again
+        else:
+            densities[some] = density
+    return densities.reshape(-1, *densities.shape[2:])[: prepared.n_pixels]
 
 
 def _densities(
@@ -689,10 +820,10 @@ def _densities(
     Yields
     ------
     blocks : slice
-    density : ndarray, shape (block, delay, LANES)
+    density : ndarray, shape (block, delay, lane)
         In units of ``exp(top)``.
-    top : ndarray, shape (block, LANES)
-    weighted : ndarray, shape (block, level, delay, LANES)
+    top : ndarray, shape (block, lane)
+    weighted : ndarray, shape (block, level, delay, lane)
         Logarithms that the density is made of, level by level, `Light.depth` left out.
     """
     weight = prepared.log_share[1:, np.newaxis, np.newaxis].astype(np.float32)
@@ -728,15 +859,15 @@ def _log_likelihoods(prepared: _Prepared) -> Iterator[tuple[slice, NDArray[np.fl
     Yields
     ------
     blocks : slice
-    log : ndarray, shape (block, level, delay, LANES)
+    log : ndarray, shape (block, level, delay, lane)
     """
-    n_levels, n_blocks, _ = prepared.signal.shape
+    n_levels, n_blocks, lanes = prepared.signal.shape
     n_delays = prepared.counts.shape[1] * prepared.echo.shape[0]
-    at_once = max(1, _AT_ONCE // (n_levels * n_delays * LANES))
+    at_once = max(1, _AT_ONCE // (n_levels * n_delays * lanes))
     for first in range(0, n_blocks, at_once):
         some = slice(first, min(first + at_once, n_blocks))
-        log = np.empty((some.stop - first, n_levels, n_delays, LANES), np.float32)
-        with entering(prepared.counts.size):
+        log = np.empty((some.stop - first, n_levels, n_delays, lanes), np.float32)
+        with entering(prepared.n_counts):
             _fill_blocks(first, prepared, log)
         yield some, log
 
@@ -747,11 +878,11 @@ _AT_ONCE = 2**19  # numbers: what is made of them should find them in the cache
 @njit(**COMPILED)
 def _fill_reach(b, prepared, fired, unfired, reach):  # type: ignore[no-untyped-def]
     """Counts and unfired pulses of a block as float32, and Σ_k (A_k - n_k) p_k(d) of each delay."""
-    n_bins = fired.shape[0]
+    n_bins, lanes = fired.shape
     n_steps, n_taps = prepared.echo.shape
-    armed = np.full(LANES, float(prepared.n_pulses))
+    armed = np.full(lanes, float(prepared.n_pulses))
     for k in range(n_bins):
-        for i in range(LANES):
+        for i in range(lanes):
             count = prepared.counts[b, k, i]
             armed[i] -= count
             fired[k, i] = count
@@ -761,17 +892,17 @@ def _fill_reach(b, prepared, fired, unfired, reach):  # type: ignore[no-untyped-
         reach[d, :] = 0.0
         for tap in range(max(0, -first), min(n_taps, n_bins - first)):
             p = prepared.echo[step, tap]
-            for i in range(LANES):
+            for i in range(lanes):
                 reach[d, i] += p * unfired[first + tap, i]
 
 
 @njit(**COMPILED)
 def _fill_level(b, level, prepared, fired, reach, gain, ratio):  # type: ignore[no-untyped-def]
-    """T(d) of one level into `ratio`, (delay, LANES)."""
-    n_bins = fired.shape[0]
+    """T(d) of one level into `ratio`, (delay, lane)."""
+    n_bins, lanes = fired.shape
     n_steps, n_taps = prepared.echo.shape
     previous_signal, previous_background = 0.0, 0.0
-    for i in range(LANES):
+    for i in range(lanes):
         signal = prepared.signal[level, b, i]
         background = prepared.background[level, b, i] / n_bins
         if i > 0 and signal == previous_signal and background == previous_background:
@@ -792,10 +923,10 @@ def _fill_level(b, level, prepared, fired, reach, gain, ratio):  # type: ignore[
                     gain[step, tap, i] = math.log1p(s / background)
     for d in range(n_bins * n_steps):
         step, first = d % n_steps, d // n_steps + prepared.first_tap
-        for i in range(LANES):
+        for i in range(lanes):
             ratio[d, i] = -np.float32(prepared.signal[level, b, i]) * reach[d, i]
         for tap in range(max(0, -first), min(n_taps, n_bins - first)):
-            for i in range(LANES):
+            for i in range(lanes):
                 ratio[d, i] += gain[step, tap, i] * fired[first + tap, i]
 
 
@@ -805,8 +936,8 @@ def _flat_likelihood(b, level, prepared, fired, unfired, flat):  # type: ignore[
 
     `fired` and `unfired` are summed over the bins here.
     """
-    n_bins = prepared.counts.shape[1]
-    for i in range(LANES):
+    n_bins, lanes = prepared.counts.shape[1:]
+    for i in range(lanes):
         here = prepared.background[level, b, i] / n_bins
         bare = prepared.background[0, b, i] / n_bins
         odds = math.expm1(-here) / math.expm1(-bare) if prepared.n_pulses > 0 else here / bare
@@ -815,18 +946,20 @@ def _flat_likelihood(b, level, prepared, fired, unfired, flat):  # type: ignore[
 
 @njit(**COMPILED)
 def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
-    """Log likelihood of each level and delay over that of no echo; (level, delay, LANES)."""
-    n_levels, n_delays, _ = log.shape
+    """Log likelihood of each level and delay over that of no echo; (level, delay, lane)."""
+    n_levels, n_delays, lanes = log.shape
     n_bins = prepared.counts.shape[1]
     n_steps, n_taps = prepared.echo.shape
     # On cache lines' boundaries: vectors that straddle them cost twice.
-    fired, unfired = lane_rows(n_bins).reshape(-1, LANES), lane_rows(n_bins).reshape(-1, LANES)
-    reach, ratio = lane_rows(n_delays).reshape(-1, LANES), lane_rows(n_delays).reshape(-1, LANES)
-    gain = lane_rows(n_steps * n_taps).reshape(n_steps, n_taps, LANES)
-    all_fired, all_unfired, flat = np.zeros((3, LANES))
+    fired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
+    unfired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
+    reach = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+    ratio = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+    gain = lane_rows(n_steps * n_taps, lanes).reshape(n_steps, n_taps, lanes)
+    all_fired, all_unfired, flat = np.zeros((3, lanes))
     _fill_reach(b, prepared, fired, unfired, reach)
     for k in range(n_bins):
-        for i in range(LANES):
+        for i in range(lanes):
             all_fired[i] += fired[k, i]
             all_unfired[i] += unfired[k, i]
     log[0] = 0.0
@@ -834,7 +967,7 @@ def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
         _fill_level(b, level, prepared, fired, reach, gain, ratio)
         _flat_likelihood(b, level, prepared, all_fired, all_unfired, flat)
         for d in range(n_delays):
-            for i in range(LANES):
+            for i in range(lanes):
                 log[level, d, i] = ratio[d, i] + np.float32(flat[i])
 
 

@@ -317,6 +317,12 @@ class Reduction:
         enough_pixels = self.skip <= side and self.pool <= len(_kept(side, self.skip))
         return enough_pixels and 0 <= first < end <= n_bins and self.merge <= end - first
 
+    def shape(self, shape: tuple[int, int, int]) -> tuple[int, int, int]:
+        """Rows, columns and bins that are left of those of a capture, which it must fit."""
+        rows, cols = (len(_kept(size, self.skip)) // self.pool for size in shape[:2])
+        first, end = self.gate or (0, shape[2])
+        return rows, cols, (end - first) // self.merge
+
     def of(self, capture: Capture) -> Capture:
         """The capture with the reductions done: pixels first, then pulses, the gate, the bins.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
@@ -37,6 +39,45 @@ def pooled(cube: NDArray[np.unsignedinteger], reach: int) -> NDArray[np.unsigned
         may not hold them.
     """
     return box_sum(cube.astype(np.uint64 if cube.dtype == np.uint32 else np.uint32), reach, "edge")
+
+
+def pooled_in(
+    cube: NDArray[np.unsignedinteger], here: tuple[slice, slice], reach: int
+) -> NDArray[np.unsignedinteger]:
+    """What `pooled` gives for some rows and columns; the cube itself where `reach` is 1."""
+    if reach == 1:
+        return cube[here]
+    wide, inner = widened(here, reach // 2)
+    return pooled(cube[wide], reach)[inner]
+
+
+Patch = tuple[slice, slice]
+"""Rows and columns of an image."""
+
+
+def widened(here: Patch, margin: int) -> tuple[Patch, Patch]:
+    """Rows and columns with a margin, as far as there is one, and where in them the former lie."""
+    first = [max(part.start - margin, 0) for part in here]
+    wide = [slice(at, part.stop + margin) for at, part in zip(first, here, strict=True)]
+    inner = [slice(part.start - at, part.stop - at) for at, part in zip(first, here, strict=True)]
+    return (wide[0], wide[1]), (inner[0], inner[1])
+
+
+def patches(shape: tuple[int, ...], most: int) -> Iterator[Patch]:
+    """Cut a cube into parts that hold about `most` counts each, about as high as wide.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows, columns and bins.
+    most : int
+    """
+    rows, cols, n_bins = shape
+    wide = min(cols, max(1, math.isqrt(most // n_bins)))
+    high = max(1, most // (wide * n_bins))
+    for row in range(0, rows, high):
+        for col in range(0, cols, wide):
+            yield slice(row, min(row + high, rows)), slice(col, min(col + wide, cols))
 
 
 def box_sum(image: NDArray[Any], reach: int, beyond: Literal["edge", "constant"]) -> NDArray[Any]:

@@ -6,6 +6,7 @@ from typing import Any
 
 from core.capture import Capture
 from core.checks import require
+from core.cost import require_memory
 from core.estimators import (
     cfar,
     chi,
@@ -70,10 +71,11 @@ def estimate(
     Raises
     ------
     ValueError
-        If the method is unknown, a parameter is unknown or out of its bounds, or the method needs
-        what the capture does not know.
+        If the method is unknown, a parameter is unknown or out of its bounds, the method needs
+        what the capture does not know, or more working memory than is free (`core.cost`).
     """
     settings = settings_of(method, settings, **parameters)
+    require_memory(capture, method, settings, false_alarm)
     return ESTIMATORS[method](capture, settings, false_alarm)
 
 

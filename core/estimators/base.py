@@ -15,7 +15,7 @@ from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
 from core.parameters import Number
 from core.posterior import Conditions, Light
-from core.spatial import pooled, pooled_at
+from core.spatial import patches, pooled_at, pooled_in
 from core.trigger import drawn, rate_per_bin, trigger_probability
 
 
@@ -230,14 +230,18 @@ class Estimator:
         onset = (places[:, np.newaxis] + np.arange(8) / 8).ravel()
         # Not the largest score but the largest that the echo adds: noise-free, a falling background
         # is still there, and where an echo is weak it would take the scores near it for the echo's.
-        without = _expected(onset[:1], given._replace(signal=np.zeros(())))  # the same for all
-        added = self.curve(_expected(onset, given), given, parameters) - self.curve(
-            without, given, parameters
-        )
-        found = added.max(axis=1) > 0
+        no_echo = _expected(onset[:1], given._replace(signal=np.zeros(())))
+        without = self.curve(no_echo, given, parameters)
+        most, at = np.empty(onset.size), np.empty(onset.size, np.intp)
+        at_once = max(1, _AT_ONCE // n_bins)
+        for first in range(0, onset.size, at_once):
+            some = slice(first, first + at_once)
+            added = self.curve(_expected(onset[some], given), given, parameters) - without
+            most[some], at[some] = added.max(axis=1), added.argmax(axis=1)
+        found = most > 0
         if not found.any():
             return 0.0
-        return float(np.median(added.argmax(axis=1)[found] - onset[found]))
+        return float(np.median(at[found] - onset[found]))
 
     def _best(self, capture: Capture, light: Light, parameters: Any) -> tuple[Floats, Floats]:
         """Bin and value of the largest score, each of shape (row, col)."""
@@ -248,17 +252,19 @@ class Estimator:
 
     def _largest(self, capture: Capture, light: Light, parameters: Any) -> tuple[Floats, Floats]:
         reach = self.reach(parameters)
-        cube = pooled(capture.cube, reach) if reach > 1 else capture.cube
         given = conditions_of(capture, light, reach)
         position, score = np.empty((2, *capture.shape))
-        # Some rows at a time: temporaries of the whole cube cost more than their arithmetic.
-        rows_at_once = max(1, 2**16 // cube[0].size)
-        for first in range(0, capture.shape[0], rows_at_once):
-            rows = slice(first, first + rows_at_once)
-            some = given._replace(signal=given.signal[rows], background=given.background[rows])
-            curve = self.curve(cube[rows].astype(float), some, parameters)
-            position[rows] = curve.argmax(axis=2)
-            score[rows] = curve.max(axis=2)
+        for patch in patches(capture.cube.shape, _AT_ONCE):
+            cube = pooled_in(capture.cube, patch, reach)
+            # A few rows at a time: temporaries beyond the cache cost more than their arithmetic.
+            rows_at_once = max(1, _IN_CACHE // cube[0].size)
+            for first in range(0, len(cube), rows_at_once):
+                rows = slice(first, first + rows_at_once)
+                signal, background = given.signal[patch][rows], given.background[patch][rows]
+                some = given._replace(signal=signal, background=background)
+                curve = self.curve(cube[rows].astype(float), some, parameters)
+                position[patch][rows] = curve.argmax(axis=2)
+                score[patch][rows] = curve.max(axis=2)
         return position, score
 
 
@@ -285,6 +291,8 @@ def _expected(onset_bin: Floats, given: Conditions) -> Floats:
     return rate if given.n_pulses is None else trigger_probability(rate) * given.n_pulses
 
 
+_AT_ONCE = 2**20  # float64 numbers of a temporary: 8 MiB
+_IN_CACHE = 2**16
 _PATCH = 64  # rows and columns that stay together, for what looks at neighbours
 
 
@@ -320,5 +328,9 @@ def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     n_bins, n_pulses = capture.acquisition.n_bins, capture.armed_pulses
     pixels = _null_pixels(capture)
     background = posterior.light_of(capture).of_pixels(pixels).typical_background
-    rate = np.repeat(background[..., np.newaxis] / n_bins, n_bins, axis=2)
-    return drawn(rate, n_pulses, rng)
+    cubes = []
+    rows_at_once = max(1, _AT_ONCE // (pixels.shape[1] * n_bins))
+    for first in range(0, len(pixels), rows_at_once):
+        rate = background[first : first + rows_at_once, :, np.newaxis] / n_bins
+        cubes.append(drawn(np.repeat(rate, n_bins, axis=2), n_pulses, rng))
+    return np.concatenate(cubes)

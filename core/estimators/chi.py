@@ -38,11 +38,12 @@ from core.estimators.kde import kernel_taps
 from core.parallel import COMPILED
 from core.parameters import Number, Zone, check_fields, parameter
 from core.posterior import TOLERANCE_BINS, Conditions, Light
-from core.spatial import neighbours, pooled, weighted_median
+from core.spatial import neighbours, patches, pooled_in, weighted_median
 
 NARROWEST, WIDEST = 0.5, 3.0
 """Bounds of a trigger's bandwidth, in those of the first density."""
 
+_AT_ONCE = 2**20  # counts treated together
 _LEVELS = 64  # of bandwidth in the table of kernels, interpolated between
 
 
@@ -176,13 +177,15 @@ def repaired(position: Floats, intensity: Floats) -> Floats:
 
 def _locate(capture: Capture, light: Light, parameters: ChiParameters) -> tuple[Floats, Floats]:
     """Repaired positions, and the density of each at its own first answer."""
-    counts = pooled(capture.cube, 3)
-    starved = counts.sum(axis=2) < capture.acquisition.n_bins
-    if starved.any():
-        counts[starved] = pooled(capture.cube, 5)[starved]
-    density = adaptive_density(counts.astype(float), parameters.bandwidth_bins)
-    height = density.max(axis=2)
-    position = np.where(height > 0, density.argmax(axis=2), np.nan)
+    position, height = np.empty((2, *capture.shape))
+    for here in patches(capture.cube.shape, _AT_ONCE):
+        counts = pooled_in(capture.cube, here, 3)
+        starved = counts.sum(axis=2) < capture.acquisition.n_bins
+        if starved.any():
+            counts[starved] = pooled_in(capture.cube, here, 5)[starved]
+        density = adaptive_density(counts.astype(float), parameters.bandwidth_bins)
+        height[here] = density.max(axis=2)
+        position[here] = np.where(height[here] > 0, density.argmax(axis=2), np.nan)
     return repaired(position, height), height
 
 

@@ -54,11 +54,11 @@ from core.estimators.base import Estimator, conditions_of
 from core.estimators.filters import echo_shape
 from core.parameters import Number, check_fields, parameter
 from core.posterior import Conditions, Light, rate_and_armed
-from core.spatial import box_sum, neighbours, weighted_median
+from core.spatial import box_sum, neighbours, patches, weighted_median, widened
 
 _LAGS = 65  # delays tried around a window
 _STEPS = 100  # of the smoothing
-_AT_ONCE = 2**21  # counts treated together: temporaries of a whole cube may not fit
+_AT_ONCE = 2**20  # counts treated together: temporaries of a whole cube may not fit
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,9 @@ def _delays(
     within, around = (around >= 0) & (around < n_bins), np.clip(around, 0, n_bins - 1)
     expected = noise[:, np.newaxis] * np.take_along_axis(exposure, around, axis=1)
     excess = np.where(within, np.take_along_axis(counts, around, axis=1) - expected, 0.0)
-    return np.asarray(ruler.lags[(excess @ ruler.templates.T).argmax(axis=1)] - ruler.offset)
+    # Not a BLAS product, whose order of summation depends on the processor.
+    match = np.einsum("pk,lk->pl", excess, ruler.templates)
+    return np.asarray(ruler.lags[match.argmax(axis=1)] - ruler.offset)
 
 
 def _ratio(numerator: Floats, denominator: Floats) -> Floats:
@@ -245,16 +247,13 @@ def find_clusters(capture: Capture, light: Light, parameters: UnmixingParameters
     found = np.zeros((len(Clusters._fields), *capture.shape))
     found[0] = np.nan
     ruler, background, growth = _ruler(capture, light), light.typical_background, parameters.growth
-    rows_at_once = max(1, _AT_ONCE // capture.cube[0].size)
-    for first in range(0, capture.shape[0], rows_at_once):
-        rows = slice(first, first + rows_at_once)
-        begin = max(first - growth, 0)  # with the rows that superpixels reach
-        around = slice(begin, first + rows_at_once + growth)
-        inner = slice(first - begin, first - begin + rows_at_once)
+    rows, cols, n_bins = capture.cube.shape
+    for here in patches((rows, cols, n_bins + _LAGS), _AT_ONCE):
+        around, inner = widened(here, growth)  # with the pixels that superpixels reach
         counts = capture.cube[around].astype(float)
         exposure = exposures(counts, background[around], capture.armed_pulses)
         for reach in range(1, 2 * growth + 2, 2):
-            waiting = np.isnan(found[0, rows]) & (capture.counts[rows] > 0)
+            waiting = np.isnan(found[0][here]) & (capture.counts[here] > 0)
             if waiting.any():
                 seen, lasts = (
                     box_sum(x, reach, "constant")[inner][waiting] for x in (counts, exposure)
@@ -262,7 +261,7 @@ def find_clusters(capture: Capture, light: Light, parameters: UnmixingParameters
                 of = _clusters(seen, lasts, ruler, parameters.false_acceptance)
                 # A superpixel's answer weighs no more for being shared.
                 of = of._replace(size=of.size / reach**2, precision=of.precision / reach**2)
-                found[:, rows][:, waiting] = of
+                found[:, *here][:, waiting] = of
     return Clusters(*found)
 
 

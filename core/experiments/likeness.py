@@ -14,9 +14,12 @@ from core.estimators import estimate
 from core.posterior import light_of, posterior_of, rate_and_armed
 from core.scene import Scene
 from core.simulate import simulate
+from core.spatial import patches
 from core.trigger import rate_per_bin
 
 MARGIN_BINS = 5
+
+_AT_ONCE = 2**20  # counts whose rates are held
 
 SURE = 0.5
 """Least confidence of an answer that `like` takes for the truth."""
@@ -146,15 +149,17 @@ def like(capture: Capture, name: str) -> Simulation:
 
 def _echo(capture: Capture, delay_bin: Floats) -> Floats:
     """Rate of each pixel over the bins that hold the middle of an echo, pile-up undone."""
-    rate, _ = rate_and_armed(capture.cube.astype(float), capture.armed_pulses)
-    until = np.pad(np.cumsum(rate, axis=2), ((0, 0), (0, 0), (1, 0)))
     n_bins = capture.acquisition.n_bins
     ends = delay_bin[..., np.newaxis] + np.divide(
         capture.pulse.span_s, capture.acquisition.bin_width_s
     )
     first, last = np.moveaxis(np.clip(np.floor(ends), 0, n_bins - 1).astype(int), 2, 0)
-    edges = np.stack([first, last + 1], axis=2)
-    return np.asarray(np.diff(np.take_along_axis(until, edges, axis=2), axis=2)[..., 0])
+    edges, echo = np.stack([first, last + 1], axis=2), np.empty(capture.shape)
+    for here in patches(capture.cube.shape, _AT_ONCE):
+        rate, _ = rate_and_armed(capture.cube[here].astype(float), capture.armed_pulses)
+        until = np.pad(np.cumsum(rate, axis=2), ((0, 0), (0, 0), (1, 0)))
+        echo[here] = np.diff(np.take_along_axis(until, edges[here], axis=2), axis=2)[..., 0]
+    return echo
 
 
 def _shared_out(levels: Floats, share: Floats, seen: Floats) -> Floats:

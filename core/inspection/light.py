@@ -23,6 +23,7 @@ _COARSE, _FINE = (9, 17), (13, 25)
 _RIGHT = math.pi / 2
 _DARKEST = 1e-200  # photons: without any a count would be impossible, and its logarithm infinite
 _NEGLIGIBLE = 25.0
+_AT_ONCE = 2**21  # likelihoods of lights and delays: 16 MiB
 _STEPS, _STEPS_CLOSE = 2, 16  # delays in a bin; where few bins are left
 _FEW_BINS, _MANY_BINS = 8, 8  # left; of an echo so wide that one delay in a bin will do
 
@@ -129,12 +130,18 @@ class _Pixel:
     def __call__(self, signal: Floats, background: Floats) -> Floats:
         """Log likelihood, of the shape of both."""
         s, b = signal.ravel(), np.maximum(background.ravel(), _DARKEST) / self._counts.size
-        ratio = self._ratio(s[:, np.newaxis, np.newaxis], b[:, np.newaxis, np.newaxis])
-        self._best = ratio.max(axis=(0, 1))
-        ratio = ratio.reshape(s.size, -1)
-        top = ratio.max(axis=1)
-        ratio -= top[:, np.newaxis]
-        mean = np.exp(ratio, out=ratio).sum(axis=1) / (self._counts.size * len(self._echo))
+        top, mean = np.empty((2, s.size))
+        self._best[:] = -np.inf
+        at_once = max(1, _AT_ONCE // (len(self._echo) * self._bins.size))
+        for first in range(0, s.size, at_once):
+            some = slice(first, first + at_once)
+            ratio = self._ratio(s[some, np.newaxis, np.newaxis], b[some, np.newaxis, np.newaxis])
+            np.maximum(self._best, ratio.max(axis=(0, 1)), out=self._best)
+            ratio = ratio.reshape(len(ratio), -1)
+            top[some] = ratio.max(axis=1)
+            ratio -= top[some, np.newaxis]
+            total = np.exp(ratio, out=ratio).sum(axis=1)
+            mean[some] = total / (self._counts.size * len(self._echo))
         return np.asarray((self._flat(b) + top + np.log(mean)).reshape(signal.shape))
 
     def _flat(self, b: Floats) -> Floats:

@@ -52,7 +52,7 @@ def _quick_draws(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _whole_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     """The light of a small image is told by all of its pixels: chance is in the counts alone."""
-    monkeypatch.setattr(posterior, "_SAMPLE", 1024)
+    monkeypatch.setattr(posterior, "SAMPLE", 1024)
 
 
 @pytest.fixture(autouse=True)
@@ -602,7 +602,7 @@ def test_depths_that_occur_are_learned() -> None:
 
 def test_light_does_not_depend_on_the_order_of_pixels() -> None:
     capture = drawn(columns(SIGNAL, 0.0), columns(0.6, 0.4)[::-1])
-    assert SIZE**2 <= posterior._SAMPLE  # beyond, some are drawn
+    assert SIZE**2 <= posterior.SAMPLE  # beyond, some are drawn
     order = np.random.default_rng(2).permutation(SIZE**2)
     cube = capture.cube.reshape(1, SIZE**2, N_BINS)[:, order]
     one, other = light_of(capture), light_of(capture_of(cube, N_PULSES))
@@ -622,7 +622,7 @@ def test_light_is_not_fooled_by_a_picket_fence(empty_column: int) -> None:
     rate = rate_per_bin(onset_bin, np.full((size, size), 0.5), 1.5, Pulse(), acquisition)
     counts = np.rint(trigger_probability(rate) * 50_000).astype(np.uint16)
     light = light_of(Capture(counts, acquisition))
-    drawn_by_chance = math.sqrt(0.25 * 0.75 / posterior._SAMPLE)
+    drawn_by_chance = math.sqrt(0.25 * 0.75 / posterior.SAMPLE)
     assert light.share[0] == pytest.approx(0.25, abs=4 * drawn_by_chance)
     # The strongest level is what the middle four fifths of an echo hold, or more.
     found = light.typical_signal.mean()

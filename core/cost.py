@@ -1,0 +1,213 @@
+"""Working memory and time of an estimate, predicted from its shape before anything is computed.
+
+Working memory is what an estimate allocates at its peak, the cube itself not counted. It is a sum
+of what grows with the counts (the blocks of `core.blocks` and the table of the posterior), with the
+pixels (images of a few float64 each), with the gate (`core.posterior` holds a table of all levels
+and delays of a few pixels) and of buffers of a fixed size. Time is that of one thread. The
+constants below were measured; ``python -m core.experiments.costs`` measures again, and prints what
+is predicted beside it. Both are right within a factor of 3 for the shapes listed there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import psutil
+
+from core.blocks import LANES
+from core.capture import Capture
+from core.checks import require
+from core.posterior import LEVELS, SAMPLE, has_posterior, lanes_of, sampled_numbers
+
+REMEDY = (
+    "crop the gate, merge bins or keep fewer pixels (core.reductions), or range the file in parts "
+    "(core.open_capture, core.estimate_large)"
+)
+
+_UNCHECKED_BYTES = 2**26  # any machine has these; looking up what is free takes longer
+
+_FIXED_BYTES = 12e6
+_PIXEL_BYTES = 120.0  # images of the answer, and of the light
+_SAMPLE_COUNT_BYTES = 6.0
+_NULL_COUNT_BYTES = 12.0
+
+_FIXED_S = 0.01
+_PIXEL_S = 0.4e-6
+_ENTRY_S, _LANE_S, _TAP_S = 4e-9, 40e-9, 0.15e-9  # of a level and delay; of a row of lanes
+_LEARNED_S = 30e-9  # of a level and delay of the sample, all steps of the maximisation
+_ECHO_S = 25e-9  # of a bin of an expected echo
+_NULL_S = 60e-9
+_FEW_PIXELS = 24  # of which each is asked for its own light (`core.inspection.mixture`)
+_LIGHT_S, _MIXTURE_S = 20e-6, 5e-6  # of a bin of a pixel
+_ECHOES = 64  # noise-free echoes of the calibration
+_USUAL_LEVELS = 4  # that a capture keeps
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What an estimate takes.
+
+    Parameters
+    ----------
+    working_bytes : int
+        Memory at its peak, in bytes, besides the capture.
+    seconds : float
+        On one thread.
+    """
+
+    working_bytes: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _Rates:
+    """What a method takes besides the posterior."""
+
+    count_s: float
+    pixel_s: float = 0.0
+    pixel_bytes: float = 0.0
+    fixed_bytes: float = 0.0
+    finds_delay: bool = False
+
+
+_USUAL = _Rates(25e-9)
+_RATES = {
+    "tracking": _Rates(5e-9),
+    "peak": _Rates(2e-9),
+    "shi": _Rates(40e-9),
+    "chi": _Rates(60e-9, 1e-6, 170.0, 40e6),
+    "unmixing": _Rates(200e-9, 5e-6, 300.0, 130e6, finds_delay=True),
+    "likelihood": _Rates(0.0, 0.3e-6, 40.0, finds_delay=True),
+    "oracle": _Rates(0.0, 0.3e-6, 60.0, finds_delay=True),
+}
+
+
+def predicted(
+    shape: tuple[int, int, int],
+    method: str,
+    settings: Any = None,
+    *,
+    false_alarm: float | None = None,
+    n_taps: int = 16,
+    is_lit: bool = False,
+) -> Cost:
+    """Working memory and time of `core.estimate`, without computing anything.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows, columns and bins.
+    method : str
+        A key of `core.ESTIMATORS`.
+    settings : object, optional
+        The method's settings; its defaults where None.
+    false_alarm : float, optional
+        As `core.estimate` takes it.
+    n_taps : int
+        Bins that an echo fills (`core.Pulse.taps`).
+    is_lit : bool
+        Whether the posterior is known already, and kept with the capture.
+    """
+    rows, cols, n_bins = shape
+    n_pixels, rates = rows * cols, _RATES.get(method, _USUAL)
+    n_counts, levels = n_pixels * n_bins, LEVELS + 1
+    n_sampled = min(n_pixels, SAMPLE)
+    entry_s = _ENTRY_S + _TAP_S * n_taps
+    steps = 0
+    if rates.finds_delay and method != "unmixing":
+        steps = 2 if settings is None else settings.steps_per_bin
+
+    n_bytes = _FIXED_BYTES + rates.fixed_bytes * min(1.0, n_counts / 1e6)
+    n_bytes += (_PIXEL_BYTES + rates.pixel_bytes) * n_pixels
+    seconds = _FIXED_S + (_PIXEL_S + rates.pixel_s) * n_pixels + rates.count_s * n_counts
+    lanes = lanes_of(levels, n_bins)
+    if not is_lit:
+        learned = min(sampled_numbers(levels, n_bins), n_sampled * levels * n_bins)
+        table = 4 * lanes * levels * n_bins * min(1.0, n_pixels / 4)
+        n_bytes += 4 * n_counts + max(table, 4 * learned + _SAMPLE_COUNT_BYTES * n_sampled * n_bins)
+        seconds += _LEARNED_S * learned
+        seconds += (entry_s + _LANE_S / lanes) * n_bins * levels * _filled(n_sampled, lanes)
+        seconds += (entry_s + _LANE_S / lanes) * n_bins * _USUAL_LEVELS * _filled(n_pixels, lanes)
+    if method == "tracking" or (not is_lit and lanes == LANES):
+        n_bytes += 2 * n_bins * _filled(n_pixels, LANES)
+    if steps:
+        lanes = lanes_of(_USUAL_LEVELS, n_bins * steps)
+        n_bytes += 8 * lanes * _USUAL_LEVELS * n_bins * steps
+        n_entries = n_bins * steps * _USUAL_LEVELS * _filled(n_pixels, lanes)
+        seconds += (entry_s + _LANE_S / lanes) * n_entries
+    if not rates.finds_delay:
+        n_bytes += 8 * 8 * min(_ECHOES * n_bins, max(2**20, n_bins))
+        seconds += _ECHOES * n_bins * (_ECHO_S + rates.count_s)
+    if false_alarm is not None and false_alarm < 1:
+        n_null = n_bins * max(min(n_pixels, 64 * 64), 2**23 // n_bins)
+        n_bytes += _NULL_COUNT_BYTES * n_null
+        seconds += (_NULL_S + rates.count_s) * n_null
+    return Cost(int(n_bytes), seconds)
+
+
+def predicted_light(n_pixels: int, n_bins: int) -> Cost:
+    """Working memory and time of a light with its intervals (`core.inspection`), likewise.
+
+    Parameters
+    ----------
+    n_pixels : int
+        Of the capture or the region; 1 for a pixel.
+    n_bins : int
+    """
+    if n_pixels < _FEW_PIXELS:
+        return Cost(int(80e6 + 160 * n_bins * n_pixels), _LIGHT_S * n_pixels * n_bins)
+    n_sampled = min(n_pixels, SAMPLE)
+    n_bytes = 20e6 + 4 * n_pixels * n_bins + _SAMPLE_COUNT_BYTES * n_sampled * n_bins
+    return Cost(int(n_bytes), _MIXTURE_S * n_sampled * n_bins)
+
+
+def _filled(n_pixels: int, lanes: int) -> int:
+    """Pixels of whole blocks."""
+    return -(-n_pixels // lanes) * lanes
+
+
+def cost_of(
+    capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
+) -> Cost:
+    """`predicted` of a capture, with what it keeps of earlier estimates."""
+    echo, _ = capture.pulse.taps(capture.acquisition.n_bins, capture.acquisition.bin_width_s)
+    return predicted(
+        _shape(capture),
+        method,
+        settings,
+        false_alarm=false_alarm,
+        n_taps=echo.size,
+        is_lit=has_posterior(capture),
+    )
+
+
+def _shape(capture: Capture) -> tuple[int, int, int]:
+    rows, cols, n_bins = capture.cube.shape
+    return rows, cols, n_bins
+
+
+def require_memory(
+    capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
+) -> None:
+    """Refuse an estimate whose working memory exceeds what the machine has free.
+
+    Raises
+    ------
+    ValueError
+        If it does.
+    """
+    is_lit = has_posterior(capture)
+    needed = predicted(
+        _shape(capture), method, settings, false_alarm=false_alarm, is_lit=is_lit
+    ).working_bytes
+    if needed > _UNCHECKED_BYTES:
+        free = psutil.virtual_memory().available
+        what = f"at most {free / 1e9:.2f} GB, which are free: {REMEDY}"
+        require(needs(capture.cube.shape, method), f"{needed / 1e9:.2f} GB", needed <= free, what)
+
+
+def needs(shape: tuple[int, ...], what: str) -> str:
+    """The name of a computation's working memory, as errors give it."""
+    rows, cols, n_bins = shape
+    return f"working memory of {what!r} for {rows} x {cols} pixels of {n_bins} bins"

@@ -1,0 +1,101 @@
+"""What an estimate takes: predicted before it is computed, bounded, and refused where too much."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import psutil
+import pytest
+
+from core import Acquisition, Capture, estimate, run
+from core.cost import predicted
+
+MB = 10**6
+
+MEASURE = """
+import sys
+from core.experiments.costs import measured
+rows, cols, n_bins = map(int, sys.argv[2:])
+print(measured((rows, cols, n_bins), sys.argv[1]).working_bytes)
+"""
+
+
+def working_bytes(method: str, *shape: int) -> int:
+    """Peak of an estimate beyond what a fresh process held before."""
+    command = [sys.executable, "-c", MEASURE, method, *map(str, shape)]
+    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def empty(*shape: int) -> Capture:
+    return Capture(np.zeros(shape, np.uint8), Acquisition(shape[2], 1e-9, n_pulses=1000))
+
+
+@pytest.mark.parametrize("method", ["tracking", "likelihood", "chi", "unmixing"])
+def test_a_long_gate_takes_no_more_memory_than_its_pixels_want(method: str) -> None:
+    # A block of 64 lanes would take 3.3 kB a bin, for a single pixel: 660 MB.
+    assert working_bytes(method, 1, 1, 200_000) < 150 * MB
+
+
+@pytest.mark.parametrize(
+    ("method", "shape"),
+    [
+        ("tracking", (1, 1, 500_000)),
+        ("kde", (8, 8, 50_000)),
+        ("tracking", (1000, 1000, 1)),
+        ("unmixing", (500, 500, 4)),
+        ("likelihood", (128, 128, 512)),
+    ],
+)
+def test_the_memory_predicted_is_what_is_taken(method: str, shape: tuple[int, int, int]) -> None:
+    expected = predicted(shape, method).working_bytes
+    assert expected / 3 < working_bytes(method, *shape) < 1.3 * expected
+
+
+def test_a_posterior_that_is_kept_is_not_counted_again() -> None:
+    shape = (256, 256, 100)
+    whole, rest = (predicted(shape, "coates", is_lit=is_lit) for is_lit in (False, True))
+    assert rest.working_bytes <= whole.working_bytes - 4 * 256 * 256 * 100
+    assert rest.seconds < whole.seconds
+
+
+def test_twice_the_steps_take_more_than_one() -> None:
+    shape = (64, 64, 1000)
+    steps = (SimpleNamespace(steps_per_bin=count) for count in (1, 8))
+    one, eight = (predicted(shape, "likelihood", each).seconds for each in steps)
+    assert eight > 2 * one
+
+
+@pytest.mark.parametrize("call", [estimate, run])
+def test_an_estimate_that_does_not_fit_is_refused_before_it_begins(call, monkeypatch) -> None:
+    free = SimpleNamespace(available=50 * MB)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    capture = empty(1000, 1000, 1)
+    with pytest.raises(ValueError, match="1000 x 1000 pixels of 1 bins") as refused:
+        call(capture, "tracking")
+    assert "0.05 GB" in str(refused.value)
+    assert "merge bins" in str(refused.value)
+    assert "blocks" not in vars(capture)  # nothing has been laid out
+    call(empty(8, 8, 100), "tracking")  # any machine has room for this
+
+
+@pytest.mark.parametrize("method", ["tracking", "likelihood", "kde", "chi", "unmixing"])
+def test_an_answer_is_the_same_bit_for_bit_however_much_is_held_at_once(method, monkeypatch):
+    rng = np.random.default_rng(0)
+    cube = rng.poisson(rng.gamma(2, 0.05, (11, 17, 1)), (11, 17, 40)).astype(np.uint16)
+    cube[..., 20:22] += rng.poisson(2.0, (11, 17, 2)).astype(np.uint16)
+
+    def answer() -> tuple[np.ndarray, ...]:
+        image = estimate(Capture(cube, Acquisition(40, 1e-9, n_pulses=200)), method)
+        return image.bin, image.score, image.confidence
+
+    expected = answer()
+    monkeypatch.setattr("core.posterior._TABLE_NUMBERS", 1000)  # two pixels side by side
+    monkeypatch.setattr("core.posterior._LIGHT_NUMBERS", 1000)
+    monkeypatch.setattr("core.posterior._AT_ONCE", 100)
+    for module in ("base", "chi", "unmixing"):
+        monkeypatch.setattr(f"core.estimators.{module}._AT_ONCE", 2000)
+    for one, other in zip(answer(), expected, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -1,0 +1,158 @@
+"""What a request and all requests together may take of a server."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from threading import Event, Thread
+from types import SimpleNamespace
+
+import numpy as np
+import psutil
+import pytest
+
+from app import budget, store
+from app.inspector_answers import capture_known, pixel_lit
+from app.jobs import Effort
+from app.ranking import Task, run_task
+from app.session import Session
+from app.state import Less, Light, Reading
+from app.store import Request, compute, effort_of, file_source
+from app.tradeoff import affordable
+from core import ESTIMATORS, Acquisition, Capture, TrackingParameters, save_capture
+from core.cost import Cost
+from core.experiments.tradeoff import candidates
+
+MB = 2**20
+
+
+@pytest.fixture
+def source(tmp_path):
+    """A file of 120 x 120 pixels and 100 bins."""
+    cube = np.random.default_rng(0).poisson(0.2, (120, 120, 100)).astype(np.uint8)
+    save_capture(Capture(cube, Acquisition(100, 1e-9, n_pulses=500)), tmp_path / "wide.npz")
+    return file_source(tmp_path / "wide.npz")
+
+
+def ask(source, less=None):
+    return Request(source, Light(), Reading(), TrackingParameters(), less or Less())
+
+
+@pytest.fixture
+def tight(monkeypatch):
+    """A server on which half of that file's pixels is too much."""
+    monkeypatch.setattr(budget, "FREE_BYTES", 16 * MB)
+    monkeypatch.setattr(budget, "REQUEST_BYTES", 16 * MB)
+
+
+def test_a_capture_too_costly_opens_reduced_and_says_so(source, tight):
+    answer = compute(ask(source), None)
+    less = answer.request.less
+    assert less.merge * less.skip > 1
+    assert answer.asked == Less()
+    assert answer.capture.cube.size < answer.whole.cube.size
+    assert "no more than this server allows" in answer.capture.source
+    # As few as will do: one step less is refused.
+    for name in ("merge", "skip"):
+        if getattr(less, name) > 1:
+            more = replace(less, **{name: getattr(less, name) - 1})
+            with pytest.raises(ValueError, match="working memory of 'tracking'"):
+                compute(ask(source, more), answer)
+
+
+def test_a_capture_that_fits_is_left_as_it_is(source):
+    answer = compute(ask(source), None)
+    assert answer.request.less == answer.asked == Less()
+    assert answer.capture.cube.shape == (120, 120, 100)
+
+
+def test_the_controls_show_what_was_left_out(source, tight):
+    session = Session({"wide": source})
+    assert session.state.less == session.answer.request.less != Less()
+    assert session.answer.request == session._request()  # the next request asks for the same
+
+
+def test_more_of_it_is_refused_with_a_remedy(source, tight):
+    answer = compute(ask(source), None)
+    with pytest.raises(ValueError, match="Less data, faster") as refused:
+        compute(ask(source), answer)
+    assert "120 x 120 pixels of 100 bins" in str(refused.value)
+
+
+def test_time_is_bounded_as_memory_is(source, monkeypatch):
+    monkeypatch.setattr(budget, "REQUEST_S", 0.04)
+    answer = compute(ask(source), None)
+    assert answer.request.less != Less()
+    with pytest.raises(ValueError, match="estimated time of 'tracking'"):
+        compute(ask(source), answer)
+
+
+def test_what_other_pages_compute_is_refused_too(source, monkeypatch):
+    answer = compute(ask(source), None)
+    monkeypatch.setattr(budget, "REQUEST_S", 1e-4)
+    for method in ("unmixing", "likelihood"):
+        with pytest.raises(ValueError, match=f"estimated time of '{method}'"):
+            run_task(Task(method, ESTIMATORS[method].parameters()), answer)
+    for work in (capture_known, lambda each: pixel_lit(each, 0, 0)):
+        with pytest.raises(ValueError, match="estimated time of 'light'"):
+            work(answer)
+
+
+def test_the_trade_off_leaves_out_what_takes_too_long(source, monkeypatch):
+    capture = compute(ask(source), None).whole
+    ways = candidates()
+    assert affordable(capture, ways) == ways
+    monkeypatch.setattr(budget, "REQUEST_S", 0.4)
+    left_out = [each for each in ways if each not in affordable(capture, ways)]
+    assert {(each.method.estimator, each.reduction.merge) for each in left_out} == {("unmixing", 1)}
+    monkeypatch.setattr(budget, "REQUEST_S", 1e-4)
+    with pytest.raises(ValueError, match="estimated time of 'likelihood'"):
+        affordable(capture, ways)
+
+
+def test_a_long_gate_is_not_ranged_on_the_page(tmp_path):
+    """Though its counts are few, its delays are many."""
+    cube = np.ones((1, 1, 300_000), np.uint8)
+    capture = Capture(cube, Acquisition(300_000, 1e-9, n_pulses=10**6))
+    save_capture(capture, tmp_path / "long.npz")
+    answer = compute(ask(file_source(tmp_path / "long.npz")), None)
+    again = replace(answer.request, tracking=TrackingParameters(t_n=50))
+    assert answer.capture.cube.size < store.FEW_COUNTS
+    assert effort_of(again, answer) is Effort.ANY
+
+
+def test_requests_wait_until_there_is_memory_for_them(monkeypatch):
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=8 * 100 * MB))
+    shared, begun, end = budget.Budget(), [Event() for _ in range(5)], Event()
+
+    def work(number):
+        with shared.spending(100 * MB):
+            begun[number].set()
+            end.wait()
+
+    threads = [Thread(target=work, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    assert all(each.wait(60) for each in begun[:4])
+    last = Thread(target=work, args=(4,))
+    last.start()
+    with shared.spending(MB):  # what is small does not wait
+        pass
+    last.join(0.05)
+    assert last.is_alive() and not begun[4].is_set()
+    end.set()
+    assert begun[4].wait(60)
+    for thread in (*threads, last):
+        thread.join()
+
+
+def test_what_fails_gives_its_memory_back():
+    shared = budget.Budget()
+    for _ in range(2):
+        with pytest.raises(KeyError), shared.spending(10**15):
+            raise KeyError
+
+
+def test_more_than_a_request_may_take_is_never_begun():
+    cost = Cost(10**15, 0.0)
+    with pytest.raises(ValueError, match="on this server"), budget.spending((1, 1, 9), "x", cost):
+        raise AssertionError
