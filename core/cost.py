@@ -139,7 +139,7 @@ def predicted(
     if not rates.finds_delay:
         n_bytes += 8 * 8 * min(_ECHOES * n_bins, max(2**20, n_bins))
         seconds += _ECHOES * n_bins * (_ECHO_S + rates.count_s)
-    if false_alarm is not None and false_alarm < 1:
+    if false_alarm not in (None, 1):
         n_null = n_bins * max(min(n_pixels, 64 * 64), 2**23 // n_bins)
         n_bytes += _NULL_COUNT_BYTES * n_null
         seconds += (_NULL_S + rates.count_s) * n_null
