@@ -65,7 +65,7 @@ def launch(kind: BrowserType) -> Browser:
 @contextmanager
 def serving(*arguments: str | Path, module: str = "app", **environment: str) -> Iterator[str]:
     """The app in a process of its own, at the address that is yielded."""
-    port = _free_port()
+    port = free_port()
     command = [sys.executable, "-m", module, "--port", str(port), *map(str, arguments)]
     # Into a file: a pipe that nobody reads would stop the server once it is full.
     with (
@@ -79,7 +79,7 @@ def serving(*arguments: str | Path, module: str = "app", **environment: str) -> 
         ) as server,
     ):
         try:
-            yield _when_up(f"http://127.0.0.1:{port}/", server, log)
+            yield when_up(f"http://127.0.0.1:{port}/", server, log)
         finally:
             server.terminate()
             _gone(server, log)
@@ -130,7 +130,8 @@ def fact(page: Page, name: str) -> Locator:
     return page.locator("dl div", has=term).locator("dd").filter(visible=True)
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port that nothing listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -146,7 +147,7 @@ def _gone(server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 60.0) 
         raise RuntimeError(f"the app was asked to stop, and went on:\n{log.read()}") from late
 
 
-def _when_up(
+def when_up(
     address: str, server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 120.0
 ) -> str:
     """The address, once it answers; a first start compiles the kernels."""
