@@ -221,6 +221,7 @@ class Layout:
         self._takeaway = TakeAway(
             lambda: script_of(session.answer, state), sizing_mode="stretch_width", margin=8
         )
+        self._is_away = self._is_built = False
         self._connection = Connection(session.page.session_context.id if session.is_served else "")
         self.pages = Pages(
             {
@@ -236,6 +237,7 @@ class Layout:
         self.pages.choice.link(state, value="page", bidirectional=True)
         self.pages.choice.param.update(sx=IN_THE_BAR, margin=(0, 0, 0, 8))
         self.page = self._build()
+        self._is_built = True
         self._announce(session.answer)
         self._listen()
         if session.refused:
@@ -301,8 +303,9 @@ class Layout:
 
     def _put_away(self, is_away: bool) -> None:
         """Put away what belongs to the session's capture, or bring it back."""
-        self._provenance.visible = not is_away
-        self.page.sidebar_open = not (is_away or self.page.is_narrow)
+        self._is_away, self._provenance.visible = is_away, not is_away
+        if self._is_built:  # a page that opens on Paper is built without its sidebar
+            self.page.sidebar_open = not (is_away or self.page.is_narrow)
 
     # What the user does
 
@@ -386,6 +389,7 @@ class Layout:
             header=[self.pages.choice],
             main=[head, *self.pages.mains.values(), self._provenance],
             sidebar_width=330,
+            sidebar_open=not self._is_away,
             theme_config=THEME,
             meta=Meta(title="firstphoton", description=words.ONE_LINE),
         )

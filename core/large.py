@@ -8,8 +8,12 @@ answer does not depend on how the image is cut, nor on who ranges which part.
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,7 +42,13 @@ IMAGES = {
 }
 """What is known of each pixel, its name in words and its unit."""
 
+log = logging.getLogger(__name__)
+
 _PATIENCE_S = 10.0  # for a cluster to answer
+
+SILENT_S = 30.0
+"""Time after which a worker is reported that the scheduler has not heard from. Workers report every
+few seconds at most."""
 
 
 def estimate_large(
@@ -145,7 +155,7 @@ def computed(parts: xr.Dataset, scheduler: str | None = None) -> xr.Dataset:
                 return parts.compute()
         from dask.distributed import progress  # noqa: PLC0415
 
-        with _client(scheduler) as client:
+        with _client(scheduler) as client, _reporting_silent_workers(client):
             client.wait_for_workers(1, timeout=_PATIENCE_S)
             begun = client.persist(parts)
             progress(begun, notebook=False)
@@ -161,6 +171,47 @@ def _client(scheduler: str) -> Any:
     except ValueError as error:
         accepted = "the address of a cluster, such as tcp://host:8786"
         raise ValueError(f"scheduler = {scheduler!r} is not accepted: give {accepted}.") from error
+
+
+@contextlib.contextmanager
+def _reporting_silent_workers(client: Any) -> Iterator[None]:
+    """Log each worker that stops reporting, such as a suspended process or a lost machine.
+
+    Dask waits for such a worker until ``distributed.scheduler.worker-ttl`` has passed, 5 minutes by
+    default and looked at as seldom, and says nothing until then.
+    """
+    over = threading.Event()
+    heard: dict[str, tuple[float, float]] = {}  # the scheduler's time, and ours when it was new
+    silent: set[str] = set()
+
+    def look() -> None:
+        for address, worker in client.scheduler_info()["workers"].items():
+            last_seen, now = worker["last_seen"], monotonic()
+            if heard.get(address, (None,))[0] != last_seen:
+                heard[address] = last_seen, now
+                silent.discard(address)
+            elif now - heard[address][1] > SILENT_S and address not in silent:
+                silent.add(address)
+                log.warning(
+                    "The worker %s has not reported for %.0f s, and its parts wait for it. Resume "
+                    "it, or end its process: others then take over. The scheduler gives it up by "
+                    "itself after its worker-ttl, 5 to 10 minutes unless it was set.",
+                    address,
+                    SILENT_S,
+                )
+
+    def watch() -> None:
+        while not over.wait(SILENT_S / 4):
+            with contextlib.suppress(OSError, RuntimeError):  # the client itself complains of them
+                look()
+
+    thread = threading.Thread(target=watch, name="firstphoton-workers", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,9 +10,29 @@ from typing import Any
 
 import numba
 
+log = logging.getLogger(__name__)
+
+
+def can_cache() -> bool:
+    """Whether a folder for compiled kernels can be written; logs a warning if none can.
+
+    Without one numba refuses to define a cached kernel at all: in a read-only checkout of a user
+    without a home folder, nothing would start.
+    """
+    try:
+        numba.njit(cache=True)(can_cache)  # looks for the folder, compiles nothing
+    except RuntimeError:
+        log.warning(
+            "No folder for compiled kernels can be written, so that each start compiles them "
+            "again (some 20 s): set NUMBA_CACHE_DIR to a folder of your own."
+        )
+        return False
+    return True
+
+
 # "contract" alone lets a multiply and an add fuse; full fastmath would drop NaN and infinity.
 COMPILED: dict[str, Any] = {
-    "cache": True,
+    "cache": can_cache(),
     "nogil": True,
     "fastmath": {"contract"},
     "error_model": "numpy",  # a division by zero gives infinity or NaN, as in numpy

@@ -70,7 +70,7 @@ def serving(
 
     What it prints goes to `log_path`, where one is given.
     """
-    port = _free_port()
+    port = free_port()
     command = [sys.executable, "-m", module, "--port", str(port), *map(str, arguments)]
     # Into a file: a pipe that nobody reads would stop the server once it is full.
     with (
@@ -84,7 +84,7 @@ def serving(
         ) as server,
     ):
         try:
-            yield _when_up(f"http://127.0.0.1:{port}/", server, log)
+            yield when_up(f"http://127.0.0.1:{port}/", server, log)
         finally:
             server.terminate()
             _gone(server, log)
@@ -135,7 +135,8 @@ def fact(page: Page, name: str) -> Locator:
     return page.locator("dl div", has=term).locator("dd").filter(visible=True)
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port that nothing listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -151,7 +152,7 @@ def _gone(server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 60.0) 
         raise RuntimeError(f"the app was asked to stop, and went on:\n{log.read()}") from late
 
 
-def _when_up(
+def when_up(
     address: str, server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 120.0
 ) -> str:
     """The address, once it answers; a first start compiles the kernels."""

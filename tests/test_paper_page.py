@@ -15,6 +15,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from app import paper as page_of_paper
 from app import paper_words, plots
+from app.address import Wanted
 from app.items import CurveCard, Gallery, table_of
 from app.jobs import InSteps, Step
 from app.layout import Layout
@@ -293,6 +294,14 @@ def test_the_page_puts_the_sidebar_away_and_brings_it_back():
     layout.pages.choice.value = "Paper"
     layout.pages.choice.value = "Explore"
     assert not layout.page.sidebar_open
+
+
+def test_a_link_opens_on_paper_without_the_sidebar():
+    layout = Layout(built_in_sources(), Wanted({"page": "Paper"}))
+    assert layout.pages.choice.value == "Paper"
+    assert not layout.page.sidebar_open
+    layout.pages.choice.value = "Explore"
+    assert layout.page.sidebar_open
 
 
 def test_only_the_part_on_screen_works(session):

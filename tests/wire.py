@@ -12,7 +12,8 @@ import json
 import re
 from base64 import b64decode
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -108,6 +109,22 @@ class Wire:
         if self._pause is None:
             await self._send_waiting()
 
+    async def say(self, model: str, message: Mapping[str, Any]) -> None:
+        """Send a message of a component's own script to its model; bytes go as buffers."""
+        buffers: dict[str, bytes] = {}
+
+        def put(value: Any) -> Any:
+            if not isinstance(value, bytes):
+                return value
+            buffers[f"b{len(buffers)}"] = value
+            return {"type": "bytes", "data": {"id": f"b{len(buffers) - 1}"}}
+
+        data = {"type": "map", "entries": [[name, put(each)] for name, each in message.items()]}
+        values = {"type": "map", "entries": [["model", {"id": model}], ["data", data]]}
+        event = {"type": "event", "name": "data_event", "values": values}
+        said = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": event}
+        await self._send("PATCH-DOC", {"events": [said]}, buffers)
+
     async def _send_waiting(self) -> None:
         events = [
             {"kind": "ModelChanged", "model": {"id": model}, "attr": attribute, "new": value}
@@ -124,11 +141,18 @@ class Wire:
         if self._waiting and not self.is_closed:
             self._sending = asyncio.ensure_future(self._send_waiting())
 
-    async def _send(self, kind: str, content: Any) -> None:
+    async def _send(
+        self, kind: str, content: Any, buffers: Mapping[str, bytes] = MappingProxyType({})
+    ) -> None:
         self._numbers[kind] += 1
         header = {"msgid": f"{kind}-{self._numbers[kind]}", "msgtype": kind}
+        if buffers:
+            header["num_buffers"] = len(buffers)
         for part in (header, {}, content):  # without a pause: nothing can come between
             sent = self._socket.write_message(json.dumps(part))
+        for name, buffer in buffers.items():
+            self._socket.write_message(json.dumps({"id": name}))
+            sent = self._socket.write_message(buffer, binary=True)
         await sent
 
     async def _receive(self) -> tuple[str, Any, dict[str, bytes]]:
@@ -200,8 +224,9 @@ def token_in(page: str) -> str:
 
 async def connected(address: str, token: str, **headers: str) -> WebSocketClientConnection:
     """The websocket of a session; raises `HTTPClientError` where it is refused."""
+    place = address.partition("?")[0].replace("http", "ws", 1)
     return await websocket_connect(
-        HTTPRequest(address.replace("http", "ws", 1) + "ws", headers=headers),
+        HTTPRequest(f"{place}ws", headers=headers),
         subprotocols=["bokeh", token],
         max_message_size=LARGEST_MESSAGE,
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -63,3 +65,29 @@ def test_core_is_a_command() -> None:
     printed = run_python("-m", "core", "--help").stdout
     for command in ("table2", "recommend"):
         assert command in printed
+
+
+ONE_KERNEL = """
+from core import estimate
+from core.readers.lzf import decompress
+print(decompress(bytes([2]) + b"abc", 3))
+"""
+
+
+def test_kernels_run_where_no_folder_for_them_can_be_written(tmp_path: Path) -> None:
+    shutil.copytree(
+        PACKAGE, tmp_path / "core", ignore=shutil.ignore_patterns("__pycache__", "tests")
+    )
+    for folder in [tmp_path / "core", *filter(Path.is_dir, (tmp_path / "core").rglob("*"))]:
+        (folder / "__pycache__").touch()  # a file: not even the superuser writes into it
+    nowhere = {"HOME": os.devnull, "XDG_CACHE_HOME": os.devnull}
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_KERNEL],
+        cwd=tmp_path,
+        env={name: os.environ[name] for name in os.environ if "CACHE" not in name} | nowhere,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "b'abc'\n", done.stderr
+    assert "NUMBA_CACHE_DIR" in done.stderr

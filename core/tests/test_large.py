@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -185,3 +188,33 @@ def test_a_cluster_gives_the_same_and_loses_nothing_with_a_worker(tmp_path: Path
     # The first ran in this process, which holds other tests' captures, too.
     assert all(0 < each.peak_bytes < 2e9 for each in found[1:])
     assert max(done for done, _ in shown) > 10
+
+
+def test_a_suspended_worker_is_reported_and_loses_nothing(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from dask.distributed import LocalCluster  # noqa: PLC0415 - slow to come
+
+    monkeypatch.setattr(large, "SILENT_S", 2.0)
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        (worker,) = cluster.workers.values()
+        address = worker.worker_address
+
+        def resume() -> None:
+            os.kill(worker.pid, signal.SIGCONT)
+
+        def resume_if_reported(record: logging.LogRecord) -> bool:
+            if record.name == large.__name__:
+                resume()
+            return True
+
+        caplog.handler.addFilter(resume_if_reported)
+        unreported = threading.Timer(20, resume)
+        unreported.start()
+        os.kill(worker.pid, signal.SIGSTOP)
+        found = computed(estimate_large(COUNTS.chunk(row=9), "peak"), cluster.scheduler_address)
+        unreported.cancel()
+        caplog.handler.removeFilter(resume_if_reported)
+    (report,) = [each.getMessage() for each in caplog.records if each.name == large.__name__]
+    assert address in report and "worker-ttl" in report
+    np.testing.assert_array_equal(found["range_m"], estimate(CAPTURE, "peak").range_m)
