@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import inspect
+import logging
 import sys
 import time
 from collections.abc import Iterator
@@ -182,6 +183,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--only", metavar="WORD", default="", help="attacks that have it in a title"
     )
     chosen = parser.parse_args(arguments)
+    logging.getLogger("asyncio").setLevel(logging.ERROR)  # sockets that a server cuts off are meant
     attacks = [each for each in ATTACKS if chosen.only.lower() in each.title.lower()]
     print(HEADER, flush=True)
     begun, held = time.monotonic(), []

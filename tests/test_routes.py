@@ -8,11 +8,13 @@ from threading import Thread
 
 import panel as pn
 import pytest
+from bokeh.util.token import get_session_id
 from tornado.routing import PathMatches
 
 from app.server.routes import SERVED
 from tests.browser import eventually, serving
 from tests.test_serving import Site
+from tests.wire import token_in
 
 REMOVED = {
     ("/metadata$", "MetadataHandler"),
@@ -97,9 +99,6 @@ def test_of_a_component_nothing_is_served_but_its_files(address, path):
         ("GET", "/autoload.js?bokeh-autoload-element=1"),
         ("GET", "/metadata"),
         ("GET", "/ws"),
-        ("GET", "/?bokeh-session-id="),
-        ("GET", "/?bokeh-session-id=a%20b"),
-        ("GET", "/?bokeh-token=abc"),
     ],
 )
 def test_what_is_not_served_is_refused_and_leaves_no_traceback(marked, method, path):
@@ -110,6 +109,30 @@ def test_what_is_not_served_is_refused_and_leaves_no_traceback(marked, method, p
     printed = log.read_text()
     assert f"{status} {method} {path}" in printed
     assert "Traceback" not in printed
+
+
+@pytest.mark.parametrize("asked", ["bokeh-session-id=", "bokeh-session-id=a%20b", "bokeh-token=a"])
+def test_a_session_that_an_address_makes_up_is_ignored(marked, asked):
+    server, _, log = marked
+    status, _, text = server.ask(f"/?{asked}")
+    assert status == 200
+    assert get_session_id(token_in(text)) != "a b"
+    assert "Traceback" not in log.read_text()
+
+
+def test_a_session_is_returned_to_from_its_own_page_alone(marked):
+    server, *_ = marked
+    named = get_session_id(token_in(server.ask()[2]))
+
+    def returned(session, **said):
+        text = server.ask(f"/?bokeh-session-id={session}", **said)[2]
+        return get_session_id(token_in(text)) == session
+
+    own = f"http://127.0.0.1:{server.port}/"
+    assert returned(named, Referer=own)
+    assert not returned(named)
+    assert not returned(named, Referer="http://evil.example.com/")
+    assert not returned("x" * 44, Referer=own)
 
 
 @pytest.mark.browser

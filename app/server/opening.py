@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import re
 from typing import Any
+from urllib.parse import urlsplit
 
 from panel.io.server import DocHandler
 from tornado.web import HTTPError, OutputTransform
@@ -18,8 +18,6 @@ the thread that builds the page, and would wait for it."""
 
 LOOKS = 5
 """Times that is waited for at most, however many others ask for something."""
-
-_SESSION_ID = re.compile(r"[A-Za-z0-9_-]{8,128}")
 
 
 class Answers(OutputTransform):
@@ -41,7 +39,7 @@ class PageHandler(DocHandler):
     """
 
     known_head = ""
-    _is_alike = False
+    _is_alike = _is_left = False
 
     def initialize(self, sessions: Sessions, **options: Any) -> None:
         """Take over what the route was made with."""
@@ -50,7 +48,7 @@ class PageHandler(DocHandler):
 
     async def get(self, *arguments: Any, **options: Any) -> None:
         """Build the page, or say that there is no room for it."""
-        with self._sessions.opening(self._named_session()) as has_room:
+        with self._sessions.opening(self._returning()) as has_room:
             if has_room:
                 await super().get(*arguments, **options)
                 return
@@ -59,22 +57,25 @@ class PageHandler(DocHandler):
         self.set_header("Cache-Control", "no-store")
         self.finish(full_page(RETRY_S))
 
-    def _named_session(self) -> str | None:
-        """The session that a reloaded page returns to.
+    def on_connection_close(self) -> None:
+        """Nobody waits for the page any more."""
+        self._is_left = True
 
-        Raises
-        ------
-        HTTPError
-            If the name is none that the server gives, or the request brings a token of its own.
+    def _returning(self) -> str | None:
+        """The session that one of its own pages returns to, where that is still there.
+
+        A name that comes by a link, or a token, is ignored: whoever made the link would know the
+        session of whoever follows it.
         """
+        arguments, headers = self.request.arguments, self.request.headers
         named = self.get_query_argument("bokeh-session-id", None)
-        is_plain = named is None or _SESSION_ID.fullmatch(named) is not None
-        others = (
-            "Bokeh-Session-Id" in self.request.headers or "bokeh-token" in self.request.arguments
-        )
-        if others or not is_plain:
-            raise HTTPError(400, "the session cannot be chosen that way")
-        return named
+        is_own_page = urlsplit(headers.get("Referer", "")).netloc == self.request.host
+        headers.pop("Bokeh-Session-Id", None)
+        arguments.pop("bokeh-token", None)
+        if named is not None and is_own_page and self._sessions.has(named):
+            return named
+        arguments.pop("bokeh-session-id", None)
+        return None
 
     async def get_session(self) -> Any:
         """The page, which is built in here."""
@@ -82,7 +83,10 @@ class PageHandler(DocHandler):
             super().write(self.known_head)
             await self.flush()
             await _quiet()
-        session = await super().get_session()
+        async with self._sessions.building():
+            if self._is_left:
+                raise HTTPError(400, "the browser has left")
+            session = await super().get_session()
         self._is_alike = "is_page" in session.document.template_variables and not self.request.query
         return session
 

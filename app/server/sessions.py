@@ -7,8 +7,9 @@ longer, so that a page can be reloaded; one that no browser ever connected to en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
 from weakref import WeakSet
@@ -20,6 +21,10 @@ from tornado.ioloop import PeriodicCallback
 
 LOOK_S = 2.0
 """Time between two looks at the sessions."""
+
+PAUSE = 0.5
+"""Time between two pages that are built, as a share of what the first one took: open pages, which
+the same thread serves, have their turn."""
 
 RETRY_S = 10
 """Time after which a browser that found no room asks again."""
@@ -79,6 +84,7 @@ class Sessions:
         self._memory, self._clock = memory, clock
         self._connected: WeakSet[ServerSession] = WeakSet()
         self._n_opening = 0
+        self._building, self._free_s = asyncio.Lock(), clock()
         self._looked_s = clock()
         self._looks = PeriodicCallback(self.look, 1000 * LOOK_S)
 
@@ -109,6 +115,18 @@ class Sessions:
             yield has_room
         finally:
             self._n_opening -= has_room
+
+    @asynccontextmanager
+    async def building(self) -> AsyncIterator[None]:
+        """Build a page, one at a time and with pauses in between."""
+        async with self._building:
+            await asyncio.sleep(max(0.0, self._free_s - self._clock()))
+            begun_s = self._clock()
+            try:
+                yield
+            finally:
+                now_s = self._clock()
+                self._free_s = now_s + PAUSE * (now_s - begun_s)
 
     def look(self) -> None:
         """End the sessions that have waited too long for their browser."""
