@@ -9,7 +9,7 @@ from app import __main__ as started
 from app.server.serve import server_of
 from app.server.sessions import Bounds
 
-BOUNDS = Bounds(sessions=4, unconnected=3, unconnected_s=4.0)
+BOUNDS = Bounds(sessions=4, unconnected=2, unconnected_s=4.0, queued=3)
 
 if __name__ == "__main__":
     started.server_of = partial(server_of, bounds=BOUNDS)

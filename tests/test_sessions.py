@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import psutil
@@ -39,7 +40,7 @@ class Clock:
 
 
 def kept_by(*kept, memory=lambda: 0, clock=None, **bounds):
-    bounds = Bounds(**({"sessions": 3, "unconnected": 2, "memory_bytes": 10} | bounds))
+    bounds = Bounds(**({"sessions": 3, "queued": 1, "memory_bytes": 10} | bounds))
     context = SimpleNamespace(sessions=list(kept))
     return Sessions(context, bounds, memory, clock or Clock())
 
@@ -67,7 +68,7 @@ def test_a_server_that_was_busy_listens_before_it_ends_a_session():
 
 def test_closed_pages_make_room_the_longest_closed_first():
     kept = [Kept("a", idle_s=5), Kept("b", idle_s=50), Kept("c", connections=1)]
-    sessions = kept_by(*kept)
+    sessions = kept_by(*kept, queued=9)
     for each in kept:
         sessions.connected(each)
     with sessions.opening(None) as has_room:
@@ -114,10 +115,17 @@ def has_room(site):
     return status == 200
 
 
-def test_pages_that_nobody_looks_at_take_no_more_than_their_share_and_go(crowded):
+def asked_at_once(site, times):
+    """Statuses of requests of pages that nobody looks at."""
+    with ThreadPoolExecutor(times) as threads:
+        return [answer[0] for answer in threads.map(lambda _: site.ask(), range(times))]
+
+
+def test_requests_of_pages_that_nobody_looks_at_wait_or_are_refused(crowded):
     eventually(lambda: has_room(crowded))
-    assert not all(has_room(crowded) for _ in range(BOUNDS.unconnected))
-    time.sleep(BOUNDS.unconnected_s)
+    statuses = asked_at_once(crowded, 12)
+    assert {*statuses} == {200, 503}
+    assert statuses.count(200) <= BOUNDS.sessions + BOUNDS.queued
     eventually(lambda: has_room(crowded))
 
 
@@ -128,11 +136,11 @@ def test_requests_of_pages_that_nobody_looks_at_do_not_fill_the_memory(crowded):
         if str(crowded.port) in process.cmdline()
     )
     eventually(lambda: has_room(crowded))
-    before = server.memory_info().rss
-    for _ in range(100):
-        crowded.ask()
+    before, n_built = server.memory_info().rss, 0
+    while n_built < 8:
+        n_built += asked_at_once(crowded, 8).count(200)
     grown = server.memory_info().rss - before
-    assert grown < 150e6  # a hundred sessions kept took 1 GB
+    assert grown < 50e6  # 8 sessions that are kept take 80 MB
 
 
 def test_beyond_the_bound_a_page_is_refused_and_those_that_are_open_go_on(crowded):
@@ -201,11 +209,18 @@ def test_a_page_that_connects_too_late_is_loaded_again(browser, crowded):
 
 @pytest.mark.browser
 def test_a_browser_that_finds_no_room_is_told_and_comes_in_later(browser, crowded):
-    eventually(lambda: has_room(crowded))
-    while has_room(crowded):
-        pass
-    page = browser.contexts[0].new_page()
-    page.goto(crowded.address)
-    expect(page.get_by_role("status")).to_contain_text("no room for another session")
-    expect(page.locator(".stage[data-camera]").first).to_be_attached()
-    page.close()
+
+    def opened():
+        page = browser.contexts[0].new_page()
+        page.goto(crowded.address)
+        return page
+
+    pages = [opened() for _ in range(BOUNDS.sessions)]
+    for page in pages:
+        expect(page.locator(".stage[data-camera]").first).to_be_attached()
+    late = opened()
+    expect(late.get_by_role("status")).to_contain_text("no room for another session")
+    pages[0].close()
+    expect(late.locator(".stage[data-camera]").first).to_be_attached()
+    for page in [*pages[1:], late]:
+        page.close()

@@ -22,6 +22,9 @@ from tornado.ioloop import PeriodicCallback
 LOOK_S = 2.0
 """Time between two looks at the sessions."""
 
+POLL_S = 0.1
+"""Time between two looks whether the next page can be built."""
+
 PAUSE = 0.5
 """Time between two pages that are built, as a share of what the first one took: open pages, which
 the same thread serves, have their turn."""
@@ -39,17 +42,21 @@ class Bounds:
     sessions : int
         Sessions at once.
     unconnected : int
-        Of them, those that no browser has connected to yet.
+        Of them, those that no browser has connected to yet. The next page is built when one of
+        these is connected, or has ended.
     unconnected_s : float
         Seconds for which a session waits for its browser.
+    queued : int
+        Pages that wait to be built.
     memory_bytes : int
         Resident memory of the server beyond which it opens no further session. By default half of
         the machine's.
     """
 
     sessions: int = 100
-    unconnected: int = 32
+    unconnected: int = 6
     unconnected_s: float = 20.0
+    queued: int = 30
     memory_bytes: int = field(default_factory=lambda: psutil.virtual_memory().total // 2)
 
 
@@ -118,9 +125,11 @@ class Sessions:
 
     @asynccontextmanager
     async def building(self) -> AsyncIterator[None]:
-        """Build a page, one at a time and with pauses in between."""
+        """Build a page once it is its turn: one at a time, with pauses in between."""
         async with self._building:
             await asyncio.sleep(max(0.0, self._free_s - self._clock()))
+            while len(self._unconnected()) >= self._bounds.unconnected:
+                await asyncio.sleep(POLL_S)
             begun_s = self._clock()
             try:
                 yield
@@ -144,7 +153,7 @@ class Sessions:
 
     def _has_room(self) -> bool:
         """Whether one more session fits; sessions whose page was closed make room for it."""
-        bounds, n_unconnected = self._bounds, len(self._unconnected()) + self._n_opening
+        bounds = self._bounds
         closed = [
             each
             for each in self._context.sessions
@@ -155,6 +164,5 @@ class Sessions:
         is_out_of_memory = self._memory() > bounds.memory_bytes
         for each in closed[: None if is_out_of_memory else max(surplus, 0)]:
             each.request_expiration()
-        return (
-            not is_out_of_memory and surplus <= len(closed) and n_unconnected < bounds.unconnected
-        )
+        has_place = surplus <= len(closed) and self._n_opening < bounds.queued
+        return has_place and not is_out_of_memory
