@@ -10,11 +10,15 @@ from functools import partial
 from tornado.httpclient import AsyncHTTPClient, HTTPRequest
 from tornado.websocket import websocket_connect
 
+from app.server.sessions import Bounds
 from tests.attacks.attack import MIB, Attack, Outcome, Server, counted
 from tests.attacks.routes import own_token
 from tests.wire import Wire
 
-MOST_GROWTH_BYTES = 512 * MIB
+MOST_GROWTH_BYTES = 2 * Bounds().unconnected * 64 * MIB
+"""By the sessions that wait for a browser, of the largest scene, and by as many that have ended and
+are not collected yet."""
+
 MOST_GROWTH_AGAIN_BYTES = 128 * MIB
 """By a second wave, once the sessions of the first have been forgotten."""
 
