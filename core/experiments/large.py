@@ -214,6 +214,7 @@ def _cluster(
             threads_per_worker=1,
             memory_limit=memory_bytes,
             dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": ":0"},  # another cluster may have the usual port
             env={"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         ) as cluster,
         Client(cluster),

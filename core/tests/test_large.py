@@ -196,7 +196,12 @@ def test_a_suspended_worker_is_reported_and_loses_nothing(
     from dask.distributed import LocalCluster  # noqa: PLC0415 - slow to come
 
     monkeypatch.setattr(large, "SILENT_S", 2.0)
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+    with LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": ":0"},
+    ) as cluster:
         (worker,) = cluster.workers.values()
         address = worker.worker_address
 
