@@ -1,4 +1,4 @@
-"""What the sessions of a server may take: memory and time of one request, memory of all at once."""
+"""Limits on the work of a server: memory and time of one request, memory of all at once."""
 
 from __future__ import annotations
 

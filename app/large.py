@@ -33,7 +33,7 @@ WINDOW_COUNTS = 2**24
 """Of a window's: a slider still answers at once."""
 
 PREVIEW_PIXELS, WINDOW_PIXELS = 2**20, 2**21
-"""Of either: of few bins, images of a pixel take more than its counts."""
+"""Pixels of either: with few bins, the images of a pixel take more memory than its counts."""
 
 AT_ONCE_S = 1.0
 """Spent reading before a preview is first shown, whatever it holds by then."""
@@ -108,7 +108,7 @@ class LargeFile:
 
     @property
     def _most_pixels(self) -> int:
-        """Of a window."""
+        """Largest number of pixels in a window."""
         return min(WINDOW_COUNTS // self._n_bins, WINDOW_PIXELS)
 
     @cached_property

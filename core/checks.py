@@ -54,7 +54,7 @@ def shown(path: Path | str) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """What went wrong, without the file names that a system's error repeats."""
+    """Message of an error, without the file names that a system's error repeats."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return printable(text)
 

@@ -46,7 +46,7 @@ _USUAL_LEVELS = 4  # that a capture keeps
 
 @dataclass(frozen=True)
 class Cost:
-    """What an estimate takes.
+    """Memory and time of an estimate.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class _Rates:
-    """What a method takes besides the posterior."""
+    """Memory and time of a method besides the posterior."""
 
     count_s: float
     pixel_s: float = 0.0

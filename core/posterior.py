@@ -671,7 +671,7 @@ class _Prepared(NamedTuple):
     """0 where not known."""
     n_pixels: int
     n_counts: int
-    """Of the whole cube that these pixels are a part of."""
+    """Number of counts in the whole cube that these pixels are a part of."""
 
 
 def _prepare(

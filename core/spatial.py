@@ -44,7 +44,7 @@ def pooled(cube: NDArray[np.unsignedinteger], reach: int) -> NDArray[np.unsigned
 def pooled_in(
     cube: NDArray[np.unsignedinteger], here: tuple[slice, slice], reach: int
 ) -> NDArray[np.unsignedinteger]:
-    """What `pooled` gives for some rows and columns; the cube itself where `reach` is 1."""
+    """Return `pooled` for some rows and columns; the cube itself where `reach` is 1."""
     if reach == 1:
         return cube[here]
     wide, inner = widened(here, reach // 2)

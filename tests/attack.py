@@ -1,7 +1,7 @@
 """Attacks on the app and the command line: ``python -m tests.attack``, or `make attack`.
 
 Each attack of `tests.attacks` is tried on a server of its own on this machine, bounded in count and
-time, while another session moves its sliders. A row tells what was tried, how often, what came of
+time, while another session moves its sliders. A row says what was tried, how often, what came of
 it, how long the other session had to wait at most, and the memory of the attacked process with its
 children. An attack holds if the server refuses or survives it within bounds, and goes on serving
 the other session. The command returns 1 if one did not hold.
@@ -53,7 +53,7 @@ SETTLED_BYTES = 1024 * MIB
 
 @dataclass(frozen=True)
 class Row:
-    """What is printed of an attack."""
+    """A row of the table."""
 
     title: str
     outcome: Outcome

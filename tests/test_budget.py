@@ -1,4 +1,4 @@
-"""What a request and all requests together may take of a server."""
+"""Memory and time of a request, and memory of all requests together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a client may take before the server knows who it is."""
+"""Limits on a client before the server knows who it is."""
 
 from __future__ import annotations
 

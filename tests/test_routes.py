@@ -1,4 +1,4 @@
-"""What is served, and that no request runs code, ends the server or leaves a traceback."""
+"""No request runs code, ends the server or leaves a traceback."""
 
 from __future__ import annotations
 

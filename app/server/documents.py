@@ -24,7 +24,9 @@ def _told(connection: ServerConnection, message: Message[Any], text: str) -> Mes
     if failure is not None:
         with set_curdoc(connection.session.document):
             state._handle_exception(failure)
-    answer = connection.protocol.create("ERROR", message.header["msgid"], "It is told by the page.")
+    answer = connection.protocol.create(
+        "ERROR", message.header["msgid"], "The error is shown in the app."
+    )
     answer.content["traceback"] = None
     return answer
 

@@ -1,4 +1,4 @@
-"""Pages of one sentence, for who is not served."""
+"""Pages of one sentence, for requests that are not served."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def token_form(sentence: str) -> str:
 
 
 def too_many_tokens(delay_s: float) -> str:
-    """What an address is told that has sent too many wrong tokens."""
+    """Sentence for an address that has sent too many wrong tokens."""
     return f"Too many wrong tokens from your address. Try again in {delay_s:.0f} s."
 
 

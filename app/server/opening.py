@@ -1,4 +1,4 @@
-"""What a browser needs for any page goes to it at once, and the page when it is built."""
+"""Serve the head of a page at once, and the page itself when it is built."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class Answers(OutputTransform):
 
 
 class PageHandler(DocHandler):
-    """Sends the head of the page before: the browser takes as long for its scripts as it is built.
+    """Sends the head of a page first: the browser loads its scripts while the page is built.
 
-    Heads are alike but for what an address asks for, and each page tells what it is for the next.
+    Heads differ only by what an address asks for, so that each page keeps its head for the next.
     Where there is no room for a session, none is built, and the page says so.
     """
 

@@ -1,4 +1,4 @@
-"""What is served: a page, its socket and its files, and nothing else that the libraries offer.
+"""Routes: a page, its socket and its files, and nothing else that the libraries offer.
 
 Of Panel's and Bokeh's routes those in `SERVED` are kept, some with a handler of our own; all others
 are removed, those that a later version adds included.
@@ -29,7 +29,7 @@ from app.server.opening import PageHandler
 from app.server.sessions import Sessions
 
 MOST_MESSAGE_BYTES = 16 * 2**20
-"""Of a message from a browser. A part of a file (`app.widgets.file_input`) is the largest."""
+"""Largest message from a browser; a part of a file (`app.widgets.file_input`) is smaller."""
 
 _COMPONENT_PACKAGE = "app."
 

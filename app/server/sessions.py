@@ -35,7 +35,7 @@ RETRY_S = 10
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the sessions of a server may take.
+    """Limits on the sessions of a server.
 
     Parameters
     ----------

@@ -49,11 +49,11 @@ def writing(path: Path) -> Iterator[None]:
         raise  # says what to do already
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "free some space, or give a folder to write to")
-        told = type(error)(f"{shown(path)} cannot be written ({reason(error)}): {remedy}.")
-        told.errno = error.errno
+        refusal = type(error)(f"{shown(path)} cannot be written ({reason(error)}): {remedy}.")
+        refusal.errno = error.errno
         for note in getattr(error, "__notes__", ()):
-            told.add_note(note)
-        raise told from error
+            refusal.add_note(note)
+        raise refusal from error
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What an estimate takes: predicted before it is computed, bounded, and refused where too much."""
+"""Memory and time of an estimate: predicted, bounded, and refused where they are too much."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What `python -m tests.attack` tries, one module for each kind of attacker."""
+"""Attacks of `python -m tests.attack`, one module for each kind of attacker."""

@@ -35,12 +35,12 @@ TOKEN = "a token of the attacks"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of an attack."""
+    """Result of an attack."""
 
     times: int
     """How often it was tried."""
     said: str
-    """What was observed, in words."""
+    """Sentence on what was observed."""
     held: bool
     peak_bytes: int = 0
     """Resident memory of the attacked process and its children at its highest."""
@@ -132,7 +132,7 @@ class Server:
     """First entry of the server's module search path; for modules and files of attacks."""
     log: IO[str]
     headers: dict[str, str] = field(default_factory=dict)
-    """What a client sends who knows the token."""
+    """Headers of a client that knows the token."""
 
     @property
     def port(self) -> int:
@@ -145,7 +145,7 @@ class Server:
         return self.process.poll() is None
 
     def logged(self, since: int = 0) -> str:
-        """What it has printed, from this character on."""
+        """Text that it has printed, from this character on."""
         with open(f"/proc/self/fd/{self.log.fileno()}", encoding="utf-8", errors="replace") as log:
             return log.read()[since:]
 
@@ -274,5 +274,5 @@ def last_line(text: str, most: int = 160) -> str:
 
 
 def counted(things: Sequence[Any]) -> str:
-    """What there is of each, such as ``3 × 403, 1 × closed``."""
+    """Number of each, such as ``3 × 403, 1 × closed``."""
     return ", ".join(f"{things.count(each)} × {each}" for each in dict.fromkeys(things))
