@@ -309,7 +309,7 @@ def test_the_door_opens_to_the_token_alone(browser):
         page.goto(f"{running_at}?unit=ns")
         page.get_by_label("Token").fill("something else")
         page.get_by_role("button", name="Enter").click()
-        expect(page.get_by_role("alert")).to_contain_text("not the token")
+        expect(page.get_by_role("alert")).to_contain_text("Wrong token")
         page.get_by_label("Token").fill(TOKEN)
         page.get_by_role("button", name="Enter").click()
         page.locator(".stage[data-camera]").wait_for()
