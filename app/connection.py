@@ -17,7 +17,7 @@ connection is lost for a minute."""
 
 
 LEAST_LINGER_S, MOST_LINGER_S = 5.0, 86_400.0
-"""A page that takes longer to connect for the first time than its session is kept is no page."""
+"""Bounds of the option: a reloaded page needs some seconds to return to its session."""
 
 
 def serving_options(linger_s: float = LINGER_S) -> dict[str, Any]:

@@ -136,11 +136,15 @@ def test_requests_of_pages_that_nobody_looks_at_do_not_fill_the_memory(crowded):
         if str(crowded.port) in process.cmdline()
     )
     eventually(lambda: has_room(crowded))
-    before, n_built = server.memory_info().rss, 0
-    while n_built < 8:
-        n_built += asked_at_once(crowded, 8).count(200)
+    before = server.memory_info().rss
+    built = 0
+    for _ in range(20):
+        built += asked_at_once(crowded, 8).count(200)
+        if built >= 8:
+            break
+    assert built >= 8
     grown = server.memory_info().rss - before
-    assert grown < 50e6  # 8 sessions that are kept take 80 MB
+    assert grown < 50e6  # as many sessions that are kept take 80 MB
 
 
 def test_beyond_the_bound_a_page_is_refused_and_those_that_are_open_go_on(crowded):

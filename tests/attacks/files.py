@@ -22,7 +22,7 @@ from tests.attacks.attack import MIB, Attack, Ended, Outcome, command, last_line
 
 MOST_BYTES = 1536 * MIB
 MOST_S = 30.0
-"""What a command may take for any of these files, its start and compilation included."""
+"""Limits on a command for any of these files, its start and compilation included."""
 
 CUBE = np.random.default_rng(0).poisson(0.1, (3, 4, 100)).astype(np.uint8)
 
@@ -196,10 +196,10 @@ def long_name(folder: Path) -> Outcome:
     ):
         ended = command("-m", "core", *arguments)
         peak = max(peak, ended.peak_bytes)
-        told = last_line(ended.printed, 999)
-        own = "Errno" not in told and "Traceback" not in ended.printed
+        printed = last_line(ended.printed, 999)
+        own = "Errno" not in printed and "Traceback" not in ended.printed
         if ended.status in (0, None) or not own:
-            wrong.append(f"{arguments[0]}: status {ended.status}, {told.replace(name, 'x…x')}")
+            wrong.append(f"{arguments[0]}: status {ended.status}, {printed.replace(name, 'x…x')}")
     return Outcome(3, "; ".join(wrong) or "refused in our own words", not wrong, peak)
 
 
@@ -215,12 +215,12 @@ def full_disk(folder: Path) -> Outcome:
             largest_file_bytes=4096,
         )
         peak = max(peak, ended.peak_bytes)
-        told = last_line(ended.printed)
-        own = out.name in told and "Traceback" not in ended.printed
+        printed = last_line(ended.printed)
+        own = out.name in printed and "Traceback" not in ended.printed
         if ended.status != 1 or not own or out.exists():
             left = ", half a file left" if out.exists() else ""
-            wrong.append(f"{suffix}: status {ended.status}, {told}{left}")
-    said = "; ".join(wrong) or f"told by the file's name ({os.strerror(errno.EFBIG)})"
+            wrong.append(f"{suffix}: status {ended.status}, {printed}{left}")
+    said = "; ".join(wrong) or f"reported by the file's name ({os.strerror(errno.EFBIG)})"
     return Outcome(3, said, not wrong, peak)
 
 

@@ -50,9 +50,9 @@ async def big_bodies(server: Server) -> Outcome:
         return status
 
     said = await asyncio.gather(*(send() for _ in range(6)), return_exceptions=True)
-    told = [each if isinstance(each, int | str) else type(each).__name__ for each in said]
+    printed = [each if isinstance(each, int | str) else type(each).__name__ for each in said]
     grown = server.memory.peak_bytes - base
-    return Outcome(6, f"{counted(told)}; +{grown / MIB:.0f} MiB", grown < MOST_GROWTH_BYTES)
+    return Outcome(6, f"{counted(printed)}; +{grown / MIB:.0f} MiB", grown < MOST_GROWTH_BYTES)
 
 
 Links = list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]
