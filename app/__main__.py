@@ -22,18 +22,20 @@ import panel as pn
 from tornado.netutil import bind_sockets
 
 import core
-from app import collector, latency, words
-from app.connection import LINGER_S
-from app.controls import Sentence
-from app.jobs import LONG
-from app.layout import build_page
+from app.model import text as words
+from app.model.state import Light, Reading
+from app.model.store import Source, built_in_sources, file_source
+from app.model.uploads import Uploads
+from app.pages.layout import build_page
+from app.server import garbage as collector
 from app.server.access import TOKEN_VARIABLE, Access
-from app.server.documents import keep_tracebacks, send_early_changes
+from app.server.patches import latency
+from app.server.patches.documents import keep_tracebacks, send_early_changes
 from app.server.serve import server_of
-from app.state import Light, Reading
-from app.store import Source, built_in_sources, file_source
-from app.uploads import Uploads
-from core.readers import READERS
+from app.tasks.jobs import LONG
+from app.widgets.connection import LINGER_S
+from app.widgets.controls import Sentence
+from core.io.readers import READERS
 
 log = logging.getLogger(__name__)
 

@@ -1,17 +1,19 @@
 """Range estimation from first-photon (Geiger-mode APD) lidar captures, without a screen."""
 
-from core import inspection, limits, metrics, reductions
+from core import inspection, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
 from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
-from core.export import save_capture, save_image, save_pixel
-from core.large import as_image, estimate_large
+from core.inference import limits
+from core.io.readers import open_capture, read_capture
+from core.io.scene_files import SceneError, read_scene
+from core.io.writers import save_capture, save_image, save_pixel
+from core.out_of_core.tiles import as_image, estimate_large
+from core.out_of_core.windows import Window, light_of_whole, read_window
 from core.pipeline import Run, run
-from core.readers import open_capture, read_capture
 from core.scene import PARTS, Scene, parts_of, scenes, without
-from core.scene_files import SceneError, read_scene
-from core.simulate import first_photons, simulate
+from core.simulation import first_photons, simulate
 from core.tracking import PRESETS, Signals, TrackingParameters, tracking_signals
 from core.trigger import (
     coates_rate,
@@ -21,7 +23,6 @@ from core.trigger import (
     trigger_probability,
 )
 from core.warmup import warm_up
-from core.windows import Window, light_of_whole, read_window
 
 __all__ = [
     "CORRECTIONS",

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
-from core.blocks import Blocks, to_blocks
 from core.checks import require
+from core.kernels.blocks import Blocks, to_blocks
 
 COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
 

@@ -1,11 +1,12 @@
 """Working memory and time of an estimate, predicted from its shape before anything is computed.
 
 Working memory is what an estimate allocates at its peak, the cube itself not counted. It is a sum
-of what grows with the counts (the blocks of `core.blocks` and the table of the posterior), with the
-pixels (images of a few float64 each), with the gate (`core.posterior` holds a table of all levels
-and delays of a few pixels) and of buffers of a fixed size. Time is that of one thread. The
-constants below were measured; ``python -m core.experiments.costs`` measures again, and prints what
-is predicted beside it. Both are right within a factor of 3 for the shapes listed there.
+of what grows with the counts (the blocks of `core.kernels.blocks` and the table of the posterior),
+with the pixels (images of a few float64 each), with the gate (`core.inference.posterior` holds a
+table of all levels and delays of a few pixels) and of buffers of a fixed size. Time is that of one
+thread. The constants below were measured; ``python -m core.studies.performance.costs`` measures
+again, and prints what is predicted beside it. Both are right within a factor of 3 for the shapes
+listed there.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from typing import Any
 
 import psutil
 
-from core.blocks import LANES
 from core.capture import Capture
 from core.checks import require
-from core.posterior import LEVELS, SAMPLE, has_posterior, lanes_of, sampled_numbers
+from core.inference.posterior import LEVELS, SAMPLE, has_posterior, lanes_of, sampled_numbers
+from core.kernels.blocks import LANES
 
 REMEDY = (
     "crop the gate, merge bins or keep fewer pixels (core.reductions), or range the file in parts "
@@ -38,7 +39,7 @@ _ENTRY_S, _LANE_S, _TAP_S = 4e-9, 40e-9, 0.15e-9  # of a level and delay; of a r
 _LEARNED_S = 30e-9  # of a level and delay of the sample, all steps of the maximisation
 _ECHO_S = 25e-9  # of a bin of an expected echo
 _NULL_S = 60e-9
-_FEW_PIXELS = 24  # of which each is asked for its own light (`core.inspection.mixture`)
+_FEW_PIXELS = 24  # of which each is asked for its own light (`core.inspection.mean_flux`)
 _LIGHT_S, _MIXTURE_S = 20e-6, 5e-6  # of a bin of a pixel
 _ECHOES = 64  # noise-free echoes of the calibration
 _USUAL_LEVELS = 4  # that a capture keeps

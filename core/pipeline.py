@@ -10,7 +10,7 @@ from core import metrics
 from core.capture import Capture
 from core.cost import require_memory
 from core.estimators import RangeImage, estimate, settings_of
-from core.posterior import posterior_of
+from core.inference.posterior import posterior_of
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from core.acquisition import Acquisition, Floats
 from core.capture import Capture
 from core.checks import require
-from core.parallel import PARALLEL, entering
-from core.streams import pixel_key, uniform_at
+from core.kernels.parallel import PARALLEL, entering
+from core.kernels.streams import pixel_key, uniform_at
 
 DRAWN_ONE_BY_ONE = 2**27
 """Detections up to which fewer pulses are drawn detection by detection; more take less time bin by

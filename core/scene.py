@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats
 from core.checks import require
-from core.parts import Backscatter, FaultyPixels, Jitter, Motion, SecondSurface
+from core.effects import Backscatter, FaultyPixels, Jitter, Motion, SecondSurface
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Scene:
     acquisition : Acquisition
         The instrument setting that suits this scene (`simulate` takes its own).
     second_surface, backscatter, faulty_pixels, motion, jitter : optional
-        Parts of `core.parts`; one that is None costs nothing.
+        Parts of `core.effects`; one that is None costs nothing.
 
     Raises
     ------

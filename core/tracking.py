@@ -36,9 +36,9 @@ from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from core.acquisition import Floats
-from core.blocks import LANES, Blocks, lane_rows, lane_spread
 from core.checks import require
-from core.parallel import COMPILED, KERNEL_LOCK, PARALLEL, SERIAL_BELOW
+from core.kernels.blocks import LANES, Blocks, lane_rows, lane_spread
+from core.kernels.parallel import COMPILED, KERNEL_LOCK, PARALLEL, SERIAL_BELOW
 from core.parameters import Choice, Number, Zone, check_fields, parameter
 
 Weight = Literal["cubic", "exponential", "survival", "none"]

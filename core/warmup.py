@@ -7,9 +7,9 @@ import numpy as np
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
-from core.parallel import SERIAL_BELOW
+from core.kernels.parallel import SERIAL_BELOW
 from core.scene import Scene
-from core.simulate import simulate
+from core.simulation import simulate
 from core.tracking import PRESETS, track, tracking_signals
 
 

@@ -9,8 +9,8 @@ import sys
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
-import app.session
-import app.store
+import app.model.store
+import app.pages.session
 from app import __main__ as started
 from core import CaptureError
 from core.checks import refusing
@@ -47,10 +47,10 @@ WHEN_INSPECTED = (3, 4)
 WHEN_TAPPED = (5, 6)
 
 simulate, enter, inspect, choose = (
-    app.store.simulate,
-    app.session.words.figure_strip,
-    app.session.inspect,
-    app.session.Session.choose_pixel,
+    app.model.store.simulate,
+    app.pages.session.words.figure_strip,
+    app.pages.session.inspect,
+    app.pages.session.Session.choose_pixel,
 )
 
 
@@ -78,8 +78,8 @@ def breaking_choose(session, row, col):
 
 
 if __name__ == "__main__":
-    app.store.simulate = breaking_simulate
-    app.session.words.figure_strip = breaking_figures
-    app.session.inspect = breaking_inspect
-    app.session.Session.choose_pixel = breaking_choose
+    app.model.store.simulate = breaking_simulate
+    app.pages.session.words.figure_strip = breaking_figures
+    app.pages.session.inspect = breaking_inspect
+    app.pages.session.Session.choose_pixel = breaking_choose
     sys.exit(started.main())

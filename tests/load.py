@@ -3,9 +3,9 @@
 Sessions are clients of Bokeh's protocol (`tests.wire`), on the same cores as the server: as many
 real browsers would measure browsers. Each drags one control after the other, 20 values a second as
 a hand does, whether or not the last one is answered. As in a browser a value that is overtaken may
-not even be sent (`app/bokeh.js`), and has no answer of its own; each counts as answered when the
-first data arrive that show it or a later one of the same drag. The data themselves tell which: T_n
-is where the weight in its plot begins, SBR follows from the first of the expected counts.
+not even be sent (`app/pages/bokeh.js`), and has no answer of its own; each counts as answered when
+the first data arrive that show it or a later one of the same drag. The data themselves tell which:
+T_n is where the weight in its plot begins, SBR follows from the first of the expected counts.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import psutil
 
-from app.plots import ENHANCED_LAYERS, HISTOGRAM_LAYERS
-from app.state import Light
+from app.model.state import Light
+from app.plots.elements import ENHANCED_LAYERS, HISTOGRAM_LAYERS
 from tests.browser import serving
 from tests.wire import Wire
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import param
 
-from app.address import defaults
-from app.state import CLOUDS, Comparison, Reading, State
+from app.model.address import defaults
+from app.model.state import CLOUDS, Comparison, Reading, State
 from core import ESTIMATORS, Pulse, Window
 from core.parameters import Choice
 

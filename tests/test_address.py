@@ -8,11 +8,11 @@ from urllib.parse import parse_qsl
 import numpy as np
 import pytest
 
-from app import words
-from app.address import Wanted, defaults, query_of
-from app.session import Session
-from app.state import Less, Light, Reading, State, Viewing
-from app.store import built_in_sources
+from app.model import text as words
+from app.model.address import Wanted, defaults, query_of
+from app.model.state import Less, Light, Reading, State, Viewing
+from app.model.store import built_in_sources
+from app.pages.session import Session
 from core import TrackingParameters
 from tests.states import OTHERWISE, another, random_state
 

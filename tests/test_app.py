@@ -10,14 +10,24 @@ import pytest
 from bokeh.document import Document
 
 import core
-from app import looks, plots, words
-from app.controls import Knob, SettingsPanel
-from app.jobs import Effort, LatestWins
-from app.layout import CUSTOM, Layout
-from app.state import Less, Light, Reading, Viewing
-from app.store import Request, built_in_sources, compute, effort_of, file_source, inspect, is_wrong
+from app.model import colors as looks
+from app.model import text as words
+from app.model.state import Less, Light, Reading, Viewing
+from app.model.store import (
+    Request,
+    built_in_sources,
+    compute,
+    effort_of,
+    file_source,
+    inspect,
+    is_wrong,
+)
+from app.pages.layout import CUSTOM, Layout
+from app.plots import elements as plots
+from app.tasks.jobs import Effort, LatestWins
 from app.theme import DARK, LIGHT, OUTSIDE_COLOR
-from app.views import ImageView, Plot, SignalPlots
+from app.widgets.controls import Knob, SettingsPanel
+from app.widgets.views import ImageView, Plot, SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
@@ -592,7 +602,9 @@ def test_showing_settings_reports_nothing():
 def layout(monkeypatch):
     """A page; what is to be done on its thread waits for `next_answer`."""
     acts = SimpleQueue()
-    monkeypatch.setattr("app.session.LatestWins", lambda on_page: LatestWins(queued(acts.put)))
+    monkeypatch.setattr(
+        "app.pages.session.LatestWins", lambda on_page: LatestWins(queued(acts.put))
+    )
     page = Layout(built_in_sources())
     page.acts, page.heard, tell = acts, [""], page.session.complain
     page.session.complain = lambda sentence: (page.heard.append(sentence), tell(sentence))

@@ -14,12 +14,12 @@ from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
 import core
-from app.cloud import point_cloud
-from app.state import Light
-from app.store import built_in_sources
+from app.model.state import Light
+from app.model.store import built_in_sources
 from app.theme import DARK, LIGHT, RANGE_COLORS, WRONG_COLOR
+from app.widgets.cloud import point_cloud
 from core import PRESETS, TrackingParameters
-from core.readers.npz import FORMAT
+from core.io.readers.npz import FORMAT
 from tests.browser import eventually, fact, serving
 
 pytestmark = pytest.mark.browser

@@ -10,17 +10,17 @@ import numpy as np
 import psutil
 import pytest
 
-from app import budget, store
-from app.inspector_answers import capture_known, pixel_lit
-from app.jobs import Effort
-from app.ranking import Task, run_task
-from app.session import Session
-from app.state import Less, Light, Reading
-from app.store import Request, compute, effort_of, file_source
-from app.tradeoff import affordable
+from app.model import budget, store
+from app.model.state import Less, Light, Reading
+from app.model.store import Request, compute, effort_of, file_source
+from app.pages.compare.ranking import Task, run_task
+from app.pages.inspect.results import capture_known, pixel_lit
+from app.pages.session import Session
+from app.pages.tradeoff.page import affordable
+from app.tasks.jobs import Effort
 from core import ESTIMATORS, Acquisition, Capture, TrackingParameters, save_capture
 from core.cost import Cost
-from core.experiments.tradeoff import candidates
+from core.studies.tradeoff.measure import candidates
 
 MB = 2**20
 

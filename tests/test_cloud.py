@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from app.cloud import PointCloud, pixel_index, point_cloud, spacing_m, view_bounds
 from app.theme import palette
-from core.cloud import sight_lines
+from app.widgets.cloud import PointCloud, pixel_index, point_cloud, spacing_m, view_bounds
+from core.geometry import sight_lines
 
 ANGLE = 2e-3
 

@@ -12,13 +12,14 @@ from PIL import Image
 from playwright.sync_api import expect
 
 import core
-from app import ranking, ranking_words
-from app.compare import MOST_PICTURES, Compare
-from app.jobs import LatestWins
-from app.layout import Layout
-from app.ranking import Result, Task
-from app.state import CLOUDS, FIRST_METHODS, Less, Light, Reading
-from app.store import Request, built_in_sources, compute
+from app.model.state import CLOUDS, FIRST_METHODS, Less, Light, Reading
+from app.model.store import Request, built_in_sources, compute
+from app.pages.compare import ranking
+from app.pages.compare import text as ranking_words
+from app.pages.compare.page import MOST_PICTURES, Compare
+from app.pages.compare.ranking import Result, Task
+from app.pages.layout import Layout
+from app.tasks.jobs import LatestWins
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
 from tests.browser import eventually, fact
@@ -142,7 +143,7 @@ class Stage:
 
     def __init__(self, monkeypatch):
         self.acts = SimpleQueue()
-        for room in ("session", "compare"):
+        for room in ("pages.session", "pages.compare.page"):
             monkeypatch.setattr(
                 f"app.{room}.LatestWins", lambda _: LatestWins(queued(self.acts.put))
             )
@@ -209,7 +210,8 @@ def test_only_what_is_missing_is_computed(stage, monkeypatch):
     ran = []
     run_task = ranking.run_task
     monkeypatch.setattr(
-        "app.compare.run_task", lambda task, of: (ran.append(task.method), run_task(task, of))[1]
+        "app.pages.compare.page.run_task",
+        lambda task, of: (ran.append(task.method), run_task(task, of))[1],
     )
     stage.view.show(True)
     stage.settle()
@@ -268,7 +270,7 @@ def test_a_method_that_fails_says_so_and_the_others_go_on(stage, monkeypatch):
             raise ValueError("no such luck.")
         return run_task(task, of)
 
-    monkeypatch.setattr("app.compare.run_task", fail)
+    monkeypatch.setattr("app.pages.compare.page.run_task", fail)
     stage.view.show(True)
     stage.settle()
     coates = ESTIMATORS["coates"].title

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import pytest
 from playwright.sync_api import expect
 
-from app.controls import Knob, SettingsPanel
+from app.widgets.controls import Knob, SettingsPanel
 from core import PRESETS, TrackingParameters
 from core.estimators import ESTIMATORS
 from core.parameters import Number, joint_doubts, spec_of

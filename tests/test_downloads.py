@@ -20,16 +20,16 @@ import trimesh
 from PIL import Image
 from playwright.sync_api import expect
 
-from app import downloads
-from app.downloads import Download, Shown, Subject
-from app.exports import drawn, facts_file, image_files, shown_table_file, table_file
-from app.layout import Layout
-from app.looks import image_of, map_of, shown
-from app.state import MAPS, Less, Light
-from app.store import built_in_sources, inspect
+from app.model.colors import image_of, map_of, shown
+from app.model.exports import drawn, facts_file, image_files, shown_table_file, table_file
+from app.model.state import MAPS, Less, Light
+from app.model.store import built_in_sources, inspect
+from app.pages.layout import Layout
+from app.pages.shared import downloads
+from app.pages.shared.downloads import Download, Shown, Subject
 from app.theme import RANGE_COLORS
 from core import TrackingParameters
-from core.experiments.items import Table
+from core.studies.outputs import Table
 from tests.browser import VIEWS, fact
 
 

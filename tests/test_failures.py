@@ -15,28 +15,30 @@ import panel as pn
 import pytest
 
 from app import __main__ as started
-from app import download_words, ranking_words, words
-from app.address import Wanted
-from app.compare import Compare
-from app.inspector import Inspector
-from app.inspector_capture import Whole
-from app.inspector_pins import Pins
-from app.inspector_pixel import Sight
-from app.inspector_views import rectangle
-from app.jobs import LatestWins, Places
-from app.layout import Layout, Page
-from app.pages import Pages, View
-from app.paper import Jump, RangeImages, Repeated, Sliders, Trials, jump
-from app.requires import Judged, Requires
-from app.session import Session
-from app.state import Light
-from app.store import built_in_sources, scene_source
-from app.tradeoff import Acquisition, Effort, Ways
-from app.trust import Trust
-from app.uploads import Uploads
+from app.model import download_text as download_words
+from app.model import text as words
+from app.model.address import Wanted
+from app.model.state import Light
+from app.model.store import built_in_sources, scene_source
+from app.model.uploads import Uploads
+from app.pages.compare import text as ranking_words
+from app.pages.compare.page import Compare
+from app.pages.inspect.capture import Whole
+from app.pages.inspect.page import Inspector
+from app.pages.inspect.pins import Pins
+from app.pages.inspect.pixel import Sight
+from app.pages.inspect.views import rectangle
+from app.pages.layout import Layout, Page
+from app.pages.navigation import Pages, View
+from app.pages.paper.page import Jump, RangeImages, Repeated, Sliders, Trials, jump
+from app.pages.session import Session
+from app.pages.tradeoff.ablation import Judged, Requires
+from app.pages.tradeoff.page import Acquisition, Effort, Ways
+from app.pages.tradeoff.sensitivity import Trust
+from app.tasks.jobs import LatestWins, Places
 from core import ESTIMATORS, CaptureError
-from core.experiments import paper
-from core.experiments.trials import Condition
+from core.studies.paper import figures as paper
+from core.studies.trials import Condition
 from tests.broken import AT_SEED, WHEN_DRAWN, WHEN_INSPECTED, WHEN_TAPPED
 from tests.browser import ROOT, eventually, serving
 from tests.load import opened
@@ -213,18 +215,18 @@ def reported(session):
 
 
 PARTS = {
-    "app.inspector.map_of": navigated,
-    "app.inspector_pins.pixel_lit": pinned,
+    "app.pages.inspect.page.map_of": navigated,
+    "app.pages.inspect.pins.pixel_lit": pinned,
     "core.inspection.region_report": added,
     "core.inspection.capture_report": reported,
     "core.inspection.accuracy_over_pulses": started_by_compute(Whole),
-    "core.experiments.paper.figure_1": moved,
-    "app.paper.trials": started_by_compute(repeated),
-    "core.experiments.paper.figure_8": started_by_compute(RangeImages),
-    "app.tradeoff.study": started_by_compute(ways),
-    "app.tradeoff.acquired": started_by_compute(Acquisition),
-    "app.requires.requirements": started_by_compute(requires),
-    "app.trust.setting_sweep": started_by_compute(trust),
+    "core.studies.paper.figures.figure_1": moved,
+    "app.pages.paper.page.trials": started_by_compute(repeated),
+    "core.studies.paper.figures.figure_8": started_by_compute(RangeImages),
+    "app.pages.tradeoff.page.study": started_by_compute(ways),
+    "app.pages.tradeoff.page.acquired": started_by_compute(Acquisition),
+    "app.pages.tradeoff.ablation.requirements": started_by_compute(requires),
+    "app.pages.tradeoff.sensitivity.setting_sweep": started_by_compute(trust),
 }
 
 
@@ -279,7 +281,7 @@ def test_a_failure_is_told_until_its_own_part_works_again(session):
 
 
 def test_another_pixel_does_not_silence_a_map_that_failed(monkeypatch, session):
-    raised, told = breaking(monkeypatch, "app.inspector.map_of"), []
+    raised, told = breaking(monkeypatch, "app.pages.inspect.page.map_of"), []
     session.complain = told.append
     raised.append(MemoryError())
     change_map, _ = navigated(session)
@@ -298,7 +300,10 @@ def messages(page):
 
 @pytest.mark.parametrize("error", RAISED, ids=lambda error: type(error).__name__)
 def test_a_method_that_fails_is_told_and_works_once_it_is_picked_anew(error, monkeypatch, session):
-    raised, name = breaking(monkeypatch, "app.compare.run_task"), ESTIMATORS["peak"].title
+    raised, name = (
+        breaking(monkeypatch, "app.pages.compare.page.run_task"),
+        ESTIMATORS["peak"].title,
+    )
     raised[:] = [error]
     session.state.comparison = replace(session.state.comparison, methods=("peak",))
     page = Compare(session)
@@ -313,7 +318,7 @@ def test_a_method_that_fails_is_told_and_works_once_it_is_picked_anew(error, mon
 
 
 def test_a_limit_that_fails_is_told_and_is_not_called_unknown(monkeypatch, session):
-    raised = breaking(monkeypatch, "app.compare.yardstick")
+    raised = breaking(monkeypatch, "app.pages.compare.page.yardstick")
     raised[:] = RAISED[2:]
     session.state.comparison = replace(session.state.comparison, methods=("peak",))
     page = Compare(session)
@@ -328,7 +333,7 @@ def test_a_limit_that_fails_is_told_and_is_not_called_unknown(monkeypatch, sessi
 
 
 def test_curves_that_fail_are_told_and_those_of_the_next_pixel_are_drawn(monkeypatch, session):
-    raised, told = breaking(monkeypatch, "app.compare.score_curves"), []
+    raised, told = breaking(monkeypatch, "app.pages.compare.page.score_curves"), []
     session.complain = told.append
     session.state.comparison = replace(session.state.comparison, methods=("peak",))
     page = Compare(session)
@@ -360,7 +365,7 @@ def test_what_is_typed_in_vain_is_told_and_the_next_reading_works():
 
 
 def test_an_address_that_asks_for_an_unreadable_file_names_no_folder(monkeypatch):
-    raised, wanted = breaking(monkeypatch, "app.session.compute"), Wanted({"seed": "3"})
+    raised, wanted = breaking(monkeypatch, "app.pages.session.compute"), Wanted({"seed": "3"})
     for error in RAISED:
         raised[:] = [error]
         with pytest.raises(type(error)):
@@ -431,7 +436,7 @@ def test_a_process_that_is_killed_is_told_and_the_next_works(monkeypatch, sessio
     session.complain = told.append
     start, goes_on = started_by_compute(ways)(session)
     with monkeypatch.context() as patched:
-        patched.setattr("core.experiments.tradeoff.held_bytes", killed)
+        patched.setattr("core.studies.tradeoff.measure.held_bytes", killed)
         start()
         eventually(lambda: told and "BrokenProcessPool" in told[-1])
     assert "Compute begins anew" in told[-1]

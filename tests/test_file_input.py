@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from playwright.sync_api import expect
 
-from app.uploads import MAX_UPLOAD_BYTES
+from app.model.uploads import MAX_UPLOAD_BYTES
 from app.widgets.file_input import PART_BYTES, FileInput
 
 PART = {

@@ -15,9 +15,9 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 import core
-from app import inspector_words
-from app.inspector_answers import SHARES
-from app.state import Light
+from app.model.state import Light
+from app.pages.inspect import text as inspector_words
+from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
 from core.tests.captures import real_capture_path
 from tests.browser import VIEWS, eventually, fact, serving

@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app import inspector_words
-from app.downloads import Download
-from app.gate import scale
-from app.inspector import Inspector
-from app.inspector_answers import accuracy_steps, pixel_seen, region_seen, with_gate
-from app.inspector_capture import Whole
-from app.inspector_pins import Pins
-from app.inspector_pixel import Sight
-from app.inspector_views import ENOUGH_CORNERS, corners_of, rectangle
-from app.layout import Layout
-from app.looks import map_of
-from app.session import Session
-from app.state import MAPS, NEED_TRUTH, Less
-from app.store import built_in_sources, compute, file_source
+from app.model.colors import map_of
+from app.model.state import MAPS, NEED_TRUTH, Less
+from app.model.store import built_in_sources, compute, file_source
+from app.pages.inspect import text as inspector_words
+from app.pages.inspect.capture import Whole
+from app.pages.inspect.page import Inspector
+from app.pages.inspect.pins import Pins
+from app.pages.inspect.pixel import Sight
+from app.pages.inspect.results import accuracy_steps, pixel_seen, region_seen, with_gate
+from app.pages.inspect.views import ENOUGH_CORNERS, corners_of, rectangle
+from app.pages.layout import Layout
+from app.pages.session import Session
+from app.pages.shared.downloads import Download
+from app.plots.gate import scale
 from app.theme import DARK
 from core import Acquisition, coates_rate, inspection, tracking_signals
 from core.tests.captures import real_capture_path
@@ -504,7 +504,7 @@ def test_pulses_that_cannot_be_had_are_taken_back(facade, monkeypatch):
             raise MemoryError
         return works(request, *more)
 
-    monkeypatch.setattr("app.session.compute", fails)
+    monkeypatch.setattr("app.pages.session.compute", fails)
     part = Whole(facade)
     part.view.show(True)
     facade.announce = lambda answer: part._follow()

@@ -9,8 +9,8 @@ from contextvars import ContextVar
 
 import pytest
 
-from app.jobs import Effort, LatestWins, Places
-from app.turns import MESSAGES_FIRST, Turns
+from app.tasks.jobs import Effort, LatestWins, Places
+from app.tasks.turns import MESSAGES_FIRST, Turns
 from tests.browser import eventually
 from tests.threads import at_once, queued
 

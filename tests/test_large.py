@@ -16,19 +16,20 @@ import pytest
 from playwright.sync_api import Page, expect
 
 import core
-from app import downloads, large
 from app.__main__ import main
-from app.address import Wanted
-from app.large import LIMIT, Grid, most_whole_bytes
-from app.large_view import bounds_of
-from app.layout import Layout
-from app.looks import image_of
-from app.state import Less, Light, Reading
-from app.store import built_in_sources, compute, file_source
+from app.model import large
+from app.model.address import Wanted
+from app.model.colors import image_of
+from app.model.large import LIMIT, Grid, most_whole_bytes
+from app.model.state import Less, Light, Reading
+from app.model.store import built_in_sources, compute, file_source
+from app.pages.layout import Layout
+from app.pages.shared import downloads
+from app.pages.shared.large_view import bounds_of
 from core import Window
-from core.experiments.tradeoff import Cancelled
-from core.posterior import lighting_of
-from core.readers.labelled import dataset
+from core.inference.posterior import lighting_of
+from core.io.readers.labelled import dataset
+from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT, fact, serving
 from tests.test_app import ask, complaint, control, next_answer, told
 from tests.test_downloads import columns_of, written
@@ -60,8 +61,8 @@ def small(monkeypatch):
     monkeypatch.setenv(LIMIT, "100000")
     monkeypatch.setattr(large, "PREVIEW_COUNTS", 24 * 32 * BINS)
     monkeypatch.setattr(large, "WINDOW_COUNTS", 48 * 64 * BINS)
-    monkeypatch.setattr("core.readers.labelled.BLOCK_BYTES", 2 * CHUNK**2 * BINS)
-    monkeypatch.setattr("core.readers.sample.SAMPLE_COUNTS", 2 * 32 * 32 * BINS)
+    monkeypatch.setattr("core.io.readers.labelled.BLOCK_BYTES", 2 * CHUNK**2 * BINS)
+    monkeypatch.setattr("core.io.readers.sample.SAMPLE_COUNTS", 2 * 32 * 32 * BINS)
 
 
 @pytest.fixture
@@ -73,14 +74,14 @@ def path(building, small, tmp_path):
 def slow(monkeypatch):
     """Nothing more than the first few pieces is read before a preview is shown."""
     monkeypatch.setattr(large, "AT_ONCE_S", 0.0)
-    read_some = core.windows.WindowReader.read_some
+    read_some = core.out_of_core.windows.WindowReader.read_some
     steps = []
 
     def counted(reader):
         steps.append(reader.window)
         read_some(reader)
 
-    monkeypatch.setattr(core.windows.WindowReader, "read_some", counted)
+    monkeypatch.setattr(core.out_of_core.windows.WindowReader, "read_some", counted)
     return steps
 
 
@@ -236,7 +237,7 @@ def looking(path, monkeypatch):
     acts = SimpleQueue()
     put = queued(acts.put)
     monkeypatch.setattr(
-        "app.session.Session.on_page", lambda _, act, due=lambda: None: put(act, due)
+        "app.pages.session.Session.on_page", lambda _, act, due=lambda: None: put(act, due)
     )
     on_explore = Wanted({"page": "Explore"})
     page = Layout({"file": file_source(path)} | built_in_sources(), on_explore)

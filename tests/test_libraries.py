@@ -19,10 +19,16 @@ from bokeh.plotting import figure
 from bokeh.protocol import Protocol
 from panel.io.document import _destroy_document
 
-from app.collector import collect_all, spare
-from app.component import Component
-from app.controls import Knob, PixelKeys
-from app.latency import FEW_BYTES, REPLACED, QuickDeserializer, QuickSerializer, _kept
+from app.server.garbage import collect_all, spare
+from app.server.patches.latency import (
+    FEW_BYTES,
+    REPLACED,
+    QuickDeserializer,
+    QuickSerializer,
+    _kept,
+)
+from app.widgets.component import Component
+from app.widgets.controls import Knob, PixelKeys
 
 # -- components ------------------------------------------------------------------------------------
 

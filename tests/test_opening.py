@@ -9,13 +9,13 @@ import panel_material_ui as pmui
 import pytest
 from tornado.httpclient import AsyncHTTPClient
 
-from app import words
 from app.__main__ import free_port
-from app.controls import Sentence
+from app.model import text as words
 from app.server import opening
 from app.server.access import Access
 from app.server.opening import Answers, PageHandler
 from app.server.serve import server_of
+from app.widgets.controls import Sentence
 
 
 @pytest.fixture(autouse=True)

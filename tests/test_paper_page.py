@@ -13,19 +13,21 @@ import pytest
 from bokeh.models import Range1d
 from playwright.sync_api import Locator, Page, expect
 
-from app import paper as page_of_paper
-from app import paper_words, plots
-from app.address import Wanted
-from app.items import CurveCard, Gallery, table_of
-from app.jobs import InSteps, Step
-from app.layout import Layout
-from app.paper import Paper, RangeImages, RepeatedAt, Scales, Trials, joined, two_scales
-from app.session import Session
-from app.store import built_in_sources
+from app.model.address import Wanted
+from app.model.store import built_in_sources
+from app.pages.layout import Layout
+from app.pages.paper import page as page_of_paper
+from app.pages.paper import text as paper_words
+from app.pages.paper.page import Paper, RangeImages, RepeatedAt, Scales, Trials, joined, two_scales
+from app.pages.session import Session
+from app.pages.shared.outputs import CurveCard, Gallery, table_of
+from app.plots import elements as plots
+from app.tasks.jobs import InSteps, Step
 from app.theme import DARK, LIGHT
 from core import PRESETS, Flux
-from core.experiments import items, paper
-from core.experiments.trials import Condition, trials
+from core.studies import outputs as items
+from core.studies.paper import figures as paper
+from core.studies.trials import Condition, trials
 from tests.browser import eventually
 from tests.threads import at_once
 

@@ -70,16 +70,19 @@ def test_no_module_is_run_that_an_address_names(marked, module, site):
     "path",
     [
         "/components/app.server.routes/ComponentFiles/_css/x",
-        "/components/app.connection/Connection/_stylesheets/../__init__.py",
-        "/components/app.connection/Connection/__init__/x",
-        "/components/app.connection/Connection/_stylesheets",
-        "/components/app.connection/Connection/modifiers/",
-        "/components/app.connection/Nothing/_stylesheets/connection.css",
+        "/components/app.widgets.connection/Connection/_stylesheets/../__init__.py",
+        "/components/app.widgets.connection/Connection/__init__/x",
+        "/components/app.widgets.connection/Connection/_stylesheets",
+        "/components/app.widgets.connection/Connection/modifiers/",
+        "/components/app.widgets.connection/Nothing/_stylesheets/connection.css",
     ],
 )
 def test_of_a_component_nothing_is_served_but_its_files(address, path):
     site = Site(address)
-    assert site.ask("/components/app.connection/Connection/_stylesheets/connection.css")[0] == 200
+    assert (
+        site.ask("/components/app.widgets.connection/Connection/_stylesheets/connection.css")[0]
+        == 200
+    )
     status, _, text = site.ask(path)
     assert 400 <= status < 500
     assert "Traceback" not in text

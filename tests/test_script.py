@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 import core
-from app.address import Wanted, defaults, query_of
-from app.large import LIMIT
-from app.looks import image_of
-from app.ranking import run_task, tasks_of
-from app.script import ELSEWHERE, script_of
-from app.session import Session
-from app.state import PAGES, State
-from app.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
-from core.readers.labelled import dataset
+from app.model.address import Wanted, defaults, query_of
+from app.model.colors import image_of
+from app.model.large import LIMIT
+from app.model.script import ELSEWHERE, script_of
+from app.model.state import PAGES, State
+from app.model.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
+from app.pages.compare.ranking import run_task, tasks_of
+from app.pages.session import Session
+from core.io.readers.labelled import dataset
 from tests.browser import ROOT
 from tests.states import another, random_state
 

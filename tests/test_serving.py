@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from app.connection import serving_options
 from app.server.access import TOKEN_VARIABLE, Access
+from app.widgets.connection import serving_options
 from tests.browser import ROOT, serving
 from tests.wire import token_in
 
@@ -263,7 +263,7 @@ STOPPED_AT_A_BAD_MOMENT = """
 import os, signal, sys, time
 from types import SimpleNamespace
 from app import __main__ as started
-from app.studies import OnePiece
+from app.pages.shared.studies import OnePiece
 
 def nothing(*_):
     pass

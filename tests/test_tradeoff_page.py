@@ -10,21 +10,23 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from app import plots, requires_words, trade_words
-from app.layout import CUSTOM, Layout
-from app.requires import Requires
-from app.session import Session
-from app.state import Less, Light
-from app.store import built_in_sources
-from app.studies import OnePiece
+from app.model.state import Less, Light
+from app.model.store import built_in_sources
+from app.pages.layout import CUSTOM, Layout
+from app.pages.session import Session
+from app.pages.shared.studies import OnePiece
+from app.pages.tradeoff import ablation_text as requires_words
+from app.pages.tradeoff import text as trade_words
+from app.pages.tradeoff.ablation import Requires
+from app.pages.tradeoff.page import Acquisition, Effort, Swept, Ways, source_of
+from app.pages.tradeoff.sensitivity import Trust
+from app.plots import elements as plots
 from app.theme import DARK, LIGHT
-from app.tradeoff import Acquisition, Effort, Swept, Ways, source_of
-from app.trust import Trust
 from core import ESTIMATORS
-from core.experiments.front import best_within, cheapest_reaching, front
-from core.experiments.tradeoff import Cancelled
-from core.experiments.trust import numbers
 from core.scene import parts_of
+from core.studies.sensitivity.sweep import numbers
+from core.studies.tradeoff.measure import Cancelled
+from core.studies.tradeoff.pareto import best_within, cheapest_reaching, front
 from tests.browser import eventually
 
 

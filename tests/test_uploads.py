@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from app.state import Light, Reading
-from app.uploads import Bounds, Uploads, harmless
+from app.model.state import Light, Reading
+from app.model.uploads import Bounds, Uploads, harmless
 from core import Acquisition, Capture, save_capture
 from tests.browser import serving
 

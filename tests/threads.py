@@ -1,4 +1,4 @@
-"""A page's thread in the hands of a test, for `app.jobs`."""
+"""A page's thread in the hands of a test, for `app.tasks.jobs`."""
 
 from __future__ import annotations
 

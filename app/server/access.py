@@ -25,15 +25,7 @@ from tornado.web import (
 )
 
 from app.server.limits import Connections, WrongTokens
-from app.server.messages import (
-    ASK,
-    FOREIGN,
-    MALFORMED,
-    WRONG,
-    refusal,
-    token_form,
-    too_many_tokens,
-)
+from app.server.messages import ASK, FOREIGN, MALFORMED, WRONG, refusal, token_form, too_many_tokens
 from core.checks import require
 
 TOKEN_VARIABLE = "FIRSTPHOTON_TOKEN"

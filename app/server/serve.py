@@ -8,12 +8,12 @@ from typing import Any
 import panel as pn
 from bokeh.server.server import Server
 
-from app.connection import LINGER_S, serving_options
 from app.server.access import Access, Headers, guard
 from app.server.limits import HTTP_LIMITS, Connections
 from app.server.opening import Answers
 from app.server.routes import MOST_MESSAGE_BYTES, restrict
 from app.server.sessions import Bounds, Sessions
+from app.widgets.connection import LINGER_S, serving_options
 
 
 def server_of(

@@ -1,8 +1,9 @@
 """Bounds on the sessions of a server: how many, how much memory, and for how long unconnected.
 
 Panel builds a session for each request of a page, whether or not a browser connects to it
-afterwards. A connected session lasts as long as its connection, and for `app.connection.LINGER_S`
-longer, so that a page can be reloaded; one that no browser ever connected to ends much sooner.
+afterwards. A connected session lasts as long as its connection, and for
+`app.widgets.connection.LINGER_S` longer, so that a page can be reloaded; one that no browser ever
+connected to ends much sooner.
 """
 
 from __future__ import annotations

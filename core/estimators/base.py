@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core import posterior
 from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
+from core.inference import posterior
+from core.inference.neighbours import patches, pooled_at, pooled_in
+from core.inference.posterior import Conditions, Light
 from core.parameters import Number
-from core.posterior import Conditions, Light
-from core.spatial import patches, pooled_at, pooled_in
 from core.trigger import drawn, rate_per_bin, trigger_probability
 
 
@@ -33,8 +33,9 @@ class RangeImage:
         The estimator's score at its answer; its unit is the estimator's own.
     confidence : ndarray of float
         Probability that there is a surface within 3 bins of the answer, by the exact first-photon
-        likelihood and the light that the capture itself tells of (`core.posterior`): among pixels
-        told 0.9, nine in ten are right, whichever estimator answers. 0 where `valid` is False.
+        likelihood and the light that the capture itself tells of (`core.inference.posterior`):
+        among pixels told 0.9, nine in ten are right, whichever estimator answers. 0 where `valid`
+        is False.
     valid : ndarray of bool
         Whether there is an answer.
     """

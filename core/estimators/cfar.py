@@ -22,8 +22,8 @@ import numpy as np
 from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
+from core.inference.posterior import Conditions
 from core.parameters import Number, check_fields, parameter
-from core.posterior import Conditions
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,10 @@ from core.capture import Capture
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
 from core.estimators.kde import kernel_taps
-from core.parallel import COMPILED
+from core.inference.neighbours import neighbours, patches, pooled_in, weighted_median
+from core.inference.posterior import TOLERANCE_BINS, Conditions, Light
+from core.kernels.parallel import COMPILED
 from core.parameters import Number, Zone, check_fields, parameter
-from core.posterior import TOLERANCE_BINS, Conditions, Light
-from core.spatial import neighbours, patches, pooled_in, weighted_median
 
 NARROWEST, WIDEST = 0.5, 3.0
 """Bounds of a trigger's bandwidth, in those of the first density."""

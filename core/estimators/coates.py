@@ -2,8 +2,8 @@
 
 The corrected rate of bin k is known to ``sqrt(λ / A_k)`` only, A_k pulses being armed, so that bins
 count in proportion to A_k: the score is the weighted least-squares amplitude of an echo over its
-standard deviation. Where the pulses hide pile-up (`core.resolution`), counts are rates and all
-bins count alike, which costs half.
+standard deviation. Where the pulses hide pile-up (`core.inference.resolution`), counts are rates
+and all bins count alike, which costs half.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate, echo_shape
-from core.posterior import Conditions, lighting_of, rate_and_armed
+from core.inference.posterior import Conditions, lighting_of, rate_and_armed
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
-from core.posterior import Conditions
+from core.inference.posterior import Conditions
 
 
 def echo_shape(conditions: Conditions) -> tuple[Floats, int]:

@@ -24,8 +24,8 @@ import scipy  # loads a submodule when it is first used
 from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
+from core.inference.posterior import Conditions
 from core.parameters import Choice, Number, Zone, check_fields, parameter
-from core.posterior import Conditions
 
 REACH = {"1x1": 1, "3x3": 3, "5x5": 5}
 """Neighbourhoods by name, and their rows and columns."""

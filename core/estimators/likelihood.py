@@ -1,7 +1,8 @@
 """The exact first-photon likelihood, with the light estimated from the capture.
 
 No estimator that looks at single pixels can find more of them than this one does with the true
-light (`core.estimators.oracle`), where all delays are equally likely; see `core.posterior`.
+light (`core.estimators.oracle`), where all delays are equally likely; see
+`core.inference.posterior`.
 """
 
 from __future__ import annotations
@@ -14,8 +15,7 @@ import numpy as np
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
-from core.parameters import Choice, Number, check_fields, parameter
-from core.posterior import (
+from core.inference.posterior import (
     Conditions,
     Light,
     detailed_lighting_of,
@@ -23,6 +23,7 @@ from core.posterior import (
     log_likelihood_ratio,
     most_likely,
 )
+from core.parameters import Choice, Number, check_fields, parameter
 
 Depths = Literal["alike", "learned"]
 

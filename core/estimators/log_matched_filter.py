@@ -13,7 +13,7 @@ import numpy as np
 from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate, echo_shape
-from core.posterior import Conditions
+from core.inference.posterior import Conditions
 
 
 @dataclass(frozen=True)

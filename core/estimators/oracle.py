@@ -7,7 +7,7 @@ import numpy as np
 from core.capture import Capture, once_per_capture
 from core.estimators.base import Estimator
 from core.estimators.likelihood import LikelihoodParameters, curve, locate
-from core.posterior import Light
+from core.inference.posterior import Light
 
 
 @once_per_capture

@@ -9,7 +9,7 @@ import numpy as np
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
-from core.posterior import Conditions, Light
+from core.inference.posterior import Conditions, Light
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ from numba import njit
 
 from core.acquisition import Floats
 from core.estimators.base import Estimator
-from core.parallel import COMPILED
+from core.inference.posterior import Conditions
+from core.kernels.parallel import COMPILED
 from core.parameters import Number, check_fields, parameter
-from core.posterior import Conditions
 
 HALF_TAPS = 12
 """Bins on either side that the sample function looks at."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
-from core.posterior import Conditions, Light
+from core.inference.posterior import Conditions, Light
 from core.tracking import TrackingParameters, track, tracking_signals
 
 

@@ -52,9 +52,9 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
 from core.estimators.base import Estimator, conditions_of
 from core.estimators.filters import echo_shape
+from core.inference.neighbours import box_sum, neighbours, patches, weighted_median, widened
+from core.inference.posterior import Conditions, Light, rate_and_armed
 from core.parameters import Number, check_fields, parameter
-from core.posterior import Conditions, Light, rate_and_armed
-from core.spatial import box_sum, neighbours, patches, weighted_median, widened
 
 _LAGS = 65  # delays tried around a window
 _STEPS = 100  # of the smoothing

@@ -1,13 +1,13 @@
 """What is known of a pixel, of a region and of a capture, and how well."""
 
-from core.inspection.light import light_found
+from core.inspection.capture import CaptureReport, Suggestion, capture_report
+from core.inspection.flux import light_found
 from core.inspection.maps import maps
-from core.inspection.mixture import mean_light
+from core.inspection.mean_flux import mean_light
 from core.inspection.pixel import Candidate, PixelReport, pixel_report
 from core.inspection.profile import LEVEL, LightFound
 from core.inspection.pulses import Accuracy, accuracy_over_pulses
 from core.inspection.region import RegionReport, pixels_in, region_report
-from core.inspection.whole import CaptureReport, Suggestion, capture_report
 
 __all__ = [
     "LEVEL",

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
-from core.parallel import PARALLEL, entering
-from core.posterior import posterior_of
+from core.inference.posterior import posterior_of
+from core.kernels.parallel import PARALLEL, entering
 
 
 @once_per_capture

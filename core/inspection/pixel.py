@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import scipy  # loads a submodule when it is first used
 
-from core import posterior
 from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
 from core.checks import require
 from core.estimators import ESTIMATORS, RangeImage, settings_of
-from core.faults import Verdict, verdict
-from core.inspection.light import METHOD, light_found
+from core.inference import posterior
+from core.inference.faults import Verdict, verdict
+from core.inference.posterior import rate_and_armed
+from core.inspection.flux import METHOD, light_found
 from core.inspection.profile import LightFound
-from core.posterior import rate_and_armed
 
 MOST_CANDIDATES = 5
 
@@ -34,7 +34,7 @@ class Candidate:
     relative: float
     """Score over that of the best candidate; 1 for that one."""
     probability: float
-    """That there is a surface within 3 bins of it (`core.posterior`)."""
+    """That there is a surface within 3 bins of it (`core.inference.posterior`)."""
 
 
 @dataclass(frozen=True, eq=False)

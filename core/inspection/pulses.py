@@ -15,8 +15,8 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, estimate, settings_of
+from core.inference.posterior import TOLERANCE_BINS
 from core.metrics import Interval
-from core.posterior import TOLERANCE_BINS
 from core.reductions import share_of_pulses
 
 

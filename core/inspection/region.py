@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, estimate
-from core.inspection.mixture import METHOD, mean_light
+from core.inspection.mean_flux import METHOD, mean_light
 from core.inspection.pixel import PixelReport, light_unit, pixel_report
 from core.inspection.profile import LightFound
 

@@ -1,8 +1,8 @@
 """Every way to keep the same counts in a file: what the readers' contract runs over.
 
 A new format is one entry of `FORMATS`; `test_readers.py` then holds it to the contract, damages its
-bytes, and demands an entry for each suffix that `core.readers.READERS` knows. What writes it lives
-in a module of its own, or in `core.tests.samples`.
+bytes, and demands an entry for each suffix that `core.io.readers.READERS` knows. What writes it
+lives in a module of its own, or in `core.tests.samples`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.sparse import csc_array, issparse
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture
-from core.readers.labelled import dataset
+from core.io.readers.labelled import dataset
 from core.tests.instruments import (
     COMPRESSED,
     IMAGE,

@@ -25,8 +25,8 @@ from tempfile import TemporaryDirectory
 from threading import Timer
 from typing import Any
 
-from core.commands.options import show_progress
-from core.experiments.items import as_markdown
+from core.cli.options import show_progress
+from core.studies.outputs import as_markdown
 from core.tests.formats import FORMATS, damaged, put
 
 LARGEST_CUBE_BYTES = 2**26
@@ -149,7 +149,7 @@ class _Watchdog:
 def _read_what_is_asked() -> None:
     """The other process: a line for each line."""
     from core.capture import CaptureError  # noqa: PLC0415
-    from core.readers import guards, read_capture  # noqa: PLC0415
+    from core.io.readers import guards, read_capture  # noqa: PLC0415
 
     for form in FORMATS.values():  # libraries come before memory is limited
         with TemporaryDirectory() as folder:

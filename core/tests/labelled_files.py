@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.readers import chunks
+from core.io.readers import chunks
 
 
 def hdf5_bytes(user_block: int = 0, **arrays: Any) -> bytes:
@@ -125,5 +125,5 @@ class Reads:
             return found
 
         monkeypatch.setattr(chunks, "read_stretch", read_stretch)
-        monkeypatch.setattr("core.readers.zarr.read_stretch", read_stretch)
+        monkeypatch.setattr("core.io.readers.zarr.read_stretch", read_stretch)
         monkeypatch.setattr(chunks.Contiguous, "__getitem__", read_box)

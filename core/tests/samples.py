@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 
 from core.acquisition import Acquisition
-from core.readers.npz import FORMAT
+from core.io.readers.npz import FORMAT
 
 
 def small_cube() -> NDArray[np.uint16]:

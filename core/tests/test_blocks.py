@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.blocks import LANES, lane_rows, lane_spread, to_blocks
+from core.kernels.blocks import LANES, lane_rows, lane_spread, to_blocks
 
 DTYPES = [np.uint8, np.uint16, np.uint32]
 

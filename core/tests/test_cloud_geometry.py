@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from core.cloud import points_m, sight_lines
+from core.geometry import points_m, sight_lines
 
 ANGLE = 2e-3
 

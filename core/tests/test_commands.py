@@ -14,14 +14,14 @@ import pytest
 import tifffile
 
 from core.acquisition import Acquisition, Flux
-from core.commands import main
-from core.commands.options import seconds
+from core.cli import main
+from core.cli.options import seconds
 from core.estimators import estimate
-from core.export import CAPTURE_SUFFIXES, save_capture
-from core.large import IMAGES
-from core.readers import READERS, read_capture
+from core.io.readers import READERS, read_capture
+from core.io.writers import CAPTURE_SUFFIXES, save_capture
+from core.out_of_core.tiles import IMAGES
 from core.scene import scenes
-from core.simulate import simulate
+from core.simulation import simulate
 
 pytestmark = pytest.mark.files
 
@@ -178,7 +178,7 @@ def test_what_exceeds_memory_is_ranged_in_parts(
     path = tmp_path / "car.zarr"
     save_capture(capture, path)
     whole = facts(capsys, "estimate", "tracking", "--capture", path, "--out", tmp_path / "w.npz")
-    monkeypatch.setattr("core.commands.captures.MAX_CUBE_BYTES", 1000)
+    monkeypatch.setattr("core.cli.captures.MAX_CUBE_BYTES", 1000)
     parts = facts(capsys, "estimate", "tracking", "--capture", path, "--out", tmp_path / "p.npz")
     assert parts["pixels_answered"] == whole["pixels_answered"]
     assert "rd_3_bins" in whole and "rd_3_bins" not in parts  # ranged without its truth
@@ -261,7 +261,7 @@ def test_a_machine_that_fails_is_no_bad_input(
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("core.commands.captures.save_capture", full)
+    monkeypatch.setattr("core.cli.captures.save_capture", full)
     code, _, err = ran(capsys, "export", frames, frames.with_name("a.npz"))
     assert code == 1 and "No space left" in err
 
@@ -283,7 +283,7 @@ def test_an_interrupt_is_told_as_shells_do(
     def stopped(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("core.commands.captures.open_capture", stopped)
+    monkeypatch.setattr("core.cli.captures.open_capture", stopped)
     code, _, err = ran(capsys, "info", frames)
     assert code == 130 and "Interrupted" in err
 

@@ -17,7 +17,7 @@ MB = 10**6
 
 MEASURE = """
 import sys
-from core.experiments.costs import measured
+from core.studies.performance.costs import measured
 rows, cols, n_bins = map(int, sys.argv[2:])
 print(measured((rows, cols, n_bins), sys.argv[1]).working_bytes)
 """
@@ -92,9 +92,9 @@ def test_an_answer_is_the_same_bit_for_bit_however_much_is_held_at_once(method, 
         return image.bin, image.score, image.confidence
 
     expected = answer()
-    monkeypatch.setattr("core.posterior._TABLE_NUMBERS", 1000)  # two pixels side by side
-    monkeypatch.setattr("core.posterior._LIGHT_NUMBERS", 1000)
-    monkeypatch.setattr("core.posterior._AT_ONCE", 100)
+    monkeypatch.setattr("core.inference.posterior._TABLE_NUMBERS", 1000)  # two pixels side by side
+    monkeypatch.setattr("core.inference.posterior._LIGHT_NUMBERS", 1000)
+    monkeypatch.setattr("core.inference.posterior._AT_ONCE", 100)
     for module in ("base", "chi", "unmixing"):
         monkeypatch.setattr(f"core.estimators.{module}._AT_ONCE", 2000)
     for one, other in zip(answer(), expected, strict=True):

@@ -16,9 +16,9 @@ from scipy import stats
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS, FALSE_ALARM, base, estimate
-from core.readers.dense import guess_detection
+from core.io.readers.dense import guess_detection
 from core.scene import Scene
-from core.simulate import simulate
+from core.simulation import simulate
 
 # Milliseconds a pixel where the kernels are plain Python.
 SIZE = 8 if numba.config.DISABLE_JIT else 40  # rows and columns of captures
@@ -41,7 +41,7 @@ def _quick() -> Iterator[None]:
     """Small images of no echo, and numpy's multinomial, which test_simulate shows to draw alike."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(base, "NULL_SIDE", NULL_SIDE)
-        patch.setattr(import_module("core.simulate"), "PULSES_DRAWN_ONE_BY_ONE", 0)
+        patch.setattr(import_module("core.simulation"), "PULSES_DRAWN_ONE_BY_ONE", 0)
         yield
 
 

@@ -17,10 +17,10 @@ from core import tracking
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.posterior import light_of
-from core.readers.dense import guess_detection
+from core.inference.posterior import light_of
+from core.io.readers.dense import guess_detection
 from core.scene import Scene, uniform
-from core.simulate import simulate
+from core.simulation import simulate
 from core.tracking import PRESETS, TrackingParameters
 from core.trigger import rate_per_bin, trigger_probability
 
@@ -45,7 +45,7 @@ scale_free = pytest.mark.parametrize("method", ["tracking", "peak", "matched_fil
 @pytest.fixture(autouse=True)
 def _quick_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     """Numpy's multinomial, which test_simulate shows to draw alike, is quick without a compiler."""
-    monkeypatch.setattr(import_module("core.simulate"), "PULSES_DRAWN_ONE_BY_ONE", 0)
+    monkeypatch.setattr(import_module("core.simulation"), "PULSES_DRAWN_ONE_BY_ONE", 0)
 
 
 @pytest.fixture

@@ -16,16 +16,19 @@ from scipy import stats
 
 from core import metrics
 from core.capture import Capture
-from core.commands import main
+from core.cli import main
 from core.estimators import ESTIMATORS, estimate
-from core.experiments import calibration, paper, recommend, trials, uniform
-from core.experiments.items import Item, Pictures, Plot, Table, as_markdown, as_text
-from core.experiments.page import write_page
-from core.experiments.printed import TABLE_2, TABLE_3, TABLE_5, Printed
-from core.experiments.report import write
-from core.experiments.trials import Condition, Method, Results, Score, summary
-from core.limits import right_bin_probability
+from core.inference.limits import right_bin_probability
 from core.scene import Scene, scenes
+from core.studies import trials
+from core.studies.methods import calibration, uniform
+from core.studies.outputs import Item, Pictures, Plot, Table, as_markdown, as_text
+from core.studies.paper import figures as paper
+from core.studies.paper import recommend
+from core.studies.paper.page import write_page
+from core.studies.paper.printed import TABLE_2, TABLE_3, TABLE_5, Printed
+from core.studies.report import write
+from core.studies.trials import Condition, Method, Results, Score, summary
 from core.tracking import PRESETS, TrackingParameters
 
 # What they share is made once.
@@ -493,7 +496,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Sequence[int]]]:
         calls.append((plan, seeds))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("core.commands.studies.trials", nothing)
+    monkeypatch.setattr("core.cli.studies.trials", nothing)
     return calls
 
 

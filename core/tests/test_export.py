@@ -31,11 +31,11 @@ from PIL import Image
 import core
 from core.acquisition import Acquisition
 from core.capture import Capture
-from core.cloud import sight_lines
 from core.estimators import RangeImage
-from core.export import CAPTURE_SUFFIXES, WRITERS, save_capture, save_image, save_pixel
-from core.export.product import Plane, Product
-from core.readers.labelled import dataset
+from core.geometry import sight_lines
+from core.io.readers.labelled import dataset
+from core.io.writers import CAPTURE_SUFFIXES, WRITERS, save_capture, save_image, save_pixel
+from core.io.writers.product import Plane, Product
 from core.tracking import TrackingParameters, tracking_signals
 
 pytestmark = pytest.mark.files
@@ -337,7 +337,7 @@ WRITES_TOO_MUCH = """
 import resource, signal, sys
 from dataclasses import replace
 from pathlib import Path
-from core.export import CAPTURE_SUFFIXES, FOLDER_WRITERS, WRITERS, save_capture, save_image
+from core.io.writers import CAPTURE_SUFFIXES, FOLDER_WRITERS, WRITERS, save_capture, save_image
 from core.tests.test_export import CAPTURE, IMAGE, fails_in_its_own_words
 
 kept = replace(CAPTURE, source="a wall")
@@ -801,7 +801,7 @@ def test_any_answer_is_read_from_any_format_as_it_was(answer: tuple[Capture, Ran
 
 def test_the_libraries_of_the_formats_wait_until_they_are_needed() -> None:
     heavy = {"laspy", "matplotlib", "trimesh", "pypcd4", "tifffile", "xarray"}
-    command = [sys.executable, "-c", "import sys, core.export; print(*sys.modules)"]
+    command = [sys.executable, "-c", "import sys, core.io.writers; print(*sys.modules)"]
     folder = Path(core.__file__).parent.parent
     loaded = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
     assert not heavy & {name.partition(".")[0] for name in loaded.split()}

@@ -10,7 +10,7 @@ import pytest
 
 from core.acquisition import Acquisition
 from core.capture import Capture
-from core.experiments import field
+from core.studies.methods import field
 
 pytestmark = pytest.mark.compiled
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from core.capture import CaptureError
-from core.readers import frames, guards, read_capture
-from core.readers.chunks import boxes
+from core.io.readers import frames, guards, read_capture
+from core.io.readers.chunks import boxes
 from core.tests.samples import CAMERA_CUBE, CUBE, frames_of, gmapd_bytes, npy_bytes, npz_bytes
 
 pytestmark = pytest.mark.files

@@ -28,7 +28,7 @@ def test_importing_all_of_core_brings_no_screen_library() -> None:
     modules = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in SOURCES]
     names = ", ".join(name.removesuffix(".__init__") for name in modules)
     loaded = run_python("-c", f"import sys, {names}; print(*sys.modules)").stdout.split()
-    assert {"core.tracking", "core.readers.npz", "core.experiments.recommend"} <= set(loaded)
+    assert {"core.tracking", "core.io.readers.npz", "core.studies.paper.recommend"} <= set(loaded)
     assert not SCREEN & {name.partition(".")[0] for name in loaded}
 
 
@@ -69,7 +69,7 @@ def test_core_is_a_command() -> None:
 
 ONE_KERNEL = """
 from core import estimate
-from core.readers.lzf import decompress
+from core.io.readers.lzf import decompress
 print(decompress(bytes([2]) + b"abc", 3))
 """
 

@@ -13,13 +13,13 @@ from scipy import stats
 from core import inspection
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
+from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.inspection import light_found, pixels_in
 from core.metrics import Interval, restored
-from core.parts import FaultyPixels
 from core.reductions import cut_gate
 from core.scene import Scene, scenes
-from core.simulate import simulate
+from core.simulation import simulate
 
 pytestmark = pytest.mark.compiled
 

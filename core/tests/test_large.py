@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core import large
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
-from core.large import IMAGES, as_image, computed, estimate_large
-from core.posterior import lighting_of
-from core.readers import open_capture, read_capture, sample
-from core.readers.labelled import dataset, describe
-from core.readers.request import Request
+from core.inference.posterior import lighting_of
+from core.io.readers import open_capture, read_capture, sample
+from core.io.readers.labelled import dataset, describe
+from core.io.readers.request import Request
+from core.out_of_core import tiles as large
+from core.out_of_core.tiles import IMAGES, as_image, computed, estimate_large
 from core.scene import Scene, scenes
-from core.simulate import simulate
+from core.simulation import simulate
 
 pytestmark = pytest.mark.compiled
 
@@ -171,7 +171,7 @@ def test_unknown_pulses_stay_unknown() -> None:
 
 def test_a_cluster_gives_the_same_and_loses_nothing_with_a_worker(tmp_path: Path) -> None:
     """The study of 8 GB, on a capture of 8 MB."""
-    from core.experiments import large as study  # noqa: PLC0415 - brings a cluster
+    from core.studies.performance import large as study  # noqa: PLC0415 - brings a cluster
 
     path = tmp_path / "small.zarr"
     study.generate(path, 256, 64, 64)

@@ -12,7 +12,7 @@ from scipy import stats
 from core import limits
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
-from core.limits import (
+from core.inference.limits import (
     best_exposure,
     cramer_rao_bins,
     cramer_rao_m,
@@ -20,7 +20,7 @@ from core.limits import (
     right_bin_probability,
 )
 from core.scene import Scene
-from core.simulate import simulate
+from core.simulation import simulate
 from core.trigger import rate_per_bin, trigger_probability
 
 GATE = Acquisition()

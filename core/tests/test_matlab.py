@@ -13,7 +13,7 @@ import pytest
 from scipy.sparse import csc_array
 
 from core.capture import CaptureError
-from core.readers import guards, read_capture
+from core.io.readers import guards, read_capture
 from core.tests.formats import list_of, matlab73
 from core.tests.labelled_files import Matlab73
 from core.tests.samples import CUBE, arrival_cells, cells_of, element, mat_bytes, mat_file, matrix

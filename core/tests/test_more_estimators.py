@@ -20,9 +20,9 @@ from core.estimators.chi import ChiParameters
 from core.estimators.kde import KdeParameters
 from core.estimators.shi import ShiParameters
 from core.estimators.unmixing import Clusters, UnmixingParameters
-from core.posterior import Conditions, Light
+from core.inference.neighbours import pooled
+from core.inference.posterior import Conditions, Light
 from core.scene import uniform
-from core.spatial import pooled
 from core.trigger import rate_per_bin, trigger_probability
 
 SIDE = 16 if numba.config.DISABLE_JIT else 48

@@ -14,18 +14,11 @@ from scipy.integrate import quad
 
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
+from core.effects import LIDAR_RATIO_SR, Backscatter, FaultyPixels, Jitter, Motion, SecondSurface
 from core.estimators import estimate
-from core.experiments.plain import bare, plain_triggered
-from core.parts import (
-    LIDAR_RATIO_SR,
-    Backscatter,
-    FaultyPixels,
-    Jitter,
-    Motion,
-    SecondSurface,
-)
 from core.scene import PARTS, Scene, parts_of, scenes, without
-from core.simulate import simulate, triggered_by_each_edge
+from core.simulation import simulate, triggered_by_each_edge
+from core.studies.ablation.plain import bare, plain_triggered
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
 GATE = Acquisition(n_bins=80, n_pulses=400)

@@ -16,7 +16,7 @@ from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
 from core.pipeline import run
 from core.scene import Scene
-from core.simulate import simulate
+from core.simulation import simulate
 from core.tracking import PRESETS
 
 pytestmark = pytest.mark.compiled
@@ -99,7 +99,8 @@ def test_nothing_is_left_to_compile_after_warming_up() -> None:
     # In a fresh process, whose kernels no other test has entered.
     script = """
 import core, numba
-from core import blocks, tracking, warmup
+from core import tracking, warmup
+from core.kernels import blocks
 from core.estimators import base
 from numba.core.dispatcher import Dispatcher
 

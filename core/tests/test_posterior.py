@@ -13,14 +13,22 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
-from core import posterior
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import estimate
-from core.posterior import Conditions, Light, Posterior, light_of, most_likely, near, posterior_of
-from core.readers.dense import guess_detection
+from core.inference import posterior
+from core.inference.posterior import (
+    Conditions,
+    Light,
+    Posterior,
+    light_of,
+    most_likely,
+    near,
+    posterior_of,
+)
+from core.io.readers.dense import guess_detection
 from core.scene import Scene
-from core.simulate import simulate
+from core.simulation import simulate
 from core.trigger import coates_rate, rate_per_bin, trigger_probability
 
 # Milliseconds a pixel where the kernels are plain Python.
@@ -46,7 +54,7 @@ pulses_known = pytest.mark.parametrize("n_pulses", [200, None], ids=["first phot
 @pytest.fixture(autouse=True)
 def _quick_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     """Numpy's multinomial, which test_simulate shows to draw alike, is quick without a compiler."""
-    monkeypatch.setattr(import_module("core.simulate"), "PULSES_DRAWN_ONE_BY_ONE", 0)
+    monkeypatch.setattr(import_module("core.simulation"), "PULSES_DRAWN_ONE_BY_ONE", 0)
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +70,7 @@ def _small_blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     The tracker's are laid out when it is imported, and stay as they are.
     """
     if numba.config.DISABLE_JIT and "uniform_captures" not in request.fixturenames:
-        monkeypatch.setattr(import_module("core.blocks"), "LANES", 16)
+        monkeypatch.setattr(import_module("core.kernels.blocks"), "LANES", 16)
         monkeypatch.setattr(posterior, "LANES", 16)
 
 
@@ -731,7 +739,7 @@ def test_nothing_depends_on_threads(n_threads: int) -> None:
 def uniform_captures() -> list[tuple[Capture, np.ndarray]]:
     """Depths all over the gate, at two ratios of signal to background, and the delays."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(import_module("core.simulate"), "PULSES_DRAWN_ONE_BY_ONE", 0)
+        patch.setattr(import_module("core.simulation"), "PULSES_DRAWN_ONE_BY_ONE", 0)
         captures = []
         for seed, sbr in enumerate((0.03, 0.06)):
             acquisition = Acquisition()

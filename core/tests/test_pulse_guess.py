@@ -11,10 +11,10 @@ from scipy.special import ndtr
 from scipy.stats import t as student
 
 from core.acquisition import Acquisition, Flux, Pulse
-from core.readers import read_capture
-from core.readers.pulse_guess import guessed_pulse, guessed_sigma_bins, pairs_by_lag
+from core.io.readers import read_capture
+from core.io.readers.pulse_guess import guessed_pulse, guessed_sigma_bins, pairs_by_lag
 from core.scene import Scene, scenes
-from core.simulate import simulate
+from core.simulation import simulate
 from core.tests.captures import real_capture_path
 
 pytestmark = pytest.mark.compiled
@@ -122,7 +122,9 @@ def test_two_digits_where_it_can() -> None:
 
 def test_pairs_are_those_counted_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     cube = np.random.default_rng(0).poisson(0.5, (8, 8, 20)).astype(np.uint8)
-    monkeypatch.setattr("core.readers.pulse_guess._weights", lambda mean: np.ones(mean.size, "f4"))
+    monkeypatch.setattr(
+        "core.io.readers.pulse_guess._weights", lambda mean: np.ones(mean.size, "f4")
+    )
     expected = np.zeros(15)
     for row in cube.reshape(-1, 20):
         bins = np.repeat(np.arange(20), row)

@@ -22,10 +22,10 @@ import trimesh
 from PIL import Image
 
 from core.acquisition import Flux
-from core.cloud import points_m, sight_lines
-from core.readers import guards
-from core.scene_files import SceneError, read_scene, suitable_acquisition
-from core.simulate import simulate
+from core.geometry import points_m, sight_lines
+from core.io.readers import guards
+from core.io.scene_files import SceneError, read_scene, suitable_acquisition
+from core.simulation import simulate
 from core.tests.refusing import assert_refused
 from core.tests.samples import mutated
 

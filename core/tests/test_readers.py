@@ -24,8 +24,8 @@ from hypothesis.extra import numpy as hnp
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
-from core.export import save_capture
-from core.readers import MAX_CUBE_BYTES, READERS, guards, hdf5, read_capture
+from core.io.readers import MAX_CUBE_BYTES, READERS, guards, hdf5, read_capture
+from core.io.writers import save_capture
 from core.tests.formats import FORMATS, Format, damaged, put
 from core.tests.refusing import assert_refused
 from core.tests.samples import (

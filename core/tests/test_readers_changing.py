@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from core.capture import CaptureError
-from core.readers import READERS, open_capture, read_capture
+from core.io.readers import READERS, open_capture, read_capture
 from core.tests.formats import FORMATS, bare, put
 from core.tests.labelled_files import hdf5_bytes, zarr_files
 from core.tests.samples import CUBE
@@ -163,7 +163,7 @@ def test_a_netcdf_3_file_cut_short_does_not_end_the_process(tmp_path: Path) -> N
     script = f"""
 import os, scipy.io
 from core.capture import CaptureError
-from core.readers import read_capture
+from core.io.readers import read_capture
 
 class Cut(scipy.io.netcdf_file):
     def __init__(self, *arguments, **options):

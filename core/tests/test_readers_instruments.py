@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from core.acquisition import Pulse
 from core.capture import CaptureError
 from core.estimators import estimate
-from core.readers import guards, read_capture
+from core.io.readers import guards, read_capture
 from core.tests.captures import real_capture_path
 from core.tests.instruments import (
     COMPRESSED,

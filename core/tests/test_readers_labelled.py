@@ -23,11 +23,11 @@ from scipy.constants import speed_of_light
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
-from core.readers import guards, open_capture, read_capture
-from core.readers.labelled import dataset, describe, oriented
-from core.readers.lzf import decompress
-from core.readers.request import Request
-from core.readers.stored import Stored, choose
+from core.io.readers import guards, open_capture, read_capture
+from core.io.readers.labelled import dataset, describe, oriented
+from core.io.readers.lzf import decompress
+from core.io.readers.request import Request
+from core.io.readers.stored import Stored, choose
 from core.tests.formats import Content, bare, put
 from core.tests.labelled_files import Reads, hdf5_bytes, netcdf_bytes, zarr_files
 from core.tests.refusing import assert_refused
@@ -213,7 +213,7 @@ def test_opening_reads_nothing_that_is_told(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(guards, "MAX_CUBE_BYTES", LARGE.nbytes // 4)
-    monkeypatch.setattr("core.readers.labelled.BLOCK_BYTES", LARGE.nbytes // 16)
+    monkeypatch.setattr("core.io.readers.labelled.BLOCK_BYTES", LARGE.nbytes // 16)
     path = put(tmp_path / name, LAZY[name]())
     with pytest.raises(CaptureError, match=r"bytes of .*counts.* are read"):
         read_capture(path)

@@ -14,6 +14,7 @@ from scipy import stats
 
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
+from core.kernels.streams import pixel_key, uniform_at
 from core.reductions import (
     Reduction,
     cut_gate,
@@ -24,8 +25,7 @@ from core.reductions import (
     skip_pixels,
 )
 from core.scene import Scene
-from core.simulate import simulate
-from core.streams import pixel_key, uniform_at
+from core.simulation import simulate
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
 SIDE = 12 if numba.config.DISABLE_JIT else 32  # rows and columns of 500 pulses each

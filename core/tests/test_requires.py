@@ -13,20 +13,21 @@ import pytest
 
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
-from core.commands import ACCEPTED, REFUSED, main
+from core.cli import ACCEPTED, REFUSED, main
 from core.corrections import moments_s, without_correction
+from core.effects import Backscatter, FaultyPixels, Motion, SecondSurface
 from core.estimators import ESTIMATORS
 from core.estimators.base import Calibration
-from core.experiments import corrections, plain, requires
-from core.experiments.requirement import UNKNOWN, Requirement, judged
-from core.experiments.requires import requirements
-from core.limits import cramer_rao_bins
+from core.inference.limits import cramer_rao_bins
+from core.inference.posterior import detailed_lighting_of, lighting_of
+from core.inference.resolution import HIDDEN, TOLD, Difference
 from core.metrics import Interval
-from core.parts import Backscatter, FaultyPixels, Motion, SecondSurface
-from core.posterior import detailed_lighting_of, lighting_of
-from core.resolution import HIDDEN, TOLD, Difference
 from core.scene import Scene, scenes
-from core.simulate import simulate
+from core.simulation import simulate
+from core.studies.ablation import corrections, plain
+from core.studies.ablation import study as requires
+from core.studies.ablation.criterion import UNKNOWN, Requirement, judged
+from core.studies.ablation.study import requirements
 
 GATE = Acquisition(n_bins=100, n_pulses=1000)
 NIGHT, DAY = Flux(0.02, 2.0), Flux(0.1041, 0.06)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.optimize import brentq
 
-from core.resolution import ERROR, HIDDEN, TOLD, Difference, difference, pile_up
+from core.inference.resolution import ERROR, HIDDEN, TOLD, Difference, difference, pile_up
 from core.trigger import trigger_probability
 
 FLAT = np.full(20, 0.01)

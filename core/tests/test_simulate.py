@@ -14,10 +14,10 @@ from scipy import stats
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.scene import Scene
-from core.simulate import add_echo, first_photons, simulate, triggered_by_each_edge
+from core.simulation import add_echo, first_photons, simulate, triggered_by_each_edge
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
-module = import_module("core.simulate")  # the package's attribute of that name is the function
+module = import_module("core.simulation")  # the package's attribute of that name is the function
 
 # Draws of a large sample: six microseconds each where the kernels are plain Python.
 DRAWS = 50_000 if numba.config.DISABLE_JIT else 2_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.spatial import box_sum, neighbours, pooled, pooled_at, weighted_median
+from core.inference.neighbours import box_sum, neighbours, pooled, pooled_at, weighted_median
 
 RNG = np.random.default_rng(0)
 CUBE = RNG.integers(0, 200, (5, 7, 3))

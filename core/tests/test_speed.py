@@ -8,14 +8,27 @@ import numba
 import numpy as np
 import pytest
 
-from core.commands import main
-from core.experiments import floors, speed, start
-from core.experiments.items import Plot, Table
-from core.experiments.report import write
-from core.experiments.speed import ONE_SHOT, PLAIN, PUBLIC, Extent, Study, exponent, regressions
-from core.experiments.yardsticks import fused_loop, numpy_over_bins, plain_loop
+from core.cli import main
 from core.scene import scenes
-from core.simulate import simulate
+from core.simulation import simulate
+from core.studies.outputs import Plot, Table
+from core.studies.performance import roofline as floors
+from core.studies.performance import speed, start
+from core.studies.performance.reference_implementations import (
+    fused_loop,
+    numpy_over_bins,
+    plain_loop,
+)
+from core.studies.performance.speed import (
+    ONE_SHOT,
+    PLAIN,
+    PUBLIC,
+    Extent,
+    Study,
+    exponent,
+    regressions,
+)
+from core.studies.report import write
 from core.tracking import TrackingParameters, tracking_signals
 
 ROUNDS = 6

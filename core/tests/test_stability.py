@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 
 from core.acquisition import Acquisition, Flux, Pulse
-from core.blocks import to_blocks
 from core.capture import Capture
-from core.commands import main
+from core.cli import main
 from core.estimators import ESTIMATORS, estimate
-from core.experiments import stability, trust
-from core.experiments.extremes import SHORT, SUBNORMAL
-from core.experiments.laws import LAWS, Law, verdict
-from core.limits import cramer_rao_bins
+from core.inference.limits import cramer_rao_bins
+from core.kernels.blocks import to_blocks
 from core.parameters import doubts
 from core.scene import Scene
-from core.simulate import simulate
+from core.simulation import simulate
+from core.studies.sensitivity import page as stability
+from core.studies.sensitivity import sweep as trust
+from core.studies.sensitivity.extremes import SHORT, SUBNORMAL
+from core.studies.sensitivity.invariants import LAWS, Law, verdict
 from core.tracking import PRESETS, TrackingParameters, track, tracking_signals
 from core.trigger import coates_rate
 

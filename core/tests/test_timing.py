@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from core.experiments import timing
-from core.experiments.timing import FEWEST_REPEATS, interleaved, machine, median_interval
+from core.studies import timing
+from core.studies.timing import FEWEST_REPEATS, interleaved, machine, median_interval
 
 
 def test_each_round_calls_each_once_in_an_order_of_its_own() -> None:

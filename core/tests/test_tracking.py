@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from core import tracking
 from core.acquisition import Acquisition, Flux
-from core.blocks import LANES, to_blocks
+from core.kernels.blocks import LANES, to_blocks
 from core.parameters import Number, spec_of
 from core.scene import Scene, uniform
-from core.simulate import simulate
+from core.simulation import simulate
 from core.tracking import (
     PRESETS,
     SigmaFrom,

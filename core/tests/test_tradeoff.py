@@ -21,22 +21,31 @@ from scipy import stats
 from core import estimators
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
-from core.commands import main
+from core.cli import main
 from core.estimators import ESTIMATORS
-from core.experiments import acquiring, tradeoff, tradeoff_plan, trials
-from core.experiments.acquiring import Sweep
-from core.experiments.front import best_within, by_condition, cheapest_reaching, front, with_light
-from core.experiments.items import Plot, Scatter
-from core.experiments.likeness import Simulation, like, window
-from core.experiments.report import write
-from core.experiments.tradeoff import Cancelled, Candidate, Piece, Point, scored, study
-from core.experiments.trials import Condition, Method, Score
-from core.export import save_capture
+from core.io.writers import save_capture
+from core.kernels.parallel import SERIAL_BELOW
 from core.metrics import Interval
-from core.parallel import SERIAL_BELOW
 from core.reductions import Reduction
 from core.scene import Scene, scenes
-from core.simulate import simulate
+from core.simulation import simulate
+from core.studies import trials
+from core.studies.outputs import Plot, Scatter
+from core.studies.report import write
+from core.studies.tradeoff import acquisition as acquiring
+from core.studies.tradeoff import measure as tradeoff
+from core.studies.tradeoff import plan as tradeoff_plan
+from core.studies.tradeoff.acquisition import Sweep
+from core.studies.tradeoff.measure import Cancelled, Candidate, Piece, Point, scored, study
+from core.studies.tradeoff.pareto import (
+    best_within,
+    by_condition,
+    cheapest_reaching,
+    front,
+    with_light,
+)
+from core.studies.tradeoff.surrogate import Simulation, like, window
+from core.studies.trials import Condition, Method, Score
 
 TARGETS = 100
 

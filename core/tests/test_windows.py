@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 from core.acquisition import Flux
 from core.capture import Capture, CaptureError
 from core.estimators import estimate
-from core.large import estimate_large
-from core.posterior import lighting_of
-from core.readers import open_capture, sample
-from core.readers.labelled import dataset
+from core.inference.posterior import lighting_of
+from core.io.readers import open_capture, sample
+from core.io.readers.labelled import dataset
+from core.out_of_core.tiles import estimate_large
+from core.out_of_core.windows import Window, WindowReader, light_of_whole, read_window
 from core.scene import scenes
-from core.simulate import simulate
+from core.simulation import simulate
 from core.tests.formats import Content, put
 from core.tests.labelled_files import Reads, hdf5_bytes, netcdf_bytes, zarr_files
-from core.windows import Window, WindowReader, light_of_whole, read_window
 
 SIDES = st.integers(1, 300)
 
@@ -50,7 +50,7 @@ FILES: dict[str, Callable[[], Content]] = {
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of a chunk or so, as those of a large capture are."""
-    monkeypatch.setattr("core.readers.labelled.BLOCK_BYTES", 2 * int(np.prod(CHUNK)))
+    monkeypatch.setattr("core.io.readers.labelled.BLOCK_BYTES", 2 * int(np.prod(CHUNK)))
 
 
 @pytest.fixture

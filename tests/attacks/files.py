@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from core.readers import read_capture
-from core.readers.labelled import dataset
+from core.io.readers import read_capture
+from core.io.readers.labelled import dataset
 from core.tests.formats import put
 from core.tests.labelled_files import zarr_files
 from core.tests.samples import OWN_FIELDS, cells_of, mat_bytes, npz_bytes

@@ -109,7 +109,7 @@ ODD = (
     ("GET", "/components/../../../../etc/passwd"),
     ("GET", "/components/%00/x/_css/y"),
     ("GET", "/components/.x/x/_css/y"),
-    ("GET", "/components/app.component/Component/_resources"),
+    ("GET", "/components/app.widgets.component/Component/_resources"),
     ("GET", "/ws"),
     ("GET", "/autoload.js"),
     ("GET", "/%"),

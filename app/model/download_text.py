@@ -1,0 +1,53 @@
+"""What downloads say: their formats, and why one failed."""
+
+from __future__ import annotations
+
+import errno
+
+from app.model.text import cause
+
+FORMATS = {
+    "png": "picture, as on screen",
+    "svg": "picture, as on screen, to enlarge and edit",
+    "csv": "the numbers on screen, as text",
+    "npz": "what is shown, and the answer's arrays, for NumPy",
+    "tif": "what is shown, then range, confidence and counts, for GIS",
+    "ply": "the points on screen, with colours",
+    "las": "the points on screen, for survey software",
+}
+
+NOTHING_DRAWN = "There is nothing to save: nothing is drawn here yet. Wait for it, then try again."
+
+NO_POINTS = (
+    "There is nothing to save: no answer is confident enough to be shown. Lower “Show from "
+    "confidence”, then try again."
+)
+
+_GOES_ON = "The page goes on as before."
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def not_saved(error: Exception) -> str:
+    """Why a file could not be written, and what to do."""
+    if isinstance(error, OSError) and error.errno in _FULL:
+        return (
+            "Nothing was saved: the server's disk for temporary files is full. Make room there, or "
+            f"choose a smaller format, then try again. {_GOES_ON}"
+        )
+    if isinstance(error, MemoryError):
+        return (
+            "Nothing was saved: the server's memory does not suffice for this file. Show less, or "
+            f"choose another format, then try again. {_GOES_ON}"
+        )
+    if isinstance(error, ValueError):
+        return cause(error)
+    return (
+        f"Nothing was saved: the file could not be written ({type(error).__name__}). Try again, or "
+        f"choose another format. {_GOES_ON}"
+    )
+
+
+def no_picture(reason: str) -> str:
+    """Why the browser could not make a picture."""
+    return f"Nothing was saved: the picture could not be made ({reason}). {_GOES_ON}"

@@ -1,0 +1,327 @@
+"""What a session's user has chosen: parameters only, each already a frozen object of `core`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from numbers import Integral, Real
+from typing import Any
+
+import param
+
+from core import ESTIMATORS, Acquisition, Flux, Pulse, TrackingParameters, Window
+from core.checks import require
+from core.estimators import FALSE_ALARM
+from core.io.readers.request import Request
+from core.parameters import Number, check_fields, parameter
+from core.reductions import Reduction
+from core.studies.ablation.criterion import TITLES
+
+
+@dataclass(frozen=True)
+class Light:
+    """How a built-in scene is lit and recorded."""
+
+    sbr: float = parameter(
+        0.06,
+        Number("SBR", 0.01, 10.0, log=True, least=0.0, open_below=True),
+        "Signal over background, both in photons per pulse over the whole gate. Daylight: < 0.1.",
+    )
+    ppp: float = parameter(
+        0.1041,
+        Number("PPP", 0.001, 10.0, log=True, least=0.0, unit="photons per pulse"),
+        "Signal photons detected per pulse, were the detector always armed.",
+    )
+    n_pulses: int = parameter(
+        1000,
+        Number("Pulses", 10, 50_000, log=True, whole=True, least=1),
+        "Pulses sent for each pixel: more make the histogram smoother, and take longer to record.",
+    )
+    seed: int = parameter(
+        0,
+        Number("Seed", 0, 999, whole=True, least=0),
+        "Which throw of the dice: the same seed gives the same capture again.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @property
+    def flux(self) -> Flux:
+        """Signal and background."""
+        return Flux(self.ppp, self.sbr)
+
+    def acquisition(self, of_scene: Acquisition) -> Acquisition:
+        """The scene's instrument setting, with this number of pulses."""
+        return replace(of_scene, n_pulses=self.n_pulses)
+
+
+@dataclass(frozen=True)
+class Viewing:
+    """How the answer is shown; changes no figure."""
+
+    least_confidence: float = parameter(
+        0.9,
+        Number("Show from confidence", 0.0, 1.0, least=0.0),
+        "Answers below are hidden in image and cloud, not in the figures. 0 shows what the "
+        "estimator makes of pure noise, too.",
+    )
+    field_of_view_deg: float = parameter(
+        5.0,
+        Number("Field of view", 0.001, 120.0, log=True, unit="degrees", least=0.0, open_below=True),
+        "Width of the image as seen from the sensor: sets how wide the cloud is, in metres.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+@dataclass(frozen=True)
+class Less:
+    """Less of a capture than there is: quicker to range, or clearer, and never as fine."""
+
+    merge: int = parameter(
+        1,
+        Number("Bins merged", 1, 8, whole=True, least=1, unit="bins"),
+        "Neighbouring bins added to one: less to range, and a coarser answer. T_n counts the "
+        "merged ones.",
+    )
+    gate_from: float = parameter(
+        0.0,
+        Number("Gate from", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
+        "Bins before are left out, and the pulses that fired in them.",
+    )
+    gate_to: float = parameter(
+        1.0,
+        Number("Gate to", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
+        "Bins behind are left out: an echo there is lost.",
+    )
+    pool: int = parameter(
+        1,
+        Number("Pixels added", 1, 8, whole=True, least=1, unit="rows and columns"),
+        "Histograms of so many rows and columns of neighbours added to one: more photons in each, "
+        "and a blurred image.",
+    )
+    skip: int = parameter(
+        1,
+        Number("Pixels skipped to", 1, 8, whole=True, least=1, unit="rows and columns"),
+        "One pixel is kept of so many rows and columns.",
+    )
+    pulses: float = parameter(
+        1.0,
+        Number(
+            "Pulses accumulated",
+            1e-3,
+            1.0,
+            log=True,
+            unit="of all",
+            least=0.0,
+            most=1.0,
+            open_below=True,
+        ),
+        "Share of the pulses whose detections are kept, as if recording had ended sooner: fewer "
+        "are a part of more.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @classmethod
+    def of(cls, reduction: Reduction, n_bins: int) -> Less:
+        """The settings that reduce a capture of so many bins like this."""
+        first, end = reduction.gate or (0, n_bins)
+        return cls(
+            reduction.merge,
+            first / n_bins,
+            end / n_bins,
+            reduction.pool,
+            reduction.skip,
+            reduction.pulses,
+        )
+
+    def reduction(self, n_bins: int) -> Reduction:
+        """What is to be done to a capture of so many bins."""
+        first = min(round(self.gate_from * n_bins), n_bins - 1)
+        end = max(round(self.gate_to * n_bins), first + 1)
+        gate = None if (first, end) == (0, n_bins) else (first, end)
+        return Reduction(
+            merge=self.merge, gate=gate, skip=self.skip, pool=self.pool, pulses=self.pulses
+        )
+
+
+def _gaussian(text: str) -> Pulse:
+    return Pulse.gaussian(float(text))
+
+
+def _shape(text: str) -> tuple[int, int]:
+    rows, cols = text.replace("×", " ").replace("x", " ").split()
+    return int(rows), int(cols)
+
+
+_CONVERT: dict[str, tuple[Callable[[str], Any], str]] = {
+    "variable": (str, "a name"),
+    "detection": (str, "first or all"),
+    "axes": (str, "names"),
+    "n_bins": (int, "a whole number"),
+    "n_pulses": (int, "a whole number"),
+    "no_trigger": (int, "a whole number"),
+    "first_detections": (int, "a whole number"),
+    "shape": (_shape, "rows and columns such as 64 x 64"),
+    "pulse": (_gaussian, "a number such as 1e-9"),
+}
+_NUMBER: tuple[Callable[[str], Any], str] = (float, "a number such as 1e-9")
+
+
+class Reading(Request):
+    """How a file is to be read; None lets the reader guess."""
+
+    @classmethod
+    def from_text(cls, typed: Mapping[str, str]) -> Reading:
+        """What was typed into one field each; an empty field leaves the reader to guess.
+
+        Raises
+        ------
+        ValueError
+            If something that should be a number is not: names the field and the text.
+        """
+        values: dict[str, Any] = {}
+        for name, text in typed.items():
+            convert, kind = _CONVERT.get(name, _NUMBER)
+            try:
+                values[name] = convert(text.strip()) if text.strip() else None
+            except ValueError:
+                require(name, text, False, f"{kind}, or nothing to let the reader guess")
+        return cls(**values)
+
+    def as_text(self, name: str) -> str:
+        """A field as it would be typed."""
+        value = getattr(self, name)
+        if isinstance(value, Pulse):
+            value = value.tau_s
+        if isinstance(value, tuple):
+            value = " x ".join(map(str, value))
+        return "" if value is None else str(value)
+
+
+FIRST_METHODS = ("peak", "coates", "likelihood", "tracking", "oracle")
+
+CLOUDS = "3D clouds"
+
+KINDS = ("Range", "Error", "Confidence", CLOUDS)
+"""What the pictures of methods may show."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Which methods are compared, how they are set, and what their pictures show.
+
+    The tracking differentiator has the settings that it has on every page.
+    """
+
+    methods: tuple[str, ...] = tuple(each for each in ESTIMATORS if each in FIRST_METHODS)
+    false_alarm: float = 1.0
+    settings: Mapping[str, Any] = field(
+        default_factory=lambda: {
+            name: each.parameters() for name, each in ESTIMATORS.items() if name != "tracking"
+        }
+    )
+    kind: str = KINDS[0]
+    viewing: Viewing = Viewing(0.0)
+
+    def __post_init__(self) -> None:
+        known = isinstance(self.methods, tuple) and all(each in ESTIMATORS for each in self.methods)
+        require("methods", self.methods, known, "some of " + ", ".join(ESTIMATORS))
+        FALSE_ALARM.check("false_alarm", self.false_alarm)
+        require("kind", self.kind, self.kind in KINDS, " or ".join(map(repr, KINDS)))
+
+
+PAGES = ("Explore", "Inspect", "Compare", "Trade-off", "Paper")
+IMAGES = ("Estimate", "Truth", "Error", "Counts")
+MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
+UNITS = ("bins", "ns", "m")
+SUBJECTS = ("Pixel", "Region", "Pins", "Capture")
+CLOUD_COLORS = ("Range", "Error", "Counts")
+NEED_TRUTH = ("Truth", "Error")
+
+
+MOST_PINS = 4
+
+MOST_CORNERS = 1000
+
+
+class Checked(param.Parameter):
+    """A parameter of which a function knows what is acceptable, and raises ``ValueError`` if not.
+
+    It is called with the parameter's name and a value.
+    """
+
+    __slots__ = ("check",)
+
+    def __init__(self, default: Any, check: Callable[[str, Any], None], **options: Any) -> None:
+        self.check = check
+        super().__init__(default, **options)
+
+    def _validate(self, val: Any) -> None:
+        self.check(self.name, val)
+
+
+def _check_pixel(name: str, value: Any) -> None:
+    require(name, value, _is_pair(value, Integral, 0), "a row and a column, both from 0")
+
+
+def _check_pins(name: str, value: Any) -> None:
+    pixels = isinstance(value, tuple) and all(_is_pair(each, Integral, 0) for each in value)
+    few = pixels and len(value) <= MOST_PINS
+    require(name, value, few, f"rows and columns of at most {MOST_PINS} pixels")
+
+
+def _check_region(name: str, value: Any) -> None:
+    corners = isinstance(value, tuple) and all(_is_pair(each, Real, -(2**31)) for each in value)
+    fit = corners and (len(value) == 0 or 3 <= len(value) <= MOST_CORNERS)
+    require(name, value, fit, f"rows and columns of 3 to {MOST_CORNERS} corners, or nothing")
+
+
+def _is_pair(value: Any, kind: type, least: int) -> bool:
+    numbers = isinstance(value, tuple) and all(isinstance(each, kind) for each in value)
+    return numbers and len(value) == 2 and all(least <= each < 2**31 for each in value)
+
+
+def _check_absent(name: str, value: Any) -> None:
+    known = isinstance(value, frozenset) and value <= set(TITLES)
+    require(name, value, known, "some of " + ", ".join(TITLES))
+
+
+class State(param.Parameterized):
+    """Everything a user can choose.
+
+    `app.model.address` writes all of it into the address of the page, and `app.model.script` what
+    concerns `core` into a script: both know a new parameter, or a new field of one, by its default.
+    """
+
+    source = param.String(default="car", doc="Key of the catalogue.")
+    light = param.ClassSelector(class_=Light, default=Light())
+    reading = param.ClassSelector(class_=Reading, default=Reading())
+    window = param.ClassSelector(
+        class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."
+    )
+    less = param.ClassSelector(class_=Less, default=Less())
+    absent: Any = Checked(
+        frozenset(), _check_absent, doc="Parts and corrections that are switched off."
+    )
+    tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
+    pixel: Any = Checked((31, 24), _check_pixel, doc="Row and column on show.")
+    image = param.Selector(default="Estimate", objects=list(IMAGES))
+    cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
+    viewing = param.ClassSelector(class_=Viewing, default=Viewing())
+    difference = param.Boolean(default=False, doc="Whether the first difference is drawn.")
+    page = param.Selector(default="Explore", objects=list(PAGES))
+    unit = param.Selector(default="bins", objects=list(UNITS), doc="Of each axis along the gate.")
+    map = param.Selector(default="Estimate", objects=list(MAPS), doc="What one navigates by.")
+    subject = param.Selector(default="Pixel", objects=list(SUBJECTS), doc="What is inspected.")
+    pins: Any = Checked((), _check_pins, doc="Up to four pixels (row, col) to compare.")
+    region: Any = Checked(
+        (),
+        _check_region,
+        doc="Corners (row, col) of a polygon of pixels that are looked at as one; none if empty.",
+    )
+    comparison = param.ClassSelector(class_=Comparison, default=Comparison())

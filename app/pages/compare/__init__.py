@@ -1,0 +1,1 @@
+"""The Compare page: methods side by side."""

@@ -1,0 +1,1 @@
+"""The Inspect page: one pixel, region or capture in detail."""

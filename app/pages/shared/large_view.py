@@ -1,0 +1,217 @@
+"""Under a picture of a file larger than memory: what is shown of it, and how to look closer."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+
+from app.model.large import Cutout, LargeFile
+from app.model.store import Answer
+from app.pages.session import Session
+from app.pages.shared.studies import OnePiece, Work
+from app.widgets.cards import button
+from app.widgets.controls import Sentence
+from core import Window
+from core.checks import require
+
+Bounds = tuple[int, int]
+"""Of rows or columns: the first, and the one behind the last."""
+
+
+class LargeView:
+    """Controls of the window that is shown; nothing where the capture is in memory as a whole.
+
+    Parameters
+    ----------
+    session : Session
+    figure : bokeh.plotting.figure
+        The picture, its axes in rows and columns of the file. What it is zoomed to can be read.
+    """
+
+    def __init__(self, session: Session, figure: Any) -> None:
+        self._session = session
+        self._cutout: Cutout | None = None
+        self._begun: LargeFile | None = None
+        self._shown: tuple[Bounds, ...] = ()
+        self._is_on_screen = False
+        self._sentence = Sentence(live=True, sizing_mode="stretch_width", margin=(2, 8))
+        self._bounds = {
+            name: pmui.TextInput(
+                label=label,
+                description=f"{label} to look at, first to last. A zoom sets them.",
+                size="small",
+                sizing_mode="stretch_width",
+                margin=(6, 4, 2, 8),
+            )
+            for name, label in (("rows", "Rows shown"), ("cols", "Columns shown"))
+        }
+        self._work = OnePiece(
+            session,
+            self._reading,
+            self._arrived,
+            "parts read",
+            label="Look closer",
+            help="Look closer: reads these rows and columns alone, as finely as they can be shown.",
+        )
+        whole = "The whole: all rows and columns; reads what is missing of them."
+        buttons, *rest = self._work.controls
+        buttons.append(button("The whole", whole, self._go_back, margin=(6, 4)))
+        self.layout = pn.Column(
+            self._sentence,
+            pn.Row(*self._bounds.values(), sizing_mode="stretch_width", margin=0),
+            buttons,
+            *rest,
+            visible=False,
+            sizing_mode="stretch_width",
+            margin=0,
+        )
+        for ranges in (figure.x_range, figure.y_range):
+            for end in ("start", "end"):
+                ranges.on_change(end, lambda _name, _old, _new: self._zoomed())
+        self._figure = figure
+        self.follow(session.answer)
+
+    # What the session and the page tell
+
+    def follow(self, answer: Answer) -> None:
+        """Show what of the file is looked at; read on where there is more of a preview."""
+        cutout, previous = answer.cutout, self._cutout
+        self._cutout = cutout
+        self.layout.visible = cutout is not None
+        if previous is not None and (cutout is None or cutout.file is not previous.file):
+            self._stop()  # reading what nobody looks at any more
+        if cutout is None:
+            return
+        self._sentence.text = told(cutout)
+        if previous is None or cutout.window != previous.window:
+            self._show_bounds(cutout.window.rows, cutout.window.cols)
+        self._begin()
+
+    def show(self, is_on_screen: bool) -> None:
+        """Go on reading a preview when it comes on screen, and stop when it leaves."""
+        self._is_on_screen = is_on_screen
+        if is_on_screen:
+            self._begin()
+        elif self._begun is not None:
+            self._stop()
+
+    def _stop(self) -> None:
+        self._begun = None
+        self._work.cancel()
+
+    def _begin(self) -> None:
+        """Read the rest of a preview, once for each file unless asked for again."""
+        cutout = self._cutout
+        if cutout is None or not self._is_on_screen or not cutout.is_preview or cutout.is_final:
+            return
+        if self._begun is not cutout.file:
+            self._begun = cutout.file
+            self._work.start(self._reading_on(cutout.file))
+
+    def _zoomed(self) -> None:
+        """Write what the picture is zoomed to into the fields."""
+        if self._cutout is None:
+            return
+        across, down = self._figure.x_range, self._figure.y_range
+        if all(map(_is_number, (across.start, across.end, down.start, down.end))):
+            window = self._cutout.window
+            self._show_bounds(
+                _within(down, window.rows, window.step), _within(across, window.cols, window.step)
+            )
+
+    def _show_bounds(self, *bounds: Bounds) -> None:
+        if bounds == self._shown:
+            return  # what was typed since then stays
+        self._shown = bounds
+        for name, (first, end) in zip(self._bounds, bounds, strict=True):
+            self._bounds[name].value = f"{first} to {end - 1}"
+
+    # What the user asks for
+
+    def _go_back(self) -> None:
+        self._begun = None
+        if self._session.state.window is None:
+            self._begin()
+        self._session.state.window = None
+
+    def _reading(self) -> Work[Window | None]:
+        """Reads the window that the fields tell."""
+        assert self._cutout is not None
+        file = self._cutout.file
+        rows, cols = (
+            bounds_of(name, field.value, getattr(file.whole, name)[1])
+            for name, field in self._bounds.items()
+        )
+        window = file.fitting(rows, cols)
+
+        def work(
+            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
+        ) -> Window | None:
+            return file.cutout(window, progress, cancelled).window
+
+        return work
+
+    def _reading_on(self, file: LargeFile) -> Work[Window | None]:
+        """Reads the rest of the preview, and shows it now and then."""
+
+        def work(
+            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
+        ) -> Window | None:
+            while not file.read_on(progress, cancelled):
+                self._session.on_page(self._session.renew)
+            return None
+
+        return work
+
+    def _arrived(self, window: Window | None) -> None:
+        """Show what has been read."""
+        if window is None:
+            self._session.renew()
+        else:
+            self._session.state.window = window
+
+
+def told(cutout: Cutout) -> str:
+    """What is seen of a file."""
+    window, (_, rows), (_, cols) = cutout.window, cutout.file.whole.rows, cutout.file.whole.cols
+    if not cutout.is_preview:
+        return f"Seen: {window}, of {rows} × {cols} pixels."
+    sentence = (
+        f"Preview of {rows} × {cols} pixels, 1 of each {window.step} × {window.step}: zoom into "
+        f"the picture, and look closer."
+    )
+    if cutout.read < 1:
+        sentence += f" {cutout.read:.0%} of it has been read; what is blank has not."
+    return sentence
+
+
+def bounds_of(name: str, text: str, size: int) -> Bounds:
+    """First row or column and the one behind the last, as typed: first to last.
+
+    Raises
+    ------
+    ValueError
+        If the text is something else, or does not lie in the file.
+    """
+    found = re.fullmatch(r"\s*(\d{1,12})\s*(?:to|[-–:])\s*(\d{1,12})\s*", text)
+    first, last = (int(each) for each in found.groups()) if found else (1, 0)
+    require(name, text, first <= last < size, f"first to last, of 0 to {size - 1}")
+    return first, last + 1
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _within(axis: Any, bounds: Bounds, step: int) -> Bounds:
+    """Rows or columns of a window between the ends of an axis, as far as there are any."""
+    low, high = sorted((axis.start, axis.end))
+    first = min(max(math.floor(low + 0.5), bounds[0]), bounds[1] - 1)
+    end = max(math.ceil(high + 0.5), first + 1)
+    # A picture of one pixel of many ends short of its last rows and columns.
+    return first, bounds[1] if end > bounds[1] - step else end

@@ -1,0 +1,343 @@
+"""Viewers of what a study shows: its curves, its pictures and its tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import panel as pn
+import panel_material_ui as pmui
+from bokeh.events import Tap
+from bokeh.models import Range1d
+
+from app.model.colors import Look
+from app.model.download_text import NOTHING_DRAWN
+from app.model.exports import image_file, plot_file, table_file
+from app.model.large import Grid
+from app.model.text import NOT_COMPUTED, number
+from app.pages.paper.text import (
+    COLUMN_HELP,
+    OUTSIDE_NOTE,
+    PLACE_HELP,
+    RECONSTRUCTION,
+    TITLES_OF_PRESETS,
+)
+from app.pages.session import Session
+from app.pages.shared.downloads import PLOT, TABLE, Shown, Subject, downloadable
+from app.plots import elements as plots
+from app.theme import LIGHT, RANGE_COLORS, Palette
+from app.widgets.cards import card
+from app.widgets.controls import Knob, Sentence, Table
+from app.widgets.method_views import TITLES, ScaleBar
+from app.widgets.views import Layers, paint_frame, pane_of, round_up
+from core.parameters import Number
+from core.studies import outputs as items
+
+GRID = """
+:host { display: grid !important; gap: 8px; width: 100%;
+  grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); }
+.scroll-button { display: none !important; }
+"""
+PICTURE_HEIGHT = 300
+
+FORMATS = {"SBR": "g", "ms": ".1f"}
+"""Of columns whose numbers do not want four decimals."""
+
+
+class CurveCard:
+    """Curves with a note below them; drawn when the first come, then only their values change.
+
+    Parameters
+    ----------
+    across : Range1d, optional
+        The horizontal axis, that of several plots above each other; its own where None.
+    waiting : str
+        Shown until there is something to show.
+    """
+
+    def __init__(self, across: Range1d | None = None, waiting: str = "") -> None:
+        self._across = across
+        self._note = Sentence(text=waiting, sizing_mode="stretch_width", margin=(2, 10, 6, 10))
+        self._plot: Layers | None = None
+        self._item: items.Plot | None = None
+        self._colors = LIGHT
+        self.card = card(self._note)
+
+    @property
+    def figure(self) -> Any:
+        """What is drawn; None before the first curves."""
+        return self._plot and self._plot.figure
+
+    def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
+        """Have a download button, for files about a subject."""
+
+        def show() -> Shown:
+            if self._item is None:
+                raise ValueError(NOTHING_DRAWN)
+            return Shown(subject(), self._item.key, {"csv": plot_file(self.figure)})
+
+        downloadable(self.card, session, "curves", show, PLOT)
+
+    def show(self, item: items.Plot) -> None:
+        """Draw curves; those of the same names are only given other values."""
+        if self._plot is None or self._item is None or _names(item) != _names(self._item):
+            self._plot = self._built(item)
+        self._item = item
+        figure = self._plot.figure
+        low, high = (
+            round_up(1.1 * max(float(np.nanmax(sign * curve, initial=0.0)) for curve in curves))
+            for sign, curves in ((-1, item.curves.values()), (1, item.curves.values()))
+        )
+        if (-low, high) != (figure.y_range.start, figure.y_range.end):
+            figure.y_range.update(start=-low, end=high, reset_start=-low, reset_end=high)
+        for name, values in item.curves.items():
+            self._plot.write(name, **{"x": item.x, "top" if name == plots.BARS else "y": values})
+        for name, (below, above) in item.bands.items():
+            self._plot.write(f"{name} band", x=item.x, y1=below, y2=above)
+        for name, place in item.marks.items():
+            x, y = plots.marker_line(place, high, -low)
+            self._plot.write(name, x=x, y=y)
+            self._plot.show(name, math.isfinite(place))
+        figure.title.text, self._note.text = item.title, item.note
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        self._colors = colors
+        if self._plot is None or self._item is None:
+            return
+        paint_frame(self._plot.figure, colors)
+        for name, (color, dash) in plots.curve_styles(self._item, colors).items():
+            glyph = self._plot.layers[name]["glyph"]
+            if name == plots.BARS:
+                glyph.update(fill_color=color, line_color=color)
+            else:
+                glyph.update(line_color=color, line_dash=dash)
+            if name in self._item.bands:
+                self._plot.layers[f"{name} band"]["glyph"].fill_color = color
+
+    def _built(self, item: items.Plot) -> Layers:
+        drawing = plots.curves(item, self._colors)
+        if self._across is not None:
+            drawing.x_range = self._across
+        drawing.y_range = Range1d(0, 1)
+        drawing.min_border_left = 68
+        paint_frame(drawing, self._colors)
+        pane = pane_of(drawing)
+        if self._plot is None:
+            self.card.insert(0, pane)
+        else:
+            self.card[0] = pane
+        return layers_of(drawing)
+
+
+def _names(item: items.Plot) -> list[str]:
+    """What a plot's layers are called."""
+    return [*item.curves, *item.marks]
+
+
+class TableCard:
+    """A table with its title above and its note below."""
+
+    def __init__(self, waiting: str = NOT_COMPUTED) -> None:
+        self._title = pmui.Typography(waiting, variant="subtitle2", margin=(6, 8))
+        self._table = Table(sizing_mode="stretch_width", margin=0)
+        self._note = Sentence(sizing_mode="stretch_width", margin=(6, 8, 12, 8))
+        self._item: items.Table | None = None
+        self.layout = pn.Column(
+            self._title, self._table, self._note, sizing_mode="stretch_width", margin=0
+        )
+
+    def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
+        """Have a download button, for files about a subject."""
+
+        def show() -> Shown:
+            if self._item is None:
+                raise ValueError(NOTHING_DRAWN)
+            return Shown(subject(), self._item.key, {"csv": table_file(self._item)})
+
+        downloadable(self.layout, session, "table", show, TABLE)
+
+    def show(self, item: items.Table) -> None:
+        """Show a table, in place of the last."""
+        self._item = item
+        columns, rows = table_of(item)
+        self._table.param.update(title=item.title, columns=columns, rows=rows)
+        self._title.object, self._note.text = f"**{item.title}**", item.note
+
+
+class Gallery:
+    """Pictures on one colour scale; a tap, or a row and a column, compare a pixel in all."""
+
+    def __init__(self) -> None:
+        self._drawn: list[Layers] = []
+        self._item: items.Pictures | None = None
+        self._colors = LIGHT
+        self._framed: Callable[[Any, str], Any] = lambda pane, _: pane
+        self._grid = pn.Column(stylesheets=[GRID], sizing_mode="stretch_width", margin=0)
+        self.place = [
+            Knob.of(Number(symbol, 0, 63, whole=True), 32, PLACE_HELP)
+            for symbol in ("Row", "Column")
+        ]
+        for knob in self.place:
+            knob.param.watch(lambda _: self._mark(), "value")
+        self._scale = ScaleBar()
+        self._scale.pane.visible = False
+        self._note = Sentence(text=NOT_COMPUTED, sizing_mode="stretch_width", margin=(4, 0))
+        self.layout = pn.Column(
+            self._grid, self._scale.pane, self._note, sizing_mode="stretch_width", margin=0
+        )
+
+    def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
+        """Have a download button on each picture, for files about a subject."""
+        self._framed = partial(self._with_button, session, subject)
+
+    def _with_button(
+        self, session: Session, subject: Callable[[], Subject], pane: Any, name: str
+    ) -> pn.Column:
+        def show() -> Shown:
+            item = self._item
+            if item is None:
+                raise ValueError(NOTHING_DRAWN)
+            look = _look(item)
+            files = {"csv": image_file(item.images[name], look, pane.object, Grid())}
+            return Shown(subject(), f"{item.key} {name}", files, scale=look)
+
+        holder = pn.Column(pane, sizing_mode="stretch_width", height=PICTURE_HEIGHT, margin=0)
+        return downloadable(holder, session, spelled(name), show, PLOT)
+
+    @property
+    def figures(self) -> list[Any]:
+        """What is drawn, in the order of the pictures."""
+        return [each.figure for each in self._drawn]
+
+    def show(self, item: items.Pictures) -> None:
+        """Draw pictures of one size, in place of the last."""
+        before, self._item = self._item, None  # no mark before all is there
+        shape = next(iter(item.images.values())).shape
+        for knob, size in zip(self.place, shape, strict=True):
+            knob.param.update(high=size - 1, initial=size // 2, value=min(knob.value, size - 1))
+        if before is None or _frame(before) != _frame(item):
+            self._build(item)
+        for drawn, image in zip(self._drawn, item.images.values(), strict=True):
+            drawn.source("picture").data["image"] = [image.astype(np.float32)]
+        self._item = item
+        self._mark()
+        self._scale.update(_look(item))
+        self._scale.pane.visible, self._note.text = True, f"{item.note} {OUTSIDE_NOTE}"
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        self._colors = colors
+        self._scale.paint(colors)
+        for drawing in self.figures:
+            paint_frame(drawing, colors)
+
+    def _build(self, item: items.Pictures) -> None:
+        self._drawn = [layers_of(drawing) for drawing in plots.pictures(item)]
+        panes = [pane_of(drawing) for drawing in self.figures]
+        for pane, drawing in zip(panes, self.figures, strict=True):
+            pane.sizing_mode, pane.height = "stretch_width", PICTURE_HEIGHT
+            paint_frame(drawing, self._colors)
+            drawing.on_event(Tap, self._tapped)
+        self._grid.objects = [
+            self._framed(pane, name) for pane, name in zip(panes, item.images, strict=True)
+        ]
+
+    def _tapped(self, event: Tap) -> None:
+        for knob, at in zip(self.place, (event.y, event.x), strict=True):
+            knob.value = min(max(math.floor(at + 0.5), 0), knob.high)
+
+    def _mark(self) -> None:
+        """Frame the pixel in all pictures, and say what each makes of it."""
+        if self._item is None:
+            return
+        row, col = (int(knob.value) for knob in self.place)
+        sides = dict(
+            zip(("left", "bottom", "right", "top"), plots.pixel_frame(row, col), strict=True)
+        )
+        for drawn, (name, image) in zip(self._drawn, self._item.images.items(), strict=True):
+            range_m = float(image[row, col])
+            told = "no target" if math.isnan(range_m) else number(range_m, "m")
+            for layer in ("shadow", "frame"):
+                drawn.write(layer, **{side: [at] for side, at in sides.items()})
+            drawn.figure.title.text = f"{spelled(name)}: {told}"
+
+
+def layers_of(drawing: Any) -> Layers:
+    """The named renderers of a Bokeh figure."""
+    found = {
+        each.name: {"source": each.data_source, "glyph": each.glyph, "glyph_renderer": each}
+        for each in drawing.renderers
+    }
+    return Layers(drawing, found)
+
+
+def _look(item: items.Pictures) -> Look:
+    """The colours that all pictures share."""
+    return Look(item.label, "", item.low, item.high, RANGE_COLORS)
+
+
+def _frame(item: items.Pictures) -> tuple[Any, ...]:
+    """What figures are built for: pictures that agree in it differ in their values alone."""
+    return item.low, item.high, [image.shape for image in item.images.values()]
+
+
+def spelled(name: str) -> str:
+    """A method's key, or any other name, as one writes it."""
+    return name.replace("_", " ")
+
+
+def table_of(item: items.Table) -> tuple[list[Any], list[dict[str, Any]]]:
+    """Columns and rows for `app.widgets.controls.Table`.
+
+    "low" and "high" become a smaller line under the value before them, "kind" one under the name; a
+    difference from what is printed is said in words, too. Columns without a value are left out.
+    """
+    names = item.columns
+    hidden = {"low", "high", "kind"}
+    shown = [
+        place
+        for place, name in enumerate(names)
+        if name not in hidden and any(row[place] != "" for row in item.rows)
+    ]
+    if "method" in names:  # it names the row, wherever it stands
+        shown.sort(key=lambda place: names[place] != "method")
+    first, *others = shown
+    columns = [[names[place], *COLUMN_HELP.get(names[place], ("", 1))] for place in shown]
+    rows = [
+        {
+            "name": _name(row[first]),
+            "note": RECONSTRUCTION if "reconstruction" in row else "",
+            "cells": [_cell(names, row, place) for place in others],
+        }
+        for row in item.rows
+    ]
+    return columns, rows
+
+
+def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]:
+    """Text, value to sort by, and what stands smaller below."""
+    value = row[place]
+    if isinstance(value, str):
+        return [_name(value), value or None, ""]
+    if names[place] in FORMATS:
+        return [format(value, FORMATS[names[place]]), value, ""]
+    below = ""
+    if names[place + 1 : place + 3] == ("low", "high"):
+        low, high = row[place + 1 : place + 3]
+        below = f"{items.as_text(low)} to {items.as_text(high)}"
+    if names[place] == "difference":
+        low, high, printed = row[place - 3 : place]
+        larger_is_better = names[place - 4].startswith("RD")
+        is_better = (value > 0) == larger_is_better
+        below = "chance may do" if low <= printed <= high else "better" if is_better else "worse"
+        return [f"{value:+.4f}", value, below]
+    known = not math.isnan(value)
+    return [items.as_text(value) if known else "–", value if known else None, below]
+
+
+def _name(text: Any) -> str:
+    return (TITLES | TITLES_OF_PRESETS).get(text, spelled(str(text)))

@@ -1,0 +1,246 @@
+"""The 3D cloud: a range image as a PyVista mesh, and as points in the browser.
+
+Its coordinates are those of `core.geometry`.
+
+The mesh never becomes a picture on the server, where OpenGL may be missing: its points and colours
+go to the browser, which draws them with the vtk.js that Panel bundles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import param
+import pyvista as pv
+from numpy.typing import ArrayLike, NDArray
+
+from app.theme import WRONG_COLOR, palette
+from app.widgets.component import Component
+from core.geometry import points_m
+
+Floats = NDArray[np.float64]
+
+
+def point_cloud(range_m: ArrayLike, pixel_angle_rad: float, **images: ArrayLike) -> pv.PolyData:
+    """Turn a range image into a cloud of one vertex per pixel that has a range.
+
+    Parameters
+    ----------
+    range_m : array_like, shape (row, col)
+        Range along each line of sight in metres; pixels that are not finite are left out.
+    pixel_angle_rad : float
+        Angle between the lines of sight of neighbouring pixels, in radians.
+    **images : array_like, shape (row, col) or (row, col, component)
+        Further images of the same size, kept as point data under their names.
+
+    Returns
+    -------
+    pyvista.PolyData
+        Point data ``range_m``, ``row``, ``col`` and the images; field data ``image_shape`` and
+        ``pixel_angle_rad``.
+
+    Raises
+    ------
+    ValueError
+        If ``range_m`` is no image, an image has another size than ``range_m``, or the angle is not
+        between 0 and π/2.
+    """
+    ranges = np.asarray(range_m, float)
+    xyz_m, row, col = points_m(ranges, pixel_angle_rad)
+    cloud = pv.PolyData(xyz_m)
+    cloud["range_m"] = ranges[row, col]
+    cloud["row"] = row
+    cloud["col"] = col
+    for name, image in images.items():
+        values = np.asarray(image)
+        if values.shape[:2] != ranges.shape:
+            raise ValueError(
+                f"{name} has shape {values.shape}: give {ranges.shape}, that of range_m."
+            )
+        cloud[name] = values[row, col]
+    cloud.field_data["image_shape"] = np.array(ranges.shape, np.int32)
+    cloud.field_data["pixel_angle_rad"] = np.array([pixel_angle_rad])
+    return cloud
+
+
+def pixel_index(cloud: pv.PolyData) -> NDArray[np.int32]:
+    """Index of each point's pixel in the flattened image, ``row * n_cols + col``."""
+    n_cols = cloud.field_data["image_shape"][1]
+    return np.asarray(cloud["row"] * n_cols + cloud["col"], np.int32)
+
+
+def spacing_m(cloud: pv.PolyData) -> float:
+    """Distance between neighbouring points of a surface at the middle range; 0 without points."""
+    if cloud.n_points == 0:
+        return 0.0
+    return float(np.median(cloud["range_m"]) * cloud.field_data["pixel_angle_rad"][0])
+
+
+def view_bounds(cloud: pv.PolyData, keep: ArrayLike | None = None) -> list[float]:
+    """Box around the target, not around points scattered through the gate.
+
+    False detections lie evenly over the ranges of the gate, so a slice of range belongs to the
+    target where it holds clearly more points than the middle slice. Where most points lie in no
+    such slice the target itself fills the gate, and nearly all ranges count.
+
+    Parameters
+    ----------
+    cloud : pyvista.PolyData
+        From `point_cloud`.
+    keep : array_like of bool, shape (point,), optional
+        Points to look at, such as those known to be right; all points if it names none.
+
+    Returns
+    -------
+    list of float
+        xmin, xmax, ymin, ymax, zmin, zmax in metres; empty for a cloud without points.
+    """
+    if cloud.n_points == 0:
+        return []
+    kept = np.ones(cloud.n_points, bool) if keep is None else np.asarray(keep, bool)
+    if not kept.any():
+        kept = ~kept
+    points, ranges = np.asarray(cloud.points)[kept], np.asarray(cloud["range_m"])[kept]
+    low, high = _target_ranges(ranges)
+    inside = points[(ranges >= low) & (ranges <= high)]
+    margin = spacing_m(cloud)
+    box = np.column_stack([inside.min(axis=0) - margin, inside.max(axis=0) + margin])
+    return [float(value) for value in box.ravel()]
+
+
+def _target_ranges(ranges: Floats) -> tuple[float, float]:
+    """Lowest and highest range of the target; looks closer while that halves the span."""
+    low, high = _dense_ranges(ranges)
+    if high - low > 0.5 * np.ptp(ranges):
+        return low, high
+    return _target_ranges(ranges[(ranges >= low) & (ranges <= high)])
+
+
+def _dense_ranges(ranges: Floats) -> tuple[float, float]:
+    """Ends of the slices that hold clearly more points than the middle one, see `view_bounds`."""
+    counts, edges = np.histogram(ranges, bins=100)
+    dense = np.flatnonzero(counts > 3 * np.median(counts) + 0.002 * ranges.size)
+    if counts[dense].sum() < 0.5 * ranges.size:
+        low, high = np.percentile(ranges, [0.5, 99.5])
+        return float(low), float(high)
+    return float(edges[dense[0]]), float(edges[dense[-1] + 1])
+
+
+class PointCloud(Component):
+    """Draw a point cloud in the browser.
+
+    Call `draw` to show a cloud; all of it travels in one message and is painted in one frame. The
+    camera stays where the user left it until ``scene_id`` changes or ``home`` is triggered. The
+    page must have been set up with ``pn.extension("vtk")``.
+    """
+
+    positions = param.Bytes(default=b"", doc="float32 x, y, z of each point in metres.")
+
+    colors = param.Bytes(default=b"", doc="uint8 red, green, blue of each point.")
+
+    pixels = param.Bytes(default=b"", doc="int32 index of each point's pixel.")
+
+    wrong = param.Bytes(default=b"", doc="uint8, 1 for points drawn as crosses; empty for none.")
+
+    selected = param.Integer(
+        default=-1,
+        doc="Index of the pixel that carries a ring, -1 for none; a click on a point sets it.",
+    )
+
+    point_size = param.Number(
+        default=1.4,
+        bounds=(0.2, 5.0),
+        doc="Diameter of a point as a multiple of the distance between neighbouring points.",
+    )
+
+    spacing_m = param.Number(default=0.0, doc="Distance between neighbouring points in metres.")
+
+    bounds = param.List(
+        default=[],
+        item_type=float,
+        doc="Box that the home view frames: xmin, xmax, ymin, ymax, zmin, zmax in metres.",
+    )
+
+    scene_id = param.String(default="", doc="Name of the scene; a new one resets the camera.")
+
+    home = param.Event(doc="Reset the camera.")
+
+    link = param.String(
+        default="", doc="Clouds of a page that share this name share their camera; empty for none."
+    )
+
+    dark = param.Boolean(default=False, doc="Take ink and paper from the dark palette.")
+
+    ink = param.Color(default=palette(dark=False).text, doc="Colour of text, as #rrggbb.")
+
+    paper = param.Color(default=palette(dark=False).paper, doc="Background, as #rrggbb.")
+
+    wrong_color = param.Color(default=WRONG_COLOR, doc="Colour of the crosses, as #rrggbb.")
+
+    label = param.String(
+        default="Point cloud. Arrow keys turn it, plus and minus zoom, 0 resets the view.",
+        doc="What a screen reader says of the picture.",
+    )
+
+    caption = param.String(default="", doc="A line of text in the lower left corner.")
+
+    _esm = Path(__file__).with_name("cloud.js")
+
+    @param.depends("dark", watch=True, on_init=True)
+    def _take_palette(self) -> None:
+        colors = palette(self.dark)
+        self.param.update(ink=colors.text, paper=colors.paper)
+
+    def draw(
+        self,
+        cloud: pv.PolyData,
+        rgb: ArrayLike,
+        wrong: ArrayLike | None = None,
+        *,
+        scene_id: str | None = None,
+        bounds: Sequence[float] | None = None,
+    ) -> None:
+        """Show a cloud in place of the present one.
+
+        Parameters
+        ----------
+        cloud : pyvista.PolyData
+            From `point_cloud`.
+        rgb : array_like of uint8, shape (point, 3)
+            Colour of each point.
+        wrong : array_like of bool, shape (point,), optional
+            Points to draw as crosses.
+        scene_id : str, optional
+            Name of the scene; if it differs from the present one the camera is reset.
+        bounds : sequence of float, optional
+            Box for the home view; for a new scene `view_bounds` of the points not wrong is taken
+            where none is given.
+
+        Raises
+        ------
+        ValueError
+            If ``rgb`` or ``wrong`` does not fit the number of points.
+        """
+        colors = np.ascontiguousarray(rgb, np.uint8)
+        if colors.shape != (cloud.n_points, 3):
+            raise ValueError(f"rgb has shape {colors.shape}: give {(cloud.n_points, 3)}.")
+        mask = np.zeros(cloud.n_points, bool) if wrong is None else np.asarray(wrong, bool)
+        if mask.shape != (cloud.n_points,):
+            raise ValueError(f"wrong has shape {mask.shape}: give {(cloud.n_points,)}.")
+        update: dict[str, Any] = {
+            "positions": np.asarray(cloud.points, "<f4").tobytes(),
+            "colors": colors.tobytes(),
+            "pixels": pixel_index(cloud).astype("<i4").tobytes(),
+            "wrong": mask.tobytes(),
+            "spacing_m": spacing_m(cloud),
+        }
+        if scene_id is not None and scene_id != self.scene_id:
+            update["scene_id"] = scene_id
+        if "scene_id" in update or not self.bounds:
+            update["bounds"] = view_bounds(cloud, ~mask)
+        if bounds is not None:
+            update["bounds"] = [float(value) for value in bounds]
+        self.param.update(**update)

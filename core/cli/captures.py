@@ -1,0 +1,421 @@
+"""Commands for captures: look at one, range it, simulate one, write it in another layout."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from core.acquisition import Acquisition
+from core.capture import Capture, Seen
+from core.checks import printable, require, shown
+from core.cli.options import (
+    LIGHT_NAMES,
+    READING_NAMES,
+    add_light,
+    add_reading,
+    flux,
+    reading,
+    require_none,
+    show,
+    whole_from_to,
+)
+from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage, estimate
+from core.inspection import LightFound, capture_report, pixel_report
+from core.io.readers import READERS, bytes_of, open_capture, read_capture
+from core.io.readers.guards import MAX_CUBE_BYTES
+from core.io.readers.labelled import describe
+from core.io.readers.request import Request
+from core.io.scene_files import read_scene
+from core.io.writers import (
+    CAPTURE_SUFFIXES,
+    CLOUD_SUFFIXES,
+    FOLDER_WRITERS,
+    WRITERS,
+    save_capture,
+    save_image,
+    save_pixel,
+)
+from core.io.writers.whole import writing
+from core.parameters import Number, doubts, spec_of
+from core.pipeline import run
+from core.scene import Scene, scenes
+from core.simulation import simulate
+from core.tracking import PRESETS
+
+_CONFIDENT = 0.9
+_MOST_REPORTED = 2**27  # counts: of more, what their pixels tell takes minutes
+_VIEW = ("unit_m", "distance_m", "pixel_angle_rad")
+
+
+def add(commands: Any) -> None:
+    """Add these commands to a parser's."""
+    for each in (_add_info, _add_estimate, _add_simulate, _add_export):
+        each(commands)
+
+
+# -- info ------------------------------------------------------------------------------------------
+
+
+def _add_info(commands: Any) -> None:
+    command = commands.add_parser(
+        "info", help="what a capture file holds, and what would be guessed of it"
+    )
+    command.add_argument("capture", type=Path, help=f"a file: {', '.join(READERS)}")
+    command.add_argument(
+        "--pixel",
+        type=int,
+        nargs=2,
+        metavar=("ROW", "COL"),
+        help="what is known of one pixel, by the tracking differentiator's defaults",
+    )
+    _add_json(command)
+    add_reading(command)
+    command.set_defaults(work=_info)
+
+
+def _info(chosen: argparse.Namespace) -> None:
+    if chosen.pixel is not None:
+        capture = read_capture(chosen.capture, **reading(chosen))
+        show(_of_pixel(capture, *chosen.pixel), chosen.json)
+        return
+    counts = open_capture(chosen.capture, **reading(chosen))
+    acquisition, pulse, detection, source = describe(counts, Request())
+    rows, cols, n_bins = counts.shape
+    begin_m, end_m = acquisition.bin_to_range_m([0, n_bins])
+    facts: dict[str, Any] = {
+        "source": source,
+        "rows": rows,
+        "cols": cols,
+        "bins": n_bins,
+        "bin_width_s": acquisition.bin_width_s,
+        "gate_delay_s": acquisition.gate_delay_s,
+        "range_from_m": float(begin_m),
+        "range_to_m": float(end_m),
+        "pulse": pulse.shape,
+        "pulse_tau_s": pulse.tau_s,
+        "n_pulses": acquisition.n_pulses,
+        "pixel_angle_rad": acquisition.pixel_angle_rad,
+        "detection": detection,
+        "bytes": counts.nbytes,
+    }
+    if counts.nbytes <= MAX_CUBE_BYTES:
+        photons = counts.sum("bin", dtype=np.int64).to_numpy()
+        facts |= {
+            "photons": int(photons.sum()),
+            "photons_per_pixel": float(photons.mean()),
+            "photons_in_one_pixel_at_most": int(photons.max()),
+            "share_of_pixels_empty": float((photons == 0).mean()),
+        }
+    if counts.size <= _MOST_REPORTED:
+        facts |= _of_capture(read_capture(chosen.capture, **reading(chosen)))
+    show(facts, chosen.json)
+
+
+def _of_capture(capture: Capture) -> dict[str, Any]:
+    """What its pixels together tell."""
+    report = capture_report(capture)
+    suggestion = report.suggestion
+    return {
+        **_light(report.light, report.light_unit),
+        "light_method": report.light_method,
+        "hot_pixels": report.n_hot,
+        "dead_pixels": report.n_dead,
+        "suggested_gate_first_bin": suggestion.gate[0],
+        "suggested_gate_end_bin": suggestion.gate[1],
+        "why_gate": suggestion.why_gate,
+        "suggested_t_n": suggestion.t_n,
+        "why_t_n": suggestion.why_t_n,
+    }
+
+
+def _of_pixel(capture: Capture, row: int, col: int) -> dict[str, Any]:
+    report = pixel_report(capture, estimate(capture, "tracking"), row, col)
+    facts: dict[str, Any] = {
+        "source": capture.source,
+        "row": report.row,
+        "col": report.col,
+        "photons": int(report.counts.sum()),
+        "range_m": report.answer_m,
+        "confidence": report.confidence,
+        **_light(report.light, report.light_unit),
+        "light_method": report.light_method,
+        "verdict": report.verdict.health,
+        "why_verdict": report.verdict.why,
+    }
+    for rank, candidate in enumerate(report.candidates, 1):
+        facts |= {f"candidate_{rank}_{name}": value for name, value in vars(candidate).items()}
+    return facts
+
+
+def _light(light: LightFound, unit: str) -> dict[str, Any]:
+    facts: dict[str, Any] = {"light_unit": unit}
+    for name, interval in light._asdict().items():
+        facts |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return facts
+
+
+# -- estimate --------------------------------------------------------------------------------------
+
+
+def _add_estimate(commands: Any) -> None:
+    command = commands.add_parser("estimate", help="range a scene or a capture by one method")
+    methods = command.add_subparsers(dest="method", required=True)
+    for name, estimator in ESTIMATORS.items():
+        method = methods.add_parser(name, help=estimator.title, description=estimator.title)
+        seen = method.add_mutually_exclusive_group()
+        seen.add_argument("--capture", type=Path, help="a file that `info` can read")
+        seen.add_argument("--scene", choices=scenes, default="car", help="to simulate (car)")
+        add_light(method)
+        method.add_argument(
+            "--false-alarm",
+            type=float,
+            help=f"share of pixels without an echo that may be answered, "
+            f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; all are where not given",
+        )
+        _add_out(method, "the answer", (*WRITERS, *FOLDER_WRITERS))
+        method.add_argument(
+            "--scheduler", help="address of a Dask cluster to range on, such as tcp://host:8786"
+        )
+        _add_json(method)
+        for each in fields(estimator.parameters):
+            spec = spec_of(each)
+            method.add_argument(
+                f"--{each.name.replace('_', '-')}",
+                dest=f"setting_{each.name}",
+                type=_kind(spec),
+                default=each.default,
+                metavar=each.name.upper(),
+                help=f"{each.metadata['help']} ({each.default})".replace("%", "%%"),
+            )
+        add_reading(method)
+        method.set_defaults(work=_estimate)
+
+
+def _kind(spec: Any) -> Callable[[str], Any]:
+    if not isinstance(spec, Number):
+        return str
+    return int if spec.whole else float
+
+
+def _settings(chosen: argparse.Namespace) -> Any:
+    prefix = "setting_"
+    told = {k.removeprefix(prefix): v for k, v in vars(chosen).items() if k.startswith(prefix)}
+    return ESTIMATORS[chosen.method].parameters(**told)
+
+
+def _estimate(chosen: argparse.Namespace) -> None:
+    _require_free(chosen)
+    settings = _settings(chosen)
+    if chosen.scheduler or _exceeds_memory(chosen):
+        seen, image, facts = _ranged_in_parts(chosen, settings)
+    else:
+        seen, image, facts = _ranged_at_once(chosen, settings)
+    for path in chosen.out:
+        save_image(seen, image, path, overwrite=chosen.overwrite)
+    known = {
+        "source": seen.source,
+        "remark": facts.pop("remark"),
+        "settings": str(settings),
+        "in_doubt": " ".join(doubts(settings)),
+        "pixels": image.valid.size,
+        "pixels_answered": int(image.valid.sum()),
+        f"of_them_at_confidence_{_CONFIDENT}": int((image.confidence >= _CONFIDENT).sum()),
+        "median_range_m": float(np.median(image.range_m[image.valid])) if image.valid.any() else "",
+        **facts,
+        "written": ", ".join(map(str, chosen.out)),
+    }
+    show({name: value for name, value in known.items() if value != ""}, chosen.json)
+
+
+def _exceeds_memory(chosen: argparse.Namespace) -> bool:
+    n_bytes = chosen.capture and bytes_of(chosen.capture, **reading(chosen))
+    return n_bytes is not None and n_bytes > MAX_CUBE_BYTES
+
+
+def _ranged_at_once(
+    chosen: argparse.Namespace, settings: Any
+) -> tuple[Seen, RangeImage, dict[str, Any]]:
+    capture = _capture(chosen)
+    print(capture.source, file=sys.stderr)  # with the guesses, before anything rests on them
+    _require_angle(chosen, capture.acquisition)
+    found = run(capture, chosen.method, settings, chosen.false_alarm)
+    facts: dict[str, Any] = found.figures | {
+        "remark": ESTIMATORS[chosen.method].remark(capture),
+        "light_s": found.light_s,
+        "estimate_s": found.estimate_s,
+    }
+    if capture.truth_range_m is not None:
+        facts["pixels_with_a_target"] = int(np.isfinite(capture.truth_range_m).sum())
+    return capture, found.image, facts
+
+
+def _ranged_in_parts(
+    chosen: argparse.Namespace, settings: Any
+) -> tuple[Seen, RangeImage, dict[str, Any]]:
+    from core.out_of_core import tiles as large  # noqa: PLC0415 - brings Dask, for which small captures need not wait
+
+    if chosen.capture is None:
+        raise ValueError("scheduler takes a --capture: a scene is simulated and ranged here.")
+    counts = open_capture(chosen.capture, **reading(chosen))
+    print(counts.attrs.get("source", ""), file=sys.stderr)
+    _require_angle(chosen, describe(counts, Request()).acquisition)
+    started = perf_counter()
+    parts = large.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)
+    seen, image = large.as_image(large.computed(parts, chosen.scheduler))
+    facts = {"remark": parts.attrs["remark"], "seconds": perf_counter() - started}
+    return seen, image, facts
+
+
+# -- simulate and export ---------------------------------------------------------------------------
+
+
+def _add_simulate(commands: Any) -> None:
+    command = commands.add_parser("simulate", help="a capture of a scene, built-in or from a file")
+    command.add_argument(
+        "--scene",
+        default="car",
+        help=f"{', '.join(scenes)}, or a file: a mesh or a depth map (car)",
+    )
+    command.add_argument("--size", type=whole_from_to(8, 4096), help="rows and columns")
+    command.add_argument("--pulses", type=whole_from_to(1, 2**32 - 1), help="the scene's own")
+    group = command.add_argument_group("how a file's scene is seen; what is not told is guessed")
+    group.add_argument("--unit", dest="unit_m", type=float, help="of the file, in metres")
+    group.add_argument(
+        "--distance",
+        dest="distance_m",
+        type=float,
+        help="to the nearest point of a mesh, in metres",
+    )
+    group.add_argument(
+        "--pixel-angle",
+        dest="pixel_angle_rad",
+        type=float,
+        help="between neighbouring pixels, in radians",
+    )
+    add_light(command)
+    _add_out(command, "the capture", CAPTURE_SUFFIXES, required=True)
+    _add_json(command)
+    command.set_defaults(work=_simulate)
+
+
+def _simulate(chosen: argparse.Namespace) -> None:
+    _require_free(chosen)
+    scene = _scene(chosen)
+    acquisition = scene.acquisition
+    if chosen.pulses is not None:
+        acquisition = replace(acquisition, n_pulses=chosen.pulses)
+    capture = _simulated(scene, acquisition, chosen)
+    told = {"unit": chosen.unit_m, "distance": chosen.distance_m, "SBR": chosen.sbr}
+    seen = [f"{name} {value:g}" for name, value in told.items() if value is not None]
+    source = ", ".join((printable(chosen.scene), capture.source, *seen))
+    _save_captures(replace(capture, source=source), chosen)
+
+
+def _scene(chosen: argparse.Namespace) -> Scene:
+    size = chosen.size
+    if chosen.scene not in scenes:
+        known = " or ".join(scenes)
+        require("scene", chosen.scene, Path(chosen.scene).suffix != "", f"{known}, or a file")
+        seen = {name: getattr(chosen, name) for name in _VIEW}
+        return read_scene(chosen.scene, size=None if size is None else (size, size), **seen)
+    require_none(vars(chosen), _VIEW, "a built-in scene has a view of its own")
+    return scenes[chosen.scene](**({} if size is None else {"size": size}))
+
+
+def _add_export(commands: Any) -> None:
+    command = commands.add_parser(
+        "export", help="write a capture in another layout, or a pixel's signals as CSV"
+    )
+    command.add_argument("capture", type=Path, help="a file that `info` can read")
+    suffixes = ", ".join(CAPTURE_SUFFIXES)
+    command.add_argument("out", type=Path, nargs="+", help=f"{suffixes}; .csv with --pixel")
+    command.add_argument(
+        "--pixel", type=int, nargs=2, metavar=("ROW", "COL"), help="whose signals are written"
+    )
+    command.add_argument(
+        "--preset", choices=PRESETS, default="recommended", help="of these signals (recommended)"
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace files")
+    _add_json(command)
+    add_reading(command)
+    command.set_defaults(work=_export, suffixes=(*CAPTURE_SUFFIXES, ".csv"))
+
+
+def _export(chosen: argparse.Namespace) -> None:
+    _require_free(chosen)
+    capture = read_capture(chosen.capture, **reading(chosen))
+    if chosen.pixel is None:
+        _save_captures(capture, chosen)
+        return
+    row, col = chosen.pixel
+    for path in chosen.out:
+        settings = PRESETS[chosen.preset]
+        save_pixel(capture, row, col, settings, path, overwrite=chosen.overwrite)
+    show({"source": capture.source, "written": ", ".join(map(str, chosen.out))}, chosen.json)
+
+
+def _save_captures(capture: Capture, chosen: argparse.Namespace) -> None:
+    for path in chosen.out:
+        save_capture(capture, path, overwrite=chosen.overwrite)
+    photons = int(capture.counts.sum())
+    written = ", ".join(map(str, chosen.out))
+    show({"source": capture.source, "photons": photons, "written": written}, chosen.json)
+
+
+# -- what they share -------------------------------------------------------------------------------
+
+
+def _add_out(command: Any, what: str, suffixes: Sequence[str], required: bool = False) -> None:
+    command.add_argument(
+        "--out",
+        type=Path,
+        action="append",
+        default=[],
+        required=required,
+        help=f"a file for {what}, its suffix tells the format: {', '.join(suffixes)}; repeatable",
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace files")
+    command.set_defaults(suffixes=suffixes)
+
+
+def _add_json(command: Any) -> None:
+    command.add_argument("--json", action="store_true", help="one JSON object instead of lines")
+
+
+def _require_angle(chosen: argparse.Namespace, acquisition: Acquisition) -> None:
+    """Refuse a cloud of pixels that look nobody knows where before they are ranged."""
+    clouds = [str(path) for path in chosen.out if path.suffix.lower() in CLOUD_SUFFIXES]
+    known = acquisition.pixel_angle_rad is not None
+    require("pixel_angle_rad", None, known or not clouds, f"it, which {', '.join(clouds)} needs")
+
+
+def _require_free(chosen: argparse.Namespace) -> None:
+    """Refuse what cannot be written before anything is computed."""
+    for path in chosen.out:
+        known = path.suffix.lower() in chosen.suffixes
+        require("suffix", path.suffix, known, "one of " + ", ".join(chosen.suffixes))
+        with writing(path):
+            if path.exists() and not chosen.overwrite:
+                raise FileExistsError(f"{path} exists: give another name, or --overwrite.")
+        if not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"{shown(path.parent)} is no folder: make it first.")
+
+
+def _capture(chosen: argparse.Namespace) -> Capture:
+    if chosen.capture:
+        require_none(vars(chosen), LIGHT_NAMES, "a capture is lit already")
+        return read_capture(chosen.capture, **reading(chosen))
+    require_none(reading(chosen), READING_NAMES, "a scene is not read from a file")
+    scene = scenes[chosen.scene]()
+    return _simulated(scene, scene.acquisition, chosen)
+
+
+def _simulated(scene: Scene, acquisition: Acquisition, chosen: argparse.Namespace) -> Capture:
+    return simulate(scene, acquisition, flux(chosen), seed=chosen.seed or 0)

@@ -1,0 +1,131 @@
+"""All that is known of a capture as a whole, and what gate and T_n its echoes suggest."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.capture import Capture, once_per_capture
+from core.inference.faults import standing_out
+from core.inference.posterior import TOLERANCE_BINS
+from core.inspection.maps import likeliest
+from core.inspection.mean_flux import METHOD, mean_light
+from core.inspection.pixel import lag_bins, light_unit
+from core.inspection.profile import LightFound
+from core.tracking import START_BINS, TrackingParameters
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Settings that the capture's own echoes suggest."""
+
+    gate: tuple[int, int]
+    """First bin and end of the window that holds them, in bins of the capture. First photons are
+    not cut in front: that would cost pulses (`core.reductions.cut_gate`), and more than it gains.
+    """
+    why_gate: str
+    t_n: int
+    """First bin in which the tracking residual may peak, in bins of the whole gate."""
+    why_t_n: str
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureReport:
+    """All that is known of a capture as a whole."""
+
+    histogram: NDArray[np.int64]
+    """Counts of all pixels together, shape (bin,)."""
+    light: LightFound
+    """Mean signal (PPP) and background of all pixels, and their ratio, with 95 % intervals."""
+    light_unit: str
+    """``"photons per pulse"``, or ``"photons"``."""
+    light_method: str
+    """How they are estimated."""
+    n_hot: int | None
+    """Pixels that stand out as hot; None where an image is too narrow to tell."""
+    n_dead: int | None
+    suggestion: Suggestion
+
+
+def capture_report(capture: Capture) -> CaptureReport:
+    """All that is known of a capture as a whole; the first time it takes as long as ranging it."""
+    faulty = standing_out(capture)
+    return CaptureReport(
+        histogram=aggregate(capture),
+        light=mean_light(capture),
+        light_unit=light_unit(capture),
+        light_method=METHOD,
+        n_hot=None if faulty is None else int(np.count_nonzero(faulty.hot)),
+        n_dead=None if faulty is None else int(np.count_nonzero(faulty.dead)),
+        suggestion=suggestion(capture),
+    )
+
+
+@once_per_capture
+def aggregate(capture: Capture) -> NDArray[np.int64]:
+    """Counts of all pixels together, shape (bin,)."""
+    return np.asarray(capture.cube.sum(axis=(0, 1), dtype=np.int64))
+
+
+_CONFIDENT = 0.9
+_FEWEST = 10  # confident answers
+_MARGIN_BINS = 3 * START_BINS
+
+
+class _Echoes(NamedTuple):
+    """Where confident answers lie."""
+
+    first: float
+    last: float
+    how_many: int
+
+
+@once_per_capture
+def _echoes(capture: Capture) -> _Echoes | None:
+    """Between which delays; None where too few are confident.
+
+    As many as are expected to be wrong are left out, half of them at each end.
+    """
+    delay, probability = likeliest(capture)
+    sure = probability >= _CONFIDENT
+    count = int(np.count_nonzero(sure))
+    if count < _FEWEST:
+        return None
+    found = np.sort(delay[sure])
+    wrong = math.ceil(float((1 - probability[sure]).sum()) / 2)
+    return _Echoes(float(found[wrong]), float(found[-1 - wrong]), count)
+
+
+@once_per_capture
+def suggestion(capture: Capture) -> Suggestion:
+    """Gate and T_n, with the reason in a sentence each."""
+    n_bins, echoes = capture.acquisition.n_bins, _echoes(capture)
+    if echoes is None:
+        why = f"Fewer than {_FEWEST} answers are confident: where echoes lie is not known."
+        t_n = min(_MARGIN_BINS, n_bins - 1)
+        return Suggestion((0, n_bins), why, t_n, f"{why} The differentiators need {t_n} bins.")
+    lag = lag_bins(capture, "tracking", TrackingParameters())
+    echo, tap = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
+    between = f"in bins {echoes.first:.0f} to {echoes.last:.0f}"
+    where = f"The {echoes.how_many:,} confident answers lie {between}"
+    end = min(math.ceil(echoes.last) + tap + echo.size + _MARGIN_BINS, n_bins)
+    if capture.armed_pulses is not None:
+        # What is cut in front takes pulses with it, of each pixel another number.
+        first, side = 0, "behind them; in front, a cut would cost the pulses that fired there"
+    else:
+        first = max(math.floor(echoes.first) + min(tap, 0) - TOLERANCE_BINS - _MARGIN_BINS, 0)
+        side = "on either side"
+    why = f"{where}; {_MARGIN_BINS} bins more let the differentiators settle {side}."
+    if (first, end) == (0, n_bins):
+        why = f"{where}; with a margin of {_MARGIN_BINS} bins that is the whole gate."
+    t_n = max(math.floor(echoes.first + lag) - TOLERANCE_BINS, 0)
+    return Suggestion(
+        (first, end),
+        why,
+        t_n,
+        f"{where}: what peaks more than {TOLERANCE_BINS} bins before them is noise.",
+    )

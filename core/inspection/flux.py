@@ -1,0 +1,170 @@
+"""How much signal and background a pixel has seen, and how well that is known.
+
+The likelihood of a histogram (`core.inference.posterior`), given signal and background, is averaged
+over all delays of the gate, none being likelier than another: where the echo lies is not known, and
+the largest peak is not taken for it. What is left is a likelihood of signal and background alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from core.acquisition import Acquisition, Floats, Pulse
+from core.inspection.profile import Box, LightFound, spans, zoomed
+
+METHOD = (
+    "95 % profile likelihood intervals of the first-photon likelihood, averaged over all delays"
+)
+
+_COARSE, _FINE = (9, 17), (13, 25)
+_RIGHT = math.pi / 2
+_DARKEST = 1e-200  # photons: without any a count would be impossible, and its logarithm infinite
+_NEGLIGIBLE = 25.0
+_AT_ONCE = 2**21  # likelihoods of lights and delays: 16 MiB
+_STEPS, _STEPS_CLOSE = 2, 16  # delays in a bin; where few bins are left
+_FEW_BINS, _MANY_BINS = 8, 8  # left; of an echo so wide that one delay in a bin will do
+
+
+def light_found(
+    histograms: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
+) -> LightFound:
+    """Signal, background and their ratio, with 95 % intervals.
+
+    Parameters
+    ----------
+    histograms : ndarray, shape (bin,) or (pixel, bin)
+        Counts of one pixel, or of some that see the same light, each with a delay of its own.
+    acquisition : Acquisition
+    pulse : Pulse
+    n_pulses : int or None
+        Pulses sent, where these are first photons; where None counts are taken for Poisson, and
+        photons are told instead of photons per pulse.
+    """
+    counts = np.atleast_2d(np.asarray(histograms, float))
+    box = _all_light(counts, n_pulses)
+    pixels = [_Pixel(each, acquisition, pulse, n_pulses) for each in counts]
+
+    def together(root: Floats, angle: Floats) -> Floats:
+        signal, background = _light_at(root, angle)
+        return np.asarray(sum(pixel(signal, background) for pixel in pixels))
+
+    box = zoomed(box, together, _COARSE)
+    # Now that the light is about known, so are the delays.
+    forgotten = [pixel.forget_delays() for pixel in pixels]
+    if any(forgotten):
+        box = zoomed(box, together, _COARSE)
+    likelihood = together(*box.grid(_FINE))
+
+    def light_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
+        signal, background = _light_at(root, angle)
+        if box.high[0] == box.most[0]:  # where every pulse fires, it may be by any light
+            signal[-1, angle > 0] = background[-1, angle < _RIGHT] = np.inf
+        return signal, background
+
+    return spans(box, likelihood, light_at)
+
+
+def _all_light(counts: Floats, n_pulses: int | None) -> Box:
+    """Bounds of ``√(S + B)`` and of ``asin √(S / (S + B))`` for pixels (pixel, bin).
+
+    In these, which have about the same standard deviation everywhere, a likelihood's peak is round.
+    """
+    n_pixels, n_bins = counts.shape
+    detected = float(counts.sum())
+    if n_pulses is None:
+        one = 1 / n_pixels
+        total, sd, most = detected * one, math.sqrt(detected) * one, 2 * detected + 100
+    else:
+        sent = n_pulses * n_pixels
+        left, one = max(sent - detected, 0.5), 1 / sent
+        total, sd = math.log(sent / left), math.sqrt(1 / left - one)
+        most = n_bins * math.log(1000.0 * sent)  # where all pulses fire beyond any doubt
+    low, high = max(total - 4 * sd - one, 0.0), min(total + 4 * sd + 4 * one, most)
+    return Box(
+        low=(math.sqrt(low), 0.0),
+        high=(math.sqrt(high), _RIGHT),
+        least=(0.0, 0.0),
+        most=(math.sqrt(most), _RIGHT),
+    )
+
+
+def _light_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
+    """Signal and background at these coordinates, each of shape (root, angle)."""
+    total = root[:, np.newaxis] ** 2
+    return total * np.sin(angle) ** 2, total * np.where(angle < _RIGHT, np.cos(angle) ** 2, 0.0)
+
+
+class _Pixel:
+    """A pixel's likelihood of signal and background, averaged over delays."""
+
+    def __init__(
+        self, counts: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
+    ) -> None:
+        self._counts, self._n_pulses = counts, n_pulses
+        self._acquisition, self._pulse = acquisition, pulse
+        n_bins = counts.size
+        self._unfired = np.ones(n_bins) if n_pulses is None else n_pulses - np.cumsum(counts)
+        self._bins = np.arange(n_bins)
+        wide = pulse.span_s[1] - pulse.span_s[0] > _MANY_BINS * acquisition.bin_width_s
+        self._take_steps(1 if wide else _STEPS)
+
+    def _take_steps(self, per_bin: int) -> None:
+        """Try so many delays in each of the bins that are left."""
+        n_bins = self._counts.size
+        delay = (np.arange(per_bin) + 0.5) / per_bin
+        self._echo, first = self._pulse.taps(n_bins, self._acquisition.bin_width_s, delay)
+        n_taps = self._echo.shape[1]
+        # What an echo at each bin meets, shape (tap, bin): nothing beyond the gate.
+        before, behind = max(-first, 0), max(first + n_taps - 1, 0)
+        at = before + first + self._bins
+        self._met_counts, met_unfired = (
+            sliding_window_view(np.pad(each, (before, behind)), n_taps)[at].T
+            for each in (self._counts, self._unfired)
+        )
+        self._reach = self._echo @ met_unfired
+        self._best = np.full(self._bins.size, -np.inf)
+
+    def __call__(self, signal: Floats, background: Floats) -> Floats:
+        """Log likelihood, of the shape of both."""
+        s, b = signal.ravel(), np.maximum(background.ravel(), _DARKEST) / self._counts.size
+        top, mean = np.empty((2, s.size))
+        self._best[:] = -np.inf
+        at_once = max(1, _AT_ONCE // (len(self._echo) * self._bins.size))
+        for first in range(0, s.size, at_once):
+            some = slice(first, first + at_once)
+            ratio = self._ratio(s[some, np.newaxis, np.newaxis], b[some, np.newaxis, np.newaxis])
+            np.maximum(self._best, ratio.max(axis=(0, 1)), out=self._best)
+            ratio = ratio.reshape(len(ratio), -1)
+            top[some] = ratio.max(axis=1)
+            ratio -= top[some, np.newaxis]
+            total = np.exp(ratio, out=ratio).sum(axis=1)
+            mean[some] = total / (self._counts.size * len(self._echo))
+        return np.asarray((self._flat(b) + top + np.log(mean)).reshape(signal.shape))
+
+    def _flat(self, b: Floats) -> Floats:
+        """Log likelihood of background alone, ``b`` photons in each bin."""
+        fires = b if self._n_pulses is None else -np.expm1(-b)
+        return np.asarray(self._counts.sum() * np.log(fires) - self._unfired.sum() * b)
+
+    def _ratio(self, signal: Floats, b: Floats) -> Floats:
+        """What an echo adds to it at each delay, shape (light, step, bin)."""
+        s = signal * self._echo
+        if self._n_pulses is None:
+            gain = np.log1p(s / b)
+        else:
+            gain = np.log1p(np.expm1(-s) * np.exp(-b) / np.expm1(-b))
+        return np.asarray(gain @ self._met_counts - signal * self._reach)
+
+    def forget_delays(self) -> bool:
+        """Leave out delays that no light of the last call makes likely; look closer at the rest.
+
+        Whether there were any.
+        """
+        likely = self._best >= self._best.max() - _NEGLIGIBLE
+        self._bins = self._bins[likely]
+        steps = _STEPS_CLOSE if self._bins.size <= _FEW_BINS else len(self._echo)
+        self._take_steps(steps)
+        return not bool(likely.all())

@@ -1,0 +1,1 @@
+"""Files: readers of captures, writers of results, scenes."""

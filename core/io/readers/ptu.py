@@ -1,0 +1,144 @@
+"""PicoQuant ``.ptu``: images of time-tagged photons (T3 mode), as TCSPC electronics record them.
+
+Each photon carries its time since the laser's last pulse in bins of the instrument, whose width the
+file tells; bins that begin within one period of the laser are kept. Frames are summed, and so are
+detectors unless ``variable`` picks one, such as ``"channel 0"``. Photons outside the scan's lines,
+as on the way back of a mirror, belong to no pixel; incomplete frames at the beginning and the end
+are left out. The gate opens with the pulse unless told otherwise. All photons of a pulse count.
+
+Electronics that measure from the photon to the next pulse (reverse start-stop) count backwards:
+tell the laser's period as ``stop_s``.
+
+`ptufile` decodes the records. Its compiled loops trust what the header claims, so that is compared
+with the file before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from io import BytesIO
+from math import ceil, inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.capture import Capture
+from core.checks import require
+from core.io.readers.dense import AXES, cube_capture
+from core.io.readers.guards import decoding, require_fits
+from core.io.readers.request import Request
+
+if TYPE_CHECKING:
+    from ptufile import PtuFile
+
+_BYTES_A_RECORD = 4
+_BYTES_A_COUNT = 4
+
+# What whole numbers the header must hold; `ptufile` raises 2 to the power of a marker.
+_ACCEPTED = {
+    "Measurement_Mode": (3, 3, "T3 records"),
+    "Measurement_SubMode": (3, 3, "an image"),
+    "ImgHdr_Dimensions": (3, 3, "an image"),
+    "ImgHdr_PixY": (1, 2**16, "pixels"),
+    "ImgHdr_PixX": (1, 2**16, "pixels"),
+    "ImgHdr_LineStart": (1, 8, "a marker"),
+    "ImgHdr_LineStop": (1, 8, "a marker"),
+    "ImgHdr_Frame": (1, 8, "a marker"),
+}
+
+
+def read(path: Path, request: Request) -> Capture:
+    """Read the histograms of an image."""
+    from ptufile import PtuFile  # noqa: PLC0415  (only who opens such a file waits for it)
+
+    require_fits("the file", path.stat().st_size)
+    data = path.read_bytes()
+    with decoding("the header"):
+        # From memory: a file's own reader asks for as many bytes as a tag claims.
+        file = PtuFile(BytesIO(data), trimdims="T")
+    with file:
+        bin_width_s, n_bins = _bins(file.tags)
+        shape = _require_image(file, len(data), n_bins)
+        with decoding("the records"):
+            channels, n_frames = file.active_channels, file.shape[0]
+            n_bins = min(n_bins, file.number_bins_max)
+        channel = _choose(channels, request.variable)
+        cube = _histograms(file, channel, (*shape, n_bins))
+    summed = [f"{n_frames} frames"] * (n_frames > 1)
+    summed += [f"{len(channels)} channels"] * (channel is None and len(channels) > 1)
+    origin = path.name if channel is None else f"{path.name}, channel {channel}"
+    origin += f", {' and '.join(summed)} summed" if summed else ""
+    known = replace(
+        request,
+        bin_width_s=request.bin_width_s or bin_width_s,
+        detection=request.detection or "all",
+    )
+    return cube_capture(cube, "the image", origin, known, " ".join(AXES))
+
+
+def _bins(tags: Mapping[str, Any]) -> tuple[float, int]:
+    """Width of a bin in seconds, and the bins that begin within one period of the laser."""
+    width_s = _positive(tags, "MeasDesc_Resolution")
+    period_s = _positive(tags, "MeasDesc_GlobalResolution")
+    n_bins = period_s / width_s
+    require(
+        "MeasDesc_GlobalResolution / MeasDesc_Resolution",
+        n_bins,
+        1 - 1e-6 <= n_bins < 2**31,
+        "a laser's period of at least one bin",
+    )
+    return width_s, ceil(n_bins - 1e-6)  # a quotient of floats may miss a whole number
+
+
+def _positive(tags: Mapping[str, Any], name: str) -> float:
+    value = tags.get(name)
+    fits = isinstance(value, int | float) and 0 < value < inf
+    require(name, value, fits, "a file whose tag is a positive number")
+    return float(value)  # type: ignore[arg-type]  # as was just required
+
+
+def _require_image(file: PtuFile, size: int, n_bins: int) -> tuple[int, int]:
+    """Rows and columns, once the header proved to be an image's, and no larger than its file."""
+    found = {"ImgHdr_Dimensions": 3, "ImgHdr_Frame": 3, **file.tags}  # these may be missing
+    for name, (lowest, highest, what) in _ACCEPTED.items():
+        value = found.get(name)
+        fits = isinstance(value, int) and lowest <= value <= highest
+        require(name, value, fits, f"{what}, from {lowest} to {highest:,}")
+    sine = found.get("ImgHdr_SinCorrection", 0)
+    require("ImgHdr_SinCorrection", sine, sine == 0, "0, a mirror that moves evenly")
+    rows, cols = found["ImgHdr_PixY"], found["ImgHdr_PixX"]
+    require_fits("the image", rows * cols * n_bins * _BYTES_A_COUNT)
+    claimed = found.get("TTResult_NumberOfRecords")
+    held = (size - file.record_offset) // _BYTES_A_RECORD
+    whole = isinstance(claimed, int) and 0 < claimed <= held
+    require("TTResult_NumberOfRecords", claimed, whole, f"a whole file: it holds {held:,} records")
+    return rows, cols
+
+
+def _choose(channels: tuple[int, ...], variable: str | None) -> int | None:
+    """The channel asked for, None for all."""
+    names = {f"channel {channel}": channel for channel in channels}
+    listed = ", ".join(names) or "none"
+    require("photons of the image", listed, bool(names), "a file with photons")
+    if variable is None:
+        return None
+    require("variable", variable, variable in names, f"None for all, or one of {listed}")
+    return names[variable]
+
+
+def _histograms(
+    file: PtuFile, channel: int | None, shape: tuple[int, int, int]
+) -> NDArray[np.unsignedinteger]:
+    """Counts (row, col, bin), summed over the frames."""
+    few = file.number_records < 2**16  # no bin can hold more
+    with decoding("the records"):
+        image: NDArray[np.unsignedinteger] = file.decode_image(
+            frame=-1,
+            channel=-1 if channel is None else channel,
+            dtime=shape[2],
+            dtype=np.uint16 if few else np.uint32,
+        )
+        return image.reshape(shape)

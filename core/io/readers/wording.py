@@ -1,0 +1,62 @@
+"""The sentence that tells where a capture came from and what was guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from core.acquisition import Acquisition, Pulse
+from core.capture import Detection
+from core.checks import printable
+from core.io.readers.request import Request
+
+UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15}
+"""Seconds of each unit of time, by its symbol."""
+
+
+def time_text(time_s: float) -> str:
+    """A time in the unit that suits it: 6.4e-11 is "64 ps"."""
+    for unit in ("s", "ms", "µs", "ns"):
+        scale = UNITS_S[unit]
+        if time_s >= scale * (1 - 1e-9):
+            return f"{time_s / scale:.6g} {unit}"
+    return f"{time_s * 1e12:.6g} ps"
+
+
+def guesses(
+    request: Request,
+    acquisition: Acquisition,
+    pulse: Pulse,
+    detection: Detection,
+    time_unit_s: float | None = None,
+) -> list[str]:
+    """What `request` left open, and the value taken for it.
+
+    Parameters
+    ----------
+    time_unit_s : float, optional
+        The unit taken for arrival times; None for a file that holds none.
+    """
+    found = []
+    if time_unit_s is not None and request.time_unit_s is None:
+        found.append(f"time unit {time_text(time_unit_s)}")
+    if request.bin_width_s is None:
+        found.append(f"bin width {time_text(acquisition.bin_width_s)}")
+    if request.gate_delay_s is None:
+        opens_ns = acquisition.gate_delay_s * 1e9
+        closes_ns = opens_ns + acquisition.n_bins * acquisition.bin_width_s * 1e9
+        found.append(f"gate {opens_ns:.6g}-{closes_ns:.6g} ns")
+    elif request.n_bins is None:
+        found.append(f"{acquisition.n_bins} bins")
+    if request.pulse is None:
+        shape = "Gaussian" if pulse.shape == "gaussian" else pulse.shape
+        found.append(f"pulse {shape} of {time_text(pulse.tau_s)}")
+    if request.detection is None:
+        found.append("first photons only" if detection == "first" else "all photons of a pulse")
+    return found
+
+
+def sentence(origin: str, guessed: Iterable[str], *remarks: str) -> str:
+    """Join the origin, the guesses and the remarks that are not empty; any encoding can hold it."""
+    listed = ", ".join(guessed)
+    parts = (origin, listed and f"guessed: {listed}", *remarks)
+    return printable("; ".join(filter(None, parts)))

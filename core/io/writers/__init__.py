@@ -1,0 +1,220 @@
+"""Captures and answers to files that other software opens: one family of formats a module.
+
+A new format is a module with a ``write(product, file)`` and a line in `WRITERS`. Captures are
+written in the layouts of `core.io.readers.npz` and `core.io.readers.labelled`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from numbers import Integral
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.capture import Capture, Seen
+from core.checks import require
+from core.estimators import RangeImage
+from core.io.readers.labelled import dataset
+from core.io.readers.npz import fields
+from core.io.writers import las, netcdf, npz, pcd, picture, ply, table, tiff
+from core.io.writers.product import Plane, Product
+from core.io.writers.table import write_columns
+from core.io.writers.whole import whole_file, whole_folder
+from core.tracking import TrackingParameters
+
+__all__ = [
+    "CAPTURE_SUFFIXES",
+    "CLOUD_SUFFIXES",
+    "FOLDER_WRITERS",
+    "WRITERS",
+    "Plane",
+    "Product",
+    "save_capture",
+    "save_image",
+    "save_pixel",
+    "write_columns",
+]
+
+WRITERS: dict[str, Callable[[Product, BinaryIO], None]] = {
+    ".npz": npz.write,
+    ".csv": table.write,
+    ".tif": tiff.write,
+    ".tiff": tiff.write,
+    ".nc": netcdf.write,
+    ".h5": netcdf.write,
+    ".ply": ply.write,
+    ".las": las.write,
+    ".laz": las.write_compressed,
+    ".pcd": pcd.write,
+    ".png": picture.write_png,
+    ".svg": picture.write_svg,
+}
+
+
+FOLDER_WRITERS: dict[str, Callable[[Product, Path], None]] = {".zarr": netcdf.write_zarr}
+"""Formats that are folders."""
+
+CLOUD_SUFFIXES = (".ply", ".las", ".laz", ".pcd")
+
+CAPTURE_SUFFIXES = (".npz", ".nc", ".h5", ".zarr")
+
+
+def save_capture(
+    capture: Capture, path: str | os.PathLike[str], *, overwrite: bool = False
+) -> None:
+    """Write a capture, whole or not at all; `core.io.readers.read_capture` gives it back.
+
+    Parameters
+    ----------
+    capture : Capture
+    path : path-like
+        A name ending in ``.npz``; ``.nc`` or ``.h5``, netCDF-4, which is HDF5; or ``.zarr``, which
+        is a folder.
+    overwrite : bool
+        Replace a file of that name.
+
+    Raises
+    ------
+    ValueError
+        If the name has another ending.
+    FileExistsError
+        If the file exists and is not to be replaced.
+    OSError
+        If the folder cannot be written; an older file is then left as it was.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    accepted = "one of " + ", ".join(CAPTURE_SUFFIXES)
+    require("suffix", path.suffix, suffix in CAPTURE_SUFFIXES, accepted)
+    if suffix == ".zarr":
+        with whole_folder(path, overwrite=overwrite) as folder:
+            netcdf.write_folder(dataset(capture), folder)
+        return
+    with whole_file(path, overwrite=overwrite) as file:
+        if suffix == ".npz":
+            np.savez_compressed(file, allow_pickle=False, **fields(capture))
+        else:
+            compressed = {"counts": {"compression": "gzip", "shuffle": True}}
+            file.write(dataset(capture).to_netcdf(engine="h5netcdf", encoding=compressed))
+
+
+def save_image(
+    capture: Seen,
+    image: RangeImage,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    pixel_angle_rad: float | None = None,
+    title: str = "",
+    rgb: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write a range image, whole or not at all; the suffix tells the format.
+
+    ==================  ===========================================================================
+    suffix              what is written
+    ==================  ===========================================================================
+    ``.npz``            NumPy: every array as it is, the acquisition, the source
+    ``.nc``, ``.h5``    netCDF-4, which is HDF5: the same, with units
+    ``.zarr``           Zarr, a folder: the same
+    ``.csv``            one line a pixel
+    ``.tif``, ``.tiff`` three pages of 32-bit floats: ``range_m``, ``confidence``, ``counts``
+    ``.ply``, ``.pcd``  point cloud; coordinates as 32-bit floats
+    ``.las``, ``.laz``  point cloud, LAS 1.4; coordinates in steps of a thousandth of a bin or less
+    ``.png``, ``.svg``  picture of the range image
+    ==================  ===========================================================================
+
+    Where there is no answer an image holds NaN, a line of text nothing, and a cloud no point. The
+    modules of `core.io.writers` describe the formats, `core.geometry` the coordinates.
+
+    Parameters
+    ----------
+    capture : Capture
+        What was ranged, or for one larger than memory what `core.out_of_core.tiles.as_image` tells
+        of it.
+    image : RangeImage
+        The answer, of the capture's shape.
+    path : path-like
+        A name ending in one of the suffixes of `WRITERS`.
+    overwrite : bool
+        Replace a file of that name.
+    pixel_angle_rad : float, optional
+        Angle between the lines of sight of neighbouring pixels, in radians; the capture's own where
+        None. Clouds need it.
+    title : str
+        Above a picture; its default says what is seen.
+    rgb : ndarray of uint8, shape (row, col, 3), optional
+        Colours of a cloud's points.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is unknown, image and capture, or image and colours, differ in shape, the
+        angle is not between 0 and π/2, or a cloud is asked for and nobody knows the angle.
+    FileExistsError
+        If the file exists and is not to be replaced.
+    OSError
+        If the folder cannot be written; an older file is then left as it was.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    known = [*WRITERS, *FOLDER_WRITERS]
+    require("suffix", path.suffix, suffix in known, "one of " + ", ".join(known))
+    if pixel_angle_rad is None:
+        pixel_angle_rad = capture.acquisition.pixel_angle_rad
+    product = Product(capture, image, pixel_angle_rad, title, rgb)
+    if suffix in FOLDER_WRITERS:
+        with whole_folder(path, overwrite=overwrite) as folder:
+            FOLDER_WRITERS[suffix](product, folder)
+        return
+    with whole_file(path, overwrite=overwrite) as file:
+        WRITERS[suffix](product, file)
+
+
+def save_pixel(
+    capture: Capture,
+    row: int,
+    col: int,
+    settings: TrackingParameters | None,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write what the tracking differentiators make of one pixel, one line a bin, as CSV.
+
+    The columns are ``bin``, ``time_s`` and ``range_m`` (where the bin begins), ``counts`` (whole
+    numbers), and the stages of `core.Signals` in counts: ``raw``, ``small``, ``large``,
+    ``residual``, ``enhanced``.
+
+    Parameters
+    ----------
+    capture : Capture
+    row, col : int
+        The pixel.
+    settings : TrackingParameters or None
+        The recommended preset where None.
+    path : path-like
+        A name ending in ``.csv``.
+    overwrite : bool
+        Replace a file of that name.
+
+    Raises
+    ------
+    ValueError
+        If the name has another ending, the pixel lies outside the image, or the weight "survival"
+        lacks the capture's pulses.
+    FileExistsError
+        If the file exists and is not to be replaced.
+    OSError
+        If the folder cannot be written; an older file is then left as it was.
+    """
+    path = Path(path)
+    require("path", str(path), path.suffix.lower() == ".csv", "a name ending in .csv")
+    for name, index, size in zip(("row", "col"), (row, col), capture.shape, strict=True):
+        inside = isinstance(index, Integral) and 0 <= index < size
+        require(name, index, inside, f"an integer from 0 to {size - 1}, within the image")
+    with whole_file(path, overwrite=overwrite) as file:
+        table.write_pixel(capture, row, col, settings or TrackingParameters(), file)

@@ -1,0 +1,75 @@
+"""LAS 1.4 point clouds, and LAZ, their compressed twin.
+
+Coordinates are whole multiples of a step: the power of ten that is a thousandth of a bin or less,
+down to a hundredth of that; only a cloud too wide for 32 bits gets coarser ones. ``intensity`` is
+the counts, at most 65535, and colours fill 16 bits as the standard asks. Extra bytes hold all else,
+their units in their descriptions.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import BinaryIO
+
+import numpy as np
+
+from core.acquisition import Floats
+from core.io.writers.product import COLORS, Product
+
+DESCRIPTIONS = {
+    "range_m": "range of the surface, m",
+    "counts": "detections of the pixel",
+    "confidence": "probability within 3 bins, 0-1",
+    "row": "row of the pixel, 0 on top",
+    "col": "column of the pixel",
+}
+"""Of the extra bytes, at most 31 characters each."""
+
+
+def write(product: Product, file: BinaryIO) -> None:
+    """Write LAS."""
+    _write(product, file, compressed=False)
+
+
+def write_compressed(product: Product, file: BinaryIO) -> None:
+    """Write LAZ."""
+    _write(product, file, compressed=True)
+
+
+def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
+    import laspy  # noqa: PLC0415 - only who writes LAS waits for it
+
+    points = product.points()
+    columns = product.point_columns(points)
+    colors = {name: columns.pop(name) for name in COLORS if name in columns}
+    header = laspy.LasHeader(version="1.4", point_format=7 if colors else 6)
+    header.generating_software = "firstphoton"
+    header.global_encoding.wkt = True  # which the standard demands of this point format
+    header.offsets, header.scales = _grid(points.xyz_m, product.capture.acquisition.bin_length_m)
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(name, values.dtype, DESCRIPTIONS[name])
+            for name, values in columns.items()
+        ]
+    )
+    las = laspy.LasData(header)
+    las.xyz = points.xyz_m
+    las.intensity = np.minimum(columns["counts"], 2**16 - 1).astype(np.uint16)
+    las.return_number[:] = las.number_of_returns[:] = 1
+    for name, values in columns.items():
+        las[name] = values
+    for name, values in colors.items():
+        las[name] = values.astype(np.uint16) * 257
+    las.write(file, do_compress=compressed)
+
+
+def _grid(xyz_m: Floats, bin_length_m: float) -> tuple[Floats, Floats]:
+    """Offsets and scales of x, y and z in metres."""
+    if not len(xyz_m):
+        return np.zeros(3), np.full(3, 10.0 ** math.floor(math.log10(bin_length_m / 1000)))
+    low, high = xyz_m.min(axis=0), xyz_m.max(axis=0)
+    offsets = np.round((low + high) / 2)
+    reach = float(np.abs(xyz_m - offsets).max())
+    fine = math.floor(math.log10(bin_length_m / 1000))
+    coarse = math.ceil(math.log10(max(reach, 1e-9) / (2**31 - 1)))
+    return offsets, np.full(3, 10.0 ** max(fine, coarse))

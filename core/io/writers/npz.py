@@ -1,0 +1,24 @@
+"""NumPy ``.npz``: the arrays of a range image as they are, without pickles.
+
+Beside `RangeImage`'s fields and ``counts`` it holds scalars ``bin_width_s``, ``gate_delay_s``,
+``n_pulses`` (0 where not known), ``pixel_angle_rad`` (absent where not known), and the texts
+``format``, ``detection`` (`core.capture.Detection`) and ``source``.
+"""
+
+from __future__ import annotations
+
+from typing import BinaryIO
+
+import numpy as np
+
+from core.io.writers.product import Product
+
+FORMAT = "firstphoton-range-image-1"
+
+
+def write(product: Product, file: BinaryIO) -> None:
+    """Write an archive of arrays."""
+    arrays = {name: plane.values for name, plane in product.planes.items()}
+    facts = {name: np.asarray(fact) for name, fact in product.facts.items()}
+    known = {"format": np.asarray(FORMAT), **facts}
+    np.savez_compressed(file, allow_pickle=False, **known, **arrays)

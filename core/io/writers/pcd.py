@@ -1,0 +1,24 @@
+"""PCD 0.7 point clouds, binary, as the Point Cloud Library reads them.
+
+Coordinates are 32-bit floats, exact to 6e-8 of themselves; ``range_m`` is a double.
+"""
+
+from __future__ import annotations
+
+from typing import BinaryIO
+
+import numpy as np
+
+from core.io.writers.product import Product
+
+
+def write(product: Product, file: BinaryIO) -> None:
+    """Write x, y, z, range_m, counts, confidence, row and col of each point, and its colour."""
+    from pypcd4 import Encoding, PointCloud  # noqa: PLC0415 - only who writes PCD waits for it
+
+    points = product.points()
+    xyz_m = dict(zip("xyz", points.xyz_m.T.astype(np.float32), strict=True))
+    columns = xyz_m | product.point_columns(points)
+    types = [values.dtype for values in columns.values()]
+    cloud = PointCloud.from_points(list(columns.values()), list(columns), types)
+    cloud.save(file, encoding=Encoding.BINARY)

@@ -1,0 +1,55 @@
+"""TIFF: pages of 32-bit floats, ``range_m``, ``confidence`` and ``counts``.
+
+What else the product shows comes first.
+
+Ranges are exact to 6e-8 of themselves, counts up to 2**24. Each page tells its name (the tag
+PageName), its meaning and unit (ImageDescription, and for GIS the tags of GDAL), and the
+acquisition. Image programs open the pages as a stack; a GIS opens the first, and the others as
+subdatasets. Where there is no answer the range is NaN; a page with NaN declares it "no data".
+"""
+
+from __future__ import annotations
+
+from typing import BinaryIO
+from xml.etree import ElementTree
+
+import numpy as np
+
+from core.io.writers.product import Plane, Product
+
+PAGES = ("range_m", "confidence", "counts")
+
+_PAGE_NAME, _GDAL_METADATA, _GDAL_NODATA = 285, 42112, 42113  # numbers of tags
+
+
+def write(product: Product, file: BinaryIO) -> None:
+    """Write the pages."""
+    from tifffile import TiffWriter  # noqa: PLC0415 - only who writes TIFF waits for it
+
+    planes = product.planes
+    with TiffWriter(file) as pages:
+        for name in dict.fromkeys((*product.shown, *PAGES)):
+            plane = planes[name]
+            tags = {_PAGE_NAME: name, _GDAL_METADATA: _gdal_metadata(name, plane, product)}
+            if np.isnan(plane.values).any() or name == "range_m":
+                tags[_GDAL_NODATA] = "nan"
+            pages.write(
+                plane.values.astype(np.float32),
+                photometric="minisblack",
+                description=f"{name} [{plane.unit}]: {plane.meaning}",
+                metadata=None,
+                software="firstphoton",
+                extratags=[(tag, "s", 0, text, True) for tag, text in tags.items()],
+            )
+
+
+def _gdal_metadata(name: str, plane: Plane, product: Product) -> str:
+    """What GDAL, and with it most GIS, reads of names, units and anything else; ASCII."""
+    root = ElementTree.Element("GDALMetadata")
+    for role, text in (("description", name), ("unittype", plane.unit)):
+        attributes = {"name": role.upper(), "sample": "0", "role": role}
+        ElementTree.SubElement(root, "Item", attributes).text = text
+    for fact, value in product.facts.items():
+        ElementTree.SubElement(root, "Item", {"name": fact}).text = str(value)
+    xml: bytes = ElementTree.tostring(root)  # ASCII, all else as character references
+    return xml.decode("ascii")

@@ -1,0 +1,126 @@
+"""A cube laid out for kernels that treat many pixels at once."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from core.kernels.parallel import COMPILED
+
+LANES = 64
+"""Pixels treated together: four vectors of sixteen float32, in flight side by side."""
+
+_PIXELS_AT_ONCE = 8
+_BINS_AT_ONCE = 4  # between reading and writing their sums, which costs more than to add
+
+
+class Blocks(NamedTuple):
+    """Counts with neighbouring pixels side by side; the last block is filled up with zeros."""
+
+    counts: NDArray[np.unsignedinteger]
+    """Shape (block, bin, LANES)."""
+    largest: NDArray[np.unsignedinteger]
+    """Largest count of each pixel, shape (block, LANES)."""
+    sigma: NDArray[np.float64]
+    """Standard deviation of each pixel's histogram over the gate, shape (block, LANES)."""
+    n_pixels: int
+    """Pixels in use."""
+
+
+def to_blocks(cube: NDArray[np.unsignedinteger]) -> Blocks:
+    """Lay out a cube (..., bin) in blocks, pixels in their order.
+
+    Counts that fit are uint16 there, whatever they come as: kernels are compiled for each type.
+    """
+    counts = lane_counts(cube, LANES)
+    largest, sigma = lane_spread(counts, cube.shape[-1])
+    return Blocks(counts, largest, sigma, math.prod(cube.shape[:-1]))
+
+
+def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.unsignedinteger]:
+    """Counts (..., bin) as (block, bin, lane), as `to_blocks` lays them out.
+
+    Parameters
+    ----------
+    cube : ndarray, shape (..., bin)
+    lanes : int
+        Pixels in a block.
+    """
+    if cube.dtype == np.uint8 or (cube.dtype == np.uint32 and cube.max(initial=0) < 2**16):
+        cube = cube.astype(np.uint16)
+    n_bins = cube.shape[-1]
+    pixels = np.ascontiguousarray(cube).reshape(-1, n_bins)
+    pixels.setflags(write=False)  # one kernel for both: whether writable is part of a type
+    filled, left = divmod(pixels.shape[0], lanes)
+    counts = np.empty((filled + (left > 0), n_bins, lanes), cube.dtype)
+    if lanes == LANES:
+        _lay_out(pixels, counts[:filled])
+    else:
+        counts[:filled] = pixels[: filled * lanes].reshape(-1, lanes, n_bins).transpose(0, 2, 1)
+    counts[filled:] = 0
+    counts[filled:, :, :left] = pixels[filled * lanes :].T
+    return counts
+
+
+@njit(**COMPILED)
+def _lay_out(pixels, counts):  # type: ignore[no-untyped-def]
+    """Pixels (pixel, bin) side by side in full blocks."""
+    for b in range(counts.shape[0]):
+        # A few pixels at a time: their rows lie far apart, and the cache holds few such lines.
+        for first in range(0, LANES, _PIXELS_AT_ONCE):
+            for k in range(counts.shape[1]):
+                for i in range(first, first + _PIXELS_AT_ONCE):
+                    counts[b, k, i] = pixels[b * LANES + i, k]
+
+
+@njit(**COMPILED)
+def lane_spread(counts, n_bins):  # type: ignore[no-untyped-def]
+    """Largest count and standard deviation over the first `n_bins` of (block, bin, LANES) counts.
+
+    Both of shape (block, LANES); 0 over no bins.
+    """
+    largest = np.zeros((counts.shape[0], LANES), counts.dtype)
+    sigma = np.zeros((counts.shape[0], LANES))
+    total, squares = np.empty(LANES, np.int64), np.empty(LANES)
+    grouped = n_bins - n_bins % _BINS_AT_ONCE
+    for b in range(counts.shape[0] if n_bins > 0 else 0):
+        block, top = counts[b], largest[b]
+        total[:] = 0
+        squares[:] = 0.0
+        for k in range(0, grouped, _BINS_AT_ONCE):
+            for i in range(LANES):
+                sums = total[i], squares[i], top[i]
+                for j in range(_BINS_AT_ONCE):
+                    sums = _with(block[k + j, i], block[0, i], sums)
+                total[i], squares[i], top[i] = sums
+        for k in range(grouped, n_bins):
+            for i in range(LANES):
+                sums = total[i], squares[i], top[i]
+                total[i], squares[i], top[i] = _with(block[k, i], block[0, i], sums)
+        for i in range(LANES):
+            mean = total[i] / n_bins
+            sigma[b, i] = math.sqrt(max(squares[i] / n_bins - mean * mean, 0.0))
+    return largest, sigma
+
+
+@njit(**COMPILED, inline="always")
+def _with(count, first, sums):  # type: ignore[no-untyped-def]
+    """Sum, sum of squares and maximum, a count added.
+
+    Moments about the first count: a constant histogram has a σ of exactly 0.
+    """
+    total, squares, top = sums
+    more = np.int64(count) - np.int64(first)
+    return total + more, squares + float(more) * float(more), count if count > top else top
+
+
+@njit(**COMPILED)
+def lane_rows(n_rows, lanes=LANES):  # type: ignore[no-untyped-def]
+    """Scratch of `n_rows` rows of `lanes` float32, on a cache line's boundary."""
+    memory = np.empty(n_rows * lanes + 16, np.float32)
+    start = (-(memory.ctypes.data // 4)) % 16
+    return memory[start : start + n_rows * lanes]

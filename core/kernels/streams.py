@@ -1,0 +1,32 @@
+"""Random numbers for kernels: one stream for each pixel, each number found by its place in it.
+
+Which thread draws a number, and whether those before it were drawn, makes no difference.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from core.kernels.parallel import COMPILED
+
+
+@njit(**COMPILED, inline="always")
+def _splitmix64(state):  # type: ignore[no-untyped-def]
+    """Output of the SplitMix64 generator (Steele, Lea & Flood 2014) at a state."""
+    z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(**COMPILED, inline="always")
+def pixel_key(seed, pixel):  # type: ignore[no-untyped-def]
+    """Where the stream of random numbers of a pixel begins."""
+    return _splitmix64(_splitmix64(seed + np.uint64(1)) + np.uint64(pixel))
+
+
+@njit(**COMPILED, inline="always")
+def uniform_at(key, draw):  # type: ignore[no-untyped-def]
+    """Number `draw` of a stream, uniform in [0, 1)."""
+    state = key + np.uint64(draw) * np.uint64(0x9E3779B97F4A7C15)
+    return np.float64(_splitmix64(state) >> np.uint64(11)) * 2.0**-53

@@ -1,0 +1,1 @@
+"""Captures larger than memory: tiles and windows."""

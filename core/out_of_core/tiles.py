@@ -1,0 +1,279 @@
+"""Captures larger than memory: ranged part by part, on this machine's threads or on a cluster.
+
+What pixels have in common, the light (`core.inference.posterior.Lighting`) and an estimator's
+calibration, is learned from a sample of the image before. A part is then ranged like any capture,
+so that the answer does not depend on how the image is cut, nor on who ranges which part.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Acquisition, Floats
+from core.capture import Capture, Detection
+from core.checks import require
+from core.estimators import ESTIMATORS, RangeImage, settings_of
+from core.estimators.base import Calibration
+from core.inference.posterior import Lighting, lighting_of
+from core.io.readers.dense import AXES, whole_counts
+from core.io.readers.labelled import Description, describe
+from core.io.readers.request import Request
+from core.io.readers.sample import sample_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+IMAGES = {
+    "range_m": ("range of the surface", "m"),
+    "bin": ("delay of the echo", "bins"),
+    "score": ("score of the answer", "1"),
+    "confidence": ("probability that the answer is right within 3 bins", "1"),
+    "counts": ("detections", "1"),
+}
+"""What is known of each pixel, its name in words and its unit."""
+
+log = logging.getLogger(__name__)
+
+_PATIENCE_S = 10.0  # for a cluster to answer
+
+SILENT_S = 30.0
+"""Time after which a worker is reported that the scheduler has not heard from. Workers report every
+few seconds at most."""
+
+
+def estimate_large(
+    counts: xr.DataArray,
+    method: str,
+    settings: Any = None,
+    *,
+    false_alarm: float | None = None,
+    **parameters: Any,
+) -> xr.Dataset:
+    """Range every pixel of a labelled array, part by part.
+
+    Parameters
+    ----------
+    counts : DataArray, shape (row, col, bin)
+        As `core.open_capture` gives them, in Dask's chunks or in memory; chunks along ``bin`` are
+        joined.
+    method, settings, false_alarm, **parameters
+        As `core.estimate` takes them.
+
+    Returns
+    -------
+    Dataset
+        `IMAGES`, each of shape (row, col), NaN where there is no answer; its attributes tell of the
+        acquisition, of the detection, of the source and, as ``remark``, what the method leaves out.
+        Nothing is ranged before ``.compute()`` or a ``.to_…()``; a sample of the image is read at
+        once. Dask ranges on threads, or on the cluster of the `dask.distributed.Client` that is
+        open.
+
+    Raises
+    ------
+    ValueError
+        As `core.estimate`; if the method needs the whole image for each of its pixels; or if the
+        array is not described as `core.io.readers.labelled` wants it.
+    """
+    import dask.array as da  # noqa: PLC0415 - half a second that others should not pay
+
+    settings = settings_of(method, settings, **parameters)
+    estimator = ESTIMATORS[method]
+    apart = [name for name, each in ESTIMATORS.items() if not each.whole_image]
+    told = " or ".join(map(repr, apart)) + ", which range a pixel without the whole image"
+    require("method", method, not estimator.whole_image, told)
+    require("axes", counts.dims, counts.dims == AXES, "row, col and bin")
+    description = describe(counts, Request())
+    array = da.asarray(counts.data).rechunk({2: -1})
+    lighting, calibration, remark = learned(array, description, method, settings, false_alarm)
+    margin = estimator.reach(settings) // 2
+    around = {0: margin, 1: margin, 2: 0}
+    # Chunks of an edge may be narrower than the margin: Dask joins them.
+    parts = da.overlap.overlap(array, depth=around, boundary="none")
+    ranged = parts.map_blocks(
+        range_part,
+        description,
+        method,
+        settings,
+        lighting,
+        calibration,
+        dtype=float,
+        chunks=(*parts.chunks[:2], (len(IMAGES),)),
+        meta=np.empty((0, 0, 0)),
+    )
+    images = da.overlap.trim_internal(ranged, around, boundary="none")
+    return _dataset(images, description, remark)
+
+
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """What is known of a capture of which not all counts are in memory."""
+
+    counts: NDArray[np.int64]
+    """Detections of each pixel, shape (row, col)."""
+    acquisition: Acquisition
+    detection: Detection
+    source: str
+
+    @property
+    def armed_pulses(self) -> int | None:
+        """As `Capture.armed_pulses`."""
+        return self.acquisition.n_pulses if self.detection == "first" else None
+
+
+def computed(parts: xr.Dataset, scheduler: str | None = None) -> xr.Dataset:
+    """Range all parts, with a bar on standard error.
+
+    Parameters
+    ----------
+    parts : Dataset
+        Of `estimate_large`.
+    scheduler : str, optional
+        Address of a Dask cluster, such as ``tcp://host:8786``; this machine's threads where None.
+
+    Raises
+    ------
+    ValueError
+        If that is no address.
+    OSError
+        If there is no cluster at the address, or it has no workers.
+    """
+    from dask.diagnostics import ProgressBar  # noqa: PLC0415 - Dask is slow to come
+
+    with contextlib.redirect_stdout(sys.stderr):
+        if scheduler is None:
+            with ProgressBar():
+                return parts.compute()
+        from dask.distributed import progress  # noqa: PLC0415
+
+        with _client(scheduler) as client, _reporting_silent_workers(client):
+            client.wait_for_workers(1, timeout=_PATIENCE_S)
+            begun = client.persist(parts)
+            progress(begun, notebook=False)
+            done: xr.Dataset = begun.compute()
+            return done
+
+
+def _client(scheduler: str) -> Any:
+    from dask.distributed import Client  # noqa: PLC0415
+
+    try:
+        return Client(scheduler, timeout=_PATIENCE_S)
+    except ValueError as error:
+        accepted = "the address of a cluster, such as tcp://host:8786"
+        raise ValueError(f"scheduler = {scheduler!r} is not accepted: give {accepted}.") from error
+
+
+@contextlib.contextmanager
+def _reporting_silent_workers(client: Any) -> Iterator[None]:
+    """Log each worker that stops reporting, such as a suspended process or a lost machine.
+
+    Dask waits for such a worker until ``distributed.scheduler.worker-ttl`` has passed, 5 minutes by
+    default and looked at as seldom, and says nothing until then.
+    """
+    over = threading.Event()
+    heard: dict[str, tuple[float, float]] = {}  # the scheduler's time, and ours when it was new
+    silent: set[str] = set()
+
+    def look() -> None:
+        for address, worker in client.scheduler_info()["workers"].items():
+            last_seen, now = worker["last_seen"], monotonic()
+            if heard.get(address, (None,))[0] != last_seen:
+                heard[address] = last_seen, now
+                silent.discard(address)
+            elif now - heard[address][1] > SILENT_S and address not in silent:
+                silent.add(address)
+                log.warning(
+                    "The worker %s has not reported for %.0f s, and its parts wait for it. Resume "
+                    "it, or end its process: others then take over. The scheduler gives it up by "
+                    "itself after its worker-ttl, 5 to 10 minutes unless it was set.",
+                    address,
+                    SILENT_S,
+                )
+
+    def watch() -> None:
+        while not over.wait(SILENT_S / 4):
+            with contextlib.suppress(OSError, RuntimeError):  # the client itself complains of them
+                look()
+
+    thread = threading.Thread(target=watch, name="firstphoton-workers", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:
+    """Convert a computed dataset of `estimate_large` to what `core.save_image` takes."""
+    known = {name: ranged[name].to_numpy() for name in IMAGES}
+    counts = known.pop("counts").astype(np.int64)
+    about = ranged.attrs
+    acquisition = Acquisition(
+        about["n_bins"],
+        about["bin_width_s"],
+        about["gate_delay_s"],
+        about.get("n_pulses"),
+        about.get("pixel_angle_rad"),
+    )
+    valid = np.isfinite(known["range_m"])
+    return (
+        Overview(counts, acquisition, about["detection"], about["source"]),
+        RangeImage(**known, valid=valid),
+    )
+
+
+def learned(
+    array: Any, description: Description, method: str, settings: Any, false_alarm: float | None
+) -> tuple[Lighting, Calibration, str]:
+    """What a sample of a Dask array (row, col, bin) tells of all its pixels; `Estimator.remark`."""
+    sample, estimator = captured(sample_of(array), description), ESTIMATORS[method]
+    calibration = estimator.calibration(sample, settings, false_alarm)
+    return lighting_of(sample), calibration, estimator.remark(sample)
+
+
+def range_part(
+    cube: NDArray[Any],
+    description: Description,
+    method: str,
+    settings: Any,
+    lighting: Lighting,
+    calibration: Calibration,
+) -> Floats:
+    """Range a part of an image; shape (row, col, len(IMAGES))."""
+    part = captured(cube, description)
+    lighting_of.tell(part, lighting)
+    image = ESTIMATORS[method].ranged(part, settings, calibration)
+    known = {name: getattr(image, name) for name in IMAGES if hasattr(image, name)}
+    return np.stack([known.get(name, part.counts) for name in IMAGES], axis=2).astype(float)
+
+
+def captured(cube: NDArray[Any], description: Description) -> Capture:
+    """Counts that are in memory as a capture, of which the description holds."""
+    acquisition, pulse, detection, source = description
+    counts = whole_counts(cube, "counts")
+    return Capture(counts, acquisition, pulse, source=source, detection=detection)
+
+
+def _dataset(images: Any, description: Description, remark: str) -> xr.Dataset:
+    import xarray as xr  # noqa: PLC0415
+
+    acquisition, _, detection, source = description
+    about = {**vars(acquisition), "detection": detection, "source": source, "remark": remark}
+    return xr.Dataset(
+        {
+            name: (AXES[:2], images[..., number], {"long_name": words, "units": unit})
+            for number, (name, (words, unit)) in enumerate(IMAGES.items())
+        },
+        attrs={name: value for name, value in about.items() if value is not None},
+    )

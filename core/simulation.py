@@ -1,0 +1,360 @@
+"""From a scene to a capture: exact draws of what a first-photon detector records.
+
+The first photon of a pulse arrives after time ``t`` with probability ``exp(-Λ(t))``, ``Λ`` being
+the expected photons before ``t``. So ``1 - exp(-Λ)`` at the bin edges is the distribution of the
+trigger bin, and one uniform number a pulse, looked up in it, is an exact draw: over the pulses of a
+pixel exactly the multinomial of Eq. 1, "no trigger" included. The parts that a scene may have
+(`core.effects`) change Λ or that distribution, and nothing else.
+
+Each pixel has its own stream of random numbers, keyed by (seed, pixel): the cube is the same for
+any number of threads, and neighbouring settings share their randomness, so that a slider moves the
+scene and not the dice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from numbers import Integral
+from typing import TypeVar
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from core.acquisition import Acquisition, Floats, Flux, Pulse
+from core.capture import Capture
+from core.checks import require
+from core.kernels.parallel import COMPILED, KERNEL_LOCK, PARALLEL
+from core.kernels.streams import pixel_key, uniform_at
+from core.scene import Scene, parts_of
+
+_Light = TypeVar("_Light", float, Floats)
+
+# Beyond this many pulses numpy's multinomial is faster: its time does not grow with them.
+PULSES_DRAWN_ONE_BY_ONE = 8192
+
+
+def simulate(
+    scene: Scene,
+    acquisition: Acquisition,
+    flux: Flux,
+    pulse: Pulse = Pulse(),
+    seed: int = 0,
+) -> Capture:
+    """Draw one first-photon histogram for each pixel of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        Ranges and, maybe, parts; a pixel without a target sees no echo.
+    acquisition : Acquisition
+        Gate, bins and pulses.
+    flux : Flux
+        Signal photons per pulse at reflectivity 1, and background.
+    pulse : Pulse
+        Shape of the echo; its time zero lies at the surface.
+    seed : int
+        The same seed gives the same capture, for any number of threads.
+
+    Returns
+    -------
+    Capture
+        With its truth: range and, where the light is one echo over uniform background and nothing
+        else, signal and background.
+
+    Raises
+    ------
+    ValueError
+        If the number of pulses is not known or 2**32 or more, or the seed is not an integer from 0
+        to 2**63 - 1.
+    """
+    n_pulses = pulses_sent(acquisition)
+    require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
+    _require_seed(seed)
+    shape = np.shape(scene.range_m)
+    triggered = triggered_by_each_edge(scene, acquisition, flux, pulse)
+    cube = np.zeros(
+        (len(triggered), acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32
+    )
+    if n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
+        with KERNEL_LOCK:
+            _draw_pulses(triggered, n_pulses, np.uint64(seed), cube)
+    else:
+        _draw_multinomial(triggered, n_pulses, seed, cube)
+    is_plain = set(parts_of(scene)) <= {"reflectivity"}
+    return Capture(
+        cube.reshape(*shape, acquisition.n_bins),
+        acquisition,
+        pulse,
+        truth_range_m=np.array(scene.range_m, float),
+        signal=_signal(scene, flux) if is_plain else None,
+        background=flux.background if is_plain else None,
+        source=f"simulated, seed {seed}",
+    )
+
+
+def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
+    """What a first-photon detector would have recorded of the photons that a capture holds.
+
+    Photons fall on the pulses at random, each on any of them alike, and a pulse fires by the first
+    that falls on it. Taken in the order of their arrival, a photon fires with probability
+    ``armed / n_pulses``, armed being the pulses that have not fired: which ones these are does not
+    matter. For light whose photons are independent that is exact.
+
+    Parameters
+    ----------
+    capture : Capture
+        One that holds all photons.
+    n_pulses : int
+        Pulses on which its photons fall, at least 1.
+    seed : int
+        The same seed gives the same capture, for any number of threads.
+
+    Returns
+    -------
+    Capture
+        First photons, `n_pulses` sent for each pixel; the light is known only where that of a pulse
+        of the capture's own was.
+
+    Raises
+    ------
+    ValueError
+        If the capture holds first photons already, or an argument is out of its range.
+    """
+    kind = capture.detection
+    require("detection", kind, kind == "all", "a capture of all photons, which still has others")
+    whole = isinstance(n_pulses, Integral)
+    require("n_pulses", n_pulses, whole and 1 <= n_pulses < 2**32, "an integer, 1 to 2**32 - 1")
+    _require_seed(seed)
+    before = capture.acquisition.n_pulses
+    share = None if before is None else before / n_pulses  # of the old pulses on each new one
+    cube = np.zeros_like(capture.cube)
+    with KERNEL_LOCK:
+        _fire_once(capture.cube, n_pulses, np.uint64(seed), cube)
+    source = f"{capture.source}; reduced to the first photons of {n_pulses} pulses, seed {seed}"
+    return replace(
+        capture,
+        cube=cube,
+        acquisition=replace(capture.acquisition, n_pulses=n_pulses),
+        signal=_times(capture.signal, share),
+        background=_times(capture.background, share),
+        detection="first",
+        source=source,
+    )
+
+
+def _times(light: _Light | None, share: float | None) -> _Light | None:
+    return None if light is None or share is None else light * share
+
+
+def _require_seed(seed: int) -> None:
+    whole = isinstance(seed, Integral)
+    require("seed", seed, whole and 0 <= seed < 2**63, "an integer from 0 to 2**63 - 1")
+
+
+def pulses_sent(acquisition: Acquisition) -> int:
+    """Pulses of an acquisition to be simulated.
+
+    Raises
+    ------
+    ValueError
+        If that number is not known.
+    """
+    if acquisition.n_pulses is None:
+        raise ValueError("n_pulses = None is not accepted: give the number of pulses to simulate.")
+    return acquisition.n_pulses
+
+
+def _signal(scene: Scene, flux: Flux) -> Floats:
+    """Signal photons per pulse of each pixel, shape (row, col); 0 where there is no target."""
+    reflectivity = 1.0 if scene.reflectivity is None else scene.reflectivity
+    return np.where(np.isfinite(scene.range_m), flux.signal * reflectivity, 0.0)
+
+
+def triggered_by_each_edge(
+    scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse
+) -> Floats:
+    """Probability that a pulse is recorded to have fired before each bin edge.
+
+    ``1 - exp(-Λ)`` of the photons ``Λ`` expected before the edge, but for what motion and jitter
+    make of it.
+
+    Returns
+    -------
+    ndarray, shape (pixel, n_bins + 1)
+        From 0 at the gate's opening to ``1 - P_none``; differences are trigger probabilities.
+
+    Raises
+    ------
+    ValueError
+        If the scene moves and the number of pulses is not known.
+    """
+    n_edges = acquisition.n_bins + 1
+    share_of_gate = np.linspace(0.0, 1.0, n_edges)
+    steady = flux.background * share_of_gate
+    if scene.backscatter is not None:
+        steady += scene.backscatter.photons_before(flux.signal, pulse, acquisition)
+    shifts_bins = np.zeros(1)
+    if scene.motion is not None:
+        shifts_bins = scene.motion.shifts_bins(pulse, acquisition, pulses_sent(acquisition))
+    echoes = [
+        (np.ravel(acquisition.range_m_to_bin(range_m)), np.ravel(signal))
+        for range_m, signal in _echoes(scene, flux)
+    ]
+    faulty = scene.faulty_pixels
+    if faulty is not None:
+        steady = steady + faulty.photons(acquisition).reshape(-1, 1) * share_of_gate
+    triggered = np.empty((np.size(scene.range_m), n_edges))
+    before = triggered if shifts_bins.size == 1 else np.empty_like(triggered)
+    for group, shift_bins in enumerate(shifts_bins):
+        before[:] = steady
+        for onset_bin, signal in echoes:
+            add_echo(onset_bin + shift_bins, signal, pulse, acquisition.bin_width_s, before)
+        np.expm1(np.negative(before, out=before), out=before)
+        if group == 0:
+            np.negative(before, out=triggered)
+        else:
+            triggered -= before
+    if shifts_bins.size > 1:
+        triggered /= shifts_bins.size
+    if faulty is not None:
+        triggered[faulty.dead.reshape(-1)] = 0.0
+    if scene.jitter is not None:
+        triggered = scene.jitter.recorded(triggered, acquisition.bin_width_s)
+    return triggered
+
+
+def _echoes(scene: Scene, flux: Flux) -> Iterator[tuple[Floats, Floats]]:
+    """Range and signal photons per pulse of each surface that pixels see, shape (row, col)."""
+    signal, second, fog = _signal(scene, flux), scene.second_surface, scene.backscatter
+    surfaces = [(scene.range_m, signal)]
+    if second is not None:
+        share = second.seen_share
+        surfaces = [(scene.range_m, (1 - share) * signal), (second.range_m, share * signal)]
+    for range_m, photons in surfaces:
+        dimmed = photons if fog is None else photons * np.nan_to_num(fog.transmission(range_m))
+        yield range_m, dimmed
+
+
+def add_echo(
+    onset_bin: Floats, signal: Floats, pulse: Pulse, bin_width_s: float, before: Floats
+) -> None:
+    """Add the photons of an echo before each edge, within the gate, to those of other light.
+
+    Parameters
+    ----------
+    onset_bin : ndarray, shape (pixel,)
+        Delay in fractional bins; one that is not finite means no echo.
+    signal : ndarray, shape (pixel,)
+        Photons per pulse.
+    pulse : Pulse
+    bin_width_s : float
+    before : ndarray, shape (pixel, n_bins + 1)
+        Added to in place.
+    """
+    samples = np.cumsum((0.0, *pulse.samples))
+    share = samples / (samples[-1] or 1.0)
+    bin_taus = bin_width_s / pulse.tau_s
+    _add_echo(onset_bin, signal, bin_taus, _SHAPES[pulse.shape], share, before)
+
+
+def _draw_multinomial(
+    triggered: Floats, n_pulses: int, seed: int, cube: NDArray[np.unsignedinteger]
+) -> None:
+    probability = np.diff(triggered, axis=-1, append=1.0)
+    cube[:] = np.random.default_rng(seed).multinomial(n_pulses, probability)[:, :-1]
+
+
+_GAMMA, _GAUSSIAN, _MEASURED = range(3)
+_SHAPES = {"gamma": _GAMMA, "gaussian": _GAUSSIAN, "measured": _MEASURED}
+_SQRT_HALF = math.sqrt(0.5)
+
+
+@njit(**COMPILED)
+def _arrived(t, shape, share):  # type: ignore[no-untyped-def]
+    """`Pulse.cdf` at `t` time constants; of a measured pulse `share` is that at its samples."""
+    if shape == _GAUSSIAN:
+        return 0.5 * math.erfc(-t * _SQRT_HALF)
+    if t <= 0.0:
+        return 0.0
+    if shape == _GAMMA:
+        return 1.0 - (1.0 + t) * math.exp(-t)
+    if t >= share.size - 1:
+        return 1.0
+    below = int(t)
+    return share[below] + (t - below) * (share[below + 1] - share[below])
+
+
+@njit(**COMPILED)
+def _add_echo(onset_bin, signal, bin_taus, shape, share, before):  # type: ignore[no-untyped-def]
+    n_pixels, n_edges = before.shape
+    for pixel in range(n_pixels):
+        onset = onset_bin[pixel]
+        if not math.isfinite(onset):
+            continue
+        early = _arrived(-onset * bin_taus, shape, share)  # before the gate opened
+        arrived = early
+        for edge in range(n_edges):
+            # Photons never leave again, as rounding would have it where bins are tiny.
+            arrived = max(arrived, _arrived((edge - onset) * bin_taus, shape, share))
+            before[pixel, edge] += signal[pixel] * (arrived - early)
+
+
+@njit(**COMPILED)
+def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
+    """Add `n_pulses` first-photon draws to `counts`, whose last element stands for "no trigger".
+
+    ``fired_by[k]`` is the probability to have fired by the end of bin k; its last element, above 1,
+    ends every search. The guide holds, for each of its cells of ``[0, 1)``, the bin in which the
+    cell's lowest number falls. `uniform` is room for a batch of numbers: drawn apart from their
+    use, they are computed several at a time.
+    """
+    k = np.uint64(0)
+    for cell in range(guide.size):
+        while fired_by[k] <= cell / guide.size:
+            k += np.uint64(1)
+        guide[cell] = k
+    done = 0
+    while done < n_pulses:
+        batch = min(uniform.size, n_pulses - done)
+        for i in range(batch):
+            uniform[i] = uniform_at(key, done + i)
+        for i in range(batch):
+            k = np.uint64(guide[np.uint64(uniform[i] * guide.size)])
+            # One step without a jump settles nearly every draw; a mispredicted jump costs five.
+            k += np.uint64(fired_by[k] <= uniform[i])
+            while fired_by[k] <= uniform[i]:
+                k += np.uint64(1)
+            counts[k] += 1
+        done += batch
+
+
+@njit(**PARALLEL)
+def _draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-def]
+    n_pixels, n_bins = cube.shape
+    for pixel in prange(n_pixels):
+        fired_by = np.full(n_bins + 1, 2.0)
+        fired_by[:n_bins] = triggered[pixel, 1:]
+        guide = np.empty(256, np.uint32)
+        uniform = np.empty(64)
+        counts = np.zeros(n_bins + 1, np.int64)
+        _draw_pixel(fired_by, n_pulses, pixel_key(seed, pixel), guide, uniform, counts)
+        for k in range(n_bins):
+            cube[pixel, k] = counts[k]
+
+
+@njit(**PARALLEL)
+def _fire_once(photons, n_pulses, seed, fired):  # type: ignore[no-untyped-def]
+    rows, cols, n_bins = photons.shape
+    for row in prange(rows):
+        for col in range(cols):
+            key = pixel_key(seed, row * cols + col)
+            armed, draw = n_pulses, 0
+            for k in range(n_bins):
+                for _ in range(photons[row, col, k]):
+                    if uniform_at(key, draw) * n_pulses < armed:
+                        fired[row, col, k] += 1
+                        armed -= 1
+                    draw += 1

@@ -1,0 +1,172 @@
+"""Published captures with a truth: how near each method comes to it.
+
+The mannequin's face, a raster scan of 340 x 340 pixels and 8 photons a pixel (photon counting), is
+compared with a scan of many photons: one offset, the median over the face, is taken off, and a
+pixel without an answer counts as wrong. The distances of a TMF8820 are compared with the plane that
+it was held before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat
+
+from core.acquisition import Acquisition, Floats, Pulse
+from core.capture import Capture
+from core.checks import require
+from core.estimators import ESTIMATORS, estimate
+from core.inference.posterior import posterior_of
+from core.io.readers import read_capture
+from core.io.readers.arrivals import NATIVE_BIN_S
+from core.studies.outputs import Table
+
+FACE, FACE_TRUTH = "data_face.mat", "data_mannequin_face_truth.mat"
+TMF8820 = "tmf8820_distance_data.json"
+
+_IN_SCAN = np.s_[0:340, 3:343]  # of the truth's 350 x 350: what registers to the capture
+_FACE_BINS = 3550.0, 3700.0
+_WALL_BIN = 4000.0
+NEAR_M, FAR_M = 0.03, 0.15
+
+GAUSSIAN = Pulse.gaussian(45 * NATIVE_BIN_S)
+METHODS = tuple(name for name in ESTIMATORS if name != "oracle")  # none knows the true light
+
+KNOWN = {
+    "all photons": (0.824, 0.940, 0.914, 0.966),
+    "first 3 detections": (0.783, 0.907, 0.821, 0.949),
+    "background, SBR 0.30": (0.599, 0.694, 0.816, 0.861),
+    "background, SBR 0.06": (0.367, 0.446, 0.647, 0.701),
+}
+"""Of pixels with a photon, peak and matched filter each within 30 mm and 150 mm, as measured by
+others on this capture with a Gaussian of 360 ps."""
+
+
+class Face(NamedTuple):
+    """The capture's truth."""
+
+    range_m: Floats
+    """Shape (row, col)."""
+    is_face: NDArray[np.bool_]
+    is_wall: NDArray[np.bool_]
+
+
+def face_truth(folder: Path) -> Face:
+    """Read what `FACE` is compared with."""
+    cells = loadmat(folder / FACE_TRUTH)["D_true"]
+    bins = np.array([cell.item() if cell.size else np.nan for cell in cells.ravel()])
+    bins = bins.reshape(cells.shape)[_IN_SCAN]
+    unit = Acquisition(n_bins=1, bin_width_s=NATIVE_BIN_S, gate_delay_s=0.0)
+    is_face = (bins > _FACE_BINS[0]) & (bins < _FACE_BINS[1])
+    return Face(unit.bin_to_range_m(bins), is_face, bins == _WALL_BIN)
+
+
+def wall_pulse(folder: Path, truth: Face) -> Pulse:
+    """The pulse as the wall behind the face returns it; the wall is not scored.
+
+    The mean background is taken off, and what is left kept from where it first exceeds a hundredth
+    of the peak to where it last does.
+    """
+    capture = read_capture(folder / FACE, bin_width_s=NATIVE_BIN_S, pulse=GAUSSIAN)
+    seen = capture.cube[truth.is_wall].sum(axis=0, dtype=np.int64).astype(float)
+    echo = np.maximum(seen - np.median(seen), 0.0)
+    kept = np.flatnonzero(echo > 0.01 * echo.max())
+    around = kept[np.abs(kept - echo.argmax()) < 300]  # other things stand in the gate, too
+    return Pulse.measured(echo[around[0] : around[-1] + 1], bin_width_s=NATIVE_BIN_S)
+
+
+def with_background(capture: Capture, sbr: float, seed: int = 0) -> Capture:
+    """The capture with uniform background added, its own photons taken for signal."""
+    rate = capture.counts.mean() / sbr / capture.acquisition.n_bins
+    added = np.random.default_rng(seed).poisson(rate, capture.cube.shape).astype(np.uint16)
+    return replace(capture, cube=capture.cube + added, source=f"{capture.source}; SBR {sbr:g}")
+
+
+def face_captures(folder: Path, pulse: Pulse) -> Iterator[tuple[str, Capture]]:
+    """The four conditions."""
+    everything = read_capture(folder / FACE, pulse=pulse)
+    names = iter(KNOWN)
+    yield next(names), everything
+    yield next(names), read_capture(folder / FACE, pulse=pulse, first_detections=3)
+    for name, sbr in zip(names, (0.30, 0.06), strict=True):
+        yield name, with_background(everything, sbr)
+
+
+def face_table(folder: Path, pulse: Pulse, title: str, progress: Callable[[str], None]) -> Table:
+    """Share of the face's pixels within 30 mm and within 150 mm, for each method.
+
+    Raises
+    ------
+    ValueError
+        If a capture is absent.
+    """
+    truth = face_truth(folder)
+    cells: dict[str, list[str]] = {method: [] for method in METHODS}
+    spent_s = dict.fromkeys(METHODS, 0.0)
+    known = ["", *(f"{p:.3f} {q:.3f} / {m:.3f} {n:.3f}" for p, q, m, n in KNOWN.values())]
+    for condition, capture in face_captures(folder, pulse):
+        posterior_of(capture)  # found once for each capture, whatever the method
+        for method in METHODS:
+            progress(f"{title}, {condition}: {method}")
+            started = perf_counter()
+            range_m = estimate(capture, method).range_m
+            spent_s[method] += perf_counter() - started
+            error_m = (range_m - truth.range_m)[truth.is_face]
+            error_m = np.abs(error_m - np.nanmedian(error_m))
+            near, far = (error_m <= NEAR_M).mean(), (error_m <= FAR_M).mean()
+            cells[method].append(f"{near:.3f} {far:.3f}")
+        seen = float((capture.counts[truth.is_face] > 0).mean())
+        known[len(cells[METHODS[0]])] += f" x {seen:.3f}"
+    rows = [(method, *cells[method], f"{spent_s[method] / 4:.1f}") for method in METHODS]
+    rows.append(("others: peak / matched filter, x share of pixels with a photon", *known[1:], ""))
+    return Table("face", title, ("method", *KNOWN, "s"), tuple(rows))
+
+
+def tmf8820_table(folder: Path) -> Table:
+    """Distances of the middle zone against the plane's, for each method: median error and spread.
+
+    Raises
+    ------
+    ValueError
+        If the capture is absent.
+    """
+    capture = read_capture(folder / TMF8820)
+    if capture.truth_range_m is None:
+        raise ValueError(f"dist_to_plane = None is not accepted: give a {TMF8820} with distances.")
+    middle = capture.shape[1] // 2
+    rows = []
+    for method in METHODS:
+        error_m = (estimate(capture, method).range_m - capture.truth_range_m)[:, middle]
+        low, median, high = np.nanpercentile(error_m, [16, 50, 84])
+        answered = float(np.isfinite(error_m).mean())
+        rows.append(
+            (method, f"{median * 1e3:.1f}", f"{(high - low) / 2e-3:.1f}", f"{answered:.2f}")
+        )
+    return Table(
+        "tmf8820",
+        f"TMF8820, middle zone of {capture.shape[0]} records, against the plane's distance",
+        ("method", "median error, mm", "half the middle 68 %, mm", "answered"),
+        tuple(rows),
+    )
+
+
+def tables(folder: Path, progress: Callable[[str], None]) -> Iterator[Table]:
+    """Everything that can be compared with a truth.
+
+    Raises
+    ------
+    ValueError
+        If a capture is absent from the folder.
+    """
+    for name in (FACE, FACE_TRUTH, TMF8820):
+        require("captures", str(folder / name), (folder / name).is_file(), "a folder that holds it")
+    wall = wall_pulse(folder, face_truth(folder))
+    yield tmf8820_table(folder)
+    yield face_table(folder, GAUSSIAN, "Face, pulse a Gaussian of 360 ps", progress)
+    yield face_table(folder, wall, "Face, pulse as the wall returns it", progress)

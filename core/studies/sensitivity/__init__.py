@@ -1,0 +1,1 @@
+"""The range of each setting within which a method can be trusted."""

@@ -1,0 +1,359 @@
+"""Within which range of each parameter is each estimator to be trusted, and what it does beyond?
+
+One parameter at a time is swept through all that it may be, everything else as it comes, on depths
+that are uniform over the gate. A value is trusted where no more than `LOSS` of the pixels are lost
+against the best value of the sweep; the loss is over the same pixels, hence paired.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Acquisition, Flux, Pulse
+from core.capture import Capture
+from core.estimators import ESTIMATORS, estimate
+from core.inference.posterior import TOLERANCE_BINS
+from core.parameters import Number, Zone, joint_doubts, spec_of
+from core.scene import Scene
+from core.simulation import simulate
+from core.studies.outputs import as_text
+from core.studies.sensitivity.estimator_invariants import compared
+from core.studies.sensitivity.extremes import SIGNAL
+from core.tracking import FEW_BINS, STEEP_ALPHA, TrackingParameters, tracking_signals
+
+LOSS = 0.1
+"""Share of the pixels that a trusted value may lose against the best one."""
+
+FAILING = 0.5
+"""Share of the best value's right answers below which a method no longer degrades, but fails."""
+
+DIFFERING = 0.01
+"""Share of pixels in which two precisions choose other bins from which on rounding decides."""
+
+BASES = (0.06, 0.1, 0.2, 0.5, 1.0)
+"""SBRs to sweep at: of each method the first at which, as it comes, it finds nine in ten."""
+
+SEED = 2000  # apart from those of the tables and of the search for the preset
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A method's answers with one value of the parameter that is swept."""
+
+    value: float
+    right: NDArray[np.bool_]
+    """Whether each target pixel is answered within 3 bins."""
+    answered: float
+    confidence: float
+    """Mean of the answers' confidence."""
+
+    @property
+    def share(self) -> float:
+        """Restoration degree within 3 bins."""
+        return float(self.right.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """One parameter of one method, the values in rising order."""
+
+    method: str
+    parameter: str
+    sbr: float
+    """That of everything else as it comes."""
+    points: Sequence[Point]
+
+    @property
+    def best(self) -> Point:
+        """The value with most right answers."""
+        return max(self.points, key=lambda point: point.share)
+
+    def loss(self, point: Point) -> tuple[float, float]:
+        """Share of pixels lost against the best value, and its standard deviation.
+
+        Where two values are not of the same pixels (as many pixels do not fit into every gate) it
+        is that of two shares.
+        """
+        best, here = self.best.right, point.right
+        if best.size == here.size:
+            lost = best.astype(float) - here
+            return float(lost.mean()), float(lost.std() / math.sqrt(lost.size))
+        variance = sum(x.mean() * (1 - x.mean()) / x.size for x in (best, here))
+        return float(best.mean() - here.mean()), math.sqrt(variance)
+
+    def state(self, point: Point) -> str:
+        """``trusted``, ``degraded`` or ``failing``; a loss that may be chance is none."""
+        loss, deviation = self.loss(point)
+        if loss - 2 * deviation <= LOSS:
+            return "trusted"
+        return "failing" if point.share < FAILING * self.best.share else "degraded"
+
+    def ranges(self, state: str) -> str:
+        """The values in one state, as ranges."""
+        runs = groupby(self.points, self.state)
+        values = [[point.value for point in run] for kind, run in runs if kind == state]
+        return ", ".join(_span(run[0], run[-1]) for run in values)
+
+    @property
+    def worst(self) -> Point:
+        """The value with fewest right answers."""
+        return min(self.points, key=lambda point: point.share)
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+
+
+# --- What a scene may be ---
+
+
+def tile(method: str) -> int:
+    """Rows and columns that see the same depth: more than one for what looks at neighbours."""
+    each = ESTIMATORS[method]
+    return 8 if each.whole_image or each.reach(each.parameters()) > 1 else 1
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A scene of depths uniform over the middle of a gate; each field is one parameter to sweep."""
+
+    signal: float = SIGNAL
+    background: float = SIGNAL / 0.06
+    n_pulses: int = 1000
+    n_bins: int = 100
+    tau_bins: float = 1.0
+
+    @cache  # noqa: B019 - as many as there are values to sweep, in a process that ends
+    def capture(self, tile: int = 1, side: int = 32) -> Capture:
+        """Rows and columns as told, or as many as a long gate leaves room for."""
+        gate = Acquisition(self.n_bins, n_pulses=self.n_pulses)
+        side = min(side, max(tile, math.isqrt(2**22 // self.n_bins)))
+        drawn = np.random.default_rng(SEED).uniform(0.2, 0.94, (side // tile, side // tile))
+        onset = self.n_bins * np.kron(drawn, np.ones((tile, tile)))
+        flux = Flux(self.signal, self.signal / self.background if self.background else np.inf)
+        pulse = Pulse(self.tau_bins * gate.bin_width_s)
+        return simulate(Scene(gate.bin_to_range_m(onset)), gate, flux, pulse, seed=SEED)
+
+
+SCENE_VALUES: dict[str, tuple[float, ...]] = {
+    "background": (0.0, 1e-7, 1e-3, 0.02, 0.1, 0.5, 1.0, 1.7, 2.6, 3.5, 5.0, 10.0, 100.0, 1e5),
+    "signal": (1e-12, 1e-3, 0.01, 0.03, 0.05, 0.08, 0.1, 0.3, 1.0, 3.0, 10.0, 1e3, 1e6),
+    "n_pulses": (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000, 10**6, 10**9),
+    "n_bins": (10, 20, 30, 50, 100, 300, 1000, 4096, 100_000),
+    "tau_bins": (1e-3, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0, 1e3),
+}
+"""Sweeps of a scene; with the signal as it comes a background of 1e5 is an SBR of 1e-6."""
+
+
+def judged(capture: Capture, method: str, settings: Any, value: float) -> Point:
+    """What a method makes of a capture with a truth."""
+    image = estimate(capture, method, settings)
+    truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
+    target = np.isfinite(truth)
+    right = np.abs(np.nan_to_num(image.bin, nan=np.inf) - truth) <= TOLERANCE_BINS
+    confidence = image.confidence[image.valid]
+    return Point(
+        value,
+        right[target],
+        float(image.valid[target].mean()),
+        float(confidence.mean()) if confidence.size else math.nan,
+    )
+
+
+@cache
+def base_sbr(method: str) -> float:
+    """The first of `BASES` at which a method as it comes finds nine pixels in ten."""
+    for sbr in BASES:
+        if judged(base(method, sbr), method, None, sbr).share >= 0.9:
+            return sbr
+    return BASES[-1]
+
+
+def base(method: str, sbr: float) -> Capture:
+    """What a method's settings are swept on."""
+    return Seen(background=SIGNAL / sbr).capture(tile(method), side=64)
+
+
+def scene_sweeps(progress: Callable[[], None] = lambda: None) -> list[Sweep]:
+    """Every parameter of a scene, for every estimator."""
+    points: dict[tuple[str, str], list[Point]] = {}
+    for parameter, values in SCENE_VALUES.items():
+        for value in values:
+            for sbr in BASES:
+                methods = [method for method in ESTIMATORS if base_sbr(method) == sbr]
+                if not methods:
+                    continue
+                changed: dict[str, Any] = {"background": SIGNAL / sbr, parameter: value}
+                seen = Seen(**changed)
+                for method in methods:
+                    found = judged(seen.capture(tile(method)), method, None, value)
+                    points.setdefault((method, parameter), []).append(found)
+            progress()
+    sweeps = [Sweep(m, p, base_sbr(m), found) for (m, p), found in points.items()]
+    return [*sweeps, *(_as_sbr(each) for each in sweeps if each.parameter == "background")]
+
+
+def _as_sbr(sweep: Sweep) -> Sweep:
+    """A sweep over the background as one over the SBR."""
+    points = [
+        replace(point, value=SIGNAL / point.value if point.value else math.inf)
+        for point in reversed(sweep.points)
+    ]
+    return replace(sweep, parameter="sbr", points=points)
+
+
+# --- What a method may be told ---
+
+
+def setting_sweeps(progress: Callable[[], None] = lambda: None) -> list[Sweep]:
+    """Every setting of every estimator that is a number, along its slider and beyond."""
+    found = []
+    for method, field, spec, default in numbers():
+        found.append(setting_sweep(method, field, along(spec, default)))
+        progress()
+    return found
+
+
+def numbers() -> list[tuple[str, str, Number, Any]]:
+    """Method, field, specification and default of every setting that is a number."""
+    return [
+        (method, field.name, spec, field.default)
+        for method, each in ESTIMATORS.items()
+        for field in fields(each.parameters)
+        if isinstance(spec := spec_of(field), Number)
+    ]
+
+
+N_SETTINGS = len(numbers())
+
+
+def setting_sweep(method: str, field: str, values: Sequence[float]) -> Sweep:
+    """One setting, everything else as it comes."""
+    sbr, kind = base_sbr(method), ESTIMATORS[method].parameters
+    capture = base(method, sbr)
+    points = [judged(capture, method, kind(**{field: v}), v) for v in values]
+    return Sweep(method, field, sbr, points)
+
+
+def along(spec: Number, default: float, steps: int = 13) -> list[float]:
+    """Values along a slider and beyond it as far as is accepted, and beside each zone's edges."""
+    space = np.geomspace if spec.log else np.linspace
+    values = {float(f"{x:.3g}") for x in space(spec.low, spec.high, steps)}
+    values |= {float(default), spec.low / 10, 10 * spec.high, 0.0, spec.least, spec.most}
+    values |= {x for zone in spec.doubtful for x in (*inside(spec, zone), *outside(spec, zone))}
+    if spec.whole:
+        return sorted({round(value) for value in values if spec.takes(round(value))})
+    return sorted(value for value in values if spec.takes(value))
+
+
+STEP = 0.2
+"""How far from a zone's edge is looked, as a share of it."""
+
+
+def inside(spec: Number, zone: Zone) -> list[float]:
+    """Values in a zone, as near to its edges as is to be told apart, that a slider reaches."""
+    return [max(zone.low * (1 + STEP), spec.low), min(zone.high * (1 - STEP), spec.high)]
+
+
+def outside(spec: Number, zone: Zone) -> list[float]:
+    """Values just beyond a zone's edges that a slider reaches and that lie in no zone."""
+    near = (zone.low * (1 - STEP), zone.high * (1 + STEP))
+    within = [value for value in near if spec.low <= value <= spec.high]
+    return [v for v in within if not any(v in each for each in spec.doubtful)]
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What makes settings doubtful; the last three are the tracking differentiator's alone."""
+
+    loss: float
+    """Share of pixels lost against the settings as they come, less what may be chance."""
+    disagreement: float = 0.0
+    """Share of pixels in which float32 and float64 choose other bins, at the worst of `BASES`."""
+    noise: float = 0.0
+    """What a scale in its linear zone leaves of white noise: the ratio of standard deviations."""
+    ringing: float = 0.0
+    """How much a scale still moves a thousand bins behind an echo, as a share of that echo."""
+
+    def __str__(self) -> str:
+        told = {
+            "pixels lost": self.loss > LOSS and f"{self.loss:.2f}",
+            "float32 differs": self.disagreement > DIFFERING and f"{self.disagreement:.2f}",
+            "noise passed": self.noise >= 1 and f"{self.noise:.2f}",
+            "ringing": self.ringing > RESTLESS and f"{self.ringing:.1g}",
+        }
+        return ", ".join(f"{name} {text}" for name, text in told.items() if text)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether any of them says so."""
+        return bool(str(self))
+
+
+RESTLESS = 1e-6
+"""Share of an echo that a filter may still move by when it is long at rest."""
+
+
+def signs(method: str, settings: Any) -> Signs:
+    """Measure them."""
+    capture = base(method, base_sbr(method))
+    usual, here = (judged(capture, method, each, 0.0).right for each in (None, settings))
+    lost = usual.astype(float) - here
+    loss = float(lost.mean() - 2 * lost.std() / math.sqrt(lost.size))
+    if method != "tracking":
+        return Signs(loss)
+    rows = [base(method, sbr).cube[:16].reshape(-1, 100) for sbr in BASES]
+    noise = np.random.default_rng(SEED).normal(0.0, 1.0, (64, 400))
+    linear = replace(settings, l=1e6, weight="none", start="zero")
+    echo = np.zeros((1, 1000))
+    echo[0, 5] = 1000.0
+    still = tracking_signals(echo, settings).small[0, -100:]
+    return Signs(
+        loss,
+        max(compared(some, settings)[0] for some in rows),
+        float(tracking_signals(noise, linear).small[:, 100:].std()),
+        float(np.ptp(still)) / 1000.0,
+    )
+
+
+JOINT: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "(m·h)²·l": ({"l": 1.0 / 1.4**2}, {"l": 0.02}),
+    "α, exponential": ({"alpha": 1.1 * STEEP_ALPHA}, {"alpha": 0.9 * STEEP_ALPHA}),
+    "start zero": ({"start": "zero"}, {"start": "mean"}),
+    "σ before T_n": (
+        {"sigma_from": "before T_n", "t_n": FEW_BINS - 1},
+        {"sigma_from": "before T_n", "t_n": 20},
+    ),
+}
+"""Settings that are in doubt together, beside some of their kind that are not."""
+
+
+def zone_rows() -> Iterator[tuple[str, ...]]:
+    """Method, parameter, zone, why, signs in it, signs beyond it, and whether they bear it out."""
+    for method, field, spec, _ in numbers():
+        for zone in spec.doubtful:
+            within = [{field: value} for value in inside(spec, zone)]
+            beyond = [{field: value} for value in outside(spec, zone)]
+            where = _span(zone.low, zone.high)
+            yield method, field, where, zone.why, *_borne_out(method, within, beyond)
+    for name, (doubtful, sound) in JOINT.items():
+        (why,) = joint_doubts(TrackingParameters(**doubtful))
+        where = ", ".join(f"{field} {as_text(value)}" for field, value in doubtful.items())
+        yield "tracking", name, where, why, *_borne_out("tracking", [doubtful], [sound])
+
+
+def _borne_out(method: str, within: Sequence[Any], beyond: Sequence[Any]) -> tuple[str, str, str]:
+    """Signs of settings that should be in doubt, of some that should not, and whether it is so."""
+    kind = ESTIMATORS[method].parameters
+    doubtful, sound = ([signs(method, kind(**each)) for each in side] for side in (within, beyond))
+    good = all(each.is_doubtful for each in doubtful) and not any(x.is_doubtful for x in sound)
+    told = ["; ".join(str(x) or "nothing" for x in side) or "–" for side in (doubtful, sound)]
+    return told[0], told[1], "yes" if good else "NO"
