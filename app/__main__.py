@@ -23,7 +23,7 @@ from tornado.netutil import bind_sockets
 
 import core
 from app.model import text as words
-from app.model.state import Light, Reading
+from app.model.state import Illumination, Reading
 from app.model.store import Source, built_in_sources, file_source
 from app.model.uploads import Uploads
 from app.pages.layout import build_page
@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = {f"path {n}": file_source(p, shared=True) for n, p in enumerate(chosen.captures)}
     for source in given.values():
         try:
-            print(source.load(Light(), Reading(), ()).source, flush=True)
+            print(source.load(Illumination(), Reading(), ()).source, flush=True)
         except ValueError as error:  # unreadable, or more than is held as a whole
             parser.error(str(error))
     sources, uploads = given | built_in_sources(), Uploads()

@@ -10,7 +10,7 @@ from core.io.readers import open_capture, read_capture
 from core.io.scene_files import SceneError, read_scene
 from core.io.writers import save_capture, save_image, save_pixel
 from core.out_of_core.tiles import as_image, estimate_large
-from core.out_of_core.windows import Window, light_of_whole, read_window
+from core.out_of_core.windows import Window, read_window, sampled_flux_prior
 from core.pipeline import Run, run
 from core.scene import PARTS, Scene, parts_of, scenes, without
 from core.simulation import first_photons, simulate
@@ -23,6 +23,8 @@ from core.trigger import (
     trigger_probability,
 )
 from core.warmup import warm_up
+
+light_of_whole = sampled_flux_prior  # deprecated name, to be removed after the next release
 
 __all__ = [
     "CORRECTIONS",
@@ -61,6 +63,7 @@ __all__ = [
     "read_window",
     "reductions",
     "run",
+    "sampled_flux_prior",
     "save_capture",
     "save_image",
     "save_pixel",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.checks import require
+from core.deprecation import renamed
 from core.kernels.blocks import Blocks, to_blocks
 
 COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
@@ -94,11 +95,11 @@ class Capture:
         kinds = get_args(Detection)
         require("detection", self.detection, self.detection in kinds, " or ".join(map(repr, kinds)))
         cube.setflags(write=False)
-        if self.armed_pulses is not None:
+        if self.gated_pulses is not None:
             most = int(self.counts.max())
             once = "no more first photons than pulses in a pixel, or 'all' for its detection"
             require(
-                f"n_pulses = {self.armed_pulses}, counts", most, most <= self.armed_pulses, once
+                f"n_pulses = {self.gated_pulses}, counts", most, most <= self.gated_pulses, once
             )
 
     @property
@@ -117,9 +118,11 @@ class Capture:
         return to_blocks(self.cube)
 
     @property
-    def armed_pulses(self) -> int | None:
+    def gated_pulses(self) -> int | None:
         """Pulses sent, where these are first photons; None where pulses are not known, too."""
         return self.acquisition.n_pulses if self.detection == "first" else None
+
+    armed_pulses = renamed("gated_pulses")
 
     @property
     def echo_bins(self) -> int:
@@ -148,8 +151,8 @@ class Seen(Protocol):
         """Where it came from."""
 
     @property
-    def armed_pulses(self) -> int | None:
-        """As `Capture.armed_pulses`."""
+    def gated_pulses(self) -> int | None:
+        """As `Capture.gated_pulses`."""
 
 
 Found = TypeVar("Found")

@@ -10,7 +10,7 @@ import numpy as np
 from core.acquisition import Pulse
 from core.capture import Capture
 from core.checks import require
-from core.inference.posterior import detailed_lighting_of, lighting_of
+from core.inference.posterior import detailed_flux_prior_of, flux_prior_of
 
 CORRECTIONS = {
     "pile_up": "pile-up",
@@ -41,7 +41,7 @@ def without_correction(capture: Capture, correction: str) -> Capture:
         acquisition = replace(capture.acquisition, gate_delay_s=gate_delay_s)
         return replace(capture, acquisition=acquisition, pulse=Pulse.gaussian(sigma_s))
     one = replace(capture)
-    lighting_of.tell(one, detailed_lighting_of(capture).with_one_level())
+    flux_prior_of.tell(one, detailed_flux_prior_of(capture).with_one_level())
     return one
 
 

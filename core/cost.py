@@ -147,7 +147,7 @@ def predicted(
     return Cost(int(n_bytes), seconds)
 
 
-def predicted_light(n_pixels: int, n_bins: int) -> Cost:
+def predicted_flux_time(n_pixels: int, n_bins: int) -> Cost:
     """Working memory and time of a light with its intervals (`core.inspection`), likewise.
 
     Parameters

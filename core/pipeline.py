@@ -9,6 +9,7 @@ from typing import Any
 from core import metrics
 from core.capture import Capture
 from core.cost import require_memory
+from core.deprecation import renamed
 from core.estimators import RangeImage, estimate, settings_of
 from core.inference.posterior import posterior_of
 
@@ -23,7 +24,7 @@ class Run:
         ``rmse_m``, ``mae_m``, ``inlier_rmse_m`` (within 3 bins), ``bias_m``, ``median_error_m``,
         ``coverage``, ``rd_1_bin``, ``rd_2_bins``, ``rd_3_bins``; empty where the capture has no
         truth: nothing is shown rather than nonsense.
-    light_s : float
+    flux_time_s : float
         Seconds spent on what all methods share and a capture keeps: its light and its posterior.
     estimate_s : float
         Seconds spent by the method itself.
@@ -32,8 +33,10 @@ class Run:
     capture: Capture
     image: RangeImage
     figures: dict[str, float]
-    light_s: float
+    flux_time_s: float
     estimate_s: float
+
+    light_s = renamed("flux_time_s")
 
 
 def run(

@@ -80,10 +80,10 @@ def cut_gate(capture: Capture, first_bin: int, end_bin: int) -> Capture:
     require("first_bin, end_bin", window, within, f"two integers in order, 0 to {before.n_bins}")
     cube = np.ascontiguousarray(capture.cube[:, :, first_bin:end_bin])
     n_pulses, source = before.n_pulses, f"{capture.source}; bins {first_bin} to {end_bin - 1}"
-    if capture.armed_pulses is not None and first_bin > 0:
+    if capture.gated_pulses is not None and first_bin > 0:
         fired = capture.cube[:, :, :first_bin].sum(axis=2, dtype=np.int64)
         most = int(cube.sum(axis=2, dtype=np.int64).max())
-        n_pulses = max(round(capture.armed_pulses - float(fired.mean())), most, 1)
+        n_pulses = max(round(capture.gated_pulses - float(fired.mean())), most, 1)
         source += f", at whose opening {n_pulses} pulses are armed on average"
     return replace(
         capture,

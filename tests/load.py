@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from app.model.state import Light
+from app.model.state import Illumination
 from app.plots.elements import ENHANCED_LAYERS, HISTOGRAM_LAYERS
 from tests.browser import serving
 from tests.wire import Wire
@@ -185,7 +185,7 @@ class Hand:
         return _nearest(self._number("r small") / self._number("σ"), _spaced(2e-3, 2e-2))
 
     def _shown_sbr(self) -> float:
-        expected, light = self._wire.values[self._expected, "counts"], Light()
+        expected, light = self._wire.values[self._expected, "counts"], Illumination()
         background = -math.log1p(-expected[0] / light.n_pulses) * expected.size
         return _nearest(light.ppp / background, _spaced(0.03, 0.5))
 

@@ -10,7 +10,7 @@ import pytest
 
 from app.model import text as words
 from app.model.address import Wanted, defaults, query_of
-from app.model.state import Less, Light, Reading, State, Viewing
+from app.model.state import Illumination, Less, Reading, State, Viewing
 from app.model.store import built_in_sources
 from app.pages.session import Session
 from core import TrackingParameters
@@ -113,7 +113,7 @@ def test_what_is_out_of_range_or_nonsense_is_refused_and_the_rest_kept(query, na
     found, refused = restored(f"{query}&light.ppp=0.5&reading.n_pulses=77")
     (sentence,) = refused
     assert named in sentence
-    expected = defaults() | {"light": Light(ppp=0.5), "reading": Reading(n_pulses=77)}
+    expected = defaults() | {"light": Illumination(ppp=0.5), "reading": Reading(n_pulses=77)}
     assert found == expected
 
 
@@ -127,7 +127,7 @@ def opened(query: str) -> Session:
 def test_a_session_opens_on_what_its_address_asks_for():
     first = opened("source=building&light.sbr=0.2&less.merge=2&less.pool=2&tracking.l=0.006")
     assert first.answer.request.source.title.startswith("Building")
-    assert first.answer.request.light == Light(sbr=0.2)
+    assert first.answer.request.light == Illumination(sbr=0.2)
     assert first.answer.request.tracking == TrackingParameters(l=0.006)
     assert first.answer.request.less == Less(merge=2, pool=2)
     first.state.param.update(pixel=(3, 5), viewing=Viewing(0.5, 1.5), image="Counts")

@@ -12,7 +12,7 @@ from bokeh.document import Document
 import core
 from app.model import colors as looks
 from app.model import text as words
-from app.model.state import Less, Light, Reading, Viewing
+from app.model.state import Illumination, Less, Reading, Viewing
 from app.model.store import (
     Request,
     built_in_sources,
@@ -38,7 +38,7 @@ NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
 
 def ask(source="car", **chosen):
     choices = {
-        "light": Light(),
+        "light": Illumination(),
         "reading": Reading(),
         "tracking": TrackingParameters(),
         "less": Less(),
@@ -85,11 +85,11 @@ def rng():
 @pytest.mark.parametrize(
     ("settings", "changes"),
     [
-        (Light(), {"sbr": 0.0}),
-        (Light(), {"ppp": -1.0}),
-        (Light(), {"n_pulses": 0}),
-        (Light(), {"n_pulses": 1.5}),
-        (Light(), {"seed": -1}),
+        (Illumination(), {"sbr": 0.0}),
+        (Illumination(), {"ppp": -1.0}),
+        (Illumination(), {"n_pulses": 0}),
+        (Illumination(), {"n_pulses": 1.5}),
+        (Illumination(), {"seed": -1}),
         (Viewing(), {"least_confidence": -0.1}),
         (Viewing(), {"field_of_view_deg": 0.0}),
     ],
@@ -101,7 +101,7 @@ def test_impossible_settings_are_refused_by_name(settings, changes):
 
 
 def test_light_is_the_flux_and_the_pulses_of_an_acquisition():
-    light = Light(sbr=0.5, ppp=0.2, n_pulses=77)
+    light = Illumination(sbr=0.5, ppp=0.2, n_pulses=77)
     assert (light.flux.sbr, light.flux.signal) == (0.5, 0.2)
     gate = Acquisition(n_bins=40, gate_delay_s=1e-6)
     assert light.acquisition(gate) == replace(gate, n_pulses=77)
@@ -150,19 +150,19 @@ def test_only_what_changed_is_computed_again(car):
     assert other_settings.capture is car.capture
     assert other_settings.capture_s == car.capture_s
     assert not np.array_equal(other_settings.run.image.bin, car.run.image.bin)
-    for change in ({"light": Light(seed=1)}, {"source": built_in_sources()["staircase"]}):
+    for change in ({"light": Illumination(seed=1)}, {"source": built_in_sources()["staircase"]}):
         assert compute(replace(car.request, **change), car).capture is not car.capture
 
 
 def test_the_page_computes_what_takes_less_than_to_draw_it(car):
     other = {"tracking": PRESETS["as printed"]}
     assert effort_of(replace(car.request, **other), car) is Effort.QUICK
-    for again in ({"light": Light(seed=1)}, {"less": Less(skip=2)}):
+    for again in ({"light": Illumination(seed=1)}, {"less": Less(skip=2)}):
         assert effort_of(replace(car.request, **again, **other), car) is Effort.SHORT
     for new in ({"source": built_in_sources()["staircase"]}, {"absent": frozenset(["jitter"])}):
         assert effort_of(replace(car.request, **new, **other), car) is Effort.ANY
     large = compute(ask("car_256"), None)
-    for change in (other, {"light": Light(seed=1)}):
+    for change in (other, {"light": Illumination(seed=1)}):
         assert effort_of(replace(large.request, **change), large) is Effort.ANY
     file = compute(ask("sample"), None)
     assert effort_of(replace(file.request, **other), file) is Effort.QUICK
@@ -195,7 +195,7 @@ def test_a_gate_is_never_empty():
 
 
 def test_an_answer_is_what_core_computes(car):
-    scene, light = core.scenes["car"](), Light()
+    scene, light = core.scenes["car"](), Illumination()
     capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
     run = core.run(capture, "tracking", TrackingParameters())
     np.testing.assert_array_equal(car.run.image.range_m, run.image.range_m)
@@ -222,7 +222,7 @@ def test_a_pixel_shows_the_stages_of_its_own_estimate(car, preset):
 
 
 def test_the_expected_counts_are_those_of_many_throws(car):
-    many = compute(ask("car", light=Light(n_pulses=100_000)), None)
+    many = compute(ask("car", light=Illumination(n_pulses=100_000)), None)
     pixel = inspect(many, 32, 30)
     np.testing.assert_allclose(pixel.signals.raw, pixel.expected, atol=5 * np.sqrt(4000))
     assert pixel.expected.sum() == pytest.approx(pixel.counts, rel=0.01)
@@ -249,9 +249,9 @@ def test_a_file_is_a_source(small_file, small_capture):
     source = file_source(small_file)
     assert source.title == "small.npz"
     assert not source.is_scene
-    read = source.load(Light(), Reading(), ())
+    read = source.load(Illumination(), Reading(), ())
     np.testing.assert_array_equal(read.cube, small_capture.cube)
-    again = source.load(Light(), Reading(bin_width_s=3e-9), ())
+    again = source.load(Illumination(), Reading(bin_width_s=3e-9), ())
     assert again.acquisition.bin_width_s == 3e-9
 
 
@@ -556,7 +556,7 @@ def test_plots_follow_the_page_into_the_dark():
 # -- controls --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("settings", [TrackingParameters(), Light(), Less(), Viewing()])
+@pytest.mark.parametrize("settings", [TrackingParameters(), Illumination(), Less(), Viewing()])
 def test_every_field_has_a_control_made_from_its_metadata(settings):
     controls = SettingsPanel(settings, lambda new: None).controls
     assert list(controls) == [each.name for each in fields(settings)]
@@ -576,12 +576,12 @@ def test_every_field_has_a_control_made_from_its_metadata(settings):
 
 def test_a_change_is_reported_as_new_settings():
     reported = []
-    panel = SettingsPanel(Light(), reported.append)
+    panel = SettingsPanel(Illumination(), reported.append)
     panel.controls["n_pulses"].value = 500.0
-    assert reported == [replace(Light(), n_pulses=500)]
+    assert reported == [replace(Illumination(), n_pulses=500)]
     assert isinstance(reported[0].n_pulses, int)
     panel.controls["sbr"].value = 1.0
-    assert reported[1:] == [replace(Light(), n_pulses=500, sbr=1.0)]
+    assert reported[1:] == [replace(Illumination(), n_pulses=500, sbr=1.0)]
 
 
 def test_showing_settings_reports_nothing():

@@ -14,7 +14,7 @@ from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
 import core
-from app.model.state import Light
+from app.model.state import Illumination
 from app.model.store import built_in_sources
 from app.theme import DARK, LIGHT, RANGE_COLORS, WRONG_COLOR
 from app.widgets.cloud import point_cloud
@@ -144,9 +144,9 @@ def pixel_on_show(page: Page) -> tuple[int, int]:
 # -- what is to be seen ----------------------------------------------------------------------------
 
 
-def car(light: Light | None = None, tracking: TrackingParameters | None = None) -> core.Run:
+def car(light: Illumination | None = None, tracking: TrackingParameters | None = None) -> core.Run:
     """The car, computed here by core alone."""
-    light, scene = light or Light(), core.scenes["car"]()
+    light, scene = light or Illumination(), core.scenes["car"]()
     acquisition = light.acquisition(scene.acquisition)
     capture = core.simulate(scene, acquisition, light.flux, seed=light.seed)
     return core.run(capture, "tracking", tracking or TrackingParameters())
@@ -346,14 +346,14 @@ def test_a_slider_moved_by_keys_changes_everything(car_page):
         slider(car_page, "SBR").press("ArrowRight")
     sbr = float(field(car_page, "SBR").input_value())
     assert sbr > 0.06
-    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Light(sbr=sbr))))
+    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Illumination(sbr=sbr))))
     eventually(changed(car_page, before))
     before = look(car_page)
     slider(car_page, "m").press("ArrowRight")
     m = float(field(car_page, "m").input_value())
     settings = TrackingParameters(m=m)
     assert settings != TrackingParameters()
-    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Light(sbr=sbr), settings)))
+    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Illumination(sbr=sbr), settings)))
     eventually(changed(car_page, before))
 
 
@@ -375,7 +375,7 @@ def test_a_quick_drag_leaves_no_queue_and_ends_at_the_last_value(car_page):
     car_page.mouse.up()
     sbr = float(field(car_page, "SBR").input_value())
     assert sbr > 1
-    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Light(sbr=sbr))))
+    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Illumination(sbr=sbr))))
     # A few were under way at release, more on a busy machine; a queue would hold most of the 60.
     assert before_release > 2
     assert car_page.evaluate("answers") - before_release <= 12
@@ -398,8 +398,8 @@ MOVE_AT_ONCE = """track => {
 def test_values_that_a_hand_has_overtaken_are_not_sent(car_page):
     slider(car_page, "SBR").evaluate(MOVE_AT_ONCE)
     sbr = float(field(car_page, "SBR").input_value())
-    assert sbr != Light().sbr
-    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Light(sbr=sbr))))
+    assert sbr != Illumination().sbr
+    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Illumination(sbr=sbr))))
     assert car_page.evaluate("told") == 2  # the first and the last
 
 
@@ -503,7 +503,7 @@ def test_typed_values_are_taken_or_refused_with_a_sentence(car_page):
     expect(fact(car_page, "RMSE")).to_have_text(rmse(car()))
     enter(car_page, "SBR", "0,5")
     expect(refusal).to_be_hidden()
-    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Light(sbr=0.5))))
+    expect(fact(car_page, "RMSE")).to_have_text(rmse(car(Illumination(sbr=0.5))))
     enter(car_page, "Pulses", "12.5")
     expect(car_page.get_by_text("12.5 is not possible here: give a whole number")).to_be_visible()
     field(car_page, "Pulses").press("Escape")
@@ -594,7 +594,7 @@ def test_a_file_that_is_no_capture_is_told_and_the_page_goes_on(page):
     expect(chosen(new, "Scene or capture")).to_have_text("Car at 50 m")
     expect(fact(new, "RMSE")).to_have_text(rmse(car()))
     slider(new, "Seed").press("ArrowRight")
-    expect(fact(new, "RMSE")).to_have_text(rmse(car(Light(seed=1))))
+    expect(fact(new, "RMSE")).to_have_text(rmse(car(Illumination(seed=1))))
     expect(warning(new)).to_be_hidden()
 
 
@@ -618,14 +618,14 @@ def test_nothing_in_a_file_becomes_a_part_of_the_page(page):
 def test_two_sessions_do_not_see_each_other(page):
     one, other = page(), page()
     enter(one, "SBR", "0.5")
-    expect(fact(one, "RMSE")).to_have_text(rmse(car(Light(sbr=0.5))))
+    expect(fact(one, "RMSE")).to_have_text(rmse(car(Illumination(sbr=0.5))))
     content = BytesIO()
     np.save(content, np.ones((3, 3, 40), np.uint16))
     upload(one, "mine.npy", content.getvalue())
     expect(chosen(one, "Scene or capture")).to_have_text("mine.npy")
     expect(field(other, "SBR")).to_have_value("0.06")
     slider(other, "Seed").press("ArrowRight")
-    expect(fact(other, "RMSE")).to_have_text(rmse(car(Light(seed=1))))
+    expect(fact(other, "RMSE")).to_have_text(rmse(car(Illumination(seed=1))))
     chosen(other, "Scene or capture").click()
     titles = [source.title for source in built_in_sources().values()]
     expect(other.get_by_role("menuitem")).to_have_text(titles)

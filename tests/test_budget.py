@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from app.model import budget, store
-from app.model.state import Less, Light, Reading
+from app.model.state import Illumination, Less, Reading
 from app.model.store import Request, compute, effort_of, file_source
 from app.pages.compare.ranking import Task, run_task
 from app.pages.inspect.results import capture_known, pixel_lit
@@ -34,7 +34,7 @@ def source(tmp_path):
 
 
 def ask(source, less=None):
-    return Request(source, Light(), Reading(), TrackingParameters(), less or Less())
+    return Request(source, Illumination(), Reading(), TrackingParameters(), less or Less())
 
 
 @pytest.fixture

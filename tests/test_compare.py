@@ -12,7 +12,7 @@ from PIL import Image
 from playwright.sync_api import expect
 
 import core
-from app.model.state import CLOUDS, FIRST_METHODS, Less, Light, Reading
+from app.model.state import CLOUDS, FIRST_METHODS, Illumination, Less, Reading
 from app.model.store import Request, built_in_sources, compute
 from app.pages.compare import ranking
 from app.pages.compare import text as ranking_words
@@ -29,7 +29,9 @@ from tests.threads import queued
 
 
 def answer_to(source):
-    request = Request(built_in_sources()[source], Light(), Reading(), TrackingParameters(), Less())
+    request = Request(
+        built_in_sources()[source], Illumination(), Reading(), TrackingParameters(), Less()
+    )
     return compute(request, None)
 
 
@@ -237,7 +239,7 @@ def test_another_capture_makes_all_of_it_outdated(stage):
     stage.view.show(True)
     stage.settle()
     before = stage.figures
-    stage.change(light=Light(seed=5))
+    stage.change(light=Illumination(seed=5))
     stage.settle()
     assert stage.figures.keys() == before.keys()
     changed = {name for name in before if stage.figures[name] != before[name]}

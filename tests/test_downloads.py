@@ -22,7 +22,7 @@ from playwright.sync_api import expect
 
 from app.model.colors import image_of, map_of, shown
 from app.model.exports import drawn, facts_file, image_files, shown_table_file, table_file
-from app.model.state import MAPS, Less, Light
+from app.model.state import MAPS, Illumination, Less
 from app.model.store import built_in_sources, inspect
 from app.pages.layout import Layout
 from app.pages.shared import downloads
@@ -65,7 +65,9 @@ def test_a_name_tells_capture_estimator_and_what_is_not_the_default():
     assert subject.file_name("range image", "png") == (
         "21km_K11_night_tracking_l0.01_Tn15_range-image.png"
     )
-    lit = Subject("car", "tracking", (Light(sbr=0.5, n_pulses=200), TrackingParameters(alpha=2.0)))
+    lit = Subject(
+        "car", "tracking", (Illumination(sbr=0.5, n_pulses=200), TrackingParameters(alpha=2.0))
+    )
     assert lit.file_name("histogram row3 col4", "csv") == (
         "car_tracking_SBR0.5_Pulses200_alpha2_histogram-row3-col4.csv"
     )
@@ -88,7 +90,9 @@ def test_a_name_tells_capture_estimator_and_what_is_not_the_default():
 def test_a_name_harms_no_system_whatever_the_capture_is_called(capture):
     everything = TrackingParameters(0.1, 3.0, 2.0, 1.1, 7.0, 5, "none", "zero", "before T_n")
     subject = Subject(
-        capture, "log_matched_filter", (Light(1.0, 1.0, 77, 5), Less(2, 0.1, 0.9), everything)
+        capture,
+        "log_matched_filter",
+        (Illumination(1.0, 1.0, 77, 5), Less(2, 0.1, 0.9), everything),
     )
     name = subject.file_name("enhanced row1000 col1000", "csv")
     assert re.fullmatch(r"[\w.+-]+", name, re.ASCII)

@@ -18,7 +18,7 @@ from app import __main__ as started
 from app.model import download_text as download_words
 from app.model import text as words
 from app.model.address import Wanted
-from app.model.state import Light
+from app.model.state import Illumination
 from app.model.store import built_in_sources, scene_source
 from app.model.uploads import Uploads
 from app.pages.compare import text as ranking_words
@@ -327,7 +327,7 @@ def test_a_limit_that_fails_is_told_and_is_not_called_unknown(monkeypatch, sessi
     eventually(lambda: messages(page)["Physics’ limit"] not in ("", words.NOT_COMPUTED))
     check_told(messages(page)["Physics’ limit"], raised[0])
     raised.clear()
-    session.state.light = Light(seed=1)
+    session.state.light = Illumination(seed=1)
     eventually(lambda: page._measure is not None and page._measure.limit is not None)
     eventually(lambda: messages(page)["Physics’ limit"] == "")
 

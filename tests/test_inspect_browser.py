@@ -15,7 +15,7 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 import core
-from app.model.state import Light
+from app.model.state import Illumination
 from app.pages.inspect import text as inspector_words
 from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
@@ -56,7 +56,7 @@ def opened(request, open_watched) -> Iterator[Inspected]:
             yield Inspected(page, capture, ranged(capture), path.stem, (100, 190))
             page.close()
     else:
-        scene, light = core.scenes["building"](), Light()
+        scene, light = core.scenes["building"](), Illumination()
         acquisition = light.acquisition(scene.acquisition)
         capture = core.simulate(scene, acquisition, light.flux, seed=light.seed)
         address = request.getfixturevalue("address")
@@ -197,11 +197,11 @@ def test_a_pixel_is_shown_with_all_that_is_known_of_it(here):
     go_to(page, row, col)
     tracking = core.TrackingParameters()
     report = inspection.pixel_report(here.capture, here.image, row, col, "tracking", tracking)
-    for name, found in zip(("Signal S", "Background B", "SBR"), report.light, strict=True):
+    for name, found in zip(("Signal S", "Background B", "SBR"), report.flux, strict=True):
         expect(fact(page, name)).to_have_text(inspector_words.interval(found))
     name, table = download(page, "numbers", "csv")
     assert name == f"{here.name}_tracking_numbers-row{row}-col{col}.csv"
-    sbr = report.light.sbr
+    sbr = report.flux.sbr
     assert f"\nSBR,{sbr.value:.3g},{sbr.low:.3g},{sbr.high:.3g},".encode() in table
     told = fact(page, "Detections")
     expect(told).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
@@ -212,7 +212,7 @@ def test_a_pixel_is_shown_with_all_that_is_known_of_it(here):
     ranks = page.get_by_role("rowheader").filter(visible=True)
     expect(ranks).to_have_text([str(n + 1) for n in range(len(report.candidates))])
     signals = core.tracking_signals(
-        here.capture.cube[row, col], tracking, here.capture.armed_pulses
+        here.capture.cube[row, col], tracking, here.capture.gated_pulses
     )
     for title, layer, column, expected in (
         (COUNTS, "raw", "raw", signals.raw),
@@ -365,8 +365,8 @@ def test_a_region_is_dragged_outlined_and_its_sum_shown(here, mode):
     expect(fact(page, "Pixels")).to_have_text(f"{inside.sum():,}")
     sum_of_all = capture.cube[inside].sum(axis=0)
     np.testing.assert_array_equal(drawn(page, COUNTS, "raw", "raw"), sum_of_all)
-    armed_pulses = capture.armed_pulses and capture.armed_pulses * int(inside.sum())
-    signals = core.tracking_signals(sum_of_all, core.TrackingParameters(), armed_pulses)
+    gated_pulses = capture.gated_pulses and capture.gated_pulses * int(inside.sum())
+    signals = core.tracking_signals(sum_of_all, core.TrackingParameters(), gated_pulses)
     residual = drawn(page, STAGES, "residual", "residual")
     np.testing.assert_allclose(residual, signals.residual, rtol=1e-6)
     outline = of_picture(
@@ -495,9 +495,9 @@ def bins_told(here: Inspected, n_bins: int | None = None) -> Locator:
 
 def test_the_capture_is_reported(whole):
     report = inspection.capture_report(whole.capture)
-    for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.light, strict=True):
+    for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.flux, strict=True):
         expect(fact(whole.page, name)).to_have_text(inspector_words.interval(found))
-    told = whole.page.get_by_text(f"Signal, background and SBR: {report.light_method}")
+    told = whole.page.get_by_text(f"Signal, background and SBR: {report.flux_method}")
     expect(told).to_be_visible()
     counts = drawn(whole.page, "Counts of all pixels", "raw", "raw")
     np.testing.assert_array_equal(counts, report.histogram)

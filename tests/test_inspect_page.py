@@ -142,7 +142,7 @@ def test_every_map_is_offered_where_it_can_be_and_drawn(field, facade):
             assert look.low < look.high
     counts, _ = map_of(facade.answer, "Counts", 0.0)
     fired, _ = map_of(facade.answer, "Fired", 0.0)
-    np.testing.assert_allclose(fired * facade.answer.capture.armed_pulses, counts)
+    np.testing.assert_allclose(fired * facade.answer.capture.gated_pulses, counts)
     fired, look = map_of(field.answer, "Fired", 0.0)
     assert np.isnan(fired).all()
     assert "pulses not known" in look.title
@@ -234,13 +234,13 @@ def test_everything_of_a_pixel_is_cores(facade):
     facade.choose_pixel(40, 30)
     eventually(lambda: part._facts.facts[0][1] == "40, 30")
     histogram = capture.cube[40, 30]
-    signals = tracking_signals(histogram, tracking, capture.armed_pulses)
+    signals = tracking_signals(histogram, tracking, capture.gated_pulses)
     plots = part._plots
     for plot, layer, expected in (
         (plots.counts, "raw", histogram),
         (plots.counts, "small", signals.small),
         (plots.counts, "large", signals.large),
-        (plots.rate, "rate", coates_rate(histogram, capture.armed_pulses)),
+        (plots.rate, "rate", coates_rate(histogram, capture.gated_pulses)),
         (plots.stages, "residual", signals.residual),
         (plots.stages, "enhanced", signals.enhanced),
     ):
@@ -250,7 +250,7 @@ def test_everything_of_a_pixel_is_cores(facade):
     marks = column(plots.counts, "candidates", "x")
     np.testing.assert_allclose(marks, [each.bin for each in report.candidates], rtol=1e-6)
     facts = {name: value for name, value, _ in part._facts.facts}
-    for name, found in zip(("Signal S", "Background B", "SBR"), report.light, strict=True):
+    for name, found in zip(("Signal S", "Background B", "SBR"), report.flux, strict=True):
         assert facts[name] == inspector_words.interval(found)
     assert report.verdict.health in part._remark.text
     assert report.verdict.why in part._remark.text
@@ -301,7 +301,7 @@ def test_a_region_shows_its_pixels_added_to_one(facade):
     image = facade.answer.run.image.range_m[40:45, 30:34]
     assert facts["Median of answers"] == f"{np.nanmedian(image):.4g} m"
     seen = region_seen(facade.answer, facade.state.region)
-    assert facts["SBR"] == inspector_words.interval(seen.region.light.sbr)
+    assert facts["SBR"] == inspector_words.interval(seen.region.flux.sbr)
     facade.state.region = ((0.1, 0.1), (0.1, 0.2), (0.2, 0.2))
     eventually(lambda: "0 pixels" in part._remark.text)
     assert not part._facts.facts
@@ -408,8 +408,8 @@ def test_the_capture_is_reported_and_suggestions_apply(facade):
         column(part._counts, "raw", "raw"), capture.cube.sum(axis=(0, 1)), rtol=1e-6
     )
     facts = {name: value for name, value, _ in part._facts.facts}
-    assert facts["SBR"] == inspector_words.interval(report.light.sbr)
-    assert report.light_method in part._light.text
+    assert facts["SBR"] == inspector_words.interval(report.flux.sbr)
+    assert report.flux_method in part._light.text
     assert facts["Hot pixels"] == str(report.n_hot)
     assert report.suggestion.why_gate in part._advice[0].text
     assert report.suggestion.why_t_n in part._advice[1].text

@@ -21,13 +21,13 @@ from app.model import large
 from app.model.address import Wanted
 from app.model.colors import image_of
 from app.model.large import LIMIT, Grid, most_whole_bytes
-from app.model.state import Less, Light, Reading
+from app.model.state import Illumination, Less, Reading
 from app.model.store import built_in_sources, compute, file_source
 from app.pages.layout import Layout
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
 from core import Window
-from core.inference.posterior import lighting_of
+from core.inference.posterior import flux_prior_of
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT, fact, serving
@@ -98,7 +98,7 @@ def test_size_decides_what_is_held_as_a_whole(path, building, monkeypatch):
     monkeypatch.setenv(LIMIT, str(building.cube.nbytes))
     source = file_source(path)
     assert source.large(reading) is None
-    np.testing.assert_array_equal(source.load(Light(), reading, ()).cube, building.cube)
+    np.testing.assert_array_equal(source.load(Illumination(), reading, ()).cube, building.cube)
     monkeypatch.delenv(LIMIT)
     assert 0 < most_whole_bytes() <= large.WHOLE_BYTES
 
@@ -106,7 +106,7 @@ def test_size_decides_what_is_held_as_a_whole(path, building, monkeypatch):
 def test_a_format_without_windows_is_refused_with_a_remedy_that_works(building, small, tmp_path):
     core.save_capture(building, tmp_path / "b.npz")
     with pytest.raises(ValueError, match=r"python -m core export b\.npz b\.zarr") as refused:
-        file_source(tmp_path / "b.npz").load(Light(), Reading(), ())
+        file_source(tmp_path / "b.npz").load(Illumination(), Reading(), ())
     assert f"= {building.cube.nbytes} " in str(refused.value)
     core.save_capture(core.read_capture(tmp_path / "b.npz"), tmp_path / "b.zarr")
     assert file_source(tmp_path / "b.zarr").large(Reading()) is not None
@@ -162,8 +162,8 @@ def test_a_window_is_read_once_and_says_what_the_whole_says(path, building, slow
     answer = compute(ask(source, window=window), None)
     assert set(slow) == {window}
     np.testing.assert_array_equal(answer.capture.cube, building.cube[40:70, 30:62])
-    light = core.light_of_whole(core.open_capture(path))
-    np.testing.assert_array_equal(lighting_of(answer.capture).depth, light.depth)
+    light = core.sampled_flux_prior(core.open_capture(path))
+    np.testing.assert_array_equal(flux_prior_of(answer.capture).depth, light.depth)
     slow.clear()
     other = compute(ask(source, window=window, tracking=core.PRESETS["as printed"]), answer)
     assert other.capture is answer.capture and slow == []

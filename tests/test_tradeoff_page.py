@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from app.model.state import Less, Light
+from app.model.state import Illumination, Less
 from app.model.store import built_in_sources
 from app.pages.layout import CUSTOM, Layout
 from app.pages.session import Session
@@ -139,7 +139,7 @@ def test_a_result_that_cannot_be_drawn_is_told(slow):
 
 def test_the_present_scene_is_measured_in_its_light():
     session = Session(built_in_sources())
-    session.state.light = Light(sbr=0.2, n_pulses=300)
+    session.state.light = Illumination(sbr=0.2, n_pulses=300)
     eventually(lambda: session.answer.request.light.sbr == 0.2)
     simulation = source_of(session.answer)
     assert (simulation.flux.sbr, simulation.acquisition.n_pulses) == (0.2, 300)
@@ -194,7 +194,7 @@ def test_a_point_is_told_apart_by_colour_and_shape():
 def test_another_capture_makes_it_outdated(ways):
     session = ways._session
     assert "compute again" not in ways._subject.text
-    session.state.light = Light(seed=3)
+    session.state.light = Illumination(seed=3)
     eventually(lambda: session.answer.request.light.seed == 3)
     ways._follow(session.answer)
     assert ways._subject.text.endswith("compute again.")
@@ -205,12 +205,12 @@ def test_opening_the_papers_method_sets_the_sliders(measured):
     (point,) = (p for p in measured if p.candidate.method.estimator == "tracking")
     less = replace(point.candidate, reduction=Less(merge=2).reduction(100))
     measured_on = layout.session.answer.request
-    changed = Light(sbr=1.0)
+    changed = Illumination(sbr=1.0)
     layout._light.show(changed)
     layout.session.state.param.update(light=changed, source="staircase")
     layout._open_point(replace(point, candidate=less), measured_on)
-    assert (layout.session.state.source, layout.session.state.light) == ("car", Light())
-    assert layout._light.controls["sbr"].value == Light().sbr
+    assert (layout.session.state.source, layout.session.state.light) == ("car", Illumination())
+    assert layout._light.controls["sbr"].value == Illumination().sbr
     assert layout.pages.choice.value == "Explore"
     assert layout.session.state.less == Less(merge=2)
     assert layout.session.state.tracking == less.settings
@@ -296,7 +296,7 @@ def test_verdicts_are_those_of_the_scene_in_its_light(worn):
         assert rows[each.part]["cells"][0][0] == each.verdict
         assert each.why in rows[each.part]["note"]
         assert len(rows[each.part]["cells"]) == len(requires_words.COLUMNS) - 1
-    worn.state.light = Light(sbr=0.5)
+    worn.state.light = Illumination(sbr=0.5)
     eventually(lambda: worn.answer.request.light.sbr == 0.5)
     section._follow(worn.answer)
     assert all("message" in row for row in section._table.rows)

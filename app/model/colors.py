@@ -106,7 +106,7 @@ def map_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array, L
     values = inspection.maps[kind](answer.capture)
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, [1, 99]).tolist() if known.size else (0.0, 1.0)
-    is_unknown = kind == "Fired" and answer.capture.armed_pulses is None
+    is_unknown = kind == "Fired" and answer.capture.gated_pulses is None
     title = FIRED_UNKNOWN if is_unknown else MAP_TITLES[kind]
     return values, Look(title, "", low, max(high, low + 1e-6), COUNT_COLORS)
 

@@ -16,9 +16,9 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from core import Capture, Window, light_of_whole, open_capture
+from core import Capture, Window, open_capture, sampled_flux_prior
 from core.checks import require
-from core.inference.posterior import Lighting
+from core.inference.posterior import FluxPrior
 from core.io.readers import bytes_of
 from core.out_of_core.windows import WindowReader
 from core.studies.tradeoff.measure import Cancelled
@@ -100,7 +100,7 @@ class LargeFile:
         self.whole = Window.fitting((0, rows), (0, cols), most)
         self._preview: Cutout | None = None
         self._latest: Cutout | None = None
-        self._reading, self._lighting_up = Lock(), Lock()
+        self._reading, self._preparing_prior = Lock(), Lock()
 
     def fitting(self, rows: tuple[int, int], cols: tuple[int, int]) -> Window:
         """The window of the finest step that may be read."""
@@ -144,14 +144,14 @@ class LargeFile:
             with self._reading:
                 reader.read_some()
             progress(reader.done, reader.of + 1)
-        lighting = self._lighting if reader.is_complete else None
+        flux_prior = self._flux_prior if reader.is_complete else None
         with self._reading:
-            self._preview = self._look(lighting)
+            self._preview = self._look(flux_prior)
             return self._preview.is_final
 
-    def _look(self, lighting: Lighting | None = None) -> Cutout:
-        read, capture = float(self._reader.seen.mean()), self._reader.capture(lighting)
-        return Cutout(self, self.whole, capture, read, is_final=lighting is not None)
+    def _look(self, flux_prior: FluxPrior | None = None) -> Cutout:
+        read, capture = float(self._reader.seen.mean()), self._reader.capture(flux_prior)
+        return Cutout(self, self.whole, capture, read, is_final=flux_prior is not None)
 
     def cutout(
         self,
@@ -184,19 +184,19 @@ class LargeFile:
             reader.read_some()
             progress(reader.done, reader.of + 1)
         _go_on(cancelled)
-        capture = reader.capture(self._lighting)
+        capture = reader.capture(self._flux_prior)
         self._latest = Cutout(self, window, capture, read=1.0, is_final=True)
         return self._latest
 
     @property
-    def _lighting(self) -> Lighting:
+    def _flux_prior(self) -> FluxPrior:
         """Learned when it is first needed, while others wait."""
-        with self._lighting_up:
-            return self._light_of_whole
+        with self._preparing_prior:
+            return self._sampled_flux_prior
 
     @cached_property
-    def _light_of_whole(self) -> Lighting:
-        return light_of_whole(self._counts)
+    def _sampled_flux_prior(self) -> FluxPrior:
+        return sampled_flux_prior(self._counts)
 
 
 def _go_on(cancelled: Callable[[], bool]) -> None:

@@ -192,7 +192,7 @@ def _shown(least_confidence: float) -> Lines:
 
 
 def _signals(name: str, pixel: str) -> str:
-    of = (f"capture.cube[{pixel}]", "settings", "capture.armed_pulses")
+    of = (f"capture.cube[{pixel}]", "settings", "capture.gated_pulses")
     return _assign(name, "core.tracking_signals", *of)
 
 
@@ -207,7 +207,7 @@ def _comparison(answer: Answer, state: State) -> Lines:
     yield "images = {}"
     for method in chosen.methods:
         try:
-            ESTIMATORS[method].light(answer.capture)
+            ESTIMATORS[method].flux_model(answer.capture)
         except ValueError:
             yield f"# {method} has no answer: it needs to be told the true light."
         else:

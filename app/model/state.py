@@ -19,7 +19,7 @@ from core.studies.ablation.criterion import TITLES
 
 
 @dataclass(frozen=True)
-class Light:
+class Illumination:
     """How a built-in scene is lit and recorded."""
 
     sbr: float = parameter(
@@ -299,7 +299,7 @@ class State(param.Parameterized):
     """
 
     source = param.String(default="car", doc="Key of the catalogue.")
-    light = param.ClassSelector(class_=Light, default=Light())
+    light = param.ClassSelector(class_=Illumination, default=Illumination())
     reading = param.ClassSelector(class_=Reading, default=Reading())
     window = param.ClassSelector(
         class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."

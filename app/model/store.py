@@ -13,7 +13,7 @@ import numpy as np
 
 from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
-from app.model.state import Less, Light, Reading
+from app.model.state import Illumination, Less, Reading
 from app.tasks.jobs import Effort
 from core import (
     Capture,
@@ -50,7 +50,7 @@ class Source:
     """Something to look at: a built-in scene to simulate, or a file to read."""
 
     title: str
-    load: Callable[[Light, Reading, Collection[str]], Capture]
+    load: Callable[[Illumination, Reading, Collection[str]], Capture]
     """Makes the capture, parts of some names left out of a scene."""
     scene: Callable[[], Scene] | None = None
     """None for a file."""
@@ -80,7 +80,7 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
 
     build = cache(partial(scenes[name], **arguments))
 
-    def load(light: Light, _reading: Reading, absent: Collection[str]) -> Capture:
+    def load(light: Illumination, _reading: Reading, absent: Collection[str]) -> Capture:
         scene = bare(build(), absent)
         return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
@@ -95,7 +95,7 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
         require_small(path, capture.cube.nbytes)
         return capture
 
-    def load(_light: Light, reading: Reading, _absent: Collection[str]) -> Capture:
+    def load(_light: Illumination, reading: Reading, _absent: Collection[str]) -> Capture:
         large = opened(reading)
         return get(reading) if large is None else large.preview.capture
 
@@ -128,7 +128,7 @@ class Request:
     """What is to be computed."""
 
     source: Source
-    light: Light
+    light: Illumination
     reading: Reading
     tracking: TrackingParameters
     less: Less
@@ -318,7 +318,7 @@ def inspect(answer: Answer, row: int, col: int) -> Pixel:
     return Pixel(
         row,
         col,
-        tracking_signals(histogram, answer.request.tracking, capture.armed_pulses),
+        tracking_signals(histogram, answer.request.tracking, capture.gated_pulses),
         expected,
         first_difference(histogram),
         float(acquisition.range_m_to_bin(truth_m)),

@@ -81,7 +81,7 @@ def figure_strip(answer: Answer) -> list[Fact]:
 def pixel_numbers(answer: Answer, pixel: Pixel, unit: str = "bins") -> list[Fact]:
     """Name, value and help of each number of a pixel; positions along the gate in a unit."""
     tracking, sigma = answer.request.tracking, float(pixel.signals.sigma)
-    n_pulses = answer.capture.armed_pulses
+    n_pulses = answer.capture.gated_pulses
     r_small = tracking.l * sigma
     row, col = answer.grid.place(pixel.row, pixel.col)
     entries = [

@@ -16,7 +16,7 @@ from panel_material_ui.template.base import Meta
 from app.model import text as words
 from app.model.address import AddressBar, Wanted
 from app.model.script import script_of
-from app.model.state import Less, Light, Reading, Viewing
+from app.model.state import Illumination, Less, Reading, Viewing
 from app.model.store import Answer, Request, Source
 from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
 from app.pages.compare.page import Compare
@@ -189,7 +189,7 @@ class Layout:
             sizing_mode="stretch_width",
             margin=(4, 8),
         )
-        self._light = SettingsPanel(Light(), partial(setattr, state, "light"))
+        self._light = SettingsPanel(Illumination(), partial(setattr, state, "light"))
         self._viewing = SettingsPanel(Viewing(), partial(setattr, state, "viewing"))
         self._tracking = SettingsPanel(TrackingParameters(), partial(setattr, state, "tracking"))
         self._less = SettingsPanel(Less(), partial(setattr, state, "less"))

@@ -27,7 +27,7 @@ from core.cli.options import (
     whole_from_to,
 )
 from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage, estimate
-from core.inspection import LightFound, capture_report, pixel_report
+from core.inspection import FluxEstimate, capture_report, pixel_report
 from core.io.readers import READERS, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
@@ -123,8 +123,8 @@ def _of_capture(capture: Capture) -> dict[str, Any]:
     report = capture_report(capture)
     suggestion = report.suggestion
     return {
-        **_light(report.light, report.light_unit),
-        "light_method": report.light_method,
+        **_light(report.flux, report.flux_unit),
+        "light_method": report.flux_method,
         "hot_pixels": report.n_hot,
         "dead_pixels": report.n_dead,
         "suggested_gate_first_bin": suggestion.gate[0],
@@ -144,8 +144,8 @@ def _of_pixel(capture: Capture, row: int, col: int) -> dict[str, Any]:
         "photons": int(report.counts.sum()),
         "range_m": report.answer_m,
         "confidence": report.confidence,
-        **_light(report.light, report.light_unit),
-        "light_method": report.light_method,
+        **_light(report.flux, report.flux_unit),
+        "light_method": report.flux_method,
         "verdict": report.verdict.health,
         "why_verdict": report.verdict.why,
     }
@@ -154,7 +154,7 @@ def _of_pixel(capture: Capture, row: int, col: int) -> dict[str, Any]:
     return facts
 
 
-def _light(light: LightFound, unit: str) -> dict[str, Any]:
+def _light(light: FluxEstimate, unit: str) -> dict[str, Any]:
     facts: dict[str, Any] = {"light_unit": unit}
     for name, interval in light._asdict().items():
         facts |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
@@ -248,7 +248,7 @@ def _ranged_at_once(
     found = run(capture, chosen.method, settings, chosen.false_alarm)
     facts: dict[str, Any] = found.figures | {
         "remark": ESTIMATORS[chosen.method].remark(capture),
-        "light_s": found.light_s,
+        "light_s": found.flux_time_s,
         "estimate_s": found.estimate_s,
     }
     if capture.truth_range_m is not None:

@@ -154,7 +154,7 @@ def _of_capture(chosen: argparse.Namespace) -> tuple[plans.Plan, list[Simulation
     else:
         around, simulation = source.window, source
     plan: plans.Plan = [(source, candidates() + variations(window=around))]
-    return plan, [simulation] if capture.armed_pulses else []
+    return plan, [simulation] if capture.gated_pulses else []
 
 
 def _on_bar(what: str) -> Callable[[int, int], None]:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
+from core.deprecation import renamed
 from core.inference import posterior
 from core.inference.neighbours import patches, pooled_at, pooled_in
-from core.inference.posterior import Conditions, Light
+from core.inference.posterior import Conditions, FluxModel
 from core.parameters import Number
 from core.trigger import drawn, rate_per_bin, trigger_probability
 
@@ -86,8 +87,8 @@ class Estimator:
         ``parameters -> bin`` before which the estimator gives no answer.
     finds_delay : bool
         Whether positions are delays of the surface already, with no lag to be calibrated.
-    light : callable
-        ``capture -> Light`` that the estimator is told; raises ``ValueError`` where it is not
+    flux_model : callable
+        ``capture -> FluxModel`` that the estimator is told; raises ``ValueError`` where it is not
         known.
     reconstructed : str
         Where the original was not available: from what the method was reconstructed.
@@ -107,16 +108,18 @@ class Estimator:
     title: str
     parameters: type[Any]
     curve: Callable[[Floats, Conditions, Any], Floats]
-    locate: Callable[[Capture, Light, Any], tuple[Floats, Floats]] | None = None
+    locate: Callable[[Capture, FluxModel, Any], tuple[Floats, Floats]] | None = None
     reach: Callable[[Any], int] = lambda _: 1
     first_bin: Callable[[Any], int] = lambda _: 0
     finds_delay: bool = False
-    light: Callable[[Capture], Light] = posterior.light_of
+    flux_model: Callable[[Capture], FluxModel] = posterior.flux_model_of
     reconstructed: str = ""
     null_side: int = NULL_SIDE
     undoes_pile_up: bool = False
     spares: Callable[[Capture], str] = lambda _: ""
     whole_image: bool = False
+
+    light = renamed("flux_model")
 
     def __call__(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
@@ -142,7 +145,7 @@ class Estimator:
     def remark(self, capture: Capture) -> str:
         """What the estimator leaves out for a capture; empty where nothing."""
         said = [self.spares(capture)]
-        if self.undoes_pile_up and capture.armed_pulses is None:
+        if self.undoes_pile_up and capture.gated_pulses is None:
             every = "the capture holds all photons, none hides another"
             why = every if capture.detection == "all" else "the number of pulses is not known"
             said.append(f"no pile-up is undone: {why}")
@@ -167,7 +170,7 @@ class Estimator:
             range_m=capture.acquisition.bin_to_range_m(bins),
             bin=bins,
             score=score,
-            confidence=posterior.near(capture, bins),
+            confidence=posterior.tolerance_probability(capture, bins),
             valid=np.isfinite(bins),
         )
 
@@ -180,7 +183,7 @@ class Estimator:
     def _delays(
         self, capture: Capture, parameters: Any, calibration: Calibration
     ) -> tuple[Floats, Floats]:
-        position, score = self._best(capture, self.light(capture), parameters)
+        position, score = self._best(capture, self.flux_model(capture), parameters)
         if calibration.least_score is not None:
             position = np.where(score > calibration.least_score, position, np.nan)
         delay = np.clip(position - calibration.lag_bins, 0.0, capture.acquisition.n_bins)
@@ -188,9 +191,9 @@ class Estimator:
 
     def curves(self, capture: Capture, row: int, col: int, parameters: Any) -> Floats:
         """The score of each bin for one pixel, shape (bin,)."""
-        light, reach = self.light(capture), self.reach(parameters)
+        flux, reach = self.flux_model(capture), self.reach(parameters)
         around = pooled_at(capture.cube, row, col, reach)
-        given = conditions_of(capture, light, reach)
+        given = conditions_of(capture, flux, reach)
         here = np.s_[row : row + 1, col : col + 1]
         conditions = given._replace(signal=given.signal[here], background=given.background[here])
         one = around[np.newaxis, np.newaxis].astype(float)
@@ -205,8 +208,8 @@ class Estimator:
         some = np.s_[: whole[0], : whole[1]]
         cube = _null_cube(capture)[some].copy()
         null = Capture(cube, capture.acquisition, capture.pulse, detection=capture.detection)
-        light = self.light(capture).of_pixels(_null_pixels(capture)[some])
-        _, score = self._best(null, light, parameters)
+        flux = self.flux_model(capture).of_pixels(_null_pixels(capture)[some])
+        _, score = self._best(null, flux, parameters)
         return float(np.quantile(score, 1 - false_alarm))
 
     def lag_bins(self, capture: Capture, parameters: Any) -> float:
@@ -222,7 +225,7 @@ class Estimator:
             Lag in bins; 0 where no echo can be found at all (every bin excluded, say).
         """
         n_bins = capture.acquisition.n_bins
-        given = conditions_of(capture, self.light(capture), self.reach(parameters))
+        given = conditions_of(capture, self.flux_model(capture), self.reach(parameters))
         given = given._replace(
             signal=np.asarray(given.signal.mean()), background=np.asarray(given.background.mean())
         )
@@ -244,16 +247,16 @@ class Estimator:
             return 0.0
         return float(np.median(at[found] - onset[found]))
 
-    def _best(self, capture: Capture, light: Light, parameters: Any) -> tuple[Floats, Floats]:
+    def _best(self, capture: Capture, flux: FluxModel, parameters: Any) -> tuple[Floats, Floats]:
         """Bin and value of the largest score, each of shape (row, col)."""
         locate = self.locate or self._largest
-        position, score = locate(capture, light, parameters)
+        position, score = locate(capture, flux, parameters)
         seen = capture.counts > 0
         return np.where(seen, position, np.nan), np.where(seen, score, 0.0)
 
-    def _largest(self, capture: Capture, light: Light, parameters: Any) -> tuple[Floats, Floats]:
+    def _largest(self, capture: Capture, flux: FluxModel, parameters: Any) -> tuple[Floats, Floats]:
         reach = self.reach(parameters)
-        given = conditions_of(capture, light, reach)
+        given = conditions_of(capture, flux, reach)
         position, score = np.empty((2, *capture.shape))
         for patch in patches(capture.cube.shape, _AT_ONCE):
             cube = pooled_in(capture.cube, patch, reach)
@@ -269,19 +272,19 @@ class Estimator:
         return position, score
 
 
-def conditions_of(capture: Capture, light: Light, reach: int = 1) -> Conditions:
+def conditions_of(capture: Capture, flux: FluxModel, reach: int = 1) -> Conditions:
     """What an estimator knows of a capture's histograms, `reach` x `reach` of them added."""
-    n_pulses = capture.armed_pulses
+    n_pulses = capture.gated_pulses
     more = 1 if n_pulses else reach * reach  # photons are counted per pixel where pulses are not
-    signal, background = light.typical_signal, light.typical_background
+    signal, background = flux.typical_signal, flux.typical_background
     return Conditions(
         capture.acquisition,
         capture.pulse,
         n_pulses * reach * reach if n_pulses else None,
         signal * more,
         background * more,
-        light.contrast,
-        light.pile_up,
+        flux.contrast,
+        flux.pile_up,
     )
 
 
@@ -326,9 +329,9 @@ def _null_pixels(capture: Capture) -> NDArray[np.intp]:
 def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     """Counts of pixels that see the capture's background alone, shape (row, col, bin)."""
     rng = np.random.default_rng(1)
-    n_bins, n_pulses = capture.acquisition.n_bins, capture.armed_pulses
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     pixels = _null_pixels(capture)
-    background = posterior.light_of(capture).of_pixels(pixels).typical_background
+    background = posterior.flux_model_of(capture).of_pixels(pixels).typical_background
     cubes = []
     rows_at_once = max(1, _AT_ONCE // (pixels.shape[1] * n_bins))
     for first in range(0, len(pixels), rows_at_once):

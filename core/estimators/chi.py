@@ -36,7 +36,7 @@ from core.estimators.base import Estimator
 from core.estimators.filters import correlate
 from core.estimators.kde import kernel_taps
 from core.inference.neighbours import neighbours, patches, pooled_in, weighted_median
-from core.inference.posterior import TOLERANCE_BINS, Conditions, Light
+from core.inference.posterior import TOLERANCE_BINS, Conditions, FluxModel
 from core.kernels.parallel import COMPILED
 from core.parameters import Number, Zone, check_fields, parameter
 
@@ -175,7 +175,7 @@ def repaired(position: Floats, intensity: Floats) -> Floats:
     return better
 
 
-def _locate(capture: Capture, light: Light, parameters: ChiParameters) -> tuple[Floats, Floats]:
+def _locate(capture: Capture, flux: FluxModel, parameters: ChiParameters) -> tuple[Floats, Floats]:
     """Repaired positions, and the density of each at its own first answer."""
     position, height = np.empty((2, *capture.shape))
     for here in patches(capture.cube.shape, _AT_ONCE):

@@ -16,7 +16,7 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate, echo_shape
-from core.inference.posterior import Conditions, lighting_of, rate_and_armed
+from core.inference.posterior import Conditions, flux_prior_of, rate_and_n_armed
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ def _curve(histogram: Floats, conditions: Conditions, parameters: CoatesParamete
     echo, first = echo_shape(conditions)
     n_pulses = conditions.n_pulses
     if conditions.pile_up or n_pulses is None:
-        rate, armed = rate_and_armed(histogram, n_pulses)
+        rate, armed = rate_and_n_armed(histogram, n_pulses)
     else:
         rate, armed = histogram / n_pulses, np.full(histogram.shape[-1], float(n_pulses))
     mean = np.maximum(rate.mean(axis=-1, keepdims=True), np.finfo(float).tiny)
@@ -40,7 +40,7 @@ def _curve(histogram: Floats, conditions: Conditions, parameters: CoatesParamete
 
 
 def _spares(capture: Capture) -> str:
-    if lighting_of(capture).pile_up or capture.armed_pulses is None:
+    if flux_prior_of(capture).pile_up or capture.gated_pulses is None:
         return ""
     return "Coates undoes no pile-up: too few pulses fire for one photon to hide another"
 

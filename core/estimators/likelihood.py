@@ -17,9 +17,9 @@ from core.capture import Capture
 from core.estimators.base import Estimator
 from core.inference.posterior import (
     Conditions,
-    Light,
-    detailed_lighting_of,
-    lighting_of,
+    FluxModel,
+    detailed_flux_prior_of,
+    flux_prior_of,
     log_likelihood_ratio,
     most_likely,
 )
@@ -55,12 +55,12 @@ class LikelihoodParameters:
 
 
 def locate(
-    capture: Capture, light: Light, parameters: LikelihoodParameters
+    capture: Capture, flux: FluxModel, parameters: LikelihoodParameters
 ) -> tuple[Floats, Floats]:
     """Delay of the largest posterior density, and its log likelihood ratio to no echo."""
     if parameters.depths == "alike":
-        light = replace(light, depth=np.ones_like(light.depth))
-    return most_likely(capture, light, parameters.steps_per_bin)
+        flux = replace(flux, depth=np.ones_like(flux.depth))
+    return most_likely(capture, flux, parameters.steps_per_bin)
 
 
 def curve(histogram: Floats, conditions: Conditions, parameters: LikelihoodParameters) -> Floats:
@@ -69,7 +69,7 @@ def curve(histogram: Floats, conditions: Conditions, parameters: LikelihoodParam
 
 
 def _spares(capture: Capture) -> str:
-    if lighting_of(capture).levels.size == detailed_lighting_of(capture).levels.size:
+    if flux_prior_of(capture).levels.size == detailed_flux_prior_of(capture).levels.size:
         return ""
     return "the likelihood takes one level of signal for all pixels: none tells its own"
 

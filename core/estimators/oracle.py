@@ -7,11 +7,11 @@ import numpy as np
 from core.capture import Capture, once_per_capture
 from core.estimators.base import Estimator
 from core.estimators.likelihood import LikelihoodParameters, curve, locate
-from core.inference.posterior import Light
+from core.inference.posterior import FluxModel
 
 
 @once_per_capture
-def true_light(capture: Capture) -> Light:
+def true_flux_model(capture: Capture) -> FluxModel:
     """The light of a simulated capture.
 
     Raises
@@ -29,7 +29,7 @@ def true_light(capture: Capture) -> Light:
     typical = float(target.mean()) if target.size else 1.0
     signal = np.where(capture.signal > 0, capture.signal, typical)
     background = np.full(capture.shape, max(capture.background, 1e-12))
-    return Light(
+    return FluxModel(
         np.stack([np.zeros(capture.shape), signal]),
         np.stack([background, background]),
         np.array([0.0, 1.0]),
@@ -43,6 +43,6 @@ ESTIMATOR = Estimator(
     curve,
     locate,
     finds_delay=True,
-    light=true_light,
+    flux_model=true_flux_model,
     undoes_pile_up=True,
 )

@@ -9,7 +9,7 @@ import numpy as np
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
-from core.inference.posterior import Conditions, Light
+from core.inference.posterior import Conditions, FluxModel
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class PeakParameters:
     """The peak has no settings."""
 
 
-def _locate(capture: Capture, light: Light, parameters: PeakParameters) -> tuple[Floats, Floats]:
+def _locate(capture: Capture, flux: FluxModel, parameters: PeakParameters) -> tuple[Floats, Floats]:
     position = capture.cube.argmax(axis=2)
     height = np.take_along_axis(capture.cube, position[..., np.newaxis], axis=2)[..., 0]
     return position.astype(float), height.astype(float)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
-from core.inference.posterior import Conditions, Light
+from core.inference.posterior import Conditions, FluxModel
 from core.tracking import TrackingParameters, track, tracking_signals
 
 
 def _locate(
-    capture: Capture, light: Light, parameters: TrackingParameters
+    capture: Capture, flux: FluxModel, parameters: TrackingParameters
 ) -> tuple[Floats, Floats]:
-    position, score = track(capture.blocks, parameters, capture.armed_pulses)
+    position, score = track(capture.blocks, parameters, capture.gated_pulses)
     return position.reshape(capture.shape).astype(float), score.reshape(capture.shape).astype(float)
 
 

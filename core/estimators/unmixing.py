@@ -53,7 +53,7 @@ from core.capture import Capture
 from core.estimators.base import Estimator, conditions_of
 from core.estimators.filters import echo_shape
 from core.inference.neighbours import box_sum, neighbours, patches, weighted_median, widened
-from core.inference.posterior import Conditions, Light, rate_and_armed
+from core.inference.posterior import Conditions, FluxModel, rate_and_n_armed
 from core.parameters import Number, check_fields, parameter
 
 _LAGS = 65  # delays tried around a window
@@ -113,7 +113,7 @@ def window_sums(values: Floats, window: int) -> Floats:
 
 def exposures(histogram: Floats, background: Floats, n_pulses: int | None) -> Floats:
     """How long each bin lasts as noise sees it, ``e_i = b A_i``; shape (..., bin)."""
-    _, armed = rate_and_armed(histogram, n_pulses)
+    _, armed = rate_and_n_armed(histogram, n_pulses)
     return np.asarray(np.asarray(background)[..., np.newaxis] * armed)
 
 
@@ -164,9 +164,9 @@ class _Ruler(NamedTuple):
     """The echo at each lag in the surroundings, each of norm 1; shape (lag, bin)."""
 
 
-def _ruler(capture: Capture, light: Light) -> _Ruler:
+def _ruler(capture: Capture, flux: FluxModel) -> _Ruler:
     pulse, acquisition = capture.pulse, capture.acquisition
-    echo, begin = echo_shape(conditions_of(capture, light))
+    echo, begin = echo_shape(conditions_of(capture, flux))
     window = window_bins(pulse, acquisition)
     fullest = int(np.argmax(window_sums(echo, window)))
     lags = np.linspace(-window, window, _LAGS)
@@ -242,16 +242,16 @@ def _ratio(numerator: Floats, denominator: Floats) -> Floats:
     return np.divide(numerator, denominator, out=nothing, where=denominator > 0)
 
 
-def find_clusters(capture: Capture, light: Light, parameters: UnmixingParameters) -> Clusters:
+def find_clusters(capture: Capture, flux: FluxModel, parameters: UnmixingParameters) -> Clusters:
     """The cluster of each pixel's smallest superpixel that has one."""
     found = np.zeros((len(Clusters._fields), *capture.shape))
     found[0] = np.nan
-    ruler, background, growth = _ruler(capture, light), light.typical_background, parameters.growth
+    ruler, background, growth = _ruler(capture, flux), flux.typical_background, parameters.growth
     rows, cols, n_bins = capture.cube.shape
     for here in patches((rows, cols, n_bins + _LAGS), _AT_ONCE):
         around, inner = widened(here, growth)  # with the pixels that superpixels reach
         counts = capture.cube[around].astype(float)
-        exposure = exposures(counts, background[around], capture.armed_pulses)
+        exposure = exposures(counts, background[around], capture.gated_pulses)
         for reach in range(1, 2 * growth + 2, 2):
             waiting = np.isnan(found[0][here]) & (capture.counts[here] > 0)
             if waiting.any():
@@ -307,10 +307,10 @@ def smoothed(values: Floats, precision: Floats, smoothness: float) -> Floats:
 
 
 def _locate(
-    capture: Capture, light: Light, parameters: UnmixingParameters
+    capture: Capture, flux: FluxModel, parameters: UnmixingParameters
 ) -> tuple[Floats, Floats]:
     """Smoothed delays, and the score of each pixel's cluster."""
-    clusters = find_clusters(capture, light, parameters)
+    clusters = find_clusters(capture, flux, parameters)
     window = window_bins(capture.pulse, capture.acquisition)
     dropped = censored(clusters, window, parameters.false_acceptance)
     known = np.isfinite(clusters.delay) & ~dropped

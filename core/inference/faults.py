@@ -51,7 +51,7 @@ def standing_out(capture: Capture) -> StandingOut | None:
     """
     if min(capture.shape) < NEIGHBOURS:
         return None
-    counts, n_pulses = capture.counts, capture.armed_pulses
+    counts, n_pulses = capture.counts, capture.gated_pulses
     of_neighbours = (scipy.ndimage.maximum_filter, scipy.ndimage.minimum_filter)
     most, least = (find(counts, footprint=_AROUND, mode="mirror") for find in of_neighbours)
     hot, dead = counts > most, counts < least
@@ -75,7 +75,7 @@ def verdict(capture: Capture, row: int, col: int) -> Verdict:
     found = standing_out(capture)
     if found is None:
         return Verdict("cannot tell", "An image so narrow has no neighbours to compare it with.")
-    counts, n_pulses = int(capture.counts[row, col]), capture.armed_pulses
+    counts, n_pulses = int(capture.counts[row, col]), capture.gated_pulses
     most, least = int(found.most[row, col]), int(found.least[row, col])
     seen = f"It detected {counts:,}, its eight neighbours {least:,} to {most:,}"
     if found.hot[row, col]:

@@ -1,21 +1,20 @@
-"""What a pixel's counts say about where its surface is: the exact first-photon likelihood.
+"""Empirical Bayes posterior of each pixel's delay, from the exact first-photon likelihood.
 
 With background ``b`` and signal ``s_k(d) = S p_k(d)`` photons per pulse in bin ``k``, ``n_k``
-detections and ``A_k`` pulses still armed, the log likelihood of an echo at delay ``d`` is, beside
-that of no echo, ::
+detections and ``A_k`` armed pulses, the log likelihood ratio of an echo at delay ``d`` to no echo
+is ::
 
     T(d) = Σ_k [ n_k ln((1 - exp(-b - s_k)) / (1 - exp(-b))) - (A_k - n_k) s_k ]
 
-which is exact for the trigger probabilities of Eq. 1. Where the number of pulses is not known, or
-where a pulse may fire more than once, counts are taken for Poisson: ``ln(1 + s_k / b)`` and ``-
-s_k``, with photons per pixel instead of per pulse.
+which is exact for the trigger probabilities of Eq. 1. Where the number of pulses is unknown, or
+where a pulse may fire more than once, counts are Poisson: ``ln(1 + s_k / b)`` and ``-s_k``, with
+photons per pixel instead of per pulse.
 
-Neither ``S`` nor ``b`` is told. How often which signal occurs in the capture is estimated from a
-sample of its pixels (`light_of`: the nonparametric maximum likelihood of a mixing distribution,
-Kiefer & Wolfowitz 1956, on a grid of levels, "no echo" being one of them), and so is how often
-which delay occurs. Each pixel's answer is then the average over the levels: an empirical Bayes
-posterior. Its mass around an answer is that answer's probability of being right, whichever
-estimator gave it.
+``S`` and ``b`` are unknown. The distribution of signal levels is estimated from a sample of the
+capture's pixels (`flux_model_of`: nonparametric maximum likelihood of a mixing distribution,
+Kiefer & Wolfowitz 1956, on a grid of levels that includes "no echo"), and so is the distribution
+of delays. The posterior averages over the levels. Its mass around an estimate is the probability
+that the estimate is right, whichever estimator made it.
 """
 
 from __future__ import annotations
@@ -56,12 +55,12 @@ class Conditions(NamedTuple):
     contrast: float
     """Signal over background, both as they are on average over the image."""
     pile_up: bool = True
-    """`Light.pile_up`."""
+    """`FluxModel.pile_up`."""
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
-    """The light that each pixel may have seen: some levels of signal, and how often each occurs.
+class FluxModel:
+    """Flux that each pixel may have seen: levels of signal, and how often each occurs.
 
     Parameters
     ----------
@@ -105,10 +104,10 @@ class Light:
             return self.image_contrast
         return float(self.typical_signal.mean() / self.typical_background.mean())
 
-    def of_pixels(self, pixels: NDArray[np.intp]) -> Light:
+    def of_pixels(self, pixels: NDArray[np.intp]) -> FluxModel:
         """The light of some pixels, given as flat indices of shape (row, col)."""
         flat = (len(self.share), -1)
-        return Light(
+        return FluxModel(
             self.signal.reshape(flat)[:, pixels],
             self.background.reshape(flat)[:, pixels],
             self.share,
@@ -118,42 +117,42 @@ class Light:
         )
 
 
-class Lighting(NamedTuple):
-    """What the pixels of an image have in common; with its counts it gives each one's `Light`."""
+class FluxPrior(NamedTuple):
+    """Flux parameters shared by all pixels of an image; with its counts they give a `FluxModel`."""
 
     levels: Floats
     """Signal photons per pulse, shape (level,)."""
     share: Floats
-    """`Light.share`."""
+    """`FluxModel.share`."""
     depth: Floats
-    """`Light.depth`."""
+    """`FluxModel.depth`."""
     background: Floats
     """Mean background over the image, per level where the signals are not known yet."""
-    trust: float
+    own_weight: float
     """Share of a background's deviation from the mean that is no chance."""
     contrast: float | None = None
-    """`Light.contrast` of the image."""
+    """`FluxModel.contrast` of the image."""
     pile_up: bool = True
-    """`Light.pile_up`."""
+    """`FluxModel.pile_up`."""
 
-    def with_one_level(self) -> Lighting:
+    def with_one_level(self) -> FluxPrior:
         """The same with the mean of all signals for each of them."""
         some = self.share[1:].sum()
         mean = float(self.share[1:] @ self.levels[1:] / some)
         return self._replace(levels=np.array([0.0, mean]), share=np.array([self.share[0], some]))
 
-    def light(self, total: Floats, least_background: float) -> Light:
+    def model(self, total: Floats, least_background: float) -> FluxModel:
         """The light of pixels of which the total rates are known, shape (row, col)."""
         shape, levels = (self.levels.size, *total.shape), self.levels[:, np.newaxis, np.newaxis]
         mean = np.broadcast_to(self.background, levels.shape)
-        if self.trust == 0:  # the same in all pixels: one number a level
+        if self.own_weight == 0:  # the same in all pixels: one number a level
             background = np.broadcast_to(np.maximum(mean, least_background), shape)
         else:
             background = np.empty(shape)
             for level, its_mean, filled in zip(levels, mean, background, strict=True):
-                own = its_mean + self.trust * (total - level - its_mean)
+                own = its_mean + self.own_weight * (total - level - its_mean)
                 np.maximum(own, least_background, out=filled)
-        return Light(
+        return FluxModel(
             np.broadcast_to(levels, shape),
             background,
             self.share,
@@ -174,7 +173,7 @@ def _weighted_sum(weights: Floats, images: Floats) -> Floats:
 class Posterior(NamedTuple):
     """What is known of each pixel's delay once its counts are known."""
 
-    near: NDArray[np.float32]
+    tolerance_probability: NDArray[np.float32]
     """Probability that there is a surface, and within `TOLERANCE_BINS` of each bin's beginning;
     shape (row, col, bin)."""
     surface: Floats
@@ -193,17 +192,17 @@ _RARE = 1e-3  # levels with a smaller share are left out
 _SAMPLE_NUMBERS = 2**25  # likelihoods of the sample's levels and delays that are held: 128 MiB
 _TABLE_NUMBERS = 2**22  # likelihoods of a block's levels and delays: 16 MiB
 _FEWEST_LANES = 2  # a single lane would be summed pairwise by numpy, which rounds differently
-_LIGHT_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
+_FLUX_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
 
 
 @once_per_capture
-def light_of(capture: Capture) -> Light:
+def flux_model_of(capture: Capture) -> FluxModel:
     """Signal levels, their shares, and each pixel's background, as the capture itself tells."""
-    return lighting_of(capture).light(_totals(capture)[0], _least_background(capture))
+    return flux_prior_of(capture).model(_totals(capture)[0], _least_background(capture))
 
 
 @once_per_capture
-def lighting_of(capture: Capture) -> Lighting:
+def flux_prior_of(capture: Capture) -> FluxPrior:
     """What a capture tells of the light that its pixels see, in the cheapest model that will do.
 
     Pile-up that the pulses hide is taken for none (`core.inference.resolution`). The mean of all
@@ -211,9 +210,9 @@ def lighting_of(capture: Capture) -> Lighting:
     pixel that cannot tell its level orders delays by any of them much alike.
 
     A part of an image too large for memory is told that of a sample of the image,
-    ``lighting_of.tell(part, lighting)``.
+    ``flux_prior_of.tell(part, flux_prior)``.
     """
-    found, n_pulses = detailed_lighting_of(capture), capture.armed_pulses
+    found, n_pulses = detailed_flux_prior_of(capture), capture.gated_pulses
     if n_pulses is not None:
         is_hidden = pile_up(capture.counts / n_pulses, n_pulses).is_hidden
         found = found._replace(pile_up=not is_hidden)
@@ -227,16 +226,16 @@ def total_rates(capture: Capture) -> Floats:
 
 
 def level_likelihoods(
-    capture: Capture, pixels: NDArray[np.intp], lighting: Lighting, steps_per_bin: int
+    capture: Capture, pixels: NDArray[np.intp], flux_prior: FluxPrior, steps_per_bin: int
 ) -> Floats:
-    """Log likelihood of each level of signal, delays being as likely as `Lighting.depth` says.
+    """Log likelihood of each level of signal, delays being as likely as `FluxPrior.depth` says.
 
     Parameters
     ----------
     capture : Capture
     pixels : ndarray, shape (pixel,)
         Flat indices.
-    lighting : Lighting
+    flux_prior : FluxPrior
     steps_per_bin : int
         Delays tried within each bin.
 
@@ -245,12 +244,12 @@ def level_likelihoods(
     ndarray, shape (pixel, level)
         But for what depends on the counts alone.
     """
-    some, n_bins, n_pulses = pixels[np.newaxis], capture.cube.shape[2], capture.armed_pulses
-    light = lighting.light(_totals(capture)[0].ravel()[some], _least_background(capture))
+    some, n_bins, n_pulses = pixels[np.newaxis], capture.cube.shape[2], capture.gated_pulses
+    flux = flux_prior.model(_totals(capture)[0].ravel()[some], _least_background(capture))
     cube = capture.cube.reshape(-1, n_bins)[some]
-    prepared = _prepare(capture, cube, light, steps_per_bin)
+    prepared = _prepare(capture, cube, flux, steps_per_bin)
     evidence = _level_evidence(prepared, prepared.depth[:, np.newaxis])
-    b = light.background[0, 0] / n_bins
+    b = flux.background[0, 0] / n_bins
     fires = b if n_pulses is None else -np.expm1(-b)
     fired, unfired = np.empty((2, pixels.size))
     for rows in _some_rows(cube[0]):
@@ -260,27 +259,27 @@ def level_likelihoods(
     return np.asarray(evidence + (fired * np.log(fires) - b * unfired)[:, np.newaxis])
 
 
-def level_differences(lighting: Lighting, capture: Capture) -> Difference:
+def level_differences(flux_prior: FluxPrior, capture: Capture) -> Difference:
     """How far each level of signal lies from their mean, shape (level - 1,).
 
     For an echo at the beginning of the gate, where most pulses are armed.
     """
     _, first = capture.pulse.taps(capture.acquisition.n_bins, capture.acquisition.bin_width_s)
-    signal = np.concatenate([lighting.with_one_level().levels[1:], lighting.levels[1:]])
+    signal = np.concatenate([flux_prior.with_one_level().levels[1:], flux_prior.levels[1:]])
     rate = rate_per_bin(
         np.full(signal.size, max(-first, 0.0)),
         signal,
-        max(float(np.mean(lighting.background)), _least_background(capture)),
+        max(float(np.mean(flux_prior.background)), _least_background(capture)),
         capture.pulse,
         capture.acquisition,
     )
-    model = rate if capture.armed_pulses is None else trigger_probability(rate)
-    return difference(model[1:], model[0], capture.armed_pulses)
+    model = rate if capture.gated_pulses is None else trigger_probability(rate)
+    return difference(model[1:], model[0], capture.gated_pulses)
 
 
 @once_per_capture
-def detailed_lighting_of(capture: Capture) -> Lighting:
-    """`lighting_of` with every level of signal that the pixels together tell.
+def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
+    """`flux_prior_of` with every level of signal that the pixels together tell.
 
     The total of a pixel's rates (Coates 1968) is signal and background together. What a level of
     signal leaves of it is background, drawn towards the image's mean background as far as its
@@ -294,14 +293,14 @@ def detailed_lighting_of(capture: Capture) -> Lighting:
     pixels, least = np.sort(drawn)[np.newaxis], _least_background(capture)
     levels = _levels(flat[pixels[0]], capture)
     # While nothing is known, each level is everyone's signal.
-    guess = Lighting(
+    guess = FluxPrior(
         levels,
         share=np.full(levels.size, 1 / levels.size),
         depth=np.ones(flat.shape[1]),
         background=total.mean() - levels[:, np.newaxis, np.newaxis],
-        trust=_trust(total, chance),
+        own_weight=_trust(total, chance),
     )
-    lit = guess.light(total.ravel()[pixels], least)
+    lit = guess.model(total.ravel()[pixels], least)
     share = _shares(_level_evidence(_prepare(capture, flat[pixels], lit, 1)))
     mean = np.asarray(share @ levels)
     variance = float(share @ (levels - mean) ** 2)
@@ -313,22 +312,22 @@ def detailed_lighting_of(capture: Capture) -> Lighting:
         levels=levels[kept],
         share=share[kept] / share[kept].sum(),
         background=total.mean() - mean,
-        trust=_trust(total, chance + variance),
+        own_weight=_trust(total, chance + variance),
     )
     # Delays take a table of all levels of the sample: in a long gate, of fewer pixels.
     each = found.share.size * flat.shape[1]
     most = sampled_numbers(found.share.size, flat.shape[1]) // each
     pixels = np.sort(drawn[:most])[np.newaxis]
-    lit = found.light(total.ravel()[pixels], least)
+    lit = found.model(total.ravel()[pixels], least)
     prepared = _prepare(capture, flat[pixels], lit, 1)
     share, depth = _shares_and_depths(_level_densities(prepared), found.share)
     found = found._replace(share=share, depth=depth)
-    return found._replace(contrast=found.light(total, least).contrast)
+    return found._replace(contrast=found.model(total, least).contrast)
 
 
 def _least_background(capture: Capture) -> float:
     """Half a count more than nothing: what was never seen may still be there."""
-    return 0.5 / (capture.armed_pulses or 1)
+    return 0.5 / (capture.gated_pulses or 1)
 
 
 def _totals(capture: Capture) -> tuple[Floats, float]:
@@ -338,7 +337,7 @@ def _totals(capture: Capture) -> tuple[Floats, float]:
     Greenwood's variances to ``1 / (M - Σ n) - 1 / M``. A logarithm of few is too small on average,
     by half its variance: over an image that would be taken for background.
     """
-    n_pulses = capture.armed_pulses
+    n_pulses = capture.gated_pulses
     if n_pulses is None:
         return capture.counts.astype(float), float(capture.counts.mean())  # Poisson
     unfired = np.maximum(n_pulses - capture.counts, 0.5)
@@ -360,7 +359,7 @@ def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats
     """
     median = np.empty(len(pixels))
     for some in _some_rows(pixels):
-        rate, armed = rate_and_armed(pixels[some].astype(float), n_pulses)
+        rate, armed = rate_and_n_armed(pixels[some].astype(float), n_pulses)
         median[some] = weighted_median(rate.T, armed.T)
     return median * pixels.shape[1]
 
@@ -375,8 +374,10 @@ def _some_rows(pixels: NDArray[Any]) -> Iterator[slice]:
 def _trust(total: Floats, unrelated: float) -> float:
     """Share of the totals' variance that is no chance, `unrelated` being the variance by chance."""
     scatter = float(total.var())
-    trust = max(0.0, 1 - unrelated / scatter) if scatter > 0 else 0.0
-    return trust if trust >= 3 * math.sqrt(2 / total.size) else 0.0  # it is known no better
+    own_weight = max(0.0, 1 - unrelated / scatter) if scatter > 0 else 0.0
+    return (
+        own_weight if own_weight >= 3 * math.sqrt(2 / total.size) else 0.0
+    )  # it is known no better
 
 
 def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture) -> Floats:
@@ -390,11 +391,11 @@ def _strongest(pixels: NDArray[np.unsignedinteger], capture: Capture) -> float:
     n_bins = pixels.shape[1]
     excess, width = np.empty(len(pixels)), min(capture.echo_bins, n_bins)
     for some in _some_rows(pixels):
-        rate, _ = rate_and_armed(pixels[some].astype(float), capture.armed_pulses)
+        rate, _ = rate_and_n_armed(pixels[some].astype(float), capture.gated_pulses)
         until = np.pad(np.cumsum(rate, axis=1), ((0, 0), (1, 0)))
         inside = (until[:, width:] - until[:, :-width]).max(axis=1)
         excess[some] = inside - until[:, -1] * width / n_bins
-    return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.armed_pulses or 1))
+    return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.gated_pulses or 1))
 
 
 def _shares(evidence: Floats) -> Floats:
@@ -508,10 +509,10 @@ def _smoothed(density):  # type: ignore[no-untyped-def]
 
 @once_per_capture
 def posterior_of(capture: Capture) -> Posterior:
-    """Where each pixel's surface may be, in the light of `light_of`."""
+    """Where each pixel's surface may be, in the light of `flux_model_of`."""
     n_pixels, n_bins = capture.counts.size, capture.cube.shape[2]
     near, surface = np.empty((n_pixels, n_bins), np.float32), np.empty(n_pixels)
-    for pixels, prepared in _groups(capture, light_of(capture), 1):
+    for pixels, prepared in _groups(capture, flux_model_of(capture), 1):
         for some, density, top, _ in _densities(prepared):
             # What lies before each delay, from so many bins before the gate to so many behind it.
             before = np.zeros((len(top), n_bins + 2 * TOLERANCE_BINS + 1, top.shape[1]), np.float32)
@@ -537,7 +538,7 @@ def has_posterior(capture: Capture) -> bool:
     return "posterior_of" in vars(capture)  # where `once_per_capture` keeps it
 
 
-def near(capture: Capture, bins: Floats) -> Floats:
+def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
     """Probability that the surface lies within `TOLERANCE_BINS` of a delay, shape (row, col).
 
     Parameters
@@ -546,7 +547,7 @@ def near(capture: Capture, bins: Floats) -> Floats:
     bins : ndarray, shape (row, col)
         Delays in fractional bins, from 0 to n_bins; the probability is 0 where NaN.
     """
-    table, found = posterior_of(capture).near, np.empty(bins.size)
+    table, found = posterior_of(capture).tolerance_probability, np.empty(bins.size)
     last = table.shape[2] - 1
     for begin in range(0, bins.size, _AT_ONCE):
         some = slice(begin, begin + _AT_ONCE)
@@ -562,7 +563,7 @@ def near(capture: Capture, bins: Floats) -> Floats:
     return found.reshape(bins.shape)
 
 
-def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Floats, Floats]:
+def most_likely(capture: Capture, flux: FluxModel, steps_per_bin: int) -> tuple[Floats, Floats]:
     """The delay of the largest posterior density.
 
     Returns
@@ -573,7 +574,7 @@ def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Flo
         Logarithm of its likelihood over that of no echo.
     """
     delay, score = np.empty((2, capture.counts.size))
-    for pixels, prepared in _groups(capture, light, steps_per_bin):
+    for pixels, prepared in _groups(capture, flux, steps_per_bin):
         for some, curve, weighted in _curves(prepared):
             at = curve.argmax(axis=1)[:, np.newaxis]
             last = curve.shape[1] - 1
@@ -592,7 +593,7 @@ def most_likely(capture: Capture, light: Light, steps_per_bin: int) -> tuple[Flo
     return delay.reshape(capture.shape), score.reshape(capture.shape)
 
 
-def rate_and_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Floats]:
+def rate_and_n_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Floats]:
     """Rate of each bin with the pile-up undone (Coates 1968), and the pulses that tell of it.
 
     Parameters
@@ -662,7 +663,7 @@ class _Prepared(NamedTuple):
     background: Floats
     log_share: Floats
     depth: NDArray[np.float32]
-    """`Light.depth`, shape (delay,)."""
+    """`FluxModel.depth`, shape (delay,)."""
     echo: NDArray[np.float32]
     """Share of an echo's photons per bin, shape (step, tap)."""
     first_tap: int
@@ -675,17 +676,17 @@ class _Prepared(NamedTuple):
 
 
 def _prepare(
-    capture: Capture, cube: NDArray[np.unsignedinteger], light: Light, steps_per_bin: int
+    capture: Capture, cube: NDArray[np.unsignedinteger], flux: FluxModel, steps_per_bin: int
 ) -> _Prepared:
     """Pixels (row, col, bin) and their light, all at once."""
-    lanes = lanes_of(light.share.size, cube.shape[2] * steps_per_bin)
+    lanes = lanes_of(flux.share.size, cube.shape[2] * steps_per_bin)
     flat = cube.reshape(-1, cube.shape[2])
     everyone = _Part(lane_counts(flat, lanes), slice(0, len(flat)), cube.size)
-    return _with_echo(capture, everyone, light, steps_per_bin)
+    return _with_echo(capture, everyone, flux, steps_per_bin)
 
 
 def _groups(
-    capture: Capture, light: Light, steps_per_bin: int
+    capture: Capture, flux: FluxModel, steps_per_bin: int
 ) -> Iterator[tuple[slice, _Prepared]]:
     """All pixels of a capture and their light, so many at a time as keep what is laid out small.
 
@@ -695,9 +696,9 @@ def _groups(
         Flat indices.
     prepared : _Prepared
     """
-    n_levels, n_pixels, n_bins = light.share.size, capture.counts.size, capture.cube.shape[2]
+    n_levels, n_pixels, n_bins = flux.share.size, capture.counts.size, capture.cube.shape[2]
     lanes = lanes_of(n_levels, n_bins * steps_per_bin)
-    at_once = lanes * max(1, _LIGHT_NUMBERS // (n_levels * lanes))
+    at_once = lanes * max(1, _FLUX_NUMBERS // (n_levels * lanes))
     if lanes < LANES:
         at_once = lanes * max(1, _TABLE_NUMBERS // (n_bins * lanes))
     flat = capture.cube.reshape(-1, n_bins)
@@ -708,7 +709,7 @@ def _groups(
         else:
             counts = capture.blocks.counts[first // LANES : -(-some.stop // LANES)]
         part = _Part(counts, some, capture.cube.size)
-        yield some, _with_echo(capture, part, light, steps_per_bin)
+        yield some, _with_echo(capture, part, flux, steps_per_bin)
 
 
 def sampled_numbers(n_levels: int, n_bins: int) -> int:
@@ -741,22 +742,22 @@ class _Part(NamedTuple):
     """Counts of the whole image."""
 
 
-def _with_echo(capture: Capture, part: _Part, light: Light, steps_per_bin: int) -> _Prepared:
+def _with_echo(capture: Capture, part: _Part, flux: FluxModel, steps_per_bin: int) -> _Prepared:
     """A part of an image with its light, that of the image being given."""
     acquisition, lanes = capture.acquisition, part.counts.shape[2]
     # Delays stand for the step around them, so that whole steps fill the gate and any whole bins.
     delay = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
     echo, first = capture.pulse.taps(acquisition.n_bins, acquisition.bin_width_s, delay)
-    log_share = np.log(np.maximum(light.share, np.finfo(float).tiny))
+    log_share = np.log(np.maximum(flux.share, np.finfo(float).tiny))
     return _Prepared(
         part.counts,
-        _in_lanes(light.signal, part.pixels, lanes),
-        _in_lanes(light.background, part.pixels, lanes),
+        _in_lanes(flux.signal, part.pixels, lanes),
+        _in_lanes(flux.background, part.pixels, lanes),
         log_share,
-        np.repeat(light.depth, steps_per_bin).astype(np.float32),
+        np.repeat(flux.depth, steps_per_bin).astype(np.float32),
         echo.astype(np.float32),
         first,
-        capture.armed_pulses or 0,
+        capture.gated_pulses or 0,
         part.pixels.stop - part.pixels.start,
         part.of_counts,
     )
@@ -824,7 +825,7 @@ def _densities(
         In units of ``exp(top)``.
     top : ndarray, shape (block, lane)
     weighted : ndarray, shape (block, level, delay, lane)
-        Logarithms that the density is made of, level by level, `Light.depth` left out.
+        Logarithms that the density is made of, level by level, `FluxModel.depth` left out.
     """
     weight = prepared.log_share[1:, np.newaxis, np.newaxis].astype(np.float32)
     for some, log in _log_likelihoods(prepared):

@@ -1,25 +1,31 @@
 """What is known of a pixel, of a region and of a capture, and how well."""
 
 from core.inspection.capture import CaptureReport, Suggestion, capture_report
-from core.inspection.flux import light_found
+from core.inspection.flux import estimate_flux
 from core.inspection.maps import maps
-from core.inspection.mean_flux import mean_light
+from core.inspection.mean_flux import estimate_mean_flux
 from core.inspection.pixel import Candidate, PixelReport, pixel_report
-from core.inspection.profile import LEVEL, LightFound
+from core.inspection.profile import LEVEL, FluxEstimate
 from core.inspection.pulses import Accuracy, accuracy_over_pulses
 from core.inspection.region import RegionReport, pixels_in, region_report
+
+# Deprecated names, to be removed after the next release.
+LightFound, light_found, mean_light = FluxEstimate, estimate_flux, estimate_mean_flux
 
 __all__ = [
     "LEVEL",
     "Accuracy",
     "Candidate",
     "CaptureReport",
+    "FluxEstimate",
     "LightFound",
     "PixelReport",
     "RegionReport",
     "Suggestion",
     "accuracy_over_pulses",
     "capture_report",
+    "estimate_flux",
+    "estimate_mean_flux",
     "light_found",
     "maps",
     "mean_light",

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.capture import Capture, once_per_capture
+from core.deprecation import renamed
 from core.inference.faults import standing_out
 from core.inference.posterior import TOLERANCE_BINS
 from core.inspection.maps import likeliest
-from core.inspection.mean_flux import METHOD, mean_light
-from core.inspection.pixel import lag_bins, light_unit
-from core.inspection.profile import LightFound
+from core.inspection.mean_flux import METHOD, estimate_mean_flux
+from core.inspection.pixel import flux_unit, lag_bins
+from core.inspection.profile import FluxEstimate
 from core.tracking import START_BINS, TrackingParameters
 
 
@@ -39,16 +40,20 @@ class CaptureReport:
 
     histogram: NDArray[np.int64]
     """Counts of all pixels together, shape (bin,)."""
-    light: LightFound
+    flux: FluxEstimate
     """Mean signal (PPP) and background of all pixels, and their ratio, with 95 % intervals."""
-    light_unit: str
+    flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
-    light_method: str
+    flux_method: str
     """How they are estimated."""
     n_hot: int | None
     """Pixels that stand out as hot; None where an image is too narrow to tell."""
     n_dead: int | None
     suggestion: Suggestion
+
+    light = renamed("flux")
+    light_unit = renamed("flux_unit")
+    light_method = renamed("flux_method")
 
 
 def capture_report(capture: Capture) -> CaptureReport:
@@ -56,9 +61,9 @@ def capture_report(capture: Capture) -> CaptureReport:
     faulty = standing_out(capture)
     return CaptureReport(
         histogram=aggregate(capture),
-        light=mean_light(capture),
-        light_unit=light_unit(capture),
-        light_method=METHOD,
+        flux=estimate_mean_flux(capture),
+        flux_unit=flux_unit(capture),
+        flux_method=METHOD,
         n_hot=None if faulty is None else int(np.count_nonzero(faulty.hot)),
         n_dead=None if faulty is None else int(np.count_nonzero(faulty.dead)),
         suggestion=suggestion(capture),
@@ -113,7 +118,7 @@ def suggestion(capture: Capture) -> Suggestion:
     between = f"in bins {echoes.first:.0f} to {echoes.last:.0f}"
     where = f"The {echoes.how_many:,} confident answers lie {between}"
     end = min(math.ceil(echoes.last) + tap + echo.size + _MARGIN_BINS, n_bins)
-    if capture.armed_pulses is not None:
+    if capture.gated_pulses is not None:
         # What is cut in front takes pulses with it, of each pixel another number.
         first, side = 0, "behind them; in front, a cut would cost the pulses that fired there"
     else:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from core.acquisition import Acquisition, Floats, Pulse
-from core.inspection.profile import Box, LightFound, spans, zoomed
+from core.inspection.profile import Box, FluxEstimate, spans, zoomed
 
 METHOD = (
     "95 % profile likelihood intervals of the first-photon likelihood, averaged over all delays"
@@ -28,9 +28,9 @@ _STEPS, _STEPS_CLOSE = 2, 16  # delays in a bin; where few bins are left
 _FEW_BINS, _MANY_BINS = 8, 8  # left; of an echo so wide that one delay in a bin will do
 
 
-def light_found(
+def estimate_flux(
     histograms: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
-) -> LightFound:
+) -> FluxEstimate:
     """Signal, background and their ratio, with 95 % intervals.
 
     Parameters
@@ -44,11 +44,11 @@ def light_found(
         photons are told instead of photons per pulse.
     """
     counts = np.atleast_2d(np.asarray(histograms, float))
-    box = _all_light(counts, n_pulses)
+    box = _whole_range(counts, n_pulses)
     pixels = [_Pixel(each, acquisition, pulse, n_pulses) for each in counts]
 
     def together(root: Floats, angle: Floats) -> Floats:
-        signal, background = _light_at(root, angle)
+        signal, background = _flux_at(root, angle)
         return np.asarray(sum(pixel(signal, background) for pixel in pixels))
 
     box = zoomed(box, together, _COARSE)
@@ -58,16 +58,16 @@ def light_found(
         box = zoomed(box, together, _COARSE)
     likelihood = together(*box.grid(_FINE))
 
-    def light_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
-        signal, background = _light_at(root, angle)
+    def flux_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
+        signal, background = _flux_at(root, angle)
         if box.high[0] == box.most[0]:  # where every pulse fires, it may be by any light
             signal[-1, angle > 0] = background[-1, angle < _RIGHT] = np.inf
         return signal, background
 
-    return spans(box, likelihood, light_at)
+    return spans(box, likelihood, flux_at)
 
 
-def _all_light(counts: Floats, n_pulses: int | None) -> Box:
+def _whole_range(counts: Floats, n_pulses: int | None) -> Box:
     """Bounds of ``√(S + B)`` and of ``asin √(S / (S + B))`` for pixels (pixel, bin).
 
     In these, which have about the same standard deviation everywhere, a likelihood's peak is round.
@@ -91,7 +91,7 @@ def _all_light(counts: Floats, n_pulses: int | None) -> Box:
     )
 
 
-def _light_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
+def _flux_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
     """Signal and background at these coordinates, each of shape (root, angle)."""
     total = root[:, np.newaxis] ** 2
     return total * np.sin(angle) ** 2, total * np.where(angle < _RIGHT, np.cos(angle) ** 2, 0.0)

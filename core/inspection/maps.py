@@ -22,15 +22,15 @@ def peak_counts(capture: Capture) -> Floats:
 @once_per_capture
 def share_fired(capture: Capture) -> Floats:
     """Share of each pixel's pulses that fired; NaN where that is not known, shape (row, col)."""
-    if capture.armed_pulses is None:
+    if capture.gated_pulses is None:
         return np.full(capture.shape, np.nan)
-    return capture.counts / capture.armed_pulses
+    return capture.counts / capture.gated_pulses
 
 
 @once_per_capture
 def likeliest(capture: Capture) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     """Bin that the surface is most probably within 3 bins of, and that probability; (row, col)."""
-    near = posterior_of(capture).near
+    near = posterior_of(capture).tolerance_probability
     delay = near.argmax(axis=2)
     return delay, np.take_along_axis(near, delay[..., np.newaxis], axis=2)[..., 0]
 
@@ -43,7 +43,7 @@ def sbr(capture: Capture) -> Floats:
     what the echo's bins hold beyond is signal, and counts as far as there is a surface at all.
     Infinite where nothing but the echo was seen.
     """
-    n_bins, n_pulses = capture.acquisition.n_bins, capture.armed_pulses
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     echo, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
     begin = np.clip(likeliest(capture)[0] + first, 0, n_bins)
     end = np.clip(begin + echo.size, 0, n_bins)

@@ -23,8 +23,8 @@ from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
 from core.inference import posterior
 from core.inference.faults import standing_out
-from core.inspection.flux import light_found
-from core.inspection.profile import LEVEL, Box, LightFound, spans, zoomed
+from core.inspection.flux import estimate_flux
+from core.inspection.profile import LEVEL, Box, FluxEstimate, spans, zoomed
 from core.metrics import Interval
 from core.reductions import share_of_pulses
 
@@ -41,7 +41,7 @@ _COARSE, _FINE = (5, 9), (7, 15)
 
 
 @once_per_capture
-def mean_light(capture: Capture) -> LightFound:
+def estimate_mean_flux(capture: Capture) -> FluxEstimate:
     """Mean signal and background of all pixels, and their ratio, with 95 % intervals.
 
     In photons per pulse where the pulses are known, else in photons. Pixels without an echo count,
@@ -51,7 +51,9 @@ def mean_light(capture: Capture) -> LightFound:
     capture = _ordinary(capture)
     n_pixels, acquisition, pulse = capture.shape[1], capture.acquisition, capture.pulse
     if n_pixels < _FEW:
-        found = light_found(capture.cube[0].astype(float), acquisition, pulse, capture.armed_pulses)
+        found = estimate_flux(
+            capture.cube[0].astype(float), acquisition, pulse, capture.gated_pulses
+        )
         return found.of(capture)
     if 2 * capture.echo_bins >= acquisition.n_bins or capture.counts.sum() < _DARK:
         return _untold(capture).of(capture)
@@ -62,7 +64,7 @@ def mean_light(capture: Capture) -> LightFound:
     echo, _ = pulse.taps(acquisition.n_bins, acquisition.bin_width_s)
     missed = max(1 - float(echo.sum()), 0.0)
 
-    def light_at(log_background: Floats, root_signal: Floats) -> tuple[Floats, Floats]:
+    def flux_at(log_background: Floats, root_signal: Floats) -> tuple[Floats, Floats]:
         background, signal = np.meshgrid(np.exp(log_background), root_signal**2, indexing="ij")
         background = np.maximum(background - missed * signal, 0.0)
         if box.low[0] == box.least[0]:
@@ -71,7 +73,7 @@ def mean_light(capture: Capture) -> LightFound:
             background[-1] = np.inf
         return signal, background
 
-    found = spans(box, surface(*box.grid(_FINE)), light_at).of(some)
+    found = spans(box, surface(*box.grid(_FINE)), flux_at).of(some)
     return found if acquisition.n_pulses else found.scaled(1 / share)
 
 
@@ -84,13 +86,13 @@ def _ordinary(capture: Capture) -> Capture:
     return replace(capture, cube=capture.cube[kept][np.newaxis], truth_range_m=None, signal=None)
 
 
-def _untold(capture: Capture) -> LightFound:
+def _untold(capture: Capture) -> FluxEstimate:
     """Of a gate that an echo fills, or of next to no photons: all may be signal, or background.
 
     The total's interval is the exact one of a binomial share (Clopper & Pearson 1934) of all pulses
     together or, of photons, of a Poisson mean (Garwood 1936).
     """
-    n_pixels, n_pulses, seen = capture.counts.size, capture.armed_pulses, int(capture.counts.sum())
+    n_pixels, n_pulses, seen = capture.counts.size, capture.gated_pulses, int(capture.counts.sum())
     tail = 0.5 - LEVEL / 2
     if n_pulses is None:
         total = seen / n_pixels
@@ -101,13 +103,13 @@ def _untold(capture: Capture) -> LightFound:
         least = float(scipy.special.betaincinv(unfired, seen + 1, tail)) if unfired else 0.0
         high = -math.log(least) if least > 0 else math.inf
     sbr = Interval(0.0 if seen else math.nan, 0.0, math.inf)
-    return LightFound(Interval(0.0, 0.0, high), Interval(total, 0.0, high), sbr)
+    return FluxEstimate(Interval(0.0, 0.0, high), Interval(total, 0.0, high), sbr)
 
 
 def _dimmer(capture: Capture) -> tuple[Capture, float]:
     """The capture with a share of its pulses, where echoes are brighter than a mean requires."""
-    strongest = float(posterior.detailed_lighting_of(capture).levels[-1])
-    share = _BRIGHT / max(strongest * (capture.armed_pulses or 1), _BRIGHT)
+    strongest = float(posterior.detailed_flux_prior_of(capture).levels[-1])
+    share = _BRIGHT / max(strongest * (capture.gated_pulses or 1), _BRIGHT)
     return (share_of_pulses(capture, share), share) if share < 1 else (capture, 1.0)
 
 
@@ -115,8 +117,8 @@ class _Mixture:
     """The likelihood of mean background and mean signal, from the pixels of a sample."""
 
     def __init__(self, capture: Capture) -> None:
-        known = posterior.detailed_lighting_of(capture)
-        total, n_pulses = posterior.total_rates(capture), capture.armed_pulses or 1
+        known = posterior.detailed_flux_prior_of(capture)
+        total, n_pulses = posterior.total_rates(capture), capture.gated_pulses or 1
         self._capture, self._known, acquisition = capture, known, capture.acquisition
         self._pixels = np.random.default_rng(0).permutation(total.size)[:_SAMPLE]
         top = 2 * float(known.levels[-1])
@@ -141,12 +143,12 @@ class _Mixture:
 
     def _log_likelihoods(self, background: float) -> Floats:
         """Of each level, shape (pixel, level)."""
-        lighting = self._known._replace(
+        flux_prior = self._known._replace(
             levels=self._levels,
             share=np.full(self._levels.size, 1 / self._levels.size),
             background=np.asarray(background),
         )
-        return posterior.level_likelihoods(self._capture, self._pixels, lighting, _STEPS)
+        return posterior.level_likelihoods(self._capture, self._pixels, flux_prior, _STEPS)
 
     def __call__(self, log_background: Floats, root_signal: Floats) -> Floats:
         """Log likelihood, shape (background, signal)."""

@@ -13,12 +13,13 @@ import scipy  # loads a submodule when it is first used
 from core.acquisition import Floats
 from core.capture import Capture, once_per_capture
 from core.checks import require
+from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.inference import posterior
 from core.inference.faults import Verdict, verdict
-from core.inference.posterior import rate_and_armed
-from core.inspection.flux import METHOD, light_found
-from core.inspection.profile import LightFound
+from core.inference.posterior import rate_and_n_armed
+from core.inspection.flux import METHOD, estimate_flux
+from core.inspection.profile import FluxEstimate
 
 MOST_CANDIDATES = 5
 
@@ -62,20 +63,25 @@ class PixelReport:
     confidence: float
     candidates: tuple[Candidate, ...]
     """The best peaks of the score, best first; none where the pixel is empty."""
-    find_light: Callable[[], LightFound] = field(repr=False)
-    """Finds `light`."""
-    light_unit: str
+    find_flux: Callable[[], FluxEstimate] = field(repr=False)
+    """Finds `flux`."""
+    flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
-    light_method: str
+    flux_method: str
     """How they are found."""
     verdict: Verdict
     """Whether the pixel is hot or dead."""
 
+    light = renamed("flux")
+    light_unit = renamed("flux_unit")
+    light_method = renamed("flux_method")
+    find_light = renamed("find_flux")
+
     @cached_property
-    def light(self) -> LightFound:
+    def flux(self) -> FluxEstimate:
         """Signal, background and their ratio, with 95 % intervals, in photons per pulse where the
         pulses are known. Found when first asked for: it takes longer than all else."""
-        return self.find_light()
+        return self.find_flux()
 
 
 def pixel_report(
@@ -112,16 +118,16 @@ def pixel_report(
     curve = ESTIMATORS[method].curves(capture, row, col, settings)
     lag = lag_bins(capture, method, settings)
 
-    def find_light() -> LightFound:
-        found = light_found(counts, capture.acquisition, capture.pulse, capture.armed_pulses)
+    def find_flux() -> FluxEstimate:
+        found = estimate_flux(counts, capture.acquisition, capture.pulse, capture.gated_pulses)
         return found.of(capture)
 
     return PixelReport(
         row=row,
         col=col,
         counts=counts,
-        rate=rate_and_armed(counts, capture.armed_pulses)[0],
-        rate_unit="photons" if capture.armed_pulses is None else "photons per pulse",
+        rate=rate_and_n_armed(counts, capture.gated_pulses)[0],
+        rate_unit="photons" if capture.gated_pulses is None else "photons per pulse",
         method=method,
         curve=curve,
         lag_bins=lag,
@@ -129,14 +135,14 @@ def pixel_report(
         answer_m=float(image.range_m[row, col]),
         confidence=float(image.confidence[row, col]),
         candidates=_candidates(capture, row, col, curve, lag),
-        find_light=find_light,
-        light_unit=light_unit(capture),
-        light_method=METHOD,
+        find_flux=find_flux,
+        flux_unit=flux_unit(capture),
+        flux_method=METHOD,
         verdict=verdict(capture, row, col),
     )
 
 
-def light_unit(capture: Capture) -> str:
+def flux_unit(capture: Capture) -> str:
     """In which light is told: ``"photons per pulse"``, or ``"photons"`` without known pulses."""
     return "photons" if capture.acquisition.n_pulses is None else "photons per pulse"
 
@@ -168,7 +174,7 @@ def _candidates(
     if not peaks.size:
         return ()
     bins = np.clip(peaks - lag_bins, 0.0, capture.acquisition.n_bins)
-    near = posterior.posterior_of(capture).near[row, col]
+    near = posterior.posterior_of(capture).tolerance_probability[row, col]
     probability = np.clip(np.interp(bins, np.arange(near.size), near), 0.0, 1.0)
     range_m = capture.acquisition.bin_to_range_m(bins)
     score = curve[peaks]

@@ -28,7 +28,7 @@ Coordinates = Callable[[Floats, Floats], tuple[Floats, Floats]]
 """Signal and background there, each of that shape."""
 
 
-class LightFound(NamedTuple):
+class FluxEstimate(NamedTuple):
     """Signal and background, with 95 % intervals."""
 
     signal: Interval
@@ -38,7 +38,7 @@ class LightFound(NamedTuple):
     sbr: Interval
     """Signal over background: infinite where there may be no background, NaN without a photon."""
 
-    def scaled(self, factor: float) -> LightFound:
+    def scaled(self, factor: float) -> FluxEstimate:
         """So many times the light."""
         signal, background = (
             Interval(x.value * factor, x.low * factor, x.high * factor)
@@ -46,10 +46,10 @@ class LightFound(NamedTuple):
         )
         return self._replace(signal=signal, background=background)
 
-    def of(self, capture: Capture) -> LightFound:
+    def of(self, capture: Capture) -> FluxEstimate:
         """In photons per pulse, where photons of all pulses were found and the pulses are known."""
         n_pulses = capture.acquisition.n_pulses
-        if capture.armed_pulses is not None or n_pulses is None:
+        if capture.gated_pulses is not None or n_pulses is None:
             return self
         return self.scaled(1 / n_pulses)
 
@@ -103,18 +103,18 @@ _MOST_ZOOMS = 30
 _FINEST = (81, 121)
 
 
-def spans(box: Box, likelihood: Floats, light_at: Coordinates) -> LightFound:
+def spans(box: Box, likelihood: Floats, flux_at: Coordinates) -> FluxEstimate:
     """Where a likelihood is largest, and the intervals, from its values on a grid of the box."""
     coarse, fine = box.grid(likelihood.shape), box.grid(_FINEST)
     log = np.maximum(likelihood - likelihood.max(), -50.0)
     smooth = scipy.interpolate.RectBivariateSpline(*coarse, log)(*fine)
     best = np.unravel_index(smooth.argmax(), smooth.shape)
     inside = smooth >= smooth[best] - _DROP
-    signal, background = light_at(*fine)
+    signal, background = flux_at(*fine)
     with np.errstate(divide="ignore", invalid="ignore"):
         sbr = signal / background
     signal_found, background_found, sbr_found = (
         Interval(float(x[best]), float(np.nanmin(x[inside])), float(np.nanmax(x[inside])))
         for x in (signal, background, sbr)
     )
-    return LightFound(signal_found, background_found, sbr_found)
+    return FluxEstimate(signal_found, background_found, sbr_found)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
+from core.deprecation import renamed
 from core.estimators import RangeImage, estimate
-from core.inspection.mean_flux import METHOD, mean_light
-from core.inspection.pixel import PixelReport, light_unit, pixel_report
-from core.inspection.profile import LightFound
+from core.inspection.mean_flux import METHOD, estimate_mean_flux
+from core.inspection.pixel import PixelReport, flux_unit, pixel_report
+from core.inspection.profile import FluxEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +42,14 @@ class RegionReport:
     """Half the range of the middle 68 % of the answers; NaN where there is none."""
     mean_confidence: float
     mean_counts: float
-    light: LightFound
+    flux: FluxEstimate
     """Mean signal and background of the pixels, and their ratio, with 95 % intervals."""
-    light_unit: str
-    light_method: str
+    flux_unit: str
+    flux_method: str
+
+    light = renamed("flux")
+    light_unit = renamed("flux_unit")
+    light_method = renamed("flux_method")
 
 
 def pixels_in(polygon: Sequence[tuple[float, float]], shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -119,9 +124,9 @@ def region_report(
         spread_m=float(high_m - low_m) / 2,
         mean_confidence=float(image.confidence[mask].mean()),
         mean_counts=float(capture.counts[mask].mean()),
-        light=mean_light(own),
-        light_unit=light_unit(own),
-        light_method=METHOD,
+        flux=estimate_mean_flux(own),
+        flux_unit=flux_unit(own),
+        flux_method=METHOD,
     )
 
 

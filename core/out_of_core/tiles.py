@@ -1,6 +1,6 @@
 """Captures larger than memory: ranged part by part, on this machine's threads or on a cluster.
 
-What pixels have in common, the light (`core.inference.posterior.Lighting`) and an estimator's
+What pixels have in common, the light (`core.inference.posterior.FluxPrior`) and an estimator's
 calibration, is learned from a sample of the image before. A part is then ranged like any capture,
 so that the answer does not depend on how the image is cut, nor on who ranges which part.
 """
@@ -24,7 +24,7 @@ from core.capture import Capture, Detection
 from core.checks import require
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.estimators.base import Calibration
-from core.inference.posterior import Lighting, lighting_of
+from core.inference.posterior import FluxPrior, flux_prior_of
 from core.io.readers.dense import AXES, whole_counts
 from core.io.readers.labelled import Description, describe
 from core.io.readers.request import Request
@@ -94,7 +94,7 @@ def estimate_large(
     require("axes", counts.dims, counts.dims == AXES, "row, col and bin")
     description = describe(counts, Request())
     array = da.asarray(counts.data).rechunk({2: -1})
-    lighting, calibration, remark = learned(array, description, method, settings, false_alarm)
+    flux_prior, calibration, remark = learned(array, description, method, settings, false_alarm)
     margin = estimator.reach(settings) // 2
     around = {0: margin, 1: margin, 2: 0}
     # Chunks of an edge may be narrower than the margin: Dask joins them.
@@ -104,7 +104,7 @@ def estimate_large(
         description,
         method,
         settings,
-        lighting,
+        flux_prior,
         calibration,
         dtype=float,
         chunks=(*parts.chunks[:2], (len(IMAGES),)),
@@ -125,8 +125,8 @@ class Overview:
     source: str
 
     @property
-    def armed_pulses(self) -> int | None:
-        """As `Capture.armed_pulses`."""
+    def gated_pulses(self) -> int | None:
+        """As `Capture.gated_pulses`."""
         return self.acquisition.n_pulses if self.detection == "first" else None
 
 
@@ -235,11 +235,11 @@ def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:
 
 def learned(
     array: Any, description: Description, method: str, settings: Any, false_alarm: float | None
-) -> tuple[Lighting, Calibration, str]:
+) -> tuple[FluxPrior, Calibration, str]:
     """What a sample of a Dask array (row, col, bin) tells of all its pixels; `Estimator.remark`."""
     sample, estimator = captured(sample_of(array), description), ESTIMATORS[method]
     calibration = estimator.calibration(sample, settings, false_alarm)
-    return lighting_of(sample), calibration, estimator.remark(sample)
+    return flux_prior_of(sample), calibration, estimator.remark(sample)
 
 
 def range_part(
@@ -247,12 +247,12 @@ def range_part(
     description: Description,
     method: str,
     settings: Any,
-    lighting: Lighting,
+    flux_prior: FluxPrior,
     calibration: Calibration,
 ) -> Floats:
     """Range a part of an image; shape (row, col, len(IMAGES))."""
     part = captured(cube, description)
-    lighting_of.tell(part, lighting)
+    flux_prior_of.tell(part, flux_prior)
     image = ESTIMATORS[method].ranged(part, settings, calibration)
     known = {name: getattr(image, name) for name in IMAGES if hasattr(image, name)}
     return np.stack([known.get(name, part.counts) for name in IMAGES], axis=2).astype(float)

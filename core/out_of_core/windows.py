@@ -18,7 +18,7 @@ import numpy as np
 
 from core.capture import Capture
 from core.checks import require
-from core.inference.posterior import Lighting, lighting_of
+from core.inference.posterior import FluxPrior, flux_prior_of
 from core.io.readers.labelled import describe
 from core.io.readers.request import Request
 from core.io.readers.sample import sample_of
@@ -162,22 +162,22 @@ class WindowReader:
             self.seen[piece] = True
         self._left = self._left[_AT_ONCE:]
 
-    def capture(self, lighting: Lighting | None = None) -> Capture:
+    def capture(self, flux_prior: FluxPrior | None = None) -> Capture:
         """What has been read so far; pixels that have not have no counts.
 
         Parameters
         ----------
-        lighting : Lighting, optional
-            Of the whole image (`light_of_whole`); learned from what has been read where None.
+        flux_prior : FluxPrior, optional
+            Of the whole image (`sampled_flux_prior`); learned from what has been read where None.
         """
         source = f"{self._description.source}; {self.window} of {' x '.join(map(str, self._shape))}"
         acquisition = coarser(self._description.acquisition, self.window.step)
         known = self._description._replace(acquisition=acquisition, source=source)
         found = captured(self._cube, known)
-        if lighting is None and not self.is_complete and self.seen.any():
-            lighting = lighting_of(replace(found, cube=found.cube[np.newaxis, self.seen]))
-        if lighting is not None:
-            lighting_of.tell(found, lighting)
+        if flux_prior is None and not self.is_complete and self.seen.any():
+            flux_prior = flux_prior_of(replace(found, cube=found.cube[np.newaxis, self.seen]))
+        if flux_prior is not None:
+            flux_prior_of.tell(found, flux_prior)
         return found
 
 
@@ -185,8 +185,9 @@ def read_window(
     counts: xr.DataArray,
     window: Window,
     *,
-    lighting: Lighting | None = None,
+    flux_prior: FluxPrior | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
+    lighting: FluxPrior | None = None,
 ) -> Capture:
     """A window of an opened capture, as a capture.
 
@@ -196,10 +197,12 @@ def read_window(
         As `core.open_capture` gives them.
     window : Window
         Rows and columns.
-    lighting : Lighting, optional
-        `light_of_whole`, where it is known already.
+    flux_prior : FluxPrior, optional
+        `sampled_flux_prior`, where it is known already.
     progress : callable
-        Told how many of how many pieces have been read.
+        Called with the numbers of pieces read and of all pieces.
+    lighting : FluxPrior, optional
+        Deprecated name of `flux_prior`.
 
     Raises
     ------
@@ -212,12 +215,12 @@ def read_window(
     while not reader.is_complete:
         reader.read_some()
         progress(reader.done, reader.of)
-    return reader.capture(light_of_whole(counts) if lighting is None else lighting)
+    return reader.capture(flux_prior or lighting or sampled_flux_prior(counts))
 
 
-def light_of_whole(counts: xr.DataArray) -> Lighting:
+def sampled_flux_prior(counts: xr.DataArray) -> FluxPrior:
     """What all pixels of an image have in common, as `core.estimate_large` learns it."""
-    return lighting_of(captured(sample_of(counts.data), describe(counts, Request())))
+    return flux_prior_of(captured(sample_of(counts.data), describe(counts, Request())))
 
 
 def _spread(chunks: tuple[tuple[int, ...], ...]) -> list[tuple[slice, slice]]:

@@ -23,7 +23,7 @@ from core import metrics
 from core.acquisition import Floats, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS
-from core.inference.posterior import light_of
+from core.inference.posterior import flux_model_of
 from core.metrics import Interval
 from core.scene import scenes
 from core.simulation import simulate
@@ -78,7 +78,7 @@ class Score:
 
 def score(capture: Capture, method: Method) -> Score:
     """Range a capture by one method and compare with its truth."""
-    light_of(capture)  # once for each capture, whatever the method
+    flux_model_of(capture)  # once for each capture, whatever the method
     started = perf_counter()
     bins, _ = ESTIMATORS[method.estimator].delays(capture, method.settings)
     seconds = perf_counter() - started

@@ -72,8 +72,8 @@ def test_blocks_are_laid_out_once() -> None:
 @pytest.mark.parametrize("n_pulses", [None, 8, 1000])
 def test_pulses_are_armed_for_first_photons_alone(n_pulses: int | None) -> None:
     first = capture_of(np.full((2, 3, 4), 2), n_pulses)
-    assert first.armed_pulses == n_pulses
-    assert replace(first, detection="all").armed_pulses is None
+    assert first.gated_pulses == n_pulses
+    assert replace(first, detection="all").gated_pulses is None
 
 
 def test_first_photons_do_not_outnumber_the_pulses() -> None:

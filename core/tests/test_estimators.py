@@ -17,7 +17,7 @@ from core import tracking
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.inference.posterior import light_of
+from core.inference.posterior import flux_model_of
 from core.io.readers.dense import guess_detection
 from core.scene import Scene, uniform
 from core.simulation import simulate
@@ -190,7 +190,7 @@ def lone_echo(onset_bin: float = 40.3, n_pulses: int = 1000, **acquisition: Any)
 def test_a_later_echo_gives_a_later_answer(method: str, later: int) -> None:
     capture = lone_echo()
     shifted = replace(capture, cube=np.roll(capture.cube, later, axis=2))
-    light_of.tell(shifted, light_of(capture))  # the light decides on the lag
+    flux_model_of.tell(shifted, flux_model_of(capture))  # the light decides on the lag
     near, far = estimate(capture, method), estimate(shifted, method)
     assert near.valid.all()
     # Rounding, once of bins near a hundred in float64 and once of densities in float32.

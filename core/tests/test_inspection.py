@@ -15,7 +15,7 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
-from core.inspection import light_found, pixels_in
+from core.inspection import estimate_flux, pixels_in
 from core.metrics import Interval, restored
 from core.reductions import cut_gate
 from core.scene import Scene, scenes
@@ -57,7 +57,7 @@ def test_the_interval_of_a_pixels_light_covers_it(signal: float, sbr: float, n_p
     capture = simulate(scene, acquisition, flux, seed=1)
     truth = (signal, flux.background, signal / flux.background)
     pixels = capture.cube.reshape(-1, acquisition.n_bins)
-    found = [light_found(each, acquisition, capture.pulse, n_pulses) for each in pixels]
+    found = [estimate_flux(each, acquisition, capture.pulse, n_pulses) for each in pixels]
     for number, value in enumerate(truth):
         hits = sum(covers(each[number], value) for each in found)
         assert is_covered_often_enough(hits, len(found))
@@ -72,7 +72,7 @@ def test_photons_of_unknown_pulses_are_counted() -> None:
     hits = np.zeros(3, int)
     for _ in range(100):
         counts = rng.poisson(8 * echo + 12 / 60)
-        found = light_found(counts, ACQUISITION, pulse, None)
+        found = estimate_flux(counts, ACQUISITION, pulse, None)
         hits += [covers(each, value) for each, value in zip(found, (8, 12, 8 / 12), strict=True)]
     assert all(is_covered_often_enough(each, 100) for each in hits)
 
@@ -81,7 +81,7 @@ def test_pixels_of_the_same_light_tell_more_of_it() -> None:
     capture = simulate(random_depths(4), ACQUISITION, Flux(0.2, 0.2), seed=2)
     pixels = capture.cube.reshape(16, -1)
     one, all_of_them = (
-        light_found(each, ACQUISITION, capture.pulse, 400) for each in (pixels[0], pixels)
+        estimate_flux(each, ACQUISITION, capture.pulse, 400) for each in (pixels[0], pixels)
     )
     assert covers(all_of_them.signal, 0.2) and covers(all_of_them.background, 1.0)
     narrower = (all_of_them.signal.high - all_of_them.signal.low) / (
@@ -171,8 +171,8 @@ def test_a_region_is_its_pixels_added_to_one() -> None:
     assert report.pixel.confidence > 0.99
     assert report.mean_counts == pytest.approx(capture.counts[mask].mean())
     assert report.median_m == pytest.approx(np.nanmedian(image.range_m[mask]))
-    for light in (report.light, report.pixel.light):
-        assert covers(light.signal, 0.1) and covers(light.background, 1.0)
+    for flux in (report.flux, report.pixel.flux):
+        assert covers(flux.signal, 0.1) and covers(flux.background, 1.0)
     with pytest.raises(ValueError, match="region = '0 pixels'"):
         inspection.region_report(capture, image, np.zeros((8, 8), bool))
     with pytest.raises(ValueError, match="mask = "):
@@ -198,7 +198,7 @@ def _hot(side: int, seed: int = 0) -> Scene:
     )
 
 
-def _mean_light_of(scene: Scene, flux: Flux) -> tuple[float, float, float]:
+def _mean_flux_of(scene: Scene, flux: Flux) -> tuple[float, float, float]:
     """Signal, background and their ratio of a scene's ordinary pixels."""
     reflectivity = 1.0 if scene.reflectivity is None else scene.reflectivity
     ordinary = np.ones(np.shape(scene.range_m), bool)
@@ -211,7 +211,7 @@ def _mean_light_of(scene: Scene, flux: Flux) -> tuple[float, float, float]:
 def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
     """All photons of so many pulses as `capture` was sent, which are not known."""
     fires = Flux(flux.signal / 1000, flux.sbr)
-    many = replace(capture.acquisition, n_pulses=1000 * (capture.armed_pulses or 0))
+    many = replace(capture.acquisition, n_pulses=1000 * (capture.gated_pulses or 0))
     # Of so dim a light next to no photon hides another.
     dim = simulate(scene, many, fires, seed=seed)
     unknown = replace(many, n_pulses=None)
@@ -237,11 +237,11 @@ def test_the_interval_of_a_captures_light_covers_it(
     for seed in range(trials):
         seen = scene(10, seed=seed)
         capture = simulate(seen, acquisition, flux, seed=seed)
-        truth = np.array(_mean_light_of(seen, flux))
+        truth = np.array(_mean_flux_of(seen, flux))
         if counting:
             capture = _photons(seen, flux, capture, seed)
             truth[:2] *= n_pulses
-        for number, each in enumerate(inspection.mean_light(capture)):
+        for number, each in enumerate(inspection.estimate_mean_flux(capture)):
             assert each.low <= each.value <= each.high
             hits[number] += covers(each, truth[number])
             off[number] += (each.value - truth[number]) / (each.high - each.low) * 2 * 1.96
@@ -271,11 +271,11 @@ def test_the_extremes_have_an_answer(
     whole = inspection.capture_report(capture)
     pixel = inspection.pixel_report(capture, image, 0, 0)
     region = inspection.region_report(capture, image, np.ones(shape[:2], bool))
-    for light in (whole.light, pixel.light, region.light, region.pixel.light):
-        for each in light:
+    for flux in (whole.flux, pixel.flux, region.flux, region.pixel.flux):
+        for each in flux:
             assert each.low >= 0 and each.high >= each.low
             assert covers(each, each.value) or math.isnan(each.value)
-        assert not math.isnan(light.signal.value) and not math.isnan(light.background.value)
+        assert not math.isnan(flux.signal.value) and not math.isnan(flux.background.value)
     first, end = whole.suggestion.gate
     assert 0 <= first < end <= shape[2]
     assert 0 <= whole.suggestion.t_n < shape[2]
@@ -283,9 +283,9 @@ def test_the_extremes_have_an_answer(
         assert find(capture).shape == shape[:2]
     if kind == "empty":
         assert pixel.candidates == ()
-        assert whole.light.signal.low == whole.light.background.low == 0
+        assert whole.flux.signal.low == whole.flux.background.low == 0
     if kind == "full" and n_pulses:
-        assert math.isinf(pixel.light.background.high)
+        assert math.isinf(pixel.flux.background.high)
 
 
 def test_maps_are_of_each_pixel() -> None:

@@ -16,7 +16,7 @@ import xarray as xr
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
-from core.inference.posterior import lighting_of
+from core.inference.posterior import flux_prior_of
 from core.io.readers import open_capture, read_capture, sample
 from core.io.readers.labelled import dataset, describe
 from core.io.readers.request import Request
@@ -141,11 +141,11 @@ def test_what_is_guessed_does_not_depend_on_the_way_in(tmp_path: Path, suffix: s
 
 def test_light_told_is_light_taken() -> None:
     part = Capture(CAPTURE.cube[:5].copy(), CAPTURE.acquisition, CAPTURE.pulse)
-    own = lighting_of(part)
+    own = flux_prior_of(part)
     told = Capture(CAPTURE.cube[:5].copy(), CAPTURE.acquisition, CAPTURE.pulse)
-    lighting_of.tell(told, lighting_of(CAPTURE))
-    assert lighting_of(told) is lighting_of(CAPTURE)
-    assert not np.array_equal(own.depth, lighting_of(told).depth)
+    flux_prior_of.tell(told, flux_prior_of(CAPTURE))
+    assert flux_prior_of(told) is flux_prior_of(CAPTURE)
+    assert not np.array_equal(own.depth, flux_prior_of(told).depth)
 
 
 def test_an_answer_in_parts_is_an_image_with_what_is_known(
@@ -158,7 +158,7 @@ def test_an_answer_in_parts_is_an_image_with_what_is_known(
     np.testing.assert_array_equal(seen.counts, CAPTURE.counts)
     assert seen.acquisition == CAPTURE.acquisition
     assert (seen.detection, seen.source) == (CAPTURE.detection, CAPTURE.source)
-    assert seen.armed_pulses == CAPTURE.armed_pulses
+    assert seen.gated_pulses == CAPTURE.gated_pulses
     printed = capsys.readouterr()
     assert printed.out == "" and "100%" in printed.err
 
@@ -166,7 +166,7 @@ def test_an_answer_in_parts_is_an_image_with_what_is_known(
 def test_unknown_pulses_stay_unknown() -> None:
     counts = dataset(Capture(CAPTURE.cube, Acquisition(100, n_pulses=None), detection="all"))
     seen, _ = as_image(estimate_large(counts.counts, "peak").compute())
-    assert seen.acquisition.n_pulses is None and seen.armed_pulses is None
+    assert seen.acquisition.n_pulses is None and seen.gated_pulses is None
 
 
 def test_a_cluster_gives_the_same_and_loses_nothing_with_a_worker(tmp_path: Path) -> None:

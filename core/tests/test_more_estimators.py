@@ -21,7 +21,7 @@ from core.estimators.kde import KdeParameters
 from core.estimators.shi import ShiParameters
 from core.estimators.unmixing import Clusters, UnmixingParameters
 from core.inference.neighbours import pooled
-from core.inference.posterior import Conditions, Light
+from core.inference.posterior import Conditions, FluxModel
 from core.scene import uniform
 from core.trigger import rate_per_bin, trigger_probability
 
@@ -46,12 +46,12 @@ def drawn(onset_bin: Any, sbr: float, seed: int, pulse: Pulse = Pulse()) -> np.n
     return np.random.default_rng(seed).multinomial(1000, chance)[..., :-1]
 
 
-def light_of(shape: tuple[int, int], sbr: float) -> Light:
+def flux_model_of(shape: tuple[int, int], sbr: float) -> FluxModel:
     """The true light, which spares the tests its estimation."""
     flux = Flux(sbr=sbr)
     photons = np.array([np.zeros(shape), np.full(shape, flux.signal)])
     background = np.full((2, *shape), flux.background)
-    return Light(photons, background, np.array([0.5, 0.5]), np.ones(ACQUISITION.n_bins))
+    return FluxModel(photons, background, np.array([0.5, 0.5]), np.ones(ACQUISITION.n_bins))
 
 
 def curve(method: str, counts: Any, settings: Any = None) -> np.ndarray:
@@ -65,7 +65,7 @@ def locate(method: str, counts: Any, sbr: float, settings: Any = None) -> tuple[
     given = estimator.parameters() if settings is None else settings
     capture = Capture(np.asarray(counts, np.uint16), ACQUISITION)
     assert estimator.locate is not None
-    return estimator.locate(capture, light_of(capture.shape, sbr), given)
+    return estimator.locate(capture, flux_model_of(capture.shape, sbr), given)
 
 
 # --- what all of them share
@@ -98,7 +98,7 @@ def test_extreme_settings_still_give_finite_scores(method: str, settings: Any, n
     if ESTIMATORS[method].locate is not None:
         cube = np.asarray(counts.reshape(2, 2, n_bins), np.uint16)
         capture = Capture(cube, conditions.acquisition)
-        position, score = ESTIMATORS[method].locate(capture, light_of((2, 2), 0.06), settings)
+        position, score = ESTIMATORS[method].locate(capture, flux_model_of((2, 2), 0.06), settings)
         assert np.isfinite(score).all()
         assert position.shape == (2, 2)
 
@@ -127,10 +127,10 @@ PULSES = {
 def test_a_slope_is_ranged_without_lag(method: str, pulse: Pulse) -> None:
     onset = np.add.outer(0.05 * np.arange(SIDE), 30 + 0.5 * np.arange(SIDE))
     capture = Capture(drawn(onset, 1.0, seed=7, pulse=pulse).astype(np.uint16), ACQUISITION, pulse)
-    light = light_of(capture.shape, 1.0)
-    estimator = replace(ESTIMATORS[method], light=lambda _: light)
+    flux = flux_model_of(capture.shape, 1.0)
+    estimator = replace(ESTIMATORS[method], flux_model=lambda _: flux)
     settings = estimator.parameters()
-    position, _ = estimator._best(capture, light, settings)
+    position, _ = estimator._best(capture, flux, settings)
     lag = 0.0 if estimator.finds_delay else estimator.lag_bins(capture, settings)
     error = position - lag - onset
     assert abs(np.median(error)) < 0.7
@@ -277,12 +277,12 @@ def test_starved_pixels_take_in_more_neighbours() -> None:
     cube[0, 0, 7] = 2
     cube[2, 2, 30] = 1
     capture = Capture(cube, Acquisition(n_bins=40))
-    position, _ = chi._locate(capture, light_of((5, 5), 0.06), ChiParameters())
+    position, _ = chi._locate(capture, flux_model_of((5, 5), 0.06), ChiParameters())
     assert position[2, 2] == 7  # beyond 3 x 3
     cube = cube.copy()
     cube[2, 2, 20:] = 4
     capture = Capture(cube, Acquisition(n_bins=40))
-    position, _ = chi._locate(capture, light_of((5, 5), 0.06), ChiParameters())
+    position, _ = chi._locate(capture, flux_model_of((5, 5), 0.06), ChiParameters())
     assert position[2, 2] >= 20
 
 
@@ -445,7 +445,7 @@ def test_unmixing_finds_delays_without_lag(pulse: Pulse) -> None:
     onset = np.linspace(30, 70, 64).reshape(8, 8)
     cube = drawn(onset, 0.3, seed=5, pulse=pulse)
     capture = Capture(cube.astype(np.uint16), ACQUISITION, pulse)
-    position, _ = unmixing._locate(capture, light_of((8, 8), 0.3), UnmixingParameters())
+    position, _ = unmixing._locate(capture, flux_model_of((8, 8), 0.3), UnmixingParameters())
     error = position - onset
     assert abs(np.median(error)) < 0.3
     assert (np.abs(error) < 1.5 + unmixing.spread_bins(pulse, ACQUISITION)).all()

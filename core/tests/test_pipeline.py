@@ -35,7 +35,7 @@ def test_a_run_is_the_estimate_and_its_figures(method: str) -> None:
     image = estimate(capture, method)
     assert done.capture is capture
     assert done.estimate_s > 0
-    assert run(capture, method).light_s < done.light_s  # kept by the capture
+    assert run(capture, method).flux_time_s < done.flux_time_s  # kept by the capture
     np.testing.assert_array_equal(done.image.range_m, image.range_m)
     truth_m, bin_m = capture.truth_range_m, capture.acquisition.bin_length_m
     assert truth_m is not None

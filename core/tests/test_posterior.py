@@ -19,12 +19,12 @@ from core.estimators import estimate
 from core.inference import posterior
 from core.inference.posterior import (
     Conditions,
-    Light,
+    FluxModel,
     Posterior,
-    light_of,
+    flux_model_of,
     most_likely,
-    near,
     posterior_of,
+    tolerance_probability,
 )
 from core.io.readers.dense import guess_detection
 from core.scene import Scene
@@ -114,19 +114,19 @@ class Twin(NamedTuple):
     """How far single precision may put a log likelihood off, (pixel,)."""
 
 
-def twin(capture: Capture, light: Light, steps_per_bin: int) -> Twin:
-    n_bins, n_pulses = capture.acquisition.n_bins, capture.armed_pulses
+def twin(capture: Capture, flux: FluxModel, steps_per_bin: int) -> Twin:
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     tail = 1e-3  # of an echo's photons, on either side, is left out
     first = math.floor(max(capture.pulse.quantile_s(tail) / BIN_S, -n_bins))
     last = math.ceil(min(capture.pulse.quantile_s(1 - tail) / BIN_S, n_bins))
     delay = (np.arange(n_bins * steps_per_bin) + 0.5) / steps_per_bin
     pixels = capture.cube.reshape(-1, n_bins).astype(float)
-    of_levels = np.empty((len(pixels), len(light.share), delay.size))
+    of_levels = np.empty((len(pixels), len(flux.share), delay.size))
     rounding = np.zeros(len(pixels))
     for i, counts in enumerate(pixels):
-        for level in range(len(light.share)):
-            signal = light.signal.reshape(len(light.share), -1)[level, i]
-            background = light.background.reshape(len(light.share), -1)[:, i] / n_bins
+        for level in range(len(flux.share)):
+            signal = flux.signal.reshape(len(flux.share), -1)[level, i]
+            background = flux.background.reshape(len(flux.share), -1)[:, i] / n_bins
             nothing = log_likelihood(counts, np.full(n_bins, background[0]), n_pulses)
             for j, d in enumerate(delay):
                 echo = capture.pulse.bin_probability(d, n_bins, BIN_S)
@@ -141,8 +141,8 @@ def twin(capture: Capture, light: Light, steps_per_bin: int) -> Twin:
                 rounding[i] = max(rounding[i], roundings * EPS_32 * terms)
         rounding[i] += 4 * EPS_32 * np.abs(of_levels[i]).max()  # level and offset, put together
     with np.errstate(divide="ignore"):
-        log_share = np.log(light.share)[1:, np.newaxis]
-    log_depth = np.log([light.depth[math.floor(d)] for d in delay])
+        log_share = np.log(flux.share)[1:, np.newaxis]
+    log_depth = np.log([flux.depth[math.floor(d)] for d in delay])
     return Twin(
         delay,
         of_levels,
@@ -168,7 +168,7 @@ def histograms(n_bins: int, n_pulses: int | None, pulse: Pulse) -> np.ndarray:
     return np.concatenate([drawn, [empty, constant, first, last]])
 
 
-def light_for(n_pixels: int, n_bins: int, n_pulses: int | None) -> Light:
+def flux_for(n_pixels: int, n_bins: int, n_pulses: int | None) -> FluxModel:
     """Three levels; backgrounds of every pixel and level, and depths, none like another."""
     photons = 200 if n_pulses is None else 1
     signal = np.repeat([[[0.0]], [[0.08]], [[0.5]]], n_pixels, axis=2)
@@ -176,27 +176,27 @@ def light_for(n_pixels: int, n_bins: int, n_pulses: int | None) -> Light:
     background = rng.uniform(0.3, 1.5, signal.shape)
     depth = rng.uniform(0.5, 1.5, n_bins)
     share = np.array([0.3, 0.5, 0.2])
-    return Light(signal * photons, background * photons, share, depth / depth.mean())
+    return FluxModel(signal * photons, background * photons, share, depth / depth.mean())
 
 
-def in_rows(light: Light, rows: int) -> Light:
-    shape = (len(light.share), rows, -1)
+def in_rows(flux: FluxModel, rows: int) -> FluxModel:
+    shape = (len(flux.share), rows, -1)
     return replace(
-        light, signal=light.signal.reshape(shape), background=light.background.reshape(shape)
+        flux, signal=flux.signal.reshape(shape), background=flux.background.reshape(shape)
     )
 
 
 def assert_equals_twin(
-    monkeypatch: pytest.MonkeyPatch, capture: Capture, light: Light, steps_per_bin: int
+    monkeypatch: pytest.MonkeyPatch, capture: Capture, flux: FluxModel, steps_per_bin: int
 ) -> None:
     n_bins = capture.acquisition.n_bins
-    expected = twin(capture, light, steps_per_bin)
+    expected = twin(capture, flux, steps_per_bin)
     shape = capture.shape
     far = expected.rounding[:, np.newaxis]
 
-    prepared = posterior._prepare(capture, capture.cube, light, steps_per_bin)
+    prepared = posterior._prepare(capture, capture.cube, flux, steps_per_bin)
     evidence, densities = posterior._level_evidence(prepared), posterior._level_densities(prepared)
-    assert evidence.shape == (capture.counts.size, len(light.share))
+    assert evidence.shape == (capture.counts.size, len(flux.share))
     assert (np.abs(evidence - expected.evidence) <= far + OF_SUMS).all()
     assert densities.shape == (*evidence.shape, expected.delay.size)
     largest = expected.log_levels.max(axis=(1, 2), keepdims=True)
@@ -204,7 +204,7 @@ def assert_equals_twin(
     assert (np.abs(densities - np.exp(expected.log_levels - largest)) <= atol).all()
 
     # At the delay found there is no less than elsewhere, and the score is what there is.
-    delay, score = (x.ravel() for x in most_likely(capture, light, steps_per_bin))
+    delay, score = (x.ravel() for x in most_likely(capture, flux, steps_per_bin))
     at = np.clip((delay * steps_per_bin).astype(int), 0, expected.delay.size - 1)
     highest = expected.log_density.max(axis=1)
     pixels = np.arange(delay.size)
@@ -226,19 +226,21 @@ def assert_equals_twin(
 
     if steps_per_bin > 1:
         return  # the posterior is made in whole bins
-    monkeypatch.setattr(posterior, "light_of", lambda _: light)
+    monkeypatch.setattr(posterior, "flux_model_of", lambda _: flux)
     found_posterior = posterior_of(capture)
     with np.errstate(divide="ignore"):
-        nothing = np.log(light.share[0])
+        nothing = np.log(flux.share[0])
     log_each = expected.log_density - math.log(expected.delay.size)
     total = np.logaddexp(np.logaddexp.reduce(log_each, axis=1), nothing)
     each = np.exp(log_each - total[:, np.newaxis])
     within = np.abs(expected.delay[:, np.newaxis] - np.arange(n_bins)) < posterior.TOLERANCE_BINS
     # Odds are off by a factor, of two likelihoods, at most.
     atol = np.expm1(2 * (far + OF_SUMS)) + 4 * EPS_32
-    assert found_posterior.near.shape == (*shape, n_bins)
-    assert found_posterior.near.dtype == np.float32
-    assert (np.abs(found_posterior.near.reshape(-1, n_bins) - each @ within) <= atol).all()
+    assert found_posterior.tolerance_probability.shape == (*shape, n_bins)
+    assert found_posterior.tolerance_probability.dtype == np.float32
+    assert (
+        np.abs(found_posterior.tolerance_probability.reshape(-1, n_bins) - each @ within) <= atol
+    ).all()
     surface = found_posterior.surface.ravel()
     assert (np.abs(surface - each.sum(axis=1)) <= atol[:, 0]).all()
 
@@ -251,9 +253,9 @@ def test_kernels_are_the_equations(
 ) -> None:
     cube = histograms(12, n_pulses, pulse)[np.newaxis]
     capture = capture_of(cube, n_pulses, pulse)
-    assert capture.armed_pulses == n_pulses
-    light = light_for(*cube.shape[1:], n_pulses)
-    assert_equals_twin(monkeypatch, capture, light, steps_per_bin)
+    assert capture.gated_pulses == n_pulses
+    flux = flux_for(*cube.shape[1:], n_pulses)
+    assert_equals_twin(monkeypatch, capture, flux, steps_per_bin)
 
 
 @any_pulse
@@ -263,10 +265,10 @@ def test_kernels_are_the_equations_in_short_gates(
     monkeypatch: pytest.MonkeyPatch, pulse: Pulse, n_pulses: int | None, n_bins: int
 ) -> None:
     cube = histograms(n_bins, n_pulses, pulse)[np.newaxis]
-    light = light_for(*cube.shape[1:], n_pulses)
+    flux = flux_for(*cube.shape[1:], n_pulses)
     for steps_per_bin in (1, 2):
         capture = capture_of(cube, n_pulses, pulse)
-        assert_equals_twin(monkeypatch, capture, light, steps_per_bin)
+        assert_equals_twin(monkeypatch, capture, flux, steps_per_bin)
 
 
 @pytest.mark.parametrize(
@@ -276,26 +278,26 @@ def test_kernels_are_the_equations_for_any_shares(
     monkeypatch: pytest.MonkeyPatch, share: list[float]
 ) -> None:
     cube = histograms(12, 200, Pulse())[np.newaxis]
-    light = light_for(*cube.shape[1:], 200)
-    light = replace(light, share=np.array(share))
-    assert_equals_twin(monkeypatch, capture_of(cube, 200), light, 1)
+    flux = flux_for(*cube.shape[1:], 200)
+    flux = replace(flux, share=np.array(share))
+    assert_equals_twin(monkeypatch, capture_of(cube, 200), flux, 1)
 
 
 def test_pixels_of_all_blocks_are_the_equations(monkeypatch: pytest.MonkeyPatch) -> None:
     one = histograms(12, 200, Pulse())
     cube = np.concatenate([np.roll(one, shift, axis=1) for shift in range(8)]).reshape(8, 9, 12)
-    light = in_rows(light_for(72, 12, 200), 8)  # more than one block of pixels
-    assert_equals_twin(monkeypatch, capture_of(cube, 200), light, 1)
+    flux = in_rows(flux_for(72, 12, 200), 8)  # more than one block of pixels
+    assert_equals_twin(monkeypatch, capture_of(cube, 200), flux, 1)
 
 
 def test_blocks_may_be_treated_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     cube = np.tile(histograms(12, 200, Pulse()), (15, 1))[np.newaxis, : 2 * posterior.LANES + 7]
     cube[0, posterior.LANES :] = np.roll(cube[0, posterior.LANES :], 3, axis=1)
-    light = light_for(*cube.shape[1:], 200)
+    flux = flux_for(*cube.shape[1:], 200)
     found = []
     for at_once in (2**20, 1):
         monkeypatch.setattr(posterior, "_AT_ONCE", at_once)
-        found.append(most_likely(capture_of(cube, 200), light, 2))
+        found.append(most_likely(capture_of(cube, 200), flux, 2))
     np.testing.assert_array_equal(*found)
 
 
@@ -304,7 +306,7 @@ def test_any_unsigned_counts_give_the_same(dtype: type) -> None:
     cube = histograms(12, 200, Pulse())[np.newaxis]
     expected = posterior_of(capture_of(cube.astype(np.uint16), 200))
     found = posterior_of(capture_of(cube.astype(dtype), 200))
-    np.testing.assert_array_equal(found.near, expected.near)
+    np.testing.assert_array_equal(found.tolerance_probability, expected.tolerance_probability)
     np.testing.assert_array_equal(found.surface, expected.surface)
 
 
@@ -312,16 +314,16 @@ def assert_probabilities(capture: Capture) -> None:
     """All of it finite and within its bounds; what warns raises."""
     found = posterior_of(capture)
     # Sums of float32 shares of a sum.
-    assert ((found.near >= 0) & (found.near <= 1 + 1e-6)).all()
+    assert ((found.tolerance_probability >= 0) & (found.tolerance_probability <= 1 + 1e-6)).all()
     assert ((found.surface >= 0) & (found.surface <= 1)).all()
-    assert (found.near <= found.surface[..., np.newaxis] + 1e-6).all()
+    assert (found.tolerance_probability <= found.surface[..., np.newaxis] + 1e-6).all()
     n_bins = capture.acquisition.n_bins
     for steps_per_bin in (1, 2):
-        delay, score = most_likely(capture, light_of(capture), steps_per_bin)
+        delay, score = most_likely(capture, flux_model_of(capture), steps_per_bin)
         assert ((delay >= 0) & (delay <= n_bins)).all()
         assert np.isfinite(score).all()
     for bins in (0.0, n_bins / 3, n_bins, math.nan):
-        chance = near(capture, np.full(capture.shape, bins))
+        chance = tolerance_probability(capture, np.full(capture.shape, bins))
         assert ((chance >= 0) & (chance <= 1)).all()
 
 
@@ -335,16 +337,16 @@ def test_light_and_posterior_are_always_defined(
     cube[..., 0] = count
     for some in (cube, cube[:1, :1]):
         capture = capture_of(some, n_pulses)
-        light = light_of(capture)
-        assert (np.isfinite(light.signal) & (light.signal >= 0)).all()
-        assert (np.isfinite(light.background) & (light.background > 0)).all()
-        assert (light.signal[0] == 0).all()
-        assert ((light.share >= 0) & (light.share[0] <= 1)).all()
-        assert light.share.sum() == pytest.approx(1, rel=1e-12)
-        assert light.depth.shape == (n_bins,)
-        assert (light.depth > 0).all()
-        assert light.depth.mean() == pytest.approx(1, rel=1e-12)
-        for typical in (light.typical_signal, light.typical_background):
+        flux = flux_model_of(capture)
+        assert (np.isfinite(flux.signal) & (flux.signal >= 0)).all()
+        assert (np.isfinite(flux.background) & (flux.background > 0)).all()
+        assert (flux.signal[0] == 0).all()
+        assert ((flux.share >= 0) & (flux.share[0] <= 1)).all()
+        assert flux.share.sum() == pytest.approx(1, rel=1e-12)
+        assert flux.depth.shape == (n_bins,)
+        assert (flux.depth > 0).all()
+        assert flux.depth.mean() == pytest.approx(1, rel=1e-12)
+        for typical in (flux.typical_signal, flux.typical_background):
             assert typical.shape == capture.shape
             assert (np.isfinite(typical) & (typical > 0)).all()
         assert_probabilities(capture)
@@ -419,7 +421,7 @@ def test_rate_and_armed_undo_the_pile_up() -> None:
     counts = np.random.default_rng(0).multinomial(300, np.full(21, 1 / 21), size=(4, 5))[..., :-1]
     counts[0, 0, 8:] = 0
     counts[0, 0, 8] = 300 - counts[0, 0].sum()  # the last pulses armed
-    rate, armed = posterior.rate_and_armed(counts.astype(float), 300)
+    rate, armed = posterior.rate_and_n_armed(counts.astype(float), 300)
     expected = coates_rate(counts, 300)
     finite = np.isfinite(expected)
     assert 0.9 < finite.mean() < 1
@@ -431,7 +433,7 @@ def test_rate_and_armed_undo_the_pile_up() -> None:
 
 @pytest.mark.parametrize("last", [1, 7, 100])
 def test_the_last_pulses_count_half_a_pulse_less(last: int) -> None:
-    rate, armed = posterior.rate_and_armed(np.array([100.0 - last, last, 0.0]), 100)
+    rate, armed = posterior.rate_and_n_armed(np.array([100.0 - last, last, 0.0]), 100)
     assert armed[1] == last
     # ln(A / (A - n)) with n = A - 1/2
     np.testing.assert_allclose(rate[1:], [math.log(2 * last), 0.0], rtol=1e-12)
@@ -439,13 +441,13 @@ def test_the_last_pulses_count_half_a_pulse_less(last: int) -> None:
 
 def test_expected_counts_are_undone_as_well() -> None:
     given = rate_per_bin(4.0, 0.5, 1.5, Pulse(), Acquisition(n_bins=12))
-    rate, _ = posterior.rate_and_armed(trigger_probability(given) * 50, 50)
+    rate, _ = posterior.rate_and_n_armed(trigger_probability(given) * 50, 50)
     np.testing.assert_allclose(rate, given, rtol=1e-12)
 
 
 def test_rates_are_counts_where_pulses_are_unknown() -> None:
     counts = np.arange(12.0).reshape(3, 4)
-    rate, armed = posterior.rate_and_armed(counts, None)
+    rate, armed = posterior.rate_and_n_armed(counts, None)
     np.testing.assert_array_equal(rate, counts)
     np.testing.assert_array_equal(armed, np.ones((3, 4)))
 
@@ -501,13 +503,13 @@ HALF_A_STEP = posterior._SPREAD ** (0.5 / (posterior.LEVELS - 1))
 @pytest.mark.parametrize("known", [True, False], ids=["first photons", "photons"])
 @pytest.mark.parametrize("signal", [0.1, 0.3])
 def test_light_of_finds_signal_and_background(signal: float, known: bool) -> None:
-    light = light_of(drawn(signal, known=known))
+    flux = flux_model_of(drawn(signal, known=known))
     photons = 1 if known else N_PULSES
-    found = float(light.typical_signal.mean()) / photons
+    found = float(flux.typical_signal.mean()) / photons
     assert signal / HALF_A_STEP < found < signal * HALF_A_STEP
     # Beside the one pixel that is added none is without an echo.
-    assert light.share[0] < 2 / SIZE**2
-    total = float(light.typical_background.mean()) / photons + (1 - light.share[0]) * found
+    assert flux.share[0] < 2 / SIZE**2
+    total = float(flux.typical_background.mean()) / photons + (1 - flux.share[0]) * found
     expected = signal + BACKGROUND
     variance = chance_variance(expected) if known else expected / N_PULSES
     assert total == pytest.approx(expected, abs=4 * math.sqrt(variance) / SIZE)
@@ -516,10 +518,10 @@ def test_light_of_finds_signal_and_background(signal: float, known: bool) -> Non
 @pytest.mark.parametrize("known", [True, False], ids=["first photons", "photons"])
 def test_light_of_tells_half_with_an_echo_from_half_without(known: bool) -> None:
     capture = drawn(columns(SIGNAL, 0.0), known=known)
-    light = light_of(capture)
+    flux = flux_model_of(capture)
     # 300 detections in some bins leave no doubt; one pixel without an echo is added.
-    assert light.share[0] == pytest.approx(0.5, abs=2 / SIZE**2)
-    found = light.typical_signal.mean() / (1 if known else N_PULSES)
+    assert flux.share[0] == pytest.approx(0.5, abs=2 / SIZE**2)
+    found = flux.typical_signal.mean() / (1 if known else N_PULSES)
     assert SIGNAL / HALF_A_STEP < found < SIGNAL * HALF_A_STEP
     # But at the end of the gate, where an echo is hardly seen.
     sure = np.abs(posterior_of(capture).surface - columns(1, 0)) < 0.01
@@ -527,26 +529,26 @@ def test_light_of_tells_half_with_an_echo_from_half_without(known: bool) -> None
 
 
 def test_light_of_tells_half_with_a_faint_echo_from_half_without() -> None:
-    light = light_of(drawn(columns(0.06, 0.0)))
+    flux = flux_model_of(drawn(columns(0.06, 0.0)))
     # An echo of 60 detections stands out of 20 a bin, though not in each pixel: some doubt is left
     # beside the scatter of a share that a sample of pixels tells.
-    assert light.share[0] == pytest.approx(0.5, abs=4 * 0.5 / SIZE)
+    assert flux.share[0] == pytest.approx(0.5, abs=4 * 0.5 / SIZE)
 
 
 def test_light_of_an_echo_free_image_has_none() -> None:
     capture = drawn(0.0)
-    light = light_of(capture)
-    assert light.share[0] > 0.99
-    assert len(light.share) == 2  # one that the sample may have missed, and no more
+    flux = flux_model_of(capture)
+    assert flux.share[0] > 0.99
+    assert len(flux.share) == 2  # one that the sample may have missed, and no more
     assert (posterior_of(capture).surface < 0.5).all()
 
 
 def test_light_of_finds_two_reflectivities() -> None:
-    light = light_of(drawn(columns(0.08, 0.4)))
+    flux = flux_model_of(drawn(columns(0.08, 0.4)))
     between = math.sqrt(0.08 * 0.4)
-    level = light.signal[:, 0, 0]
+    level = flux.signal[:, 0, 0]
     dark, bright = level[1:] < between, level[1:] > between
-    share = light.share[1:]
+    share = flux.share[1:]
     # 80 detections and 400, known to 1 in 5: none is taken for the other.
     assert share[dark].sum() == pytest.approx(0.5, abs=2 / SIZE**2)
     assert share[bright].sum() == pytest.approx(0.5, abs=2 / SIZE**2)
@@ -556,27 +558,27 @@ def test_light_of_finds_two_reflectivities() -> None:
 
 
 def test_background_is_one_where_chance_alone_makes_it_scatter() -> None:
-    light = light_of(drawn(SIGNAL))
+    flux = flux_model_of(drawn(SIGNAL))
     # A variance of n numbers scatters by sqrt(2 / n) of itself: more than that is not kept.
     excess = 4 * math.sqrt(2) / SIZE
     scatter = math.sqrt(chance_variance(SIGNAL + BACKGROUND) * (1 + excess))
-    assert light.typical_background.std() <= excess * scatter
+    assert flux.typical_background.std() <= excess * scatter
 
 
 def test_background_is_one_where_signal_alone_differs() -> None:
-    light = light_of(drawn(columns(SIGNAL, 0.0)))
+    flux = flux_model_of(drawn(columns(SIGNAL, 0.0)))
     # Totals differ by the signal, and backgrounds by no more than what levels miss of it.
-    assert light.background[0].std() < 0.5 * SIGNAL / 2
+    assert flux.background[0].std() < 0.5 * SIGNAL / 2
 
 
 def test_background_that_differs_is_not_drawn_to_its_mean() -> None:
     background = np.linspace(0.3, 1.2, SIZE)
-    light = light_of(drawn(0.1, background))
-    error = light.typical_background - background
+    flux = flux_model_of(drawn(0.1, background))
+    error = flux.typical_background - background
     # As good as each pixel's own total, or better: errors are what chance makes.
     chance = np.mean([chance_variance(0.1 + b) for b in background])
     assert (error - error.mean()).var() <= chance * (1 + 4 * math.sqrt(2) / SIZE)
-    assert np.polyfit(background, light.typical_background.mean(axis=0), 1)[0] > 0.9
+    assert np.polyfit(background, flux.typical_background.mean(axis=0), 1)[0] > 0.9
 
 
 def test_totals_are_of_the_background_and_scatter_by_chance() -> None:
@@ -593,7 +595,7 @@ def test_totals_are_of_the_background_and_scatter_by_chance() -> None:
 
 
 def test_depths_that_are_alike_are_found_alike() -> None:
-    depth = light_of(drawn(SIGNAL)).depth
+    depth = flux_model_of(drawn(SIGNAL)).depth
     # Echoes begin in bins 0 to 21; a pixel or more in each, over five bins of smoothing.
     excess = 4 / math.sqrt(5 * SIZE**2 / (N_BINS - 8))
     expected = (1 - posterior._ALIKE) * N_BINS / (N_BINS - 8)
@@ -602,10 +604,10 @@ def test_depths_that_are_alike_are_found_alike() -> None:
 
 
 def test_depths_that_occur_are_learned() -> None:
-    light = light_of(drawn(0.1, onset_bin=10.0))
-    assert light.depth[6:15].sum() > 0.7 * N_BINS
+    flux = flux_model_of(drawn(0.1, onset_bin=10.0))
+    assert flux.depth[6:15].sum() > 0.7 * N_BINS
     # But none is ruled out.
-    assert light.depth.min() > 0.05
+    assert flux.depth.min() > 0.05
 
 
 def test_light_does_not_depend_on_the_order_of_pixels() -> None:
@@ -613,7 +615,7 @@ def test_light_does_not_depend_on_the_order_of_pixels() -> None:
     assert SIZE**2 <= posterior.SAMPLE  # beyond, some are drawn
     order = np.random.default_rng(2).permutation(SIZE**2)
     cube = capture.cube.reshape(1, SIZE**2, N_BINS)[:, order]
-    one, other = light_of(capture), light_of(capture_of(cube, N_PULSES))
+    one, other = flux_model_of(capture), flux_model_of(capture_of(cube, N_PULSES))
     # Sums round as their order has it, which a hundred steps may magnify.
     np.testing.assert_allclose(other.share, one.share, rtol=0, atol=1e-9)
     for field in ("signal", "background"):
@@ -629,32 +631,32 @@ def test_light_is_not_fooled_by_a_picket_fence(empty_column: int) -> None:
     onset_bin[:, empty_column::4] = np.nan
     rate = rate_per_bin(onset_bin, np.full((size, size), 0.5), 1.5, Pulse(), acquisition)
     counts = np.rint(trigger_probability(rate) * 50_000).astype(np.uint16)
-    light = light_of(Capture(counts, acquisition))
+    flux = flux_model_of(Capture(counts, acquisition))
     drawn_by_chance = math.sqrt(0.25 * 0.75 / posterior.SAMPLE)
-    assert light.share[0] == pytest.approx(0.25, abs=4 * drawn_by_chance)
+    assert flux.share[0] == pytest.approx(0.25, abs=4 * drawn_by_chance)
     # The strongest level is what the middle four fifths of an echo hold, or more.
-    found = light.typical_signal.mean()
+    found = flux.typical_signal.mean()
     assert 0.8 * 0.5 / HALF_A_STEP < found <= 0.5
 
 
 def test_light_of_pixels_is_theirs() -> None:
-    light = in_rows(light_for(6, 12, 200), 2)
-    some = light.of_pixels(np.array([[4, 0], [4, 5]]))
+    flux = in_rows(flux_for(6, 12, 200), 2)
+    some = flux.of_pixels(np.array([[4, 0], [4, 5]]))
     assert some.signal.shape == some.background.shape == (3, 2, 2)
-    np.testing.assert_array_equal(some.background[:, 0, 0], light.background[:, 1, 1])
-    np.testing.assert_array_equal(some.background[:, 1], light.background[:, 1, 1:])
-    np.testing.assert_array_equal(some.share, light.share)
-    np.testing.assert_array_equal(some.depth, light.depth)
+    np.testing.assert_array_equal(some.background[:, 0, 0], flux.background[:, 1, 1])
+    np.testing.assert_array_equal(some.background[:, 1], flux.background[:, 1, 1:])
+    np.testing.assert_array_equal(some.share, flux.share)
+    np.testing.assert_array_equal(some.depth, flux.depth)
 
 
 def test_typical_light_is_the_mean_light() -> None:
     share = np.array([0.5, 0.1, 0.4])
     signal = np.array([0.0, 1.0, 2.0]).reshape(3, 1, 1)
-    light = Light(signal, np.array([3.0, 2.0, 1.0]).reshape(3, 1, 1), share, np.ones(9))
+    flux = FluxModel(signal, np.array([3.0, 2.0, 1.0]).reshape(3, 1, 1), share, np.ones(9))
     # Of the pixels that see an echo; of all.
-    np.testing.assert_allclose(light.typical_signal, [[(0.1 * 1 + 0.4 * 2) / 0.5]], rtol=1e-12)
-    np.testing.assert_allclose(light.typical_background, [[1.5 + 0.2 + 0.4]], rtol=1e-12)
-    dark = Light(signal, signal, np.array([1.0, 0.0, 0.0]), np.ones(9))
+    np.testing.assert_allclose(flux.typical_signal, [[(0.1 * 1 + 0.4 * 2) / 0.5]], rtol=1e-12)
+    np.testing.assert_allclose(flux.typical_background, [[1.5 + 0.2 + 0.4]], rtol=1e-12)
+    dark = FluxModel(signal, signal, np.array([1.0, 0.0, 0.0]), np.ones(9))
     np.testing.assert_allclose(dark.typical_signal, [[1.5]], rtol=1e-12)
 
 
@@ -683,37 +685,43 @@ def test_near_interpolates_between_bins(table: Callable[[Any], Capture]) -> None
         (1.75, [0.125, 0.375]),
         (2.0, [0.0, 0.5]),
     ):
-        np.testing.assert_array_equal(near(capture, np.full((1, 2), bins)), [expected])
-    np.testing.assert_array_equal(near(capture, np.array([[0.5, 1.75]])), [[0.375, 0.375]])
+        np.testing.assert_array_equal(
+            tolerance_probability(capture, np.full((1, 2), bins)), [expected]
+        )
+    np.testing.assert_array_equal(
+        tolerance_probability(capture, np.array([[0.5, 1.75]])), [[0.375, 0.375]]
+    )
 
 
 def test_near_is_nothing_where_there_is_no_answer(table: Callable[[Any], Capture]) -> None:
     capture = table(np.full((2, 3), 0.5))
-    np.testing.assert_array_equal(near(capture, np.array([[math.nan, 1.0]])), [[0.0, 0.5]])
+    np.testing.assert_array_equal(
+        tolerance_probability(capture, np.array([[math.nan, 1.0]])), [[0.0, 0.5]]
+    )
 
 
 @pytest.mark.parametrize("rows", [[0.25, 0.5, 0.75], [0.25]], ids=["three bins", "one bin"])
 def test_near_ends_at_the_gates_edges(table: Callable[[Any], Capture], rows: Any) -> None:
     capture = table(rows)
-    assert near(capture, np.array([[0.0]])) == 0.25
+    assert tolerance_probability(capture, np.array([[0.0]])) == 0.25
     for beyond in (len(rows) - 0.5, len(rows)):
-        assert near(capture, np.array([[beyond]])) == rows[-1]
+        assert tolerance_probability(capture, np.array([[beyond]])) == rows[-1]
 
 
 def test_near_is_a_probability_though_sums_round(table: Callable[[Any], Capture]) -> None:
     capture = table([1 + 2e-7, -1e-9])
     for bins in (0.0, 1.0):
-        assert 0 <= near(capture, np.array([[bins]])) <= 1
+        assert 0 <= tolerance_probability(capture, np.array([[bins]])) <= 1
 
 
 def test_nothing_seen_leaves_every_delay_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     share = np.array([0.6, 0.4])
     level = np.array([0.0, 1e-9]).reshape(2, 1, 1)  # an echo too faint to be missed
-    light = Light(level, np.ones((2, 1, 1)), share, np.ones(40))
-    monkeypatch.setattr(posterior, "light_of", lambda _: light)
+    flux = FluxModel(level, np.ones((2, 1, 1)), share, np.ones(40))
+    monkeypatch.setattr(posterior, "flux_model_of", lambda _: flux)
     found = posterior_of(capture_of(np.zeros((1, 1, 40))))
     expected = 0.4 * (np.minimum(np.arange(40) + 3, 40) - np.maximum(np.arange(40) - 3, 0)) / 40
-    np.testing.assert_allclose(found.near[0, 0], expected, rtol=1e-5)
+    np.testing.assert_allclose(found.tolerance_probability[0, 0], expected, rtol=1e-5)
     np.testing.assert_allclose(found.surface, 0.4, rtol=1e-5)
 
 
@@ -723,13 +731,19 @@ def test_nothing_depends_on_threads(n_threads: int) -> None:
     cube = np.tile(histograms(12, 200, Pulse()), (15, 1))[np.newaxis, : 2 * posterior.LANES + 7]
     numba.set_num_threads(1)
     one = capture_of(cube, 200)
-    light, expected, peaks = light_of(one), posterior_of(one), most_likely(one, light_of(one), 2)
+    flux, expected, peaks = (
+        flux_model_of(one),
+        posterior_of(one),
+        most_likely(one, flux_model_of(one), 2),
+    )
     numba.set_num_threads(n_threads)
     other = capture_of(cube, 200)
-    np.testing.assert_array_equal(light_of(other).share, light.share)
-    np.testing.assert_array_equal(posterior_of(other).near, expected.near)
+    np.testing.assert_array_equal(flux_model_of(other).share, flux.share)
+    np.testing.assert_array_equal(
+        posterior_of(other).tolerance_probability, expected.tolerance_probability
+    )
     np.testing.assert_array_equal(posterior_of(other).surface, expected.surface)
-    np.testing.assert_array_equal(most_likely(other, light, 2), peaks)
+    np.testing.assert_array_equal(most_likely(other, flux, 2), peaks)
 
 
 # --- Calibration: what is told comes true as often. ---
@@ -752,7 +766,9 @@ def uniform_captures() -> list[tuple[Capture, np.ndarray]]:
 
 def assert_calibrated(answers: list[tuple[Capture, np.ndarray, np.ndarray]]) -> None:
     """As many of the answers (capture, delay, true delay) are right as was told."""
-    chance = np.concatenate([near(capture, bins).ravel() for capture, bins, _ in answers])
+    chance = np.concatenate(
+        [tolerance_probability(capture, bins).ravel() for capture, bins, _ in answers]
+    )
     error = np.concatenate([np.abs(bins - truth).ravel() for _, bins, truth in answers])
     right = error <= posterior.TOLERANCE_BINS
     # The posterior is made in whole bins: half a bin is more than it can tell.
@@ -775,7 +791,7 @@ def test_confidence_is_the_share_of_right_answers(
     for capture, truth in uniform_captures:
         image = estimate(capture, method)
         assert image.valid.all()
-        np.testing.assert_array_equal(image.confidence, near(capture, image.bin))
+        np.testing.assert_array_equal(image.confidence, tolerance_probability(capture, image.bin))
         answers.append((capture, image.bin, truth))
     assert_calibrated(answers)
 

@@ -19,7 +19,7 @@ from core.effects import Backscatter, FaultyPixels, Motion, SecondSurface
 from core.estimators import ESTIMATORS
 from core.estimators.base import Calibration
 from core.inference.limits import cramer_rao_bins
-from core.inference.posterior import detailed_lighting_of, lighting_of
+from core.inference.posterior import detailed_flux_prior_of, flux_prior_of
 from core.inference.resolution import HIDDEN, TOLD, Difference
 from core.metrics import Interval
 from core.scene import Scene, scenes
@@ -226,13 +226,15 @@ def test_one_level_of_signal_is_taken_where_no_pixel_tells_its_own() -> None:
     merged = 0
     for seed in range(4):
         capture = seen(Flux(0.05, 1.0), size=64, seed=seed)
-        lighting, detailed = lighting_of(capture), detailed_lighting_of(capture)
-        assert lighting.levels.size == 2
+        flux_prior, detailed = flux_prior_of(capture), detailed_flux_prior_of(capture)
+        assert flux_prior.levels.size == 2
         merged += detailed.levels.size > 2
         spares = ESTIMATORS["likelihood"].remark(capture)
         assert ("one level of signal" in spares) == (detailed.levels.size > 2)
-        assert lighting.share.sum() == pytest.approx(1)
-        assert lighting.share @ lighting.levels == pytest.approx(detailed.share @ detailed.levels)
+        assert flux_prior.share.sum() == pytest.approx(1)
+        assert flux_prior.share @ flux_prior.levels == pytest.approx(
+            detailed.share @ detailed.levels
+        )
         _stays_within_its_uncertainty(
             capture,
             "likelihood",
@@ -262,7 +264,7 @@ def _stays_within_its_uncertainty(
 def test_levels_that_pixels_tell_are_kept() -> None:
     reflectivity = np.where(np.arange(32) % 2 == 0, 0.2, 2.0) * np.ones((32, 1))
     capture = simulate(wall(reflectivity=reflectivity), GATE, Flux(0.1, 1.0))
-    assert lighting_of(capture).levels.size > 2
+    assert flux_prior_of(capture).levels.size > 2
     assert ESTIMATORS["likelihood"].remark(capture) == ""
 
 
@@ -270,13 +272,13 @@ def test_levels_that_pixels_tell_are_kept() -> None:
 def test_coates_undoes_no_pile_up_that_pulses_hide() -> None:
     for seed in range(3):
         faint = seen(size=64, seed=seed)
-        assert not lighting_of(faint).pile_up
+        assert not flux_prior_of(faint).pile_up
         assert "Coates undoes no pile-up" in ESTIMATORS["coates"].remark(faint)
         exact = corrections.with_correction(faint, "pile_up")
-        assert lighting_of(exact).pile_up
+        assert flux_prior_of(exact).pile_up
         _stays_within_its_uncertainty(faint, "coates", exact, faint)
     bright = seen(DAY)
-    assert lighting_of(bright).pile_up
+    assert flux_prior_of(bright).pile_up
     assert ESTIMATORS["coates"].remark(bright) == ""
 
 
@@ -290,7 +292,7 @@ def test_parts_of_an_image_spare_what_the_whole_does(method: str) -> None:
     expected = estimator.ranged(whole, settings, calibration)
     for rows in (slice(0, 5), slice(5, 32)):
         part = Capture(whole.cube[rows].copy(), whole.acquisition, whole.pulse)
-        lighting_of.tell(part, lighting_of(whole))
+        flux_prior_of.tell(part, flux_prior_of(whole))
         found = estimator.ranged(part, settings, calibration)
         np.testing.assert_array_equal(found.bin, expected.bin[rows])
         np.testing.assert_array_equal(found.confidence, expected.confidence[rows])

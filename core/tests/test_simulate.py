@@ -294,7 +294,7 @@ def test_first_photons_are_some_of_all() -> None:
     photons = all_photons(50, 100)
     first = first_photons(photons, 50)
     assert np.all(first.cube <= photons.cube)
-    assert first.counts.max() <= first.armed_pulses == 50
+    assert first.counts.max() <= first.gated_pulses == 50
     np.testing.assert_array_equal(first.cube, first_photons(photons, 50).cube)
     assert not np.array_equal(first.cube, first_photons(photons, 50, seed=1).cube)
     assert "first photons of 50 pulses" in first.source

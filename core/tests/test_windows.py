@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from core.acquisition import Flux
 from core.capture import Capture, CaptureError
 from core.estimators import estimate
-from core.inference.posterior import lighting_of
+from core.inference.posterior import flux_prior_of
 from core.io.readers import open_capture, sample
 from core.io.readers.labelled import dataset
 from core.out_of_core.tiles import estimate_large
-from core.out_of_core.windows import Window, WindowReader, light_of_whole, read_window
+from core.out_of_core.windows import Window, WindowReader, read_window, sampled_flux_prior
 from core.scene import scenes
 from core.simulation import simulate
 from core.tests.formats import Content, put
@@ -109,8 +109,8 @@ def test_a_window_holds_its_pixels_and_reads_few_others(
     name: str, window: Window, tmp_path: Path, small_blocks: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts = open_capture(put(tmp_path / name, FILES[name]()))
-    light, reads = lighting_of(CAPTURE), Reads(monkeypatch)
-    found = read_window(counts, window, lighting=light)
+    light, reads = flux_prior_of(CAPTURE), Reads(monkeypatch)
+    found = read_window(counts, window, flux_prior=light)
     rows, cols = window.picked
     np.testing.assert_array_equal(found.cube, CAPTURE.cube[np.ix_(rows, cols)])
     assert found.shape == window.shape
@@ -158,7 +158,7 @@ def test_a_window_says_what_the_whole_says(
     window = Window((40, 72), (30, 62))
     here = {"row": slice(*window.rows), "col": slice(*window.cols)}
     found = read_window(opened, window)
-    np.testing.assert_array_equal(lighting_of(found).depth, light_of_whole(opened).depth)
+    np.testing.assert_array_equal(flux_prior_of(found).depth, sampled_flux_prior(opened).depth)
     image = estimate(found, "likelihood")
     np.testing.assert_array_equal(image.bin, whole["bin"].isel(here))
     np.testing.assert_array_equal(image.confidence, whole["confidence"].isel(here))
@@ -167,11 +167,11 @@ def test_a_window_says_what_the_whole_says(
 def test_what_is_not_read_yet_tells_nothing_of_the_light(opened: xr.DataArray) -> None:
     reader = WindowReader(opened, Window((0, 96), (0, 96), 2))
     reader.read_some()
-    light = lighting_of(reader.capture())
+    light = flux_prior_of(reader.capture())
     known = Capture(
         reader.capture().cube[reader.seen][np.newaxis], CAPTURE.acquisition, CAPTURE.pulse
     )
-    assert light.background == lighting_of(known).background
+    assert light.background == flux_prior_of(known).background
 
 
 # -- what goes wrong -------------------------------------------------------------------------------

@@ -207,8 +207,8 @@ def pixels(_: Path) -> Answers:
         for method in ("tracking", "likelihood", "shi"):
             image = core.estimate(capture, method)
             report = core.inspection.pixel_report(capture, image, 1, 3, method)
-            light = report.light if method == "tracking" else None
-            yield f"{name}, {method}", {"report": report, "light": light}
+            flux = report.flux if method == "tracking" else None
+            yield f"{name}, {method}", {"report": report, "flux": flux}
 
 
 def regions(_: Path) -> Answers:
@@ -217,7 +217,7 @@ def regions(_: Path) -> Answers:
         mask = core.inspection.pixels_in([(0, 0), (0, 4), (4, 4), (3, 0)], capture.shape)
         image = core.estimate(capture, method)
         report = core.inspection.region_report(capture, image, mask, method)
-        yield name, {"mask": mask, "report": report, "light": report.pixel.light}
+        yield name, {"mask": mask, "report": report, "flux": report.pixel.flux}
 
 
 def whole(_: Path) -> Answers:
@@ -295,7 +295,7 @@ def files(folder: Path) -> Answers:
         yield f"capture{suffix}", core.read_capture(path)
         counts = core.open_capture(path)
         yield f"window{suffix}", core.read_window(counts, core.Window((1, 5), (0, 5), 2))
-    yield "light", core.light_of_whole(counts)
+    yield "flux_prior", core.sampled_flux_prior(counts)
     for method, estimator in core.ESTIMATORS.items():
         if not estimator.whole_image and method != "oracle":
             alarms = 0.1 if method == "peak" else None

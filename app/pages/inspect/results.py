@@ -12,7 +12,7 @@ from app.model.state import Less
 from app.model.store import Answer, Pixel, inspect, reduced
 from app.pages.inspect.views import Corners, Curves
 from core import inspection
-from core.cost import predicted_light
+from core.cost import predicted_flux_time
 from core.inspection import Accuracy, CaptureReport, PixelReport, RegionReport, Suggestion
 
 SHARES = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)
@@ -58,9 +58,9 @@ def pixel_seen(answer: Answer, row: int, col: int) -> Seen:
 def pixel_lit(answer: Answer, row: int, col: int) -> Seen:
     """The same, its light found: on a worker, where to find it would hold up the page."""
     n_bins = answer.capture.acquisition.n_bins
-    with spending((1, 1, n_bins), "light", predicted_light(1, n_bins)):
+    with spending((1, 1, n_bins), "light", predicted_flux_time(1, n_bins)):
         seen = pixel_seen(answer, row, col)
-        _ = seen.report.light
+        _ = seen.report.flux
         return seen
 
 
@@ -68,7 +68,7 @@ def region_seen(answer: Answer, region: Corners) -> Seen:
     """All that is known of a region of an answer's pixels."""
     mask = inspection.pixels_in(region, answer.capture.shape)
     n_pixels, n_bins = int(np.count_nonzero(mask)), answer.capture.acquisition.n_bins
-    with spending((1, n_pixels, n_bins), "light", predicted_light(n_pixels, n_bins)):
+    with spending((1, n_pixels, n_bins), "light", predicted_flux_time(n_pixels, n_bins)):
         report = inspection.region_report(
             answer.capture, answer.run.image, mask, "tracking", answer.request.tracking
         )
@@ -79,7 +79,7 @@ def region_seen(answer: Answer, region: Corners) -> Seen:
 def capture_known(answer: Answer) -> CaptureReport:
     """All that is known of the capture of an answer."""
     rows, cols, n_bins = answer.capture.cube.shape
-    with spending((rows, cols, n_bins), "light", predicted_light(rows * cols, n_bins)):
+    with spending((rows, cols, n_bins), "light", predicted_flux_time(rows * cols, n_bins)):
         return inspection.capture_report(answer.capture)
 
 

@@ -11,7 +11,7 @@ from app.model.store import Answer
 from app.model.text import Fact, number, share
 from app.pages.inspect.results import Seen
 from app.plots.gate import COMPLEMENT, TITLES, Scale, scale
-from core.inspection import Accuracy, Candidate, CaptureReport, LightFound
+from core.inspection import Accuracy, Candidate, CaptureReport, FluxEstimate
 from core.metrics import Interval
 
 EXPLANATION = """
@@ -86,13 +86,13 @@ def _pixel_facts(answer: Answer, seen: Seen, unit: str) -> list[Fact]:
             ("Error", error, "Estimate minus truth."),
         ]
     counts, fired = f"{pixel.counts:,}", "Counts in this pixel's histogram"
-    if answer.capture.armed_pulses is not None:
-        counts += f" ({share(pixel.counts / answer.capture.armed_pulses)})"
+    if answer.capture.gated_pulses is not None:
+        counts += f" ({share(pixel.counts / answer.capture.gated_pulses)})"
         fired += ", and their share of the pulses"
     return [
         *found,
         ("Detections", counts, f"{fired}."),
-        *_light(report.light, report.light_unit),
+        *_light(report.flux, report.flux_unit),
     ]
 
 
@@ -108,7 +108,7 @@ def _region_facts(seen: Seen, unit: str) -> list[Fact]:
         ("Answered", share(region.share_answered), "Share of its pixels with an answer."),
         ("Mean confidence", share(region.mean_confidence), "Of its pixels, one by one."),
         ("Mean detections", number(region.mean_counts, ""), "Of a pixel."),
-        *_light(region.light, region.light_unit),
+        *_light(region.flux, region.flux_unit),
     ]
 
 
@@ -121,7 +121,7 @@ def _estimate(seen: Seen, along: Scale) -> list[Fact]:
     return [*found, ("Confidence", share(pixel.confidence), sure)]
 
 
-def _light(found: LightFound, unit: str) -> list[Fact]:
+def _light(found: FluxEstimate, unit: str) -> list[Fact]:
     per = f", in {unit}, with 95 % interval."
     return [
         ("Signal S", interval(found.signal), f"Photons of the echo{per}"),
@@ -136,7 +136,7 @@ def remark(seen: Seen) -> str:
         return f"Verdict: {seen.report.verdict.health}. {seen.report.verdict.why}"
     return (
         f"The plots show its pixels added to one. Light of a pixel on average: "
-        f"{seen.region.light_method}."
+        f"{seen.region.flux_method}."
     )
 
 
@@ -181,7 +181,7 @@ def pin_columns(unit: str) -> list[Sequence[Any]]:
 def pin_row(seen: Seen, name: str, color: str, along: Scale, other: Scale) -> dict[str, Any]:
     """A pinned pixel."""
     pixel, report = seen.pixel, seen.report
-    sbr = report.light.sbr
+    sbr = report.flux.sbr
     value, *ends = interval(sbr).split(" ", 1)
     known = not math.isnan(pixel.answer_bin)
     below = other.place(pixel.answer_bin) if known else "no answer"
@@ -221,7 +221,7 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
     """Name, value and help of each number of a capture."""
     rows, cols = answer.capture.shape
     n_pulses = answer.capture.acquisition.n_pulses
-    light, per = report.light, f", in {report.light_unit}, with 95 % interval."
+    light, per = report.flux, f", in {report.flux_unit}, with 95 % interval."
     narrow = "–" if report.n_hot is None else None
     return [
         ("Pixels", f"{rows} × {cols}", "Rows and columns."),
@@ -237,7 +237,7 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
 
 def light_told(report: CaptureReport) -> str:
     """How the light of a capture was found."""
-    return f"Signal, background and SBR: {report.light_method}; in {report.light_unit}."
+    return f"Signal, background and SBR: {report.flux_method}; in {report.flux_unit}."
 
 
 def gate_advice(report: CaptureReport, along: Scale) -> str:

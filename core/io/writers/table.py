@@ -41,7 +41,7 @@ def write_pixel(
 ) -> None:
     """Write the signals of one pixel, see `core.io.writers.save_pixel`."""
     acquisition, counts = capture.acquisition, capture.cube[row, col]
-    signals = tracking_signals(counts, settings, capture.armed_pulses)
+    signals = tracking_signals(counts, settings, capture.gated_pulses)
     bins = np.arange(acquisition.n_bins)
     columns = {
         "bin": bins,

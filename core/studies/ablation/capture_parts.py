@@ -46,7 +46,7 @@ def rows(capture: Capture, method: str) -> list[Callable[[], Requirement]]:
 
 def pile_up(capture: Capture, method: str) -> Requirement:
     """Whether early photons hide later ones, by the share of pulses that fired."""
-    n_pulses = capture.armed_pulses
+    n_pulses = capture.gated_pulses
     if n_pulses is not None:
         fired = capture.counts / n_pulses
         return _corrected(capture, method, "pile_up", resolution.pile_up(fired, n_pulses))
@@ -112,14 +112,14 @@ class _Sample(NamedTuple):
 def _sample_of(capture: Capture) -> _Sample | None:
     """None where too few pixels are sure of their surface."""
     bins = corrections.delays(capture, "likelihood")
-    sure = posterior.near(capture, bins) >= _SURE
+    sure = posterior.tolerance_probability(capture, bins) >= _SURE
     faulty = faults.standing_out(capture)
     if faulty is not None:
         sure &= ~(faulty.hot | faulty.dead)
     pixels = np.random.default_rng(0).permutation(np.flatnonzero(sure))[:_SAMPLE]
     if pixels.size < _FEWEST:
         return None
-    n_bins, n_pulses = capture.acquisition.n_bins, capture.armed_pulses
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     counts, delay_bin = capture.cube.reshape(-1, n_bins)[pixels].astype(float), bins.ravel()[pixels]
     armed = np.ones_like(counts)
     if n_pulses is not None:
@@ -157,7 +157,7 @@ def backscatter(capture: Capture) -> Requirement:
     sample = _sample_of(capture)
     if sample is None:
         return _unknown("backscatter", _NOT_SURE)
-    n_pulses, n_bins, rate = capture.armed_pulses, sample.background.size, sample.background
+    n_pulses, n_bins, rate = capture.gated_pulses, sample.background.size, sample.background
     even = np.full(n_bins, rate.mean())
     if n_pulses is not None:  # a share of the armed pulses fires, of the rate that makes it do so
         rate, even = (trigger_probability(-np.log1p(-np.minimum(x, 0.999))) for x in (rate, even))
@@ -204,9 +204,9 @@ def _twin(capture: Capture, sample: _Sample) -> tuple[NDArray[np.unsignedinteger
     seen = np.where(sample.beside, 0.0, sample.armed * echo).sum(axis=1, keepdims=True)
     signal = np.maximum(excess.sum(axis=1, keepdims=True), 0.0) / np.maximum(seen, 1e-9)
     rate, rng = signal * echo + sample.background, np.random.default_rng(0)
-    counts = drawn(rate, capture.armed_pulses, rng)
+    counts = drawn(rate, capture.gated_pulses, rng)
     twin = replace(capture, cube=counts[np.newaxis], truth_range_m=None, signal=None)
-    posterior.lighting_of.tell(twin, posterior.lighting_of(capture))
+    posterior.flux_prior_of.tell(twin, posterior.flux_prior_of(capture))
     return counts, corrections.delays(twin, "likelihood")[0]
 
 
@@ -254,7 +254,7 @@ def second_surface(capture: Capture) -> Requirement:
     chance[seen < 1] = 1.0
     shows = chance.min(axis=1) * whole.sum(axis=1) < faults.BY_CHANCE
     excess = np.where(shows, (seen - expected).max(axis=1), 0.0)
-    sent = capture.armed_pulses or sample.counts.sum(axis=1)
+    sent = capture.gated_pulses or sample.counts.sum(axis=1)
     return _found("second_surface", shows, excess / sent, f"{shows.size} of them looked at")
 
 
@@ -272,7 +272,7 @@ def faulty_pixels(capture: Capture) -> Requirement:
     found = faults.standing_out(capture)
     if found is None:
         return _unknown("faulty_pixels", "an image so narrow has no neighbours")
-    counts, n_pulses = capture.counts, capture.armed_pulses
+    counts, n_pulses = capture.counts, capture.gated_pulses
     usual, faulty = faults.usual_counts(capture), found.hot | found.dead
     too_dark = faults.fewer_by_chance(0, int(np.median(usual)), n_pulses) > faults.BY_CHANCE
     if not faulty.any() and too_dark:

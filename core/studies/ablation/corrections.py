@@ -15,10 +15,10 @@ from core.capture import Capture
 from core.estimators import ESTIMATORS
 from core.inference.posterior import (
     TOLERANCE_BINS,
-    detailed_lighting_of,
+    detailed_flux_prior_of,
+    flux_model_of,
+    flux_prior_of,
     level_differences,
-    light_of,
-    lighting_of,
 )
 from core.inference.resolution import Difference
 from core.metrics import Interval
@@ -30,19 +30,19 @@ def with_correction(capture: Capture, correction: str) -> Capture:
     if correction == "pulse_shape":
         return capture
     made = replace(capture)
-    light = detailed_lighting_of(capture)
+    light = detailed_flux_prior_of(capture)
     if correction == "pile_up":
-        light = lighting_of(capture)._replace(pile_up=True)
-    lighting_of.tell(made, light)
+        light = flux_prior_of(capture)._replace(pile_up=True)
+    flux_prior_of.tell(made, light)
     return made
 
 
 def levels_apart(capture: Capture) -> Difference:
     """How far each pixel's level of signal lies from the mean level, for 1000 pixels."""
-    lighting = detailed_lighting_of(capture)
-    share = lighting.share[1:] / lighting.share[1:].sum()
+    flux_prior = detailed_flux_prior_of(capture)
+    share = flux_prior.share[1:] / flux_prior.share[1:].sum()
     pixels = np.maximum(np.round(1000 * share), 1).astype(int)
-    return Difference(*(np.repeat(each, pixels) for each in level_differences(lighting, capture)))
+    return Difference(*(np.repeat(each, pixels) for each in level_differences(flux_prior, capture)))
 
 
 def delays(capture: Capture, method: str) -> Floats:
@@ -91,8 +91,8 @@ def _some_rows(capture: Capture) -> Capture:
     """As many as are ranged in some milliseconds."""
     rows = max(1, 2**19 // capture.cube[0].size)
     some = replace(capture, cube=capture.cube[:rows].copy(), truth_range_m=None, signal=None)
-    lighting_of.tell(some, lighting_of(capture))
-    light_of(some)
+    flux_prior_of.tell(some, flux_prior_of(capture))
+    flux_model_of(some)
     return some
 
 

@@ -136,13 +136,13 @@ def study(path: Path, workers: int, memory_bytes: int, progress: Progress) -> It
 def _one_by_one(path: Path, progress: Progress) -> tuple[NDArray[Any], int]:
     counts = open_capture(path)
     description, settings = describe(counts, Request()), settings_of(METHOD)
-    lighting, calibration, _ = learned(counts.data, description, METHOD, settings, None)
+    flux_prior, calibration, _ = learned(counts.data, description, METHOD, settings, None)
     images = np.empty((*counts.shape[:2], len(IMAGES)))
     parts = list(da.core.slices_from_chunks(counts.data.chunks[:2]))
     with _Memory(lambda: [os.getpid()]) as memory, dask.config.set(scheduler="synchronous"):
         for done, part in enumerate(parts):
             cube = counts[part].to_numpy()
-            images[part] = range_part(cube, description, METHOD, settings, lighting, calibration)
+            images[part] = range_part(cube, description, METHOD, settings, flux_prior, calibration)
             progress(done + 1, len(parts))
     return images, memory.peak_bytes
 

@@ -23,7 +23,7 @@ from core import limits
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.inference.posterior import TOLERANCE_BINS, light_of
+from core.inference.posterior import TOLERANCE_BINS, flux_model_of
 from core.kernels.blocks import to_blocks
 from core.out_of_core.tiles import estimate_large
 from core.scene import Scene
@@ -193,14 +193,14 @@ def _by_rows(capture: Capture, method: str) -> float:
     """Pixels that are answered differently where each row is a capture of its own."""
     estimator = ESTIMATORS[method]
     parameters = estimator.parameters()
-    told, light = estimator.calibration(capture, parameters), light_of(capture)
+    told, light = estimator.calibration(capture, parameters), flux_model_of(capture)
     whole = estimator.ranged(capture, parameters, told)
     differing = 0.0
     for row in range(capture.shape[0]):
         one = np.s_[row : row + 1]
         part = Capture(capture.cube[one].copy(), capture.acquisition, capture.pulse)
         pixels = np.arange(capture.counts.size).reshape(capture.shape)[one]
-        light_of.tell(part, light.of_pixels(pixels))
+        flux_model_of.tell(part, light.of_pixels(pixels))
         expected = RangeImage(**{name: image[one] for name, image in vars(whole).items()})
         differing += _differing(estimator.ranged(part, parameters, told), expected)
     return differing
@@ -242,7 +242,7 @@ def scales(grid: Grid) -> Iterator[Case]:
         cube = capture.cube.astype(np.uint32) * np.uint32(scale)
         acquisition = replace(capture.acquisition, n_pulses=1000 * scale)
         more = replace(capture, cube=cube, acquisition=acquisition)
-        light_of.tell(more, light_of(capture))
+        flux_model_of.tell(more, flux_model_of(capture))
         moved = estimate(more, method).bin != estimate(capture, method).bin
         yield float(np.count_nonzero(moved)), f"{method}, counts x {scale}"
 
@@ -270,7 +270,7 @@ def evidence(grid: Grid) -> Iterator[Case]:
             cube = capture.cube.copy()
             cube[:, :, int(onset) + 1] += np.minimum(more, 1000 - capture.counts).astype(cube.dtype)
             stronger = replace(capture, cube=cube)
-            light_of.tell(stronger, light_of(capture))
+            flux_model_of.tell(stronger, flux_model_of(capture))
             after = estimate(stronger, method)
             right = np.abs(before.bin - onset) <= 3
             left = right & ~(np.abs(after.bin - onset) <= 3)
@@ -439,7 +439,7 @@ def _estimation(light: Light, method: str) -> Callable[[], Any]:
     )
     estimator = ESTIMATORS[method]
     parameters = estimator.parameters()
-    light_of(many)
+    flux_model_of(many)
     return lambda: estimator.delays(many, parameters)
 
 

@@ -87,7 +87,7 @@ def draws(grid: Grid) -> Iterator[Case]:
 def round_trip(grid: Grid) -> Iterator[Case]:
     """By what share of a count Coates' rates miss the counts that they were made from."""
     for where, capture in _first_photons(grid):
-        sent = int(capture.armed_pulses or 0)
+        sent = int(capture.gated_pulses or 0)
         rate = np.nan_to_num(coates_rate(capture.cube, sent), nan=0.0, posinf=np.inf)
         again = trigger_probability(rate) * sent
         yield float((np.abs(again - capture.cube) / np.maximum(capture.cube, 1)).max()), where

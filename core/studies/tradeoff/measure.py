@@ -29,7 +29,7 @@ from core.capture import Capture
 from core.checks import require
 from core.estimators import ESTIMATORS, Estimator
 from core.estimators.cfar import CfarParameters
-from core.inference.posterior import Light, light_of
+from core.inference.posterior import FluxModel, flux_model_of
 from core.metrics import Interval
 from core.reductions import Reduction
 from core.studies.timing import FEWEST_REPEATS, interleaved, median_interval
@@ -57,9 +57,9 @@ MOST_COUNTS = 2**21
 
 
 def _all_signals(
-    capture: Capture, light: Light, parameters: TrackingParameters
+    capture: Capture, light: FluxModel, parameters: TrackingParameters
 ) -> tuple[Floats, Floats]:
-    signals = tracking_signals(capture.cube, parameters, capture.armed_pulses)
+    signals = tracking_signals(capture.cube, parameters, capture.gated_pulses)
     return signals.position_bin, signals.enhanced.max(axis=2)
 
 
@@ -115,7 +115,7 @@ class Candidate:
     @property
     def is_told_the_light(self) -> bool:
         """Whether it rests on what no instrument knows, as the oracle does."""
-        return self.estimator.light is not light_of
+        return self.estimator.flux_model is not flux_model_of
 
     def answer(self, reduced: Capture, shape: tuple[int, int]) -> Floats:
         """Ranges in metres at full resolution `shape` from the reduced capture."""
@@ -453,7 +453,7 @@ def scored(piece: Piece) -> list[list[Score]]:
     reduced = {each.reduction: each.reduction.of(capture) for each in piece.candidates}
     scores = []
     for candidate in piece.candidates:
-        light_of(reduced[candidate.reduction])
+        flux_model_of(reduced[candidate.reduction])
         started = perf_counter()
         range_m = candidate.answer(reduced[candidate.reduction], capture.shape)
         seconds = perf_counter() - started
@@ -476,17 +476,17 @@ class _Untouched:
         self._reduced = {
             each.reduction: each.reduction.of(copy.copy(self._capture)) for each in ways
         }
-        self._lights = {way: light_of(copy.copy(less)) for way, less in self._reduced.items()}
+        self._lights = {way: flux_model_of(copy.copy(less)) for way, less in self._reduced.items()}
 
     def range(self, candidate: Candidate) -> None:
         """Reduce and range it."""
         less = candidate.reduction.of(copy.copy(self._capture))
-        light_of.tell(less, self._lights[candidate.reduction])
+        flux_model_of.tell(less, self._lights[candidate.reduction])
         candidate.answer(less, self._capture.shape)
 
     def light(self, reduction: Reduction) -> None:
         """Find the light of the reduced capture again."""
-        light_of(copy.copy(self._reduced[reduction]))
+        flux_model_of(copy.copy(self._reduced[reduction]))
 
 
 def held_bytes(piece: Piece) -> list[int]:

@@ -12,7 +12,7 @@ from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture, Detection
 from core.estimators import estimate
 from core.inference.neighbours import patches
-from core.inference.posterior import light_of, posterior_of, rate_and_armed
+from core.inference.posterior import flux_model_of, posterior_of, rate_and_n_armed
 from core.scene import Scene
 from core.simulation import simulate
 from core.trigger import rate_per_bin
@@ -105,7 +105,7 @@ def like(capture: Capture, name: str) -> Simulation:
 
     The range of each pixel is the likelihood's answer where its confidence is at least `SURE`, else
     that of the nearest such pixel; pixels that more likely than not see no surface have no target.
-    The levels of signal and their shares are those of `core.inference.posterior.light_of`, the
+    The levels of signal and their shares are those of `core.inference.posterior.flux_model_of`, the
     stronger ones given to the pixels that show more photons at their answer; the background is its
     mean.
 
@@ -118,7 +118,7 @@ def like(capture: Capture, name: str) -> Simulation:
     ValueError
         If no pixel is ranged with that confidence.
     """
-    light, image = light_of(capture), estimate(capture, "likelihood")
+    light, image = flux_model_of(capture), estimate(capture, "likelihood")
     target = posterior_of(capture).surface > SURE
     sure = target & image.valid & (image.confidence >= SURE)
     if not sure.any():
@@ -157,7 +157,7 @@ def _echo(capture: Capture, delay_bin: Floats) -> Floats:
     first, last = np.moveaxis(np.clip(np.floor(ends), 0, n_bins - 1).astype(int), 2, 0)
     edges, echo = np.stack([first, last + 1], axis=2), np.empty(capture.shape)
     for here in patches(capture.cube.shape, _AT_ONCE):
-        rate, _ = rate_and_armed(capture.cube[here].astype(float), capture.armed_pulses)
+        rate, _ = rate_and_n_armed(capture.cube[here].astype(float), capture.gated_pulses)
         until = np.pad(np.cumsum(rate, axis=2), ((0, 0), (0, 0), (1, 0)))
         echo[here] = np.diff(np.take_along_axis(until, edges[here], axis=2), axis=2)[..., 0]
     return echo

@@ -1,0 +1,17 @@
+"""Old names of public attributes, kept for one release."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+
+def renamed(new: str) -> Any:
+    """Return a read-only attribute that warns and reads the attribute of the new name."""
+
+    def read(self: Any) -> Any:
+        message = f"This attribute of {type(self).__name__} is now called {new}."
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return getattr(self, new)
+
+    return property(read, doc=f"Deprecated name of `{new}`.")
