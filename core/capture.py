@@ -6,7 +6,18 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, update_wrapper
-from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Concatenate,
+    Generic,
+    Literal,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+    get_args,
+)
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +26,9 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.checks import require
 from core.deprecation import renamed
 from core.kernels.blocks import Blocks, to_blocks
+
+if TYPE_CHECKING:
+    from core.inference.posterior import FluxPrior
 
 COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
 
@@ -51,6 +65,10 @@ class Capture:
     detection : str
         ``"first"`` where a pulse fires a pixel at most once, so that what comes first hides what
         comes later (pile-up); ``"all"`` where every photon counts.
+    flux_prior : FluxPrior, optional
+        Flux parameters of the image that these pixels are a part of; estimated from these pixels
+        where None. ``replace`` keeps it: pass ``flux_prior=None`` along with counts of another
+        image, gate or number of pulses.
 
     Raises
     ------
@@ -66,6 +84,7 @@ class Capture:
     background: float | None = None
     source: str = ""
     detection: Detection = "first"
+    flux_prior: FluxPrior | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         cube = self.cube
@@ -155,24 +174,32 @@ class Seen(Protocol):
         """As `Capture.gated_pulses`."""
 
 
-Found = TypeVar("Found")
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
-class once_per_capture(Generic[Found]):
-    """Decorator: keep what a function finds in a capture for as long as the capture lives."""
+class cached_per_capture(Generic[_Arguments, _Result]):
+    """Decorator: compute a function of a capture once and keep the result while the capture lives.
 
-    def __init__(self, find: Callable[[Capture], Found]) -> None:
-        update_wrapper(self, find)
-        self._find, self._name = find, find.__qualname__
+    The function must be deterministic, its further arguments hashable, and its result must not
+    refer to the capture, which could then never be freed.
+    """
 
-    def __call__(self, capture: Capture) -> Found:
-        """What is kept, or found now."""
-        known = capture.__dict__  # where cached_property keeps its values, too
-        if self._name not in known:
-            known[self._name] = self._find(capture)
-        found: Found = known[self._name]
-        return found
+    def __init__(self, compute: Callable[Concatenate[Capture, _Arguments], _Result]) -> None:
+        update_wrapper(self, compute)
+        self._compute = compute
+        self._results: WeakKeyDictionary[Capture, dict[Any, _Result]] = WeakKeyDictionary()
 
-    def tell(self, capture: Capture, found: Found) -> None:
-        """Say what is to be found in a capture, such as what the image it is part of tells."""
-        capture.__dict__[self._name] = found
+    def __call__(
+        self, capture: Capture, *args: _Arguments.args, **kwargs: _Arguments.kwargs
+    ) -> _Result:
+        """Return the cached result, or compute it."""
+        results = self._results.setdefault(capture, {})
+        key = (args, *kwargs.items())
+        if key not in results:
+            results.setdefault(key, self._compute(capture, *args, **kwargs))
+        return results[key]
+
+    def is_cached(self, capture: Capture) -> bool:
+        """Return whether there is any result for a capture."""
+        return bool(self._results.get(capture))

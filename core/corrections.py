@@ -10,7 +10,7 @@ import numpy as np
 from core.acquisition import Pulse
 from core.capture import Capture
 from core.checks import require
-from core.inference.posterior import detailed_flux_prior_of, flux_prior_of
+from core.inference.posterior import detailed_flux_prior_of
 
 CORRECTIONS = {
     "pile_up": "pile-up",
@@ -33,16 +33,15 @@ def without_correction(capture: Capture, correction: str) -> Capture:
     """
     require("correction", correction, correction in CORRECTIONS, " or ".join(CORRECTIONS))
     if correction == "pile_up":
-        return replace(capture, detection="all")
+        return replace(capture, detection="all", flux_prior=None)
     if correction == "pulse_shape":
         mean_s, sigma_s = moments_s(capture.pulse)
         # A Gaussian's time zero is its centre: the gate opens that much earlier after it.
         gate_delay_s = capture.acquisition.gate_delay_s - mean_s
         acquisition = replace(capture.acquisition, gate_delay_s=gate_delay_s)
-        return replace(capture, acquisition=acquisition, pulse=Pulse.gaussian(sigma_s))
-    one = replace(capture)
-    flux_prior_of.tell(one, detailed_flux_prior_of(capture).with_one_level())
-    return one
+        pulse = Pulse.gaussian(sigma_s)
+        return replace(capture, acquisition=acquisition, pulse=pulse, flux_prior=None)
+    return replace(capture, flux_prior=detailed_flux_prior_of(capture).with_one_level())
 
 
 def moments_s(pulse: Pulse) -> tuple[float, float]:

@@ -51,6 +51,7 @@ def merge_bins(capture: Capture, factor: int) -> Capture:
         acquisition=replace(before, n_bins=n_bins, bin_width_s=before.bin_width_s * factor),
         background=_share(capture.background, end / before.n_bins),
         source=f"{capture.source}; {factor} bins merged",
+        flux_prior=None,
     )
 
 
@@ -96,6 +97,7 @@ def cut_gate(capture: Capture, first_bin: int, end_bin: int) -> Capture:
         ),
         background=_share(capture.background, (end_bin - first_bin) / before.n_bins),
         source=source,
+        flux_prior=None,
     )
 
 
@@ -116,6 +118,7 @@ def skip_pixels(capture: Capture, step: int) -> Capture:
         truth_range_m=None if capture.truth_range_m is None else capture.truth_range_m[kept],
         signal=None if capture.signal is None else capture.signal[kept],
         source=f"{capture.source}; 1 pixel of each {step} x {step}",
+        flux_prior=None,
     )
 
 
@@ -141,6 +144,7 @@ def pool_pixels(capture: Capture, side: int) -> Capture:
         truth_range_m=None if truth_m is None else _median(_each_of_tile(truth_m, side)),
         signal=None if signal is None else np.mean(_each_of_tile(signal, side), axis=0),
         source=f"{capture.source}; {side} x {side} pixels added",
+        flux_prior=None,
     )
 
 
@@ -175,6 +179,7 @@ def first_pulses(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
         cube=cube,
         acquisition=replace(capture.acquisition, n_pulses=n_pulses),
         source=f"{capture.source}; {n_pulses} of {sent} pulses, seed {seed}",
+        flux_prior=None,
     )
 
 
@@ -203,6 +208,7 @@ def share_of_pulses(capture: Capture, share: float, seed: int = 0) -> Capture:
         signal=None if capture.signal is None else capture.signal * share,
         background=_share(capture.background, share),
         source=f"{capture.source}; {share:.3g} of the pulses, seed {seed}",
+        flux_prior=None,
     )
 
 

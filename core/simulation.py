@@ -142,6 +142,7 @@ def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
         background=_times(capture.background, share),
         detection="first",
         source=source,
+        flux_prior=None,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 from core.deprecation import renamed
 from core.inference import posterior
 from core.inference.neighbours import patches, pooled_at, pooled_in
@@ -306,7 +306,7 @@ def _whole(side: int, size: int) -> int:
     return max(1, round(side / patch)) * patch
 
 
-@once_per_capture
+@cached_per_capture
 def _null_pixels(capture: Capture) -> NDArray[np.intp]:
     """Pixels of the capture, in patches drawn at random, whose background an echo-free image sees.
 
@@ -325,7 +325,7 @@ def _null_pixels(capture: Capture) -> NDArray[np.intp]:
     return np.asarray((row * cols + col).reshape(down * high, across * wide))
 
 
-@once_per_capture
+@cached_per_capture
 def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     """Counts of pixels that see the capture's background alone, shape (row, col, bin)."""
     rng = np.random.default_rng(1)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 from core.estimators.base import Estimator
 from core.estimators.likelihood import LikelihoodParameters, curve, locate
 from core.inference.posterior import FluxModel
 
 
-@once_per_capture
+@cached_per_capture
 def true_flux_model(capture: Capture) -> FluxModel:
     """The light of a simulated capture.
 

@@ -9,7 +9,7 @@ import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 
 NEIGHBOURS = 3
 """Rows and columns that an image needs for a pixel to have any."""
@@ -43,7 +43,7 @@ class Verdict(NamedTuple):
     """One sentence."""
 
 
-@once_per_capture
+@cached_per_capture
 def standing_out(capture: Capture) -> StandingOut | None:
     """Pixels that stand out among their eight neighbours; None where an image has no neighbours.
 

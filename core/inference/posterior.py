@@ -30,7 +30,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 from core.inference.neighbours import weighted_median
 from core.inference.resolution import FEW, Difference, difference, pile_up
 from core.kernels.blocks import LANES, lane_counts, lane_rows
@@ -195,13 +195,13 @@ _FEWEST_LANES = 2  # a single lane would be summed pairwise by numpy, which roun
 _FLUX_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
 
 
-@once_per_capture
+@cached_per_capture
 def flux_model_of(capture: Capture) -> FluxModel:
     """Signal levels, their shares, and each pixel's background, as the capture itself tells."""
     return flux_prior_of(capture).model(_totals(capture)[0], _least_background(capture))
 
 
-@once_per_capture
+@cached_per_capture
 def flux_prior_of(capture: Capture) -> FluxPrior:
     """What a capture tells of the light that its pixels see, in the cheapest model that will do.
 
@@ -209,9 +209,10 @@ def flux_prior_of(capture: Capture) -> FluxPrior:
     levels of signal is taken for each of them, where a pixel's pulses do not tell them from it: a
     pixel that cannot tell its level orders delays by any of them much alike.
 
-    A part of an image too large for memory is told that of a sample of the image,
-    ``flux_prior_of.tell(part, flux_prior)``.
+    That of `Capture.flux_prior` where it is given.
     """
+    if capture.flux_prior is not None:
+        return capture.flux_prior
     found, n_pulses = detailed_flux_prior_of(capture), capture.gated_pulses
     if n_pulses is not None:
         is_hidden = pile_up(capture.counts / n_pulses, n_pulses).is_hidden
@@ -277,7 +278,7 @@ def level_differences(flux_prior: FluxPrior, capture: Capture) -> Difference:
     return difference(model[1:], model[0], capture.gated_pulses)
 
 
-@once_per_capture
+@cached_per_capture
 def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     """`flux_prior_of` with every level of signal that the pixels together tell.
 
@@ -507,7 +508,7 @@ def _smoothed(density):  # type: ignore[no-untyped-def]
     return smooth
 
 
-@once_per_capture
+@cached_per_capture
 def posterior_of(capture: Capture) -> Posterior:
     """Where each pixel's surface may be, in the light of `flux_model_of`."""
     n_pixels, n_bins = capture.counts.size, capture.cube.shape[2]
@@ -534,8 +535,8 @@ def posterior_of(capture: Capture) -> Posterior:
 
 
 def has_posterior(capture: Capture) -> bool:
-    """Whether `posterior_of` is known already."""
-    return "posterior_of" in vars(capture)  # where `once_per_capture` keeps it
+    """Return whether `posterior_of` has been computed."""
+    return posterior_of.is_cached(capture)
 
 
 def tolerance_probability(capture: Capture, bins: Floats) -> Floats:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 from core.deprecation import renamed
 from core.inference.faults import standing_out
 from core.inference.posterior import TOLERANCE_BINS
@@ -70,7 +70,7 @@ def capture_report(capture: Capture) -> CaptureReport:
     )
 
 
-@once_per_capture
+@cached_per_capture
 def aggregate(capture: Capture) -> NDArray[np.int64]:
     """Counts of all pixels together, shape (bin,)."""
     return np.asarray(capture.cube.sum(axis=(0, 1), dtype=np.int64))
@@ -89,7 +89,7 @@ class _Echoes(NamedTuple):
     how_many: int
 
 
-@once_per_capture
+@cached_per_capture
 def _echoes(capture: Capture) -> _Echoes | None:
     """Between which delays; None where too few are confident.
 
@@ -105,7 +105,7 @@ def _echoes(capture: Capture) -> _Echoes | None:
     return _Echoes(float(found[wrong]), float(found[-1 - wrong]), count)
 
 
-@once_per_capture
+@cached_per_capture
 def suggestion(capture: Capture) -> Suggestion:
     """Gate and T_n, with the reason in a sentence each."""
     n_bins, echoes = capture.acquisition.n_bins, _echoes(capture)

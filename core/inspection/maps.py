@@ -7,19 +7,19 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 from core.inference.posterior import posterior_of
 from core.kernels.parallel import PARALLEL, entering
 
 
-@once_per_capture
+@cached_per_capture
 def peak_counts(capture: Capture) -> Floats:
     """Largest count of each pixel, shape (row, col)."""
     largest = capture.blocks.largest.ravel()[: capture.blocks.n_pixels]
     return largest.reshape(capture.shape).astype(float)
 
 
-@once_per_capture
+@cached_per_capture
 def share_fired(capture: Capture) -> Floats:
     """Share of each pixel's pulses that fired; NaN where that is not known, shape (row, col)."""
     if capture.gated_pulses is None:
@@ -27,7 +27,7 @@ def share_fired(capture: Capture) -> Floats:
     return capture.counts / capture.gated_pulses
 
 
-@once_per_capture
+@cached_per_capture
 def likeliest(capture: Capture) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     """Bin that the surface is most probably within 3 bins of, and that probability; (row, col)."""
     near = posterior_of(capture).tolerance_probability
@@ -35,7 +35,7 @@ def likeliest(capture: Capture) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     return delay, np.take_along_axis(near, delay[..., np.newaxis], axis=2)[..., 0]
 
 
-@once_per_capture
+@cached_per_capture
 def sbr(capture: Capture) -> Floats:
     """Signal over background of each pixel, shape (row, col); NaN where it saw nothing.
 

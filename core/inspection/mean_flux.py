@@ -20,7 +20,7 @@ import numpy as np
 import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 from core.inference import posterior
 from core.inference.faults import standing_out
 from core.inspection.flux import estimate_flux
@@ -40,7 +40,7 @@ _BRIGHT = 400  # photons of the brightest echo: more tell nothing more of the me
 _COARSE, _FINE = (5, 9), (7, 15)
 
 
-@once_per_capture
+@cached_per_capture
 def estimate_mean_flux(capture: Capture) -> FluxEstimate:
     """Mean signal and background of all pixels, and their ratio, with 95 % intervals.
 
@@ -83,7 +83,8 @@ def _ordinary(capture: Capture) -> Capture:
     kept = np.ones(capture.shape, bool) if faulty is None else ~(faulty.hot | faulty.dead)
     if not kept.any():
         kept[:] = True
-    return replace(capture, cube=capture.cube[kept][np.newaxis], truth_range_m=None, signal=None)
+    cube = capture.cube[kept][np.newaxis]
+    return replace(capture, cube=cube, truth_range_m=None, signal=None, flux_prior=None)
 
 
 def _untold(capture: Capture) -> FluxEstimate:

@@ -11,7 +11,7 @@ import numpy as np
 import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
@@ -147,20 +147,11 @@ def flux_unit(capture: Capture) -> str:
     return "photons" if capture.acquisition.n_pulses is None else "photons per pulse"
 
 
-@once_per_capture
-def _lags_bins(capture: Capture) -> dict[tuple[str, Any], float]:
-    """Of the methods that were asked for."""
-    return {}
-
-
+@cached_per_capture
 def lag_bins(capture: Capture, method: str, settings: Any) -> float:
-    """`Estimator.lag_bins`, found once for each method and its settings."""
-    estimator, known = ESTIMATORS[method], _lags_bins(capture)
-    if estimator.finds_delay:
-        return 0.0
-    if (method, settings) not in known:
-        known[method, settings] = estimator.lag_bins(capture, settings)
-    return known[method, settings]
+    """Return the estimator's lag, in bins; see `Estimator.lag_bins`."""
+    estimator = ESTIMATORS[method]
+    return 0.0 if estimator.finds_delay else estimator.lag_bins(capture, settings)
 
 
 def _candidates(

@@ -138,6 +138,7 @@ def _own(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
         truth_range_m=None,
         signal=None,
         source=f"{capture.source}; a region of it",
+        flux_prior=None,
     )
 
 
@@ -153,4 +154,5 @@ def _summed(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
         truth_range_m=None,
         signal=None,
         source=f"{capture.source}; {n_pixels} pixels added",
+        flux_prior=None,
     )

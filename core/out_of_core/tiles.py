@@ -12,7 +12,7 @@ import logging
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
@@ -251,8 +251,7 @@ def range_part(
     calibration: Calibration,
 ) -> Floats:
     """Range a part of an image; shape (row, col, len(IMAGES))."""
-    part = captured(cube, description)
-    flux_prior_of.tell(part, flux_prior)
+    part = replace(captured(cube, description), flux_prior=flux_prior)
     image = ESTIMATORS[method].ranged(part, settings, calibration)
     known = {name: getattr(image, name) for name in IMAGES if hasattr(image, name)}
     return np.stack([known.get(name, part.counts) for name in IMAGES], axis=2).astype(float)

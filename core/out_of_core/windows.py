@@ -176,9 +176,7 @@ class WindowReader:
         found = captured(self._cube, known)
         if flux_prior is None and not self.is_complete and self.seen.any():
             flux_prior = flux_prior_of(replace(found, cube=found.cube[np.newaxis, self.seen]))
-        if flux_prior is not None:
-            flux_prior_of.tell(found, flux_prior)
-        return found
+        return found if flux_prior is None else replace(found, flux_prior=flux_prior)
 
 
 def read_window(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,8 @@ import numpy as np
 import pytest
 
 from core.acquisition import Acquisition, Pulse
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
+from core.inference.posterior import flux_prior_of
 
 
 def capture_of(cube: Any, n_pulses: int | None = 1000, dtype: type = np.uint16) -> Capture:
@@ -95,96 +95,60 @@ def test_echo_bins_hold_the_middle_of_an_echo(pulse: Pulse) -> None:
     assert capture.echo_bins * 1e-9 >= end_s - begin_s
 
 
-def summed() -> tuple[Callable[[Capture], list[int]], list[Capture]]:
-    """Something found in captures once, and the captures in which it was sought."""
-    sought: list[Capture] = []
-
-    @once_per_capture
-    def sums(capture: Capture) -> list[int]:
-        """Counts of the first row."""
-        sought.append(capture)
-        return [int(count) for count in capture.counts[0]]
-
-    return sums, sought
-
-
-def test_what_is_found_in_a_capture_is_kept() -> None:
-    sums, sought = summed()
-    one, other = capture_of(np.full((2, 3, 4), 1)), capture_of(np.full((2, 3, 4), 2))
-    assert sums(one) == [4, 4, 4]
-    assert sums(other) == [8, 8, 8]
-    assert sums(one) is sums(one)
-    assert sums(other) is not sums(one)
-    assert [id(capture) for capture in sought] == [id(one), id(other)]
-
-
-def test_a_changed_capture_is_searched_anew() -> None:
-    sums, _ = summed()
-    one = capture_of(np.full((2, 3, 4), 1))
-    assert sums(one) == [4, 4, 4]
-    assert sums(replace(one, cube=np.full((2, 3, 4), 2, np.uint16))) == [8, 8, 8]
-
-
-def test_each_thing_found_is_kept_for_itself() -> None:
-    @once_per_capture
-    def largest(capture: Capture) -> int:
-        return int(capture.cube.max())
-
-    @once_per_capture
-    def smallest(capture: Capture) -> int:
-        return int(capture.cube.min())
-
-    capture = capture_of(np.arange(24).reshape(2, 3, 4))
-    for _ in range(2):
-        assert (largest(capture), smallest(capture)) == (23, 0)
-
-
-def test_nothing_found_is_something_found() -> None:
+def test_a_result_is_computed_once_for_each_capture_and_argument() -> None:
     calls = []
 
-    @once_per_capture
-    def nothing(capture: Capture) -> None:
-        calls.append(capture)
+    @cached_per_capture
+    def total(capture: Capture, factor: int) -> int:
+        """Counts times a factor."""
+        calls.append((capture, factor))
+        return factor * int(capture.counts.sum())
 
-    capture = capture_of(np.ones((1, 1, 1)))
-    assert nothing(capture) is None
-    assert nothing(capture) is None
-    assert len(calls) == 1
+    one, other = capture_of(np.ones((1, 2, 4))), capture_of(np.full((1, 2, 4), 2))
+    assert not total.is_cached(one)
+    for _ in range(2):
+        assert (total(one, 1), total(one, 3), total(other, 1)) == (8, 24, 16)
+    assert calls == [(one, 1), (one, 3), (other, 1)]
+    assert total.is_cached(one) and not total.is_cached(replace(one))
+    assert (total.__name__, total.__doc__) == ("total", "Counts times a factor.")
 
 
-def test_what_could_not_be_found_is_sought_again() -> None:
-    tries = []
+def test_none_is_cached_and_an_error_is_not() -> None:
+    results = iter([ValueError("not yet"), None])
 
-    @once_per_capture
-    def second_time(capture: Capture) -> int:
-        tries.append(capture)
-        if len(tries) == 1:
-            raise ValueError("not yet")
-        return 7
+    @cached_per_capture
+    def flaky(capture: Capture) -> None:
+        result = next(results)
+        if result is not None:
+            raise result
 
     capture = capture_of(np.ones((1, 1, 1)))
     with pytest.raises(ValueError, match="not yet"):
-        second_time(capture)
-    assert second_time(capture) == 7
+        flaky(capture)
+    assert flaky(capture) is None
+    assert flaky(capture) is None
 
 
-def test_what_is_found_goes_with_its_capture() -> None:
-    class Found:
+def test_a_cached_result_is_freed_with_its_capture() -> None:
+    class Result:
         pass
 
-    @once_per_capture
-    def something(capture: Capture) -> Found:
-        return Found()
+    @cached_per_capture
+    def result_of(capture: Capture) -> Result:
+        return Result()
 
     capture = capture_of(np.ones((1, 1, 1)))
-    found = weakref.ref(something(capture))
-    assert found() is not None
+    result = weakref.ref(result_of(capture))
+    assert result() is not None
     del capture
     gc.collect()
-    assert found() is None
+    assert result() is None
 
 
-def test_a_function_asked_once_keeps_its_name() -> None:
-    sums, _ = summed()
-    assert sums.__name__ == "sums"
-    assert sums.__doc__ == "Counts of the first row."
+def test_a_copy_keeps_the_flux_prior() -> None:
+    capture = capture_of(np.random.default_rng(0).poisson(1.0, (8, 8, 20)))
+    prior = flux_prior_of(capture)
+    part = replace(capture, cube=capture.cube[:2], flux_prior=prior)
+    assert flux_prior_of(part) is prior
+    assert flux_prior_of(replace(part, source="a copy")) is prior
+    assert flux_prior_of(replace(part, flux_prior=None)) is not prior

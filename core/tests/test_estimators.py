@@ -17,7 +17,7 @@ from core import tracking
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.inference.posterior import flux_model_of
+from core.inference.posterior import flux_prior_of
 from core.io.readers.dense import guess_detection
 from core.scene import Scene, uniform
 from core.simulation import simulate
@@ -189,8 +189,8 @@ def lone_echo(onset_bin: float = 40.3, n_pulses: int = 1000, **acquisition: Any)
 @pytest.mark.parametrize("later", [1, 7, 33])
 def test_a_later_echo_gives_a_later_answer(method: str, later: int) -> None:
     capture = lone_echo()
-    shifted = replace(capture, cube=np.roll(capture.cube, later, axis=2))
-    flux_model_of.tell(shifted, flux_model_of(capture))  # the light decides on the lag
+    cube, flux_prior = np.roll(capture.cube, later, axis=2), flux_prior_of(capture)
+    shifted = replace(capture, cube=cube, flux_prior=flux_prior)  # the flux decides on the lag
     near, far = estimate(capture, method), estimate(shifted, method)
     assert near.valid.all()
     # Rounding, once of bins near a hundred in float64 and once of densities in float32.

@@ -16,7 +16,6 @@ import xarray as xr
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
-from core.inference.posterior import flux_prior_of
 from core.io.readers import open_capture, read_capture, sample
 from core.io.readers.labelled import dataset, describe
 from core.io.readers.request import Request
@@ -137,15 +136,6 @@ def test_what_is_guessed_does_not_depend_on_the_way_in(tmp_path: Path, suffix: s
     assert pulse.tau_s == pytest.approx(3e-9, rel=0.2)
     whole, parts = estimate(read, "likelihood"), estimate_large(opened, "likelihood").compute()
     np.testing.assert_array_equal(parts["range_m"], whole.range_m)
-
-
-def test_light_told_is_light_taken() -> None:
-    part = Capture(CAPTURE.cube[:5].copy(), CAPTURE.acquisition, CAPTURE.pulse)
-    own = flux_prior_of(part)
-    told = Capture(CAPTURE.cube[:5].copy(), CAPTURE.acquisition, CAPTURE.pulse)
-    flux_prior_of.tell(told, flux_prior_of(CAPTURE))
-    assert flux_prior_of(told) is flux_prior_of(CAPTURE)
-    assert not np.array_equal(own.depth, flux_prior_of(told).depth)
 
 
 def test_an_answer_in_parts_is_an_image_with_what_is_known(

@@ -291,8 +291,8 @@ def test_parts_of_an_image_spare_what_the_whole_does(method: str) -> None:
     calibration: Calibration = estimator.calibration(whole, settings)
     expected = estimator.ranged(whole, settings, calibration)
     for rows in (slice(0, 5), slice(5, 32)):
-        part = Capture(whole.cube[rows].copy(), whole.acquisition, whole.pulse)
-        flux_prior_of.tell(part, flux_prior_of(whole))
+        part = replace(whole, cube=whole.cube[rows].copy(), truth_range_m=None, signal=None)
+        part = replace(part, flux_prior=flux_prior_of(whole))
         found = estimator.ranged(part, settings, calibration)
         np.testing.assert_array_equal(found.bin, expected.bin[rows])
         np.testing.assert_array_equal(found.confidence, expected.confidence[rows])

@@ -354,7 +354,7 @@ def numbers_in(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
             yield name, array
         return
     if is_dataclass(value):
-        inside = {each.name: getattr(value, each.name) for each in fields(value)}
+        inside = {each.name: getattr(value, each.name) for each in fields(value) if each.repr}
     elif hasattr(value, "_asdict"):
         inside = value._asdict()
     elif isinstance(value, dict):

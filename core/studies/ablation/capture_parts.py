@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import pdtrc
 
 from core.acquisition import Floats
-from core.capture import Capture, once_per_capture
+from core.capture import Capture, cached_per_capture
 from core.corrections import without_correction
 from core.inference import faults, posterior, resolution
 from core.inference.posterior import TOLERANCE_BINS
@@ -108,7 +108,7 @@ class _Sample(NamedTuple):
     """Rate in each bin, of all these pixels together, beside their echoes; shape (bin,)."""
 
 
-@once_per_capture
+@cached_per_capture
 def _sample_of(capture: Capture) -> _Sample | None:
     """None where too few pixels are sure of their surface."""
     bins = corrections.delays(capture, "likelihood")
@@ -205,8 +205,13 @@ def _twin(capture: Capture, sample: _Sample) -> tuple[NDArray[np.unsignedinteger
     signal = np.maximum(excess.sum(axis=1, keepdims=True), 0.0) / np.maximum(seen, 1e-9)
     rate, rng = signal * echo + sample.background, np.random.default_rng(0)
     counts = drawn(rate, capture.gated_pulses, rng)
-    twin = replace(capture, cube=counts[np.newaxis], truth_range_m=None, signal=None)
-    posterior.flux_prior_of.tell(twin, posterior.flux_prior_of(capture))
+    twin = replace(
+        capture,
+        cube=counts[np.newaxis],
+        truth_range_m=None,
+        signal=None,
+        flux_prior=posterior.flux_prior_of(capture),
+    )
     return counts, corrections.delays(twin, "likelihood")[0]
 
 

@@ -29,12 +29,10 @@ def with_correction(capture: Capture, correction: str) -> Capture:
     """The same counts for an estimator that makes one of `CORRECTIONS`, whatever it would spare."""
     if correction == "pulse_shape":
         return capture
-    made = replace(capture)
-    light = detailed_flux_prior_of(capture)
+    flux_prior = detailed_flux_prior_of(capture)
     if correction == "pile_up":
-        light = flux_prior_of(capture)._replace(pile_up=True)
-    flux_prior_of.tell(made, light)
-    return made
+        flux_prior = flux_prior_of(capture)._replace(pile_up=True)
+    return replace(capture, flux_prior=flux_prior)
 
 
 def levels_apart(capture: Capture) -> Difference:
@@ -90,8 +88,13 @@ def ranging_ratio(with_it: Capture, without_it: Capture, method: str) -> Interva
 def _some_rows(capture: Capture) -> Capture:
     """As many as are ranged in some milliseconds."""
     rows = max(1, 2**19 // capture.cube[0].size)
-    some = replace(capture, cube=capture.cube[:rows].copy(), truth_range_m=None, signal=None)
-    flux_prior_of.tell(some, flux_prior_of(capture))
+    some = replace(
+        capture,
+        cube=capture.cube[:rows].copy(),
+        truth_range_m=None,
+        signal=None,
+        flux_prior=flux_prior_of(capture),
+    )
     flux_model_of(some)
     return some
 

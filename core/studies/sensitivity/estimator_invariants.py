@@ -23,7 +23,7 @@ from core import limits
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.inference.posterior import TOLERANCE_BINS, flux_model_of
+from core.inference.posterior import TOLERANCE_BINS, flux_model_of, flux_prior_of
 from core.kernels.blocks import to_blocks
 from core.out_of_core.tiles import estimate_large
 from core.scene import Scene
@@ -193,14 +193,13 @@ def _by_rows(capture: Capture, method: str) -> float:
     """Pixels that are answered differently where each row is a capture of its own."""
     estimator = ESTIMATORS[method]
     parameters = estimator.parameters()
-    told, light = estimator.calibration(capture, parameters), flux_model_of(capture)
+    told, flux_prior = estimator.calibration(capture, parameters), flux_prior_of(capture)
     whole = estimator.ranged(capture, parameters, told)
     differing = 0.0
     for row in range(capture.shape[0]):
         one = np.s_[row : row + 1]
-        part = Capture(capture.cube[one].copy(), capture.acquisition, capture.pulse)
-        pixels = np.arange(capture.counts.size).reshape(capture.shape)[one]
-        flux_model_of.tell(part, light.of_pixels(pixels))
+        cube = capture.cube[one].copy()
+        part = Capture(cube, capture.acquisition, capture.pulse, flux_prior=flux_prior)
         expected = RangeImage(**{name: image[one] for name, image in vars(whole).items()})
         differing += _differing(estimator.ranged(part, parameters, told), expected)
     return differing
@@ -241,8 +240,8 @@ def scales(grid: Grid) -> Iterator[Case]:
     for method, scale in product(("peak", "matched_filter"), SCALES):
         cube = capture.cube.astype(np.uint32) * np.uint32(scale)
         acquisition = replace(capture.acquisition, n_pulses=1000 * scale)
-        more = replace(capture, cube=cube, acquisition=acquisition)
-        flux_model_of.tell(more, flux_model_of(capture))
+        flux_prior = flux_prior_of(capture)
+        more = replace(capture, cube=cube, acquisition=acquisition, flux_prior=flux_prior)
         moved = estimate(more, method).bin != estimate(capture, method).bin
         yield float(np.count_nonzero(moved)), f"{method}, counts x {scale}"
 
@@ -269,8 +268,7 @@ def evidence(grid: Grid) -> Iterator[Case]:
         for more in (1, 3, 10, 30, 100):
             cube = capture.cube.copy()
             cube[:, :, int(onset) + 1] += np.minimum(more, 1000 - capture.counts).astype(cube.dtype)
-            stronger = replace(capture, cube=cube)
-            flux_model_of.tell(stronger, flux_model_of(capture))
+            stronger = replace(capture, cube=cube, flux_prior=flux_prior_of(capture))
             after = estimate(stronger, method)
             right = np.abs(before.bin - onset) <= 3
             left = right & ~(np.abs(after.bin - onset) <= 3)

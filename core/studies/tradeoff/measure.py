@@ -117,10 +117,18 @@ class Candidate:
         """Whether it rests on what no instrument knows, as the oracle does."""
         return self.estimator.flux_model is not flux_model_of
 
-    def answer(self, reduced: Capture, shape: tuple[int, int]) -> Floats:
-        """Ranges in metres at full resolution `shape` from the reduced capture."""
+    def answer(
+        self, reduced: Capture, shape: tuple[int, int], flux: FluxModel | None = None
+    ) -> Floats:
+        """Ranges in metres at full resolution `shape` from the reduced capture.
+
+        A flux model that is given is not estimated again; the oracle keeps the true one.
+        """
+        estimator = self.estimator
+        if flux is not None and not self.is_told_the_light:
+            estimator = replace(estimator, flux_model=lambda _: flux)
         with _threads(self.threads):
-            bins, _ = self.estimator.delays(reduced, self.settings)
+            bins, _ = estimator.delays(reduced, self.settings)
         return self.reduction.spread(reduced.acquisition.bin_to_range_m(bins), shape)
 
     def __str__(self) -> str:
@@ -476,13 +484,12 @@ class _Untouched:
         self._reduced = {
             each.reduction: each.reduction.of(copy.copy(self._capture)) for each in ways
         }
-        self._lights = {way: flux_model_of(copy.copy(less)) for way, less in self._reduced.items()}
+        self._flux = {way: flux_model_of(copy.copy(less)) for way, less in self._reduced.items()}
 
     def range(self, candidate: Candidate) -> None:
         """Reduce and range it."""
         less = candidate.reduction.of(copy.copy(self._capture))
-        flux_model_of.tell(less, self._lights[candidate.reduction])
-        candidate.answer(less, self._capture.shape)
+        candidate.answer(less, self._capture.shape, self._flux[candidate.reduction])
 
     def light(self, reduction: Reduction) -> None:
         """Find the light of the reduced capture again."""
