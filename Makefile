@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 KERNELS := blocks capture detection estimators inspection matlab more_estimators posterior \
 	reductions simulate spatial speed tracking
 
-.PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration field large fuzz attack clean
+.PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration results field large fuzz attack clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
@@ -53,6 +53,15 @@ uniform: $(VENV)/.app ## every method on depths uniform over the gate
 
 calibration: $(VENV)/.app ## is a confidence of 0.9 right nine times in ten?
 	$(BIN)/python -m core calibration
+
+results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
+	$(BIN)/python -m core paper --repetitions 100 --results assets/results/paper.md
+	$(BIN)/python -m core uniform --results assets/results/uniform.md
+	$(BIN)/python -m core calibration --results assets/results/calibration.md
+	$(BIN)/python -m core tradeoff --results assets/results/tradeoff.md
+	$(BIN)/python -m core speed --results assets/results/speed.md
+	$(BIN)/python -m core stability --results assets/results/sensitivity.md
+	$(BIN)/python -m core requires --scene worn --results assets/results/ablation.md
 
 field: $(VENV)/.app ## published captures with a truth, in the folder CAPTURES=path
 	$(BIN)/python -m core field "$(CAPTURES)"

@@ -33,6 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     requires.add(commands)
     stability.add(commands)
     chosen = parser.parse_args(arguments)
+    chosen.arguments = sys.argv[1:] if arguments is None else arguments
     try:
         chosen.work(chosen)
         sys.stdout.flush()

@@ -21,13 +21,14 @@ from core.cli.options import (
     show_progress,
     whole_from_to,
 )
+from core.cli.results import add_results, show_tables
 from core.estimators import ESTIMATORS
 from core.io.readers import read_capture
 from core.scene import scenes
 from core.studies.ablation import plain
 from core.studies.ablation import study as requires
 from core.studies.ablation.criterion import Requirement
-from core.studies.outputs import Table, as_markdown
+from core.studies.outputs import Table
 from core.studies.timing import machine
 
 _SEEDS = 16
@@ -48,6 +49,7 @@ def add(commands: Any) -> None:
     )
     command.add_argument("--folder", type=Path, help="for a page and its tables")
     command.add_argument("--json", action="store_true", help="one JSON object instead of tables")
+    add_results(command)
     add_reading(command)
     command.set_defaults(work=_requires)
 
@@ -59,8 +61,7 @@ def _requires(chosen: argparse.Namespace) -> None:
     if chosen.json:
         show({row.part: asdict(row) for row in rows}, as_json=True)
     else:
-        for each in tables:
-            print(f"{each.title}\n\n{as_markdown(each.columns, each.rows)}\n")
+        show_tables(tables, chosen)
     if chosen.folder is not None:
         from core.studies.report import write  # noqa: PLC0415 - draws, as nothing else here
 

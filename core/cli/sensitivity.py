@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
 from core.cli.options import show_progress
-from core.studies.outputs import Table, as_markdown
+from core.cli.results import add_results, show_tables
+from core.studies.outputs import Table
 
 
 class BrokenLaw(ArithmeticError):
@@ -22,6 +24,7 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--folder", type=Path, default=Path("stability"), help="written to (stability)"
     )
+    add_results(command)
     command.set_defaults(work=_stability)
 
 
@@ -30,9 +33,8 @@ def _stability(chosen: argparse.Namespace) -> None:
 
     items, broken = stability.study(show_progress)
     page = stability.write_page(items, chosen.folder)
-    for item in items:
-        if isinstance(item, Table):
-            print(f"\n{item.title}\n\n{as_markdown(item.columns, item.rows)}")
-    print(f"\n{page}")
+    print(file=sys.stderr)
+    show_tables((item for item in items if isinstance(item, Table)), chosen)
+    print(page)
     if broken:
         raise BrokenLaw("\n".join(broken))

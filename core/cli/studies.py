@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from core.cli.options import add_processes, show_progress, whole_from_to
+from core.cli.results import add_results, show_tables
 from core.io.readers import read_capture
 from core.studies.methods import calibration, field, uniform
-from core.studies.outputs import Table, as_markdown, as_text
+from core.studies.outputs import Table, as_markdown
 from core.studies.paper import figures as paper
 from core.studies.paper import recommend
 from core.studies.paper.printed import TABLE_2
@@ -35,6 +36,7 @@ def _add_paper(commands: Any) -> None:
     command.add_argument("--folder", type=Path, default=Path("paper"), help="written to (paper)")
     command.add_argument("--field", type=Path, help="a measured capture to compare methods on")
     add_processes(command)
+    add_results(command)
     command.set_defaults(work=_paper)
 
 
@@ -50,7 +52,9 @@ def _paper(chosen: argparse.Namespace) -> None:
         processes=chosen.processes,
         progress=show_progress,
     )
-    print("\nFigures ...", file=sys.stderr)
+    print(file=sys.stderr)
+    show_tables([paper.table_2(results), paper.table_3(results)], chosen)
+    print("Figures ...", file=sys.stderr)
     print(page.write_page(results, chosen.folder, chosen.repetitions, measured))
 
 
@@ -59,6 +63,7 @@ def _add_table2(commands: Any) -> None:
     command.add_argument("--seeds", type=whole_from_to(2, MOST_SEEDS), default=20)
     command.add_argument("--preset", choices=PRESETS, default="recommended")
     add_processes(command)
+    add_results(command)
     command.set_defaults(work=_table2)
 
 
@@ -67,38 +72,30 @@ def _table2(chosen: argparse.Namespace) -> None:
     print(f"Preset {chosen.preset}, seeds 0 to {chosen.seeds - 1}: {settings}\n")
     method = Method(chosen.preset, "tracking", settings)
     results = _tried({Condition("car", sbr): [method] for sbr in TABLE_2}, chosen)
-    table = paper.table_2(results, (method,))
-    print(as_markdown(table.columns, table.rows))
+    show_tables([paper.table_2(results, (method,))], chosen)
 
 
 def _add_uniform(commands: Any) -> None:
     command = commands.add_parser("uniform", help="every method on depths uniform over the gate")
     command.add_argument("--seeds", type=whole_from_to(2, MOST_SEEDS), default=24)
     add_processes(command)
+    add_results(command)
     command.set_defaults(work=_uniform)
 
 
 def _uniform(chosen: argparse.Namespace) -> None:
-    table = uniform.table(_tried(uniform.PLAN, chosen))
-    print(as_markdown(table.columns, table.rows))
+    show_tables([uniform.table(_tried(uniform.PLAN, chosen))], chosen)
 
 
 def _add_calibration(commands: Any) -> None:
     command = commands.add_parser("calibration", help="is a confidence of 0.9 right 9 times in 10?")
     command.add_argument("--seeds", type=whole_from_to(1, MOST_SEEDS), default=5)
+    add_results(command)
     command.set_defaults(work=_calibration)
 
 
 def _calibration(chosen: argparse.Namespace) -> None:
-    columns = ("scene", "SBR", "method", "calibration error", "confidence: share right (answers)")
-    print(as_markdown(columns, ()))
-    for report in calibration.reports(range(chosen.seeds)):
-        told = ", ".join(
-            f"{t.confidence:.2f}: {t.right.value:.2f} ({t.count})" for t in report.told
-        )
-        sbr = "all six" if report.sbr is None else f"{report.sbr:g}"
-        row = (report.scene, sbr, report.method, as_text(report.error), told)
-        print("| " + " | ".join(row) + " |", flush=True)
+    show_tables([calibration.table(calibration.reports(range(chosen.seeds)))], chosen)
 
 
 def _add_field(commands: Any) -> None:
@@ -106,12 +103,12 @@ def _add_field(commands: Any) -> None:
         "field", help="published captures with a truth: how near each method comes to it"
     )
     command.add_argument("captures", type=Path, help="the folder that holds them")
+    add_results(command)
     command.set_defaults(work=_field)
 
 
 def _field(chosen: argparse.Namespace) -> None:
-    for table in field.tables(chosen.captures, lambda what: print(what, file=sys.stderr)):
-        print(f"{table.title}\n\n{as_markdown(table.columns, table.rows)}\n", flush=True)
+    show_tables(field.tables(chosen.captures, lambda what: print(what, file=sys.stderr)), chosen)
 
 
 def _add_large(commands: Any) -> None:
@@ -126,6 +123,7 @@ def _add_large(commands: Any) -> None:
     command.add_argument(
         "--memory", type=float, default=2.0, help="of all workers together, in GB (2)"
     )
+    add_results(command)
     command.set_defaults(work=_large)
 
 
@@ -145,8 +143,7 @@ def _large(chosen: argparse.Namespace) -> None:
     for each in large.study(path, chosen.workers, memory_bytes, show_progress):
         found.append(each)
         print(f"\r{each.title}: {each.seconds:.1f} s" + " " * 40, file=sys.stderr)
-    table = large.table(found)
-    print(as_markdown(table.columns, table.rows))
+    show_tables([large.table(found)], chosen)
     if not all(each.same for each in found):
         raise ValueError("same answer = NO is not accepted: see the table.")
 
@@ -159,6 +156,7 @@ def _add_speed(commands: Any) -> None:
     command.add_argument(
         "--rounds", type=whole_from_to(6, 1000), default=21, help="of each measurement (21)"
     )
+    add_results(command)
     command.set_defaults(work=_speed)
 
 
@@ -169,9 +167,7 @@ def _speed(chosen: argparse.Namespace) -> None:
     found = speed.study(speed.Extent(rounds=chosen.rounds), show_progress)
     page = report.write(found.items, chosen.folder, "Speed", speed.INTRODUCTION)
     print(file=sys.stderr)
-    for item in found.items:
-        if isinstance(item, Table):
-            print(f"{item.title}\n\n{as_markdown(item.columns, item.rows)}\n")
+    show_tables((item for item in found.items if isinstance(item, Table)), chosen)
     print(page)
     if found.regressions:
         sys.exit("\n".join(found.regressions))

@@ -22,9 +22,10 @@ from core.cli.options import (
     show_progress,
     whole_from_to,
 )
+from core.cli.results import add_results, show_tables
 from core.io.readers import read_capture
 from core.scene import scenes
-from core.studies.outputs import Table, as_markdown
+from core.studies.outputs import Table
 from core.studies.timing import FEWEST_REPEATS
 from core.studies.tradeoff import page
 from core.studies.tradeoff import plan as plans
@@ -82,6 +83,7 @@ def add(commands: Any) -> None:
         "--folder", type=Path, default=Path("tradeoff"), help="written to (tradeoff)"
     )
     add_processes(command)
+    add_results(command)
     add_reading(command)
     command.set_defaults(work=_tradeoff)
 
@@ -109,9 +111,7 @@ def _tradeoff(chosen: argparse.Namespace) -> None:
     if chosen.with_light:
         points = with_light(points)
     items = page.items(points, found, chosen.within, chosen.reach, chosen.tolerance)
-    for each in items:
-        if isinstance(each, Table) and each.key in SAID:
-            print(f"{each.title}\n\n{as_markdown(each.columns, each.rows)}\n", flush=True)
+    show_tables((each for each in items if isinstance(each, Table) and each.key in SAID), chosen)
     introduction = [
         f"{len(points)} ways and conditions, {len(seeds)} seeds, the same for all ways.",
         *dict.fromkeys(f"{each.source}: {each.note}." for each in points if each.note),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage
 from core.inference.posterior import TOLERANCE_BINS
 from core.metrics import Told, calibration_error, reliability
+from core.studies.outputs import Table
 from core.studies.paper.printed import TABLE_2
 from core.studies.trials import Condition
 
@@ -71,3 +72,18 @@ def reports(seeds: Sequence[int]) -> Iterator[Report]:
 def _pooled(pairs: Sequence[tuple[Floats, NDArray[np.bool_]]]) -> list[Told]:
     confidence, right = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     return reliability(confidence, right)
+
+
+def table(reports: Iterable[Report]) -> Table:
+    """Return a row for each report: its calibration error, and the share right by confidence."""
+    rows = []
+    for report in reports:
+        bins = (f"{t.confidence:.2f}: {t.right.value:.2f} ({t.count})" for t in report.told)
+        sbr = "all six" if report.sbr is None else f"{report.sbr:g}"
+        rows.append((report.scene, sbr, report.method, report.error, ", ".join(bins)))
+    return Table(
+        "calibration",
+        "Calibration of confidence",
+        ("scene", "SBR", "method", "calibration error", "confidence: share right (estimates)"),
+        tuple(rows),
+    )
