@@ -15,6 +15,9 @@ from core.tests.captures import real_capture_path
 settings.register_profile("core", derandomize=True, deadline=None)
 settings.load_profile("core")
 
+# Helpers that assert, imported by the tests: without this they fail with a bare AssertionError.
+pytest.register_assert_rewrite("core.tests.refusing")
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Run as plain Python, uint64 numbers that wrap round, as SplitMix64 needs, make numpy warn."""
