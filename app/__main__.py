@@ -35,7 +35,7 @@ from app.server.serve import server_of
 from app.tasks.jobs import LONG
 from app.widgets.connection import LINGER_S
 from app.widgets.controls import Sentence
-from core.io.readers import READERS
+from core.io.readers import SUFFIXES
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "captures", nargs="*", type=Path, help=f"capture files to open ({', '.join(READERS)})"
+        "captures", nargs="*", type=Path, help=f"capture files to open ({', '.join(SUFFIXES)})"
     )
     parser.add_argument(
         "--port", type=port_number, default=5006, help="default: 5006; 0 takes a free one"

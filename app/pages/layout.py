@@ -45,7 +45,7 @@ from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import FileInput
 from app.widgets.share import TakeAway
 from core import PRESETS, TrackingParameters
-from core.io.readers import READERS
+from core.io.readers import SUFFIXES
 from core.studies.tradeoff.measure import Point
 
 CUSTOM = "custom"
@@ -182,7 +182,7 @@ class Layout:
         self._file = FileInput(
             lambda reason: self._complain(words.not_uploaded(reason, MAX_UPLOAD_BYTES)),
             label="Open a capture file",
-            accept=",".join(READERS),
+            accept=",".join(SUFFIXES),
             max_file_size=MAX_UPLOAD_BYTES,
             variant="outlined",
             size="small",

@@ -28,7 +28,7 @@ from core.cli.options import (
 )
 from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage, estimate
 from core.inspection import FluxEstimate, capture_report, pixel_report
-from core.io.readers import READERS, bytes_of, open_capture, read_capture
+from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
 from core.io.readers.request import Request
@@ -67,7 +67,7 @@ def _add_info(commands: Any) -> None:
     command = commands.add_parser(
         "info", help="what a capture file holds, and what would be guessed of it"
     )
-    command.add_argument("capture", type=Path, help=f"a file: {', '.join(READERS)}")
+    command.add_argument("capture", type=Path, help=f"a file: {', '.join(SUFFIXES)}")
     command.add_argument(
         "--pixel",
         type=int,

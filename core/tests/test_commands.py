@@ -17,7 +17,8 @@ from core.acquisition import Acquisition, Flux
 from core.cli import main
 from core.cli.options import seconds
 from core.estimators import estimate
-from core.io.readers import READERS, read_capture
+from core.io import readers
+from core.io.readers import Reader, read_capture
 from core.io.writers import CAPTURE_SUFFIXES, save_capture
 from core.out_of_core.tiles import IMAGES
 from core.scene import scenes
@@ -272,7 +273,7 @@ def test_a_file_that_the_machine_cannot_read_is_no_bad_input(
     def broken(*_: Any, **__: Any) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setitem(READERS, ".npy", broken)
+    monkeypatch.setattr(readers, "READERS", (Reader("", (".npy",), broken),))
     code, _, err = ran(capsys, "info", frames)
     assert code == 1 and "counts.npy" in err and "Input/output error" in err
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import os
 import random
@@ -24,7 +25,7 @@ from hypothesis.extra import numpy as hnp
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
-from core.io.readers import MAX_CUBE_BYTES, READERS, guards, hdf5, read_capture
+from core.io.readers import MAX_CUBE_BYTES, SUFFIXES, guards, hdf5, read_capture
 from core.io.writers import save_capture
 from core.tests.formats import FORMATS, Format, damaged, put
 from core.tests.refusing import assert_refused
@@ -57,7 +58,9 @@ def cell_bytes(values: list[Any]) -> bytes:
 
 
 def test_every_reader_is_under_the_contract() -> None:
-    assert {Path(kept.name).suffix.lower() for kept in FORMATS.values()} == set(READERS)
+    tested = {Path(kept.name).suffix.lower() for kept in FORMATS.values()}
+    assert tested | {".gz"} == set(SUFFIXES)
+    assert all(SUFFIXES.values())
 
 
 @pytest.fixture
@@ -95,6 +98,18 @@ def test_contract_everything_guessed(kind: str, saved: Callable[[Format], Path])
     assert ("guessed: " in capture.source) == bool(kept.guesses)
     for guessed in kept.guesses:
         assert guessed in capture.source
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_contract_content_determines_the_format(kind: str, tmp_path: Path) -> None:
+    kept, content = FORMATS[kind], FORMATS[kind].build()
+    if isinstance(content, bytes):
+        (tmp_path / f"{kept.name}.gz").write_bytes(gzip.compress(content))
+        capture = read_capture(tmp_path / f"{kept.name}.gz", **kept.needs)
+        np.testing.assert_array_equal(capture.cube, kept.cube)
+    if not kept.name.endswith(".bin"):  # which has no signature
+        capture = read_capture(put(tmp_path / "other.name", content), **kept.needs)
+        np.testing.assert_array_equal(capture.cube, kept.cube)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -512,14 +527,22 @@ STRINGS = np.array([["one", "two"]], object)
 DAMAGED = "damaged"
 
 REFUSED: dict[str, tuple[str, Builder, str]] = {
-    "unknown suffix": ("a.csv", lambda: b"1,2", r"suffix = '.csv'.*\.npz, \.npy, \.mat"),
+    "unknown format": ("a.csv", lambda: b"1,2", r"suffix = '.csv' .*like text: .*\.npz, \.npy, "),
+    "empty file of no format": ("a.x", lambda: b"", "like an empty file"),
+    "bytes of no format": ("a.x", lambda: bytes(99), "like binary data of an unknown format"),
+    "picture": ("a.mat", lambda: b"\x89PNG\r\n".ljust(99), "content = 'a PNG picture'"),
+    "damaged gzip": (
+        "a.npy.gz",
+        lambda: gzip.compress(npy_bytes(CUBE))[:-9],
+        "gzip file .*damaged",
+    ),
+    "gzip in gzip": ("a.gz", lambda: gzip.compress(gzip.compress(b"")), "like binary data"),
     "empty npz": ("a.npz", lambda: b"", DAMAGED),
     "empty npy": ("a.npy", lambda: b"", DAMAGED),
     "empty mat": ("a.mat", lambda: b"", "version"),
     "wrong magic in npy": ("a.npy", lambda: b"\x00" * 200, DAMAGED),
     "wrong magic in npz": ("a.npz", lambda: b"\x00" * 200, DAMAGED),
     "wrong magic in mat": ("a.mat", lambda: b"\x00" * 200, "version.*-v7"),
-    "npz under the name of mat": ("a.mat", lambda: npz_bytes(cube=CUBE), "version"),
     "truncated npy": (
         "a.npy",
         lambda: npy_bytes(CUBE)[:-10],
@@ -723,6 +746,7 @@ def test_what_unpacks_beyond_the_limit_is_refused(
         "bomb.npz": bomb_npz(2**22),
         "pixels.npz": npz_bytes(cube=np.zeros((512, 512, 1), np.uint8)),  # and their sums of int64
         "bomb.npy": npy_bytes(bomb),
+        "bomb.gz": gzip.compress(npy_bytes(bomb)),
         "bomb.mat": mat_bytes(True, cube=bomb),
         "cells.mat": mat_bytes(True, Ts=cells_of([np.ones(2**22, np.uint8)], (1, 1))),
         "wide.npy": npy_bytes(bomb[:, :, : 2**20 - 200]),  # uint8 that would double

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from core.capture import CaptureError
-from core.io.readers import READERS, open_capture, read_capture
+from core.io import readers
+from core.io.readers import READERS, Reader, open_capture, read_capture
+from core.io.readers.content import reader_of
 from core.tests.formats import FORMATS, bare, put
 from core.tests.labelled_files import hdf5_bytes, zarr_files
 from core.tests.samples import CUBE
@@ -94,23 +96,23 @@ def test_a_file_that_changes_during_reading_is_refused(
 ) -> None:
     for change in CHANGES:
         path = stored(kind, tmp_path)
-        read = READERS[path.suffix.lower()]
+        reader = reader_of(path, READERS)
 
         def changing(
             path: Path,
             request: Any,
-            read: Callable[..., Any] = read,
+            reader: Reader = reader,
             change: Callable[[Path], None] = change,
         ) -> Any:
             if is_before:
                 change(path)
-                return read(path, request)
-            found = read(path, request)
+                return reader.read(path, request)
+            found = reader.read(path, request)
             change(path)
             return found
 
         with monkeypatch.context() as patched, pytest.raises(CaptureError) as caught:
-            patched.setitem(READERS, path.suffix.lower(), changing)
+            patched.setattr(readers, "READERS", (Reader("", (path.suffix.lower(),), changing),))
             read_capture(path, **FORMATS[kind].needs)
         assert str(caught.value).startswith(f"{path.name}: version of {path.name} = ")
 

@@ -356,7 +356,7 @@ REFUSED: dict[str, tuple[str, Callable[[], bytes], str]] = {
     ),
     # TMF8820
     "empty json": ("a.json", lambda: b"", "list of records.*damaged"),
-    "no json": ("a.json", lambda: b"\x89PNG\r\n", "list of records.*damaged"),
+    "not JSON": ("a.json", lambda: b"record", "list of records.*damaged"),
     "truncated json": ("a.json", lambda: records_with()[:-10], "list of records.*damaged"),
     "json of something else": ("a.json", lambda: b'{"hists": []}', "the file = 'dict'"),
     "json of no records": ("a.json", lambda: b"[]", "records = 0"),

@@ -1,40 +1,53 @@
-"""Captures from files: one format a module, one function for all.
+"""Captures from files: one format per module, one function for all.
 
-A new format is a module with a ``read(path, request) -> Capture`` and a line in `READERS`.
+A new format is a module with ``read(path, request) -> Capture`` and a line in `READERS`.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from core.acquisition import Pulse
 from core.capture import Capture, CaptureError, Detection
 from core.checks import refusing, require, shown
-from core.io.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820
+from core.io.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820, zarr
+from core.io.readers.content import Reader, decompressed, is_gzip, reader_of, suffixes_of
 from core.io.readers.guards import MAX_CUBE_BYTES, FileVersion
 from core.io.readers.request import Request
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["MAX_CUBE_BYTES", "READERS", "bytes_of", "open_capture", "read_capture"]
+__all__ = [
+    "MAX_CUBE_BYTES",
+    "READERS",
+    "SUFFIXES",
+    "Reader",
+    "bytes_of",
+    "open_capture",
+    "read_capture",
+]
 
-READERS: dict[str, Callable[[Path, Request], Capture]] = {
-    ".npz": npz.read,
-    ".npy": npy.read,
-    ".mat": matlab.read,
-    ".h5": labelled.read,
-    ".hdf5": labelled.read,
-    ".nc": labelled.read,
-    ".zarr": labelled.read,
-    ".bin": gmapd.read,
-    ".ptu": ptu.read,
-    ".sdt": sdt.read,
-    ".json": tmf8820.read,
-}
+_LABELLED = (labelled.read, labelled.recognizes, labelled.open_counts)
+
+READERS: tuple[Reader, ...] = (
+    Reader("NumPy archive, this project's own layout", (".npz",), npz.read, npz.recognizes),
+    Reader("NumPy array: counts or raw frames", (".npy",), npy.read, npy.recognizes),
+    Reader("HDF5 or netCDF", (".h5", ".hdf5", ".nc"), *_LABELLED),
+    Reader("Zarr folder", (".zarr",), *_LABELLED, folder_marks=zarr.MARKS),
+    Reader("MATLAB", (".mat",), matlab.read, matlab.recognizes),
+    Reader("Princeton Lightwave camera frames", (".bin",), gmapd.read),
+    Reader("PicoQuant image", (".ptu",), ptu.read, ptu.recognizes),
+    Reader("Becker & Hickl histograms", (".sdt",), sdt.read, sdt.recognizes),
+    Reader("AMS TMF8820 records", (".json",), tmf8820.read, tmf8820.recognizes),
+)
+"""All formats. Where several recognize a file and none has its suffix, the first one reads it."""
+
+SUFFIXES: Mapping[str, str] = suffixes_of(READERS)
+"""One-line description of the format of each suffix."""
 
 
 def read_capture(
@@ -55,16 +68,16 @@ def read_capture(
     no_trigger: int | None = None,
     first_detections: int | None = None,
 ) -> Capture:
-    """Read a capture from a file; its suffix tells the format.
+    """Read a capture from a file; the content determines the format, and any may be gzipped.
 
-    What is None comes from the file, or is guessed where the file does not say; ``.source`` of the
-    answer tells every guess. The modules of `core.io.readers` describe the formats,
+    None takes a value from the file, or guesses it where the file does not specify it; ``.source``
+    of the capture lists every guess. The modules of `core.io.readers` describe the formats,
     `core.io.readers.arrivals` the rules for guessing.
 
     Parameters
     ----------
     path : path-like
-        A file with one of the suffixes in `READERS`, or a ``.zarr`` directory.
+        A file of one of the `READERS`, or a Zarr directory.
     time_unit_s : float, optional
         Unit of the arrival times in seconds; only for a file that holds such.
     bin_width_s : float, optional
@@ -136,19 +149,18 @@ def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
     Parameters
     ----------
     path : path-like
-        As of `read_capture`. HDF5, netCDF-4 and Zarr are read as they are asked for, whatever their
-        size; other files are read at once.
+        As for `read_capture`. Parts of HDF5, netCDF and Zarr are read when they are needed,
+        whatever the size of the file; other files are read at once.
     **options
-        As of `read_capture`.
+        As for `read_capture`.
 
     Returns
     -------
     DataArray, shape (row, col, bin)
         Counts of type uint8, uint16 or uint32 with the attributes and coordinates of
         `core.io.readers.labelled`, so that `core.io.readers.labelled.describe` has nothing left to
-        guess: its ``source`` tells what was guessed here. Where the number of pulses is known, all
-        of it is taken for first photons unless ``detection`` is told: nobody counted. A number that
-        is no count raises `CaptureError` when it is read.
+        guess; the attribute ``source`` lists what was guessed here. A number that is not a count
+        raises `CaptureError` when it is read.
 
     Raises
     ------
@@ -161,36 +173,36 @@ def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
         raise TypeError(f"open_capture() got unexpected arguments: {', '.join(unknown)}")
     with refusing(path, CaptureError):
         request = Request(**options)
-        if _suffix(path) in labelled.LAZY:
-            return labelled.open_counts(path, request)
-        return labelled.dataset(_read(path, request))["counts"]
+        _require_exists(path)
+        open_counts = None if is_gzip(path) else reader_of(path, READERS).open_counts
+        if open_counts is None:
+            return labelled.dataset(_read(path, request))["counts"]
+        return open_counts(path, request)
 
 
 def bytes_of(path: str | os.PathLike[str], **options: Any) -> int | None:
-    """Bytes of all counts of a file, of which none is read; None where they would have to be.
+    """Return the bytes of all counts of a file without reading them; None if it must be read.
 
     Parameters
     ----------
     path, **options
-        As of `open_capture`, which raises the same.
+        As for `open_capture`, which raises the same.
     """
-    if Path(path).suffix.lower() not in labelled.LAZY:
-        return None
-    # With nothing left to guess, nothing is read.
+    path = Path(path)
+    with refusing(path, CaptureError):
+        _require_exists(path)
+        if is_gzip(path) or reader_of(path, READERS).open_counts is None:
+            return None
+    # With pulse and detection given, no count is read to guess them.
     return int(open_capture(path, **options | {"pulse": Pulse(), "detection": "all"}).nbytes)
 
 
 def _read(path: Path, request: Request) -> Capture:
-    """Read a file that does not change meanwhile."""
-    read = READERS[_suffix(path)]
-    with FileVersion.of(path).unchanged():
-        return read(path, request)
+    """Read a file, which must not change meanwhile."""
+    _require_exists(path)
+    with FileVersion.of(path).unchanged(), decompressed(path) as plain:
+        return reader_of(plain, READERS).read(plain, request)
 
 
-def _suffix(path: Path) -> str:
-    """The suffix of a file that exists, in small letters, if it is known."""
-    suffix = path.suffix.lower()
-    there = path.is_file() or (suffix == ".zarr" and path.is_dir())
-    require("path", shown(path), there, "an existing file")
-    require("suffix", path.suffix, suffix in READERS, "one of " + ", ".join(READERS))
-    return suffix
+def _require_exists(path: Path) -> None:
+    require("path", shown(path), path.is_file() or path.is_dir(), "an existing file")

@@ -65,9 +65,6 @@ UNITS_S["km"] = 1e3 * UNITS_S["m"]
 """Seconds of the light's way there and back, for each unit of a coordinate along the bins."""
 
 
-LAZY = (".h5", ".hdf5", ".nc", ".zarr")
-"""Suffixes of what `open_counts` opens without reading it."""
-
 BLOCK_BYTES = 2**24
 """About what a block of an array takes that is opened, not read."""
 
@@ -225,6 +222,13 @@ class _File:
                 values = whole(one.numbers).astype(float, copy=False)
                 return values.T if turned else values
         return None
+
+
+def recognizes(start: bytes) -> bool:
+    """Whether a file starts like HDF5, but not like one of MATLAB, or like classic netCDF."""
+    places = (0, *(2**k for k in range(9, 13)))
+    is_hdf5 = any(start[k : k + 8] == hdf5.SIGNATURE for k in places)
+    return start[:4] in netcdf3.SIGNATURES or (is_hdf5 and not start.startswith(b"MATLAB"))
 
 
 def read(path: Path, request: Request) -> Capture:

@@ -35,6 +35,7 @@ from core.io.readers.variables import Variable, bin_width, choose
 
 _HEADER_BYTES = 128
 _USER_BLOCK = 512  # what stands before the HDF5 of version 7.3
+_VERSIONS_5 = (b"\x00\x01IM", b"\x01\x00MI")
 _BYTES_A_CELL = 256  # of memory that one loaded cell takes
 
 # Codes of the format, as in "MAT-File Format", The MathWorks.
@@ -50,6 +51,11 @@ _DIMENSIONS = 6  # where they begin, in words of 4 bytes, after the tag and the 
 _BEGINNING_BYTES = 4096
 
 
+def recognizes(start: bytes) -> bool:
+    """Whether a file starts like one of MATLAB, or like HDF5 that may be of version 7.3."""
+    return start[124:128] in _VERSIONS_5 or hdf5.SIGNATURE in (start[:8], start[512:520])
+
+
 def read(path: Path, request: Request) -> Capture:
     """Read a cell array of arrival times, a cube, or a sparse matrix."""
     with path.open("rb") as file:
@@ -59,7 +65,7 @@ def read(path: Path, request: Request) -> Capture:
     require_fits("the file", path.stat().st_size)
     data = path.read_bytes()
     # SciPy takes a zero in the first four bytes for version 4.
-    known = data[124:128] in (b"\x00\x01IM", b"\x01\x00MI") and 0 not in data[:4]
+    known = data[124:128] in _VERSIONS_5 and 0 not in data[:4]
     require("version", data[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
     order = "<" if data[126:128] == b"IM" else ">"
     variables = _variables(data, order)

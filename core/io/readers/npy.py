@@ -30,6 +30,11 @@ class Header(NamedTuple):
     dtype: np.dtype[Any]
 
 
+def recognizes(start: bytes) -> bool:
+    """Whether a file starts like a NumPy array."""
+    return start.startswith(npy_format.MAGIC_PREFIX)
+
+
 def read(path: Path, request: Request) -> Capture:
     """Read a cube, or frames; everything else is given or guessed."""
     require("variable", request.variable, request.variable is None, "None: .npy holds one array")

@@ -89,6 +89,11 @@ def fields(capture: Capture) -> dict[str, NDArray[Any]]:
     return {name: np.asarray(value) for name, value in kept.items() if value is not None}
 
 
+def recognizes(start: bytes) -> bool:
+    """Whether a file starts like a ZIP archive."""
+    return start.startswith((b"PK\x03\x04", b"PK\x05\x06"))
+
+
 def read(path: Path, request: Request) -> Capture:
     """Read our own layout, the one cube of an archive, or raw frames."""
     with decoding("the archive"):

@@ -50,6 +50,11 @@ _ACCEPTED = {
 }
 
 
+def recognizes(start: bytes) -> bool:
+    """Whether a file starts like one of PicoQuant."""
+    return start.startswith(b"PQTTTR")
+
+
 def read(path: Path, request: Request) -> Capture:
     """Read the histograms of an image."""
     from ptufile import PtuFile  # noqa: PLC0415  (only who opens such a file waits for it)

@@ -36,6 +36,12 @@ _COMPRESSED = 0x1000
 _HISTOGRAMS = {0x00: "decay curves", 0x10: "pages", 0x60: "an image"}
 _CONTENT = 0xF0
 _NEW_HEADER_REVISION = 15
+_VALID_AT, _VALID = 32, b"\x55\x55"
+
+
+def recognizes(start: bytes) -> bool:
+    """Whether a file starts with a header of Becker & Hickl that is marked as valid."""
+    return start[_VALID_AT : _VALID_AT + 2] == _VALID
 
 
 def read(path: Path, request: Request) -> Capture:

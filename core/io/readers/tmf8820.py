@@ -54,6 +54,11 @@ _RISE = 0.01
 Record = dict[str, Any]
 
 
+def recognizes(start: bytes) -> bool:
+    """Whether a file starts like a list of JSON."""
+    return start.lstrip().startswith(b"[") and b"\0" not in start
+
+
 def read(path: Path, request: Request) -> Capture:
     """Read all records, or one."""
     require_fits("the records", path.stat().st_size * _MEMORY_A_BYTE)

@@ -26,7 +26,9 @@ from core.io.readers.guards import FileVersion, decoding
 from core.io.readers.stored import Stored
 
 _MOST_JSON_BYTES = 2**24  # of a whole directory
-_METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs")
+MARKS = ("zarr.json", ".zarray", ".zgroup")
+"""Names of files, one of which the folder contains."""
+_METADATA = (*MARKS, ".zattrs")
 _TYPES_2 = re.compile(r"[<>|]([iu][1248]|f[248])")
 _TYPES_3 = re.compile(r"u?int(8|16|32|64)|float(16|32|64)")
 _CODECS = {"zlib": "deflate", "gzip": "deflate", "zstd": "zstd", "blosc": "blosc"}

@@ -1,0 +1,164 @@
+"""The reader for a file, chosen by its content; the suffix decides where several or none fit."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from core.capture import Capture
+from core.checks import require
+from core.io.readers.guards import decoding, require_fits
+from core.io.readers.request import Request
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+GZIP = ".gz"
+
+_GZIP_MAGIC = b"\x1f\x8b"
+_START_BYTES = 2**13  # the largest user block before an HDF5 signature that is recognized
+_PIECE_BYTES = 2**18
+
+_OTHER_CONTENT = {
+    b"\x89PNG": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"II*\0": "a TIFF picture",
+    b"MM\0*": "a TIFF picture",
+    b"LASF": "a LAS point cloud",
+    b"ply": "a PLY point cloud",
+    b"glTF": "a glTF scene",
+    b"%PDF": "a PDF document",
+    b"BZh": "a bzip2 archive",
+    b"\xfd7zXZ\0": "an xz archive",
+    b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive",
+}
+
+
+def never(_: bytes) -> bool:
+    """Recognize nothing: a format without a signature is chosen by its suffix."""
+    return False
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A file format.
+
+    Parameters
+    ----------
+    title : str
+        One-line description.
+    suffixes : tuple of str
+        Usual endings of the file name, in lower case.
+    read : callable
+        Reads a whole capture.
+    recognizes : callable
+        Whether the first bytes of a file are of this format.
+    open_counts : callable, optional
+        Opens the counts without reading them.
+    folder_marks : tuple of str
+        For a format that is a folder: names, one of which the folder contains.
+    """
+
+    title: str
+    suffixes: tuple[str, ...]
+    read: Callable[[Path, Request], Capture]
+    recognizes: Callable[[bytes], bool] = never
+    open_counts: Callable[[Path, Request], xr.DataArray] | None = None
+    folder_marks: tuple[str, ...] = ()
+
+
+def reader_of(path: Path, readers: Sequence[Reader]) -> Reader:
+    """Choose the reader for an existing file or folder.
+
+    Raises
+    ------
+    ValueError
+        If no reader recognizes the content or has the suffix.
+    """
+    is_folder = path.is_dir()
+    possible = [reader for reader in readers if bool(reader.folder_marks) == is_folder]
+    of_suffix = [reader for reader in possible if path.suffix.lower() in reader.suffixes]
+    start = b"" if is_folder else _start(path)
+    fitting = [
+        reader
+        for reader in possible
+        if reader.recognizes(start) or any((path / name).exists() for name in reader.folder_marks)
+    ]
+    for reader in of_suffix:
+        if reader in fitting:
+            return reader
+    if fitting:
+        return fitting[0]
+    found = _description(start)
+    known = ", ".join(suffixes_of(readers))
+    if of_suffix:
+        other = found in _OTHER_CONTENT.values()
+        require("content", found, not other, f"a capture: {known}")
+        return of_suffix[0]
+    require("path", str(path), not is_folder, "an existing file, or a Zarr folder")
+    raise ValueError(
+        f"suffix = {path.suffix!r} is not accepted, and the content looks like {found}: "
+        f"give one of {known}."
+    )
+
+
+def suffixes_of(readers: Sequence[Reader]) -> dict[str, str]:
+    """One-line descriptions of all formats by their suffixes, gzip files included."""
+    known = {suffix: reader.title for reader in readers for suffix in reader.suffixes}
+    return known | {GZIP: "any of these files, compressed by gzip"}
+
+
+def is_gzip(path: Path) -> bool:
+    """Whether a file is compressed by gzip, whatever its name."""
+    return path.is_file() and _start(path).startswith(_GZIP_MAGIC)
+
+
+@contextmanager
+def decompressed(path: Path) -> Iterator[Path]:
+    """Yield the file itself, or a temporary file with the content of a gzip file.
+
+    Raises
+    ------
+    ValueError
+        If the gzip file is damaged, or contains more than `core.io.readers.guards.MAX_CUBE_BYTES`.
+    """
+    if not is_gzip(path):
+        yield path
+        return
+    with TemporaryDirectory(prefix="firstphoton-") as folder:
+        content = Path(folder) / (path.stem if path.suffix.lower() == GZIP else path.name)
+        n_bytes = 0
+        with gzip.open(path) as packed, content.open("wb") as target:
+            while True:
+                with decoding("the gzip file"):
+                    piece = packed.read(_PIECE_BYTES)
+                if not piece:
+                    break
+                n_bytes += len(piece)
+                require_fits("the decompressed file", n_bytes)
+                target.write(piece)
+        yield content
+
+
+def _start(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_START_BYTES)
+
+
+def _description(start: bytes) -> str:
+    """Name the content of a file that no reader recognizes."""
+    for magic, name in _OTHER_CONTENT.items():
+        if start.startswith(magic):
+            return name
+    if not start:
+        return "an empty file"
+    try:
+        text = start.decode()
+    except UnicodeDecodeError:
+        return "binary data of an unknown format"
+    return "text" if "\0" not in text else "binary data of an unknown format"
