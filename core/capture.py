@@ -28,7 +28,7 @@ from core.deprecation import renamed
 from core.kernels.blocks import Blocks, to_blocks
 
 if TYPE_CHECKING:
-    from core.inference.posterior import FluxPrior
+    from core.inference.flux_model import FluxPrior
 
 COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
 

@@ -10,7 +10,7 @@ import numpy as np
 from core.acquisition import Pulse
 from core.capture import Capture
 from core.checks import require
-from core.inference.posterior import detailed_flux_prior_of
+from core.inference.flux import detailed_flux_prior_of
 
 CORRECTIONS = {
     "pile_up": "pile-up",

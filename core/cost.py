@@ -18,7 +18,9 @@ import psutil
 
 from core.capture import Capture
 from core.checks import require
-from core.inference.posterior import LEVELS, SAMPLE, has_posterior, lanes_of, sampled_numbers
+from core.inference.flux import LEVELS, SAMPLE
+from core.inference.likelihood import lanes_of, sampled_numbers
+from core.inference.posterior import has_posterior
 from core.kernels.blocks import LANES
 
 REMEDY = (

@@ -27,7 +27,7 @@ from app.pages.layout import Layout
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
 from core import Window
-from core.inference.posterior import flux_prior_of
+from core.inference.flux import flux_prior_of
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT, fact, serving

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.deprecation import renamed
-from core.inference import posterior
+from core.inference.flux import flux_model_of
+from core.inference.flux_model import FluxModel
+from core.inference.likelihood import Conditions
 from core.inference.neighbours import patches, pooled_at, pooled_in
-from core.inference.posterior import Conditions, FluxModel
+from core.inference.posterior import tolerance_probability
 from core.parameters import Number
 from core.trigger import drawn, rate_per_bin, trigger_probability
 
@@ -112,7 +114,7 @@ class Estimator:
     reach: Callable[[Any], int] = lambda _: 1
     first_bin: Callable[[Any], int] = lambda _: 0
     finds_delay: bool = False
-    flux_model: Callable[[Capture], FluxModel] = posterior.flux_model_of
+    flux_model: Callable[[Capture], FluxModel] = flux_model_of
     reconstructed: str = ""
     null_side: int = NULL_SIDE
     undoes_pile_up: bool = False
@@ -170,7 +172,7 @@ class Estimator:
             range_m=capture.acquisition.bin_to_range_m(bins),
             bin=bins,
             score=score,
-            confidence=posterior.tolerance_probability(capture, bins),
+            confidence=tolerance_probability(capture, bins),
             valid=np.isfinite(bins),
         )
 
@@ -331,7 +333,7 @@ def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     rng = np.random.default_rng(1)
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     pixels = _null_pixels(capture)
-    background = posterior.flux_model_of(capture).of_pixels(pixels).typical_background
+    background = flux_model_of(capture).of_pixels(pixels).typical_background
     cubes = []
     rows_at_once = max(1, _AT_ONCE // (pixels.shape[1] * n_bins))
     for first in range(0, len(pixels), rows_at_once):

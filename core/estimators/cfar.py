@@ -22,7 +22,7 @@ import numpy as np
 from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
-from core.inference.posterior import Conditions
+from core.inference.likelihood import Conditions
 from core.parameters import Number, check_fields, parameter
 
 

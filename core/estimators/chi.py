@@ -35,8 +35,10 @@ from core.capture import Capture
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
 from core.estimators.kde import kernel_taps
+from core.inference.flux_model import FluxModel
+from core.inference.likelihood import Conditions
 from core.inference.neighbours import neighbours, patches, pooled_in, weighted_median
-from core.inference.posterior import TOLERANCE_BINS, Conditions, FluxModel
+from core.inference.posterior import TOLERANCE_BINS
 from core.kernels.parallel import COMPILED
 from core.parameters import Number, Zone, check_fields, parameter
 

@@ -16,7 +16,8 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate, echo_shape
-from core.inference.posterior import Conditions, flux_prior_of, rate_and_n_armed
+from core.inference.flux import flux_prior_of
+from core.inference.likelihood import Conditions, rate_and_n_armed
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
-from core.inference.posterior import Conditions
+from core.inference.likelihood import Conditions
 
 
 def echo_shape(conditions: Conditions) -> tuple[Floats, int]:

@@ -24,7 +24,7 @@ import scipy  # loads a submodule when it is first used
 from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
-from core.inference.posterior import Conditions
+from core.inference.likelihood import Conditions
 from core.parameters import Choice, Number, Zone, check_fields, parameter
 
 REACH = {"1x1": 1, "3x3": 3, "5x5": 5}

@@ -15,14 +15,10 @@ import numpy as np
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
-from core.inference.posterior import (
-    Conditions,
-    FluxModel,
-    detailed_flux_prior_of,
-    flux_prior_of,
-    log_likelihood_ratio,
-    most_likely,
-)
+from core.inference.flux import detailed_flux_prior_of, flux_prior_of
+from core.inference.flux_model import FluxModel
+from core.inference.likelihood import Conditions, log_likelihood_ratio
+from core.inference.posterior import most_likely
 from core.parameters import Choice, Number, check_fields, parameter
 
 Depths = Literal["alike", "learned"]

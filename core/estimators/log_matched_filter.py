@@ -13,7 +13,7 @@ import numpy as np
 from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate, echo_shape
-from core.inference.posterior import Conditions
+from core.inference.likelihood import Conditions
 
 
 @dataclass(frozen=True)

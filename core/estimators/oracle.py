@@ -7,7 +7,7 @@ import numpy as np
 from core.capture import Capture, cached_per_capture
 from core.estimators.base import Estimator
 from core.estimators.likelihood import LikelihoodParameters, curve, locate
-from core.inference.posterior import FluxModel
+from core.inference.flux_model import FluxModel
 
 
 @cached_per_capture

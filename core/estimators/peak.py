@@ -9,7 +9,8 @@ import numpy as np
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
-from core.inference.posterior import Conditions, FluxModel
+from core.inference.flux_model import FluxModel
+from core.inference.likelihood import Conditions
 
 
 @dataclass(frozen=True)

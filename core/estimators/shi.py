@@ -24,7 +24,7 @@ from numba import njit
 
 from core.acquisition import Floats
 from core.estimators.base import Estimator
-from core.inference.posterior import Conditions
+from core.inference.likelihood import Conditions
 from core.kernels.parallel import COMPILED
 from core.parameters import Number, check_fields, parameter
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
-from core.inference.posterior import Conditions, FluxModel
+from core.inference.flux_model import FluxModel
+from core.inference.likelihood import Conditions
 from core.tracking import TrackingParameters, track, tracking_signals
 
 

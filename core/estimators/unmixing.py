@@ -52,8 +52,9 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
 from core.estimators.base import Estimator, conditions_of
 from core.estimators.filters import echo_shape
+from core.inference.flux_model import FluxModel
+from core.inference.likelihood import Conditions, rate_and_n_armed
 from core.inference.neighbours import box_sum, neighbours, patches, weighted_median, widened
-from core.inference.posterior import Conditions, FluxModel, rate_and_n_armed
 from core.parameters import Number, check_fields, parameter
 
 _LAGS = 65  # delays tried around a window

@@ -21,8 +21,8 @@ import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
-from core.inference import posterior
 from core.inference.faults import standing_out
+from core.inference.flux import detailed_flux_prior_of, level_likelihoods, total_rates
 from core.inspection.flux import estimate_flux
 from core.inspection.profile import LEVEL, Box, FluxEstimate, spans, zoomed
 from core.metrics import Interval
@@ -109,7 +109,7 @@ def _untold(capture: Capture) -> FluxEstimate:
 
 def _dimmer(capture: Capture) -> tuple[Capture, float]:
     """The capture with a share of its pulses, where echoes are brighter than a mean requires."""
-    strongest = float(posterior.detailed_flux_prior_of(capture).levels[-1])
+    strongest = float(detailed_flux_prior_of(capture).levels[-1])
     share = _BRIGHT / max(strongest * (capture.gated_pulses or 1), _BRIGHT)
     return (share_of_pulses(capture, share), share) if share < 1 else (capture, 1.0)
 
@@ -118,8 +118,8 @@ class _Mixture:
     """The likelihood of mean background and mean signal, from the pixels of a sample."""
 
     def __init__(self, capture: Capture) -> None:
-        known = posterior.detailed_flux_prior_of(capture)
-        total, n_pulses = posterior.total_rates(capture), capture.gated_pulses or 1
+        known = detailed_flux_prior_of(capture)
+        total, n_pulses = total_rates(capture), capture.gated_pulses or 1
         self._capture, self._known, acquisition = capture, known, capture.acquisition
         self._pixels = np.random.default_rng(0).permutation(total.size)[:_SAMPLE]
         top = 2 * float(known.levels[-1])
@@ -149,7 +149,7 @@ class _Mixture:
             share=np.full(self._levels.size, 1 / self._levels.size),
             background=np.asarray(background),
         )
-        return posterior.level_likelihoods(self._capture, self._pixels, flux_prior, _STEPS)
+        return level_likelihoods(self._capture, self._pixels, flux_prior, _STEPS)
 
     def __call__(self, log_background: Floats, root_signal: Floats) -> Floats:
         """Log likelihood, shape (background, signal)."""

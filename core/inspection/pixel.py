@@ -15,9 +15,9 @@ from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
-from core.inference import posterior
 from core.inference.faults import Verdict, verdict
-from core.inference.posterior import rate_and_n_armed
+from core.inference.likelihood import rate_and_n_armed
+from core.inference.posterior import posterior_of
 from core.inspection.flux import METHOD, estimate_flux
 from core.inspection.profile import FluxEstimate
 
@@ -165,7 +165,7 @@ def _candidates(
     if not peaks.size:
         return ()
     bins = np.clip(peaks - lag_bins, 0.0, capture.acquisition.n_bins)
-    near = posterior.posterior_of(capture).tolerance_probability[row, col]
+    near = posterior_of(capture).tolerance_probability[row, col]
     probability = np.clip(np.interp(bins, np.arange(near.size), near), 0.0, 1.0)
     range_m = capture.acquisition.bin_to_range_m(bins)
     score = curve[peaks]

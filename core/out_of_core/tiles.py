@@ -24,7 +24,8 @@ from core.capture import Capture, Detection
 from core.checks import require
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.estimators.base import Calibration
-from core.inference.posterior import FluxPrior, flux_prior_of
+from core.inference.flux import flux_prior_of
+from core.inference.flux_model import FluxPrior
 from core.io.readers.dense import AXES, whole_counts
 from core.io.readers.labelled import Description, describe
 from core.io.readers.request import Request

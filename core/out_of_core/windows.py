@@ -18,7 +18,8 @@ import numpy as np
 
 from core.capture import Capture
 from core.checks import require
-from core.inference.posterior import FluxPrior, flux_prior_of
+from core.inference.flux import flux_prior_of
+from core.inference.flux_model import FluxPrior
 from core.io.readers.labelled import describe
 from core.io.readers.request import Request
 from core.io.readers.sample import sample_of

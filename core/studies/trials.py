@@ -23,7 +23,7 @@ from core import metrics
 from core.acquisition import Floats, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS
-from core.inference.posterior import flux_model_of
+from core.inference.flux import flux_model_of
 from core.metrics import Interval
 from core.scene import scenes
 from core.simulation import simulate

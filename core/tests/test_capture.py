@@ -12,7 +12,7 @@ import pytest
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, cached_per_capture
-from core.inference.posterior import flux_prior_of
+from core.inference.flux import flux_prior_of
 
 
 def capture_of(cube: Any, n_pulses: int | None = 1000, dtype: type = np.uint16) -> Capture:

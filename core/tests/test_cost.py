@@ -92,9 +92,9 @@ def test_an_answer_is_the_same_bit_for_bit_however_much_is_held_at_once(method, 
         return image.bin, image.score, image.confidence
 
     expected = answer()
-    monkeypatch.setattr("core.inference.posterior._TABLE_NUMBERS", 1000)  # two pixels side by side
-    monkeypatch.setattr("core.inference.posterior._LIGHT_NUMBERS", 1000)
-    monkeypatch.setattr("core.inference.posterior._AT_ONCE", 100)
+    monkeypatch.setattr("core.inference.likelihood._TABLE_NUMBERS", 1000)  # two pixels side by side
+    monkeypatch.setattr("core.inference.likelihood._FLUX_NUMBERS", 1000)
+    monkeypatch.setattr("core.inference.likelihood._AT_ONCE", 100)
     for module in ("base", "chi", "unmixing"):
         monkeypatch.setattr(f"core.estimators.{module}._AT_ONCE", 2000)
     for one, other in zip(answer(), expected, strict=True):

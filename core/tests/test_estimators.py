@@ -17,7 +17,7 @@ from core import tracking
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.inference.posterior import flux_prior_of
+from core.inference.flux import flux_prior_of
 from core.io.readers.dense import guess_detection
 from core.scene import Scene, uniform
 from core.simulation import simulate

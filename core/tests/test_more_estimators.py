@@ -20,8 +20,9 @@ from core.estimators.chi import ChiParameters
 from core.estimators.kde import KdeParameters
 from core.estimators.shi import ShiParameters
 from core.estimators.unmixing import Clusters, UnmixingParameters
+from core.inference.flux_model import FluxModel
+from core.inference.likelihood import Conditions
 from core.inference.neighbours import pooled
-from core.inference.posterior import Conditions, FluxModel
 from core.scene import uniform
 from core.trigger import rate_per_bin, trigger_probability
 

@@ -16,17 +16,26 @@ from scipy import ndimage, stats
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import estimate
-from core.inference import posterior
-from core.inference.posterior import (
+from core.inference.flux import _SPREAD, LEVELS, _shares_and_depths, _totals, flux_model_of
+from core.inference.flux_model import FluxModel
+from core.inference.likelihood import (
     Conditions,
-    FluxModel,
+    level_densities,
+    level_evidence,
+    log_likelihood_ratio,
+    prepare,
+    rate_and_n_armed,
+)
+from core.inference.posterior import (
+    TOLERANCE_BINS,
     Posterior,
-    flux_model_of,
     most_likely,
     posterior_of,
     tolerance_probability,
 )
 from core.io.readers.dense import guess_detection
+from core.kernels.blocks import LANES
+from core.kernels.posterior import _ALIKE, learn_shares, smoothed
 from core.scene import Scene
 from core.simulation import simulate
 from core.trigger import coates_rate, rate_per_bin, trigger_probability
@@ -60,7 +69,7 @@ def _quick_draws(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _whole_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     """The light of a small image is told by all of its pixels: chance is in the counts alone."""
-    monkeypatch.setattr(posterior, "SAMPLE", 1024)
+    monkeypatch.setattr("core.inference.flux.SAMPLE", 1024)
 
 
 @pytest.fixture(autouse=True)
@@ -71,7 +80,7 @@ def _small_blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     """
     if numba.config.DISABLE_JIT and "uniform_captures" not in request.fixturenames:
         monkeypatch.setattr(import_module("core.kernels.blocks"), "LANES", 16)
-        monkeypatch.setattr(posterior, "LANES", 16)
+        monkeypatch.setattr("core.inference.likelihood.LANES", 16)
 
 
 @pytest.fixture
@@ -194,8 +203,8 @@ def assert_equals_twin(
     shape = capture.shape
     far = expected.rounding[:, np.newaxis]
 
-    prepared = posterior._prepare(capture, capture.cube, flux, steps_per_bin)
-    evidence, densities = posterior._level_evidence(prepared), posterior._level_densities(prepared)
+    prepared = prepare(capture, capture.cube, flux, steps_per_bin)
+    evidence, densities = level_evidence(prepared), level_densities(prepared)
     assert evidence.shape == (capture.counts.size, len(flux.share))
     assert (np.abs(evidence - expected.evidence) <= far + OF_SUMS).all()
     assert densities.shape == (*evidence.shape, expected.delay.size)
@@ -226,14 +235,14 @@ def assert_equals_twin(
 
     if steps_per_bin > 1:
         return  # the posterior is made in whole bins
-    monkeypatch.setattr(posterior, "flux_model_of", lambda _: flux)
+    monkeypatch.setattr("core.inference.posterior.flux_model_of", lambda _: flux)
     found_posterior = posterior_of(capture)
     with np.errstate(divide="ignore"):
         nothing = np.log(flux.share[0])
     log_each = expected.log_density - math.log(expected.delay.size)
     total = np.logaddexp(np.logaddexp.reduce(log_each, axis=1), nothing)
     each = np.exp(log_each - total[:, np.newaxis])
-    within = np.abs(expected.delay[:, np.newaxis] - np.arange(n_bins)) < posterior.TOLERANCE_BINS
+    within = np.abs(expected.delay[:, np.newaxis] - np.arange(n_bins)) < TOLERANCE_BINS
     # Odds are off by a factor, of two likelihoods, at most.
     atol = np.expm1(2 * (far + OF_SUMS)) + 4 * EPS_32
     assert found_posterior.tolerance_probability.shape == (*shape, n_bins)
@@ -291,12 +300,12 @@ def test_pixels_of_all_blocks_are_the_equations(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_blocks_may_be_treated_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    cube = np.tile(histograms(12, 200, Pulse()), (15, 1))[np.newaxis, : 2 * posterior.LANES + 7]
-    cube[0, posterior.LANES :] = np.roll(cube[0, posterior.LANES :], 3, axis=1)
+    cube = np.tile(histograms(12, 200, Pulse()), (15, 1))[np.newaxis, : 2 * LANES + 7]
+    cube[0, LANES:] = np.roll(cube[0, LANES:], 3, axis=1)
     flux = flux_for(*cube.shape[1:], 200)
     found = []
     for at_once in (2**20, 1):
-        monkeypatch.setattr(posterior, "_AT_ONCE", at_once)
+        monkeypatch.setattr("core.inference.likelihood._AT_ONCE", at_once)
         found.append(most_likely(capture_of(cube, 200), flux, 2))
     np.testing.assert_array_equal(*found)
 
@@ -388,7 +397,7 @@ def test_log_likelihood_ratio_is_that_of_the_distribution(
     signal = np.linspace(0.02, 0.6, len(counts)) * photons
     background = np.linspace(2.0, 0.2, len(counts)) * photons
     conditions = Conditions(acquisition, pulse, n_pulses, signal, background, 0.1)
-    found = posterior.log_likelihood_ratio(counts.astype(float), conditions)
+    found = log_likelihood_ratio(counts.astype(float), conditions)
     for i, histogram in enumerate(counts):
 
         def log_probability(onset_bin: float, histogram: np.ndarray = histogram, i: int = i) -> Any:
@@ -412,16 +421,16 @@ def test_log_likelihood_ratio_takes_one_light_for_all() -> None:
     acquisition = Acquisition(n_bins=12)
     one = Conditions(acquisition, Pulse(), 200, np.float64(0.2), np.float64(1.1), 0.2)
     each = one._replace(signal=np.full((3, 3), 0.2), background=np.full((3, 3), 1.1))
-    found = posterior.log_likelihood_ratio(counts, one)
+    found = log_likelihood_ratio(counts, one)
     assert found.shape == (3, 3, 12)
-    np.testing.assert_allclose(found, posterior.log_likelihood_ratio(counts, each), rtol=1e-12)
+    np.testing.assert_allclose(found, log_likelihood_ratio(counts, each), rtol=1e-12)
 
 
 def test_rate_and_armed_undo_the_pile_up() -> None:
     counts = np.random.default_rng(0).multinomial(300, np.full(21, 1 / 21), size=(4, 5))[..., :-1]
     counts[0, 0, 8:] = 0
     counts[0, 0, 8] = 300 - counts[0, 0].sum()  # the last pulses armed
-    rate, armed = posterior.rate_and_n_armed(counts.astype(float), 300)
+    rate, armed = rate_and_n_armed(counts.astype(float), 300)
     expected = coates_rate(counts, 300)
     finite = np.isfinite(expected)
     assert 0.9 < finite.mean() < 1
@@ -433,7 +442,7 @@ def test_rate_and_armed_undo_the_pile_up() -> None:
 
 @pytest.mark.parametrize("last", [1, 7, 100])
 def test_the_last_pulses_count_half_a_pulse_less(last: int) -> None:
-    rate, armed = posterior.rate_and_n_armed(np.array([100.0 - last, last, 0.0]), 100)
+    rate, armed = rate_and_n_armed(np.array([100.0 - last, last, 0.0]), 100)
     assert armed[1] == last
     # ln(A / (A - n)) with n = A - 1/2
     np.testing.assert_allclose(rate[1:], [math.log(2 * last), 0.0], rtol=1e-12)
@@ -441,13 +450,13 @@ def test_the_last_pulses_count_half_a_pulse_less(last: int) -> None:
 
 def test_expected_counts_are_undone_as_well() -> None:
     given = rate_per_bin(4.0, 0.5, 1.5, Pulse(), Acquisition(n_bins=12))
-    rate, _ = posterior.rate_and_n_armed(trigger_probability(given) * 50, 50)
+    rate, _ = rate_and_n_armed(trigger_probability(given) * 50, 50)
     np.testing.assert_allclose(rate, given, rtol=1e-12)
 
 
 def test_rates_are_counts_where_pulses_are_unknown() -> None:
     counts = np.arange(12.0).reshape(3, 4)
-    rate, armed = posterior.rate_and_n_armed(counts, None)
+    rate, armed = rate_and_n_armed(counts, None)
     np.testing.assert_array_equal(rate, counts)
     np.testing.assert_array_equal(armed, np.ones((3, 4)))
 
@@ -496,7 +505,7 @@ def columns(left: float, right: float) -> np.ndarray:
     return np.where(np.arange(SIZE) % 2 == 0, left, right)
 
 
-HALF_A_STEP = posterior._SPREAD ** (0.5 / (posterior.LEVELS - 1))
+HALF_A_STEP = _SPREAD ** (0.5 / (LEVELS - 1))
 """A signal is found as the level next to it, or spread over the two."""
 
 
@@ -584,7 +593,7 @@ def test_background_that_differs_is_not_drawn_to_its_mean() -> None:
 def test_totals_are_of_the_background_and_scatter_by_chance() -> None:
     n_pulses, background, n_pixels = 30, 0.9, 40_000
     fired = np.random.default_rng(0).binomial(n_pulses, -math.expm1(-background), (200, 200))
-    total, chance = posterior._totals(capture_of(fired[..., np.newaxis], n_pulses))
+    total, chance = _totals(capture_of(fired[..., np.newaxis], n_pulses))
     variance = chance_variance(background, n_pulses)
     # To the first order in 1 / pulses; the next is a quarter of it, so few are the pulses.
     assert total.mean() == pytest.approx(
@@ -598,7 +607,7 @@ def test_depths_that_are_alike_are_found_alike() -> None:
     depth = flux_model_of(drawn(SIGNAL)).depth
     # Echoes begin in bins 0 to 21; a pixel or more in each, over five bins of smoothing.
     excess = 4 / math.sqrt(5 * SIZE**2 / (N_BINS - 8))
-    expected = (1 - posterior._ALIKE) * N_BINS / (N_BINS - 8)
+    expected = (1 - _ALIKE) * N_BINS / (N_BINS - 8)
     assert (np.abs(depth[3:18] / expected - 1) < 0.15 + excess).all()
     assert depth[-4:].mean() < 0.5
 
@@ -612,7 +621,7 @@ def test_depths_that_occur_are_learned() -> None:
 
 def test_light_does_not_depend_on_the_order_of_pixels() -> None:
     capture = drawn(columns(SIGNAL, 0.0), columns(0.6, 0.4)[::-1])
-    assert SIZE**2 <= posterior.SAMPLE  # beyond, some are drawn
+    assert SIZE**2 <= 1024  # beyond, some are drawn
     order = np.random.default_rng(2).permutation(SIZE**2)
     cube = capture.cube.reshape(1, SIZE**2, N_BINS)[:, order]
     one, other = flux_model_of(capture), flux_model_of(capture_of(cube, N_PULSES))
@@ -632,7 +641,7 @@ def test_light_is_not_fooled_by_a_picket_fence(empty_column: int) -> None:
     rate = rate_per_bin(onset_bin, np.full((size, size), 0.5), 1.5, Pulse(), acquisition)
     counts = np.rint(trigger_probability(rate) * 50_000).astype(np.uint16)
     flux = flux_model_of(Capture(counts, acquisition))
-    drawn_by_chance = math.sqrt(0.25 * 0.75 / posterior.SAMPLE)
+    drawn_by_chance = math.sqrt(0.25 * 0.75 / 1024)
     assert flux.share[0] == pytest.approx(0.25, abs=4 * drawn_by_chance)
     # The strongest level is what the middle four fifths of an echo hold, or more.
     found = flux.typical_signal.mean()
@@ -670,7 +679,7 @@ def table(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], Capture]:
     def told(rows: Any) -> Capture:
         rows = np.atleast_2d(np.asarray(rows, np.float32))[np.newaxis]
         known = Posterior(rows, np.ones(rows.shape[:2]))
-        monkeypatch.setattr(posterior, "posterior_of", lambda _: known)
+        monkeypatch.setattr("core.inference.posterior.posterior_of", lambda _: known)
         return capture_of(np.zeros(rows.shape))
 
     return told
@@ -718,7 +727,7 @@ def test_nothing_seen_leaves_every_delay_alike(monkeypatch: pytest.MonkeyPatch) 
     share = np.array([0.6, 0.4])
     level = np.array([0.0, 1e-9]).reshape(2, 1, 1)  # an echo too faint to be missed
     flux = FluxModel(level, np.ones((2, 1, 1)), share, np.ones(40))
-    monkeypatch.setattr(posterior, "flux_model_of", lambda _: flux)
+    monkeypatch.setattr("core.inference.posterior.flux_model_of", lambda _: flux)
     found = posterior_of(capture_of(np.zeros((1, 1, 40))))
     expected = 0.4 * (np.minimum(np.arange(40) + 3, 40) - np.maximum(np.arange(40) - 3, 0)) / 40
     np.testing.assert_allclose(found.tolerance_probability[0, 0], expected, rtol=1e-5)
@@ -728,7 +737,7 @@ def test_nothing_seen_leaves_every_delay_alike(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize("n_threads", THREADS)
 @pytest.mark.usefixtures("threads")
 def test_nothing_depends_on_threads(n_threads: int) -> None:
-    cube = np.tile(histograms(12, 200, Pulse()), (15, 1))[np.newaxis, : 2 * posterior.LANES + 7]
+    cube = np.tile(histograms(12, 200, Pulse()), (15, 1))[np.newaxis, : 2 * LANES + 7]
     numba.set_num_threads(1)
     one = capture_of(cube, 200)
     flux, expected, peaks = (
@@ -770,9 +779,9 @@ def assert_calibrated(answers: list[tuple[Capture, np.ndarray, np.ndarray]]) -> 
         [tolerance_probability(capture, bins).ravel() for capture, bins, _ in answers]
     )
     error = np.concatenate([np.abs(bins - truth).ravel() for _, bins, truth in answers])
-    right = error <= posterior.TOLERANCE_BINS
+    right = error <= TOLERANCE_BINS
     # The posterior is made in whole bins: half a bin is more than it can tell.
-    doubtful = np.abs(error - posterior.TOLERANCE_BINS) < 0.5
+    doubtful = np.abs(error - TOLERANCE_BINS) < 0.5
     variance = (chance * (1 - chance)).sum() + 0.25 * np.count_nonzero(doubtful)
     assert abs(chance.sum() - np.count_nonzero(right)) <= 4 * math.sqrt(variance)
     tenth = np.minimum((chance * 10).astype(int), 9)
@@ -819,7 +828,7 @@ def test_surfaces_are_as_many_as_were_told() -> None:
 def test_depths_are_smoothed_by_a_gaussian(n_bins: int) -> None:
     density = np.random.default_rng(n_bins).random(n_bins)
     expected = ndimage.gaussian_filter1d(density, 2.0, mode="nearest")
-    np.testing.assert_allclose(posterior._smoothed(density), expected, rtol=1e-13)
+    np.testing.assert_allclose(smoothed(density), expected, rtol=1e-13)
 
 
 # --- Shares, step by step, in float64. ---
@@ -846,7 +855,7 @@ def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None
         share = np.maximum(share, 1e-12)
         learned = ndimage.gaussian_filter1d(joint[:, 1:].sum(axis=(0, 1)), 2.0, mode="nearest")
         depth = 0.9 * learned / learned.sum() + 0.1 / n_bins
-    found = posterior._shares_and_depths(density, told)
+    found = _shares_and_depths(density, told)
     np.testing.assert_allclose(found[0], share, rtol=1e-4)
     np.testing.assert_allclose(found[1], depth * n_bins, rtol=1e-4)
     assert (told == 1 / n_levels).all()
@@ -855,7 +864,7 @@ def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None
 def test_no_echo_at_all_leaves_depths_alike() -> None:
     density = any_densities(3, 9)
     density[:, 1:] = 0.0
-    share, depth = posterior._shares_and_depths(density, np.full(3, 1 / 3))
+    share, depth = _shares_and_depths(density, np.full(3, 1 / 3))
     np.testing.assert_allclose(share, [1, 1e-12, 1e-12])
     np.testing.assert_array_equal(depth, np.ones(9))
 
@@ -868,5 +877,5 @@ def test_shares_are_the_equations() -> None:
         joint /= joint.sum(axis=1, keepdims=True)
         share = (np.eye(5)[0] + joint.sum(axis=0)) / (len(evidence) + 1)
     learned = np.full(5, 0.2)
-    posterior._learn_shares(np.exp(evidence), learned)
+    learn_shares(np.exp(evidence), learned)
     np.testing.assert_allclose(learned, share, rtol=1e-9)

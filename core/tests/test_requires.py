@@ -18,8 +18,8 @@ from core.corrections import moments_s, without_correction
 from core.effects import Backscatter, FaultyPixels, Motion, SecondSurface
 from core.estimators import ESTIMATORS
 from core.estimators.base import Calibration
+from core.inference.flux import detailed_flux_prior_of, flux_prior_of
 from core.inference.limits import cramer_rao_bins
-from core.inference.posterior import detailed_flux_prior_of, flux_prior_of
 from core.inference.resolution import HIDDEN, TOLD, Difference
 from core.metrics import Interval
 from core.scene import Scene, scenes

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from core.acquisition import Flux
 from core.capture import Capture, CaptureError
 from core.estimators import estimate
-from core.inference.posterior import flux_prior_of
+from core.inference.flux import flux_prior_of
 from core.io.readers import open_capture, sample
 from core.io.readers.labelled import dataset
 from core.out_of_core.tiles import estimate_large

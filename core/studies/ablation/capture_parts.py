@@ -18,8 +18,9 @@ from scipy.special import pdtrc
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.corrections import without_correction
-from core.inference import faults, posterior, resolution
-from core.inference.posterior import TOLERANCE_BINS
+from core.inference import faults, resolution
+from core.inference.flux import flux_prior_of
+from core.inference.posterior import TOLERANCE_BINS, tolerance_probability
 from core.inference.resolution import FEW, Difference, difference
 from core.metrics import Interval
 from core.studies.ablation import corrections
@@ -112,7 +113,7 @@ class _Sample(NamedTuple):
 def _sample_of(capture: Capture) -> _Sample | None:
     """None where too few pixels are sure of their surface."""
     bins = corrections.delays(capture, "likelihood")
-    sure = posterior.tolerance_probability(capture, bins) >= _SURE
+    sure = tolerance_probability(capture, bins) >= _SURE
     faulty = faults.standing_out(capture)
     if faulty is not None:
         sure &= ~(faulty.hot | faulty.dead)
@@ -210,7 +211,7 @@ def _twin(capture: Capture, sample: _Sample) -> tuple[NDArray[np.unsignedinteger
         cube=counts[np.newaxis],
         truth_range_m=None,
         signal=None,
-        flux_prior=posterior.flux_prior_of(capture),
+        flux_prior=flux_prior_of(capture),
     )
     return counts, corrections.delays(twin, "likelihood")[0]
 

@@ -13,13 +13,13 @@ from core import metrics
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators import ESTIMATORS
-from core.inference.posterior import (
-    TOLERANCE_BINS,
+from core.inference.flux import (
     detailed_flux_prior_of,
     flux_model_of,
     flux_prior_of,
     level_differences,
 )
+from core.inference.posterior import TOLERANCE_BINS
 from core.inference.resolution import Difference
 from core.metrics import Interval
 from core.studies.timing import FEWEST_REPEATS, interleaved, median_interval

@@ -23,7 +23,8 @@ from core import limits
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.inference.posterior import TOLERANCE_BINS, flux_model_of, flux_prior_of
+from core.inference.flux import flux_model_of, flux_prior_of
+from core.inference.posterior import TOLERANCE_BINS
 from core.kernels.blocks import to_blocks
 from core.out_of_core.tiles import estimate_large
 from core.scene import Scene

@@ -12,7 +12,7 @@ import numpy as np
 from core import limits
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
-from core.inference.posterior import Conditions, log_likelihood_ratio
+from core.inference.likelihood import Conditions, log_likelihood_ratio
 from core.studies.sensitivity.extremes import (
     SUBNORMAL,
     Case,

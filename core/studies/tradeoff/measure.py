@@ -29,7 +29,8 @@ from core.capture import Capture
 from core.checks import require
 from core.estimators import ESTIMATORS, Estimator
 from core.estimators.cfar import CfarParameters
-from core.inference.posterior import FluxModel, flux_model_of
+from core.inference.flux import flux_model_of
+from core.inference.flux_model import FluxModel
 from core.metrics import Interval
 from core.reductions import Reduction
 from core.studies.timing import FEWEST_REPEATS, interleaved, median_interval

@@ -11,8 +11,10 @@ from scipy.ndimage import distance_transform_edt
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture, Detection
 from core.estimators import estimate
+from core.inference.flux import flux_model_of
+from core.inference.likelihood import rate_and_n_armed
 from core.inference.neighbours import patches
-from core.inference.posterior import flux_model_of, posterior_of, rate_and_n_armed
+from core.inference.posterior import posterior_of
 from core.scene import Scene
 from core.simulation import simulate
 from core.trigger import rate_per_bin

@@ -1,0 +1,124 @@
+"""Flux of an image: what its pixels share, and the levels that each of them may have seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class FluxModel:
+    """Flux that each pixel may have seen: levels of signal, and how often each occurs.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (level, row, col)
+        Signal photons per pulse; the first level is 0, "no echo".
+    background : ndarray, shape (level, row, col)
+        Background photons per pulse over the gate, if the signal is of that level.
+    share : ndarray, shape (level,)
+        Share of the pixels at each level; sums to 1.
+    depth : ndarray, shape (bin,)
+        How much more often than in others a surface's delay falls in each bin; 1 on average.
+    image_contrast : float, optional
+        `contrast` of the image that these pixels are a part of; None where they are all of it.
+    pile_up : bool
+        Whether the pulses show that early photons hide later ones.
+    """
+
+    signal: Floats
+    background: Floats
+    share: Floats
+    depth: Floats
+    image_contrast: float | None = None
+    pile_up: bool = True
+
+    @cached_property
+    def typical_signal(self) -> Floats:
+        """Mean signal of the pixels that see an echo, shape (row, col)."""
+        share = self.share[1:]
+        share = share / share.sum() if share.sum() > 0 else np.full(share.size, 1 / share.size)
+        return _weighted_sum(share, self.signal[1:])
+
+    @cached_property
+    def typical_background(self) -> Floats:
+        """Mean background, shape (row, col)."""
+        return _weighted_sum(self.share, self.background)
+
+    @property
+    def contrast(self) -> float:
+        """Signal over background, both on average over the image."""
+        if self.image_contrast is not None:
+            return self.image_contrast
+        return float(self.typical_signal.mean() / self.typical_background.mean())
+
+    def of_pixels(self, pixels: NDArray[np.intp]) -> FluxModel:
+        """The light of some pixels, given as flat indices of shape (row, col)."""
+        flat = (len(self.share), -1)
+        return FluxModel(
+            self.signal.reshape(flat)[:, pixels],
+            self.background.reshape(flat)[:, pixels],
+            self.share,
+            self.depth,
+            self.contrast,
+            self.pile_up,
+        )
+
+
+class FluxPrior(NamedTuple):
+    """Flux parameters shared by all pixels of an image; with its counts they give a `FluxModel`."""
+
+    levels: Floats
+    """Signal photons per pulse, shape (level,)."""
+    share: Floats
+    """`FluxModel.share`."""
+    depth: Floats
+    """`FluxModel.depth`."""
+    background: Floats
+    """Mean background over the image, per level where the signals are not known yet."""
+    own_weight: float
+    """Share of a background's deviation from the mean that is no chance."""
+    contrast: float | None = None
+    """`FluxModel.contrast` of the image."""
+    pile_up: bool = True
+    """`FluxModel.pile_up`."""
+
+    def with_one_level(self) -> FluxPrior:
+        """The same with the mean of all signals for each of them."""
+        some = self.share[1:].sum()
+        mean = float(self.share[1:] @ self.levels[1:] / some)
+        return self._replace(levels=np.array([0.0, mean]), share=np.array([self.share[0], some]))
+
+    def model(self, total: Floats, least_background: float) -> FluxModel:
+        """The light of pixels of which the total rates are known, shape (row, col)."""
+        shape, levels = (self.levels.size, *total.shape), self.levels[:, np.newaxis, np.newaxis]
+        mean = np.broadcast_to(self.background, levels.shape)
+        if self.own_weight == 0:  # the same in all pixels: one number a level
+            background = np.broadcast_to(np.maximum(mean, least_background), shape)
+        else:
+            background = np.empty(shape)
+            for level, its_mean, filled in zip(levels, mean, background, strict=True):
+                own = its_mean + self.own_weight * (total - level - its_mean)
+                np.maximum(own, least_background, out=filled)
+        return FluxModel(
+            np.broadcast_to(levels, shape),
+            background,
+            self.share,
+            self.depth,
+            self.contrast,
+            self.pile_up,
+        )
+
+
+def _weighted_sum(weights: Floats, images: Floats) -> Floats:
+    """``Σ_i weights_i images_i``, added in this order: a BLAS product depends on the processor."""
+    total = np.zeros(images.shape[1:])
+    for weight, image in zip(weights, images, strict=True):
+        total += weight * image
+    return total
