@@ -13,21 +13,19 @@ scene and not the dice.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from numbers import Integral
 from typing import TypeVar
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.checks import require
-from core.kernels.parallel import COMPILED, KERNEL_LOCK, PARALLEL
-from core.kernels.streams import pixel_key, uniform_at
+from core.kernels.parallel import KERNEL_LOCK
+from core.kernels.simulate import SHAPE_CODES, add_echo_photons, draw_pulses, fire_once
 from core.scene import Scene, parts_of
 
 _Light = TypeVar("_Light", float, Floats)
@@ -80,7 +78,7 @@ def simulate(
     )
     if n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
         with KERNEL_LOCK:
-            _draw_pulses(triggered, n_pulses, np.uint64(seed), cube)
+            draw_pulses(triggered, n_pulses, np.uint64(seed), cube)
     else:
         _draw_multinomial(triggered, n_pulses, seed, cube)
     is_plain = set(parts_of(scene)) <= {"reflectivity"}
@@ -132,7 +130,7 @@ def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
     share = None if before is None else before / n_pulses  # of the old pulses on each new one
     cube = np.zeros_like(capture.cube)
     with KERNEL_LOCK:
-        _fire_once(capture.cube, n_pulses, np.uint64(seed), cube)
+        fire_once(capture.cube, n_pulses, np.uint64(seed), cube)
     source = f"{capture.source}; reduced to the first photons of {n_pulses} pulses, seed {seed}"
     return replace(
         capture,
@@ -258,7 +256,7 @@ def add_echo(
     samples = np.cumsum((0.0, *pulse.samples))
     share = samples / (samples[-1] or 1.0)
     bin_taus = bin_width_s / pulse.tau_s
-    _add_echo(onset_bin, signal, bin_taus, _SHAPES[pulse.shape], share, before)
+    add_echo_photons(onset_bin, signal, bin_taus, SHAPE_CODES[pulse.shape], share, before)
 
 
 def _draw_multinomial(
@@ -266,96 +264,3 @@ def _draw_multinomial(
 ) -> None:
     probability = np.diff(triggered, axis=-1, append=1.0)
     cube[:] = np.random.default_rng(seed).multinomial(n_pulses, probability)[:, :-1]
-
-
-_GAMMA, _GAUSSIAN, _MEASURED = range(3)
-_SHAPES = {"gamma": _GAMMA, "gaussian": _GAUSSIAN, "measured": _MEASURED}
-_SQRT_HALF = math.sqrt(0.5)
-
-
-@njit(**COMPILED)
-def _arrived(t, shape, share):  # type: ignore[no-untyped-def]
-    """`Pulse.cdf` at `t` time constants; of a measured pulse `share` is that at its samples."""
-    if shape == _GAUSSIAN:
-        return 0.5 * math.erfc(-t * _SQRT_HALF)
-    if t <= 0.0:
-        return 0.0
-    if shape == _GAMMA:
-        return 1.0 - (1.0 + t) * math.exp(-t)
-    if t >= share.size - 1:
-        return 1.0
-    below = int(t)
-    return share[below] + (t - below) * (share[below + 1] - share[below])
-
-
-@njit(**COMPILED)
-def _add_echo(onset_bin, signal, bin_taus, shape, share, before):  # type: ignore[no-untyped-def]
-    n_pixels, n_edges = before.shape
-    for pixel in range(n_pixels):
-        onset = onset_bin[pixel]
-        if not math.isfinite(onset):
-            continue
-        early = _arrived(-onset * bin_taus, shape, share)  # before the gate opened
-        arrived = early
-        for edge in range(n_edges):
-            # Photons never leave again, as rounding would have it where bins are tiny.
-            arrived = max(arrived, _arrived((edge - onset) * bin_taus, shape, share))
-            before[pixel, edge] += signal[pixel] * (arrived - early)
-
-
-@njit(**COMPILED)
-def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
-    """Add `n_pulses` first-photon draws to `counts`, whose last element stands for "no trigger".
-
-    ``fired_by[k]`` is the probability to have fired by the end of bin k; its last element, above 1,
-    ends every search. The guide holds, for each of its cells of ``[0, 1)``, the bin in which the
-    cell's lowest number falls. `uniform` is room for a batch of numbers: drawn apart from their
-    use, they are computed several at a time.
-    """
-    k = np.uint64(0)
-    for cell in range(guide.size):
-        while fired_by[k] <= cell / guide.size:
-            k += np.uint64(1)
-        guide[cell] = k
-    done = 0
-    while done < n_pulses:
-        batch = min(uniform.size, n_pulses - done)
-        for i in range(batch):
-            uniform[i] = uniform_at(key, done + i)
-        for i in range(batch):
-            k = np.uint64(guide[np.uint64(uniform[i] * guide.size)])
-            # One step without a jump settles nearly every draw; a mispredicted jump costs five.
-            k += np.uint64(fired_by[k] <= uniform[i])
-            while fired_by[k] <= uniform[i]:
-                k += np.uint64(1)
-            counts[k] += 1
-        done += batch
-
-
-@njit(**PARALLEL)
-def _draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-def]
-    n_pixels, n_bins = cube.shape
-    for pixel in prange(n_pixels):
-        fired_by = np.full(n_bins + 1, 2.0)
-        fired_by[:n_bins] = triggered[pixel, 1:]
-        guide = np.empty(256, np.uint32)
-        uniform = np.empty(64)
-        counts = np.zeros(n_bins + 1, np.int64)
-        _draw_pixel(fired_by, n_pulses, pixel_key(seed, pixel), guide, uniform, counts)
-        for k in range(n_bins):
-            cube[pixel, k] = counts[k]
-
-
-@njit(**PARALLEL)
-def _fire_once(photons, n_pulses, seed, fired):  # type: ignore[no-untyped-def]
-    rows, cols, n_bins = photons.shape
-    for row in prange(rows):
-        for col in range(cols):
-            key = pixel_key(seed, row * cols + col)
-            armed, draw = n_pulses, 0
-            for k in range(n_bins):
-                for _ in range(photons[row, col, k]):
-                    if uniform_at(key, draw) * n_pulses < armed:
-                        fired[row, col, k] += 1
-                        armed -= 1
-                    draw += 1

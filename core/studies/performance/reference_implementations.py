@@ -13,14 +13,8 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.kernels.parallel import COMPILED
-from core.tracking import (
-    ROUNDING_32,
-    START_BINS,
-    TrackingParameters,
-    common_weight,
-    differentiate,
-    differentiator_step,
-)
+from core.kernels.tracking import ROUNDING_32, differentiate, differentiator_step
+from core.tracking import START_BINS, TrackingParameters, common_weight
 
 Pixels = NDArray[np.floating]
 """Counts, shape (pixel, bin)."""
@@ -46,7 +40,7 @@ def numpy_over_bins(pixels: Pixels, settings: TrackingParameters) -> Pixels:
 def _numpy_step(
     x1: Pixels, x2: Pixels, s: Pixels, r: Pixels, settings: TrackingParameters
 ) -> tuple[Pixels, Pixels]:
-    """`core.tracking.differentiator_step` of many pixels."""
+    """`core.kernels.tracking.differentiator_step` of many pixels."""
     h, h0 = settings.h, settings.m * settings.h
     d = r * h0
     y = x1 - s + h0 * x2

@@ -1,0 +1,173 @@
+"""Settings of the tracking differentiators: bounds, texts and recommended presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from core.parameters import Choice, Number, Zone, check_fields, parameter
+
+Weight = Literal["cubic", "exponential", "survival", "none"]
+Start = Literal["zero", "mean"]
+SigmaFrom = Literal["gate", "before T_n"]
+
+
+# Where settings are in doubt, as ``python -m core stability`` measures it.
+CALM_M = 0.8  # chaotic below
+LINEAR = 1.0
+STEEP_ALPHA = 1.6
+FEW_BINS = 4
+
+
+@dataclass(frozen=True)
+class TrackingParameters:
+    """Settings of the dual-scale tracking differentiator; the defaults are the recommended preset.
+
+    Each field's meaning, unit and bounds are in its metadata (`core.parameters`).
+
+    Raises
+    ------
+    ValueError
+        If a value lies outside its bounds.
+    """
+
+    l: float = parameter(  # noqa: E741 - the paper's letter
+        0.004,
+        Number(
+            "l",
+            1e-4,
+            1.0,
+            log=True,
+            least=0.0,
+            most=1e6,
+            doubtful=(
+                Zone(0.0, 7e-4, "So slow a small scale leaves dim pixels without an answer."),
+                Zone(0.03, 1e6, "So fast a small scale follows the echo, too: it is lost in it."),
+            ),
+        ),
+        "Speed of the small scale, r_small = l·σ: smaller follows only the slow trend.",
+    )
+    n: float = parameter(
+        1000.0,
+        Number(
+            "n",
+            1.0,
+            1e4,
+            log=True,
+            least=0.0,
+            most=1e9,
+            doubtful=(
+                Zone(0.0, 70.0, "The scales are too much alike; at n = 1 nothing is left of them."),
+            ),
+        ),
+        "Large scale over small scale, r_large = n·r_small: larger follows the echo's jump faster.",
+    )
+    h: float = parameter(
+        1.0,
+        Number(
+            "h",
+            0.25,
+            4.0,
+            log=True,
+            least=0.0,
+            most=1e6,
+            open_below=True,
+            unit="bins",
+            doubtful=(
+                Zone(0.0, 0.42, "As too small an l: dim pixels are left without an answer."),
+                Zone(2.6, 1e6, "As too large an l: the small scale follows the echo, too."),
+            ),
+        ),
+        "Step of the integration. Only (m·h)²·l counts: h and l are one knob.",
+    )
+    m: float = parameter(
+        1.4,
+        Number(
+            "m",
+            0.4,
+            5.0,
+            least=1e-3,
+            most=1e6,
+            doubtful=(
+                Zone(1e-3, 0.5, "It never comes to rest: at ½ and below it cycles for ever."),
+                Zone(
+                    0.5,
+                    CALM_M,
+                    "Chaotic: rounding decides, and float32 finds other echoes.",
+                ),
+                Zone(
+                    CALM_M,
+                    1.0,
+                    "It smooths nothing: at 1 a pure delay, below it overshoots.",
+                ),
+            ),
+        ),
+        "Smoothing, h0 = m·h: delays by 2m - 1 bins.",
+    )
+    alpha: float = parameter(
+        0.15,
+        Number("α", 0.1, 30.0, log=True, least=0.0, most=1e6),
+        "Strength of the weight. With the cubic weight, as printed, it scales every bin alike and "
+        "cannot move a range; with the exponential weight it can.",
+    )
+    t_n: int = parameter(
+        20,
+        Number("T_n", 0, 99, whole=True, least=0, most=2**31 - 1, unit="bins"),
+        "First bin in which the residual may peak, about two bins behind the echo's onset: what "
+        "comes before is taken for noise.",
+    )
+    weight: Weight = parameter(
+        "exponential",
+        Choice("Weight", ("none", "survival", "cubic", "exponential")),
+        "What the residual is multiplied by: nothing, 1 / share of pulses still armed (undoes the "
+        "decay by pile-up), α·(k/N)³ as printed, or exp(α·(k/N)³).",
+    )
+    start: Start = parameter(
+        "mean",
+        Choice("Start", ("mean", "zero")),
+        "First value of both scales: the mean of the first five bins, or zero, whose start-up jump "
+        "T_n must hide.",
+    )
+    sigma_from: SigmaFrom = parameter(
+        "gate",
+        Choice("σ from", ("gate", "before T_n")),
+        "Bins whose standard deviation is σ: the whole gate (Eq. 6) or those before T_n "
+        "(Algorithm 1). The paper prints both.",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def joint_doubts(self) -> list[str]:
+        """Why answers are in doubt with settings that are sound one by one."""
+        linear = (self.m * self.h) ** 2 * self.l
+        found = []
+        if linear >= LINEAR:
+            found.append(
+                f"(m·h)²·l = {linear:.2g}: from about {LINEAR:g} on both scales turn linear and "
+                "move alike, which leaves little residual or none."
+            )
+        if self.weight == "exponential" and self.alpha >= STEEP_ALPHA:
+            found.append(
+                f"An exponential weight of α = {self.alpha:g}, {STEEP_ALPHA:g} or more, favours "
+                "the end of the gate over any echo before it."
+            )
+        if self.start == "zero" and self.weight != "cubic":
+            found.append(
+                "From zero both scales must first jump up to the background; only the cubic weight "
+                "hides that jump."
+            )
+        if self.sigma_from == "before T_n" and self.t_n < FEW_BINS:
+            found.append(
+                f"σ of the {self.t_n} bins before T_n, fewer than {FEW_BINS}, is chance; of one "
+                "bin or none it is 0, and nothing is answered."
+            )
+        return found
+
+
+PRESETS: dict[str, TrackingParameters] = {
+    "recommended": TrackingParameters(),
+    "as printed": TrackingParameters(
+        l=0.001, n=1000.0, h=1.0, m=1.5, alpha=1.0, t_n=20, weight="cubic", start="zero"
+    ),
+}
