@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 KERNELS := blocks capture detection estimators inspection matlab more_estimators posterior \
 	reductions simulate spatial speed tracking
 
-.PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration results field large fuzz attack clean
+.PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration results field large fuzz attack wheel clean
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
@@ -74,6 +74,9 @@ fuzz: $(VENV)/.test ## 20,000 damaged files: each is read or refused, nothing el
 
 attack: $(VENV)/.test ## requests, files and stray photons that should not take a server down
 	$(BIN)/python -m tests.attack
+
+wheel: $(VENV)/.test ## build the wheel, and install and run it on every supported Python found here
+	$(BIN)/python -m tests.wheel
 
 # Stamps: made again when what they depend on has changed.
 $(VENV)/.app: pyproject.toml constraints.txt

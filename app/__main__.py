@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import panel as pn
-from tornado.netutil import bind_sockets
 
 import core
 from app.model import text as words
@@ -31,6 +30,7 @@ from app.server import garbage as collector
 from app.server.access import TOKEN_VARIABLE, Access
 from app.server.patches import latency
 from app.server.patches.documents import keep_tracebacks, send_early_changes
+from app.server.ports import free_port, port_number
 from app.server.serve import server_of
 from app.tasks.jobs import LONG
 from app.widgets.connection import LINGER_S
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 def main(arguments: list[str] | None = None) -> int:
     """Serve until interrupted; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m app",
+        prog="firstphoton" if Path(sys.argv[0]).stem == "firstphoton" else "python -m app",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -61,6 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
         metavar="HOST[:PORT]",
         help="how browsers reach an --address that others reach; more than one is possible",
     )
+    parser.add_argument("--version", action="version", version=f"firstphoton {core.__version__}")
     parser.add_argument("--show", action="store_true", help="open a browser")
     parser.add_argument(
         "--linger",
@@ -111,22 +112,6 @@ def main(arguments: list[str] | None = None) -> int:
     server.stop()
     LONG.is_closed = True
     return 0
-
-
-def port_number(text: str) -> int:
-    """A port as the command line names it."""
-    if not (text.isdecimal() and int(text) < 2**16):
-        raise argparse.ArgumentTypeError(f"{text!r} is not accepted: give 0 to {2**16 - 1}.")
-    return int(text)
-
-
-def free_port(address: str) -> int:
-    """A port that nobody uses at present."""
-    first, *others = bind_sockets(0, address)
-    port: int = first.getsockname()[1]
-    for each in (first, *others):
-        each.close()
-    return port
 
 
 def page_for(sources: Mapping[str, Source], uploads: Uploads) -> Any:

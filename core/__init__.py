@@ -26,6 +26,8 @@ from core.warmup import warm_up
 
 light_of_whole = sampled_flux_prior  # deprecated name, to be removed after the next release
 
+__version__ = "0.1.0"
+
 __all__ = [
     "CORRECTIONS",
     "ESTIMATORS",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -130,7 +130,7 @@ def car(size: int = 64) -> Scene:
         If there is no image of that size.
     """
     require("size", size, size in (64, 256), "64 or 256")
-    with np.load(Path(__file__).resolve().parent.parent / "assets" / "car.npz") as stored:
+    with resources.files("assets").joinpath("car.npz").open("rb") as file, np.load(file) as stored:
         range_m = stored[f"range_m_{size}"].astype(float)
         pixel_angle_rad = float(stored[f"pixel_angle_rad_{size}"])
     return Scene(range_m, acquisition=_near_gate(pixel_angle_rad))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,8 @@ from urllib.error import HTTPError
 from urllib.request import urlopen
 
 from playwright.sync_api import Browser, BrowserType, Locator, Page, sync_playwright
+
+from app.server.ports import free_port
 
 VIEWS = """
 const views = [];
@@ -133,13 +134,6 @@ def fact(page: Page, name: str) -> Locator:
     """The value of a figure or of a pixel's number on the page that is shown."""
     term = page.locator("dt").filter(has_text=re.compile(f"^{re.escape(name)}$"))
     return page.locator("dl div", has=term).locator("dd").filter(visible=True)
-
-
-def free_port() -> int:
-    """A port that nothing listens at."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _gone(server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 60.0) -> None:

@@ -9,11 +9,11 @@ import panel_material_ui as pmui
 import pytest
 from tornado.httpclient import AsyncHTTPClient
 
-from app.__main__ import free_port
 from app.model import text as words
 from app.server import opening
 from app.server.access import Access
 from app.server.opening import Answers, PageHandler
+from app.server.ports import free_port
 from app.server.serve import server_of
 from app.widgets.controls import Sentence
 

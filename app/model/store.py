@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
+from importlib import resources
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -42,7 +43,7 @@ FEW_COUNTS = 2**20
 FEW_S = 0.25
 """Estimated time of what is ranged on the page's own thread at most; some times what it takes."""
 
-ASSETS = Path(__file__).resolve().parents[2] / "assets"
+ASSETS = Path(str(resources.files("assets")))
 
 
 @dataclass(frozen=True)

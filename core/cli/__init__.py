@@ -6,7 +6,9 @@ import argparse
 import io
 import os
 import sys
+from pathlib import Path
 
+import core
 from core.cli import ablation as requires
 from core.cli import captures, studies
 from core.cli import sensitivity as stability
@@ -23,9 +25,12 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack letters of a file name
             stream.reconfigure(errors="backslashreplace")
     parser = argparse.ArgumentParser(
-        prog="python -m core",
+        prog="firstphoton-core"
+        if Path(sys.argv[0]).stem == "firstphoton-core"
+        else "python -m core",
         description="First-photon lidar without a screen: capture files in, ranges out.",
     )
+    parser.add_argument("--version", action="version", version=f"firstphoton {core.__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
     captures.add(commands)
     studies.add(commands)

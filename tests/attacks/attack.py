@@ -19,7 +19,8 @@ from typing import IO, Any
 
 import psutil
 
-from tests.browser import ROOT, free_port, when_up
+from app.server.ports import free_port
+from tests.browser import ROOT, when_up
 from tests.load import Hand
 from tests.wire import Wire
 

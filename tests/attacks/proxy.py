@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from tests.browser import free_port
+from app.server.ports import free_port
 
 
 class Proxy:

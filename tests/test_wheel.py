@@ -1,0 +1,72 @@
+"""The wheel, installed outside the checkout; ``make wheel`` installs all dependencies, too."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from zipfile import ZipFile
+
+import pytest
+
+import core
+from tests.browser import ROOT
+from tests.wheel import (
+    SUPPORTED,
+    build,
+    describe_sample,
+    install,
+    outside,
+    pythons,
+    run,
+    start_page,
+)
+
+VERSION = f"firstphoton {core.__version__}"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("wheel"))
+
+
+def test_the_wheel_has_types_and_data_and_no_tests(wheel):
+    names = ZipFile(wheel).namelist()
+    assert {"core/py.typed", "app/py.typed", "assets/car.npz"} <= set(names)
+    assert not [name for name in names if "tests" in name or name.endswith((".png", ".md"))]
+
+
+def test_the_installed_wheel_describes_the_sample_and_serves_the_app(wheel, tmp_path):
+    commands = install(wheel, sys.executable, tmp_path / "env", dependencies=False)
+    # The dependencies of the tests; their .pth files, which name the checkout, are not followed.
+    (packages,) = commands.parent.glob("lib/python*/site-packages")
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    _take_compiled_kernels(packages / "core")
+    assert run(commands / "firstphoton", "--version") == VERSION
+    assert "Sample capture" in describe_sample(commands)
+    assert "<title>firstphoton</title>" in start_page(commands)
+
+
+def _take_compiled_kernels(installed):
+    """Copy numba's cache of the checkout, which is valid for sources of the same size and time."""
+    for source in installed.rglob("*.py"):
+        original = ROOT / "core" / source.relative_to(installed)
+        os.utime(source, (original.stat().st_atime, original.stat().st_mtime))
+    for cached in (ROOT / "core").rglob("__pycache__/*.nb?"):
+        copy = installed / cached.relative_to(ROOT / "core")
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copy2(cached, copy)
+
+
+@pytest.mark.parametrize("version", SUPPORTED)
+def test_every_python_of_this_machine_accepts_the_wheel(wheel, version, tmp_path):
+    """Only metadata and syntax: the dependencies are installed for one Python."""
+    found = pythons()
+    if version not in found:
+        pytest.skip(f"Python {version} is not on this machine")
+    commands = install(wheel, found[version], tmp_path / "env", dependencies=False)
+    (packages,) = commands.parent.glob("lib/python*/site-packages")
+    compiling = [commands / "python", "-m", "compileall", "-q", packages]
+    subprocess.run(compiling, env=outside(), check=True)
