@@ -27,7 +27,9 @@ from app.plots import elements as plots
 from app.tasks.jobs import Effort, LatestWins
 from app.theme import DARK, LIGHT, OUTSIDE_COLOR
 from app.widgets.controls import Knob, SettingsPanel
-from app.widgets.views import ImageView, Plot, SignalPlots
+from app.widgets.figures import Plot
+from app.widgets.image_view import ImageView
+from app.widgets.signal_plots import SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
 from core.parameters import Number, spec_of
 from core.reductions import Reduction

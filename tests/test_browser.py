@@ -14,10 +14,10 @@ from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
 import core
+from app.model.mesh import point_cloud
 from app.model.state import Illumination
 from app.model.store import built_in_sources
 from app.theme import DARK, LIGHT, RANGE_COLORS, WRONG_COLOR
-from app.widgets.cloud import point_cloud
 from core import PRESETS, TrackingParameters
 from core.io.readers.npz import FORMAT
 from tests.browser import eventually, fact, serving

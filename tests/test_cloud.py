@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from app.model.mesh import pixel_index, point_cloud, spacing_m, view_bounds
 from app.theme import palette
-from app.widgets.cloud import PointCloud, pixel_index, point_cloud, spacing_m, view_bounds
+from app.widgets.cloud import PointCloud
 from core.geometry import sight_lines
 
 ANGLE = 2e-3

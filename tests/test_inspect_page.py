@@ -20,8 +20,8 @@ from app.pages.inspect.views import ENOUGH_CORNERS, corners_of, rectangle
 from app.pages.layout import Layout
 from app.pages.session import Session
 from app.pages.shared.downloads import Download
-from app.plots.gate import scale
 from app.theme import DARK
+from app.units import scale
 from core import Acquisition, coates_rate, inspection, tracking_signals
 from core.tests.captures import real_capture_path
 from tests.browser import eventually

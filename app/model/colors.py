@@ -10,10 +10,10 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
+from app.model.mesh import point_cloud
 from app.model.state import Viewing
 from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS, OUTSIDE_COLOR, RANGE_COLORS
-from app.widgets.cloud import point_cloud
 from core import inspection
 
 Array = NDArray[Any]

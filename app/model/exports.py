@@ -22,8 +22,8 @@ from app.model.large import Grid
 from app.model.state import UNITS, Viewing
 from app.model.store import Answer
 from app.model.text import Fact
-from app.plots.gate import TITLES, scale
 from app.theme import WRONG_COLOR
+from app.units import AXIS_TITLES, scale
 from core import Acquisition
 from core.io.writers import WRITERS, Plane, Product, write_columns
 from core.studies.outputs import Table, as_csv
@@ -74,7 +74,7 @@ def drawn(figure: Any, acquisition: Acquisition | None = None) -> dict[str, Arra
     else:
         along = {unit: scale(unit, acquisition) for unit in UNITS}
         columns = {
-            TITLES[unit]: each.origin + each.step * places.astype(float)
+            AXIS_TITLES[unit]: each.origin + each.step * places.astype(float)
             for unit, each in along.items()
         }
     for name in dict.fromkeys(name for _, curves in groups.values() for name in curves):

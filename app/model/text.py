@@ -9,7 +9,7 @@ from concurrent.futures import BrokenExecutor
 import numpy as np
 
 from app.model.store import Answer, Pixel
-from app.plots.gate import scale
+from app.units import scale
 from core.studies.ablation.criterion import TITLES
 
 Fact = tuple[str, str, str]

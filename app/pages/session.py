@@ -33,7 +33,8 @@ from app.tasks.turns import TURNS, Soon
 from app.theme import WRONG_COLOR, palette
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import FACTS_PX, HEADLINE_PX, Facts, PixelKeys
-from app.widgets.views import ImageView, SignalPlots
+from app.widgets.image_view import ImageView
+from app.widgets.signal_plots import SignalPlots
 from core.inspection import pixels_in
 
 log = logging.getLogger(__name__)

@@ -1,6 +1,6 @@
 """Plots as pure functions: arrays in, HoloViews elements or Bokeh figures out.
 
-They are declared once. When values change, `app.widgets.views` writes the changed columns to the
+They are declared once. When values change, `app.widgets.figures` writes the changed columns to the
 rendered plots: building a plot again would take ten times as long as drawing it.
 """
 

@@ -5,9 +5,7 @@ Data stay in bins; only what is written at a position changes with the unit.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from bokeh.models import (
@@ -18,12 +16,8 @@ from bokeh.models import (
     LinearAxis,
 )
 
+from app.units import AXIS_TITLES, OPPOSITE_UNIT, scale
 from core import Acquisition
-
-COMPLEMENT = {"bins": "m", "ns": "m", "m": "bins"}
-"""What stands on the opposite axis."""
-
-TITLES = {"bins": "Bin", "ns": "Time (ns)", "m": "Range (m)"}
 
 # Ticks at 1, 2, 2.5 or 5 times a power of ten in the unit, and where these are in bins.
 TICKS = """
@@ -50,45 +44,6 @@ return (origin + step * tick).toFixed(decimals);
 """
 
 
-@dataclass(frozen=True)
-class Scale:
-    """A unit along a gate: ``origin + step * bin``."""
-
-    name: str
-    origin: float
-    step: float
-
-    def at(self, position_bin: float) -> float:
-        """A position in the unit."""
-        return self.origin + self.step * position_bin
-
-    @property
-    def decimals(self) -> int:
-        """Of a position: as many as show about a hundredth of a bin."""
-        return max(0, 2 - math.floor(math.log10(self.step)))
-
-    def number(self, position_bin: float) -> str:
-        """A position without its unit; a dash where there is none."""
-        known = math.isfinite(position_bin)
-        return f"{self.at(position_bin):,.{self.decimals}f}" if known else "–"
-
-    def place(self, position_bin: float) -> str:
-        """A position in words; a dash where there is none."""
-        number = self.number(position_bin)
-        if number == "–":
-            return number
-        return f"bin {number}" if self.name == "bins" else f"{number} {self.name}"
-
-
-def scale(unit: str, acquisition: Acquisition) -> Scale:
-    """A unit of `app.model.state.UNITS` along the gate of an acquisition."""
-    if unit == "bins":
-        return Scale(unit, 0.0, 1.0)
-    if unit == "ns":
-        return Scale(unit, acquisition.gate_delay_s * 1e9, acquisition.bin_width_s * 1e9)
-    return Scale(unit, float(acquisition.bin_to_range_m(0)), acquisition.bin_length_m)
-
-
 class GateAxes:
     """Both horizontal axes of a plot over bins: the unit below, its complement above.
 
@@ -113,12 +68,12 @@ class GateAxes:
 
     def follow(self, unit: str, acquisition: Acquisition) -> None:
         """Take on another unit or gate."""
-        for axis, name in zip(self._axes, (unit, COMPLEMENT[unit]), strict=False):
+        for axis, name in zip(self._axes, (unit, OPPOSITE_UNIT[unit]), strict=False):
             along = scale(name, acquisition)
             args = {"origin": along.origin, "step": along.step, "name": name}
             if axis.formatter.args != args:
                 axis.ticker.args = axis.formatter.args = args
-            axis.axis_label = TITLES[name]
+            axis.axis_label = AXIS_TITLES[name]
 
 
 # What stands where the pointer is: the bin's own number, the place of its middle, or a curve there.

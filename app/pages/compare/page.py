@@ -15,6 +15,8 @@ import panel_material_ui as pmui
 from app.model.colors import cloud_of, image_of
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import cloud_files, facts_file, image_files, plot_file, shown_table_file
+from app.model.mesh import view_bounds
+from app.model.methods import method_title
 from app.model.state import CLOUDS, KINDS, Comparison, Viewing
 from app.model.store import Answer
 from app.pages.compare import text as ranking_words
@@ -49,17 +51,9 @@ from app.pages.shared.downloads import (
 from app.tasks.jobs import LatestWins
 from app.theme import method_style, palette
 from app.widgets.cards import card, part
-from app.widgets.cloud import view_bounds
 from app.widgets.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table
-from app.widgets.method_views import (
-    CurvePlot,
-    Picture,
-    ReliabilityPlot,
-    ScaleBar,
-    Style,
-    answer_bin,
-    title_of,
-)
+from app.widgets.method_picture import Picture, ScaleBar
+from app.widgets.method_plots import CurvePlot, ReliabilityPlot, Style
 from core import ESTIMATORS
 from core.estimators import FALSE_ALARM
 
@@ -146,7 +140,7 @@ class Compare:
         chosen = self._chosen
         self._picks = pmui.CheckBoxGroup(
             label="Methods to compare",
-            options={title_of(method): method for method in ESTIMATORS},
+            options={method_title(method): method for method in ESTIMATORS},
             value=list(chosen.methods),
             sizing_mode="stretch_width",
             margin=(0, 8),
@@ -457,7 +451,7 @@ class Compare:
             what = f"{kind} image"
         subject = ranged(self._session, answer, method, self._tasks[method].settings)
         subject = viewed(self._session, subject, viewing)
-        return Shown(subject, what.lower(), files, title_of(method), look)
+        return Shown(subject, what.lower(), files, method_title(method), look)
 
     def _curves_shown(self) -> Shown:
         table = plot_file(self._curves.pane.object, self._capture.acquisition)
@@ -508,7 +502,7 @@ class Compare:
             for picture, button, method in zip(
                 self._pictures, self._buttons, methods, strict=False
             ):
-                picture.title.text = button.what = title_of(method)
+                picture.title.text = button.what = method_title(method)
                 button.offer(CLOUD if clouds else IMAGE)
                 picture.dim(method not in answers)
                 picture.resize(CLOUD_HEIGHT if clouds else IMAGE_HEIGHT)
@@ -521,7 +515,7 @@ class Compare:
     def _draw_cloud(self, picture: Picture, method: str, answer: Answer) -> None:
         cloud, rgb, wrong = cloud_of(answer, "Range", self._chosen.viewing)
         view = picture.show_cloud(self._dark)
-        view.label = f"Point cloud: {title_of(method)}. Arrow keys turn all clouds together."
+        view.label = f"Point cloud: {method_title(method)}. Arrow keys turn all clouds together."
         view.draw(cloud, rgb, wrong, scene_id=self._scene_id, bounds=self._bounds)
 
     def _make_pictures(self, count: int) -> None:
@@ -591,7 +585,7 @@ class Compare:
         with pn.io.hold(self._session.page):
             self._curves.update(
                 {method: curve for method, curve in curves.items() if method in answers},
-                {method: answer_bin(each, *pixel) for method, each in answers.items()},
+                {method: float(each.run.image.bin[pixel]) for method, each in answers.items()},
                 float(acquisition.range_m_to_bin(truth)),
                 acquisition,
                 self._styles(),

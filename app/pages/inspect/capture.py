@@ -32,12 +32,12 @@ from app.pages.shared.downloads import (
 from app.pages.shared.studies import Study
 from app.plots import elements as plots
 from app.plots import inspect as inspector_plots
-from app.plots.gate import scale
 from app.tasks.jobs import LatestWins, Step
 from app.theme import palette
+from app.units import scale
 from app.widgets.cards import button
 from app.widgets.controls import Facts, Knob, Sentence
-from app.widgets.views import cover, pane_of
+from app.widgets.figures import cover, pane_of
 from core.inspection import Accuracy, CaptureReport
 from core.parameters import Number, spec_of
 

@@ -31,7 +31,7 @@ from app.plots import inspect as inspector_plots
 from app.tasks.jobs import LatestWins
 from app.theme import palette
 from app.widgets.controls import Sentence, Table
-from app.widgets.views import cover, pane_of
+from app.widgets.figures import cover, pane_of
 
 
 class Pins:

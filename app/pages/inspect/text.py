@@ -10,7 +10,7 @@ from app.model.large import Grid
 from app.model.store import Answer
 from app.model.text import Fact, number, share
 from app.pages.inspect.results import Seen
-from app.plots.gate import COMPLEMENT, TITLES, Scale, scale
+from app.units import AXIS_TITLES, OPPOSITE_UNIT, Scale, scale
 from core.inspection import Accuracy, Candidate, CaptureReport, FluxEstimate
 from core.metrics import Interval
 
@@ -142,7 +142,7 @@ def remark(seen: Seen) -> str:
 
 def candidate_columns(unit: str) -> list[Sequence[Any]]:
     """Titles, help and order of the candidates' columns."""
-    place = (TITLES[unit], "Where it lies along the gate, the estimator's lag removed.", 1)
+    place = (AXIS_TITLES[unit], "Where it lies along the gate, the estimator's lag removed.", 1)
     return [("Rank", "By the score.", 1), place, *CANDIDATE_COLUMNS]
 
 
@@ -164,14 +164,14 @@ def candidate_rows(candidates: Sequence[Candidate], along: Scale, other: Scale) 
 def both_scales(unit: str, answer: Answer) -> tuple[Scale, Scale]:
     """The unit along the gate, and what complements it."""
     acquisition = answer.capture.acquisition
-    return scale(unit, acquisition), scale(COMPLEMENT[unit], acquisition)
+    return scale(unit, acquisition), scale(OPPOSITE_UNIT[unit], acquisition)
 
 
 def pin_columns(unit: str) -> list[Sequence[Any]]:
     """Titles, help and order of the pins' columns."""
     return [
         ("Pixel", "Row and column.", 1),
-        (TITLES[unit], "The estimate along the gate.", 1),
+        (AXIS_TITLES[unit], "The estimate along the gate.", 1),
         ("Sure", "Confidence: probability of a surface within 3 bins of the estimate.", -1),
         ("SBR", "Signal over background; below, its 95 % interval.", -1),
         ("Verdict", "Whether the pixel is hot or dead.", 1),

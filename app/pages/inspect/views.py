@@ -25,7 +25,8 @@ from app.plots import elements as plots
 from app.plots import inspect as inspector_plots
 from app.plots.gate import GateAxes, GateReadOut
 from app.theme import Palette
-from app.widgets.views import ImageView, Layers, cover, paint_frame, pane_of, round_up
+from app.widgets.figures import Layers, cover, paint_frame, pane_of, round_up
+from app.widgets.image_view import ImageView
 from core import Acquisition
 
 Array = NDArray[Any]

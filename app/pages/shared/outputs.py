@@ -17,6 +17,7 @@ from app.model.colors import Look
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import image_file, plot_file, table_file
 from app.model.large import Grid
+from app.model.methods import METHOD_TITLES
 from app.model.text import NOT_COMPUTED, number
 from app.pages.paper.text import (
     COLUMN_HELP,
@@ -31,8 +32,8 @@ from app.plots import elements as plots
 from app.theme import LIGHT, RANGE_COLORS, Palette
 from app.widgets.cards import card
 from app.widgets.controls import Knob, Sentence, Table
-from app.widgets.method_views import TITLES, ScaleBar
-from app.widgets.views import Layers, paint_frame, pane_of, round_up
+from app.widgets.figures import Layers, paint_frame, pane_of, round_up
+from app.widgets.method_picture import ScaleBar
 from core.parameters import Number
 from core.studies import outputs as items
 
@@ -340,4 +341,4 @@ def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]
 
 
 def _name(text: Any) -> str:
-    return (TITLES | TITLES_OF_PRESETS).get(text, spelled(str(text)))
+    return (METHOD_TITLES | TITLES_OF_PRESETS).get(text, spelled(str(text)))

@@ -26,7 +26,7 @@ from app.plots import elements as plots
 from app.theme import LIGHT, method_style, palette
 from app.widgets.cards import card, part
 from app.widgets.controls import Sentence, SettingsPanel, Table
-from app.widgets.views import paint_frame, pane_of
+from app.widgets.figures import paint_frame, pane_of
 from core import ESTIMATORS
 from core.cost import predicted
 from core.metrics import Interval

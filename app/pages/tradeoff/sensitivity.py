@@ -7,6 +7,7 @@ from functools import partial
 
 import panel as pn
 
+from app.model.methods import METHOD_TITLES
 from app.pages.navigation import View
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject
@@ -17,13 +18,12 @@ from app.tasks.jobs import Step
 from app.theme import palette
 from app.widgets.cards import part
 from app.widgets.controls import SettingsPanel
-from app.widgets.method_views import TITLES
 from core.parameters import Choice, Number, check_fields, parameter
 from core.studies.sensitivity.page import ranges_table, setting_plot
 from core.studies.sensitivity.sweep import Sweep, along, numbers, setting_sweep
 
 SWEPT = tuple(dict.fromkeys(method for method, *_ in numbers()))
-METHODS = {TITLES[method]: method for method in SWEPT}
+METHODS = {METHOD_TITLES[method]: method for method in SWEPT}
 
 CARDS = """
 :host {{ display: grid !important; gap: 8px; flex: none !important; height: {wide}px !important;
@@ -40,7 +40,7 @@ class Swept:
     """Which method's settings are swept."""
 
     method: str = parameter(
-        TITLES["tracking"], Choice("Method", tuple(METHODS)), trust_words.METHOD_HELP
+        METHOD_TITLES["tracking"], Choice("Method", tuple(METHODS)), trust_words.METHOD_HELP
     )
 
     def __post_init__(self) -> None:

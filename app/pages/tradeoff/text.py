@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from app.widgets.method_views import TITLES
+from app.model.methods import METHOD_TITLES
 from core.metrics import Interval
 from core.studies.tradeoff.measure import Candidate, Point
 from core.studies.tradeoff.pareto import Recommendation
@@ -61,7 +61,7 @@ COLUMNS = (
 
 def name_of(candidate: Candidate) -> str:
     """A way to range, as one reads it."""
-    title = TITLES[candidate.method.estimator]
+    title = METHOD_TITLES[candidate.method.estimator]
     reduction = str(candidate.reduction)
     return title if reduction == "whole" else f"{title}, {reduction}"
 

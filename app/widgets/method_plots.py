@@ -1,142 +1,29 @@
-"""Viewers of several methods at once: one picture each, their common scale, curves, reliability."""
+"""Plots that compare methods: scores along the gate of a pixel, and reliability."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import panel as pn
-from bokeh.models import BasicTicker, ColorBar, LegendItem, LinearColorMapper, Range1d
-from bokeh.plotting import figure
+from bokeh.models import BasicTicker, LegendItem, Range1d
 from numpy.typing import NDArray
 
-from app.model.colors import Look
-from app.model.store import Answer
+from app.model.methods import METHOD_TITLES
 from app.plots import elements as plots
 from app.plots.gate import GateAxes
-from app.theme import LIGHT, WRONG_COLOR, Palette
-from app.widgets.cloud import PointCloud
-from app.widgets.controls import Sentence
-from app.widgets.views import ImageView, Plot, paint_frame, pane_of
-from core import ESTIMATORS, Acquisition
+from app.theme import LIGHT, Palette
+from app.widgets.figures import Plot, paint_frame, pane_of
+from core import Acquisition
 
 Array = NDArray[Any]
 
-TITLES = {method: estimator.title for method, estimator in ESTIMATORS.items()}
 
 Style = tuple[str, list[int]]
 """Colour and dashes of a method's line."""
 
-PICTURE = """
-:host { display: flex !important; flex-direction: column; min-width: 0; overflow: hidden;
-  height: 100% !important;
-  border: 1px solid var(--mui-palette-divider, #d5dbe2); border-radius: 8px;
-  background: var(--mui-palette-background-paper, #fff); transition: opacity 0.2s 0.25s; }
-"""
-
-# Titles of one line and of three: the pictures below them stand at one height.
-TITLE = ":host { flex: 1 !important } .note { font-weight: 600 }"
-CAPTION = ".note { white-space: nowrap; overflow: hidden; text-overflow: ellipsis }"
-
 LOWEST_SCORE = -1.0
 """Of the scale that runs from a curve's median, 0, to its maximum, 1: what lies lower is cut."""
-
-
-class Picture:
-    """One method's image, or its cloud, with a line on the pixel below it.
-
-    Parameters
-    ----------
-    tapped : callable
-        Called with the row and column of a tapped pixel of the image.
-    picked : callable
-        Called with the flat index of a tapped point of the cloud.
-    """
-
-    def __init__(
-        self, tapped: Callable[[int, int], None], picked: Callable[[int], None], height: int
-    ) -> None:
-        self.image = ImageView(tapped)
-        self.cloud: PointCloud | None = None
-        # On the right there is room for a download button.
-        self.title = Sentence(
-            stylesheets=[TITLE], sizing_mode="stretch_width", margin=(4, 30, 0, 8)
-        )
-        self.caption = Sentence(
-            stylesheets=[CAPTION], sizing_mode="stretch_width", margin=(0, 8, 4, 8)
-        )
-        self._picked = picked
-        self._stage = pn.Column(self.image.pane, sizing_mode="stretch_width", margin=0)
-        self.card = pn.Column(
-            self.title,
-            self._stage,
-            self.caption,
-            stylesheets=[PICTURE],
-            sizing_mode="stretch_width",
-            margin=0,
-        )
-        self.resize(height)
-
-    def draw_image(self, values: Array, look: Look) -> None:
-        """Show an image (row, col) on the common scale, in place of the cloud."""
-        self.image.pane.visible = True
-        if self.cloud is not None:
-            self.cloud.visible = False
-        self.image.update(values, replace(look, title=""))
-
-    def resize(self, height: int) -> None:
-        """Make picture and cloud this high."""
-        self._stage.height = height
-
-    def dim(self, is_outdated: bool) -> None:
-        """Draw what is still to be replaced faintly."""
-        self.card.styles = {"opacity": "0.35" if is_outdated else "1"}
-
-    def show_cloud(self, dark: bool) -> PointCloud:
-        """Put the cloud in place of the image; it is made when it is first asked for."""
-        if self.cloud is None:
-            self.cloud = PointCloud(
-                wrong_color=WRONG_COLOR, link="methods", dark=dark, sizing_mode="stretch_both"
-            )
-            self.cloud.param.watch(lambda event: self._picked(event.new), "selected")
-            self._stage.append(self.cloud)
-        self.image.pane.visible, self.cloud.visible = False, True
-        return self.cloud
-
-
-class ScaleBar:
-    """The one colour scale of several pictures."""
-
-    def __init__(self) -> None:
-        # A colour bar needs a figure to stand in; nothing is drawn in this one.
-        self.figure = figure(
-            height=52,
-            sizing_mode="stretch_width",
-            toolbar_location=None,
-            x_range=Range1d(0, 1),
-            y_range=Range1d(0, 1),
-        )
-        self.figure.scatter([], [])
-        self.figure.axis.visible = self.figure.grid.visible = False
-        self.figure.min_border_left = self.figure.min_border_right = 16
-        self._mapper = LinearColorMapper(palette=["#000000"], low=0.0, high=1.0)
-        self._bar = ColorBar(
-            color_mapper=self._mapper, height=9, padding=0, title_standoff=3, label_standoff=3
-        )
-        self.figure.add_layout(self._bar, "below")
-        self.pane = pane_of(self.figure)
-        self.pane.sizing_mode = "stretch_width"
-
-    def update(self, look: Look) -> None:
-        """Show another scale."""
-        self._mapper.update(low=look.low, high=look.high, palette=look.colors)
-        self._bar.title = look.legend
-
-    def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
-        paint_frame(self.figure, colors)
 
 
 class Lines:
@@ -153,7 +40,7 @@ class Lines:
         self.source.data = {
             "xs": [x.astype(np.float32) for x, _ in lines.values()],
             "ys": [y.astype(np.float32) for _, y in lines.values()],
-            "title": [TITLES[method] for method in lines],
+            "title": [METHOD_TITLES[method] for method in lines],
             "color": [styles[method][0] for method in lines],
             "dash": [styles[method][1] or "solid" for method in lines],
         }
@@ -248,13 +135,3 @@ class ReliabilityPlot:
         """Take on the colours of the mode; those of the lines come with `update`."""
         paint_frame(self._plot.figure, colors)
         self._plot.layers["honest"]["glyph"].line_color = colors.muted
-
-
-def title_of(method: str) -> str:
-    """A method's name; of a reconstruction, marked as such."""
-    return TITLES[method] + (" (reconstruction)" if ESTIMATORS[method].reconstructed else "")
-
-
-def answer_bin(answer: Answer, row: int, col: int) -> float:
-    """Where a method puts a pixel's echo; NaN where it does not answer."""
-    return float(answer.run.image.bin[row, col])

@@ -1,0 +1,133 @@
+"""Rendered figures whose data are updated in place, and their colours, panes and axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import bokeh.models
+import holoviews as hv
+import numpy as np
+import panel as pn
+from bokeh.events import DoubleTap
+from bokeh.models import ColorBar, CustomJS, Range1d
+from numpy.typing import ArrayLike
+
+from app.theme import STYLES, Palette
+
+
+class Layers:
+    """A figure that stays; new values go into the sources of its layers.
+
+    Parameters
+    ----------
+    figure : bokeh.plotting.figure
+    layers : mapping
+        Of each layer the "source", the "glyph" and the "glyph_renderer".
+    """
+
+    def __init__(self, figure: Any, layers: Mapping[str, Mapping[str, Any]]) -> None:
+        self.figure = figure
+        self.layers = layers
+        reset = CustomJS(args={"figure": self.figure}, code="figure.reset.emit()")
+        self.figure.js_on_event(DoubleTap, reset)
+
+    def source(self, layer: str) -> Any:
+        """The data source of a layer."""
+        return self.layers[layer]["source"]
+
+    def write(self, layer: str, **columns: ArrayLike) -> None:
+        """Replace columns of a layer; only what changed travels, as float32."""
+        data = self.source(layer).data
+        new = {name: np.asarray(values, np.float32) for name, values in columns.items()}
+        new = {n: v for n, v in new.items() if not np.array_equal(data[n], v, equal_nan=True)}
+        if new:
+            data.update(new)
+
+    def show(self, layer: str, visible: bool) -> None:
+        """Draw a layer, and its line in the legend, or leave them out."""
+        renderer = self.layers[layer]["glyph_renderer"]
+        if renderer.visible == visible:
+            return
+        renderer.visible = visible
+        for legend in self.figure.legend:
+            for item in legend.items:
+                if renderer in item.renderers:
+                    item.visible = visible
+
+
+class Plot(Layers):
+    """A HoloViews overlay, rendered once.
+
+    Parameters
+    ----------
+    overlay : hv.Overlay
+    layers : sequence of str
+        A palette's name for each element of the overlay, in their order.
+    """
+
+    def __init__(self, overlay: hv.Overlay, layers: Sequence[str]) -> None:
+        rendered = hv.renderer("bokeh").get_plot(overlay)
+        handles = [each.handles for each in rendered.subplots.values()]
+        super().__init__(rendered.state, dict(zip(layers, handles, strict=True)))
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        paint_frame(self.figure, colors)
+        for layer, handles in self.layers.items():
+            glyph, color = handles["glyph"], getattr(colors, layer)
+            glyph.line_color = color
+            if hasattr(glyph, "fill_color"):
+                glyph.fill_color = color
+
+
+def paint_frame(figure: Any, colors: Palette) -> None:
+    """Colours of all that surrounds the data."""
+    figure.title.text_color = colors.text
+    for axis in figure.axis:
+        axis.axis_label_text_color = axis.major_label_text_color = colors.muted
+        axis.axis_line_color = axis.major_tick_line_color = colors.muted
+    figure.grid.grid_line_color = colors.grid
+    for legend in figure.legend:
+        legend.label_text_color = colors.text
+        legend.background_fill_color = legend.inactive_fill_color = colors.paper
+    for bar in color_bars(figure):
+        bar.title_text_color = bar.major_label_text_color = colors.muted
+
+
+def color_bars(figure: Any) -> list[ColorBar]:
+    """Of a figure, below it or at its right side."""
+    return [each for each in (*figure.below, *figure.right) if isinstance(each, ColorBar)]
+
+
+def pane_of(figure: Any) -> pn.pane.Bokeh:
+    """A place that the figure fills."""
+    for renderer in figure.renderers:
+        # How a line would look if it were chosen, or others were: nothing is chosen in a plot.
+        renderer.update(selection_glyph=None, nonselection_glyph=None, muted_glyph=None)
+    for model in (figure, figure.title, *figure.axis, *figure.legend, *color_bars(figure)):
+        for kind, sizes in STYLES.items():
+            if isinstance(model, getattr(bokeh.models, kind)):
+                model.update(**sizes)
+    return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
+
+
+def cover(bins: Range1d, n_bins: int) -> bool:
+    """Let an axis show a whole gate, whatever it was zoomed to; whether that was another gate."""
+    if n_bins == bins.reset_end:
+        return False
+    bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
+    return True
+
+
+def round_up(value: float) -> float:
+    """The next of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten: an axis that rests."""
+    if value <= 0.0:
+        return 0.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(
+        step * power
+        for step in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 12)
+        if step * power >= value
+    )

@@ -1,0 +1,117 @@
+"""An image in which a tap selects a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from bokeh.events import Tap
+from bokeh.models import BoxZoomTool, CustomJS, DataRange1d
+from numpy.typing import NDArray
+
+from app.model.colors import Look
+from app.model.large import Grid
+from app.plots import elements as plots
+from app.theme import Palette
+from app.widgets.figures import Plot, color_bars, paint_frame, pane_of
+
+Array = NDArray[Any]
+
+
+class ImageView:
+    """The image to navigate by; a tap chooses a pixel.
+
+    Parameters
+    ----------
+    tapped : callable
+        Called with the row and column of a tapped pixel.
+    """
+
+    def __init__(self, tapped: Callable[[int, int], None]) -> None:
+        self._plot = Plot(
+            plots.range_image(np.zeros((2, 2)), 0.0, 1.0), ("picture", "shadow", "frame")
+        )
+        self._shape, self._grid = (0, 0), Grid()
+        self._look: Look | None = None
+        self.figure = self._plot.figure
+        self.pane = pane_of(self.figure)
+        self.figure.match_aspect = True
+        self.figure.x_range = DataRange1d(range_padding=0, renderers=[])
+        self.figure.y_range = DataRange1d(range_padding=0, flipped=True, renderers=[])
+        picture = self._plot.layers["picture"]
+        for ranges in (self.figure.x_range, self.figure.y_range):
+            ranges.renderers = [picture["glyph_renderer"]]
+        for layer in ("shadow", "frame"):  # which move more often than the picture below changes
+            self._plot.layers[layer]["glyph_renderer"].level = "overlay"
+        self._mapper = picture["color_mapper"]
+        (self._bar,) = color_bars(self.figure)
+        (zoom,) = self.figure.select(BoxZoomTool)
+        zoom.match_aspect = True
+        # HoloViews adds others, of which Bokeh takes the first.
+        self.figure.toolbar.active_drag = zoom
+
+        def tap(event: Tap) -> None:
+            row, col = self._grid.pixel(event.y, event.x)
+            if 0 <= row < self._shape[0] and 0 <= col < self._shape[1]:
+                tapped(row, col)
+
+        self.figure.on_event(Tap, tap)
+        reset = CustomJS(args={"figure": self.figure}, code="figure.reset.emit()")
+        self.figure.js_on_change("tags", reset)
+
+    def join(self, first: ImageView) -> None:
+        """Become one of several side by side, with one view, and one scale that stands by them."""
+        self._bar.visible = False
+        self.figure.xaxis.axis_label = self.figure.yaxis.axis_label = None
+        if first is self:
+            return
+        for name in ("x_range", "y_range"):
+            shared = getattr(first.figure, name)
+            shared.renderers = [*shared.renderers, *getattr(self.figure, name).renderers]
+            setattr(self.figure, name, shared)
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        paint_frame(self.figure, colors)
+
+    def fit(self, rows: int, cols: int, grid: Grid) -> None:
+        """Make room for an image of other pixels; for one of the same, the zoom stays."""
+        if ((rows, cols), grid) != (self._shape, self._grid):
+            self.enter(rows, cols, grid)
+
+    def enter(self, rows: int, cols: int, grid: Grid) -> None:
+        """Make room for another image, blank so far."""
+        self._shape, self._grid = (rows, cols), grid
+        blank = [np.full((rows, cols), np.nan, np.float32)]
+        left, above, *_ = plots.pixel_frame(*grid.place(0, 0), grid.step / 2)
+        size = {"dw": [cols * grid.step], "dh": [rows * grid.step]}
+        self._plot.source("picture").data = {"image": blank, "x": [left], "y": [above], **size}
+        self.figure.tags = [*grid.first, grid.step, rows, cols]  # which ends a zoom
+
+    def update(self, image: Array, look: Look) -> None:
+        """Show an image (row, col); NaN is left blank."""
+        self._plot.source("picture").data["image"] = [np.asarray(image, np.float32)]
+        if look == self._look:
+            return  # Bokeh would look at every single colour again
+        self._look = look
+        self._mapper.update(
+            low=look.low,
+            high=look.high,
+            palette=look.colors,
+            low_color=look.outside,
+            high_color=look.outside,
+        )
+        self._bar.title = look.unit
+        self.figure.title.text = look.title
+
+    @property
+    def half_frame(self) -> float:
+        """Half the side of a frame, in pixels of the file: it is seen in a large image, too."""
+        return max(1.5, 0.014 * max(self._shape)) * self._grid.step
+
+    def mark(self, row: int, col: int) -> None:
+        """Frame a pixel."""
+        left, bottom, right, top = plots.pixel_frame(*self._grid.place(row, col), self.half_frame)
+        for layer in ("shadow", "frame"):
+            self._plot.write(layer, left=[left], bottom=[bottom], right=[right], top=[top])

@@ -1,0 +1,128 @@
+"""Image or point cloud of one method, and the colour scale that several methods share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import panel as pn
+from bokeh.models import ColorBar, LinearColorMapper, Range1d
+from bokeh.plotting import figure
+from numpy.typing import NDArray
+
+from app.model.colors import Look
+from app.theme import WRONG_COLOR, Palette
+from app.widgets.cloud import PointCloud
+from app.widgets.controls import Sentence
+from app.widgets.figures import paint_frame, pane_of
+from app.widgets.image_view import ImageView
+
+Array = NDArray[Any]
+
+
+PICTURE = """
+:host { display: flex !important; flex-direction: column; min-width: 0; overflow: hidden;
+  height: 100% !important;
+  border: 1px solid var(--mui-palette-divider, #d5dbe2); border-radius: 8px;
+  background: var(--mui-palette-background-paper, #fff); transition: opacity 0.2s 0.25s; }
+"""
+
+# Titles of one line and of three: the pictures below them stand at one height.
+TITLE = ":host { flex: 1 !important } .note { font-weight: 600 }"
+CAPTION = ".note { white-space: nowrap; overflow: hidden; text-overflow: ellipsis }"
+
+
+class Picture:
+    """One method's image, or its cloud, with a line on the pixel below it.
+
+    Parameters
+    ----------
+    tapped : callable
+        Called with the row and column of a tapped pixel of the image.
+    picked : callable
+        Called with the flat index of a tapped point of the cloud.
+    """
+
+    def __init__(
+        self, tapped: Callable[[int, int], None], picked: Callable[[int], None], height: int
+    ) -> None:
+        self.image = ImageView(tapped)
+        self.cloud: PointCloud | None = None
+        # On the right there is room for a download button.
+        self.title = Sentence(
+            stylesheets=[TITLE], sizing_mode="stretch_width", margin=(4, 30, 0, 8)
+        )
+        self.caption = Sentence(
+            stylesheets=[CAPTION], sizing_mode="stretch_width", margin=(0, 8, 4, 8)
+        )
+        self._picked = picked
+        self._stage = pn.Column(self.image.pane, sizing_mode="stretch_width", margin=0)
+        self.card = pn.Column(
+            self.title,
+            self._stage,
+            self.caption,
+            stylesheets=[PICTURE],
+            sizing_mode="stretch_width",
+            margin=0,
+        )
+        self.resize(height)
+
+    def draw_image(self, values: Array, look: Look) -> None:
+        """Show an image (row, col) on the common scale, in place of the cloud."""
+        self.image.pane.visible = True
+        if self.cloud is not None:
+            self.cloud.visible = False
+        self.image.update(values, replace(look, title=""))
+
+    def resize(self, height: int) -> None:
+        """Make picture and cloud this high."""
+        self._stage.height = height
+
+    def dim(self, is_outdated: bool) -> None:
+        """Draw what is still to be replaced faintly."""
+        self.card.styles = {"opacity": "0.35" if is_outdated else "1"}
+
+    def show_cloud(self, dark: bool) -> PointCloud:
+        """Put the cloud in place of the image; it is made when it is first asked for."""
+        if self.cloud is None:
+            self.cloud = PointCloud(
+                wrong_color=WRONG_COLOR, link="methods", dark=dark, sizing_mode="stretch_both"
+            )
+            self.cloud.param.watch(lambda event: self._picked(event.new), "selected")
+            self._stage.append(self.cloud)
+        self.image.pane.visible, self.cloud.visible = False, True
+        return self.cloud
+
+
+class ScaleBar:
+    """The one colour scale of several pictures."""
+
+    def __init__(self) -> None:
+        # A colour bar needs a figure to stand in; nothing is drawn in this one.
+        self.figure = figure(
+            height=52,
+            sizing_mode="stretch_width",
+            toolbar_location=None,
+            x_range=Range1d(0, 1),
+            y_range=Range1d(0, 1),
+        )
+        self.figure.scatter([], [])
+        self.figure.axis.visible = self.figure.grid.visible = False
+        self.figure.min_border_left = self.figure.min_border_right = 16
+        self._mapper = LinearColorMapper(palette=["#000000"], low=0.0, high=1.0)
+        self._bar = ColorBar(
+            color_mapper=self._mapper, height=9, padding=0, title_standoff=3, label_standoff=3
+        )
+        self.figure.add_layout(self._bar, "below")
+        self.pane = pane_of(self.figure)
+        self.pane.sizing_mode = "stretch_width"
+
+    def update(self, look: Look) -> None:
+        """Show another scale."""
+        self._mapper.update(low=look.low, high=look.high, palette=look.colors)
+        self._bar.title = look.legend
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        paint_frame(self.figure, colors)

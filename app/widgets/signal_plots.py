@@ -1,0 +1,129 @@
+"""The three plots of a pixel: histogram, residual and enhanced signal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import panel as pn
+from bokeh.models import BasicTicker, Range1d
+from numpy.typing import NDArray
+
+from app.model.store import Pixel
+from app.plots import elements as plots
+from app.plots.gate import GateAxes, GateReadOut
+from app.theme import LIGHT, Palette
+from app.widgets.figures import Plot, cover, pane_of, round_up
+from core import Acquisition
+
+Array = NDArray[Any]
+
+
+class SignalPlots:
+    """The pixel's three plots, linked along the gate."""
+
+    def __init__(self) -> None:
+        one = np.zeros(1)
+        self.histogram = Plot(plots.histogram(one, one, one, one, LIGHT), plots.HISTOGRAM_LAYERS)
+        self.residual = Plot(plots.residual(one, one, LIGHT), plots.RESIDUAL_LAYERS)
+        self.enhanced = Plot(plots.enhanced(one, one, LIGHT), plots.ENHANCED_LAYERS)
+        self._bins = Range1d(0, 1)
+        for plot in self._plots:
+            figure = plot.figure
+            figure.x_range, figure.y_range = self._bins, Range1d(0, 1)
+            figure.min_border_left, figure.min_border_right = 46, 14
+            figure.min_border_top = figure.min_border_bottom = 4
+            figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
+        # The second axis once: the plots stand above each other.
+        self._axes = [GateAxes(plot.figure, plot is self.histogram) for plot in self._plots]
+        raw = ("Counts", self.histogram.source("raw"), "top")
+        small, large = (
+            (f"{name} scale".capitalize(), self.histogram.source(name), "counts")
+            for name in ("small", "large")
+        )
+        rest = (
+            ("Residual", self.residual.source("residual"), "residual"),
+            ("Enhanced", self.enhanced.source("enhanced"), "enhanced"),
+        )
+        self._read_outs = [
+            GateReadOut(plot.figure, plot.layers[layer]["glyph_renderer"], rows)
+            for plot, layer, rows in (
+                (self.histogram, "raw", (raw, small, large)),
+                (self.residual, "residual", rest),
+                (self.enhanced, "enhanced", rest),
+            )
+        ]
+
+    @property
+    def panes(self) -> list[pn.pane.Bokeh]:
+        """The three plots, from top to bottom."""
+        return [pane_of(plot.figure) for plot in self._plots]
+
+    @property
+    def _plots(self) -> tuple[Plot, Plot, Plot]:
+        return self.histogram, self.residual, self.enhanced
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of the mode."""
+        for plot in self._plots:
+            plot.paint(colors)
+
+    def update(
+        self, pixel: Pixel, acquisition: Acquisition, with_difference: bool, unit: str = "bins"
+    ) -> None:
+        """Show a pixel, positions in a unit."""
+        for axes in self._axes:
+            axes.follow(unit, acquisition)
+        for read_out in self._read_outs:
+            read_out.follow(acquisition)
+        if cover(self._bins, acquisition.n_bins):
+            self._lay_out(acquisition.n_bins)
+        signals, nothing = pixel.signals, np.full(acquisition.n_bins, np.nan)
+        expected = nothing if pixel.expected is None else pixel.expected
+        self.histogram.write("raw", top=signals.raw)
+        self.histogram.write("expected", counts=expected)
+        self.histogram.write("small", counts=signals.small)
+        self.histogram.write("large", counts=signals.large)
+        self.histogram.show("expected", pixel.expected is not None)
+        self._frame(self.histogram, pixel, 0.0, signals.raw, signals.large, expected)
+
+        difference = pixel.difference if with_difference else nothing
+        self.residual.write("residual", residual=signals.residual)
+        self.residual.write("raw", residual=difference)
+        self.residual.show("raw", with_difference)
+        low = float(np.nanmin(difference)) if with_difference else 0.0
+        self._frame(self.residual, pixel, low, signals.residual, difference)
+
+        top = float(signals.enhanced.max()) or 1.0
+        weight = signals.weight * (0.8 * top / (signals.weight.max() or 1.0))
+        self.enhanced.write("enhanced", enhanced=signals.enhanced)
+        self.enhanced.write("weight", enhanced=weight)
+        self._frame(self.enhanced, pixel, 0.0, signals.enhanced, weight)
+
+    def _lay_out(self, n_bins: int) -> None:
+        """Lay out the plots for another number of bins."""
+        edges, centres = plots.edges(n_bins), plots.centres(n_bins)
+        empty = np.zeros(n_bins)
+        bars = {"left": edges[:-1], "right": edges[1:], "top": empty, "bottom": empty}
+        self.histogram.source("raw").data = bars
+        for plot, column, layers in (
+            (self.histogram, "counts", ("expected", "small", "large")),
+            (self.residual, "residual", ("raw", "residual")),
+            (self.enhanced, "enhanced", ("weight", "enhanced")),
+        ):
+            for layer in layers:
+                plot.source(layer).data = {"bin": centres, column: empty}
+
+    @staticmethod
+    def _frame(plot: Plot, pixel: Pixel, low: float, *curves: Array) -> None:
+        """Fit the vertical axis, and draw truth and answer from bottom to top."""
+        highest = max(float(np.nanmax(curve, initial=0.0)) for curve in curves)
+        vertical = plot.figure.y_range
+        end, start = round_up(highest * 1.15), -round_up(-low * 1.05)
+        if (start, end) != (vertical.start, vertical.end):
+            vertical.update(start=start, end=end, reset_start=start, reset_end=end)
+        (column,) = (name for name in plot.source("truth").data if name != "bin")
+        for layer, position in (("truth", pixel.truth_bin), ("answer", pixel.answer_bin)):
+            x, y = plots.marker_line(position, end)
+            plot.write(layer, **{"bin": x, column: y})
+            plot.show(layer, bool(np.isfinite(position)))
