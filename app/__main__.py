@@ -35,7 +35,7 @@ from app.server.serve import server_of
 from app.tasks.jobs import LONG
 from app.widgets.connection import LINGER_S
 from app.widgets.controls import Sentence
-from core.io.readers import SUFFIXES
+from core.io import SUFFIXES
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,8 @@
-"""Range estimation from first-photon (Geiger-mode APD) lidar captures, without a screen."""
+"""Range estimation from first-photon (Geiger-mode APD) lidar captures, without a screen.
+
+The names exported here are what most scripts need. `PUBLIC_MODULES` export more; any other module
+may change without notice.
+"""
 
 from core import inspection, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
@@ -6,11 +10,16 @@ from core.capture import Capture, CaptureError
 from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
 from core.inference import limits
-from core.io.readers import open_capture, read_capture
-from core.io.scene_files import SceneError, read_scene
-from core.io.writers import save_capture, save_image, save_pixel
-from core.out_of_core.tiles import as_image, estimate_large
-from core.out_of_core.windows import Window, read_window, sampled_flux_prior
+from core.io import (
+    SceneError,
+    open_capture,
+    read_capture,
+    read_scene,
+    save_capture,
+    save_image,
+    save_pixel,
+)
+from core.out_of_core import Window, as_image, estimate_large, read_window, sampled_flux_prior
 from core.pipeline import Run, run
 from core.scene import PARTS, Scene, parts_of, scenes, without
 from core.simulation import first_photons, simulate
@@ -23,6 +32,28 @@ from core.trigger import (
     trigger_probability,
 )
 from core.warmup import warm_up
+
+PUBLIC_MODULES = (
+    "core.checks",
+    "core.corrections",
+    "core.cost",
+    "core.estimators",
+    "core.geometry",
+    "core.inference",
+    "core.inspection",
+    "core.io",
+    "core.metrics",
+    "core.out_of_core",
+    "core.parameters",
+    "core.reductions",
+    "core.studies",
+    "core.studies.ablation",
+    "core.studies.paper",
+    "core.studies.sensitivity",
+    "core.studies.tradeoff",
+    "core.studies.trials",
+)
+"""Modules whose ``__all__`` is public, too."""
 
 light_of_whole = sampled_flux_prior  # deprecated name, to be removed after the next release
 

@@ -8,6 +8,11 @@ from numbers import Integral
 from pathlib import Path
 from typing import Any
 
+__all__ = [
+    "refusing",
+    "require",
+]
+
 _MOST_SHOWN = 200  # characters of a file's path
 
 

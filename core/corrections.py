@@ -12,6 +12,12 @@ from core.capture import Capture
 from core.checks import require
 from core.inference.flux import detailed_flux_prior_of
 
+__all__ = [
+    "CORRECTIONS",
+    "moments_s",
+    "without_correction",
+]
+
 CORRECTIONS = {
     "pile_up": "pile-up",
     "pulse_shape": "shape of the pulse",

@@ -23,6 +23,15 @@ from core.inference.likelihood import lanes_of, sampled_numbers
 from core.inference.posterior import has_posterior
 from core.kernels.blocks import LANES
 
+__all__ = [
+    "Cost",
+    "cost_of",
+    "needs",
+    "predicted",
+    "predicted_flux_time",
+    "require_memory",
+]
+
 REMEDY = (
     "crop the gate, merge bins or keep fewer pixels (core.reductions), or range the file in parts "
     "(core.open_capture, core.estimate_large)"

@@ -15,6 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from core.acquisition import Floats
 from core.checks import require
 
+__all__ = [
+    "Points",
+    "points_m",
+    "sight_lines",
+]
+
 
 class Points(NamedTuple):
     """The pixels of a range image that have a range, row by row."""

@@ -19,6 +19,27 @@ from numpy.typing import ArrayLike, NDArray
 from core.acquisition import Floats
 from core.checks import require
 
+__all__ = [
+    "Detection",
+    "Interval",
+    "Told",
+    "bias_m",
+    "calibration_error",
+    "coverage",
+    "errors_m",
+    "estimator_variance_m2",
+    "inlier_rmse_m",
+    "mae_m",
+    "median_error_m",
+    "precision_recall",
+    "rd_variance",
+    "reliability",
+    "restoration_degree",
+    "restored",
+    "rmse_m",
+    "wilson",
+]
+
 
 def errors_m(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
     """Errors in metres of all target pixels, flat; NaN where a target has no answer.

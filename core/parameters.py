@@ -13,6 +13,17 @@ from typing import Any
 
 from core.checks import require
 
+__all__ = [
+    "Choice",
+    "Number",
+    "Zone",
+    "check_fields",
+    "doubts",
+    "joint_doubts",
+    "parameter",
+    "spec_of",
+]
+
 
 @dataclass(frozen=True)
 class Zone:

@@ -21,6 +21,17 @@ from core.checks import require
 from core.kernels.parallel import PARALLEL, entering
 from core.kernels.streams import pixel_key, uniform_at
 
+__all__ = [
+    "Reduction",
+    "coarser",
+    "cut_gate",
+    "first_pulses",
+    "merge_bins",
+    "pool_pixels",
+    "share_of_pulses",
+    "skip_pixels",
+]
+
 DRAWN_ONE_BY_ONE = 2**27
 """Detections up to which fewer pulses are drawn detection by detection; more take less time bin by
 bin."""

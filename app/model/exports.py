@@ -25,8 +25,8 @@ from app.model.text import Fact
 from app.theme import WRONG_COLOR
 from app.units import AXIS_TITLES, scale
 from core import Acquisition
-from core.io.writers import WRITERS, Plane, Product, write_columns
-from core.studies.outputs import Table, as_csv
+from core.io import WRITERS, Plane, Product, write_columns
+from core.studies import Table, as_csv
 
 Array = NDArray[Any]
 

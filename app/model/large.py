@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from core import Capture, Window, open_capture, sampled_flux_prior
 from core.checks import require
-from core.inference.flux_model import FluxPrior
-from core.io.readers import bytes_of
-from core.out_of_core.windows import WindowReader
-from core.studies.tradeoff.measure import Cancelled
+from core.inference import FluxPrior
+from core.io import bytes_of
+from core.out_of_core import WindowReader
+from core.studies.tradeoff import Cancelled
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -12,10 +12,10 @@ import param
 from core import ESTIMATORS, Acquisition, Flux, Pulse, TrackingParameters, Window
 from core.checks import require
 from core.estimators import FALSE_ALARM
-from core.io.readers.request import Request
+from core.io import Request
 from core.parameters import Number, check_fields, parameter
 from core.reductions import Reduction
-from core.studies.ablation.criterion import TITLES
+from core.studies.ablation import TITLES
 
 
 @dataclass(frozen=True)

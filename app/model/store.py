@@ -17,6 +17,8 @@ from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.model.state import Illumination, Less, Reading
 from app.tasks.jobs import Effort
 from core import (
+    CORRECTIONS,
+    PARTS,
     Capture,
     Run,
     Scene,
@@ -31,11 +33,11 @@ from core import (
     simulate,
     tracking_signals,
     trigger_probability,
+    without,
+    without_correction,
 )
-from core.corrections import CORRECTIONS, without_correction
 from core.cost import Cost, cost_of, predicted
-from core.inference.posterior import has_posterior, posterior_of
-from core.scene import PARTS, without
+from core.inference import has_posterior, posterior_of
 
 FEW_COUNTS = 2**20
 """Of a capture, up to which it is ranged in less time than its picture is drawn."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from app.model.store import Answer, Pixel
 from app.units import scale
-from core.studies.ablation.criterion import TITLES
+from core.studies.ablation import TITLES
 
 Fact = tuple[str, str, str]
 """Name, value, and a line of help."""

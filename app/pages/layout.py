@@ -45,8 +45,8 @@ from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import FileInput
 from app.widgets.share import TakeAway
 from core import PRESETS, TrackingParameters
-from core.io.readers import SUFFIXES
-from core.studies.tradeoff.measure import Point
+from core.io import SUFFIXES
+from core.studies.tradeoff import Point
 
 CUSTOM = "custom"
 

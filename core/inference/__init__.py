@@ -1,1 +1,30 @@
-"""What photon counts say about flux and range, and the limits that physics sets."""
+"""Inference from photon counts: signal and background flux, posterior, and physical limits."""
+
+from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_prior_of
+from core.inference.flux_model import FluxModel, FluxPrior
+from core.inference.likelihood import Conditions, log_likelihood_ratio, rate_and_n_armed
+from core.inference.posterior import (
+    TOLERANCE_BINS,
+    Posterior,
+    has_posterior,
+    most_likely,
+    posterior_of,
+    tolerance_probability,
+)
+
+__all__ = [
+    "TOLERANCE_BINS",
+    "Conditions",
+    "FluxModel",
+    "FluxPrior",
+    "Posterior",
+    "detailed_flux_prior_of",
+    "flux_model_of",
+    "flux_prior_of",
+    "has_posterior",
+    "log_likelihood_ratio",
+    "most_likely",
+    "posterior_of",
+    "rate_and_n_armed",
+    "tolerance_probability",
+]

@@ -1,1 +1,32 @@
-"""Files: readers of captures, writers of results, scenes."""
+"""Files: readers of captures, writers of results, and scenes."""
+
+from core.io.readers import READERS, SUFFIXES, bytes_of, open_capture, read_capture
+from core.io.readers.request import Request
+from core.io.scene_files import SceneError, read_scene
+from core.io.writers import (
+    WRITERS,
+    Plane,
+    Product,
+    save_capture,
+    save_image,
+    save_pixel,
+    write_columns,
+)
+
+__all__ = [
+    "READERS",
+    "SUFFIXES",
+    "WRITERS",
+    "Plane",
+    "Product",
+    "Request",
+    "SceneError",
+    "bytes_of",
+    "open_capture",
+    "read_capture",
+    "read_scene",
+    "save_capture",
+    "save_image",
+    "save_pixel",
+    "write_columns",
+]

@@ -1,1 +1,10 @@
 """Studies that anyone can run again: settings as data, rows as records, tables as Markdown."""
+
+from core.studies import outputs
+from core.studies.outputs import Table, as_csv
+
+__all__ = [
+    "Table",
+    "as_csv",
+    "outputs",
+]

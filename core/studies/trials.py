@@ -28,6 +28,8 @@ from core.metrics import Interval
 from core.scene import scenes
 from core.simulation import simulate
 
+__all__ = ["Condition", "Method", "Results", "Score", "as_they_come", "trials"]
+
 TOLERANCES_BINS = (1, 2, 3)
 
 

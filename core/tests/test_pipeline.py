@@ -73,12 +73,6 @@ def test_without_truth_there_are_no_figures() -> None:
     assert run(Capture(capture.cube, capture.acquisition), "peak").figures == {}
 
 
-def test_public_names_exist() -> None:
-    assert sorted(core.__all__) == sorted(set(core.__all__))
-    for name in core.__all__:
-        assert hasattr(core, name)
-
-
 def test_nothing_is_left_to_compile_after_warming_up() -> None:
     # In a fresh process, whose kernels no other test has entered.
     script = """

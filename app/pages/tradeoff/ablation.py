@@ -17,11 +17,9 @@ from app.pages.shared.studies import OnePiece, Work, aside
 from app.pages.tradeoff import ablation_text as requires_words
 from app.widgets.cards import part
 from app.widgets.controls import Sentence, SettingsPanel, Table
-from core.corrections import CORRECTIONS
+from core import CORRECTIONS, parts_of
 from core.parameters import Number, check_fields, parameter
-from core.scene import parts_of
-from core.studies.ablation.criterion import Requirement
-from core.studies.ablation.study import requirements
+from core.studies.ablation import Requirement, requirements
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ import math
 from collections.abc import Collection
 
 from core.metrics import Interval
-from core.studies.ablation.criterion import TITLES, Requirement
-from core.studies.ablation.study import NOTE
+from core.studies.ablation import NOTE, TITLES, Requirement
 
 __all__ = ["COLUMNS", "EXPLANATION", "NOTE", "REPETITIONS_HELP", "TITLE", "row", "subject"]
 

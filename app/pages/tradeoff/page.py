@@ -31,10 +31,23 @@ from core import ESTIMATORS
 from core.cost import predicted
 from core.metrics import Interval
 from core.parameters import Choice, Number, check_fields, parameter
-from core.studies.tradeoff.measure import Cancelled, Candidate, Point, Source, candidates, study
-from core.studies.tradeoff.page import acquired, acquiring_items, points_table
-from core.studies.tradeoff.pareto import best_within, cheapest_reaching, front, with_light
-from core.studies.tradeoff.surrogate import Simulation, like
+from core.studies.tradeoff import (
+    Cancelled,
+    Candidate,
+    Point,
+    Simulation,
+    Source,
+    acquired,
+    acquiring_items,
+    best_within,
+    candidates,
+    cheapest_reaching,
+    front,
+    like,
+    points_table,
+    study,
+    with_light,
+)
 from core.studies.trials import Method, as_they_come
 
 Array = NDArray[Any]

@@ -19,8 +19,14 @@ from app.theme import palette
 from app.widgets.cards import part
 from app.widgets.controls import SettingsPanel
 from core.parameters import Choice, Number, check_fields, parameter
-from core.studies.sensitivity.page import ranges_table, setting_plot
-from core.studies.sensitivity.sweep import Sweep, along, numbers, setting_sweep
+from core.studies.sensitivity import (
+    Sweep,
+    along,
+    numbers,
+    ranges_table,
+    setting_plot,
+    setting_sweep,
+)
 
 SWEPT = tuple(dict.fromkeys(method for method, *_ in numbers()))
 METHODS = {METHOD_TITLES[method]: method for method in SWEPT}

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from app.model.methods import METHOD_TITLES
 from core.metrics import Interval
-from core.studies.tradeoff.measure import Candidate, Point
-from core.studies.tradeoff.pareto import Recommendation
+from core.studies.tradeoff import Candidate, Point, Recommendation
 
 EXPLANATION = """
 Each point is a way to range this scene, or this capture: a method, with some bins merged or not.

@@ -1,1 +1,11 @@
 """Which parts of a model a scene requires."""
+
+from core.studies.ablation.criterion import TITLES, Requirement
+from core.studies.ablation.study import NOTE, requirements
+
+__all__ = [
+    "NOTE",
+    "TITLES",
+    "Requirement",
+    "requirements",
+]

@@ -1,1 +1,7 @@
 """The paper: its figures and tables beside ours."""
+
+from core.studies.paper import figures
+
+__all__ = [
+    "figures",
+]

@@ -1,1 +1,13 @@
 """The range of each setting within which a method can be trusted."""
+
+from core.studies.sensitivity.page import ranges_table, setting_plot
+from core.studies.sensitivity.sweep import Sweep, along, numbers, setting_sweep
+
+__all__ = [
+    "Sweep",
+    "along",
+    "numbers",
+    "ranges_table",
+    "setting_plot",
+    "setting_sweep",
+]

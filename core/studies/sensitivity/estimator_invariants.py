@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import core
-from core import limits
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage, estimate
+from core.inference import limits
 from core.inference.flux import flux_model_of, flux_prior_of
 from core.inference.posterior import TOLERANCE_BINS
 from core.kernels.blocks import to_blocks

@@ -9,9 +9,9 @@ from itertools import product
 
 import numpy as np
 
-from core import limits
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
+from core.inference import limits
 from core.inference.likelihood import Conditions, log_likelihood_ratio
 from core.studies.sensitivity.extremes import (
     SUBNORMAL,

@@ -1,0 +1,77 @@
+"""Which module of core may import which."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import core
+
+PACKAGE = Path(core.__file__).parent
+
+ROOMS = (
+    {"kernels", "checks", "deprecation"},
+    {"parameters", "acquisition"},
+    {"trigger", "effects", "geometry", "metrics", "tracking_parameters"},
+    {"scene", "tracking", "capture"},
+    {"simulation", "reductions", "inference"},
+    {"corrections", "cost"},
+    {"estimators"},
+    {"inspection", "pipeline", "warmup", "io"},
+    {"out_of_core"},
+    {"studies"},
+    {"cli"},
+)
+"""From the bottom up: a module imports from its own room and from rows before its own."""
+
+
+def imported_names(path: Path) -> Iterator[tuple[str, str]]:
+    """Modules and names that a file imports at run time."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for_types = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in ast.walk(block)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and id(node) not in for_types:
+            yield from ((node.module or "", alias.name) for alias in node.names)
+
+
+def sources(package: Path) -> list[Path]:
+    """Source files of a package without its tests."""
+    return sorted(path for path in package.rglob("*.py") if "tests" not in path.parts)
+
+
+def room_of(module: str, name: str = "") -> str:
+    """Part of a dotted name below the package; ``from core import x`` counts as x's."""
+    return f"{module}.{name}".split(".")[1]
+
+
+def test_each_room_imports_from_lower_rooms_only() -> None:
+    row_of = {room: row for row, rooms in enumerate(ROOMS) for room in rooms}
+    wrong = []
+    for path in sources(PACKAGE):
+        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if room in ("__init__", "__main__"):
+            continue
+        for module, name in imported_names(path):
+            if module.partition(".")[0] == "core":
+                other = room_of(module, name)
+                if other != room and row_of[other] >= row_of[room]:
+                    wrong.append(f"{path.relative_to(PACKAGE)} imports {module}.{name}")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("name", ["core", *core.PUBLIC_MODULES])
+def test_public_names_exist_and_are_sorted_out(name: str) -> None:
+    module = import_module(name)
+    assert module.__doc__
+    assert len(module.__all__) == len(set(module.__all__))
+    for each in module.__all__:
+        assert hasattr(module, each)

@@ -1,0 +1,62 @@
+"""What the app imports: public names of core, and of its own rooms only lower ones."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+import app
+import core
+from core.tests.test_imports import imported_names, room_of, sources
+
+PACKAGE = Path(app.__file__).parent
+
+ROOMS = (
+    {"theme", "units", "tasks"},
+    {"model"},
+    {"plots"},
+    {"widgets"},
+    {"pages"},
+    {"server"},
+)
+"""From the bottom up: a module imports from its own room and from rows before its own."""
+
+EXCEPTIONS = {
+    "model/address.py imports app.widgets.component.Component",
+    "model/colors.py imports app.widgets.cloud.point_cloud",
+    "model/exports.py imports app.plots.gate.TITLES",
+    "model/exports.py imports app.plots.gate.scale",
+    "model/text.py imports app.plots.gate.scale",
+    "pages/layout.py imports app.server.garbage",
+}
+"""Still to be removed."""
+
+
+def test_the_app_uses_public_names_of_core_only() -> None:
+    public = {
+        (module, name)
+        for module in ("core", *core.PUBLIC_MODULES)
+        for name in import_module(module).__all__
+    }
+    private = [
+        f"{path.relative_to(PACKAGE)} imports {module}.{name}"
+        for path in sources(PACKAGE)
+        for module, name in imported_names(path)
+        if module.partition(".")[0] == "core" and (module, name) not in public
+    ]
+    assert private == []
+
+
+def test_each_room_imports_from_lower_rooms_only() -> None:
+    row_of = {room: row for row, rooms in enumerate(ROOMS) for room in rooms}
+    wrong = set()
+    for path in sources(PACKAGE):
+        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if room in ("__init__", "__main__"):
+            continue
+        for module, name in imported_names(path):
+            if module.partition(".")[0] == "app":
+                other = room_of(module, name)
+                if other != room and row_of[other] >= row_of[room]:
+                    wrong.add(f"{path.relative_to(PACKAGE)} imports {module}.{name}")
+    assert wrong <= EXCEPTIONS
