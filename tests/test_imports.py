@@ -23,10 +23,6 @@ ROOMS = (
 
 EXCEPTIONS = {
     "model/address.py imports app.widgets.component.Component",
-    "model/colors.py imports app.widgets.cloud.point_cloud",
-    "model/exports.py imports app.plots.gate.TITLES",
-    "model/exports.py imports app.plots.gate.scale",
-    "model/text.py imports app.plots.gate.scale",
     "pages/layout.py imports app.server.garbage",
 }
 """Still to be removed."""
