@@ -36,7 +36,7 @@ speed: $(VENV)/.app ## the kernels beside plain ones and the machine's floors; f
 tradeoff: $(VENV)/.app ## what accuracy costs, and what to choose; CAPTURE=path for your own
 	$(BIN)/python -m core tradeoff $(if $(CAPTURE),--capture "$(CAPTURE)")
 
-stability: $(VENV)/.app ## laws held at every extreme, and the range within which each setting is trustworthy
+stability: $(VENV)/.app ## the range in which each setting of each method can be trusted
 	$(BIN)/python -m core stability
 
 requires: $(VENV)/.app ## which parts and corrections a scene needs; SCENE=fog for another

@@ -16,7 +16,7 @@ from core.cli import tradeoff as trade
 from core.cli.options import as_options
 
 ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
-"""Exit codes: done; the machine failed (a full disk, say), or a law; bad input; Ctrl-C."""
+"""Exit codes: done; the machine (a full disk, say) or a check failed; bad input; Ctrl-C."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read us has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except (OSError, stability.BrokenLaw) as error:
+    except (OSError, stability.UnconfirmedZone) as error:
         return _said(FAILED, error)
     except MemoryError as error:
         return _said(FAILED, f"memory is too small: {error}")

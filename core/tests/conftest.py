@@ -13,6 +13,7 @@ from core.tests.captures import real_capture_path
 
 # The same examples on every run; a kernel's first call compiles it, so no example has a deadline.
 settings.register_profile("core", derandomize=True, deadline=None)
+settings.register_profile("thorough", max_examples=5000, deadline=None)
 settings.load_profile("core")
 
 # Helpers that assert, imported by the tests: without this they fail with a bare AssertionError.

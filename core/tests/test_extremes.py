@@ -1,0 +1,511 @@
+"""Properties that hold at every extreme of gate, flux, counts and settings.
+
+``pytest core/tests/test_extremes.py --hypothesis-profile thorough`` tries many more examples.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from core.acquisition import Acquisition, Floats, Flux, Pulse
+from core.capture import Capture, Detection
+from core.estimators import ESTIMATORS, RangeImage, estimate
+from core.inference import limits
+from core.inference.flux import flux_prior_of
+from core.inference.likelihood import Conditions, log_likelihood_ratio
+from core.inference.posterior import TOLERANCE_BINS
+from core.kernels.blocks import to_blocks
+from core.out_of_core.tiles import estimate_large
+from core.parameters import Choice, Number, spec_of
+from core.scene import Scene
+from core.simulation import simulate
+from core.studies.sensitivity.sweep import float32_disagreement, lost_to_rounding
+from core.studies.trials import Condition
+from core.tracking import CALM_M, PRESETS, TrackingParameters, track, tracking_signals
+from core.trigger import coates_rate, no_trigger_probability, rate_per_bin, trigger_probability
+
+pytestmark = pytest.mark.compiled
+
+SUBNORMAL = 5e-324
+SIGNAL = 0.1041  # the paper's photons per pulse
+EPS_32 = float(np.finfo(np.float32).eps)
+ROUNDINGS = 16  # float32 operations between a count and a score, about
+PHOTONS = (0.0, SUBNORMAL, 1e-12, SIGNAL / 1e6, 1e-3, SIGNAL, 1.0, 30.0, 1e6)
+WITHOUT_ORACLE = [name for name in ESTIMATORS if name != "oracle"]
+
+
+# -- Flux and gates --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """A gate with bins of 1 ns, and the flux that enters it."""
+
+    n_bins: int
+    n_pulses: int
+    tau_bins: float
+    signal: float
+    background: float
+
+    @property
+    def acquisition(self) -> Acquisition:
+        return Acquisition(self.n_bins, n_pulses=self.n_pulses)
+
+    @property
+    def pulse(self) -> Pulse:
+        return Pulse(self.tau_bins * self.acquisition.bin_width_s)
+
+    @property
+    def model(self) -> tuple[float, float, Pulse, Acquisition]:
+        """Signal, background, pulse and gate, as functions of `core.limits` take them."""
+        return self.signal, self.background, self.pulse, self.acquisition
+
+    @property
+    def rate(self) -> Floats:
+        """Rate of each onset in each bin, shape (onset, bin)."""
+        at = onsets(self.n_bins)
+        return rate_per_bin(at, np.full(at.size, self.signal), *self.model[1:])
+
+    def capture(self) -> Capture:
+        """Simulate one pixel for each onset, and one without a target."""
+        onset = np.append(onsets(self.n_bins), np.nan).reshape(3, -1)
+        sbr = self.signal / self.background if self.background else np.inf
+        # A flux has no background without a signal: there the scene reflects nothing.
+        flux = Flux(self.signal, sbr) if sbr > 0 else Flux(self.background, 1.0)
+        reflectivity = np.full(onset.shape, 1.0 if sbr > 0 else 0.0)
+        scene = Scene(self.acquisition.bin_to_range_m(onset), reflectivity)
+        return simulate(scene, self.acquisition, flux, self.pulse)
+
+
+def onsets(n_bins: int) -> Floats:
+    """Delays before, at and behind each edge of a gate, and inside it; shape (11,)."""
+    edges = [-1e6, -1.0, -1e-9, 0.0, 1e-9, n_bins - 1e-9, n_bins, n_bins + 1.0, n_bins + 1e6]
+    return np.array([*edges, 0.5, n_bins / 2])
+
+
+def lightings(n_bins: tuple[int, ...] = (1, 2, 100, 4096)) -> st.SearchStrategy[Lighting]:
+    return st.builds(
+        Lighting,
+        st.sampled_from(n_bins),
+        st.sampled_from((1, 1000, 10**9)),
+        st.sampled_from((1e-3, 1.0, 1e3)),
+        st.sampled_from(PHOTONS),
+        st.sampled_from((*PHOTONS, SIGNAL / 0.06, SIGNAL / 1e-6)),
+    )
+
+
+@given(lightings())
+def test_trigger_probabilities_sum_to_one(lighting: Lighting) -> None:
+    probability = trigger_probability(lighting.rate)
+    assert ((probability >= 0) & (probability <= 1)).all()
+    total = probability.sum(axis=-1) + no_trigger_probability(lighting.rate)
+    np.testing.assert_allclose(total, 1.0, atol=1e-12)
+
+
+@given(lightings())
+def test_trigger_probabilities_keep_their_digits_down_to_the_smallest_number(
+    lighting: Lighting,
+) -> None:
+    rate = lighting.rate
+    before = np.cumsum(np.pad(rate[:, :-1], ((0, 0), (1, 0))), axis=-1)
+    with np.errstate(divide="ignore"):
+        expected = np.log(-np.expm1(-rate)) - before
+        found = np.log(trigger_probability(rate))
+    normal = expected > math.log(np.finfo(float).tiny)
+    off = np.abs(found[normal] - expected[normal]) / np.maximum(1.0, np.abs(expected[normal]))
+    assert off.max(initial=0.0) <= 1e-12
+    assert (found[expected < math.log(SUBNORMAL) - 1] == -np.inf).all()
+
+
+@given(lightings())
+def test_simulated_counts_are_possible(lighting: Lighting) -> None:
+    capture = lighting.capture()
+    onset = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
+    rate = rate_per_bin(onset, np.asarray(capture.signal), *lighting.model[1:])
+    assert (capture.counts <= lighting.n_pulses).all()
+    assert (capture.cube[trigger_probability(rate) == 0] == 0).all()
+
+
+@given(lightings((1, 2, 100)))
+def test_coates_rates_reproduce_simulated_counts(lighting: Lighting) -> None:
+    assert_coates_reproduces(lighting.capture())
+
+
+def assert_coates_reproduces(capture: Capture) -> None:
+    sent = int(capture.gated_pulses or 0)
+    rate = np.nan_to_num(coates_rate(capture.cube, sent), nan=0.0, posinf=np.inf)
+    off = np.abs(trigger_probability(rate) * sent - capture.cube)
+    assert (off <= 1e-9 * np.maximum(capture.cube, 1)).all()
+
+
+@given(lightings((1, 2, 100)))
+def test_limits_are_numbers(lighting: Lighting) -> None:
+    onset = onsets(lighting.n_bins)
+    right = limits.right_bin_probability(onset, *lighting.model)
+    assert ((right >= 0) & (right <= 1)).all()
+    assert (limits.cramer_rao_bins(onset, *lighting.model) >= 0).all()
+    if lighting.n_pulses == 1:
+        exposure = limits.best_exposure(onset, *lighting.model)
+        assert ((exposure > 0) & (exposure <= 1)).all()
+
+
+@given(lightings((1, 2, 100)))
+def test_more_background_never_lowers_the_cramer_rao_bound(lighting: Lighting) -> None:
+    before = np.zeros(11)
+    for background in PHOTONS:
+        model = replace(lighting, n_pulses=1000, background=background).model
+        bound = limits.cramer_rao_bins(onsets(lighting.n_bins), *model)
+        assert ((bound >= before) | (bound >= before * (1 - 1e-9))).all(), background
+        before = bound
+
+
+# -- Histograms and settings -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Histograms:
+    """Named histograms of a few pixels."""
+
+    name: str
+    cube: NDArray[np.unsignedinteger]
+    n_pulses: int | None
+    detection: Detection
+
+    def __repr__(self) -> str:
+        return f"{self.name}, {self.cube.shape[2]} bins"
+
+    @property
+    def capture(self) -> Capture:
+        """The histograms as a capture with a flux that the oracle can be given."""
+        return Capture(
+            self.cube.copy(),
+            Acquisition(self.cube.shape[2], n_pulses=self.n_pulses),
+            signal=np.full(self.cube.shape[:2], SIGNAL),
+            background=SIGNAL / 0.06,
+            detection=self.detection,
+        )
+
+
+def histograms_of(n_bins: int) -> Iterator[Histograms]:
+    """Constant, one-hot, alternating, saturated and empty ones, and those next to an overflow."""
+    shape = (2, 3, n_bins)
+    places = np.array([0, 1, n_bins // 3, n_bins // 2, n_bins - 2, n_bins - 1]) % n_bins
+    one_hot = np.eye(n_bins)[places].reshape(shape)
+    noise = np.random.default_rng(0).poisson(3, shape)
+    first: dict[str, Any] = {
+        "empty": np.zeros(shape),
+        "constant": np.full(shape, 7),
+        "alternating": np.where(np.arange(n_bins) % 2, 0, 9) * np.ones(shape),
+        "one photon": one_hot,
+        "every pulse in one bin": 1000 * one_hot,
+        "noise": noise,
+    }
+    for name, cube in first.items():
+        yield Histograms(name, cube.astype(np.uint16), 1000, "first")
+    for dtype in (np.uint8, np.uint16, np.uint32):
+        full = np.full(shape, np.iinfo(dtype).max, dtype)
+        yield Histograms(f"full {np.dtype(dtype)} counters", full, None, "all")
+    for top in (254, 255, 256, 65534, 65535, 65536, 65537):
+        cube = np.where(one_hot > 0, top, noise).astype(np.min_scalar_type(top))
+        yield Histograms(f"{top} counts in a bin", cube, None, "all")
+
+
+HISTOGRAMS = [each for n_bins in (1, 2, 100) for each in histograms_of(n_bins)]
+
+
+def settings_of(method: str) -> Iterator[Any]:
+    """The default settings of an estimator, and each setting at each of its extremes."""
+    kind = ESTIMATORS[method].parameters
+    yield kind()
+    for field in fields(kind):
+        for value in extremes(spec_of(field)):
+            yield kind(**{field.name: value})
+
+
+def extremes(spec: Number | Choice) -> list[Any]:
+    if isinstance(spec, Choice):
+        return list(spec.options)
+    numbers = (0.0, SUBNORMAL, 1e-300, 1e-12, 1e-3, 1.0, 1e3, 1e6, 1e9)
+    # T_n at the last bin of a gate, behind it, and beyond.
+    edges = (0, 1, 2, 3, 99, 100, 101)
+    tried = {spec.least, spec.low, spec.high, spec.most, *numbers, *map(float, edges)}
+    values = {int(x) if spec.whole else x for x in tried if spec.takes(int(x) if spec.whole else x)}
+    return sorted(values)
+
+
+SETTINGS = [(method, each) for method in ESTIMATORS for each in settings_of(method)]
+
+
+@pytest.mark.parametrize("counts", HISTOGRAMS, ids=repr)
+def test_the_likelihood_is_finite(counts: Histograms) -> None:
+    for signal, background in product(PHOTONS, PHOTONS):
+        conditions = Conditions(
+            Acquisition(counts.cube.shape[2]),
+            Pulse(),
+            counts.n_pulses,
+            np.asarray(signal),
+            np.asarray(background),
+            1.0,
+        )
+        ratio = log_likelihood_ratio(counts.cube.astype(float), conditions)
+        assert np.isfinite(ratio).all(), (signal, background)
+
+
+@pytest.mark.parametrize("counts", [h for h in HISTOGRAMS if h.detection == "first"], ids=repr)
+def test_coates_rates_reproduce_extreme_counts(counts: Histograms) -> None:
+    assert_coates_reproduces(counts.capture)
+
+
+def assert_valid(capture: Capture, image: RangeImage) -> None:
+    """Every estimate lies in the gate and is finite; every other pixel is NaN and not valid."""
+    valid = image.valid
+    assert ((image.bin >= 0) & (image.bin <= capture.acquisition.n_bins))[valid].all()
+    assert np.isfinite(image.range_m[valid]).all()
+    assert np.isnan(image.bin[~valid]).all()
+    assert np.isnan(image.range_m[~valid]).all()
+    assert np.isfinite(image.score).all()
+    assert ((image.confidence >= 0) & (image.confidence <= valid)).all()
+    assert (capture.counts[valid] > 0).all()
+
+
+@pytest.mark.parametrize("method", ESTIMATORS)
+@given(lightings((1, 2, 100)) | st.just(Lighting(4096, 10**9, 1.0, SIGNAL, SIGNAL / 0.06)))
+def test_estimates_are_valid_under_any_flux(method: str, lighting: Lighting) -> None:
+    capture = lighting.capture()
+    assert_valid(capture, estimate(capture, method))
+
+
+@pytest.mark.parametrize("method", ESTIMATORS)
+def test_estimates_above_a_false_alarm_threshold_are_valid(method: str) -> None:
+    for signal in (0.0, SIGNAL, 30.0):
+        capture = Lighting(100, 1000, 1.0, signal, SIGNAL / 0.06).capture()
+        assert_valid(capture, estimate(capture, method, false_alarm=0.01))
+
+
+@given(st.sampled_from(SETTINGS), st.sampled_from(HISTOGRAMS))
+def test_estimates_are_valid_with_any_settings(chosen: tuple[str, Any], counts: Histograms) -> None:
+    method, parameters = chosen
+    # This weight needs the number of pulses.
+    assume(getattr(parameters, "weight", None) != "survival" or counts.n_pulses is not None)
+    assert_valid(counts.capture, estimate(counts.capture, method, parameters))
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+def test_numbers_without_end_are_refused_by_name(value: float) -> None:
+    built: list[tuple[str, Any]] = [
+        ("bin_width_s", lambda: Acquisition(bin_width_s=value)),
+        ("gate_delay_s", lambda: Acquisition(gate_delay_s=value)),
+        ("tau_s", lambda: Pulse(value)),
+        ("signal", lambda: Flux(value)),
+        ("signal", lambda: limits.cramer_rao_bins(1.0, value, 1.0, Pulse(), Acquisition())),
+        ("background", lambda: limits.cramer_rao_bins(1.0, 1.0, value, Pulse(), Acquisition())),
+    ]
+    for each in ESTIMATORS.values():
+        names = [field.name for field in fields(each.parameters)]
+        built += [(n, lambda each=each, n=n: each.parameters(**{n: value})) for n in names]
+    for name, build in built:
+        with pytest.raises(ValueError, match=rf"{name}.* is not accepted: give"):
+            build()
+
+
+# -- Invariance ------------------------------------------------------------------------------------
+
+
+def echoes(sbr: float = 0.06, rows: int = 16, cols: int = 64) -> Capture:
+    """Echoes at depths all over the gate, as the paper's instrument records them."""
+    whole = Condition("uniform", sbr).capture(0)
+    return replace(
+        whole,
+        cube=whole.cube[:rows, :cols].copy(),
+        truth_range_m=np.asarray(whole.truth_range_m)[:rows, :cols],
+        signal=np.asarray(whole.signal)[:rows, :cols],
+    )
+
+
+def assert_same(found: RangeImage, expected: RangeImage) -> None:
+    for name, image in vars(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), image, err_msg=name)
+
+
+@pytest.mark.parametrize("method", WITHOUT_ORACLE)  # the oracle shares the likelihood's kernels
+def test_estimates_do_not_depend_on_the_number_of_threads(method: str) -> None:
+    some = echoes()
+    # Many counts, or one thread would do all of the work.
+    cube = np.tile(some.cube, (30, 1, 1))
+    before, found = numba.get_num_threads(), []
+    for threads in (1, numba.config.NUMBA_NUM_THREADS):
+        numba.set_num_threads(threads)
+        found.append(estimate(Capture(cube, some.acquisition, some.pulse), method))
+    numba.set_num_threads(before)
+    assert_same(*found)
+
+
+@pytest.mark.parametrize("method", [m for m in WITHOUT_ORACLE if not ESTIMATORS[m].whole_image])
+def test_estimates_do_not_depend_on_tiles(method: str) -> None:
+    cube = echoes(rows=12, cols=20).cube
+    counts = xr.DataArray(
+        cube,
+        dims=("row", "col", "bin"),
+        attrs={"bin_width_s": 1e-9, "gate_delay_s": 280e-9, "n_pulses": 1000, "tau_s": 1e-9},
+    )
+    whole, *tiled = (
+        estimate_large(counts.chunk({"row": row, "col": col, "bin": -1}), method).compute()
+        for row, col in ((12, 20), (1, 20), (5, 7))
+    )
+    for each in tiled:
+        xr.testing.assert_equal(each, whole)
+
+
+@pytest.mark.parametrize("method", ESTIMATORS)
+def test_estimates_do_not_depend_on_the_type_of_counts(method: str) -> None:
+    cube = np.minimum(4 * echoes(rows=4, cols=16).cube, 255)  # sums that exceed a narrow type
+    signal = np.full(cube.shape[:2], SIGNAL)
+    images = [
+        estimate(
+            Capture(
+                cube.astype(dtype), Acquisition(n_pulses=4000), signal=signal, background=1.735
+            ),
+            method,
+        )
+        for dtype in (np.uint8, np.uint16, np.uint32)
+    ]
+    for each in images[1:]:
+        assert_same(each, images[0])
+
+
+SCALES = (2, 3, 7, 1000, 65_537)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_scaled_counts_move_tracking_only_by_rounding(preset: str, scale: int) -> None:
+    rows, chosen = echoes().cube.reshape(-1, 100), PRESETS[preset]
+    scaled = rows.astype(np.uint32) * np.uint32(scale)
+    signals = tracking_signals(rows, chosen)
+    for position in (
+        track(to_blocks(scaled), chosen)[0],
+        tracking_signals(scaled, chosen).position_bin,
+    ):
+        assert lost_to_rounding(rows, signals.enhanced, signals.weight, position) <= 1
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("method", ["peak", "matched_filter"])
+def test_scaled_counts_move_no_linear_filter(method: str, scale: int) -> None:
+    capture = echoes()
+    more = replace(
+        capture,
+        cube=capture.cube.astype(np.uint32) * np.uint32(scale),
+        acquisition=replace(capture.acquisition, n_pulses=1000 * scale),
+        flux_prior=flux_prior_of(capture),
+    )
+    np.testing.assert_array_equal(estimate(more, method).bin, estimate(capture, method).bin)
+
+
+@pytest.mark.parametrize("method", ESTIMATORS)
+@pytest.mark.parametrize("sbr", [0.1, 1.0])  # some methods find nothing at the lower one
+def test_more_photons_in_an_echo_never_move_the_estimate_away(method: str, sbr: float) -> None:
+    acquisition, onset = Acquisition(), 53.6
+    plane = Scene(np.full((8, 8), float(acquisition.bin_to_range_m(onset))))
+    capture = simulate(plane, acquisition, Flux(SIGNAL, sbr), seed=4)
+    before = estimate(capture, method)
+    right = np.abs(before.bin - onset) <= TOLERANCE_BINS
+    for added in (1, 3, 10, 30, 100):
+        cube = capture.cube.copy()
+        cube[:, :, int(onset) + 1] += np.minimum(added, 1000 - capture.counts).astype(cube.dtype)
+        after = estimate(replace(capture, cube=cube, flux_prior=flux_prior_of(capture)), method)
+        assert (np.abs(after.bin - onset)[right] <= TOLERANCE_BINS).all(), added
+        assert (after.confidence >= before.confidence - 1e-3)[right].all(), added
+
+
+@pytest.mark.parametrize("method", ["likelihood", "coates", "tracking"])
+def test_confidence_does_not_exceed_the_share_of_right_estimates(method: str) -> None:
+    # At the last six the background fires every pulse, or nearly.
+    for sbr in (1e6, 1.0, 0.06, 0.02, 0.015, 0.01, 0.003, 1e-4, 1e-6):
+        capture = echoes(sbr, rows=32)
+        truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
+        image = estimate(capture, method)
+        right = np.abs(image.bin - truth)[image.valid] <= TOLERANCE_BINS
+        confidence = image.confidence[image.valid]
+        assert confidence.size == 0 or float((confidence - right).mean()) <= 0.05, sbr
+
+
+# -- Precision -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sbr", [0.06, 10.0])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_float32_tracking_differs_by_rounding_only(preset: str, sbr: float) -> None:
+    rows, default = echoes(sbr, rows=8).cube.reshape(-1, 100), TrackingParameters()
+    for chosen in settings_of("tracking"):
+        changed = {n: v for n, v in vars(chosen).items() if v != getattr(default, n)}
+        mixed = replace(PRESETS[preset], **changed)
+        if mixed.m >= CALM_M:
+            share, roundings = float32_disagreement(rows, mixed, 1000)
+            assert share <= 1e-3, changed
+            assert roundings <= 1, changed
+
+
+@pytest.mark.parametrize("n_pulses", [1, 1000, 10**9])
+@pytest.mark.parametrize("sbr", [1e-6, 1e-3, 0.06, 1.0, 1e3, 1e6])
+def test_no_delay_is_likelier_in_float64_than_the_one_found_in_float32(
+    n_pulses: int, sbr: float
+) -> None:
+    steps = 2
+    lighting = Lighting(100, n_pulses, 1.0, SIGNAL, SIGNAL / sbr)
+    capture = lighting.capture()
+    delay = (np.arange(100 * steps) + 0.5) / steps
+    rate = rate_per_bin(delay, np.full(delay.size, SIGNAL), *lighting.model[1:])
+    armed = n_pulses - np.cumsum(capture.cube, axis=2, dtype=np.int64)
+    log = capture.cube @ np.log(-np.expm1(-rate)).T - armed @ rate.T
+    flat = np.log(-np.expm1(-lighting.background / 100))
+    size = np.abs(capture.cube * flat).sum(axis=2) + armed[..., -1] * (SIGNAL + lighting.background)
+    found = estimate(capture, "oracle", steps_per_bin=steps)
+    place = np.nan_to_num(found.bin) * steps
+    # The parabola may lead to the edge of a step: look at either side of it.
+    at = np.stack([np.floor(place), np.ceil(place) - 1], axis=2).astype(np.intp)
+    there = np.take_along_axis(log, np.clip(at, 0, delay.size - 1), axis=2).max(axis=2)
+    lost = np.where(found.valid, log.max(axis=2) - there, 0.0)
+    assert (lost <= np.maximum(ROUNDINGS * EPS_32 * size, 0.0)).all()
+
+
+def plain_estimates() -> dict[str, Floats]:
+    """Bin and confidence by every method of a few pixels: plain kernels take seconds for them."""
+    gate = Acquisition(20, n_pulses=1000)
+    onset = np.linspace(3, 15, 16).reshape(2, 8)
+    few = simulate(Scene(gate.bin_to_range_m(onset)), gate, Flux(SIGNAL, 0.2))
+    images = {method: estimate(few, method) for method in ESTIMATORS}
+    return {method: np.stack([each.bin, each.confidence]) for method, each in images.items()}
+
+
+def test_compiled_and_plain_kernels_agree(tmp_path: Path) -> None:
+    path = tmp_path / "plain.npz"
+    script = (
+        "import sys, numpy, core.tests.test_extremes as t; "
+        "numpy.savez(sys.argv[1], **t.plain_estimates())"
+    )
+    subprocess.run(
+        [sys.executable, "-c", script, str(path)],
+        check=True,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONWARNINGS": "ignore"},
+    )
+    with np.load(path) as plain:
+        for method, compiled in plain_estimates().items():
+            np.testing.assert_allclose(plain[method], compiled, atol=1e-3, err_msg=method)
