@@ -32,7 +32,7 @@ from app.server.patches import latency
 from app.server.patches.documents import keep_tracebacks, send_early_changes
 from app.server.ports import free_port, port_number
 from app.server.serve import server_of
-from app.tasks.jobs import LONG
+from app.tasks.scheduler import STUDIES
 from app.widgets.connection import LINGER_S
 from app.widgets.controls import Sentence
 from core.io import SUFFIXES
@@ -110,12 +110,14 @@ def main(arguments: list[str] | None = None) -> int:
     server.io_loop.start()  # until Ctrl+C
     signal.signal(signal.SIGINT, signal.default_int_handler)  # the next waits for nothing
     server.stop()
-    LONG.is_closed = True
+    STUDIES.is_closed = True
     return 0
 
 
 def page_for(sources: Mapping[str, Source], uploads: Uploads) -> Any:
     """The page of a new session, or a sentence where it cannot be built."""
+    if pn.state.curdoc is not None:
+        pn.state.onload(collector.spare)
     try:
         return build_page(sources, uploads)
     except Exception:

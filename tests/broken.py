@@ -10,6 +10,7 @@ from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import app.model.store
+import app.pages.explore.page
 import app.pages.session
 from app import __main__ as started
 from core import CaptureError
@@ -48,8 +49,8 @@ WHEN_TAPPED = (5, 6)
 
 simulate, enter, inspect, choose = (
     app.model.store.simulate,
-    app.pages.session.words.figure_strip,
-    app.pages.session.inspect,
+    app.pages.explore.text.figure_strip,
+    app.pages.explore.page.inspect,
     app.pages.session.Session.choose_pixel,
 )
 
@@ -79,7 +80,7 @@ def breaking_choose(session, row, col):
 
 if __name__ == "__main__":
     app.model.store.simulate = breaking_simulate
-    app.pages.session.words.figure_strip = breaking_figures
-    app.pages.session.inspect = breaking_inspect
+    app.pages.explore.text.figure_strip = breaking_figures
+    app.pages.explore.page.inspect = breaking_inspect
     app.pages.session.Session.choose_pixel = breaking_choose
     sys.exit(started.main())

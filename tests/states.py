@@ -19,6 +19,7 @@ OTHERWISE: dict[str, list[Any]] = {
     "window": [Window((0, 8), (3, 9)), Window((2, 30), (0, 40), step=3)],
     "absent": [frozenset({"jitter"}), frozenset({"pile_up", "signal_levels", "motion"})],
     "pixel": [(0, 0), (63, 5)],
+    "page": ["Inspect", "Compare", "Trade-off", "Paper"],
     "pins": [((1, 2),), ((1, 2), (3, 4), (0, 0), (9, 9))],
     "region": [((1, 2), (1, 9), (7, 5)), ((0.5, 1.25), (-3.0, 9.0), (7.0, 5.1))],
     "reading": [

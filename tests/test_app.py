@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, fields, replace
-from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -12,19 +11,22 @@ from bokeh.document import Document
 import core
 from app.model import colors as looks
 from app.model import text as words
+from app.model.address import Wanted
 from app.model.state import Illumination, Less, Reading, Viewing
 from app.model.store import (
     Request,
     built_in_sources,
     compute,
-    effort_of,
     file_source,
     inspect,
     is_wrong,
 )
+from app.pages.catalog import PAGES
+from app.pages.explore import text as explore_text
 from app.pages.layout import CUSTOM, Layout
+from app.pages.shared.estimate import lane_of
 from app.plots import elements as plots
-from app.tasks.jobs import Effort, LatestWins
+from app.tasks.scheduler import GENERAL, PAGE, SHORT
 from app.theme import DARK, LIGHT, OUTSIDE_COLOR
 from app.widgets.controls import Knob, SettingsPanel
 from app.widgets.figures import Plot
@@ -33,7 +35,7 @@ from app.widgets.signal_plots import SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
-from tests.threads import queued
+from tests.threads import HeldLayout, control
 
 NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
 
@@ -158,17 +160,17 @@ def test_only_what_changed_is_computed_again(car):
 
 def test_the_page_computes_what_takes_less_than_to_draw_it(car):
     other = {"tracking": PRESETS["as printed"]}
-    assert effort_of(replace(car.request, **other), car) is Effort.QUICK
+    assert lane_of(replace(car.request, **other), car) is PAGE
     for again in ({"light": Illumination(seed=1)}, {"less": Less(skip=2)}):
-        assert effort_of(replace(car.request, **again, **other), car) is Effort.SHORT
+        assert lane_of(replace(car.request, **again, **other), car) is SHORT
     for new in ({"source": built_in_sources()["staircase"]}, {"absent": frozenset(["jitter"])}):
-        assert effort_of(replace(car.request, **new, **other), car) is Effort.ANY
+        assert lane_of(replace(car.request, **new, **other), car) is GENERAL
     large = compute(ask("car_256"), None)
     for change in (other, {"light": Illumination(seed=1)}):
-        assert effort_of(replace(large.request, **change), large) is Effort.ANY
+        assert lane_of(replace(large.request, **change), large) is GENERAL
     file = compute(ask("sample"), None)
-    assert effort_of(replace(file.request, **other), file) is Effort.QUICK
-    assert effort_of(replace(file.request, less=Less(skip=2)), file) is Effort.ANY
+    assert lane_of(replace(file.request, **other), file) is PAGE
+    assert lane_of(replace(file.request, less=Less(skip=2)), file) is GENERAL
 
 
 def test_less_of_a_capture_is_taken_from_the_whole_of_it(car):
@@ -334,10 +336,11 @@ def names(facts):
 
 
 def test_figures_and_numbers_are_cores(car):
-    figures = {name: value for name, value, _ in words.figure_strip(car)}
+    figures = {name: value for name, value, _ in explore_text.figure_strip(car)}
     assert figures["RMSE"] == f"{car.run.figures['rmse_m']:.4g} m"
     assert figures["Within 3 bins"] == f"{100 * car.run.figures['rd_3_bins']:.1f} %"
-    numbers = {name: value for name, value, _ in words.pixel_numbers(car, inspect(car, 32, 30))}
+    pixel = explore_text.pixel_numbers(car, inspect(car, 32, 30))
+    numbers = {name: value for name, value, _ in pixel}
     image, sigma, settings = car.run.image, car.capture.cube[32, 30].std(), TrackingParameters()
     assert numbers["Pixel"] == "row 32, col 30"
     assert numbers["Estimate"] == f"{image.range_m[32, 30]:.4g} m"
@@ -351,33 +354,35 @@ def test_figures_and_numbers_are_cores(car):
 def test_what_needs_a_truth_is_left_out_without_one(car, sample):
     def said(answer):
         pixel = inspect(answer, 32, 32)
-        return names(words.figure_strip(answer)) | names(words.pixel_numbers(answer, pixel))
+        numbers = explore_text.pixel_numbers(answer, pixel)
+        return names(explore_text.figure_strip(answer)) | names(numbers)
 
     assert said(car) >= NEED_TRUTH
     assert said(car) - said(sample) == NEED_TRUTH | {"Simulated in"}
-    assert "wrong" in words.cloud_caption(car, 10, 3)
-    assert "wrong" not in words.cloud_caption(sample, 10, None)
+    assert "wrong" in explore_text.cloud_caption(car, 10, 3)
+    assert "wrong" not in explore_text.cloud_caption(sample, 10, None)
 
 
 def test_a_pixel_without_a_target_says_so(car):
     row, col = np.argwhere(np.isnan(car.capture.truth_range_m))[0]
-    numbers = {name: value for name, value, _ in words.pixel_numbers(car, inspect(car, row, col))}
+    pixel = explore_text.pixel_numbers(car, inspect(car, row, col))
+    numbers = {name: value for name, value, _ in pixel}
     assert numbers["Truth"] == "no target"
     assert numbers["Error"] == "–"
 
 
 def test_pulses_that_are_not_known_are_not_counted(small_file):
     answer = compute(ask(file_source(small_file)), None)
-    said = names(words.pixel_numbers(answer, inspect(answer, 0, 0)))
+    said = names(explore_text.pixel_numbers(answer, inspect(answer, 0, 0)))
     assert "Pulses that fired" not in said
 
 
 def test_the_page_is_told_plain_text_only(car, sample):
     for answer in (car, sample):
         pixel = inspect(answer, 32, 32)
-        facts = words.figure_strip(answer) + words.pixel_numbers(answer, pixel)
+        facts = explore_text.figure_strip(answer) + explore_text.pixel_numbers(answer, pixel)
         texts = [text for fact in facts for text in fact]
-        texts += [words.provenance(answer), words.cloud_caption(answer, 1, 1)]
+        texts += [words.provenance(answer), explore_text.cloud_caption(answer, 1, 1)]
         assert all(texts)
         assert not [text for text in texts if "<" in text or "&" in text]
 
@@ -601,27 +606,22 @@ def test_showing_settings_reports_nothing():
 
 
 @pytest.fixture
-def layout(monkeypatch):
-    """A page; what is to be done on its thread waits for `next_answer`."""
-    acts = SimpleQueue()
-    monkeypatch.setattr(
-        "app.pages.session.LatestWins", lambda on_page: LatestWins(queued(acts.put))
-    )
-    page = Layout(built_in_sources())
-    page.acts, page.heard, tell = acts, [""], page.session.complain
-    page.session.complain = lambda sentence: (page.heard.append(sentence), tell(sentence))
-    return page
+def layout():
+    return HeldLayout(built_in_sources())
 
 
-def next_answer(layout):
-    """Let the page draw what the worker gives it next, and return what it then shows."""
-    layout.acts.get(timeout=20)()
-    return layout.session.answer
+@pytest.fixture
+def explore(layout):
+    return layout.contents["Explore"]
 
 
 def complaint(layout):
-    """The sentence that the session told its page last, empty for none."""
+    """The sentence that the page shows on failures, empty for none."""
     return layout.heard[-1]
+
+
+def next_answer(layout):
+    return layout.next_answer()
 
 
 def open_file(layout, path):
@@ -630,23 +630,18 @@ def open_file(layout, path):
     layout.session.state.param.update(source=path.name, reading=Reading())
 
 
-def control(layout, label):
-    (found,) = layout.page.select(lambda each: getattr(each, "label", None) == label)
-    return found
-
-
 def told(facts):
     return {name: value for name, value, _ in facts.facts}
 
 
-def test_a_page_is_complete_and_answered(layout):
+def test_a_page_is_complete_and_answered(layout, explore):
     session = layout.session
-    assert told(session.figures)["RMSE"] == f"{session.answer.run.figures['rmse_m']:.4g} m"
-    assert told(session.numbers)["Pixel"] == "row {}, col {}".format(*session.state.pixel)
+    assert told(explore.figures)["RMSE"] == f"{session.answer.run.figures['rmse_m']:.4g} m"
+    assert told(explore.numbers)["Pixel"] == "row {}, col {}".format(*session.state.pixel)
     assert np.isfinite(session.answer.capture.truth_range_m[session.state.pixel])
     shown = looks.shown(session.answer, 0.9).sum()
-    assert len(session.cloud.positions) == 12 * shown
-    assert f"{shown:,} of 4,096" in session.cloud.caption
+    assert len(explore.cloud.positions) == 12 * shown
+    assert f"{shown:,} of 4,096" in explore.cloud.caption
     model = layout.page.get_root()
     kinds = [type(part).__name__ for part in model.references()]
     assert kinds.count("figure") == 4
@@ -654,7 +649,7 @@ def test_a_page_is_complete_and_answered(layout):
 
 
 @pytest.mark.parametrize("key", built_in_sources())
-def test_every_source_can_be_drawn_in_every_way(layout, key):
+def test_every_source_can_be_drawn_in_every_way(layout, explore, key):
     session = layout.session
     if key != session.state.source:
         control(layout, "Scene or capture").value = key
@@ -662,20 +657,22 @@ def test_every_source_can_be_drawn_in_every_way(layout, key):
     assert complaint(layout) == ""
     for kind in session.state.param.image.objects:
         session.state.image = kind
-        assert session.image.figure.title.text
+        layout.settle()
+        assert explore.image.figure.title.text
     for kind in session.state.param.cloud_color.objects:
         session.state.cloud_color = kind
-        assert len(session.cloud.colors) == len(session.cloud.positions) / 4
+        layout.settle()
+        assert len(explore.cloud.colors) == len(explore.cloud.positions) / 4
 
 
-def test_a_tracking_parameter_changes_the_answer(layout):
-    before, figures = layout.session.answer, told(layout.session.figures)
+def test_a_tracking_parameter_changes_the_answer(layout, explore):
+    before, figures = layout.session.answer, told(explore.figures)
     control(layout, "l").value = 0.05
     answer = next_answer(layout)
     assert answer.request.tracking == TrackingParameters(l=0.05)
     assert answer.capture is before.capture
-    assert told(layout.session.figures)["RMSE"] == f"{answer.run.figures['rmse_m']:.4g} m"
-    assert told(layout.session.figures)["RMSE"] != figures["RMSE"]
+    assert told(explore.figures)["RMSE"] == f"{answer.run.figures['rmse_m']:.4g} m"
+    assert told(explore.figures)["RMSE"] != figures["RMSE"]
 
 
 def test_presets_set_all_controls_and_a_change_makes_them_custom(layout):
@@ -727,21 +724,28 @@ def test_a_weight_that_needs_pulses_is_refused_where_they_are_not_known(layout, 
     assert complaint(layout) == ""
 
 
+def opened(layout, title):
+    """A part of the sidebar, unfolded."""
+    (part,) = layout.page.select(lambda each: getattr(each, "title", "") == title)
+    part.collapsed = False
+    return part
+
+
 def test_what_is_folded_away_is_built_when_it_is_first_opened(layout):
-    (part,) = layout.page.select(lambda each: getattr(each, "title", "") == "Less data, faster")
-    fields = list(layout._less.controls.values())
+    names = [spec_of(each).symbol for each in fields(Less)]
 
     def on_page():
-        return [each for each in layout.page.select(lambda each: True) if each in fields]
+        return [each.label for each in layout.page.select(Knob) if each.label in names]
 
     assert on_page() == []
+    part = opened(layout, "Less data, faster")
     for collapsed in (False, True, False):
         part.collapsed = collapsed
-        assert on_page() == fields
+        assert on_page() == names
 
 
 def test_typed_text_changes_how_a_file_is_read(layout, small_file):
-    layout._reading_card.collapsed = False
+    opened(layout, "How to read the file")
     open_file(layout, small_file)
     before = next_answer(layout)
     control(layout, "Bin width (s)").value = "wide"
@@ -754,22 +758,22 @@ def test_typed_text_changes_how_a_file_is_read(layout, small_file):
 
 
 def test_less_of_a_capture_is_another_view_of_it(layout):
-    panel = layout._less.controls
-    panel["pool"].value = 4
+    opened(layout, "Less data, faster")
+    control(layout, "Pixels added").value = 4
     assert next_answer(layout).capture.shape == (16, 16)
     assert max(layout.session.state.pixel) < 16
-    panel["merge"].value = 2
+    control(layout, "Bins merged").value = 2
     assert next_answer(layout).capture.cube.shape == (16, 16, 50)
-    panel["gate_from"].value = 1.0  # leaves one bin, where two are to be merged
+    control(layout, "Gate from").value = 1.0  # leaves one bin, where two are to be merged
     next_answer(layout)
     assert "factor = 2 is not accepted" in complaint(layout)
-    assert (panel["merge"].value, panel["gate_from"].value) == (2, 0.0)
+    assert (control(layout, "Bins merged").value, control(layout, "Gate from").value) == (2, 0.0)
     control(layout, "Scene or capture").value = "staircase"
     assert next_answer(layout).capture.shape == (64, 64)
-    assert panel["pool"].value == 1
+    assert control(layout, "Pixels added").value == 1
 
 
-def test_a_capture_without_truth_hides_what_needs_one(layout, real_capture):
+def test_a_capture_without_truth_hides_what_needs_one(layout, explore, real_capture):
     session = layout.session
     session.state.param.update(image="Error", cloud_color="Error")
     open_file(layout, real_capture("21km_K11_night.mat"))
@@ -777,15 +781,15 @@ def test_a_capture_without_truth_hides_what_needs_one(layout, real_capture):
     assert session.state.param.image.objects == ["Estimate", "Counts"]
     assert session.state.param.cloud_color.objects == ["Range", "Counts"]
     assert (session.state.image, session.state.cloud_color) == ("Estimate", "Range")
-    assert not NEED_TRUTH & (set(told(session.figures)) | set(told(session.numbers)))
-    assert not any(session.cloud.wrong)
+    assert not NEED_TRUTH & (set(told(explore.figures)) | set(told(explore.numbers)))
+    assert not any(explore.cloud.wrong)
     control(layout, "Scene or capture").value = "car"
     assert next_answer(layout).request.source.is_scene
     assert session.state.param.image.objects == ["Estimate", "Truth", "Error", "Counts"]
 
 
 @pytest.mark.parametrize("counts", [0, 1])
-def test_a_capture_without_any_answer_is_shown_as_such(layout, tmp_path, counts):
+def test_a_capture_without_any_answer_is_shown_as_such(layout, explore, tmp_path, counts):
     path = tmp_path / "silence.npz"
     save_capture(Capture(np.full((3, 5, 40), counts, np.uint16), Acquisition(40)), path)
     open_file(layout, path)
@@ -793,9 +797,9 @@ def test_a_capture_without_any_answer_is_shown_as_such(layout, tmp_path, counts)
     assert answer.request.source.title == "silence.npz"
     assert not answer.run.image.valid.any()
     assert "No pixel has an answer" in complaint(layout)
-    assert told(layout.session.numbers)["Estimate"] == "–"
-    assert layout.session.cloud.positions == b""
-    assert layout.session.cloud.caption.startswith("0 of 15 answers")
+    assert told(explore.numbers)["Estimate"] == "–"
+    assert explore.cloud.positions == b""
+    assert explore.cloud.caption.startswith("0 of 15 answers")
 
 
 def test_a_gate_that_ends_before_t_n_is_told(layout, tmp_path):
@@ -812,22 +816,35 @@ def test_a_gate_that_ends_before_t_n_is_told(layout, tmp_path):
     assert complaint(layout) == ""
 
 
-def test_a_pixel_can_be_chosen_by_point_and_by_key(layout):
+def test_a_pixel_can_be_chosen_by_point_and_by_key(layout, explore):
     session = layout.session
-    session.cloud.selected = 10 * 64 + 20
-    assert session.state.pixel == tuple(session.image_keys.pixel) == (10, 20)
-    session.image_keys.pixel = [11, 20]  # a list, as the browser sends it
-    assert session.cloud.selected == 11 * 64 + 20
-    assert told(session.numbers)["Pixel"] == "row 11, col 20"
+    explore.cloud.selected = 10 * 64 + 20
+    layout.settle()
+    assert session.state.pixel == tuple(explore.image_keys.pixel) == (10, 20)
+    explore.image_keys.pixel = [11, 20]  # a list, as the browser sends it
+    layout.settle()
+    assert explore.cloud.selected == 11 * 64 + 20
+    assert told(explore.numbers)["Pixel"] == "row 11, col 20"
 
 
-def test_hidden_answers_leave_the_cloud_but_not_the_figures(layout):
-    session, figures = layout.session, told(layout.session.figures)
+def test_a_page_off_screen_is_not_drawn_and_catches_up(layout, explore):
+    layout.pages.choice.value = "Inspect"
+    before = explore.numbers.facts
+    layout.session.choose_pixel(3, 4)
+    layout.settle()
+    assert explore.numbers.facts is before
+    layout.pages.choice.value = "Explore"
+    assert told(explore.numbers)["Pixel"] == "row 3, col 4"
+
+
+def test_hidden_answers_leave_the_cloud_but_not_the_figures(layout, explore):
+    session, figures = layout.session, told(explore.figures)
     confidence = session.answer.run.image.confidence
     for least in (0.0, 0.5, 1.0):
         control(layout, "Show from confidence").value = least
-        assert len(session.cloud.positions) / 12 == (confidence >= least).sum()
-        assert told(session.figures) == figures
+        layout.settle()
+        assert len(explore.cloud.positions) / 12 == (confidence >= least).sum()
+        assert told(explore.figures) == figures
 
 
 def test_controls_fit_the_capture_they_are_for(layout, small_file):
@@ -837,6 +854,25 @@ def test_controls_fit_the_capture_they_are_for(layout, small_file):
     field_of_view = control(layout, "Field of view")
     width_deg = np.degrees(answer.capture.shape[1] * answer.capture.acquisition.pixel_angle_rad)
     assert field_of_view.value == field_of_view.initial == pytest.approx(width_deg, rel=0.01)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_page_can_be_the_first_one(page):
+    layout = Layout(built_in_sources(), Wanted({"page": page.name}))
+    assert (layout.pages.choice.value, [*layout.contents]) == (page.name, [page.name])
+    assert layout.page.sidebar_open != page.is_standalone
+    assert layout.page.get_root().references()
+    for other in (*PAGES, page):
+        layout.pages.choice.value = other.name
+        assert layout.session.state.page == other.name
+        assert layout.page.sidebar_open != other.is_standalone
+    assert layout.alert.text == ""
+
+
+def test_a_page_that_does_not_exist_is_refused_by_name():
+    layout = Layout(built_in_sources(), Wanted({"page": "Nowhere"}))
+    assert layout.pages.choice.value == "Explore"
+    assert "page = 'Nowhere' is not accepted: give Explore, Inspect" in layout.alert.text
 
 
 def test_sessions_share_no_control_and_no_source(layout):

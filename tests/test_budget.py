@@ -10,14 +10,15 @@ import numpy as np
 import psutil
 import pytest
 
-from app.model import budget, store
+from app.model import budget
 from app.model.state import Illumination, Less, Reading
-from app.model.store import Request, compute, effort_of, file_source
+from app.model.store import Request, compute, file_source
 from app.pages.compare.ranking import Task, run_task
 from app.pages.inspect.results import capture_known, pixel_lit
 from app.pages.session import Session
+from app.pages.shared.estimate import FEW_COUNTS, lane_of
 from app.pages.tradeoff.page import affordable
-from app.tasks.jobs import Effort
+from app.tasks.scheduler import GENERAL
 from core import ESTIMATORS, Acquisition, Capture, TrackingParameters, save_capture
 from core.cost import Cost
 from core.studies.tradeoff.measure import candidates
@@ -68,7 +69,7 @@ def test_a_capture_that_fits_is_left_as_it_is(source):
 def test_the_controls_show_what_was_left_out(source, tight):
     session = Session({"wide": source})
     assert session.state.less == session.answer.request.less != Less()
-    assert session.answer.request == session._request()  # the next request asks for the same
+    assert session.answer.request == session.estimate.request  # the next request asks for the same
 
 
 def test_more_of_it_is_refused_with_a_remedy(source, tight):
@@ -116,8 +117,8 @@ def test_a_long_gate_is_not_ranged_on_the_page(tmp_path):
     save_capture(capture, tmp_path / "long.npz")
     answer = compute(ask(file_source(tmp_path / "long.npz")), None)
     again = replace(answer.request, tracking=TrackingParameters(t_n=50))
-    assert answer.capture.cube.size < store.FEW_COUNTS
-    assert effort_of(again, answer) is Effort.ANY
+    assert answer.capture.cube.size < FEW_COUNTS
+    assert lane_of(again, answer) is GENERAL
 
 
 def test_requests_wait_until_there_is_memory_for_them(monkeypatch):

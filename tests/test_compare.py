@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from io import BytesIO
-from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -18,12 +17,11 @@ from app.pages.compare import ranking
 from app.pages.compare import text as ranking_words
 from app.pages.compare.page import MOST_PICTURES, Compare
 from app.pages.compare.ranking import Result, Task
-from app.pages.layout import Layout
-from app.tasks.jobs import LatestWins
+from app.pages.session import Session
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
 from tests.browser import eventually, fact
-from tests.threads import queued
+from tests.threads import HeldTasks
 
 # -- what is computed ------------------------------------------------------------------------------
 
@@ -143,21 +141,16 @@ def test_methods_are_told_apart_by_colour_and_dashes():
 class Stage:
     """A Compare page whose thread is the test's own."""
 
-    def __init__(self, monkeypatch):
-        self.acts = SimpleQueue()
-        for room in ("pages.session", "pages.compare.page"):
-            monkeypatch.setattr(
-                f"app.{room}.LatestWins", lambda _: LatestWins(queued(self.acts.put))
-            )
-        self.layout = Layout(built_in_sources())
-        self.session = self.layout.session
+    def __init__(self):
+        self.tasks = HeldTasks()
+        self.session = Session(built_in_sources(), tasks=self.tasks)
         self.page = Compare(self.session)
         self.view = self.page.view
         self.view.paint(False)
-        self.session.announce = self.view.follow
+        self.session.estimate.changed.subscribe(self.view.follow)
 
     def act(self):
-        self.acts.get(timeout=30)()
+        self.tasks.run_one()
 
     def change(self, **chosen):
         """Have the session answer another request."""
@@ -170,7 +163,7 @@ class Stage:
         """Let the page do all that is to be done."""
         while self.page._is_busy or self.page._measure is None:
             self.act()
-        while not self.acts.empty():
+        while not self.tasks.waiting.empty():
             self.act()
 
     @property
@@ -183,12 +176,12 @@ class Stage:
 
 
 @pytest.fixture
-def stage(monkeypatch):
-    return Stage(monkeypatch)
+def stage():
+    return Stage()
 
 
 def test_nothing_is_computed_before_the_page_is_seen(stage):
-    assert stage.acts.empty()
+    assert stage.tasks.waiting.empty()
     assert not stage.page._is_busy
     stage.view.show(True)
     stage.settle()
@@ -229,7 +222,7 @@ def test_only_what_is_missing_is_computed(stage, monkeypatch):
     assert ran == ["matched_filter", "likelihood"]
     stage.view.show(False)
     stage.page._false_alarm.value = 0.1
-    assert stage.acts.empty()
+    assert stage.tasks.waiting.empty()
     stage.view.show(True)
     stage.settle()
     assert len(ran) == 2 + 6
@@ -252,7 +245,7 @@ def test_cancel_stops_before_the_next_method_and_goes_on(stage):
     stage.page._stop_or_go_on()
     while stage.page._is_busy:
         stage.act()
-    while not stage.acts.empty():
+    while not stage.tasks.waiting.empty():
         stage.act()
     done = sum(isinstance(each, Result) for each in stage.page._results.values())
     assert stage.page._status.text == f"Stopped: {done} of 5 done"
@@ -327,16 +320,6 @@ def test_every_source_can_be_shown_in_every_way(stage, key):
     assert len({tuple(cloud.bounds) for cloud in clouds}) == 1
     stage.view.paint(True)
     assert all(cloud.dark for cloud in clouds)
-
-
-def test_the_hidden_page_is_not_drawn_and_catches_up(stage):
-    session = stage.session
-    session.show(False)
-    before = session.numbers.facts
-    session.choose_pixel(3, 4)
-    assert session.numbers.facts is before
-    session.show(True)
-    assert session.numbers.facts[0][1] == "row 3, col 4"
 
 
 # -- in a browser ----------------------------------------------------------------------------------

@@ -39,6 +39,11 @@ def layout():
 
 
 @pytest.fixture
+def explore(layout):
+    return layout.contents["Explore"]
+
+
+@pytest.fixture
 def session(layout):
     return layout.session
 
@@ -102,12 +107,12 @@ def test_a_name_harms_no_system_whatever_the_capture_is_called(capture):
     assert name.endswith("_enhanced-row1000-col1000.csv")
 
 
-def test_a_name_follows_the_page(session):
+def test_a_name_follows_the_page(explore, session):
     subject = downloads.explored(session)
     assert subject.file_name("cloud", "las") == "car_tracking_cloud.las"
     assert "simulated" in subject.about("cloud")
     row, col = session.state.pixel
-    shown_now = downloads.pixel_plot(session, session.signals.histogram.figure, "histogram")
+    shown_now = downloads.pixel_plot(session, explore.signals.histogram.figure, "histogram")
     assert f"row{row} col{col}" in shown_now.what
 
 
@@ -119,11 +124,11 @@ def test_a_name_follows_the_page(session):
         ({"field_of_view_deg": 7.0}, "_field-of-view-deg7"),
     ],
 )
-def test_names_of_image_and_cloud_tell_how_they_are_seen(session, changed, told):
+def test_names_of_image_and_cloud_tell_how_they_are_seen(explore, session, changed, told):
     before = session.state.viewing
     session.state.viewing = replace(before, **changed)
     try:
-        shown = downloads.range_image(session), downloads.cloud_on_show(session)
+        shown = explore.image_shown(), explore.cloud_shown()
     finally:
         session.state.viewing = before
     image, cloud = (each.subject.file_name(each.what, "csv") for each in shown)
@@ -134,9 +139,9 @@ def test_names_of_image_and_cloud_tell_how_they_are_seen(session, changed, told)
 # -- contents --------------------------------------------------------------------------------------
 
 
-def test_a_plots_table_holds_its_curves(session):
+def test_a_plots_table_holds_its_curves(explore, session):
     signals = inspect(session.answer, *session.state.pixel).signals
-    plot = session.signals.histogram
+    plot = explore.signals.histogram
     found = columns_of(
         written(downloads.pixel_plot(session, plot.figure, "histogram").files["csv"])
     )
@@ -159,8 +164,8 @@ def test_a_plots_table_holds_its_curves(session):
     np.testing.assert_allclose(found["Bin"][answer], at, rtol=1e-6)
 
 
-def test_what_is_hidden_or_out_of_view_is_left_out_of_a_plots_table(session):
-    plot = session.signals.histogram
+def test_what_is_hidden_or_out_of_view_is_left_out_of_a_plots_table(explore, session):
+    plot = explore.signals.histogram
     plot.show("small", False)
     plot.figure.x_range.update(start=20.2, end=30.9)
     try:
@@ -175,10 +180,10 @@ def test_what_is_hidden_or_out_of_view_is_left_out_of_a_plots_table(session):
 
 
 @pytest.mark.parametrize("kind", ["Estimate", "Error", "Counts"])
-def test_an_images_table_holds_its_pixels(session, kind):
+def test_an_images_table_holds_its_pixels(explore, session, kind):
     session.state.image = kind
     try:
-        found = columns_of(written(downloads.range_image(session).files["csv"]))
+        found = columns_of(written(explore.image_shown().files["csv"]))
     finally:
         session.state.image = "Estimate"
     values, look = image_of(session.answer, kind, session.state.viewing.least_confidence)
@@ -187,12 +192,12 @@ def test_an_images_table_holds_its_pixels(session, kind):
     np.testing.assert_array_equal(shown_values, values.ravel())
 
 
-def test_an_images_table_holds_the_pixels_in_view(session):
-    figure = session.image.figure
+def test_an_images_table_holds_the_pixels_in_view(explore, session):
+    figure = explore.image.figure
     figure.x_range.update(start=9.7, end=20.2)
     figure.y_range.update(start=30.4, end=5.6)
     try:
-        found = columns_of(written(downloads.range_image(session).files["csv"]))
+        found = columns_of(written(explore.image_shown().files["csv"]))
     finally:
         figure.x_range.update(start=np.nan, end=np.nan)
         figure.y_range.update(start=np.nan, end=np.nan)
@@ -200,8 +205,8 @@ def test_an_images_table_holds_the_pixels_in_view(session):
     assert (found["row"].min(), found["row"].max()) == (6, 30)
 
 
-def test_the_answers_arrays_leave_without_what_is_hidden(session):
-    files = downloads.range_image(session).files
+def test_the_answers_arrays_leave_without_what_is_hidden(explore, session):
+    files = explore.image_shown().files
     visible = shown(session.answer, session.state.viewing.least_confidence)
     range_m = np.where(visible, session.answer.run.image.range_m, np.nan)
     arrays = np.load(io.BytesIO(written(files["npz"])))
@@ -213,10 +218,10 @@ def test_the_answers_arrays_leave_without_what_is_hidden(session):
 
 
 @pytest.mark.parametrize("kind", MAPS)
-def test_arrays_and_pages_hold_the_map_that_is_shown(session, kind):
+def test_arrays_and_pages_hold_the_map_that_is_shown(explore, session, kind):
     least = 0.9
     values, look = map_of(session.answer, kind, least)
-    files = image_files(session.answer, kind, least, session.image.figure)
+    files = image_files(session.answer, kind, least, explore.image.figure)
     arrays = np.load(io.BytesIO(written(files["npz"])))
     name = "range_m" if kind == "Estimate" else kind.lower()
     np.testing.assert_array_equal(arrays[name], values)
@@ -229,9 +234,9 @@ def test_arrays_and_pages_hold_the_map_that_is_shown(session, kind):
     assert set(told) == {name, "range_m", "confidence", "counts"}
 
 
-def points_on_screen(session):
+def points_on_screen(explore):
     """Coordinates and colours of the points as the browser has them."""
-    cloud = session.cloud
+    cloud = explore.cloud
     xyz_m = np.frombuffer(cloud.positions, "<f4").reshape(-1, 3)
     rgb = np.frombuffer(cloud.colors, np.uint8).reshape(-1, 3).copy()
     rgb[np.frombuffer(cloud.wrong, bool)] = tuple(bytes.fromhex(cloud.wrong_color[1:]))
@@ -240,15 +245,13 @@ def points_on_screen(session):
 
 @pytest.mark.parametrize("kind", ["Range", "Error", "Counts"])
 @pytest.mark.parametrize("least", [0.0, 0.9])
-def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(session, kind, least):
+def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(explore, session, kind, least):
     state = session.state
     before = state.viewing
     state.param.update(cloud_color=kind, viewing=replace(before, least_confidence=least))
     try:
-        files = {
-            name: written(each) for name, each in downloads.cloud_on_show(session).files.items()
-        }
-        xyz_m, rgb = points_on_screen(session)
+        files = {name: written(each) for name, each in explore.cloud_shown().files.items()}
+        xyz_m, rgb = points_on_screen(explore)
     finally:
         state.param.update(cloud_color="Range", viewing=before)
     ply = trimesh.load(io.BytesIO(files["ply"]), file_type="ply")
@@ -268,8 +271,8 @@ def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(session, kind
 
 @pytest.mark.parametrize("kind", ["Range", "Error", "Confidence", "3D clouds"])
 def test_a_methods_picture_leaves_as_its_answer(layout, kind):
-    compare = layout._compare
-    compare.view.show(True)
+    layout.pages.choice.value = "Compare"
+    compare = layout.contents["Compare"]
     limit = time.monotonic() + 60
     while "peak" not in compare._answers():
         assert time.monotonic() < limit
@@ -277,7 +280,7 @@ def test_a_methods_picture_leaves_as_its_answer(layout, kind):
     compare._kind.value = kind
     place = compare._pictured().index("peak")
     found = compare._picture_shown(place)
-    compare.view.show(False)
+    layout.pages.choice.value = "Explore"
     image = compare._answers()["peak"].run.image
     assert (found.heading, found.subject.estimator) == ("Peak of the histogram", "peak")
     if kind == "3D clouds":
@@ -335,7 +338,7 @@ class Heard(Download):
 
 
 def complaint(layout):
-    return layout._alert.text
+    return layout.alert.text
 
 
 def offering(write):
@@ -405,16 +408,16 @@ def test_a_file_that_cannot_be_written_is_told_and_not_given(layout, write, word
     assert good.ask(suffix="csv")["piece"] == b"all"
 
 
-def test_a_cloud_without_points_is_told(layout):
+def test_a_cloud_without_points_is_told(explore, layout):
     session = layout.session
     before = session.answer
     image = replace(before.run.image, valid=np.zeros((64, 64), bool))
-    session.answer = replace(before, run=replace(before.run, image=image))
+    session.estimate.answer = replace(before, run=replace(before.run, image=image))
     try:
-        button = Heard(session, lambda: downloads.cloud_on_show(session), "ply")
+        button = Heard(session, explore.cloud_shown, "ply")
         assert button.ask(suffix="ply") == {"failed": True}
     finally:
-        session.answer = before
+        session.estimate.answer = before
     assert "nothing to save: no answer is confident enough" in complaint(layout)
 
 

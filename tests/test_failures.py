@@ -6,7 +6,7 @@ import asyncio
 import os
 import re
 import signal
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from itertools import cycle
 from pkgutil import resolve_name
@@ -28,21 +28,22 @@ from app.pages.inspect.page import Inspector
 from app.pages.inspect.pins import Pins
 from app.pages.inspect.pixel import Sight
 from app.pages.inspect.views import rectangle
-from app.pages.layout import Layout, Page
+from app.pages.layout import Layout, Template
 from app.pages.navigation import Pages, View
 from app.pages.paper.page import Jump, RangeImages, Repeated, Sliders, Trials, jump
 from app.pages.session import Session
+from app.pages.shared.failures import FailureLog
 from app.pages.tradeoff.ablation import Judged, Requires
 from app.pages.tradeoff.page import Acquisition, Effort, Ways
 from app.pages.tradeoff.sensitivity import Trust
-from app.tasks.jobs import LatestWins, Places
 from core import ESTIMATORS, CaptureError
 from core.studies.paper import figures as paper
 from core.studies.trials import Condition
 from tests.broken import AT_SEED, WHEN_DRAWN, WHEN_INSPECTED, WHEN_TAPPED
 from tests.browser import ROOT, eventually, serving
-from tests.load import opened
-from tests.threads import at_once
+from tests.load import opened as opened_wire
+from tests.test_app import opened
+from tests.threads import control
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def provoke(address, break_it, mend_it):
     """What the page says when something is broken, and when it has been mended."""
 
     async def session():
-        wire, _ = await opened(address, seed=0)
+        wire, _ = await opened_wire(address, seed=0)
         alert = wire.find("Sentence", warning=True)
         said = []
         for act, is_over in ((break_it, bool), (mend_it, lambda text: not text)):
@@ -103,18 +104,6 @@ def test_a_callback_that_fails_is_told_and_the_next_works(broken):
         )
         assert "KeyError" in said
         assert str(ROOT) not in said
-
-
-def test_where_no_thread_can_be_had_the_page_is_told_of_each_request(monkeypatch):
-    def refuse(*_):
-        raise BrokenExecutor("no thread can be had")
-
-    monkeypatch.setattr(ThreadPoolExecutor, "submit", refuse)
-    told = []
-    jobs = LatestWins(at_once, Places(1, "dead"))
-    for _ in range(3):
-        jobs.submit(lambda: 1, told.append, told.append)
-    assert [type(each) for each in told] == [BrokenExecutor] * 3
 
 
 # -- parts of the pages, without a browser ---------------------------------------------------------
@@ -246,7 +235,7 @@ def session():
 @pytest.mark.parametrize("where", PARTS)
 def test_work_of_a_page_that_fails_is_told_and_the_next_works(where, monkeypatch, session):
     raised, told = breaking(monkeypatch, where), []
-    session.complain = told.append
+    session.failures.shown.subscribe(told.append)
     errors = RAISED[1:] if where in REFUSE else RAISED
     raised[:] = errors[:1]
     act, goes_on = PARTS[where](session)
@@ -263,26 +252,26 @@ def test_work_of_a_page_that_fails_is_told_and_the_next_works(where, monkeypatch
     eventually(lambda: told[-1] == "")
 
 
-def test_a_failure_is_told_until_its_own_part_works_again(session):
-    told = []
-    session.complain = told.append
+def test_a_failure_is_shown_until_its_own_part_works_again():
+    failures, shown = FailureLog(), []
+    failures.shown.subscribe(shown.append)
     map_, pins = object(), object()
-    session.fail(MemoryError(), of=map_)
-    session.fail(OSError(28, "full"), of=pins)
-    of_map, of_pins = told
-    session.recover(session)
-    session.recover(map_)  # the latest is told all along
-    assert told[-1] == of_pins
-    session.fail(MemoryError(), of=map_)
-    session.recover(map_)
-    assert told[2:] == [of_pins, of_map, of_pins]
-    session.recover(pins)
-    assert told[-1] == ""
+    failures.report(MemoryError(), part=map_)
+    failures.report(OSError(28, "full"), part=pins)
+    of_map, of_pins = shown
+    failures.resolve(failures)
+    failures.resolve(map_)  # the latest has been shown all along
+    assert shown[-1] == of_pins
+    failures.report(MemoryError(), part=map_)
+    failures.resolve(map_)
+    assert shown[2:] == [of_pins, of_map, of_pins]
+    failures.resolve(pins)
+    assert shown[-1] == ""
 
 
 def test_another_pixel_does_not_silence_a_map_that_failed(monkeypatch, session):
     raised, told = breaking(monkeypatch, "app.pages.inspect.page.map_of"), []
-    session.complain = told.append
+    session.failures.shown.subscribe(told.append)
     raised.append(MemoryError())
     change_map, _ = navigated(session)
     sight = Sight(session, "pixel")
@@ -322,7 +311,7 @@ def test_a_limit_that_fails_is_told_and_is_not_called_unknown(monkeypatch, sessi
     raised[:] = RAISED[2:]
     session.state.comparison = replace(session.state.comparison, methods=("peak",))
     page = Compare(session)
-    session.announce = page.view.follow
+    session.estimate.changed.subscribe(page.view.follow)
     page.view.show(True)
     eventually(lambda: messages(page)["Physics’ limit"] not in ("", words.NOT_COMPUTED))
     check_told(messages(page)["Physics’ limit"], raised[0])
@@ -334,7 +323,7 @@ def test_a_limit_that_fails_is_told_and_is_not_called_unknown(monkeypatch, sessi
 
 def test_curves_that_fail_are_told_and_those_of_the_next_pixel_are_drawn(monkeypatch, session):
     raised, told = breaking(monkeypatch, "app.pages.compare.page.score_curves"), []
-    session.complain = told.append
+    session.failures.shown.subscribe(told.append)
     session.state.comparison = replace(session.state.comparison, methods=("peak",))
     page = Compare(session)
     page.view.show(True)
@@ -351,21 +340,26 @@ def test_curves_that_fail_are_told_and_those_of_the_next_pixel_are_drawn(monkeyp
 
 def test_what_is_typed_in_vain_is_told_and_the_next_reading_works():
     layout = Layout({"sample": built_in_sources()["sample"]})
-    width, alert = layout._reading["bin_width_s"], layout._alert
+    opened(layout, "How to read the file")
+    width, alert, again = (
+        control(layout, "Bin width (s)"),
+        layout.alert,
+        control(layout, "Read again"),
+    )
     width.value = "<b>wide</b>"
-    layout._read_again()
+    again.clicks += 1
     assert "bin_width_s = '<b>wide</b>' is not accepted: give" in alert.text
     width.value = "-2e-9"
-    layout._read_again()
+    again.clicks += 1
     eventually(lambda: "bin_width_s = -2e-09" in alert.text)
     width.value = "2e-9"
-    layout._read_again()
+    again.clicks += 1
     eventually(lambda: alert.text == "")
     assert layout.session.answer.capture.acquisition.bin_width_s == 2e-9
 
 
 def test_an_address_that_asks_for_an_unreadable_file_names_no_folder(monkeypatch):
-    raised, wanted = breaking(monkeypatch, "app.pages.session.compute"), Wanted({"seed": "3"})
+    raised, wanted = breaking(monkeypatch, "app.model.restore.compute"), Wanted({"seed": "3"})
     for error in RAISED:
         raised[:] = [error]
         with pytest.raises(type(error)):
@@ -384,7 +378,7 @@ def test_a_page_that_cannot_be_built_says_so_and_the_log_says_why(monkeypatch, c
         assert (page.text, page.warning) == (words.NO_PAGE, True)
         assert caplog.records[-1].exc_info[1] is error
     raised.clear()
-    assert isinstance(started.page_for(few_pixels(), Uploads()), Page)
+    assert isinstance(started.page_for(few_pixels(), Uploads()), Template)
 
 
 def test_files_have_names_and_no_folders():
@@ -433,7 +427,7 @@ def killed(_):
 
 def test_a_process_that_is_killed_is_told_and_the_next_works(monkeypatch, session):
     told = []
-    session.complain = told.append
+    session.failures.shown.subscribe(told.append)
     start, goes_on = started_by_compute(ways)(session)
     with monkeypatch.context() as patched:
         patched.setattr("core.studies.tradeoff.measure.held_bytes", killed)

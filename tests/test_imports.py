@@ -23,7 +23,6 @@ ROOMS = (
 
 EXCEPTIONS = {
     "model/address.py imports app.widgets.component.Component",
-    "pages/layout.py imports app.server.garbage",
 }
 """Still to be removed."""
 

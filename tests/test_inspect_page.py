@@ -75,9 +75,9 @@ def test_a_position_is_told_in_the_unit(unit):
 
 
 def test_axes_take_on_unit_and_gate_without_new_data():
-    session = Session(built_in_sources())
-    figure = session.signals.histogram.figure
-    data = session.signals.histogram.source("raw").data
+    layout = Layout(built_in_sources())
+    session, histogram = layout.session, layout.contents["Explore"].signals.histogram
+    figure, data = histogram.figure, histogram.source("raw").data
     before = {name: np.array(values) for name, values in data.items()}
     labels = []
     for unit in ("bins", "ns", "m"):
@@ -89,7 +89,7 @@ def test_axes_take_on_unit_and_gate_without_new_data():
         ("Range (m)", "Bin"),
     ]
     for name, values in before.items():
-        np.testing.assert_array_equal(session.signals.histogram.source("raw").data[name], values)
+        np.testing.assert_array_equal(histogram.source("raw").data[name], values)
     axis = figure.below[0]
     capture = session.answer.capture
     assert axis.formatter.args["step"] == pytest.approx(capture.acquisition.bin_length_m)
@@ -429,7 +429,7 @@ def test_the_capture_is_reported_and_suggestions_apply(facade):
 
 def test_what_is_no_longer_known_of_a_capture_is_taken_back(facade, monkeypatch):
     part, told = Whole(facade), []
-    facade.complain = told.append
+    facade.failures.shown.subscribe(told.append)
     part.view.show(True)
     part._study._work.cancel()
     eventually(lambda: part._facts.facts)
@@ -488,7 +488,7 @@ def test_an_answer_to_pulses_chosen_before_takes_nothing_back(facade):
     for share in (0.5, 0.25):
         part._pulses.value = share
     eventually(lambda: facade.answer is not before)
-    facade.answer = replace(
+    facade.estimate.answer = replace(
         facade.answer, request=replace(facade.answer.request, less=Less(pulses=0.5))
     )
     part._follow()
@@ -504,10 +504,10 @@ def test_pulses_that_cannot_be_had_are_taken_back(facade, monkeypatch):
             raise MemoryError
         return works(request, *more)
 
-    monkeypatch.setattr("app.pages.session.compute", fails)
+    monkeypatch.setattr("app.pages.shared.estimate.compute", fails)
     part = Whole(facade)
     part.view.show(True)
-    facade.announce = lambda answer: part._follow()
+    facade.estimate.changed.subscribe(lambda answer: part._follow())
     part._pulses.value = 0.5
     eventually(lambda: part._pulses.value == 1.0)
     assert facade.state.less == Less()

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from app.model.colors import image_of
 from app.model.large import LIMIT, Grid, most_whole_bytes
 from app.model.state import Illumination, Less, Reading
 from app.model.store import built_in_sources, compute, file_source
-from app.pages.layout import Layout
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
 from core import Window
@@ -31,9 +29,9 @@ from core.inference.flux import flux_prior_of
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT, fact, serving
-from tests.test_app import ask, complaint, control, next_answer, told
+from tests.test_app import ask, complaint, control, told
 from tests.test_downloads import columns_of, written
-from tests.threads import queued
+from tests.threads import HeldLayout
 
 ROWS, COLS, CHUNK = 96, 128, 16
 PIECES = ROWS * COLS // CHUNK**2
@@ -232,28 +230,21 @@ def test_other_bounds_are_refused(text):
 
 
 @pytest.fixture
-def looking(path, monkeypatch):
-    """A page on a large file; what is to be done on its thread waits for `next_answer`."""
-    acts = SimpleQueue()
-    put = queued(acts.put)
-    monkeypatch.setattr(
-        "app.pages.session.Session.on_page", lambda _, act, due=lambda: None: put(act, due)
-    )
-    on_explore = Wanted({"page": "Explore"})
-    page = Layout({"file": file_source(path)} | built_in_sources(), on_explore)
-    page.acts, page.heard, tell = acts, [""], page.session.complain
-    page.session.complain = lambda sentence: (page.heard.append(sentence), tell(sentence))
-    return page
+def looking(path):
+    """A page on a large file, its thread in the hands of the test."""
+    return HeldLayout({"file": file_source(path)} | built_in_sources(), Wanted({"page": "Explore"}))
 
 
 def settle(page, holds):
     while not holds():
-        next_answer(page)
+        page.tasks.run_one()
 
 
-def taken_away(session):
+def taken_away(page):
     """First and last row and column of the image's table, and how many pixels it holds."""
-    rows, cols, shown = columns_of(written(downloads.range_image(session).files["csv"])).values()
+    table = page.contents["Explore"].image_shown().files["csv"]
+    rows, cols, shown = columns_of(written(table)).values()
+    session = page.session
     values, _ = image_of(session.answer, "Estimate", session.state.viewing.least_confidence)
     at = [session.answer.grid.pixel(*each) for each in zip(rows, cols, strict=True)]
     np.testing.assert_array_equal(shown, [values[each] for each in at])
@@ -261,12 +252,12 @@ def taken_away(session):
 
 
 def test_the_table_of_a_preview_holds_the_pixels_in_view(looking):
-    session = looking.session
+    session, explore = looking.session, looking.contents["Explore"]
     settle(looking, lambda: session.answer.cutout.is_final)
     step = session.answer.grid.step
     assert step > 1
-    session.image.figure.x_range.update(start=60.2, end=90.1)
-    _, (first, last), _ = taken_away(session)
+    explore.image.figure.x_range.update(start=60.2, end=90.1)
+    _, (first, last), _ = taken_away(looking)
     assert 60.2 - step / 2 < first <= 60.2 + step / 2
     assert 90.1 - step / 2 <= last < 90.1 + step / 2
 
@@ -283,9 +274,10 @@ def test_a_page_reads_on_until_the_preview_is_whole(looking):
 
 
 def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
-    session = looking.session
+    session, explore = looking.session, looking.contents["Explore"]
     settle(looking, lambda: session.answer.cutout.is_final and control(looking, "Cancel").disabled)
     session.choose_pixel(10, 12)
+    looking.settle()
     place = session.answer.grid.place(10, 12)
     histogram = session.answer.capture.cube[10, 12]
     control(looking, "Rows shown").value, control(looking, "Columns shown").value = (
@@ -298,14 +290,14 @@ def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
     assert session.state.window == session.answer.cutout.window == Window((30, 70), (20, 80))
     assert session.answer.grid.place(*session.state.pixel) == place
     np.testing.assert_array_equal(session.answer.capture.cube[session.state.pixel], histogram)
-    assert told(session.numbers)["Pixel"] == "row {}, col {}".format(*place)
-    picture = session.image._plot.source("picture").data
+    assert told(explore.numbers)["Pixel"] == "row {}, col {}".format(*place)
+    picture = explore.image._plot.source("picture").data
     assert (picture["x"][0], picture["dw"][0]) == (19.5, 60)
-    assert taken_away(session) == ((30, 69), (20, 79), 40 * 60)
+    assert taken_away(looking) == ((30, 69), (20, 79), 40 * 60)
     name = downloads.explored(session).file_name("range image", "csv")
     assert "_rows30-69_cols20-79_" in name
     at = "row{} col{}".format(*place)
-    assert downloads.pixel_plot(session, session.signals.histogram.figure, "h").what == f"h {at}"
+    assert downloads.pixel_plot(session, explore.signals.histogram.figure, "h").what == f"h {at}"
     control(looking, "The whole").clicks += 1
     settle(looking, lambda: session.answer.cutout.is_preview)
     assert session.state.window is None
@@ -317,8 +309,7 @@ def test_reading_ends_when_something_else_is_looked_at(looking):
     session.state.param.update(source="car")
     settle(looking, lambda: session.answer.request.source.is_scene)
     settle(looking, lambda: control(looking, "Cancel").disabled)
-    while not looking.acts.empty():
-        next_answer(looking)
+    looking.settle()
     assert session.state.source == "car" and session.state.window is None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -18,93 +17,18 @@ from app.model.store import built_in_sources
 from app.pages.layout import Layout
 from app.pages.paper import page as page_of_paper
 from app.pages.paper import text as paper_words
-from app.pages.paper.page import Paper, RangeImages, RepeatedAt, Scales, Trials, joined, two_scales
+from app.pages.paper.page import RangeImages, RepeatedAt, Scales, Trials, joined, two_scales
 from app.pages.session import Session
 from app.pages.shared.outputs import CurveCard, Gallery, table_of
 from app.plots import elements as plots
-from app.tasks.jobs import InSteps, Step
 from app.theme import DARK, LIGHT
 from core import PRESETS, Flux
 from core.studies import outputs as items
 from core.studies.paper import figures as paper
 from core.studies.trials import Condition, trials
 from tests.browser import eventually
-from tests.threads import at_once
 
 SOON_MS = 20_000
-
-
-# -- work in steps ---------------------------------------------------------------------------------
-
-
-class Told:
-    """Steps whose work waits until it is let go, and what came of them."""
-
-    def __init__(self, count=3, fails_at=None):
-        self.gate, self.drawn, self.failures = threading.Semaphore(0), [], []
-        self.begun = 0
-        self.work = InSteps(at_once, lambda: None, self.failures.append)
-        self.steps = [
-            Step(lambda k=k: self._do(k, fails_at), self.drawn.append) for k in range(count)
-        ]
-
-    def _do(self, k, fails_at):
-        self.begun += 1
-        self.gate.acquire()
-        if k == fails_at:
-            raise ValueError("no")
-        return k
-
-
-def test_steps_are_done_one_after_the_other():
-    told = Told()
-    told.gate.release(3)
-    told.work.start(told.steps)
-    eventually(lambda: not told.work.is_running)
-    assert told.drawn == [0, 1, 2]
-    assert (told.work.done, told.work.of) == (3, 3)
-
-
-def test_cancelled_work_draws_no_more_and_begins_no_step():
-    told = Told()
-    told.gate.release(1)
-    told.work.start(told.steps)
-    eventually(lambda: told.begun == 2)
-    told.work.cancel()
-    told.gate.release(2)
-    time.sleep(0.1)
-    assert (told.drawn, told.begun, told.work.is_running) == ([0], 2, False)
-
-
-def test_paused_work_goes_on_where_it_stopped():
-    told = Told()
-    told.work.start(told.steps)
-    told.work.pause(True)
-    told.gate.release(3)
-    eventually(lambda: told.drawn == [0])
-    time.sleep(0.1)
-    assert told.begun == 1
-    told.work.pause(False)
-    eventually(lambda: told.drawn == [0, 1, 2])
-    assert told.begun == 3
-
-
-def test_another_start_forgets_the_first():
-    told = Told()
-    told.work.start(told.steps)
-    eventually(lambda: told.begun == 1)
-    told.work.start(told.steps[1:])
-    told.gate.release(3)
-    eventually(lambda: not told.work.is_running)
-    assert told.drawn == [1, 2]
-
-
-def test_a_failure_ends_the_work_and_is_told():
-    told = Told(fails_at=1)
-    told.gate.release(3)
-    told.work.start(told.steps)
-    eventually(lambda: told.failures)
-    assert (told.drawn, told.begun, told.work.is_running) == ([0], 2, False)
 
 
 # -- plots, pictures, tables -----------------------------------------------------------------------
@@ -304,15 +228,6 @@ def test_a_link_opens_on_paper_without_the_sidebar():
     assert not layout.page.sidebar_open
     layout.pages.choice.value = "Explore"
     assert layout.page.sidebar_open
-
-
-def test_only_the_part_on_screen_works(session):
-    told = []
-    page = Paper(session, told.append)
-    view = page.view
-    view.show(True)
-    view.show(False)
-    assert told == [True, False]
 
 
 @pytest.fixture

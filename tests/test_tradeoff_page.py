@@ -18,7 +18,7 @@ from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import ablation_text as requires_words
 from app.pages.tradeoff import text as trade_words
 from app.pages.tradeoff.ablation import Requires
-from app.pages.tradeoff.page import Acquisition, Effort, Swept, Ways, source_of
+from app.pages.tradeoff.page import Acquisition, Effort, Swept, Ways, show_point, source_of
 from app.pages.tradeoff.sensitivity import Trust
 from app.plots import elements as plots
 from app.theme import DARK, LIGHT
@@ -28,6 +28,7 @@ from core.studies.sensitivity.sweep import numbers
 from core.studies.tradeoff.measure import Cancelled
 from core.studies.tradeoff.pareto import best_within, cheapest_reaching, front
 from tests.browser import eventually
+from tests.threads import control
 
 
 def unheard(_done, _of):
@@ -101,7 +102,7 @@ def test_work_is_drawn_once_it_is_done(slow):
 
 def test_cancelled_work_ends_and_is_not_drawn(slow):
     complaints = []
-    slow.session.complain = complaints.append
+    slow.session.failures.shown.subscribe(complaints.append)
     slow.piece.start()
     eventually(lambda: slow.sentence == "1 of 4 steps.")
     slow.piece.cancel()
@@ -115,7 +116,7 @@ def test_cancelled_work_ends_and_is_not_drawn(slow):
 
 def test_work_that_fails_says_so():
     session, complaints = Session(built_in_sources()), []
-    session.complain = complaints.append
+    session.failures.shown.subscribe(complaints.append)
 
     def fail(progress, cancelled):
         raise ValueError("no such luck.")
@@ -127,7 +128,7 @@ def test_work_that_fails_says_so():
 
 def test_a_result_that_cannot_be_drawn_is_told(slow):
     complaints = []
-    slow.session.complain = complaints.append
+    slow.session.failures.shown.subscribe(complaints.append)
     slow.piece = OnePiece(slow.session, lambda: slow.work, lambda _: 1 / 0, "steps")
     slow.leave.set()
     slow.piece.start()
@@ -206,16 +207,15 @@ def test_opening_the_papers_method_sets_the_sliders(measured):
     less = replace(point.candidate, reduction=Less(merge=2).reduction(100))
     measured_on = layout.session.answer.request
     changed = Illumination(sbr=1.0)
-    layout._light.show(changed)
-    layout.session.state.param.update(light=changed, source="staircase")
-    layout._open_point(replace(point, candidate=less), measured_on)
+    layout.session.state.param.update(light=changed, source="staircase", page="Trade-off")
+    show_point(layout.session, replace(point, candidate=less), measured_on)
     assert (layout.session.state.source, layout.session.state.light) == ("car", Illumination())
-    assert layout._light.controls["sbr"].value == Illumination().sbr
+    assert control(layout, "SBR").value == Illumination().sbr
     assert layout.pages.choice.value == "Explore"
     assert layout.session.state.less == Less(merge=2)
     assert layout.session.state.tracking == less.settings
-    assert layout._preset.value == CUSTOM
-    assert layout._tracking.controls["t_n"].value == less.settings.t_n == 10
+    assert control(layout, "Preset").value == CUSTOM
+    assert control(layout, "T_n").value == less.settings.t_n == 10
 
 
 def test_opening_another_method_picks_it_in_compare(measured):
@@ -224,11 +224,11 @@ def test_opening_another_method_picks_it_in_compare(measured):
     settings = replace(point.candidate.settings, guard_bins=9)
     method = replace(point.candidate.method, settings=settings)
     another = replace(point, candidate=replace(point.candidate, method=method))
-    layout._open_point(another, layout.session.answer.request)
+    show_point(layout.session, another, layout.session.answer.request)
     assert layout.pages.choice.value == "Compare"
-    assert "cfar" in layout._compare._picks.value
-    assert layout._compare._tasks["cfar"].settings == settings
-    assert layout._compare._own["cfar"].controls["guard_bins"].value == 9
+    assert "cfar" in layout.contents["Compare"]._picks.value
+    assert layout.contents["Compare"]._tasks["cfar"].settings == settings
+    assert layout.contents["Compare"]._own["cfar"].controls["guard_bins"].value == 9
 
 
 # -- how to acquire --------------------------------------------------------------------------------

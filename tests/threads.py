@@ -1,25 +1,73 @@
-"""A page's thread in the hands of a test, for `app.tasks.jobs`."""
+"""A page's thread in the hands of a test."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from queue import SimpleQueue
+from typing import Any
 
-Act = Callable[[], None]
+from app.model.address import Wanted
+from app.model.store import Answer, Source
+from app.pages.layout import Layout
+from app.tasks.page import PageTasks
+from app.tasks.scheduler import Act
 
 
-def at_once(act: Act, due: Act | None = None) -> None:
-    """The page's turn comes at once."""
-    if due:
-        due()
-    act()
+class HeldTasks(PageTasks):
+    """Callbacks of a page wait until the test runs them, as if it were the page's thread.
 
+    Attributes
+    ----------
+    waiting : SimpleQueue
+        Callbacks in the order in which their turns have come.
+    """
 
-def queued(put: Callable[[Act], None]) -> Callable[..., None]:
-    """What is to be done on the page is put somewhere, as if its turn had come."""
+    def __init__(self) -> None:
+        super().__init__()
+        self.waiting: SimpleQueue[Act] = SimpleQueue()
 
-    def on_page(act: Act, due: Act | None = None) -> None:
-        if due:
+    def queue(self, act: Act, due: Act | None = None) -> None:
+        """Keep a callback; its turn has come."""
+        if due is not None:
             due()
-        put(act)
+        self.waiting.put(act)
 
-    return on_page
+    def run_one(self) -> None:
+        """Run the next callback; wait for it if necessary."""
+        self.waiting.get(timeout=60)()
+
+
+class HeldLayout(Layout):
+    """The app without a browser, its page's thread in the hands of the test.
+
+    Attributes
+    ----------
+    heard : list of str
+        Every sentence on failures, the latest last; empty ones where all works.
+    """
+
+    def __init__(self, sources: Mapping[str, Source], wanted: Wanted | None = None) -> None:
+        self.tasks = HeldTasks()
+        super().__init__(sources, wanted, tasks=self.tasks)
+        self.heard = [""]
+        self.session.failures.shown.subscribe(self.heard.append)
+        self._answers: list[Answer] = []
+        self.session.estimate.changed.subscribe(self._answers.append)
+
+    def next_answer(self) -> Answer:
+        """Let the page draw until a request is answered; return the answer that is shown then."""
+        before = len(self._answers)
+        while len(self._answers) == before:
+            self.tasks.run_one()
+        return self._answers[-1]
+
+    def settle(self) -> None:
+        """Let the page do all that is waiting now."""
+        while not self.tasks.waiting.empty():
+            self.tasks.run_one()
+
+
+def control(layout: Layout, label: str) -> Any:
+    """The one widget of this label."""
+    (found,) = layout.page.select(lambda each: getattr(each, "label", None) == label)
+    return found

@@ -235,7 +235,6 @@ class Comparison:
         require("kind", self.kind, self.kind in KINDS, " or ".join(map(repr, KINDS)))
 
 
-PAGES = ("Explore", "Inspect", "Compare", "Trade-off", "Paper")
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
 UNITS = ("bins", "ns", "m")
@@ -243,6 +242,9 @@ SUBJECTS = ("Pixel", "Region", "Pins", "Capture")
 CLOUD_COLORS = ("Range", "Error", "Counts")
 NEED_TRUTH = ("Truth", "Error")
 
+
+COMPUTED_FROM = ("source", "light", "reading", "window", "less", "absent", "tracking")
+"""Parameters of the state that an answer is computed from."""
 
 MOST_PINS = 4
 
@@ -263,6 +265,11 @@ class Checked(param.Parameter):
 
     def _validate(self, val: Any) -> None:
         self.check(self.name, val)
+
+
+def _check_page(name: str, value: Any) -> None:
+    named = isinstance(value, str) and value.replace("-", "").isalpha() and len(value) <= 20
+    require(name, value, named, "the name of a page")
 
 
 def _check_pixel(name: str, value: Any) -> None:
@@ -314,7 +321,7 @@ class State(param.Parameterized):
     cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
     viewing = param.ClassSelector(class_=Viewing, default=Viewing())
     difference = param.Boolean(default=False, doc="Whether the first difference is drawn.")
-    page = param.Selector(default="Explore", objects=list(PAGES))
+    page: Any = Checked("Explore", _check_page, doc="Name of a page of `app.pages.catalog`.")
     unit = param.Selector(default="bins", objects=list(UNITS), doc="Of each axis along the gate.")
     map = param.Selector(default="Estimate", objects=list(MAPS), doc="What one navigates by.")
     subject = param.Selector(default="Pixel", objects=list(SUBJECTS), doc="What is inspected.")

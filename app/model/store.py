@@ -15,7 +15,6 @@ import numpy as np
 from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.model.state import Illumination, Less, Reading
-from app.tasks.jobs import Effort
 from core import (
     CORRECTIONS,
     PARTS,
@@ -36,14 +35,8 @@ from core import (
     without,
     without_correction,
 )
-from core.cost import Cost, cost_of, predicted
+from core.cost import Cost, predicted
 from core.inference import has_posterior, posterior_of
-
-FEW_COUNTS = 2**20
-"""Of a capture, up to which it is ranged in less time than its picture is drawn."""
-
-FEW_S = 0.25
-"""Estimated time of what is ranged on the page's own thread at most; some times what it takes."""
 
 ASSETS = Path(str(resources.files("assets")))
 
@@ -234,19 +227,6 @@ def _fitting(whole: Capture, request: Request) -> Less:
     rows, cols, n_bins = whole.cube.shape
     found = fitting((rows, cols, n_bins), "tracking", request.less.reduction(n_bins))
     return request.less if found is None else replace(request.less, merge=found[0], skip=found[1])
-
-
-def effort_of(request: Request, previous: Answer) -> Effort:
-    """What `compute` takes."""
-    seen = previous.request
-    if previous.cutout is not None or previous.whole.cube.size > FEW_COUNTS:
-        return Effort.ANY
-    if cost_of(previous.capture, "tracking", request.tracking).seconds > FEW_S:
-        return Effort.ANY
-    if request == replace(seen, tracking=request.tracking):
-        return Effort.QUICK
-    is_drawn_again = request.source.is_scene and _same(request, seen, "source", "absent")
-    return Effort.SHORT if is_drawn_again else Effort.ANY
 
 
 def _cutout(request: Request, previous: Answer | None) -> Cutout | None:

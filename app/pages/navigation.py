@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Any, Protocol
 
 import panel as pn
 import panel_material_ui as pmui
@@ -12,31 +13,71 @@ import panel_material_ui as pmui
 from app.model.store import Answer
 from app.widgets.cards import CHOICE_PX
 
-# As high as its parts, and not as wide as all of them side by side: that is more than a phone.
+if TYPE_CHECKING:
+    from app.pages.session import Session
+
+# As high as its parts, and not as wide as all of them side by side, which exceeds a phone.
 HOLDER = """
 :host { flex: none !important; height: auto !important; max-height: none !important;
   min-width: 0 !important; }
 """
 
 
-def _nothing(_told: Any) -> None:
-    """What a page does that need not be told."""
+class Shared(Enum):
+    """Parts of the sidebar that pages share, all about the session's capture."""
+
+    UNIT = auto()
+    """Unit of the axes along the gate."""
+    TRACKING = auto()
+    """Settings of the tracking differentiator."""
+    REDUCTION = auto()
+    """Which part of the capture is used."""
+
+
+def _ignore(_value: Any) -> None:
+    """Do nothing: the default of a page that needs no notification."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What a page consists of, and what it is told."""
+    """The content of a page, and its reactions."""
 
     main: Any
     """An object, or several, one below the other."""
     aside: Any
     """Its own part of the sidebar, or several."""
-    show: Callable[[bool], None] = _nothing
+    show: Callable[[bool], None] = _ignore
     """Called with True when it comes on screen, and with False when it leaves."""
-    follow: Callable[[Answer], None] = _nothing
+    follow: Callable[[Answer], None] = _ignore
     """Called with each new answer, on screen or not."""
-    paint: Callable[[bool], None] = _nothing
+    paint: Callable[[bool], None] = _ignore
     """Called with True when the page becomes dark, with False when light; once when built."""
+
+
+class Content(Protocol):
+    """What builds the content of a page."""
+
+    @property
+    def view(self) -> View:
+        """The content."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page of the app, listed in `app.pages.catalog`."""
+
+    name: str
+    """On its button, and in links."""
+    build: Callable[[Session], Content]
+    """Called when the page is first visited."""
+    help: str
+    """What the page does: the rest of a sentence that begins with its name."""
+    shared: frozenset[Shared] = frozenset(Shared)
+    """Parts of the sidebar that have an effect on this page."""
+    is_standalone: bool = False
+    """Whether the session's capture has no part in the page: the sidebar is closed."""
+    sidebar_last: bool = False
+    """Whether its own part of the sidebar stands below the shared ones."""
 
 
 class Pages:
@@ -48,22 +89,20 @@ class Pages:
     Parameters
     ----------
     builders : mapping of str to callable
-        What builds each page, by the name on its button.
+        The builder of each page, by the name on its button.
     label, help : str
-        What the buttons choose, and a sentence about it.
+        Name of the row of buttons, and a sentence about it.
     orientation : {"horizontal", "vertical"}
-        How the buttons stand.
+        Orientation of the buttons.
     first : str, optional
-        The page that is opened at once; the first of all if not given.
+        The page that is opened at once; by default the first one.
     """
 
     def __init__(
         self,
         builders: Mapping[str, Callable[[], View]],
         label: str = "Page",
-        help: str = "Explore looks into one method, Inspect into any pixel of a capture, Compare "
-        "puts methods side by side, Trade-off measures speed against accuracy, Paper computes what "
-        "the paper prints.",
+        help: str = "",
         orientation: str = "horizontal",
         first: str | None = None,
     ) -> None:
@@ -97,7 +136,7 @@ class Pages:
             view.paint(dark)
 
     def show(self, is_on_screen: bool) -> None:
-        """Pass on that the page that is open comes on screen with all of them, or leaves."""
+        """Pass on that the open page comes on screen together with its parent, or leaves."""
         self._built[self.choice.value].show(is_on_screen)
 
     def _go(self, old: str, new: str) -> None:
@@ -108,7 +147,7 @@ class Pages:
             try:
                 self._open(new)
             except Exception:
-                self.choice.value = old  # which is opened again
+                self.choice.value = old  # reopens it
                 raise
 
     def _open(self, name: str) -> None:
@@ -117,7 +156,7 @@ class Pages:
         else:
             view = self._builders[name]()
             view.paint(self._dark)
-            # First what is shown, then where: the browser gets the page in one piece.
+            # Drawn before it is placed, the page reaches the browser in one piece.
             view.show(True)
             self.mains[name].extend(_several(view.main))
             self.asides[name].extend(_several(view.aside))

@@ -1,4 +1,4 @@
-"""What is drawn next: many pages one after the other, and on a page what the eye follows first."""
+"""Fair turns on the thread that draws all pages."""
 
 from __future__ import annotations
 
@@ -9,78 +9,51 @@ from contextvars import Context, copy_context
 from itertools import cycle
 
 MESSAGES_FIRST = 6
-"""Times the loop goes round between two turns, which cost next to nothing where there is nothing to
-do. A message takes some ten: what hands move in the meantime arrives before the next pages are
-drawn, and what it overtakes need not be drawn at all."""
+"""Rounds of the event loop between two turns. A message from a browser takes about ten; one that
+arrives in between may replace a value that would otherwise be computed and drawn in vain. A round
+in which nothing happens costs next to nothing."""
 
 
 class Turns:
-    """A queue for the page's thread, which all sessions share.
+    """A queue for the event loop's thread, which all sessions share.
 
-    Without it each time round the loop draws every page that has something new. A message, which
-    takes several times round, then waits for as many drawings of everyone, and values that have
-    long been overtaken queue up before the newest.
+    Without it each round of the loop would draw every page that has something new, while messages,
+    which take several rounds, pile up behind.
 
-    What was computed and everything else take turns: of the computed there are few at a time
-    (`app.tasks.jobs.Places`), and the next are begun when these are drawn.
+    Results from other threads and all other callbacks alternate: few results arrive at a time
+    (`app.tasks.scheduler.Lane`), and the next computations start when these are drawn.
     """
 
     def __init__(self) -> None:
         self._computed: deque[tuple[Callable[[], None], Context]] = deque()
         self._others: deque[tuple[Callable[[], None], Context]] = deque()
-        self._is_going_round = False
+        self._is_running = False
 
     @property
     def is_crowded(self) -> bool:
-        """Whether someone waits."""
+        """Whether a callback is waiting."""
         return bool(self._computed or self._others)
 
     def ask(self, begin: Callable[[], None], is_computed: bool = False) -> None:
-        """Have something begun when its turn comes; from the loop's own thread.
+        """Call a function when its turn comes; to be called on the loop's thread.
 
-        It begins in the context of who asked: Panel's has the document that is worked on.
+        It runs in the context of the caller: Panel keeps the present document there.
         """
         queue = self._computed if is_computed else self._others
         queue.append((begin, copy_context()))
-        if not self._is_going_round:
-            self._is_going_round = True
-            self._task = asyncio.ensure_future(self._go_round())
+        if not self._is_running:
+            self._is_running = True
+            self._task = asyncio.ensure_future(self._run())
 
-    async def _go_round(self) -> None:
+    async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         queues = cycle((self._computed, self._others))
         while self.is_crowded:
             begin, context = next(filter(None, queues)).popleft()
-            loop.call_soon(begin, context=context)  # which logs a failure, and goes on
+            loop.call_soon(begin, context=context)  # logs a failure and continues
             for _ in range(MESSAGES_FIRST):
                 await asyncio.sleep(0)
-        self._is_going_round = False
+        self._is_running = False
 
 
 TURNS = Turns()
-
-
-class Soon:
-    """Something to be done on a page, when called, soon: once for all calls until then.
-
-    Parameters
-    ----------
-    on_page : callable
-        As for `app.tasks.jobs.LatestWins`.
-    act : callable
-    """
-
-    def __init__(self, on_page: Callable[[Callable[[], None]], None], act: Callable[[], None]):
-        self._on_page = on_page
-        self._act = act
-        self._is_due = False
-
-    def __call__(self) -> None:
-        """Ask for it."""
-        if not self._is_due:
-            self._is_due = True
-            self._on_page(self._do)
-
-    def _do(self) -> None:
-        self._is_due = False
-        self._act()

@@ -29,7 +29,7 @@ from app.pages.compare.ranking import (
     tasks_of,
     yardstick,
 )
-from app.pages.navigation import View
+from app.pages.navigation import Page, View
 from app.pages.session import Session
 from app.pages.shared.downloads import (
     CLOUD,
@@ -48,7 +48,6 @@ from app.pages.shared.downloads import (
     ranged,
     viewed,
 )
-from app.tasks.jobs import LatestWins
 from app.theme import method_style, palette
 from app.widgets.cards import card, part
 from app.widgets.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table
@@ -103,8 +102,8 @@ class Compare:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._jobs: LatestWins[Any] = LatestWins(session.on_page)
-        self._curve_jobs: LatestWins[Any] = LatestWins(session.on_page)
+        self._jobs = session.tasks.latest()
+        self._curve_jobs = session.tasks.latest()
         self._capture = session.answer.capture
         self._results: dict[Task, Result | str] = {}
         self._measure: Yardstick | None = None
@@ -121,18 +120,6 @@ class Compare:
     def view(self) -> View:
         """The page."""
         return View(self._main(), self._aside(), self._show, self._follow, self._paint)
-
-    def pick(self, method: str, settings: Any) -> None:
-        """Have a method among those compared, with these settings."""
-        if method in self._own:
-            self._set(method, settings)
-            self._own[method].show(settings)
-        if method in self._picks.value:
-            self._picked()
-        else:
-            self._picks.value = [
-                each for each in ESTIMATORS if each in (*self._picks.value, method)
-            ]
 
     # Controls and views
 
@@ -269,7 +256,15 @@ class Compare:
     def _show(self, is_on_screen: bool) -> None:
         self._is_on_screen = is_on_screen
         if is_on_screen:
+            self._show_choice()
             self._refresh()
+
+    def _show_choice(self) -> None:
+        """Show methods and settings, which another page may have changed."""
+        chosen = self._chosen
+        for method, panel in self._own.items():
+            panel.show(chosen.settings[method])
+        self._picks.value = list(chosen.methods)
 
     def _follow(self, _answer: Answer) -> None:
         self._refresh()
@@ -425,7 +420,7 @@ class Compare:
         self._curve_jobs.submit(
             partial(score_curves, self._capture, tasks, *pixel),
             partial(self._draw_curves, answers, pixel),
-            partial(self._session.fail, of=self),
+            partial(self._session.failures.report, part=self),
         )
 
     # What is taken away
@@ -575,7 +570,7 @@ class Compare:
     def _draw_curves(
         self, answers: dict[str, Answer], pixel: tuple[int, int], curves: dict[str, Any]
     ) -> None:
-        self._session.recover(self)
+        self._session.failures.resolve(self)
         tasks = self._tasks
         answers = {method: each for method, each in answers.items() if method in tasks}
         if pixel != self._session.state.pixel or not answers:
@@ -591,3 +586,6 @@ class Compare:
                 self._styles(),
                 self._session.state.unit,
             )
+
+
+PAGE = Page("Compare", Compare, "puts methods side by side")

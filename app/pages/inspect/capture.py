@@ -32,7 +32,7 @@ from app.pages.shared.downloads import (
 from app.pages.shared.studies import Study
 from app.plots import elements as plots
 from app.plots import inspect as inspector_plots
-from app.tasks.jobs import LatestWins, Step
+from app.tasks.scheduler import Step
 from app.theme import palette
 from app.units import scale
 from app.widgets.cards import button
@@ -56,8 +56,8 @@ class Whole:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._jobs: LatestWins[CaptureReport] = LatestWins(session.on_page)
-        self._count_jobs: LatestWins[Any] = LatestWins(session.on_page)
+        self._jobs = session.tasks.latest()
+        self._count_jobs = session.tasks.latest()
         self._is_on_screen = False
         self._report: CaptureReport | None = None
         self._reported: Answer | None = None
@@ -132,7 +132,7 @@ class Whole:
     def _follow(self) -> None:
         if not self._is_on_screen:
             return
-        answer, fail = self._session.answer, partial(self._session.fail, of=self)
+        answer, fail = self._session.answer, partial(self._session.failures.report, part=self)
         # Not the answer's, which may be to what was chosen before.
         self._pulses.value = self._session.state.less.pulses
         if self._reported is None or answer.capture is not self._reported.capture:
@@ -224,7 +224,7 @@ class Whole:
             self._counts.frame(counts)
 
     def _arrived(self, answer: Answer, report: CaptureReport) -> None:
-        self._session.recover(self)
+        self._session.failures.resolve(self)
         if answer is self._session.answer:
             self._report, self._reported = report, answer
             self._draw()
@@ -240,7 +240,7 @@ class Whole:
                 each.disabled = True
             self._counts.source("window").data = {"left": [], "right": []}
             self._counts.source("suggested").data = {"x": [], "y": []}
-        self._session.fail(error, of=self)
+        self._session.failures.report(error, part=self)
 
     def _draw(self) -> None:
         answer, report = self._reported, self._report

@@ -18,12 +18,10 @@ from app.pages.inspect.capture import Whole
 from app.pages.inspect.pins import Pins, pin_colors
 from app.pages.inspect.pixel import BREAK_PX, COLUMN, FILLING, Sight, framed
 from app.pages.inspect.views import Corners, Navigator, rectangle
-from app.pages.navigation import Pages, View
-from app.pages.session import REST_MS, Session
+from app.pages.navigation import Page, Pages, View
+from app.pages.session import Session
 from app.pages.shared.downloads import CORNER_PX, IMAGE, Shown, downloadable, image_on_show
 from app.pages.shared.large_view import LargeView
-from app.tasks.jobs import LatestWins
-from app.tasks.turns import Soon
 from app.theme import palette
 from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part
 from app.widgets.controls import Chips, PixelKeys, Sentence
@@ -36,6 +34,9 @@ TABLES = f"""
   overflow-y: auto; }}
 @media (max-width: {BREAK_PX}px) {{ :host {{ max-height: none }} }}
 """
+PICTURES_MS = 60
+"""The map is drawn this long after the pixel's plots, which the eye follows."""
+
 ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 4px 6px; }"
 
 
@@ -49,8 +50,8 @@ class Inspector:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._jobs: LatestWins[tuple[Any, Look]] = LatestWins(session.on_page)
-        self._name_place_soon = Soon(session.on_page, self._name_place)
+        self._jobs = session.tasks.latest()
+        self._name_place_soon = session.tasks.soon(self._name_place)
         self._is_on_screen = self._dark = False
         self._navigator = Navigator(session.choose_pixel, self._select)
         self._navigator.figure.min_border_top = CORNER_PX  # else the button hides a number
@@ -188,7 +189,8 @@ class Inspector:
             self._enter()
             self._subjects.follow(answer)
             # As on Explore: the eye follows the plots.
-            self._session.wait(REST_MS, partial(self._session.tell, self._ask_map))
+            tasks = self._session.tasks
+            tasks.call_later(PICTURES_MS, partial(tasks.run_next, self._ask_map))
 
     def _paint(self, dark: bool) -> None:
         self._dark = dark
@@ -311,11 +313,11 @@ class Inspector:
         if self._is_on_screen:
             session, state = self._session, self._session.state
             work = partial(map_of, session.answer, state.map, state.viewing.least_confidence)
-            fail = partial(session.fail, of=self)
+            fail = partial(session.failures.report, part=self)
             self._jobs.submit(work, partial(self._draw_map, session.answer), fail)
 
     def _draw_map(self, answer: Answer, drawn: tuple[Any, Look]) -> None:
-        self._session.recover(self)
+        self._session.failures.resolve(self)
         if answer is self._session.answer:
             with pn.io.hold(self._session.page):
                 self._navigator.update(*drawn)
@@ -350,3 +352,6 @@ def _span(name: str, text: str, first: int, last: int) -> tuple[int, int]:
     inside = len(ends) in (1, 2) and first <= min(ends) and max(ends) <= last
     require(name, text, inside, f"two whole numbers from {first} to {last}, such as 10-20")
     return min(ends), max(ends)
+
+
+PAGE = Page("Inspect", Inspector, "into any pixel of a capture")

@@ -28,7 +28,6 @@ from app.pages.shared.downloads import (
 )
 from app.plots import elements as plots
 from app.plots import inspect as inspector_plots
-from app.tasks.jobs import LatestWins
 from app.theme import palette
 from app.widgets.controls import Sentence, Table
 from app.widgets.figures import cover, pane_of
@@ -44,7 +43,7 @@ class Pins:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._jobs: LatestWins[list[Seen]] = LatestWins(session.on_page)
+        self._jobs = session.tasks.latest()
         self._is_on_screen = self._dark = False
         self._found: list[Seen] = []
         bins = Range1d(0, 1)
@@ -108,12 +107,12 @@ class Pins:
             self._jobs.submit(
                 lambda: [pixel_lit(answer, *pin) for pin in pins],
                 partial(self._draw, answer, pins),
-                partial(session.fail, of=self),
+                partial(session.failures.report, part=self),
             )
 
     def _draw(self, answer: Any, pins: Any, found: list[Seen]) -> None:
         session = self._session
-        session.recover(self)
+        session.failures.resolve(self)
         if answer is not session.answer or pins != session.state.pins:
             return  # the user has moved on
         unit, acquisition = session.state.unit, answer.capture.acquisition

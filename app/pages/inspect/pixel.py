@@ -29,8 +29,6 @@ from app.pages.shared.downloads import (
     pixel_on_show,
     region_on_show,
 )
-from app.tasks.jobs import LatestWins
-from app.tasks.turns import Soon
 from app.theme import palette
 from app.widgets.cards import card, column, unrolled
 from app.widgets.controls import FACTS_PX, LINE_PX, Facts, Sentence, Table
@@ -83,8 +81,8 @@ class Sight:
     def __init__(self, session: Session, watched: str) -> None:
         self._session = session
         self._watched = watched
-        self._jobs: LatestWins[Seen] = LatestWins(session.on_page)
-        self._tell_soon = Soon(session.on_page, self._tell)
+        self._jobs = session.tasks.latest()
+        self._tell_soon = session.tasks.soon(self._tell)
         self._is_on_screen = self._is_behind = False
         self._drawn: tuple[Answer, Seen] | None = None
         self._plots = PixelPlots()
@@ -172,7 +170,7 @@ class Sight:
     def _failed(self, error: Exception) -> None:
         self._lack(reason(error))
         if not isinstance(error, ValueError):
-            self._session.fail(error, of=self)
+            self._session.failures.report(error, part=self)
 
     def _lack(self, why: str) -> None:
         """Say why there is nothing to see."""
@@ -183,7 +181,7 @@ class Sight:
                 each.visible = False
 
     def _draw(self, answer: Answer, found: Seen) -> None:
-        self._session.recover(self)
+        self._session.failures.resolve(self)
         if not self._is_on_screen or answer is not self._session.answer:
             return  # the user has moved on
         unit = self._session.state.unit

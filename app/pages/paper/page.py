@@ -12,13 +12,13 @@ import panel as pn
 from bokeh.models import Range1d
 
 from app.model.text import NOT_COMPUTED
-from app.pages.navigation import Pages, View
+from app.pages.navigation import Page, Pages, View
 from app.pages.paper import text as paper_words
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject
 from app.pages.shared.outputs import CurveCard, Gallery, TableCard
 from app.pages.shared.studies import Study, aside
-from app.tasks.jobs import LatestWins, Step
+from app.tasks.scheduler import Step
 from app.theme import palette
 from app.widgets.controls import Sentence, SettingsPanel
 from core import PRESETS, Flux
@@ -156,13 +156,9 @@ class Paper:
     ----------
     session : Session
         Whose page it is; its capture has no part in this.
-    alone : callable
-        Called with True when the page comes on screen, which has no use for what the other pages
-        share, and with False when it leaves.
     """
 
-    def __init__(self, session: Session, alone: Callable[[bool], None]) -> None:
-        self._alone = alone
+    def __init__(self, session: Session) -> None:
         self._sections = Pages(
             {
                 "Figures 1, 2: the jump": lambda: (
@@ -211,13 +207,9 @@ class Paper:
         return View(
             pn.Column(left, right, stylesheets=[BOARD], sizing_mode="stretch_both", margin=0),
             Sentence(text=paper_words.SIDEBAR_AWAY, margin=8),
-            show=self._show,
+            show=sections.show,
             paint=sections.paint,
         )
-
-    def _show(self, is_on_screen: bool) -> None:
-        self._alone(is_on_screen)
-        self._sections.show(is_on_screen)
 
 
 # What the sliders compute
@@ -270,7 +262,7 @@ class Sliders(Generic[Settings]):
         self._session = session
         self._compute = compute
         self._words = words
-        self._jobs: LatestWins[Sequence[items.Plot]] = LatestWins(session.on_page)
+        self._jobs = session.tasks.latest()
         across = Range1d(-0.5, 100)
         self._cards = [CurveCard(across, NOT_COMPUTED) for _ in range(count)]
         self._settings = settings
@@ -286,11 +278,11 @@ class Sliders(Generic[Settings]):
 
     def _ask(self, settings: Settings) -> None:
         self._settings = settings
-        fail = partial(self._session.fail, of=self)
+        fail = partial(self._session.failures.report, part=self)
         self._jobs.submit(partial(self._compute, settings), self._draw, fail)
 
     def _draw(self, plots: Sequence[items.Plot]) -> None:
-        self._session.recover(self)
+        self._session.failures.resolve(self)
         with pn.io.hold(self._session.page):
             for card, plot in zip(self._cards, plots, strict=True):
                 card.show(plot)
@@ -465,3 +457,12 @@ def joined(plots: Sequence[items.Plot], x: Sequence[float]) -> items.Plot:
 def _stack(*cards: CurveCard) -> pn.Column:
     content = [card.card for card in cards]
     return pn.Column(*content, stylesheets=[STACK], sizing_mode="stretch_both", margin=0)
+
+
+PAGE = Page(
+    "Paper",
+    Paper,
+    "computes what the paper prints",
+    shared=frozenset(),
+    is_standalone=True,
+)

@@ -21,20 +21,17 @@ import panel as pn
 import param
 
 from app.model import download_text as words
-from app.model.colors import Look, color_values
-from app.model.exports import Write, cloud_files, facts_file, image_files, plot_file
+from app.model.colors import Look
+from app.model.exports import Write, image_files, plot_file
 from app.model.state import Viewing
 from app.model.store import Answer, Request
 from app.pages.session import Session
-from app.tasks.jobs import LatestWins, Places
+from app.tasks.scheduler import FILES
 from app.widgets.component import Component
 from core import inspection
 from core.parameters import spec_of
 
 log = logging.getLogger(__name__)
-
-# Few at a time, for all sessions together: a large file takes much memory, and waits for no slider.
-_WRITERS = Places(2, "firstphoton-files")
 
 PIECE_BYTES = 2**20
 """What travels at once: other messages of the page pass in between."""
@@ -174,7 +171,7 @@ class Download(Component):
         self.offer(formats)
         self._session = session
         self._show = show
-        self._jobs: LatestWins[IO[bytes]] = LatestWins(session.on_page, _WRITERS)
+        self._jobs = session.tasks.latest(FILES)
         self._file: IO[bytes] | None = None
         self._name = ""
         self._size = 0
@@ -191,7 +188,7 @@ class Download(Component):
             elif "from" in asked:
                 self._send_piece(asked["from"])
             elif "failed" in asked:
-                self._session.complain(words.no_picture(str(asked["failed"])))
+                self._session.failures.show(words.no_picture(str(asked["failed"])))
         except Exception as error:  # whatever it is, the page must tell it
             self._fail(error)
 
@@ -233,7 +230,7 @@ class Download(Component):
     def _fail(self, error: Exception) -> None:
         log.warning("a download failed", exc_info=error)
         self._close()
-        self._session.complain(words.not_saved(error))
+        self._session.failures.show(words.not_saved(error))
         self._send_msg({"failed": True})
 
     def _close(self) -> None:
@@ -361,31 +358,8 @@ def region_on_show(session: Session) -> str:
     return _part(*((each.min(), each.max()) for each in answer.grid.place(*inside.nonzero())))
 
 
-def numbers_on_show(session: Session) -> Shown:
-    """What is told of the session's image and pixel."""
-    table = facts_file([*session.figures.facts, *session.numbers.facts])
-    return Shown(explored(session), f"numbers {pixel_on_show(session)}", {"csv": table})
-
-
-def range_image(session: Session) -> Shown:
-    """The session's image, whatever it shows."""
-    kind = session.state.image
-    what = "range image" if kind == "Estimate" else f"{kind} image".lower()
-    return image_on_show(session, kind, session.image.figure, what)
-
-
 def image_on_show(session: Session, kind: str, figure: Any, what: str) -> Shown:
     """An image of the session's answer, as `app.model.exports.image_files` takes it."""
     viewing = session.state.viewing
     files = image_files(session.answer, kind, viewing.least_confidence, figure)
     return Shown(viewed(session, explored(session), viewing), what, files)
-
-
-def cloud_on_show(session: Session) -> Shown:
-    """The session's cloud, with the colour scale that the page shows beside the image alone."""
-    answer, state = session.answer, session.state
-    _, look = color_values(answer, state.cloud_color)
-    files = cloud_files(answer, state.cloud_color, state.viewing)
-    heading = f"3D cloud, coloured by {state.cloud_color.lower()}"
-    subject = viewed(session, explored(session), state.viewing)
-    return Shown(subject, "cloud", files, heading, look)

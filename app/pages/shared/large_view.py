@@ -13,7 +13,8 @@ import panel_material_ui as pmui
 from app.model.large import Cutout, LargeFile
 from app.model.store import Answer
 from app.pages.session import Session
-from app.pages.shared.studies import OnePiece, Work
+from app.pages.shared.studies import OnePiece
+from app.tasks.scheduler import Work
 from app.widgets.cards import button
 from app.widgets.controls import Sentence
 from core import Window
@@ -163,7 +164,7 @@ class LargeView:
             progress: Callable[[int, int], None], cancelled: Callable[[], bool]
         ) -> Window | None:
             while not file.read_on(progress, cancelled):
-                self._session.on_page(self._session.renew)
+                self._session.tasks.queue(self._session.estimate.refresh)
             return None
 
         return work
@@ -171,7 +172,7 @@ class LargeView:
     def _arrived(self, window: Window | None) -> None:
         """Show what has been read."""
         if window is None:
-            self._session.renew()
+            self._session.estimate.refresh()
         else:
             self._session.state.window = window
 

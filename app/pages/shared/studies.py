@@ -1,9 +1,8 @@
-"""Long work with its controls, and how controls stand beside what they control."""
+"""Long work with its controls."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, TypeVar
 
@@ -12,14 +11,14 @@ import panel_material_ui as pmui
 
 from app.model.text import progress, unfinished
 from app.pages.session import Session
-from app.tasks.jobs import LONG, InSteps, LatestWins, Step
+from app.tasks.scheduler import LongWork, Step, Work
 from app.widgets.controls import Sentence
 
 Result = TypeVar("Result")
 
 
 class WorkControls:
-    """Buttons that start and cancel long work, a bar, and a sentence on how far it is."""
+    """Buttons that start and cancel long work, a progress bar, and a sentence on the progress."""
 
     def __init__(
         self,
@@ -27,7 +26,7 @@ class WorkControls:
         cancel: Callable[[], None],
         noun: str,
         label: str = "Compute",
-        help: str = "Compute: begins anew with the settings above.",
+        help: str = "Compute: starts again with the settings above.",
     ) -> None:
         self._noun = noun
         self._start = pmui.Button(
@@ -38,7 +37,7 @@ class WorkControls:
         )
         self._cancel = pmui.Button(
             label="Cancel",
-            description="Cancel: stops, and keeps what there is.",
+            description="Cancel: stops the work and keeps its results so far.",
             variant="outlined",
             size="small",
             disabled=True,
@@ -57,22 +56,23 @@ class WorkControls:
         buttons = pn.Row(self._start, self._cancel, margin=0)
         return [buttons, self._bar, self._sentence]
 
-    def tell(self, done: int, of: int, is_running: bool) -> None:
-        """Show how far the work is."""
-        self._cancel.disabled = not is_running
-        self._bar.value = round(100 * done / max(of, 1))
-        self._sentence.text = progress(done, of, self._noun, is_running)
+    def show(self, work: LongWork) -> None:
+        """Show the progress of the work."""
+        self._cancel.disabled = not work.is_running
+        self._bar.value = round(100 * work.done / max(work.of, 1))
+        self._sentence.text = progress(work.done, work.of, self._noun, work.is_running)
 
 
 class Study:
     """Long work in steps with its controls.
 
-    It begins when it first comes on screen, and pauses while it is not.
+    It starts when it first comes on screen, and pauses while it is off screen.
 
     Parameters
     ----------
+    session : Session
     steps : callable
-        The work, by the controls of that moment.
+        Returns the steps, from the present settings.
     noun : str
         What the steps are called.
     """
@@ -82,8 +82,8 @@ class Study:
     ) -> None:
         self._session = session
         self._steps = steps
-        fail = partial(session.fail, told=unfinished, of=self)
-        self._work = InSteps(session.on_page, self._tell, fail)
+        fail = partial(session.failures.report, describe=unfinished, part=self)
+        self._work = session.tasks.long_work(self._show_progress, fail)
         self._controls = WorkControls(self.start, self._work.cancel, noun)
 
     @property
@@ -92,22 +92,18 @@ class Study:
         return self._controls.layout
 
     def start(self) -> None:
-        """Begin anew."""
-        self._session.recover(self)
+        """Start with the present settings, in place of the present work."""
+        self._session.failures.resolve(self)
         self._work.start(self._steps())
 
     def show(self, is_on_screen: bool) -> None:
-        """Begin or go on when it comes on screen, and pause when it leaves."""
+        """Start or continue on screen, and pause off screen."""
         self._work.pause(not is_on_screen)
         if is_on_screen and self._work.of == 0:
             self.start()
 
-    def _tell(self) -> None:
-        self._controls.tell(self._work.done, self._work.of, self._work.is_running)
-
-
-Work = Callable[[Callable[[int, int], None], Callable[[], bool]], Result]
-"""Long work that calls ``progress(done, of)`` now and then, and raises once ``cancelled()``."""
+    def _show_progress(self) -> None:
+        self._controls.show(self._work)
 
 
 class OnePiece(Generic[Result]):
@@ -115,10 +111,11 @@ class OnePiece(Generic[Result]):
 
     Parameters
     ----------
+    session : Session
     work : callable
-        The work, by the controls of that moment.
+        Returns the work, from the present settings.
     draw : callable
-        Shows, on the page, what came out.
+        Shows the result on the page.
     noun : str
         What its progress counts.
     **start : str
@@ -134,11 +131,11 @@ class OnePiece(Generic[Result]):
         **start: str,
     ) -> None:
         self._session = session
-        self._work = work
+        self._make_work = work
         self._draw = draw
-        self._jobs: LatestWins[Result] = LatestWins(session.on_page, LONG)
+        fail = partial(session.failures.report, describe=unfinished, part=self)
+        self._work = session.tasks.long_work(self._show_progress, fail)
         self._controls = WorkControls(self.start, self.cancel, noun, **start)
-        self._run = _Run()
 
     @property
     def controls(self) -> list[Any]:
@@ -146,59 +143,20 @@ class OnePiece(Generic[Result]):
         return self._controls.layout
 
     def start(self, work: Work[Result] | None = None) -> None:
-        """Begin anew, with other work than the button's if told; what is under way ends."""
-        work, page = work or self._work(), self._session
-        self.cancel()
-        page.recover(self)
-        run = self._run = _Run(is_running=True)
-
-        def told(done: int, of: int) -> None:
-            run.done, run.of = done, of
-            if not run.is_telling:  # a page that is busy is not told of every step in between
-                run.is_telling = True
-                page.on_page(partial(self._tell, run))
-
-        def cancelled() -> bool:
-            return not run.is_running or page.is_gone or LONG.is_closed
-
-        self._tell(run)
-        self._jobs.submit(
-            partial(work, told, cancelled), partial(self._done, run), partial(self._ended, run)
-        )
+        """Start this work, or the button's, in place of the present work."""
+        work = work or self._make_work()
+        self._session.failures.resolve(self)
+        self._work.start_piece(work, self._draw)
 
     def cancel(self) -> None:
-        """Ask it to end, and draw nothing of it."""
-        self._run.is_running = False
-        self._tell(self._run)
+        """Ask the work to end; its result is not drawn."""
+        self._work.cancel()
 
-    def _tell(self, run: _Run) -> None:
-        run.is_telling = False
-        if run is self._run:
-            self._controls.tell(run.done, run.of, run.is_running)
-
-    def _done(self, run: _Run, result: Result) -> None:
-        if run.is_running:
-            self._draw(result)
-            run.is_running, run.done = False, run.of
-            self._tell(run)
-
-    def _ended(self, run: _Run, error: Exception) -> None:
-        if run.is_running:  # else this is what it was asked for
-            self.cancel()
-            self._session.fail(error, unfinished, self)
+    def _show_progress(self) -> None:
+        self._controls.show(self._work)
 
 
-@dataclass
-class _Run:
-    """How far one run is."""
-
-    is_running: bool = False
-    is_telling: bool = False
-    done: int = 0
-    of: int = 0
-
-
-def aside(words: str, *controls: Any) -> pn.Column:
-    """What there is to see, and the controls of it."""
-    text = pmui.Typography(words, variant="body2", margin=(8, 8, 4, 8))
+def aside(explanation: str, *controls: Any) -> pn.Column:
+    """Explanatory text above controls."""
+    text = pmui.Typography(explanation, variant="body2", margin=(8, 8, 4, 8))
     return pn.Column(text, *controls, sizing_mode="stretch_width", margin=0)

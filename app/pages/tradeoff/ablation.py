@@ -13,8 +13,9 @@ from app.model.store import Answer, same_subject
 from app.pages.navigation import View
 from app.pages.session import Session
 from app.pages.shared.downloads import TABLE, Shown, below, downloadable, looked_at
-from app.pages.shared.studies import OnePiece, Work, aside
+from app.pages.shared.studies import OnePiece, aside
 from app.pages.tradeoff import ablation_text as requires_words
+from app.tasks.scheduler import Work
 from app.widgets.cards import part
 from app.widgets.controls import Sentence, SettingsPanel, Table
 from core import CORRECTIONS, parts_of

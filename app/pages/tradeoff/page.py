@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,18 @@ from numpy.typing import NDArray
 from app.model.budget import fits, require_fitting
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import table_file
+from app.model.state import Less
 from app.model.store import Answer, Request, bare, same_capture
-from app.pages.navigation import Pages, View
+from app.pages.navigation import Page, Pages, Shared, View
 from app.pages.session import Session
 from app.pages.shared.downloads import PLOT, TABLE, Shown, Subject, below, downloadable, looked_at
 from app.pages.shared.outputs import CurveCard, TableCard, layers_of, spelled
-from app.pages.shared.studies import OnePiece, Work, aside
+from app.pages.shared.studies import OnePiece, aside
 from app.pages.tradeoff import text as trade_words
 from app.pages.tradeoff.ablation import Requires
 from app.pages.tradeoff.sensitivity import Trust
 from app.plots import elements as plots
+from app.tasks.scheduler import Work
 from app.theme import LIGHT, method_style, palette
 from app.widgets.cards import card, part
 from app.widgets.controls import Sentence, SettingsPanel, Table
@@ -112,11 +115,10 @@ class Tradeoff:
     Parameters
     ----------
     session : Session
-    open_point : callable
-        Shows a way to range, and what it was measured on, on the page that it belongs to.
     """
 
-    def __init__(self, session: Session, open_point: Callable[[Point, Request], None]) -> None:
+    def __init__(self, session: Session) -> None:
+        open_point = partial(show_point, session)
         self._sections = Pages(
             {
                 "Speed against accuracy": lambda: Ways(session, open_point).view,
@@ -422,6 +424,30 @@ class Acquisition:
             self._needed.show(needed)
 
 
+def show_point(session: Session, point: Point, measured: Request) -> None:
+    """Show a measured configuration: the paper's method on Explore, others on Compare."""
+    state, candidate = session.state, point.candidate
+    method = candidate.method.estimator
+    changes = {
+        "source": session.key(measured.source),
+        "light": measured.light,
+        "reading": measured.reading,
+        "absent": measured.absent,
+        "window": measured.window,
+        "less": Less.of(candidate.reduction, point.shape[2]),
+    }
+    if method == "tracking":
+        state.param.update(tracking=candidate.settings, page="Explore", **changes)
+        return
+    chosen = state.comparison
+    settings = chosen.settings
+    if candidate.settings is not None and method in settings:
+        settings = {**settings, method: candidate.settings}
+    methods = tuple(each for each in ESTIMATORS if each in (*chosen.methods, method))
+    comparison = replace(chosen, methods=methods, settings=settings)
+    state.param.update(comparison=comparison, page="Compare", **changes)
+
+
 def _ends(intervals: Sequence[Interval]) -> dict[str, Array]:
     names = ("value", "low", "high")
     return {name: np.array([getattr(each, name) for each in intervals]) for name in names}
@@ -468,3 +494,11 @@ def methods(answer: Answer) -> list[Method]:
     """Every method with its defaults, the tracking differentiator with the page's settings."""
     tracking = Method("tracking", "tracking", answer.request.tracking)
     return [tracking if each.name == "tracking" else each for each in as_they_come()]
+
+
+PAGE = Page(
+    "Trade-off",
+    Tradeoff,
+    "measures speed against accuracy",
+    shared=frozenset({Shared.TRACKING}),
+)

@@ -14,7 +14,7 @@ from app.pages.shared.downloads import Subject
 from app.pages.shared.outputs import CurveCard, TableCard
 from app.pages.shared.studies import Study, aside
 from app.pages.tradeoff import sensitivity_text as trust_words
-from app.tasks.jobs import Step
+from app.tasks.scheduler import Step
 from app.theme import palette
 from app.widgets.cards import part
 from app.widgets.controls import SettingsPanel

@@ -36,7 +36,7 @@ from app.server.garbage import collect_all
 
 DEBOUNCE_MS = 0
 """Panel collects property changes for 50 ms. So short a time suits callbacks as short as ours,
-which hand the work to `app.tasks.jobs`; under slow ones it would build a backlog."""
+which hand the work to `app.tasks.scheduler`; under slow ones it would build a backlog."""
 
 SWITCH_S = 1e-4
 """A thread that computes keeps the others waiting for 5 ms whenever they have let go of the

@@ -1,0 +1,162 @@
+"""The present estimate of a session: computed from the state whenever that changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from time import perf_counter
+
+import param
+
+from app.model.capture_defaults import enter, own_field_of_view_deg
+from app.model.restore import request_of
+from app.model.state import COMPUTED_FROM, State
+from app.model.store import Answer, Request, Source, compute, same_view
+from app.model.text import lack
+from app.pages.shared.failures import FailureLog
+from app.tasks.page import PageTasks
+from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane
+from app.tasks.signals import Signal
+from core.cost import cost_of
+
+BUSY_MS = 200
+"""A request that takes longer is shown to be under way."""
+
+FEW_COUNTS = 2**20
+"""Counts of a capture up to which an estimate takes less time than drawing it."""
+
+FEW_S = 0.25
+"""Estimated time up to which an estimate may run on the page's thread; an upper bound."""
+
+
+class CurrentEstimate:
+    """Keeps the answer to the state's request up to date.
+
+    Parameters
+    ----------
+    state : State
+    sources : mapping of str to Source
+    tasks : PageTasks
+    failures : FailureLog
+    first : Answer
+        The answer to the state's present request.
+
+    Attributes
+    ----------
+    answer : Answer
+        The latest answer that could be computed.
+    changed : Signal of Answer
+        Emitted on the page with each new answer, and with the old one again where a request failed.
+    own_field_of_view_deg : float
+        The field of view that suits the present capture.
+    busy : Signal of bool
+        Emitted with True when a request takes long, and with False when it is answered.
+    """
+
+    def __init__(
+        self,
+        state: State,
+        sources: Mapping[str, Source],
+        tasks: PageTasks,
+        failures: FailureLog,
+        first: Answer,
+    ) -> None:
+        self.answer = first
+        self.changed: Signal[Answer] = Signal()
+        self.busy: Signal[bool] = Signal()
+        self._state, self._sources = state, sources
+        self._tasks, self._failures = tasks, failures
+        self._channel = tasks.latest()
+        self._is_busy = False
+        self._asked_s: float | None = None
+        self.own_field_of_view_deg = own_field_of_view_deg(first)
+        self._take_reduction(first)
+        state.param.watch(lambda *_: self.refresh(), list(COMPUTED_FROM))
+
+    @property
+    def request(self) -> Request:
+        """What the state asks for."""
+        return request_of(self._state, self._sources)
+
+    def refresh(self) -> None:
+        """Compute the state's request, or again when more of its file has been read."""
+        request = self.request
+        if self._asked_s is None:
+            self._begin_waiting()
+        self._channel.submit(
+            partial(compute, request, self.answer),
+            self._accept,
+            partial(self._restore, request),
+            lane_of(request, self.answer),
+        )
+
+    def _accept(self, answer: Answer) -> None:
+        previous, self.answer = self.answer, answer
+        self._take_reduction(answer)
+        if not same_view(answer.request, previous.request):
+            self.own_field_of_view_deg = own_field_of_view_deg(answer)
+            enter(self._state, answer, previous)
+        with self._tasks.hold():  # all that follows reaches the browser at once
+            self._failures.clear(lack(answer))
+            self._end_waiting()
+            self.changed.emit(answer)
+
+    def _take_reduction(self, answer: Answer) -> None:
+        """Show the reduction that was needed to stay within the limits of a request."""
+        if self._state.less == answer.asked != answer.request.less:
+            with param.discard_events(self._state):
+                self._state.less = answer.request.less
+
+    def _restore(self, request: Request, error: Exception) -> None:
+        """Return to the request that the page still shows, unless the user has moved on."""
+        shown, state = self.answer.request, self._state
+        if request == self.request:
+            source = next(key for key, each in self._sources.items() if each is shown.source)
+            with param.discard_events(state):
+                state.param.update(
+                    source=source,
+                    reading=shown.reading,
+                    less=shown.less,
+                    absent=shown.absent,
+                    window=shown.window,
+                )
+        self._end_waiting()
+        self.changed.emit(self.answer)
+        self._failures.report(error)
+
+    # How long a request has been under way
+
+    def _begin_waiting(self) -> None:
+        self._asked_s = perf_counter()
+        self._tasks.call_later(BUSY_MS, self._check_busy)
+
+    def _check_busy(self) -> None:
+        if self._asked_s is not None and perf_counter() - self._asked_s >= 0.9e-3 * BUSY_MS:
+            self._is_busy = True
+            self._tasks.run_next(partial(self.busy.emit, True))
+
+    def _end_waiting(self) -> None:
+        self._asked_s = None
+        if self._channel.has_more:
+            self._begin_waiting()
+        elif self._is_busy:  # a following request keeps the sign, which would only flicker
+            self._tasks.call_later(BUSY_MS, partial(self._tasks.run_next, self._end_busy))
+
+    def _end_busy(self) -> None:
+        if self._asked_s is None and self._is_busy:
+            self._is_busy = False
+            self.busy.emit(False)
+
+
+def lane_of(request: Request, previous: Answer) -> Lane:
+    """Return the lane in which a request is computed, by what it costs after the previous one."""
+    before = previous.request
+    if previous.cutout is not None or previous.whole.cube.size > FEW_COUNTS:
+        return GENERAL
+    if cost_of(previous.capture, "tracking", request.tracking).seconds > FEW_S:
+        return GENERAL
+    if request == replace(before, tracking=request.tracking):
+        return PAGE
+    same_scene = request.source is before.source and request.absent == before.absent
+    return SHORT if request.source.is_scene and same_scene else GENERAL

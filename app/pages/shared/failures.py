@@ -1,0 +1,53 @@
+"""Failures of the parts of a page, and the one sentence that the page shows about them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from app.model.text import failure
+from app.tasks.signals import Signal
+
+log = logging.getLogger(__name__)
+
+
+class FailureLog:
+    """Sentences on failures, by the part of the page that failed.
+
+    Attributes
+    ----------
+    shown : Signal of str
+        Emitted with the sentence to show; empty where everything works.
+    """
+
+    def __init__(self) -> None:
+        self.shown: Signal[str] = Signal()
+        self._sentences: dict[object, str] = {}
+        self._otherwise = ""
+
+    def report(
+        self,
+        error: Exception,
+        describe: Callable[[Exception], str] = failure,
+        part: object = None,
+    ) -> None:
+        """Log an error and show a sentence about it, until its part works again."""
+        log.warning("a request failed", exc_info=error)
+        self._sentences.pop(part, None)  # the latest failure comes last
+        self._sentences[part] = describe(error)
+        self.shown.emit(self._sentences[part])
+
+    def resolve(self, part: object) -> None:
+        """Remove the failure of a part that works again, or is tried again."""
+        if self._sentences.pop(part, None) is not None:
+            self.shown.emit(next(reversed(self._sentences.values()), self._otherwise))
+
+    def clear(self, otherwise: str = "") -> None:
+        """Remove all failures; show another sentence as long as there are none."""
+        self._sentences.clear()
+        self._otherwise = otherwise
+        self.shown.emit(otherwise)
+
+    def show(self, sentence: str) -> None:
+        """Show a sentence that belongs to no part, until the next one."""
+        self.shown.emit(sentence)
