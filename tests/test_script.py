@@ -19,13 +19,16 @@ from app.model.address import Wanted, defaults, query_of
 from app.model.colors import image_of
 from app.model.large import LIMIT
 from app.model.script import ELSEWHERE, script_of
-from app.model.state import PAGES, State
+from app.model.state import State
 from app.model.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
+from app.pages.catalog import PAGES
 from app.pages.compare.ranking import run_task, tasks_of
 from app.pages.session import Session
 from core.io.readers.labelled import dataset
 from tests.browser import ROOT
 from tests.states import another, random_state
+
+PAGE_NAMES = [page.name for page in PAGES]
 
 NOT_CODE = {"cloud_color", "unit"}
 """Of the state, what changes nothing that `core` could find: colours, and units on axes."""
@@ -214,7 +217,7 @@ def test_every_parameter_is_in_the_script_of_some_page(name, car):
     """Fails for a new parameter, or a new field of one, of which a script knows nothing."""
     first = {"source": "sample" if name in ("reading", "window") else "worn"}
     for value in ["building"] if name == "source" else another(name):
-        seen = [{"page": page, **first} for page in PAGES]
+        seen = [{"page": page, **first} for page in PAGE_NAMES]
         assert any(
             told_by(car, State(**one)) != told_by(car, State(**one | {name: value})) for one in seen
         )

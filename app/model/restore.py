@@ -9,8 +9,8 @@ from typing import Any
 from app.model import text
 from app.model.address import Wanted, defaults
 from app.model.capture_defaults import FROM_CAPTURE, defaults_of, enter
-from app.model.state import COMPUTED_FROM, State
-from app.model.store import Answer, Request, Source, compute
+from app.model.state import State
+from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute
 
 log = logging.getLogger(__name__)
 
@@ -69,12 +69,11 @@ def _first_answer(
 
 def request_of(state: State, sources: Mapping[str, Source]) -> Request:
     """Return what a state asks to be computed."""
-    return Request(
-        sources[state.source],
-        state.light,
-        state.reading,
-        state.tracking,
-        state.less,
-        state.absent,
-        state.window,
-    )
+    chosen = {name: getattr(state, name) for name in COMPUTED_FROM}
+    return Request(**chosen | {"source": sources[state.source]})
+
+
+def parameters_of(request: Request, sources: Mapping[str, Source]) -> dict[str, Any]:
+    """Return the parameters of the state that ask for a request: the inverse of `request_of`."""
+    key = next(key for key, each in sources.items() if each is request.source)
+    return {name: getattr(request, name) for name in COMPUTED_FROM} | {"source": key}

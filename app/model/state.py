@@ -234,6 +234,12 @@ class Comparison:
         FALSE_ALARM.check("false_alarm", self.false_alarm)
         require("kind", self.kind, self.kind in KINDS, " or ".join(map(repr, KINDS)))
 
+    def including(self, method: str, settings: Any) -> Comparison:
+        """Return the comparison with one more method, or with other settings of it."""
+        methods = tuple(each for each in ESTIMATORS if each in (*self.methods, method))
+        own = {method: settings} if method in self.settings and settings is not None else {}
+        return replace(self, methods=methods, settings={**self.settings, **own})
+
 
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
@@ -242,9 +248,6 @@ SUBJECTS = ("Pixel", "Region", "Pins", "Capture")
 CLOUD_COLORS = ("Range", "Error", "Counts")
 NEED_TRUTH = ("Truth", "Error")
 
-
-COMPUTED_FROM = ("source", "light", "reading", "window", "less", "absent", "tracking")
-"""Parameters of the state that an answer is computed from."""
 
 MOST_PINS = 4
 

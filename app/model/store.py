@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, lru_cache, partial
 from importlib import resources
 from pathlib import Path
@@ -132,6 +132,10 @@ class Request:
     """Parts of the scene and corrections of the estimators that are switched off."""
     window: Window | None = None
     """Of a capture larger than memory; None for all of it."""
+
+
+COMPUTED_FROM = tuple(each.name for each in fields(Request))
+"""Parameters of the state that an answer is computed from."""
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,10 @@ from panel_material_ui.template.base import Meta
 
 from app.model import text as words
 from app.model.address import AddressBar, Wanted
+from app.model.restore import parameters_of
 from app.model.script import script_of
 from app.model.state import Illumination, Less, Reading
-from app.model.store import Answer, Source
+from app.model.store import Answer, Request, Source
 from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
 from app.pages.catalog import PAGES
 from app.pages.navigation import Content, Page, Pages, Shared, View
@@ -369,10 +370,10 @@ class Layout:
     # Actions of the user
 
     def _go_to(self, key: str) -> None:
-        if key != self.session.state.source:
-            self.session.state.param.update(
-                source=key, reading=Reading(), less=Less(), absent=frozenset(), window=None
-            )
+        session, state = self.session, self.session.state
+        if key != state.source:
+            request = Request(session.sources[key], state.light, Reading(), state.tracking, Less())
+            state.param.update(parameters_of(request, session.sources))
 
     def _preset_changed(self, name: str) -> None:
         if name in PRESETS:

@@ -10,9 +10,9 @@ from time import perf_counter
 import param
 
 from app.model.capture_defaults import enter, own_field_of_view_deg
-from app.model.restore import request_of
-from app.model.state import COMPUTED_FROM, State
-from app.model.store import Answer, Request, Source, compute, same_view
+from app.model.restore import parameters_of, request_of
+from app.model.state import State
+from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute, same_view
 from app.model.text import lack
 from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
@@ -110,17 +110,11 @@ class CurrentEstimate:
 
     def _restore(self, request: Request, error: Exception) -> None:
         """Return to the request that the page still shows, unless the user has moved on."""
-        shown, state = self.answer.request, self._state
         if request == self.request:
-            source = next(key for key, each in self._sources.items() if each is shown.source)
-            with param.discard_events(state):
-                state.param.update(
-                    source=source,
-                    reading=shown.reading,
-                    less=shown.less,
-                    absent=shown.absent,
-                    window=shown.window,
-                )
+            # Sliders stay where they are: the next move starts from there.
+            shown = replace(self.answer.request, light=request.light, tracking=request.tracking)
+            with param.discard_events(self._state):
+                self._state.param.update(parameters_of(shown, self._sources))
         self._end_waiting()
         self.changed.emit(self.answer)
         self._failures.report(error)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from app.model.budget import fits, require_fitting
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import table_file
+from app.model.restore import parameters_of
 from app.model.state import Less
 from app.model.store import Answer, Request, bare, same_capture
 from app.pages.navigation import Page, Pages, Shared, View
@@ -427,25 +428,16 @@ class Acquisition:
 def show_point(session: Session, point: Point, measured: Request) -> None:
     """Show a measured configuration: the paper's method on Explore, others on Compare."""
     state, candidate = session.state, point.candidate
-    method = candidate.method.estimator
-    changes = {
-        "source": session.key(measured.source),
-        "light": measured.light,
-        "reading": measured.reading,
-        "absent": measured.absent,
-        "window": measured.window,
-        "less": Less.of(candidate.reduction, point.shape[2]),
-    }
+    method, settings = candidate.method.estimator, candidate.settings
+    request = replace(measured, less=Less.of(candidate.reduction, point.shape[2]))
     if method == "tracking":
-        state.param.update(tracking=candidate.settings, page="Explore", **changes)
-        return
-    chosen = state.comparison
-    settings = chosen.settings
-    if candidate.settings is not None and method in settings:
-        settings = {**settings, method: candidate.settings}
-    methods = tuple(each for each in ESTIMATORS if each in (*chosen.methods, method))
-    comparison = replace(chosen, methods=methods, settings=settings)
-    state.param.update(comparison=comparison, page="Compare", **changes)
+        page, comparison = "Explore", state.comparison
+        request = replace(request, tracking=settings)
+    else:
+        page, comparison = "Compare", state.comparison.including(method, settings)
+        request = replace(request, tracking=state.tracking)
+    asked = parameters_of(request, session.sources)
+    state.param.update(comparison=comparison, page=page, **asked)
 
 
 def _ends(intervals: Sequence[Interval]) -> dict[str, Array]:
