@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.io.readers import chunks
+from core.io.readers.stored import Numbers
 
 
 def hdf5_bytes(user_block: int = 0, **arrays: Any) -> bytes:
@@ -109,21 +109,15 @@ class Matlab73:
 
 
 class Reads:
-    """How many bytes of arrays were read from files."""
+    """Count the bytes of arrays that are read from files."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.n_bytes = 0
-        fetch, box = chunks.read_stretch, chunks.Contiguous.__getitem__
+        read = Numbers.__getitem__
 
-        def read_stretch(path: Path, offset: int, n_bytes: int) -> bytes:
-            self.n_bytes += n_bytes
-            return fetch(path, offset, n_bytes)
-
-        def read_box(array: chunks.Contiguous, key: tuple[slice, ...]) -> NDArray[Any]:
-            found = box(array, key)
+        def counted(array: Numbers, box: tuple[slice, ...]) -> NDArray[Any]:
+            found = read(array, box)
             self.n_bytes += found.nbytes
             return found
 
-        monkeypatch.setattr(chunks, "read_stretch", read_stretch)
-        monkeypatch.setattr("core.io.readers.zarr.read_stretch", read_stretch)
-        monkeypatch.setattr(chunks.Contiguous, "__getitem__", read_box)
+        monkeypatch.setattr(Numbers, "__getitem__", counted)

@@ -14,7 +14,6 @@ import pytest
 
 from core.capture import CaptureError
 from core.io.readers import frames, guards, read_capture
-from core.io.readers.chunks import boxes
 from core.tests.samples import CAMERA_CUBE, CUBE, frames_of, gmapd_bytes, npy_bytes, npz_bytes
 
 pytestmark = pytest.mark.files
@@ -52,7 +51,7 @@ def test_any_order_of_axes_in_any_stretch(
 def test_boxes_are_the_array_in_its_order() -> None:
     values = np.arange(4 * 5 * 6).reshape(4, 5, 6)
     for most in (1, 5, 6, 13, 30, 1000):
-        parts = [values[box].ravel() for box in boxes(values.shape, most)]
+        parts = [values[box].ravel() for box in frames.boxes(values.shape, most)]
         np.testing.assert_array_equal(np.concatenate(parts), values.ravel())
         assert max(part.size for part in parts) <= most
 

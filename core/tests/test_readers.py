@@ -13,7 +13,6 @@ import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from hypothesis.extra import numpy as hnp
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
-from core.io.readers import MAX_CUBE_BYTES, SUFFIXES, guards, hdf5, read_capture
+from core.io.readers import MAX_CUBE_BYTES, SUFFIXES, guards, read_capture
 from core.io.writers import save_capture
 from core.tests.formats import FORMATS, Format, damaged, put
 from core.tests.refusing import assert_refused
@@ -64,9 +63,7 @@ def test_every_reader_is_under_the_contract() -> None:
 
 
 @pytest.fixture
-def saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Format], Path]:
-    """Path of a file of a format, which no longer changes: what is in it is looked up once."""
-    monkeypatch.setattr(hdf5, "isolated", cache(guards.isolated))
+def saved(tmp_path: Path) -> Callable[[Format], Path]:
     return lambda kept: put(tmp_path / kept.name, kept.build())
 
 

@@ -9,6 +9,7 @@ import pickle
 import tracemalloc
 import zlib
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,8 @@ from scipy.constants import speed_of_light
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
-from core.io.readers import guards, open_capture, read_capture
+from core.io.readers import guards, isolation, open_capture, read_capture
 from core.io.readers.labelled import dataset, describe, oriented
-from core.io.readers.lzf import decompress
 from core.io.readers.request import Request
 from core.io.readers.stored import Stored, choose
 from core.tests.formats import Content, bare, put
@@ -368,31 +368,6 @@ def test_an_array_alone_is_a_zarr_directory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_capture(tmp_path / "a.zarr").cube, CUBE)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_lzf_is_h5py_s(seed: int, tmp_path: Path) -> None:
-    rng = np.random.default_rng(seed)
-    cube = rng.poisson(10.0**-seed, (8, 8, 900)).astype(np.uint16)
-    kept = {"data": cube, "compression": "lzf", "shuffle": bool(seed % 2)}
-    path = put(tmp_path / "l.h5", hdf5_bytes(counts=kept))
-    np.testing.assert_array_equal(read_capture(path).cube, cube)
-
-
-def test_lzf_never_leaves_its_buffers() -> None:
-    assert decompress(b"\x02abc", 3) == b"abc"
-    assert decompress(b"\x00a\xe0\x05\x00", 100) == b"a" * 15
-    # Cut short, longer than told, and copied from before the beginning.
-    for packed in (b"\x05ab", b"\x02abc", b"\xe0", b"\xe0\x05", b"\x20", b"\x00a\x20\x05"):
-        with pytest.raises(ValueError, match="LZF"):
-            decompress(packed, 2)
-    rng = np.random.default_rng(0)
-    for _ in range(2000):
-        packed = rng.integers(256, size=rng.integers(40), dtype=np.uint8).tobytes()
-        try:
-            assert len(decompress(packed, 50)) <= 50
-        except ValueError:
-            continue
-
-
 # -- what must be refused --------------------------------------------------------------------------
 
 
@@ -438,33 +413,12 @@ def texts(file: h5py.File) -> None:
     file.create_dataset("counts", (3, 4, 5), h5py.string_dtype())
 
 
-def narrow(file: h5py.File) -> None:
-    kind = h5py.h5t.STD_U16LE.copy()
-    kind.set_precision(12)
-    space = h5py.h5s.create_simple((3, 4, 5))
-    h5py.h5d.create(file.id, b"counts", kind, space)
-
-
-def scaled(file: h5py.File) -> None:
-    file.create_dataset("counts", data=CUBE, chunks=(3, 4, 100), scaleoffset=0)
-
-
 def huge_chunk(file: h5py.File) -> None:
     shape = (1500, 1000, 1000)
     file.create_dataset("counts", shape, "u2", chunks=shape, compression="gzip")
 
 
-def many_chunks(file: h5py.File) -> None:
-    file.create_dataset("counts", (10**5, 10**5, 10**5), "u1", chunks=(1, 1, 1))
-
-
-def bomb(file: h5py.File) -> None:
-    """A chunk that unpacks to a thousand times what it may hold."""
-    array = file.create_dataset("counts", (3, 4, 100), "u2", chunks=(3, 4, 100), compression=1)
-    array.id.write_direct_chunk((0, 0, 0), zlib.compress(bytes(2_400_000)))
-
-
-def bomb_of_checksums(file: h5py.File) -> None:
+def wrong_checksum(file: h5py.File) -> None:
     array = file.create_dataset("counts", (3, 4, 100), "u2", chunks=(3, 4, 100), fletcher32=True)
     array.id.write_direct_chunk((0, 0, 0), CUBE.tobytes() + b"\1\2\3\4")
 
@@ -513,12 +467,8 @@ HDF5_REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "compound": (written(compound), "counts = 'no numbers'"),
     "ragged": (written(ragged), "counts = 'no numbers'"),
     "text": (written(texts), "counts = 'no numbers'"),
-    "numbers of 12 bits": (written(narrow), "counts = 'numbers of an unusual layout"),
-    "an unknown filter": (written(scaled), "counts = 'packed by the filter scaleoffset'"),
     "a huge chunk": (written(huge_chunk), "a chunk of counts = 3000000000 "),
-    "too many chunks": (written(many_chunks), "chunks of counts = 1000000000000000 "),
-    "a bomb": (written(bomb), r"chunk \(0, 0, 0\) of counts .*more than 2,416"),
-    "a wrong checksum": (written(bomb_of_checksums), r"chunk \(0, 0, 0\) of counts .*checksum"),
+    "a wrong checksum": (written(wrong_checksum), "counts cannot be read"),
     "gaps": (written(gaps), "_FillValue of counts = 3.0 .*without gaps"),
     "gaps by another name": (written(gaps_by_another_name), "missing_value of counts = 3.0"),
     "truth of many pixels": (
@@ -537,18 +487,6 @@ HDF5_REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "a pulse of text": (known(pulse_tau_s="long"), "pulse_tau_s = 'long'"),
     "unknown detection": (known(detection="some"), "detection = 'some'"),
 }
-
-
-def test_a_shuffle_of_other_elements_is_refused(tmp_path: Path) -> None:
-    content = hdf5_bytes(c={"data": CUBE, "chunks": (2, 3, 64), "shuffle": True})
-    kept = b"shuffle\0" + (2).to_bytes(4, "little")
-    assert content.count(kept) == 1
-    path = put(tmp_path / "s.h5", content)
-    np.testing.assert_array_equal(read_capture(path).cube, CUBE)
-    for n_bytes in (0, 4, 10**9):
-        put(path, content.replace(kept, b"shuffle\0" + n_bytes.to_bytes(4, "little")))
-        with pytest.raises(CaptureError, match=f"shuffled in elements of {n_bytes} bytes, not 2"):
-            read_capture(path)
 
 
 @pytest.mark.parametrize("what", HDF5_REFUSED)
@@ -660,109 +598,42 @@ def first_chunk(data: bytes, **changes: Any) -> Callable[[], Mapping[str, bytes]
 
 
 SIZE = 2 * 3 * 64 * 2
-ZLIB, BLOSC, ZSTD = (
-    {"id": "zlib", "level": 1},
-    {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1, "blocksize": 0},
-    {"id": "zstd", "level": 1},
-)
-BLOSC_CHUNK = numcodecs.Blosc().encode(bytes(SIZE))
+ZLIB = {"id": "zlib", "level": 1}
+BLOSC = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1, "blocksize": 0}
 
 ZARR_REFUSED: dict[str, tuple[Callable[[], Mapping[str, bytes]], str]] = {
     "no arrays": (lambda: {"zarr.json": b'{"zarr_format": 3, "node_type": "group"}'}, "arrays = 0"),
-    "nothing of Zarr": (lambda: {"a.txt": b"a"}, "arrays = 0"),
-    "no JSON": (lambda: files_3() | {"counts/zarr.json": b"{"}, "zarr.json cannot be read"),
+    "no JSON": (lambda: files_3() | {"counts/zarr.json": b"{"}, "metadata of 'counts'"),
     "deep JSON": (
         lambda: files_3() | {"counts/zarr.json": b"[" * 100_000},
-        "zarr.json cannot be read",
+        "metadata of 'counts'",
     ),
-    "a list": (lambda: files_3() | {"counts/zarr.json": b"[]"}, "zarr.json cannot be read"),
     "two versions": (lambda: files_3() | {"counts/.zarray": b"{}"}, "versions 2 and 3"),
-    "another version": (in_3(zarr_format=4), "zarr_format = 4"),
+    "another version": (in_3(zarr_format=4), "variable counts"),
     "pickled objects": (
         in_2(dtype="|O", filters=[{"id": "pickle", "protocol": 5}]),
-        "dtype = '|O'",
+        "variable counts",
     ),
-    "a pickling filter": (in_2(filters=[{"id": "pickle", "protocol": 5}]), "codec = 'pickle'"),
-    "structured": (in_2(dtype=[["a", "<u2"]]), "dtype = "),
-    "complex": (in_2(dtype="<c16"), "dtype = '<c16'"),
-    "text": (in_3(data_type="string"), "data_type = 'string'"),
-    "an unknown codec": (codec_3(name="numcodecs.lzma"), "codec = 'numcodecs.lzma'"),
-    "shards": (codec_3(name="sharding_indexed"), "codec = 'sharding_indexed'"),
-    "a wild grid": (in_3(chunk_grid={"name": "rectilinear"}), "chunk_grid = 'rectilinear'"),
+    "a pickling filter": (in_2(filters=[{"id": "pickle", "protocol": 5}]), "'pickle'"),
+    "complex": (in_2(dtype="<c16"), "no numbers"),
     "a key that leaves": (
         in_3(chunk_key_encoding={"name": "v2", "configuration": {"separator": "/../"}}),
-        "separator = '/../'",
+        "variable counts",
     ),
-    "a separator that leaves": (in_2(dimension_separator="../"), "dimension_separator = '../'"),
-    "transformers": (in_3(storage_transformers=[{"name": "x"}]), "storage_transformers"),
-    "a shape of text": (in_2(shape="large"), "sizes = 'large'"),
-    "a negative shape": (in_2(shape=[-3, 4, 100]), r"sizes = \[-3, 4, 100\]"),
-    "a shape of fractions": (in_2(shape=[3.5, 4, 100]), r"sizes = \[3.5"),
-    "no chunks": (in_2(chunks=[0, 3, 64]), r"sizes = \[0"),
-    "chunks of other axes": (in_2(chunks=[3, 64]), "chunk of counts"),
+    "a separator that leaves": (in_2(dimension_separator="../"), "variable counts"),
     "a huge chunk": (in_2(chunks=[10**4] * 3), "a chunk of counts = 2000000000000"),
     "a chunk much larger than its array": (
         in_2(chunks=[512, 512, 512]),
         "bytes of a chunk of counts = 268435456 .*16,777,216",
     ),
-    "a fill beyond the type": (in_2(fill_value=70_000), "fill_value of counts = 70000"),
-    "a negative fill": (in_3(fill_value=-1), "fill_value of counts = -1"),
-    "half a fill": (in_3(fill_value=0.7), "fill_value of counts = 0.7"),
-    "a fill beyond all floats": (
-        in_3(data_type="float64", fill_value=10**400),
-        "fill_value of counts = 1000",
-    ),
     "gaps": (lambda: zarr_files(bare(), 2, _FillValue=3), "_FillValue of counts = 3.0"),
-    "gaps by no number": (
-        lambda: edited(
-            zarr_files(bare(), 3), "counts/zarr.json", attributes={"_FillValue": "AAA="}
-        ),
-        "counts = 'ValueError",
-    ),
     "a huge array": (in_2(shape=[10**5] * 3, chunks=[1000] * 3), "bytes of counts = 2000"),
     "too many chunks": (in_2(shape=[10**5] * 3), "chunks of counts = "),
-    "a wild order": (in_2(order="X"), "order = 'X'"),
-    "a wild fill": (in_2(fill_value="nothing"), "fill_value = 'nothing'"),
-    "an element of nothing": (
-        in_2(filters=[{"id": "shuffle", "elementsize": 0}]),
-        "elementsize = 0 .*1 to 16",
-    ),
-    "a huge element": (
-        in_2(filters=[{"id": "shuffle", "elementsize": 10**9}]),
-        "elementsize = 1000000000 .*1 to 16",
-    ),
-    "a huge element in version 3": (
-        codec_3(name="shuffle", configuration={"elementsize": 17}),
-        "elementsize = 17 .*1 to 16",
-    ),
-    "an element of text": (in_2(filters=[{"id": "shuffle", "elementsize": "2"}]), "elementsize"),
-    "many filters": (in_2(filters=[{"id": "shuffle"}] * 33), "filters = .*34 of them"),
-    "many codecs": (
-        in_3(codecs=[{"name": "bytes"}, *[{"name": "shuffle"}] * 10_000]),
-        "codecs = .*10,001 of them",
-    ),
-    "many axes": (in_2(shape=[3] * 10_000, chunks=[1] * 10_000), "sizes = .*10,000 of them"),
-    "an axis beyond all sizes": (in_2(shape=[3, 4, 2**63]), "sizes = .*9223372036854775808"),
-    "a short chunk": (first_chunk(b"", compressor=None), "damaged.*bytes = 0"),
-    "a long chunk": (first_chunk(bytes(SIZE + 1), compressor=None), f"bytes = {SIZE + 1}"),
-    "a bomb": (
-        first_chunk(zlib.compress(bytes(2**24)), compressor=ZLIB),
-        r"chunk \(0, 0, 0\) of counts .*more than",
-    ),
-    "cut short": (first_chunk(zlib.compress(bytes(SIZE))[:-3], compressor=ZLIB), "cut short"),
-    "a bomb of zstd": (
-        first_chunk(numcodecs.Zstd().encode(bytes(2**24)), compressor=ZSTD),
-        "bytes unpacked = 16777216",
-    ),
-    "no zstd": (first_chunk(bytes(100), compressor=ZSTD), "a zstd frame"),
-    "a bomb of blosc": (
-        first_chunk(numcodecs.Blosc().encode(bytes(2**24)), compressor=BLOSC),
-        "bytes unpacked = 16777216",
-    ),
-    "blosc cut short": (first_chunk(BLOSC_CHUNK[:-2], compressor=BLOSC), "bytes of a blosc chunk"),
-    "a checksum that fails": (
-        lambda: {**codec_3(name="crc32c")(), "counts/c/0/0/0": bytes(SIZE + 4)},
-        "checksum of a chunk",
+    "a short chunk": (first_chunk(b"", compressor=None), "counts cannot be read"),
+    "a bomb": (first_chunk(zlib.compress(bytes(2**24)), compressor=ZLIB), "counts cannot be read"),
+    "blosc cut short": (
+        first_chunk(numcodecs.Blosc().encode(bytes(SIZE))[:-2], compressor=BLOSC),
+        "counts cannot be read .*Blosc",
     ),
 }
 
@@ -794,57 +665,50 @@ def test_zarr_holds_no_links_and_no_pipes(tmp_path: Path) -> None:
     assert_refused(read_capture, path, "a file of the directory = 'more'", CaptureError, 2**22)
 
 
-# -- a process of its own --------------------------------------------------------------------------
+# -- isolation -------------------------------------------------------------------------------------
+
+
+def replying(array: list[Any]) -> str:
+    return f"import json; print(json.dumps(dict(told={{}}, arrays=[{array}])))"
 
 
 @pytest.mark.parametrize(
     ("does", "message"),
     [
         ("import os; os.abort()", "its library ended by SIGABRT"),
-        ("import time; time.sleep(60)", "more than 1 s to look at"),
-        ("while True: pass", "more than 1 s to look at"),
+        ("import time; time.sleep(60)", "more than 1 s"),
         ("import sys; sys.exit(3)", "its library ended by status 3"),
-        ("print('no archive')", "damaged"),
-        ("import absent_library", "without its library .*No module named 'absent_library'"),
+        ("print('no reply')", "damaged"),
+        (replying(["O", [1]]), "bytes of a reply"),
+        (replying(["u1", [99999999999]]), "bytes of a reply"),
     ],
 )
-def test_what_becomes_of_a_process(
+def test_a_process_that_fails_is_a_refusal(
     does: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guards, "_LEAST_CHILD_SECONDS", 1)
+    path = put(tmp_path / "c.h5", hdf5_bytes(counts=CUBE))
     script = tmp_path / "script.py"
     script.write_text(does)
-    with pytest.raises(ValueError, match=f"the file .*{message}"):
-        guards.isolated(script, script, "the file", "look")
+    with monkeypatch.context() as patched:
+        patched.setattr(isolation, "WORKER", script)
+        patched.setattr(isolation, "LEAST_SECONDS", 1)
+        isolation.end_idle_processes()
+        with pytest.raises(CaptureError, match=f"^c.h5: .*{message}"):
+            read_capture(path)
+    np.testing.assert_array_equal(read_capture(path).cube, CUBE)
 
 
-def test_a_process_finds_what_is_installed_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Wherever that is; but not what lies beside the script, nor in the current folder."""
-    for folder in ("installed", "script", "current"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / f"only_{folder}.py").touch()
-    monkeypatch.syspath_prepend(tmp_path / "installed")
-    monkeypatch.chdir(tmp_path / "current")
-    script = tmp_path / "script" / "script.py"
-    answer = "import sys, numpy; numpy.savez(sys.stdout.buffer, _told=numpy.array('{}'))"
-    script.write_text(f"import only_installed; {answer}")
-    assert guards.isolated(script, script, "the file", "look") == ({}, {})
-    for folder in ("script", "current"):
-        script.write_text(f"import only_{folder}; {answer}")
-        with pytest.raises(ValueError, match=f"No module named 'only_{folder}'"):
-            guards.isolated(script, script, "the file", "look")
+def test_a_process_has_limited_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = hdf5_bytes(counts={"data": CUBE, "chunks": CUBE.shape, "compression": "gzip"})
+    path = put(tmp_path / "c.h5", content)
+    monkeypatch.setattr(isolation, "BASE_BYTES", 2**24)
+    with pytest.raises(CaptureError, match=r"cannot be read|ended by"):
+        read_capture(path)
 
 
-def test_a_process_has_so_much_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guards, "MAX_CHILD_BYTES", 2**29)
-    file = io.BytesIO()
-    with h5py.File(file, "w", userblock_size=512) as target:
-        big = target.create_dataset("#refs#/a", (1, 2**28), "f8", chunks=(1, 2**28), compression=1)
-        big.id.write_direct_chunk((0, 0), zlib.compress(bytes(1000)))
-        target.create_dataset("Ts", data=[[big.ref]], dtype=h5py.ref_dtype)
-        target["Ts"].attrs["MATLAB_class"] = np.bytes_("cell")
-    monkeypatch.setattr(guards, "MAX_CUBE_BYTES", 2**36)
-    with pytest.raises(CaptureError, match="more memory than it may have"):
-        read_capture(put(tmp_path / "m.mat", file.getvalue()))
+def test_threads_read_at_the_same_time(tmp_path: Path) -> None:
+    path = put(tmp_path / "c.h5", hdf5_bytes(counts=LARGE))
+    opened = open_capture(path, pulse=Pulse.gaussian(1e-9), detection="all")
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda k: opened[k].compute(scheduler="synchronous").data, range(64)))
+    np.testing.assert_array_equal(found, LARGE)

@@ -183,7 +183,7 @@ def test_a_damaged_chunk_is_told_and_can_be_tried_again(tmp_path: Path, small_bl
     chunk = path / "counts" / "0.0.0"
     whole = chunk.read_bytes()
     chunk.write_bytes(whole[:-20])
-    with pytest.raises(CaptureError, match=r"c\.zarr: chunk \(0, 0, 0\) .*damaged"):
+    with pytest.raises(CaptureError, match=r"c\.zarr: counts cannot be read"):
         reader.read_some()
     assert reader.done == 0 and not reader.seen.any()
     chunk.write_bytes(whole)

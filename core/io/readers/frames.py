@@ -11,8 +11,9 @@ of the first 65,536 bins: a larger number more likely stands for no trigger.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from math import prod
 from typing import IO, Any
 
 import numpy as np
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.chunks import boxes
 from core.io.readers.dense import count_dtype, dense_capture
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.request import Request
@@ -184,3 +184,23 @@ def _more_bins(
     wider = np.zeros((n_rows, n_cols, n_bins), cube.dtype)
     wider[:, :, :before] = cube
     return wider
+
+
+def boxes(shape: tuple[int, ...], most: int) -> Iterator[tuple[slice, ...]]:
+    """Cut an array into boxes of at most `most` elements, one after the other in memory.
+
+    Each box is one stretch of an array in C order, and the next one begins where it ends.
+    """
+    if not shape:
+        yield ()
+        return
+    first, *rest = shape
+    inner = prod(rest)
+    if inner > most:
+        for k in range(first):
+            for box in boxes(tuple(rest), most):
+                yield (slice(k, k + 1), *box)
+        return
+    step = max(1, most // max(1, inner))
+    for k in range(0, first, step):
+        yield (slice(k, min(k + step, first)), *(slice(0, n) for n in rest))

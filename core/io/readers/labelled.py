@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from core.acquisition import SPEED_OF_LIGHT_M_S, Acquisition, Floats, Pulse
 from core.capture import COUNT_TYPES, Capture, CaptureError, Detection
 from core.checks import require
-from core.io.readers import hdf5, netcdf3, wording, zarr
+from core.io.readers import hdf5, wording, zarr
 from core.io.readers.dense import (
     AXES,
     PULSE,
@@ -157,7 +157,7 @@ class _File:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.arrays, self.groups = _arrays(path)
+        self.arrays, self.groups = (zarr if path.is_dir() else hdf5).arrays(path)
 
     def origin(self, chosen: Stored) -> str:
         """What to call a capture in its source."""
@@ -228,7 +228,7 @@ def recognizes(start: bytes) -> bool:
     """Whether a file starts like HDF5, but not like one of MATLAB, or like classic netCDF."""
     places = (0, *(2**k for k in range(9, 13)))
     is_hdf5 = any(start[k : k + 8] == hdf5.SIGNATURE for k in places)
-    return start[:4] in netcdf3.SIGNATURES or (is_hdf5 and not start.startswith(b"MATLAB"))
+    return start[:4] in hdf5.CLASSIC_SIGNATURES or (is_hdf5 and not start.startswith(b"MATLAB"))
 
 
 def read(path: Path, request: Request) -> Capture:
@@ -283,14 +283,6 @@ def open_counts(path: Path, request: Request) -> xr.DataArray:
     counts = oriented(file.labelled(chosen, lazy, request), request)
     known = describe(counts, request, file.origin(chosen), _guessed(chosen, request))
     return completed(counts, known)
-
-
-def _arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
-    if path.is_dir():
-        return zarr.arrays(path)
-    with path.open("rb") as file:
-        start = file.read(4)
-    return netcdf3.arrays(path) if start in netcdf3.SIGNATURES else hdf5.arrays(path)
 
 
 def _named_axes(chosen: Stored, request: Request) -> tuple[str, ...]:

@@ -7,33 +7,85 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from math import prod
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.checks import require
+from core.io.readers.guards import FileVersion, decoding, require_fits
+from core.io.readers.isolation import isolated
 from core.io.readers.request import Request
 
+_SMALL_CHUNK = 2**24  # bytes, however small the array
+_MOST_CHUNKS = 2**24  # of one array
 
-class Numbers(Protocol):
-    """An array that is read box by box."""
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Its size along each axis."""
+@dataclass(frozen=True)
+class Numbers:
+    """An array in a file, read box by box in an isolated process.
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """The type of its numbers."""
+    Parameters
+    ----------
+    name : str
+        Of the array within the file.
+    shape : tuple of int
+    dtype : dtype
+        Type of its numbers.
+    chunk : tuple of int
+        Size of a chunk along each axis; ones where any box is read without the rest.
+    versions : tuple of FileVersion
+        The file first, then all else that a box depends on; refused once any of them has changed.
+    task : str
+        Task of `core.io.readers.file_worker` that reads a box.
 
-    @property
-    def chunk(self) -> tuple[int, ...]:
-        """The size of a box that is read in one go, along each axis."""
+    Raises
+    ------
+    ValueError
+        If a chunk is too large, or there are too many.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    chunk: tuple[int, ...]
+    versions: tuple[FileVersion, ...]
+    task: str
+
+    def __post_init__(self) -> None:
+        fits = len(self.chunk) == len(self.shape) > 0 and min(*self.shape, *self.chunk) > 0
+        require(self.name, f"an array of shape {self.shape}", fits, "one with numbers in it")
+        in_all, n_bytes = (prod(one) * self.dtype.itemsize for one in (self.shape, self.chunk))
+        most = max(2 * in_all, _SMALL_CHUNK)
+        what = f"bytes of a chunk of {self.name}"
+        require_fits(what, n_bytes)
+        require(what, n_bytes, n_bytes <= most, f"up to {most:,}, as its array has {in_all:,}")
+        if n_bytes > self.dtype.itemsize:
+            n_chunks = prod(-(-n // step) for n, step in zip(self.shape, self.chunk, strict=True))
+            require(f"chunks of {self.name}", n_chunks, n_chunks <= _MOST_CHUNKS, "larger chunks")
 
     def __getitem__(self, box: tuple[slice, ...]) -> NDArray[Any]:
-        """The numbers in a box of slices, of any positive step."""
+        """Read the numbers in a box of slices of positive steps."""
+        edges = [slice_.indices(n) for slice_, n in zip(box, self.shape, strict=True)]
+        shape = tuple(len(range(*each)) for each in edges)
+        n_bytes, chunk_bytes = (prod(one) * self.dtype.itemsize for one in (shape, self.chunk))
+        require_fits(self.name, n_bytes)
+        if not n_bytes:
+            return np.empty(shape, self.dtype)
+        path = self.versions[0].path
+        with ExitStack() as stack:
+            for version in self.versions:
+                stack.enter_context(version.unchanged())
+            memory = 2 * n_bytes + 4 * chunk_bytes
+            _, (found,) = isolated(path, self.name, self.task, memory, name=self.name, box=edges)
+            read = f"array of {found.dtype} and shape {found.shape}"
+            same = (found.shape, found.dtype) == (shape, self.dtype)
+            require(f"content of {self.name}", read, same, f"{self.dtype} and shape {shape}")
+        return found
 
 
 def whole(numbers: Numbers) -> NDArray[Any]:
@@ -98,6 +150,43 @@ def choose(arrays: Sequence[Stored], request: Request) -> Stored:
         require("variable", ", ".join(cubes) or None, name is not None, remedy)
     require("variable", name, name in named, remedy)
     chosen = named[str(name)]
-    within = "an array of numbers in the file itself, packed by deflate, LZF, zstd or blosc"
+    within = "an array of whole or real numbers in the file itself"
     require(f"variable {name}", chosen.refused, chosen.numbers is not None, within)
     return chosen
+
+
+def listed(
+    path: Path, task: str, read: str, versions: Mapping[str, tuple[FileVersion, ...]], **more: Any
+) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
+    """List all arrays of a file, and the attributes of its groups by name; its own under ``""``.
+
+    Parameters
+    ----------
+    path : Path
+    task, read : str
+        Tasks of `core.io.readers.file_worker` that list the arrays and read a box.
+    versions : dict
+        What each array depends on; under ``""`` what all others do.
+    **more
+        Arguments of the task.
+    """
+    told, _ = isolated(path, "the file", task, **more)
+    found = []
+    with decoding("the list of arrays"):
+        for one in told["arrays"]:
+            name, known = str(one["name"]), one.get("attributes", {})
+            axes = tuple(one.get("axes", ()))
+            if "refused" in one:
+                references = tuple(one.get("references", ()))
+                found.append(Stored(name, None, axes, known, str(one["refused"]), references))
+                continue
+            shape, dtype = tuple(one["shape"]), np.dtype(one["type"])
+            chunk = tuple(one["chunk"] or (1,) * len(shape))
+            own = versions.get(name, versions[""])
+            try:
+                numbers = Numbers(name, shape, dtype, chunk, own, read)
+            except ValueError as error:
+                found.append(Stored(name, None, axes, known, str(error)))
+            else:
+                found.append(Stored(name, numbers, axes, known))
+        return found, told["groups"]

@@ -1,0 +1,227 @@
+"""Run file libraries in processes of limited memory and time, so that no file harms this one.
+
+Processes that are idle are used again, one for each thread that reads at the same time.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import signal
+import subprocess
+import sys
+from math import prod
+from pathlib import Path
+from threading import Lock, Timer
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.capture import CaptureError
+from core.checks import require
+from core.io.readers import guards
+from core.io.readers.guards import decoding
+
+BASE_BYTES = 2**30
+"""Address space for the libraries of a process, beyond what it reads. Not limited on Windows."""
+
+MAX_SECONDS = 120
+LEAST_SECONDS = 15
+SECONDS_PER_MIB = 2
+
+WORKER = Path(__file__).with_name("file_worker.py")
+"""Script of the processes."""
+
+_MOST_REPLY_BYTES = 2**27
+_REMEDY = "a whole file: copy or save it again"
+
+_idle: list[_Process] = []
+_lock = Lock()
+
+
+class _Ended(Exception):
+    """A process ended in place of a reply."""
+
+
+class _Process:
+    """A process that reads files."""
+
+    def __init__(self) -> None:
+        # No BLAS threads, which reserve memory; no plugins that a file may name.
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+        environment["BLOSC_NTHREADS"] = "1"
+        # -P: the folder of the script has modules named like others.
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(WORKER)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+        )
+        self.owner = os.getpid()
+        self.is_used = False
+
+    @property
+    def is_alive(self) -> bool:
+        return self.owner == os.getpid() and self._process.poll() is None
+
+    def ask(self, request: dict[str, Any], most_bytes: int) -> tuple[Any, list[NDArray[Any]]]:
+        """Send a request; return the JSON reply and arrays of no more than so many bytes."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        timer = Timer(request["seconds"], self._process.kill)
+        timer.daemon = True
+        timer.start()
+        try:
+            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline(_MOST_REPLY_BYTES)
+            if not line:
+                raise _Ended
+            reply = json.loads(line)
+            arrays = []
+            for kind, shape in reply["arrays"]:
+                dtype = np.dtype(kind)
+                n_bytes = prod(shape) * dtype.itemsize
+                plain = dtype.kind in "iuf" and 0 <= n_bytes <= most_bytes
+                require("bytes of a reply", n_bytes, plain, f"up to {most_bytes:,}")
+                array = np.empty(shape, dtype)
+                if (
+                    n_bytes
+                    and self._process.stdout.readinto(  # type: ignore[attr-defined]
+                        array.reshape(-1).view(np.uint8).data
+                    )
+                    != n_bytes
+                ):
+                    raise _Ended
+                arrays.append(array)
+            return reply["told"], arrays
+        except OSError as error:
+            raise _Ended from error
+        finally:
+            timer.cancel()
+            timer.join()
+            self.is_used = True
+
+    def end(self) -> str:
+        """End the process; return how it ended."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        try:
+            status = self._process.wait(0.1)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            status = self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            try:
+                pipe.close()
+            except OSError:
+                continue
+        return signal.Signals(-status).name if status < 0 else f"status {status}"
+
+
+def isolated(
+    path: Path, what: str, task: str, working_bytes: int = 0, **arguments: Any
+) -> tuple[Any, list[NDArray[Any]]]:
+    """Run a task of `core.io.readers.file_worker` in a process of its own.
+
+    Parameters
+    ----------
+    path : Path
+        File or directory that it reads; a large file may take longer.
+    what : str
+        Name for error messages.
+    task : str
+        Name of the task.
+    working_bytes : int
+        Memory that the task may take beyond `BASE_BYTES`.
+    **arguments
+        Passed to the task with the path.
+
+    Returns
+    -------
+    told : object
+        The reply's JSON.
+    arrays : list of ndarray
+
+    Raises
+    ------
+    CaptureError
+        If the file is refused or damaged, or the task ends or takes more than it may.
+    """
+    allowed = LEAST_SECONDS + SECONDS_PER_MIB * path.stat().st_size // 2**20
+    request = {
+        "task": task,
+        "path": str(path.absolute()),
+        "memory_bytes": BASE_BYTES + working_bytes,
+        "seconds": min(allowed, MAX_SECONDS),
+        **arguments,
+    }
+    with decoding(what):
+        told, arrays = _asked(request)
+    if "refused" in told:
+        raise CaptureError(told["refused"])
+    if "missing" in told:
+        raise CaptureError(f"{what} needs a library ({told['missing']}): install it.")
+    if "error" in told:
+        raise CaptureError(f"{what} cannot be read ({told['error']}): give {_REMEDY}.")
+    return told, arrays
+
+
+def _asked(request: dict[str, Any]) -> tuple[Any, list[NDArray[Any]]]:
+    """Ask an idle process; if it fails, where an earlier file may be the cause, a new one."""
+    process = _take()
+    while True:
+        was_used, began = process.is_used, monotonic()
+        told: dict[str, Any] | None = None
+        arrays: list[NDArray[Any]] = []
+        ending = ""
+        try:
+            told, arrays = process.ask(request, guards.MAX_CUBE_BYTES)
+        except _Ended:
+            ending = process.end()
+        except BaseException:
+            process.end()
+            raise
+        if told is not None and "exhausted" not in told:
+            _give(process)
+            return told, arrays
+        if told is not None:
+            process.end()
+        if monotonic() - began >= request["seconds"]:
+            return {"error": f"more than {request['seconds']} s"}, []
+        if not was_used:
+            return told or {"error": f"its library ended by {ending}"}, []
+        process = _Process()
+
+
+def _take() -> _Process:
+    """Return an idle process that is alive, else a new one."""
+    with _lock:
+        while _idle:
+            process = _idle.pop()
+            if process.is_alive:
+                return process
+            if process.owner == os.getpid():
+                process.end()
+    return _Process()
+
+
+def _give(process: _Process) -> None:
+    with _lock:
+        if len(_idle) < (os.cpu_count() or 1):
+            _idle.append(process)
+            return
+    process.end()
+
+
+@atexit.register
+def end_idle_processes() -> None:
+    """End all processes that wait for work."""
+    with _lock:
+        while _idle:
+            process = _idle.pop()
+            if process.owner == os.getpid():
+                process.end()
