@@ -546,8 +546,8 @@ REFUSED: dict[str, tuple[str, Builder, str]] = {
         "bytes of the array = 2390 .*claims 2400",
     ),
     "truncated npz": ("a.npz", lambda: npz_bytes(cube=CUBE)[:-10], DAMAGED),
-    "truncated mat": ("a.mat", lambda: mat_bytes(Ts=CUBE)[:-10], "cut short"),
-    "truncated in a tag": ("a.mat", lambda: mat_bytes(Ts=CUBE) + b"\x0e\0", DAMAGED),
+    "truncated mat": ("a.mat", lambda: mat_bytes(Ts=CUBE)[:-10], "cannot be read"),
+    "truncated in a tag": ("a.mat", lambda: mat_bytes(Ts=CUBE) + b"\x0e\0", "cannot be read"),
     "no variables": ("a.mat", lambda: mat_file("<"), "the file has nothing"),
     "MATLAB 7.3": (
         "a.mat",
@@ -653,31 +653,31 @@ REFUSED: dict[str, tuple[str, Builder, str]] = {
     "nested cells": (
         "a.mat",
         lambda: mat_file("<", matrix("<", CELL, (1, 1), b"Ts", nested_cells(50_000))),
-        "content of Ts = 'a nested",
+        "Ts cannot be read",
     ),
     "type code out of the table": (
         "a.mat",
         lambda: mat_file(
             "<", matrix("<", UINT16_CLASS, (1, 1, 2), b"Ts", element("<", 2000, b"abcd"))
         ),
-        "content of Ts",
+        "Ts cannot be read",
     ),
     "huge cell array": (
         "a.mat",
         lambda: mat_file("<", matrix("<", CELL, (10**6, 10**6), b"Ts", photon_cell("<", 5))),
-        "1,000,000,000,000 cells",
+        "more memory",
     ),
     "more cells than bytes": (
         "a.mat",
         lambda: mat_file("<", matrix("<", CELL, (1000, 1000), b"Ts", photon_cell("<", 5))),
-        "cells of Ts = 1000000",
+        "Ts cannot be read",
     ),
     "more numbers than bytes": (
         "a.mat",
         lambda: mat_file("<", matrix("<", UINT16_CLASS, (10**4, 10**4, 10**4), b"Ts", b"")),
-        "numbers of Ts = 1000000000000",
+        "Ts cannot be read",
     ),
-    "huge when inflated": ("a.mat", claims_more_inflated, "bytes of Ts = 3221225472"),
+    "huge when inflated": ("a.mat", claims_more_inflated, "Ts cannot be read"),
 }
 
 

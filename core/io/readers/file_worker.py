@@ -1,4 +1,4 @@
-"""Read HDF5, Zarr and classic netCDF with their libraries, in a process of limited memory and time.
+"""Read HDF5, Zarr, netCDF and MATLAB with their libraries, in a process of limited resources.
 
 `core.io.readers.isolation` starts this script. The libraries are not robust to malformed files:
 some keep them busy forever, others crash them. The script imports nothing of the package.
@@ -347,9 +347,54 @@ def read_netcdf3(path: str, name: str, box: list[list[int]]) -> Reply:
     return {}, [data[tuple(slice(*edges) for edges in box)]]
 
 
+def list_mat5(path: str) -> Reply:
+    """List name, shape and class of the variables of a MATLAB file before version 7.3."""
+    from scipy.io import whosmat  # noqa: PLC0415
+
+    return {"variables": [(name, list(shape), kind) for name, shape, kind in whosmat(path)]}, []
+
+
+def read_mat5(path: str, name: str) -> Reply:
+    """Read an array, the vectors and sizes of cells, or the parts of a sparse matrix."""
+    from scipy.io import loadmat  # noqa: PLC0415
+    from scipy.sparse import issparse  # noqa: PLC0415
+
+    found = loadmat(path, variable_names=[name])[name]
+    if issparse(found):
+        arrays = [found.data, found.indices, found.indptr]
+    elif found.dtype == object:
+        vectors = found.ravel().tolist()
+        arrays = [vector for vector in vectors if isinstance(vector, np.ndarray)]
+        arrays = arrays if len(arrays) == len(vectors) else [found]
+    else:
+        arrays = [found]
+    if any(array.dtype.kind not in "iuf" for array in arrays):
+        found = "'a nested, complex or non-numeric array' is not accepted"
+        raise Refused(f"content of {name} = {found}: give real numbers, a vector in each cell.")
+    if issparse(found) or found.dtype != object:
+        return {}, arrays
+    for k, vector in enumerate(arrays):
+        if vector.size > max(vector.shape):
+            place = divmod(k, found.shape[1])
+            what = f"{name} in pixel {place} = array of shape {vector.shape}"
+            raise Refused(f"{what} is not accepted: give a vector.")
+    sizes = np.array([vector.size for vector in arrays], np.int64)
+    return {}, [np.concatenate(arrays, axis=None), sizes]
+
+
 TASKS: dict[str, Callable[..., Reply]] = {
     task.__name__: task
-    for task in (list_hdf5, read_hdf5, read_cells, list_zarr, read_zarr, list_netcdf3, read_netcdf3)
+    for task in (
+        list_hdf5,
+        read_hdf5,
+        read_cells,
+        list_zarr,
+        read_zarr,
+        list_netcdf3,
+        read_netcdf3,
+        list_mat5,
+        read_mat5,
+    )
 }
 
 
@@ -378,9 +423,14 @@ def reply(line: bytes, target: BinaryIO) -> None:
     try:
         asked = json.loads(line)
         limit(asked.pop("memory_bytes"), asked.pop("seconds"))
+        most_bytes, what = asked.pop("most_bytes"), asked.get("name", "the file")
         told, arrays = TASKS[asked.pop("task")](**asked)
+        n_bytes = max((array.nbytes for array in arrays), default=0)
+        if n_bytes > most_bytes:
+            accepted = f"give a smaller file: at most {most_bytes:,} bytes are read"
+            raise Refused(f"bytes of {what} = {n_bytes} is not accepted: {accepted}.")
     except Refused as error:
-        told = {"refused": str(error)}
+        told, arrays = {"refused": str(error)}, []
     except MemoryError:
         told = {"error": "more memory than it may have", "exhausted": True}
     except ModuleNotFoundError as error:

@@ -1,54 +1,164 @@
-"""MATLAB ``.mat`` version 5 (saved with ``-v6`` or ``-v7``); 7.3 is in `core.io.readers.matlab73`.
+"""MATLAB ``.mat`` of version 5 (saved with ``-v6`` or ``-v7``) and 7.3 (``-v7.3``, HDF5).
 
 Either a cell array (row, col) holding each pixel's photon arrival times as a vector, or a cube
 (row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts as in `core.io.readers.sparse`.
-Other variables may lie beside it, as long as only one fits; of these, a number named like
-``bin_width`` or ``resolution`` that can be seconds is taken for the bin width, as a guess.
+The file may have other variables if only one fits; a number named like ``bin_width`` or
+``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
 
-SciPy reads the numbers, but those of sparse matrices, whose places it does not check. It trusts the
-file, though: a type code out of its table, or a few hundred kilobytes of cells within cells, end
-the whole process, and it takes as much memory as a size claims. So the layout is checked before.
+SciPy and h5py read the variables in an isolated process (`core.io.readers.isolation`). In version
+7.3 the axes are reversed, a cell array is an array of references, and a sparse matrix a group of
+three arrays.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
-from io import BytesIO
-from math import prod
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.io.readers import hdf5, matlab73
-from core.io.readers.arrivals import arrivals_capture
+from core.io.readers import guards, hdf5
+from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
 from core.io.readers.dense import cube_capture
-from core.io.readers.guards import decoding, require_fits
+from core.io.readers.guards import FileVersion, decoding, require_fits
+from core.io.readers.isolation import isolated
 from core.io.readers.request import Request
 from core.io.readers.sparse import Sparse, sparse_capture
-from core.io.readers.variables import Variable, bin_width, choose
+from core.io.readers.stored import Numbers, Stored, whole
 
-_HEADER_BYTES = 128
-_USER_BLOCK = 512  # what stands before the HDF5 of version 7.3
+_USER_BLOCK = 512  # before the HDF5 of version 7.3
 _VERSIONS_5 = (b"\x00\x01IM", b"\x01\x00MI")
-_BYTES_A_CELL = 256  # of memory that one loaded cell takes
 
-# Codes of the format, as in "MAT-File Format", The MathWorks.
-_UINT32, _INT32, _MATRIX, _COMPRESSED = 6, 5, 14, 15
-_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8"}
-_NUMBERS |= {13: "u8"}
-_FIRST_NUMERIC_CLASS, _LAST_NUMERIC_CLASS = 6, 15
-_COMPLEX_FLAG, _LOGICAL_FLAG = 0x0800, 0x0200
-_CLASSES = {1: "cell", 2: "struct", 3: "object", 4: "char", 5: "sparse", 16: "function"}
-_CLASSES |= {6: "double", 7: "single", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16"}
-_CLASSES |= {12: "int32", 13: "uint32", 14: "int64", 15: "uint64"}
-_DIMENSIONS = 6  # where they begin, in words of 4 bytes, after the tag and the flags
-_BEGINNING_BYTES = 4096
+NUMERIC = ("double", "single", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)))
+
+_WIDTH_NAMES = {"binwidth", "binsize", "binresolution", "timeresolution", "resolution"}
+_SHORTEST_S, _LONGEST_S = 1e-13, 1e-6
+
+
+class Variable(NamedTuple):
+    """A variable of a file.
+
+    ``shape`` is MATLAB's, ``kind`` the class of its elements, or ``"sparse"``; ``content`` loads it
+    in version 7.3.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    kind: str
+    content: Any
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.kind}, {' x '.join(map(str, self.shape))})"
+
+    @property
+    def fits(self) -> bool:
+        """Whether it has the shape of a capture."""
+        is_cube = self.kind in NUMERIC and len(self.shape) == 3
+        is_list = self.kind in ("cell", "sparse") and len(self.shape) == 2
+        return (is_cube or is_list) and min(self.shape) > 0
+
+    @property
+    def may_be_bin_width(self) -> bool:
+        """Whether it is one number, named like the width of a bin."""
+        plain = self.name.lower().replace("_", "")
+        return self.kind in NUMERIC and set(self.shape) == {1} and plain in _WIDTH_NAMES
+
+
+def _choose(variables: Sequence[Variable], name: str | None) -> Variable:
+    """The variable asked for, or the only one that fits.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or more than one.
+    """
+    for known, times in Counter(variable.name for variable in variables).items():
+        require(f"variables named {known!r}", times, times == 1, "each name once")
+    fitting = {variable.name: variable for variable in variables if variable.fits}
+    listed = ", ".join(map(str, variables)) or "nothing"
+    remedy = (
+        "a cell (row, col) of arrival times, a cube (row, col, bin), or a sparse matrix "
+        f"(pixel, bin); the file has {listed}"
+    )
+    if name is not None:
+        require("variable", name, name in fitting, f"the name of {remedy}")
+        return fitting[name]
+    found = ", ".join(fitting) or None
+    require("variable", found, len(fitting) == 1, f"as variable the name of {remedy}")
+    return next(iter(fitting.values()))
+
+
+def _bin_width(values: Iterable[float]) -> float | None:
+    """The one of some numbers that can be the width of a bin in seconds; None if not just one."""
+    found = {value for value in values if _SHORTEST_S <= value <= _LONGEST_S}
+    return found.pop() if len(found) == 1 else None
+
+
+class _Version5:
+    """The variables of a file of version 5."""
+
+    def __init__(self, path: Path) -> None:
+        self._version = FileVersion.of(path)
+        require_fits("the file", path.stat().st_size)
+        told, _ = isolated(path, "the list of variables", "list_mat5")
+        with decoding("the list of variables"):
+            self.variables = [
+                Variable(str(name), tuple(shape), str(kind), None)
+                for name, shape, kind in told["variables"]
+            ]
+
+    def cells(self, variable: Variable) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Arrival times, and the pixel of each."""
+        times, sizes = self._read(variable, 2)
+        return times, np.repeat(np.arange(sizes.size), sizes)
+
+    def array(self, variable: Variable) -> NDArray[Any]:
+        """The numbers of an array."""
+        return self._read(variable, 1)[0]
+
+    def sparse(self, variable: Variable) -> Sparse:
+        """A sparse matrix."""
+        values, rows, starts = self._read(variable, 3)
+        return Sparse(values, rows, starts, (variable.shape[0], variable.shape[1]))
+
+    def _read(self, variable: Variable, n_arrays: int) -> list[NDArray[Any]]:
+        name, memory = variable.name, 2 * guards.MAX_CUBE_BYTES
+        with self._version.unchanged():
+            _, found = isolated(self._version.path, name, "read_mat5", memory, name=name)
+        require(f"parts of {name}", len(found), len(found) == n_arrays, f"{n_arrays}")
+        return found
+
+
+class _Version73:
+    """The variables of a file of version 7.3."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        arrays, groups = hdf5.arrays(path)
+        self.variables = _variables({array.name: array for array in arrays}, groups)
+
+    def cells(self, variable: Variable) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Arrival times, and the pixel of each."""
+        most = guards.MAX_CUBE_BYTES // BYTES_A_PHOTON
+        times, sizes = hdf5.cells(self._path, variable.name, most)
+        n_rows, n_cols = variable.shape
+        with decoding(variable.name):
+            col, row = np.divmod(np.arange(n_rows * n_cols), n_rows)
+            return times, np.repeat(row * n_cols + col, sizes)
+
+    def array(self, variable: Variable) -> NDArray[Any]:
+        """The numbers of an array."""
+        return whole(variable.content).transpose()
+
+    def sparse(self, variable: Variable) -> Sparse:
+        """A sparse matrix."""
+        values, rows, starts = (whole(part) for part in variable.content)
+        return Sparse(values, rows, starts, (variable.shape[0], variable.shape[1]))
 
 
 def recognizes(start: bytes) -> bool:
@@ -58,196 +168,50 @@ def recognizes(start: bytes) -> bool:
 
 def read(path: Path, request: Request) -> Capture:
     """Read a cell array of arrival times, a cube, or a sparse matrix."""
-    with path.open("rb") as file:
-        start = file.read(_USER_BLOCK + len(hdf5.SIGNATURE))
+    with path.open("rb") as opened:
+        start = opened.read(_USER_BLOCK + len(hdf5.SIGNATURE))
+    file: _Version5 | _Version73
     if hdf5.SIGNATURE in (start[: len(hdf5.SIGNATURE)], start[_USER_BLOCK:]):
-        return matlab73.read(path, request)
-    require_fits("the file", path.stat().st_size)
-    data = path.read_bytes()
-    # SciPy takes a zero in the first four bytes for version 4.
-    known = data[124:128] in _VERSIONS_5 and 0 not in data[:4]
-    require("version", data[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
-    order = "<" if data[126:128] == b"IM" else ">"
-    variables = _variables(data, order)
-    variable = choose(variables, request.variable)
-    name, header = variable.name, data[:_HEADER_BYTES]
-    origin = f"{path.name}, variable {name}"
-    if variable.kind == "cell":
-        array = _load(variable, header, order)
-        times, pixel = _flat(array, name)
-        shape = (array.shape[0], array.shape[1])
-        return arrivals_capture(times, pixel, shape, name, origin, request)
-    widths = [_load(one, header, order) for one in variables if one.may_tell_bin_width]
-    width_s = bin_width(float(value.item()) for value in widths)
-    if variable.kind == "sparse":
-        return sparse_capture(_sparse(variable, order), name, origin, request, width_s)
-    array = _load(variable, header, order)
-    return cube_capture(array, name, origin, request, guessed_bin_width_s=width_s)
-
-
-def _variables(data: bytes, order: str) -> list[Variable]:
-    found = []
-    for element in _elements(data, order):
-        with decoding("the list of variables"):
-            start = _beginning(element, order)
-            words = np.frombuffer(start, order + "u4", len(start) // 4)
-            require(
-                "kind of a variable", int(words[0]), words[0] == _MATRIX, f"{_MATRIX}, a matrix"
-            )
-            name_at = int(_after(words, np.array(_DIMENSIONS)))
-            shape = tuple(_numbers(start, words, _DIMENSIONS, order).tolist())
-            name = _numbers(start, words, name_at, order).tobytes().decode("latin-1")
-            kind = _CLASSES.get(int(words[4]) & 0xFF, "unknown")
-            if words[4] & _LOGICAL_FLAG and kind != "sparse":
-                kind = "logical"
-        found.append(Variable(name, shape, kind, element))
-    return found
-
-
-def _beginning(element: memoryview, order: str) -> bytes:
-    """As much of a variable's element as its description takes, decompressed if need be."""
-    if struct.unpack_from(order + "I", element)[0] != _COMPRESSED:
-        return bytes(element[:_BEGINNING_BYTES])
-    return zlib.decompressobj().decompress(element[8:], _BEGINNING_BYTES)
-
-
-def _elements(data: bytes, order: str) -> list[memoryview]:
-    """The file's parts, one for each variable."""
-    parts, start = [], _HEADER_BYTES
-    while start < len(data):
-        with decoding("the list of variables"):
-            _, size = struct.unpack_from(order + "II", data, start)
-        end = start + 8 + size
-        whole = f"at most {len(data):,}, where the file ends: it was cut short, copy it again"
-        require("end of a variable", f"{end:,}", end <= len(data), whole)
-        parts.append(memoryview(data)[start:end])
-        start = end
-    return parts
-
-
-def _load(variable: Variable, header: bytes, order: str) -> NDArray[Any]:
-    """The variable's array, alone, after its layout was checked."""
-    name, n_elements = variable.name, prod(variable.shape)
-    element = _inflated(variable, order)
-    # Each number takes a byte at least, each cell eight.
-    remedy = "an array no larger than its file"
-    if variable.kind == "cell":
-        require_fits(f"{n_elements:,} cells", n_elements * _BYTES_A_CELL)
-        require(f"cells of {name}", n_elements, 8 * n_elements <= len(element), remedy)
+        file = _Version73(path)
     else:
-        require(f"numbers of {name}", n_elements, n_elements <= len(element), remedy)
-    words = np.frombuffer(element, order + "u4", len(element) // 4).astype(np.uint32, copy=False)
-    with decoding(name):
-        start = np.zeros(1, np.int64)
-        starts = _cells(words, n_elements) if variable.kind == "cell" else start
-        plain = _plain(words, starts)
-    found = "a nested, complex or non-numeric array"
-    require(f"content of {name}", found, bool(plain.all()), "real numbers, one vector in each cell")
-    with decoding(name):
-        array: NDArray[Any] = scipy.io.loadmat(BytesIO(b"".join((header, element))))[name]
-    return array
-
-
-def _inflated(variable: Variable, order: str) -> bytes | memoryview:
-    """The variable's element, decompressed if need be, and no further than it claims to go."""
-    tag = struct.Struct(order + "II")
-    packed: memoryview = variable.content
-    if tag.unpack_from(packed)[0] != _COMPRESSED:
-        return packed
-    with decoding(variable.name):
-        inflater = zlib.decompressobj()
-        start = inflater.decompress(packed[8:], tag.size)
-        size = tag.unpack(start)[1]
-    require_fits(variable.name, size)
-    with decoding(variable.name):
-        # Room for one byte more lets the checksum at the end be read, and shows an excess.
-        element = start + inflater.decompress(inflater.unconsumed_tail, size + 1)
-    found = len(element) - tag.size
-    whole = inflater.eof and found == size
-    require(f"bytes of {variable.name}", found, whole, f"{size:,}: copy or save the file again")
-    return element
-
-
-def _sparse(variable: Variable, order: str) -> Sparse:
-    """A sparse matrix: after its name come the rows, the starts of the columns, the values."""
-    element = _inflated(variable, order)
-    words = np.frombuffer(element, order + "u4", len(element) // 4).astype(np.uint32, copy=False)
-    with decoding(variable.name):
-        place = _after(words, _after(words, np.array(_DIMENSIONS)))
-        parts = []
-        for _ in ("rows", "starts", "values"):
-            parts.append(_numbers(element, words, int(place), order))
-            place = _after(words, place)
-        is_real = not words[4] & _COMPLEX_FLAG
-    require(f"content of {variable.name}", "complex numbers", is_real, "real numbers")
-    rows, starts, values = parts
-    return Sparse(values, rows, starts, (variable.shape[0], variable.shape[1]))
-
-
-def _numbers(
-    element: bytes | memoryview, words: NDArray[np.uint32], place: int, order: str
-) -> NDArray[Any]:
-    """The numbers of the data element that starts at a word."""
-    small = int(words[place]) >> 16
-    size = small or int(words[place + 1])
-    dtype = np.dtype(order + _NUMBERS[int(words[place]) & 0xFFFF if small else int(words[place])])
-    begin = 4 * place + (4 if small else 8)
-    return np.frombuffer(element, dtype, size // dtype.itemsize, begin)
-
-
-def _cells(words: NDArray[np.uint32], n_cells: int) -> NDArray[np.int64]:
-    """Where each filled cell starts, in words of 4 bytes."""
-    position = int(
-        _after(words, _after(words, np.array(_DIMENSIONS)))
-    )  # beyond the dimensions and the name
-    view = words.data
-    starts = []
-    for _ in range(n_cells):
-        size = view[position + 1]
-        if size:
-            starts.append(position)
-        position += 2 + (size + 7) // 8 * 2
-    return np.array(starts, np.int64)
-
-
-def _plain(words: NDArray[np.uint32], starts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether a plain array of real numbers lies at each start, and ends where it says."""
-    kind, size, flags_kind, flags_size, flags = (words[starts + k] for k in range(5))
-    array_class = flags & 0xFF
-    data = _after(words, _after(words, starts + _DIMENSIONS))
-    data_kind = np.where(words[data] >> 16, words[data] & 0xFFFF, words[data])
-    return np.asarray(
-        (kind == _MATRIX)
-        & (flags_kind == _UINT32)
-        & (flags_size == 8)
-        & (words[starts + _DIMENSIONS] == _INT32)
-        & (array_class >= _FIRST_NUMERIC_CLASS)
-        & (array_class <= _LAST_NUMERIC_CLASS)
-        & (flags & _COMPLEX_FLAG == 0)
-        & np.isin(data_kind, [*_NUMBERS])
-        & (_after(words, data) == starts + 2 + (size.astype(np.int64) + 7) // 8 * 2)
+        # SciPy takes a zero in the first four bytes for version 4.
+        known = start[124:128] in _VERSIONS_5 and 0 not in start[:4]
+        require("version", start[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
+        file = _Version5(path)
+    variable = _choose(file.variables, request.variable)
+    name, origin = variable.name, f"{path.name}, variable {variable.name}"
+    if variable.kind == "cell":
+        times, pixel = file.cells(variable)
+        shape = (variable.shape[0], variable.shape[1])
+        return arrivals_capture(times, pixel, shape, name, origin, request)
+    width_s = _bin_width(
+        float(file.array(one).item()) for one in file.variables if one.may_be_bin_width
     )
+    if variable.kind == "sparse":
+        return sparse_capture(file.sparse(variable), name, origin, request, width_s)
+    return cube_capture(file.array(variable), name, origin, request, guessed_bin_width_s=width_s)
 
 
-def _after(words: NDArray[np.uint32], position: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where the next data element starts, in words of 4 bytes.
-
-    A small element has its size in the upper half of its first word and its data in the second.
-    """
-    is_small = words[position] >> 16 > 0
-    size = words[position + 1].astype(np.int64)
-    return np.asarray(position + 2 + np.where(is_small, 0, (size + 7) // 8 * 2))
-
-
-def _flat(cells: NDArray[np.object_], name: str) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """The arrival times of all pixels, and the index of each photon's pixel."""
-    vectors = cells.ravel()
-    n_photons = np.fromiter((vector.size for vector in vectors), np.int64, vectors.size)
-    longest = np.fromiter((max(vector.shape) for vector in vectors), np.int64, vectors.size)
-    wide = np.flatnonzero(n_photons > longest)
-    if wide.size:
-        row, col = divmod(int(wide[0]), cells.shape[1])
-        shape = vectors[wide[0]].shape
-        require(f"{name} in pixel ({row}, {col})", f"array of shape {shape}", False, "a vector")
-    times = np.concatenate(list(vectors), axis=None)
-    return times, np.repeat(np.arange(vectors.size), n_photons)
+def _variables(arrays: dict[str, Stored], groups: dict[str, dict[str, Any]]) -> list[Variable]:
+    found = []
+    for name, array in arrays.items():
+        known = array.attributes
+        kind = known.get("MATLAB_class", array.numbers and array.numbers.dtype.name)
+        shape = array.references if array.numbers is None else array.numbers.shape
+        hollow = "MATLAB_empty" in known or (array.numbers is None and not array.references)
+        if "/" in name:
+            continue
+        if hollow or "MATLAB_int_decode" in known:
+            kind = array.refused or f"{kind}, not numbers"
+        found.append(Variable(name, shape[::-1], str(kind), array.numbers))
+    for name, known in groups.items():
+        parts = [arrays.get(f"{name}/{part}") for part in ("data", "ir", "jc")]
+        numbers: list[Numbers] = [
+            part.numbers for part in parts if part is not None and part.numbers is not None
+        ]
+        if "MATLAB_sparse" in known and len(numbers) == len(parts):
+            shape = (int(known["MATLAB_sparse"]), numbers[2].shape[0] - 1)
+            found.append(Variable(name, shape, "sparse", numbers))
+        elif name and "/" not in name:
+            found.append(Variable(name, (), str(known.get("MATLAB_class", "group")), None))
+    return found
