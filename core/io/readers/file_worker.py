@@ -1,4 +1,4 @@
-"""Read HDF5, Zarr, netCDF and MATLAB with their libraries, in a process of limited resources.
+"""Read files with the libraries of their formats, in a process of limited memory and time.
 
 `core.io.readers.isolation` starts this script. The libraries are not robust to malformed files:
 some keep them busy forever, others crash them. The script imports nothing of the package.
@@ -382,6 +382,54 @@ def read_mat5(path: str, name: str) -> Reply:
     return {}, [np.concatenate(arrays, axis=None), sizes]
 
 
+def list_sdt(path: str) -> Reply:
+    """List the types of the blocks of a Becker & Hickl file."""
+    from sdtfile import SdtFile  # noqa: PLC0415
+
+    with SdtFile(path) as file:
+        return {"types": [int(header.block_type) for header in file.block_headers]}, []
+
+
+def read_sdt(path: str, block: int) -> Reply:
+    """Read the counts and the times of a block."""
+    from sdtfile import SdtFile  # noqa: PLC0415
+
+    with SdtFile(path) as file:
+        data, claimed = file.data[block], int(file.block_headers[block].block_length)
+        if data.nbytes <= claimed - data.itemsize:
+            raise ValueError(f"block {block} has {data.nbytes:,} of {claimed:,} bytes")
+        return {}, [data, file.times[block]]
+
+
+def list_ptu(path: str) -> Reply:
+    """List the tags of a PicoQuant file that are numbers, and where its records begin."""
+    from ptufile import PtuFile  # noqa: PLC0415
+
+    with PtuFile(path, trimdims="T") as file:
+        tags = {name: value for name, value in file.tags.items() if isinstance(value, int | float)}
+        return {"tags": tags, "record_offset": int(file.record_offset)}, []
+
+
+def read_ptu(path: str, channel: int | None, shape: list[int]) -> Reply:
+    """Read the histograms (row, col, bin) of a channel, or of all, summed over the frames."""
+    from ptufile import PtuFile  # noqa: PLC0415
+
+    with PtuFile(path, trimdims="T") as file:
+        channels = [int(one) for one in file.active_channels]
+        told = {"channels": channels, "n_frames": int(file.shape[0])}
+        if not channels or channel not in (None, *channels):
+            return told, []
+        rows, cols, n_bins = shape
+        n_bins = min(n_bins, int(file.number_bins_max))
+        image = file.decode_image(
+            frame=-1,
+            channel=-1 if channel is None else channel,
+            dtime=n_bins,
+            dtype=np.uint16 if file.number_records < 2**16 else np.uint32,  # no bin holds more
+        )
+        return told, [image.reshape(rows, cols, n_bins)]
+
+
 TASKS: dict[str, Callable[..., Reply]] = {
     task.__name__: task
     for task in (
@@ -394,6 +442,10 @@ TASKS: dict[str, Callable[..., Reply]] = {
         read_netcdf3,
         list_mat5,
         read_mat5,
+        list_sdt,
+        read_sdt,
+        list_ptu,
+        read_ptu,
     )
 }
 

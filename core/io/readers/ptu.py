@@ -9,30 +9,23 @@ are left out. The gate opens with the pulse unless told otherwise. All photons o
 Electronics that measure from the photon to the next pulse (reverse start-stop) count backwards:
 tell the laser's period as ``stop_s``.
 
-`ptufile` decodes the records. Its compiled loops trust what the header claims, so that is compared
-with the file before.
+`ptufile` decodes the records in an isolated process (`core.io.readers.isolation`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from io import BytesIO
 from math import ceil, inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import AXES, cube_capture
-from core.io.readers.guards import decoding, require_fits
+from core.io.readers.guards import MAX_CUBE_BYTES, require_fits
+from core.io.readers.isolation import isolated
 from core.io.readers.request import Request
-
-if TYPE_CHECKING:
-    from ptufile import PtuFile
 
 _BYTES_A_RECORD = 4
 _BYTES_A_COUNT = 4
@@ -57,31 +50,30 @@ def recognizes(start: bytes) -> bool:
 
 def read(path: Path, request: Request) -> Capture:
     """Read the histograms of an image."""
-    from ptufile import PtuFile  # noqa: PLC0415  (only who opens such a file waits for it)
-
-    require_fits("the file", path.stat().st_size)
-    data = path.read_bytes()
-    with decoding("the header"):
-        # From memory: a file's own reader asks for as many bytes as a tag claims.
-        file = PtuFile(BytesIO(data), trimdims="T")
-    with file:
-        bin_width_s, n_bins = _bins(file.tags)
-        shape = _require_image(file, len(data), n_bins)
-        with decoding("the records"):
-            channels, n_frames = file.active_channels, file.shape[0]
-            n_bins = min(n_bins, file.number_bins_max)
-        channel = _choose(channels, request.variable)
-        cube = _histograms(file, channel, (*shape, n_bins))
+    told, _ = isolated(path, "the header", "list_ptu")
+    tags = told["tags"]
+    bin_width_s, n_bins = _bins(tags)
+    shape = _require_image(tags, path.stat().st_size - told["record_offset"], n_bins)
+    channel = _channel(request.variable)
+    memory = 2 * MAX_CUBE_BYTES
+    known, cubes = isolated(
+        path, "the records", "read_ptu", memory, channel=channel, shape=[*shape, n_bins]
+    )
+    channels, n_frames = known["channels"], known["n_frames"]
+    listed = ", ".join(f"channel {one}" for one in channels) or "none"
+    require("photons of the image", listed, bool(channels), "a file with photons")
+    require("variable", request.variable, bool(cubes), f"None for all, or one of {listed}")
+    (cube,) = cubes
     summed = [f"{n_frames} frames"] * (n_frames > 1)
     summed += [f"{len(channels)} channels"] * (channel is None and len(channels) > 1)
     origin = path.name if channel is None else f"{path.name}, channel {channel}"
     origin += f", {' and '.join(summed)} summed" if summed else ""
-    known = replace(
+    complete = replace(
         request,
         bin_width_s=request.bin_width_s or bin_width_s,
         detection=request.detection or "all",
     )
-    return cube_capture(cube, "the image", origin, known, " ".join(AXES))
+    return cube_capture(cube, "the image", origin, complete, " ".join(AXES))
 
 
 def _bins(tags: Mapping[str, Any]) -> tuple[float, int]:
@@ -105,9 +97,9 @@ def _positive(tags: Mapping[str, Any], name: str) -> float:
     return float(value)  # type: ignore[arg-type]  # as was just required
 
 
-def _require_image(file: PtuFile, size: int, n_bins: int) -> tuple[int, int]:
+def _require_image(tags: Mapping[str, Any], size: int, n_bins: int) -> tuple[int, int]:
     """Rows and columns, once the header proved to be an image's, and no larger than its file."""
-    found = {"ImgHdr_Dimensions": 3, "ImgHdr_Frame": 3, **file.tags}  # these may be missing
+    found = {"ImgHdr_Dimensions": 3, "ImgHdr_Frame": 3, **tags}  # these may be missing
     for name, (lowest, highest, what) in _ACCEPTED.items():
         value = found.get(name)
         fits = isinstance(value, int) and lowest <= value <= highest
@@ -117,33 +109,15 @@ def _require_image(file: PtuFile, size: int, n_bins: int) -> tuple[int, int]:
     rows, cols = found["ImgHdr_PixY"], found["ImgHdr_PixX"]
     require_fits("the image", rows * cols * n_bins * _BYTES_A_COUNT)
     claimed = found.get("TTResult_NumberOfRecords")
-    held = (size - file.record_offset) // _BYTES_A_RECORD
+    held = size // _BYTES_A_RECORD
     whole = isinstance(claimed, int) and 0 < claimed <= held
     require("TTResult_NumberOfRecords", claimed, whole, f"a whole file: it holds {held:,} records")
     return rows, cols
 
 
-def _choose(channels: tuple[int, ...], variable: str | None) -> int | None:
-    """The channel asked for, None for all."""
-    names = {f"channel {channel}": channel for channel in channels}
-    listed = ", ".join(names) or "none"
-    require("photons of the image", listed, bool(names), "a file with photons")
+def _channel(variable: str | None) -> int | None:
+    """Number of the channel asked for, None for all, -1 for a name of none."""
     if variable is None:
         return None
-    require("variable", variable, variable in names, f"None for all, or one of {listed}")
-    return names[variable]
-
-
-def _histograms(
-    file: PtuFile, channel: int | None, shape: tuple[int, int, int]
-) -> NDArray[np.unsignedinteger]:
-    """Counts (row, col, bin), summed over the frames."""
-    few = file.number_records < 2**16  # no bin can hold more
-    with decoding("the records"):
-        image: NDArray[np.unsignedinteger] = file.decode_image(
-            frame=-1,
-            channel=-1 if channel is None else channel,
-            dtime=shape[2],
-            dtype=np.uint16 if few else np.uint32,
-        )
-        return image.reshape(shape)
+    number = variable.removeprefix("channel ")
+    return int(number) if variable == f"channel {number}" and number.isdecimal() else -1
