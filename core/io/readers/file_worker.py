@@ -430,6 +430,54 @@ def read_ptu(path: str, channel: int | None, shape: list[int]) -> Reply:
         return told, [image.reshape(rows, cols, n_bins)]
 
 
+def read_mesh(path: str, suffix: str, most_faces: int) -> Reply:
+    """Read vertices (vertex, 3) and faces (face, 3) of all parts of a mesh, each in its place."""
+    import trimesh  # noqa: PLC0415
+
+    # From memory and without a resolver of names, a loader cannot reach another file.
+    data = Path(path).read_bytes()
+    if b"\0" not in data:  # text: do not guess its encoding
+        data = data.decode(errors="replace").encode()
+    scene = trimesh.load_scene(
+        trimesh.util.wrap_as_stream(data),
+        file_type=suffix[1:],
+        process=False,
+        skip_materials=True,
+    )
+    vertices, faces, n_vertices, n_faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0, 0
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        part = scene.geometry[name]
+        if not len(getattr(part, "faces", ())):
+            continue
+        n_faces += len(part.faces)
+        if n_faces > most_faces:
+            raise Refused(
+                f"faces of the mesh = {n_faces} is not accepted: give 1 to {most_faces:,}."
+            )
+        placed, triangles = _placed(part, np.asarray(matrix, float))
+        vertices.append(placed)
+        faces.append(triangles + n_vertices)
+        n_vertices += len(placed)
+    return {}, [np.concatenate(vertices), np.concatenate(faces)]
+
+
+def _placed(part: Any, matrix: np.ndarray[Any, Any]) -> tuple[Any, Any]:
+    """Move a part by a (4, 4) matrix; leave out vertices that no face has."""
+    vertices, faces = np.asarray(part.vertices, float), np.asarray(part.faces, np.int64)
+    lowest, highest, last = int(faces.min()), int(faces.max()), len(vertices) - 1
+    if lowest < 0 or highest > last:
+        found = f"vertices of a face = {(lowest, highest)}"
+        raise Refused(f"{found} is not accepted: give from 0 to {last}, the last one.")
+    is_used = np.zeros(len(vertices), bool)
+    is_used[faces] = True
+    vertices = vertices[is_used]
+    n_odd = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
+    if n_odd:
+        raise Refused(f"vertices at no place = {n_odd} is not accepted: give finite coordinates.")
+    return vertices @ matrix[:3, :3].T + matrix[:3, 3], (np.cumsum(is_used) - 1)[faces]
+
+
 TASKS: dict[str, Callable[..., Reply]] = {
     task.__name__: task
     for task in (
@@ -446,6 +494,7 @@ TASKS: dict[str, Callable[..., Reply]] = {
         read_sdt,
         list_ptu,
         read_ptu,
+        read_mesh,
     )
 }
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from core.acquisition import Floats
 from core.checks import require
 from core.geometry import sight_lines
-from core.io.readers.guards import decoding, require_fits
-from core.io.scene_files import glb
+from core.io.readers import guards
+from core.io.readers.guards import require_fits
+from core.io.readers.isolation import isolated
 
 SUFFIXES = (".ply", ".stl", ".obj", ".glb")
 
@@ -24,7 +25,6 @@ _DEFAULT_DIRECTION = (0.0, 1.0, 0.0)
 _BYTES_A_PIXEL = 128  # of memory, while its line of sight is followed
 _MOST_FACES = 4_000_000
 _BYTES_A_FACE = 400  # of memory: its corners, twice, and the tree that finds it
-_BYTES_A_BYTE, _BYTES_A_LINE = 12, 256  # of memory that a parser takes for its file
 _RAYS_AT_ONCE = 2**18
 FARTHEST_M = 1e8
 _MISSED_M = 1e30  # Embree answers with 1e37
@@ -96,79 +96,16 @@ def load(path: Path) -> Triangles:
     ValueError
         If the file is damaged, too large, has no surfaces, or refers to other files for them.
     """
-    import trimesh  # noqa: PLC0415  (only who opens such a file waits for it)
-
     suffix = path.suffix.lower()
     require_fits("the file", path.stat().st_size)
-    data = _parsable(path.read_bytes())
-    if suffix == ".glb":
-        glb.require_harmless(data, _MOST_FACES)
-    with decoding("the mesh"), np.errstate(all="ignore"):  # numbers out of range show below
-        # From memory and without a resolver of names, a loader cannot reach another file.
-        scene = trimesh.load_scene(
-            trimesh.util.wrap_as_stream(data),
-            file_type=suffix[1:],
-            process=False,
-            skip_materials=True,
-        )
-        parts = [
-            (scene.geometry[name], np.asarray(matrix, float))
-            for matrix, name in (scene.graph[node] for node in scene.graph.nodes_geometry)
-        ]
-        parts = [(part, matrix) for part, matrix in parts if len(getattr(part, "faces", ())) > 0]
-    n_faces = sum(len(part.faces) for part, _ in parts)
-    require("faces of the mesh", n_faces, 1 <= n_faces <= _MOST_FACES, f"1 to {_MOST_FACES:,}")
-    require_fits("the faces", n_faces * _BYTES_A_FACE)
-    with decoding("the mesh"):
-        whole = [
-            Triangles(np.asarray(part.vertices, float), np.asarray(part.faces, np.int64))
-            for part, _ in parts
-        ]
-    placed = [_placed(_used(part), matrix) for part, (_, matrix) in zip(whole, parts, strict=True)]
-    vertices = np.concatenate([part.vertices for part in placed])
-    first = np.cumsum([0, *(len(part.vertices) for part in placed[:-1])])
-    faces = np.concatenate([part.faces + n for part, n in zip(placed, first, strict=True)])
+    _, (vertices, faces) = isolated(
+        path, "the mesh", "read_mesh", guards.MAX_CUBE_BYTES, suffix=suffix, most_faces=_MOST_FACES
+    )
+    require("faces of the mesh", len(faces), len(faces) > 0, f"1 to {_MOST_FACES:,}")
+    require_fits("the faces", len(faces) * _BYTES_A_FACE)
     if suffix == ".glb":
         vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
     return Triangles(vertices, faces)
-
-
-def _parsable(data: bytes) -> bytes:
-    """The file as its parser should get it: text as UTF-8, what is not that replaced.
-
-    `trimesh` makes an array of each line, so a file of short lines takes a hundred times its size;
-    and it guesses at other encodings, slowly.
-
-    Raises
-    ------
-    ValueError
-        If a parser would take too much memory.
-    """
-    is_text = b"\0" not in data
-    codes = np.frombuffer(data if is_text else b"", np.uint8)
-    n_lines = int(np.count_nonzero((codes < ord(" ")) | (codes > ord("~"))))
-    require_fits("the mesh, parsed", len(data) * _BYTES_A_BYTE + n_lines * _BYTES_A_LINE)
-    return data.decode(errors="replace").encode() if is_text else data
-
-
-def _used(part: Triangles) -> Triangles:
-    """The same without vertices that no face has; Embree would read beyond those that there are."""
-    lowest, highest = int(part.faces.min()), int(part.faces.max())
-    last = len(part.vertices) - 1
-    accepted = f"from 0 to {last}, the last one"
-    require("vertices of a face", (lowest, highest), lowest >= 0 and highest <= last, accepted)
-    is_used = np.zeros(len(part.vertices), bool)
-    is_used[part.faces] = True
-    vertices = part.vertices[is_used]
-    n_odd = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
-    require("vertices at no place", n_odd, n_odd == 0, "0: finite coordinates for each")
-    return Triangles(vertices, (np.cumsum(is_used) - 1)[part.faces])
-
-
-def _placed(part: Triangles, matrix: Floats) -> Triangles:
-    """The same, moved by a (4, 4) matrix."""
-    with np.errstate(over="ignore", invalid="ignore"):  # what is out of range shows when it is seen
-        return part._replace(vertices=part.vertices @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def _as_seen(vertices_m: Floats, view: View) -> Floats:
