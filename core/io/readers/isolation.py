@@ -36,7 +36,6 @@ WORKER = Path(__file__).with_name("file_worker.py")
 """Script of the processes."""
 
 _MOST_REPLY_BYTES = 2**27
-_REMEDY = "a whole file: copy or save it again"
 
 _idle: list[_Process] = []
 _lock = Lock()
@@ -168,7 +167,10 @@ def isolated(
     if "missing" in told:
         raise CaptureError(f"{what} needs a library ({told['missing']}): install it.")
     if "error" in told:
-        raise CaptureError(f"{what} cannot be read ({told['error']}): give {_REMEDY}.")
+        raise CaptureError(
+            f"{what} cannot be read, the file is damaged or too large ({told['error']}): copy or "
+            "save it again."
+        )
     return told, arrays
 
 
