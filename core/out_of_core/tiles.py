@@ -1,8 +1,8 @@
 """Captures larger than memory: ranged part by part, on this machine's threads or on a cluster.
 
-What pixels have in common, the light (`core.inference.posterior.FluxPrior`) and an estimator's
-calibration, is learned from a sample of the image before. A part is then ranged like any capture,
-so that the answer does not depend on how the image is cut, nor on who ranges which part.
+What pixels share, the flux prior (`core.inference.posterior.FluxPrior`) and an estimator's
+calibration, is learned from a sample of the image first. A tile is then processed like any capture,
+so that the result depends neither on the tiling nor on the worker that processes a tile.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ IMAGES = {
     "confidence": ("probability that the answer is right within 3 bins", "1"),
     "counts": ("detections", "1"),
 }
-"""What is known of each pixel, its name in words and its unit."""
+"""Images of a result, each with its description and unit."""
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +73,7 @@ def estimate_large(
     Returns
     -------
     Dataset
-        `IMAGES`, each of shape (row, col), NaN where there is no answer; its attributes tell of the
+        `IMAGES`, each of shape (row, col), NaN without an estimate; its attributes describe the
         acquisition, of the detection, of the source and, as ``remark``, what the method leaves out.
         Nothing is ranged before ``.compute()`` or a ``.to_…()``; a sample of the image is read at
         once. Dask ranges on threads, or on the cluster of the `dask.distributed.Client` that is
@@ -237,7 +237,7 @@ def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:
 def learned(
     array: Any, description: Description, method: str, settings: Any, false_alarm: float | None
 ) -> tuple[FluxPrior, Calibration, str]:
-    """What a sample of a Dask array (row, col, bin) tells of all its pixels; `Estimator.remark`."""
+    """Learn from a sample of a Dask array what all pixels share; with `Estimator.remark`."""
     sample, estimator = captured(sample_of(array), description), ESTIMATORS[method]
     calibration = estimator.calibration(sample, settings, false_alarm)
     return flux_prior_of(sample), calibration, estimator.remark(sample)

@@ -1,8 +1,8 @@
 """Windows of captures larger than memory: some rows and columns, read without the rest.
 
 A window is a `Capture` like any other: one pixel of each ``step`` x ``step``, with all its bins.
-What its pixels share with the whole image, the light, is learned from a sample of the whole, so
-that a window says of its pixels what the whole would say of them. A preview is a window of
+The flux that its pixels share with the whole image is learned from a sample of the whole, so
+that the results of a window equal those of the whole. A preview is a window of
 everything; it can be looked at while it is being read, from all over the image.
 """
 
@@ -34,7 +34,7 @@ _AT_ONCE = 4  # pieces that are unpacked side by side; each holds a chunk or two
 
 @dataclass(frozen=True)
 class Window:
-    """Rows and columns of an image, and how many of their pixels are looked at.
+    """Rows and columns of an image, and the share of their pixels that is read.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ class WindowReader:
         self._left = self._left[_AT_ONCE:]
 
     def capture(self, flux_prior: FluxPrior | None = None) -> Capture:
-        """What has been read so far; pixels that have not have no counts.
+        """Return what has been read so far; other pixels have no counts.
 
         Parameters
         ----------
@@ -188,7 +188,7 @@ def read_window(
     progress: Callable[[int, int], None] = lambda done, of: None,
     lighting: FluxPrior | None = None,
 ) -> Capture:
-    """A window of an opened capture, as a capture.
+    """Read a window of an opened capture.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def read_window(
 
 
 def sampled_flux_prior(counts: xr.DataArray) -> FluxPrior:
-    """What all pixels of an image have in common, as `core.estimate_large` learns it."""
+    """Return the flux prior of an image, as `core.estimate_large` learns it."""
     return flux_prior_of(captured(sample_of(counts.data), describe(counts, Request())))
 
 

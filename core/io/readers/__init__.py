@@ -106,8 +106,8 @@ def read_capture(
         For common-stop instruments: times count backwards from this time after the pulse, often
         the laser's period.
     no_trigger : int, optional
-        For raw frames (pulse, row, col) of trigger bins: what stands where nothing fired. Tells the
-        array of a ``.npy`` or ``.npz`` file to be such frames.
+        For raw frames (pulse, row, col) of trigger bins: value that marks no
+        trigger. Declares the array of a ``.npy`` or ``.npz`` file as such frames.
     first_detections : int, optional
         Keep so many detections of each pixel, in the order of the file; only for a file that lists
         photons.

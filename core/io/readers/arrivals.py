@@ -2,7 +2,7 @@
 
 The time unit. Whole numbers, the largest above 100,000: picoseconds. Fractions, all below 0.001:
 seconds. Other whole numbers: bins of the instrument, 8 ps as in published captures. Other fractions
-are refused, since nothing tells microseconds from nanoseconds.
+are refused, since microseconds and nanoseconds cannot be distinguished.
 
 The bin width. 1 ns (the nearest multiple of the unit) if that gives 100 to 65,536 bins from the
 gate's opening to the last photon; else the smallest power-of-two multiple of the unit that gives at
@@ -73,12 +73,12 @@ def arrivals_capture(
     shape : tuple of int
         Rows and columns.
     name, origin : str
-        What to call the times in a refusal, and the capture in its source.
+        Name of the times in errors, and origin of the capture in its source.
 
     Raises
     ------
     ValueError
-        If a time is no time, nothing sensible can be guessed, or no photon lies in the gate.
+        If a time is invalid, a setting cannot be guessed, or no photon lies in the gate.
     """
     _require_times(times, pixel, shape, name)
     request.refuse(["shape", "no_trigger"], "lists of photons lie in pixels already")
@@ -284,8 +284,8 @@ def _cube(
 ) -> NDArray[np.unsignedinteger]:
     """Count the photons of each pixel and bin.
 
-    The photons are few beside the cube: sorting them is faster than a histogram of 8-byte counts,
-    and needs a quarter of the memory.
+    Photons are few compared with the cube: sorting them is faster than a histogram of 8-byte
+    counts, and needs a quarter of the memory.
     """
     size = shape[0] * shape[1] * n_bins
     remedy = "a larger bin_width_s, or a narrower gate by gate_delay_s and n_bins"

@@ -1,8 +1,8 @@
 """A histogram cube of any number type, and what is guessed where only the cube is known.
 
-Unless told otherwise, the axes are (row, col, bin), bins are 1 ns wide, the gate opens with the
+By default the axes are (row, col, bin), bins are 1 ns wide, the gate opens with the
 pulse, and the echo is what `core.io.readers.pulse_guess` makes of the counts. A common-stop
-instrument's bins (``stop_s``) are turned round.
+instrument's bins (``stop_s``) are reversed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from core.io.readers.wording import guesses, sentence, time_text
 AXES = ("row", "col", "bin")
 
 PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
-"""Fields of our own layouts that tell a pulse together."""
+"""Fields of our own layouts that define a pulse together."""
 
 LARGEST_COUNT = 2**32 - 1
 _MOST_SAMPLES = 2**20
@@ -83,12 +83,12 @@ def require_image(name: str, found: tuple[int, ...], shape: tuple[int, ...]) -> 
 
 
 def stored_pulse(tau_s: float | None, shape: str, samples: NDArray[Any]) -> Pulse:
-    """The pulse that a file of our own layouts tells.
+    """Return the pulse of a file of our own layouts.
 
     Raises
     ------
     ValueError
-        If there is no time beside the shape, or it is no pulse.
+        If the time is missing, or the pulse is invalid.
     """
     if tau_s is None:
         raise ValueError("pulse_tau_s = None is not accepted: give a time beside the shape.")
@@ -123,7 +123,7 @@ def cube_capture(
     axes: str | None = None,
     guessed_bin_width_s: float | None = None,
 ) -> Capture:
-    """A capture from an array of counts, its axes in the order that is told or in the usual one.
+    """Build a capture from an array of counts, its axes in the given or the usual order.
 
     Parameters
     ----------
@@ -131,9 +131,9 @@ def cube_capture(
     name, origin : str
         What to call the array in a refusal, and the capture in its source.
     axes : str, optional
-        The order of the file's own axes, where it tells.
+        Order of the file's own axes, if known.
     guessed_bin_width_s : float, optional
-        Taken where none is told.
+        Used if none is given.
     """
     request = replace(request, axes=request.axes or axes)
     order = request.order(AXES)
@@ -164,13 +164,13 @@ def dense_capture(
     ----------
     counts : ndarray, shape (row, col, bin)
     origin : str
-        What to call the capture in its source.
+        Origin of the capture in its source.
     assumed_pulse : Pulse, optional
-        Taken where none is given, in place of one that the counts tell of.
+        Used if none is given, in place of one guessed from the counts.
     also_guessed : sequence of str
-        What was guessed before.
+        Guesses made before.
     guessed_bin_width_s : float, optional
-        Taken where none is given, in place of 1 ns.
+        Used if none is given, in place of 1 ns.
     """
     asked, n_bins = request.n_bins, counts.shape[2]
     require_sums(counts.shape)

@@ -1,7 +1,7 @@
 """Raw frames of a Geiger-mode camera: for each pulse and pixel the bin that triggered, or none.
 
 Frames are counted as they are read, a stretch of the file at a time. So only the cube must fit in
-`core.io.readers.guards.MAX_CUBE_BYTES`, never the frames: beside the cube, and a second one while
+`core.io.readers.guards.MAX_CUBE_BYTES`, never the frames: besides the cube, and a second one while
 the number of bins is still being found, a stretch of `STRETCH` values takes some 40 bytes for each.
 
 Each frame is one pulse, and each pixel triggers once in it or never: these are first photons, as
@@ -53,13 +53,13 @@ def frames_capture(
     shape : tuple of int
         Pulses, rows and columns of them all.
     no_trigger : int
-        What stands where nothing fired.
+        Value that marks no trigger.
     name, origin : str
-        What to call the frames in a refusal, and the capture in its source.
+        Name of the frames in errors, and origin of the capture in its source.
     first_bin : int, optional
-        The number that stands for the first bin; 0 where not told, but 1 where 0 stands for none.
+        Value of the first bin; by default 0, or 1 if 0 marks no trigger.
     bin_width_s : float, optional
-        The camera's, taken where none is told.
+        Bin width of the camera, used if none is given.
     also_guessed : sequence of str
         What was guessed before.
 
@@ -67,7 +67,7 @@ def frames_capture(
     ------
     ValueError
         If a value is neither a bin nor `no_trigger`, the number of pulses told is not that of the
-        frames, or nothing triggered and ``n_bins`` is not told.
+        frames, or nothing triggered and ``n_bins`` is not given.
     """
     n_pulses = shape[0]
     require(f"frames of {name}", shape, min(shape) > 0, "pulses, rows and columns, none of them 0")
@@ -146,7 +146,7 @@ def stretches_of(
         Of that array.
     dtype : dtype
     request : Request
-        May tell the order of the axes.
+        May give the order of the axes.
     fortran_order : bool
         Whether the first axis of the array is the fastest.
     """

@@ -2,9 +2,9 @@
 
 A frame is one pulse: a header row of 32 numbers, then 32 rows of 32, all little-endian uint16. 0
 stands where nothing fired, any other number is the bin plus 4. The gate has 153 bins, of 250 ps
-where nothing else is told. Frames are counted as they are read, see `core.io.readers.frames`: the
-file may be larger than memory. Nothing in it tells what it is but its length and its range of
-numbers.
+by default. Frames are counted as they are read, see `core.io.readers.frames`: the
+file may be larger than memory. Only its length and its range of numbers identify the
+format.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What keeps a damaged or hostile file from doing more than being refused."""
+"""Limits and checks that turn a damaged or hostile file into a clear error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from core.capture import CaptureError
 from core.checks import require
 
 # Largest cube, file, and decompressed part of a file, each by itself: to read one takes a few times
-# as much, which is in memory beside it. Checked before memory is asked for: a header of a hundred
+# as much memory in addition. Checked before memory is allocated: a header of a hundred
 # bytes can claim any size.
 MAX_CUBE_BYTES = 2 * 1024**3
 
@@ -74,7 +74,7 @@ def decoding(what: str) -> Iterator[None]:
     try:
         yield
     except CaptureError:
-        raise  # said already
+        raise  # already clear
     except Exception as error:
         reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise CaptureError(

@@ -66,7 +66,7 @@ UNITS_S["km"] = 1e3 * UNITS_S["m"]
 
 
 BLOCK_BYTES = 2**24
-"""About what a block of an array takes that is opened, not read."""
+"""Approximate size of a block of an array that is opened lazily."""
 
 _LONGEST = 2**20  # coordinate that is read
 _MOST_COORDINATES = 100
@@ -78,7 +78,7 @@ _OF_ENCODING = (
 
 
 class Description(NamedTuple):
-    """What is known of an array of counts without looking at them."""
+    """Metadata of an array of counts, without the counts themselves."""
 
     acquisition: Acquisition
     pulse: Pulse
@@ -97,7 +97,7 @@ class Counts:
     name, file : str
         What to call the array and the file in a refusal.
     missing : dict
-        What stands for a number that is not there, by the name of the attribute that says so.
+        Values that mark missing numbers, by the name of the attribute that defines them.
     """
 
     numbers: Numbers
@@ -138,7 +138,7 @@ class Counts:
 
 
 def _box(key: int | slice, size: int) -> tuple[slice, int | slice]:
-    """The slice of positive step that an index along an axis asks for, and the index within it."""
+    """Convert an index along an axis to a slice of positive step and an index within it."""
     if not isinstance(key, slice):
         place = range(size)[key]
         return slice(place, place + 1), 0
@@ -160,7 +160,7 @@ class _File:
         self.arrays, self.groups = (zarr if path.is_dir() else hdf5).arrays(path)
 
     def origin(self, chosen: Stored) -> str:
-        """What to call a capture in its source."""
+        """Describe the origin of a capture for its source."""
         return f"{self.path.name}, variable {chosen.name}"
 
     def counts(self, chosen: Stored) -> Counts:
@@ -207,7 +207,7 @@ class _File:
         return xr.DataArray(data, coords=coords, dims=dims, name=name, attrs=known)
 
     def image(self, chosen: Stored, name: str, request: Request) -> Floats | None:
-        """An array (row, col) beside the counts, None where there is none."""
+        """Read an image (row, col) that accompanies the counts; None if the file has none."""
         prefix = chosen.name.removesuffix("counts")
         dims = _named_axes(chosen, request)
         places = _places(dims, request, chosen.name)
@@ -225,14 +225,14 @@ class _File:
 
 
 def recognizes(start: bytes) -> bool:
-    """Whether a file starts like HDF5, but not like one of MATLAB, or like classic netCDF."""
+    """Return whether a file starts like HDF5 (but not MATLAB) or like classic netCDF."""
     places = (0, *(2**k for k in range(9, 13)))
     is_hdf5 = any(start[k : k + 8] == hdf5.SIGNATURE for k in places)
     return start[:4] in hdf5.CLASSIC_SIGNATURES or (is_hdf5 and not start.startswith(b"MATLAB"))
 
 
 def read(path: Path, request: Request) -> Capture:
-    """Read counts and, from a file of our own layout, the truth beside them."""
+    """Read counts and, from a file of our own layout, the ground truth."""
     file = _File(path)
     chosen = choose(file.arrays, request)
     every = (slice(None),) * len(AXES)
@@ -254,7 +254,7 @@ def read(path: Path, request: Request) -> Capture:
 
 
 def open_counts(path: Path, request: Request) -> xr.DataArray:
-    """Counts of which none is read before it is asked for; `describe` has nothing left to guess.
+    """Open counts lazily; `describe` then has nothing left to guess.
 
     Parameters
     ----------
@@ -286,20 +286,20 @@ def open_counts(path: Path, request: Request) -> xr.DataArray:
 
 
 def _named_axes(chosen: Stored, request: Request) -> tuple[str, ...]:
-    """Names of an array's axes, where the file gives none those that are guessed."""
+    """Return the names of an array's axes, guessed if the file gives none."""
     if _guessed(chosen, request):
         return AXES
     return tuple(name or f"axis_{k}" for k, name in enumerate(chosen.axes))
 
 
 def _guessed(chosen: Stored, request: Request) -> list[str]:
-    """The guess at the axes, where neither the file nor the request names any."""
+    """Return the guess of the axes if neither the file nor the request names any."""
     nameless = chosen.n_axes == len(AXES) and not any(chosen.axes) and request.axes is None
     return [f"axes ({', '.join(AXES)})"] if nameless else []
 
 
 def _blocks(counts: Counts, time_axis: int) -> tuple[int, ...]:
-    """Whole chunks together, all bins and as many pixels as some `BLOCK_BYTES` hold."""
+    """Return the shape of a block: whole chunks, all bins, about `BLOCK_BYTES`."""
     block = list(counts.numbers.chunk)
     block[time_axis] = counts.shape[time_axis]
     for axis in reversed(range(len(block))):
@@ -330,7 +330,7 @@ def dataset(capture: Capture) -> xr.Dataset:
 
 
 def completed(counts: xr.DataArray, known: Description) -> xr.DataArray:
-    """Counts (row, col, bin) whose attributes and coordinates tell all of a description."""
+    """Return counts (row, col, bin) with a description as attributes and coordinates."""
     acquisition, pulse = known.acquisition, known.pulse
     opens = np.arange(acquisition.n_bins)
     time_s = acquisition.gate_delay_s + opens * acquisition.bin_width_s
@@ -359,12 +359,12 @@ def completed(counts: xr.DataArray, known: Description) -> xr.DataArray:
 def oriented(counts: xr.DataArray, request: Request) -> xr.DataArray:
     """The array with its axes named and ordered (row, col, bin).
 
-    A common-stop instrument's bins (``stop_s``) are turned round.
+    The bins of a common-stop instrument (``stop_s``) are reversed.
 
     Raises
     ------
     ValueError
-        If it has not three axes, or they are named otherwise and ``axes`` is not told.
+        If it does not have three axes, or their names are unknown and ``axes`` is not given.
     """
     import xarray as xr  # noqa: PLC0415
 
@@ -387,7 +387,7 @@ def oriented(counts: xr.DataArray, request: Request) -> xr.DataArray:
 
 
 def _places(dims: tuple[str, ...], request: Request, name: str) -> tuple[int, ...]:
-    """Where row, col and bin lie among the axes of an array."""
+    """Return the positions of row, col and bin among the axes of an array."""
     require(f"axes of {name}", dims, len(dims) == 3, "three: row, col and bin")
     order = request.order(AXES)
     if order is not None:
@@ -408,23 +408,23 @@ def _with_unit(name: str, known: Mapping[Any, Any]) -> dict[Any, Any]:
 def describe(
     counts: xr.DataArray, request: Request, origin: str = "", also_guessed: Sequence[str] = ()
 ) -> Description:
-    """What the request, the attributes and the coordinates tell of counts; the rest is guessed.
+    """Describe counts by the request, the attributes and the coordinates; guess the rest.
 
     Parameters
     ----------
     counts : DataArray, shape (row, col, bin)
         As `oriented` gives them; a sample is looked at where pulse or detection must be guessed.
     request : Request
-        Goes before what the array says.
+        Takes precedence over the attributes of the array.
     origin : str
-        What to call the capture, where it does not say itself.
+        Origin of the capture if its attributes name none.
     also_guessed : sequence of str
-        What was guessed before.
+        Guesses made before.
 
     Raises
     ------
     ValueError
-        If an attribute or a coordinate is no such thing.
+        If an attribute or a coordinate is invalid.
     """
     known = counts.attrs
     request.refuse(["time_unit_s", "first_detections"], "labelled counts know their bins")
@@ -479,7 +479,7 @@ def describe(
 
 
 def _times(counts: xr.DataArray) -> tuple[xr.DataArray | None, list[str]]:
-    """The first coordinate along the bins that tells of time or range; what is left out if none."""
+    """Return the first time or range coordinate along the bins, else those ignored."""
     coordinate: xr.DataArray
     left_out = []
     for name, coordinate in counts.coords.items():

@@ -64,7 +64,7 @@ class Variable(NamedTuple):
 
     @property
     def may_be_bin_width(self) -> bool:
-        """Whether it is one number, named like the width of a bin."""
+        """Whether it is a single number with a name like that of a bin width."""
         plain = self.name.lower().replace("_", "")
         return self.kind in NUMERIC and set(self.shape) == {1} and plain in _WIDTH_NAMES
 
@@ -75,7 +75,7 @@ def _choose(variables: Sequence[Variable], name: str | None) -> Variable:
     Raises
     ------
     ValueError
-        If there is none, or more than one.
+        If no variable fits, or more than one.
     """
     for known, times in Counter(variable.name for variable in variables).items():
         require(f"variables named {known!r}", times, times == 1, "each name once")
@@ -162,7 +162,7 @@ class _Version73:
 
 
 def recognizes(start: bytes) -> bool:
-    """Whether a file starts like one of MATLAB, or like HDF5 that may be of version 7.3."""
+    """Return whether a file starts like MATLAB, or like HDF5 that may be of version 7.3."""
     return start[124:128] in _VERSIONS_5 or hdf5.SIGNATURE in (start[:8], start[512:520])
 
 

@@ -1,6 +1,6 @@
 """NumPy ``.npy``: one histogram cube (row, col, bin) of non-negative whole numbers.
 
-Where ``no_trigger`` is told the array is raw frames (pulse, row, col), see
+If ``no_trigger`` is given, the array holds raw frames (pulse, row, col), see
 `core.io.readers.frames`.
 """
 
@@ -23,7 +23,7 @@ from core.io.readers.request import Request
 
 
 class Header(NamedTuple):
-    """What an array's header says."""
+    """Header of an array."""
 
     shape: tuple[int, ...]
     fortran_order: bool
@@ -31,7 +31,7 @@ class Header(NamedTuple):
 
 
 def recognizes(start: bytes) -> bool:
-    """Whether a file starts like a NumPy array."""
+    """Return whether a file starts like a NumPy array."""
     return start.startswith(npy_format.MAGIC_PREFIX)
 
 
@@ -50,7 +50,7 @@ def frames_in(file: IO[bytes], size: int, name: str, origin: str, request: Reque
     """A capture from an array of frames in a file of `size` bytes, counted as they are read.
 
     Parameters are those of `read_array` and `core.io.readers.frames.frames_capture`; the request's
-    ``no_trigger`` tells what stands where nothing fired.
+    ``no_trigger`` is the value that marks no trigger.
     """
     shape, fortran_order, dtype = read_header(file, name)
     require_frames(shape, dtype, name)

@@ -25,8 +25,8 @@ if exactly one array has three axes, or if ``variable`` names one; its pulse is 
 Gaussian of one bin.
 
 In place of a cube there may be raw ``frames`` (pulse, row, col) of trigger bins with a whole number
-``no_trigger`` for where nothing fired, as in `core.io.readers.frames`; the other fields may stand
-beside them. Frames that are stored without compression may be larger than memory.
+``no_trigger`` that marks no trigger, as in `core.io.readers.frames`; the other fields may
+accompany them. Frames that are stored without compression may be larger than memory.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def fields(capture: Capture) -> dict[str, NDArray[Any]]:
 
 
 def recognizes(start: bytes) -> bool:
-    """Whether a file starts like a ZIP archive."""
+    """Return whether a file starts like a ZIP archive."""
     return start.startswith((b"PK\x03\x04", b"PK\x05\x06"))
 
 
@@ -157,7 +157,7 @@ def _known(stored: Mapping[str, NDArray[Any]], request: Request) -> Request:
 def _completed(
     capture: Capture, archive: ZipFile, stored: Mapping[str, NDArray[Any]], request: Request
 ) -> Capture:
-    """A capture with the truth beside its counts, once its own pulse proved short enough."""
+    """Add the ground truth to a capture after checking the length of its pulse."""
     if request.pulse is None:
         require_pulse_in_gate(capture.pulse, capture.acquisition)
     return replace(
@@ -207,7 +207,7 @@ def _text(stored: Mapping[str, NDArray[Any]], name: str, default: str) -> str:
 
 
 def _image(archive: ZipFile, name: str, shape: tuple[int, int]) -> Floats | None:
-    """An image beside the counts, of which only the header is read unless it fits them."""
+    """Read an image that accompanies the counts, after checking the shape in its header."""
     if f"{name}.npy" not in archive.namelist():
         return None
     header = _header(archive, name)

@@ -1,13 +1,13 @@
 """PicoQuant ``.ptu``: images of time-tagged photons (T3 mode), as TCSPC electronics record them.
 
-Each photon carries its time since the laser's last pulse in bins of the instrument, whose width the
-file tells; bins that begin within one period of the laser are kept. Frames are summed, and so are
+Each photon carries its time since the laser's last pulse in bins of the instrument, whose width is
+in the file; bins that begin within one period of the laser are kept. Frames are summed, and so are
 detectors unless ``variable`` picks one, such as ``"channel 0"``. Photons outside the scan's lines,
 as on the way back of a mirror, belong to no pixel; incomplete frames at the beginning and the end
-are left out. The gate opens with the pulse unless told otherwise. All photons of a pulse count.
+are left out. The gate opens with the pulse by default. All photons of a pulse count.
 
 Electronics that measure from the photon to the next pulse (reverse start-stop) count backwards:
-tell the laser's period as ``stop_s``.
+give the laser's period as ``stop_s``.
 
 `ptufile` decodes the records in an isolated process (`core.io.readers.isolation`).
 """
@@ -44,7 +44,7 @@ _ACCEPTED = {
 
 
 def recognizes(start: bytes) -> bool:
-    """Whether a file starts like one of PicoQuant."""
+    """Return whether a file starts like one of PicoQuant."""
     return start.startswith(b"PQTTTR")
 
 

@@ -24,8 +24,8 @@ from core.io.readers.request import Request
 class Sparse(NamedTuple):
     """A matrix as MATLAB keeps it.
 
-    The ``values`` of one column come after those of the column before it, ``rows`` tells in which
-    row each lies, and ``starts`` where each column begins, with the end of them all.
+    The ``values`` are in column order, ``rows`` gives the row of each, and ``starts`` where each
+    column begins, followed by the end of the last one.
     """
 
     values: NDArray[Any]
@@ -43,10 +43,10 @@ def sparse_capture(
     ----------
     matrix : Sparse
     name, origin : str
-        What to call the matrix in a refusal, and the capture in its source.
+        Name of the matrix in errors, and origin of the capture in its source.
     request : Request
     bin_width_s : float, optional
-        Taken where none is told.
+        Used if none is given.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Arrays that a file may hold many of, each with a name: what HDF5, netCDF and Zarr have in common.
+"""Named arrays of HDF5, netCDF and Zarr files, read box by box.
 
-Nothing of an array is read before it is asked for.
+No array is read before a box of it is needed.
 """
 
 from __future__ import annotations
@@ -131,12 +131,12 @@ class Stored:
 
 
 def choose(arrays: Sequence[Stored], request: Request) -> Stored:
-    """The array asked for, or ``counts``, or the only one with three axes.
+    """Choose the requested array, else ``counts``, else the only one with three axes.
 
     Raises
     ------
     ValueError
-        If there is none, or it is refused.
+        If no array fits, or the one chosen is refused.
     """
     for known, times in Counter(array.name for array in arrays).items():
         require(f"arrays named {known!r}", times, times == 1, "each name once")

@@ -14,15 +14,15 @@ field                shape           meaning
 Other fields are left alone. The capture is the image (record, zone): one row for each measurement.
 ``variable="record 17"`` takes that one alone, its zones as the square that they see.
 
-Where not told: a bin is 91 ps. The pulse is the sum of the reference histograms from the first bin
+Defaults: a bin is 91 ps. The pulse is the sum of the reference histograms from the first bin
 that reaches a hundredth of the highest; that bin is its time zero. An echo from 0 m has its peak
 1.1 ns after the histogram begins (both times are those published with the data), so the gate opens
 as much before the pulse, less the time from the pulse's zero to its peak. All photons of a pulse
 count.
 
-The truth is the distance of the plane for every zone. Zones beside the middle one see it at an
+The truth is the distance of the plane for every zone. Zones next to the middle one see it at an
 angle, up to 3 % further away. In the published records, ranges of the middle zone come out 6 mm too
-far (1.14 ns would fit) and those of the others 0 to 21 mm: each zone has a delay of its own. The
+far (1.14 ns would fit) and those of the others 0 to 21 mm: each zone has its own delay. The
 sensor's clock is not corrected.
 """
 
@@ -55,7 +55,7 @@ Record = dict[str, Any]
 
 
 def recognizes(start: bytes) -> bool:
-    """Whether a file starts like a list of JSON."""
+    """Return whether a file starts like a JSON list."""
     return start.lstrip().startswith(b"[") and b"\0" not in start
 
 
@@ -84,7 +84,7 @@ def read(path: Path, request: Request) -> Capture:
 def _capture(
     cube: NDArray[Any], reference: Floats | None, origin: str, request: Request
 ) -> Capture:
-    """A capture with this sensor's times, where not told."""
+    """Build a capture with this sensor's default times."""
     counts = whole_counts(cube, "hists")
     width_s = request.bin_width_s or BIN_WIDTH_S
     pulse = None if reference is None else Pulse.measured(reference, width_s)
@@ -180,7 +180,7 @@ def _reference(records: list[Record], first: int) -> Floats | None:
 
 
 def _truth_m(records: list[Record], first: int, n_zones: int) -> Floats | None:
-    """Distance of the plane for each record and zone; None where no record tells it."""
+    """Distance of the plane for each record and zone; None if no record has it."""
     distances: list[float] = []
     for number, record in enumerate(records, first):
         value = record.get("dist_to_plane")

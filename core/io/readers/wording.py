@@ -1,4 +1,4 @@
-"""The sentence that tells where a capture came from and what was guessed."""
+"""Sentence on the origin of a capture and on what was guessed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def guesses(
     detection: Detection,
     time_unit_s: float | None = None,
 ) -> list[str]:
-    """What `request` left open, and the value taken for it.
+    """List the settings that `request` left open, and the values used.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Scenes from files: a mesh that is looked at, or a depth map.
+"""Scenes from files: meshes and depth maps.
 
 The gate is chosen so that it holds all surfaces: 1 ns bins, or the narrowest of whole nanoseconds
 that keep to 1024 of them, with 20 bins or so to spare on both sides and never fewer than 100. It
@@ -40,12 +40,12 @@ def read_scene(
     position_m: Sequence[float] | None = None,
     direction: Sequence[float] | None = None,
 ) -> Scene:
-    """Read what an instrument is to look at; the file's suffix tells the format.
+    """Read a scene to simulate; the file's suffix determines the format.
 
-    A mesh (``.ply``, ``.stl``, ``.obj``, ``.glb``) is looked at by the pinhole model, as the point
+    A mesh (``.ply``, ``.stl``, ``.obj``, ``.glb``) is rendered by the pinhole model, as the point
     clouds of this package are drawn: along `direction`, rows from the top, columns from the left.
     Axes are those of the file, z up; but glTF, whose y is up, is turned first, so that y points
-    away from who looks at its front. Materials and other files that a mesh refers to are not read.
+    away from a viewer of its front. Materials and other files that a mesh refers to are not read.
 
     A depth map (16-bit ``.png``; ``.tif``, ``.tiff`` of 16-bit numbers or 32-bit floats) holds for
     each pixel the range along its line of sight; 0 and NaN mean that there is no target.
@@ -54,19 +54,19 @@ def read_scene(
     ----------
     path : path-like
     size : tuple of int, optional
-        Rows and columns of the view of a mesh, (64, 64) if not told.
+        Rows and columns of the view of a mesh, (64, 64) by default.
     pixel_angle_rad : float, optional
-        Angle between neighbouring pixels in radians. A mesh fills its image if not told.
+        Angle between neighbouring pixels in radians. By default a mesh fills its image.
     unit_m : float, optional
-        Unit of the file in metres. Not told: 1 for a mesh and for floats, 0.001 for the whole
+        Unit of the file in metres. Default: 1 for a mesh and for floats, 0.001 for the whole
         numbers of a depth map.
     distance_m : float, optional
         From the sensor to the nearest point of a mesh, along `direction`, the middle of its
-        bounding box in the middle of the image; 50 m if not told.
+        bounding box in the middle of the image; 50 m by default.
     position_m : sequence of 3 floats, optional
         Where the sensor stands instead, in metres.
     direction : sequence of 3 floats, optional
-        Where the sensor looks at a mesh, (0, 1, 0) if not told. What is up in the image is up, or
+        Where the sensor looks at a mesh, (0, 1, 0) by default. What is up in the image is up, or
         for a look straight up or down, the y axis.
 
     Returns

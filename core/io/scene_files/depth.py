@@ -1,6 +1,6 @@
 """Depth maps: 16-bit PNG, and the first page of a TIFF of 16-bit numbers or 32-bit floats.
 
-Whole numbers are millimetres and floats metres, unless told. Pillow decodes: it takes an image's
+Whole numbers are millimetres and floats metres by default. Pillow decodes: it takes an image's
 size from its header, and never unpacks more than that.
 """
 
@@ -27,7 +27,7 @@ _MILLIMETRE_M = 1e-3
 
 def read(path: Path, unit_m: float | None) -> Floats:
     """Read ranges in metres, shape (row, col), NaN where there is no target."""
-    from PIL import Image  # noqa: PLC0415  (only who opens such a file waits for it)
+    from PIL import Image  # noqa: PLC0415 - slow to import
 
     require_fits("the file", path.stat().st_size)
     with decoding(_IMAGE):

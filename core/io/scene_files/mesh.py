@@ -1,4 +1,4 @@
-"""Meshes, and a look at them: Embree finds what each pixel's line of sight meets first."""
+"""Meshes as range images: Embree intersects each pixel's line of sight."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MISSED_M = 1e30  # Embree answers with 1e37
 
 @dataclass(frozen=True)
 class View:
-    """The arguments of `core.io.scene_files.read_scene` that tell how a mesh is looked at."""
+    """Arguments of `core.io.scene_files.read_scene` that define the view of a mesh."""
 
     size: tuple[int, int] | None
     pixel_angle_rad: float | None
@@ -42,7 +42,7 @@ class View:
 
     @property
     def of_a_mesh(self) -> dict[str, object]:
-        """What only a mesh has a use for."""
+        """Settings that apply to meshes only."""
         return {
             "size": self.size,
             "distance_m": self.distance_m,
@@ -61,7 +61,7 @@ class Triangles(NamedTuple):
 
 
 def read(path: Path, unit_m: float, view: View) -> tuple[Floats, float]:
-    """Look at a mesh.
+    """Render a mesh as a range image.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Captures and answers to files that other software opens: one family of formats a module.
+"""Write captures and range images to files for other software, one module per format family.
 
 A new format is a module with a ``write(product, file)`` and a line in `WRITERS`. Captures are
 written in the layouts of `core.io.readers.npz` and `core.io.readers.labelled`.
@@ -66,7 +66,7 @@ CAPTURE_SUFFIXES = (".npz", ".nc", ".h5", ".zarr")
 def save_capture(
     capture: Capture, path: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
-    """Write a capture, whole or not at all; `core.io.readers.read_capture` gives it back.
+    """Write a capture atomically; `core.io.readers.read_capture` gives it back.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def save_image(
     title: str = "",
     rgb: NDArray[np.uint8] | None = None,
 ) -> None:
-    """Write a range image, whole or not at all; the suffix tells the format.
+    """Write a range image atomically; the suffix determines the format.
 
     ==================  ===========================================================================
     suffix              what is written
@@ -127,14 +127,14 @@ def save_image(
     ``.png``, ``.svg``  picture of the range image
     ==================  ===========================================================================
 
-    Where there is no answer an image holds NaN, a line of text nothing, and a cloud no point. The
+    Without a detection, an image holds NaN, a line of text an empty field, a cloud no point. The
     modules of `core.io.writers` describe the formats, `core.geometry` the coordinates.
 
     Parameters
     ----------
     capture : Capture
-        What was ranged, or for one larger than memory what `core.out_of_core.tiles.as_image` tells
-        of it.
+        Source of the range image; for one larger than memory, the overview that
+        `core.out_of_core.tiles.as_image` returns.
     image : RangeImage
         The answer, of the capture's shape.
     path : path-like
@@ -145,7 +145,7 @@ def save_image(
         Angle between the lines of sight of neighbouring pixels, in radians; the capture's own where
         None. Clouds need it.
     title : str
-        Above a picture; its default says what is seen.
+        Title of a picture.
     rgb : ndarray of uint8, shape (row, col, 3), optional
         Colours of a cloud's points.
 
@@ -153,7 +153,7 @@ def save_image(
     ------
     ValueError
         If the suffix is unknown, image and capture, or image and colours, differ in shape, the
-        angle is not between 0 and π/2, or a cloud is asked for and nobody knows the angle.
+        angle is not between 0 and π/2, or a cloud needs an angle that is unknown.
     FileExistsError
         If the file exists and is not to be replaced.
     OSError

@@ -23,7 +23,7 @@ DESCRIPTIONS = {
     "row": "row of the pixel, 0 on top",
     "col": "column of the pixel",
 }
-"""Of the extra bytes, at most 31 characters each."""
+"""Descriptions of the extra bytes, at most 31 characters each."""
 
 
 def write(product: Product, file: BinaryIO) -> None:
@@ -37,7 +37,7 @@ def write_compressed(product: Product, file: BinaryIO) -> None:
 
 
 def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
-    import laspy  # noqa: PLC0415 - only who writes LAS waits for it
+    import laspy  # noqa: PLC0415 - slow to import
 
     points = product.points()
     columns = product.point_columns(points)
@@ -69,7 +69,7 @@ def _grid(xyz_m: Floats, bin_length_m: float) -> tuple[Floats, Floats]:
         return np.zeros(3), np.full(3, 10.0 ** math.floor(math.log10(bin_length_m / 1000)))
     low, high = xyz_m.min(axis=0), xyz_m.max(axis=0)
     offsets = np.round((low + high) / 2)
-    reach = float(np.abs(xyz_m - offsets).max())
+    extent = float(np.abs(xyz_m - offsets).max())
     fine = math.floor(math.log10(bin_length_m / 1000))
-    coarse = math.ceil(math.log10(max(reach, 1e-9) / (2**31 - 1)))
+    coarse = math.ceil(math.log10(max(extent, 1e-9) / (2**31 - 1)))
     return offsets, np.full(3, 10.0 ** max(fine, coarse))

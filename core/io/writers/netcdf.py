@@ -46,7 +46,7 @@ def write_folder(data: xr.Dataset, folder: Path) -> None:
 
 
 def _dataset(product: Product) -> xr.Dataset:
-    import xarray as xr  # noqa: PLC0415 - only who writes netCDF waits for it
+    import xarray as xr  # noqa: PLC0415 - slow to import
 
     variables = {
         name: (("row", "col"), _numbers(plane), _attributes(plane))

@@ -14,7 +14,7 @@ from core.io.writers.product import Product
 
 def write(product: Product, file: BinaryIO) -> None:
     """Write x, y, z, range_m, counts, confidence, row and col of each point, and its colour."""
-    from pypcd4 import Encoding, PointCloud  # noqa: PLC0415 - only who writes PCD waits for it
+    from pypcd4 import Encoding, PointCloud  # noqa: PLC0415 - slow to import
 
     points = product.points()
     xyz_m = dict(zip("xyz", points.xyz_m.T.astype(np.float32), strict=True))

@@ -28,7 +28,7 @@ def write_svg(product: Product, file: BinaryIO) -> None:
 
 
 def _write(product: Product, file: BinaryIO, **options: Any) -> None:
-    import matplotlib  # noqa: PLC0415 - only who draws waits for it
+    import matplotlib  # noqa: PLC0415 - slow to import
 
     # The salt makes the identifiers within an SVG the same each time.
     with matplotlib.rc_context({"svg.hashsalt": "firstphoton", "svg.fonttype": "none"}):

@@ -1,7 +1,7 @@
 """PLY point clouds, binary and little-endian.
 
-Coordinates are 32-bit floats, which every reader knows: exact to 6e-8 of themselves. ``range_m`` is
-a double.
+Coordinates are 32-bit floats, which every reader supports: exact to a relative 6e-8. ``range_m``
+is a double.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from core.io.writers.product import Product
 
 def write(product: Product, file: BinaryIO) -> None:
     """Write x, y, z, range_m, counts, confidence, row and col of each point, and its colour."""
-    from trimesh import PointCloud  # noqa: PLC0415 - only who writes PLY waits for it
+    from trimesh import PointCloud  # noqa: PLC0415 - slow to import
 
     points = product.points()
     cloud = PointCloud(points.xyz_m, process=False)

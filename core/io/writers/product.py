@@ -1,4 +1,4 @@
-"""What is known of a range image once it leaves the house: the same in every format."""
+"""Range image with all metadata that a file may hold, the same for every format."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Plane(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Product:
-    """A range image with all that a file may want to say of it.
+    """Range image with its metadata.
 
     Parameters
     ----------
     capture : Seen
-        What was ranged.
+        Source of the range image.
     image : RangeImage
-        The answer, of the capture's shape.
+        Range image of the capture's shape.
     pixel_angle_rad : float, optional
         Angle between the lines of sight of neighbouring pixels, in radians.
     title : str
@@ -43,7 +43,7 @@ class Product:
     rgb : ndarray of uint8, shape (row, col, 3), optional
         Colours of the points of a cloud.
     shown : mapping of str to Plane
-        What else, or instead, is shown of the capture; comes first among `planes`.
+        Further or replacing images of the capture; they come first among `planes`.
 
     Raises
     ------
@@ -128,7 +128,7 @@ class Product:
         return points_m(self.image.range_m, angle_rad)
 
     def point_columns(self, points: Points) -> dict[str, NDArray[Any]]:
-        """What a cloud says of each point beside its coordinates; each of shape (point,)."""
+        """Return the columns of a point cloud other than coordinates; each of shape (point,)."""
         here = points.row, points.col
         rgb = {} if self.rgb is None else dict(zip(COLORS, self.rgb[here].T, strict=True))
         return {

@@ -2,7 +2,7 @@
 
 What else the product shows comes first.
 
-Ranges are exact to 6e-8 of themselves, counts up to 2**24. Each page tells its name (the tag
+Ranges are exact to 6e-8 of themselves, counts up to 2**24. Each page has its name (the tag
 PageName), its meaning and unit (ImageDescription, and for GIS the tags of GDAL), and the
 acquisition. Image programs open the pages as a stack; a GIS opens the first, and the others as
 subdatasets. Where there is no answer the range is NaN; a page with NaN declares it "no data".
@@ -24,7 +24,7 @@ _PAGE_NAME, _GDAL_METADATA, _GDAL_NODATA = 285, 42112, 42113  # numbers of tags
 
 def write(product: Product, file: BinaryIO) -> None:
     """Write the pages."""
-    from tifffile import TiffWriter  # noqa: PLC0415 - only who writes TIFF waits for it
+    from tifffile import TiffWriter  # noqa: PLC0415 - slow to import
 
     planes = product.planes
     with TiffWriter(file) as pages:
@@ -44,7 +44,7 @@ def write(product: Product, file: BinaryIO) -> None:
 
 
 def _gdal_metadata(name: str, plane: Plane, product: Product) -> str:
-    """What GDAL, and with it most GIS, reads of names, units and anything else; ASCII."""
+    """Return the GDAL metadata that most GIS read: names, units and more; ASCII."""
     root = ElementTree.Element("GDALMetadata")
     for role, text in (("description", name), ("unittype", plane.unit)):
         attributes = {"name": role.upper(), "sample": "0", "role": role}
