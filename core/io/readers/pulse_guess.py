@@ -12,10 +12,11 @@ of first photons under a strong background would bend the floor. What remains of
 line. A peak of a Gaussian pulse on that line, blurred by the bins, is fitted by least squares:
 first the width whose peak stands out most, then, around it, the width that fits best.
 
-A width is estimated only if its peak is significant: fitted to each of 32 groups of pixels, the mean number of pairs in the peak is 6 standard errors above zero, and its height is 2 % of the
+A width is estimated only if its peak is significant: fitted to each of 32 groups of pixels,
+the mean number of pairs in the peak is 6 standard errors above zero, and its height is 2 % of the
 floor, less than which a line that does not quite follow the floor might leave. A pulse as wide as a
 tenth of the gate is out of reach, and so is, above a twentieth, that of a wall all at one range.
-Nothing is estimated from fewer than 16 bins or 32 pixels, nor of more than 65,536 bins.
+Nothing is estimated from fewer than 16 bins or 32 pixels, nor from more than 65,536 bins.
 Where a real pulse has a tail, the Gaussian is that of its core rather.
 """
 

@@ -1,8 +1,8 @@
 """NumPy ``.npz``: the arrays of a range image as they are, without pickles.
 
 In addition to `RangeImage`'s fields and ``counts`` it holds scalars ``bin_width_s``,
-``gate_delay_s``, ``n_pulses`` (0 where not known), ``pixel_angle_rad`` (absent where not known), and the texts
-``format``, ``detection`` (`core.capture.Detection`) and ``source``.
+``gate_delay_s``, ``n_pulses`` (0 where not known), ``pixel_angle_rad`` (absent where not known),
+and the texts ``format``, ``detection`` (`core.capture.Detection`) and ``source``.
 """
 
 from __future__ import annotations
