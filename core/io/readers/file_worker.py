@@ -18,6 +18,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -258,10 +259,10 @@ def _decode_blosc(_: Any, data: Any, out: Any = None) -> Any:
     return blosc.decompress(data, out)
 
 
-def list_zarr(path: str, folders: list[str]) -> Reply:
+def list_zarr(path: str, described_folders: list[str]) -> Reply:
     """Describe the arrays in some folders of a Zarr directory."""
     arrays, groups = [], {}
-    for name in folders:
+    for name in described_folders:
         folder = Path(path) / name
         try:
             attributes = folder / ".zattrs"
@@ -315,9 +316,19 @@ def _missing(array: Any, known: dict[str, Any]) -> dict[str, float]:
 
 
 def read_zarr(path: str, name: str, box: list[list[int]]) -> Reply:
-    """Read the numbers in a box of the array in a folder."""
+    """Read the numbers in a box of the array in a folder; tell whether a chunk is absent."""
     folder = Path(path) / name if (Path(path) / name).is_dir() else Path(path)
-    return {}, [np.asarray(_open_zarr(str(folder))[tuple(slice(*edges) for edges in box)])]
+    array = _open_zarr(str(folder))
+    found = np.asarray(array[tuple(slice(*edges) for edges in box)])
+    steps = array.shards or array.chunks
+    touched = (
+        sorted({k // step for k in range(*edges)}) for edges, step in zip(box, steps, strict=True)
+    )
+    absent = any(
+        not (folder / array.metadata.encode_chunk_key(index)).exists()
+        for index in product(*touched)
+    )
+    return {"absent": absent}, [found]
 
 
 def _open_netcdf3(path: str) -> Any:

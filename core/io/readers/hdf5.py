@@ -23,7 +23,7 @@ CLASSIC_SIGNATURES = (b"CDF\x01", b"CDF\x02")
 
 def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     """List all arrays of a file, and the attributes of its groups by name; its own under ``""``."""
-    versions = {"": (FileVersion.of(path),)}
+    versions = {"": FileVersion.of(path)}
     with path.open("rb") as file:
         kind = "netcdf3" if file.read(4) in CLASSIC_SIGNATURES else "hdf5"
     return listed(path, f"list_{kind}", f"read_{kind}", versions)

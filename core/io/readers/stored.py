@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
@@ -38,10 +37,14 @@ class Numbers:
         Type of its numbers.
     chunk : tuple of int
         Size of a chunk along each axis; ones where any box is read without the rest.
-    versions : tuple of FileVersion
-        The file first, then all else that a box depends on; refused once any of them has changed.
+    path : Path
+        The file or directory.
     task : str
         Task of `core.io.readers.file_worker` that reads a box.
+    version : FileVersion
+        Of the file or the metadata; refused once it has changed.
+    folders : tuple of FileVersion
+        Folders of the chunks: an absent chunk was never written unless one of them has changed.
 
     Raises
     ------
@@ -53,8 +56,10 @@ class Numbers:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     chunk: tuple[int, ...]
-    versions: tuple[FileVersion, ...]
+    path: Path
     task: str
+    version: FileVersion
+    folders: tuple[FileVersion, ...] = ()
 
     def __post_init__(self) -> None:
         fits = len(self.chunk) == len(self.shape) > 0 and min(*self.shape, *self.chunk) > 0
@@ -76,12 +81,13 @@ class Numbers:
         require_fits(self.name, n_bytes)
         if not n_bytes:
             return np.empty(shape, self.dtype)
-        path = self.versions[0].path
-        with ExitStack() as stack:
-            for version in self.versions:
-                stack.enter_context(version.unchanged())
-            memory = 2 * n_bytes + 4 * chunk_bytes
-            _, (found,) = isolated(path, self.name, self.task, memory, name=self.name, box=edges)
+        memory = 2 * n_bytes + 4 * chunk_bytes
+        with self.version.unchanged():
+            told, (found,) = isolated(
+                self.path, self.name, self.task, memory, name=self.name, box=edges
+            )
+            for folder in self.folders if told.get("absent") else ():
+                folder.require()
             read = f"array of {found.dtype} and shape {found.shape}"
             same = (found.shape, found.dtype) == (shape, self.dtype)
             require(f"content of {self.name}", read, same, f"{self.dtype} and shape {shape}")
@@ -156,7 +162,12 @@ def choose(arrays: Sequence[Stored], request: Request) -> Stored:
 
 
 def listed(
-    path: Path, task: str, read: str, versions: Mapping[str, tuple[FileVersion, ...]], **more: Any
+    path: Path,
+    task: str,
+    read: str,
+    versions: Mapping[str, FileVersion],
+    folders: Mapping[str, tuple[FileVersion, ...]] | None = None,
+    **more: Any,
 ) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     """List all arrays of a file, and the attributes of its groups by name; its own under ``""``.
 
@@ -165,8 +176,8 @@ def listed(
     path : Path
     task, read : str
         Tasks of `core.io.readers.file_worker` that list the arrays and read a box.
-    versions : dict
-        What each array depends on; under ``""`` what all others do.
+    versions, folders : dict
+        Of each array, see `Numbers`; under ``""`` the version of all others.
     **more
         Arguments of the task.
     """
@@ -182,9 +193,9 @@ def listed(
                 continue
             shape, dtype = tuple(one["shape"]), np.dtype(one["type"])
             chunk = tuple(one["chunk"] or (1,) * len(shape))
-            own = versions.get(name, versions[""])
+            own, around = versions.get(name, versions[""]), (folders or {}).get(name, ())
             try:
-                numbers = Numbers(name, shape, dtype, chunk, own, read)
+                numbers = Numbers(name, shape, dtype, chunk, path, read, own, around)
             except ValueError as error:
                 found.append(Stored(name, None, axes, known, str(error)))
             else:

@@ -25,9 +25,9 @@ _MOST_JSON_BYTES = 2**24  # of a whole directory
 def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
     """List all arrays in a directory, and the attributes of its groups by name."""
     n_bytes = 0
-    folders: list[str] = []
-    # A chunk that is missing was never written, unless its folder has changed since.
-    versions: dict[str, tuple[FileVersion, ...]] = {"": (FileVersion.of(path),)}
+    described_folders: list[str] = []
+    versions = {"": FileVersion.of(path)}
+    folders: dict[str, tuple[FileVersion, ...]] = {}
     for folder, files in _folders(path):
         name = folder.relative_to(path).as_posix().removeprefix(".")
         described = [one for one in _METADATA if one in files]
@@ -38,13 +38,14 @@ def arrays(path: Path) -> tuple[list[Stored], dict[str, dict[str, Any]]]:
             mixed = "zarr.json" in files and bool(files & {".zarray", ".zgroup"})
             both = "versions 2 and 3"
             require(f"metadata of {name or path.name}", both, not mixed, "one of them")
-            folders.append(name)
-            owner = name or path.name
-            own = (FileVersion.of(folder / described[0]), FileVersion.of(folder))
-            versions[owner] = (*versions[""], *own)
-        elif folders and folder.is_relative_to(path / folders[-1]):
-            versions[folders[-1] or path.name] += (FileVersion.of(folder),)
-    found = listed(path, "list_zarr", "read_zarr", versions, folders=folders)
+            described_folders.append(name)
+            versions[name or path.name] = FileVersion.of(folder / described[0])
+            folders[name or path.name] = (FileVersion.of(folder),)
+        elif described_folders and folder.is_relative_to(path / described_folders[-1]):
+            folders[described_folders[-1] or path.name] += (FileVersion.of(folder),)
+    found = listed(
+        path, "list_zarr", "read_zarr", versions, folders, described_folders=described_folders
+    )
     require("arrays", 0, bool(found[0]), "a directory that holds some, of Zarr version 2 or 3")
     return found
 
