@@ -25,7 +25,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if numba.config.DISABLE_JIT:
         config.addinivalue_line(
             "filterwarnings",
-            r"ignore:overflow encountered in scalar (add|multiply):RuntimeWarning:core\.kernels\.streams",
+            r"ignore:overflow encountered in scalar (add|multiply)"
+            r":RuntimeWarning:core\.kernels\.streams",
         )
 
 
