@@ -10,7 +10,10 @@ BIN := $(VENV)/bin
 KERNELS := blocks capture detection estimators inspection matlab more_estimators posterior \
 	reductions simulate spatial speed tracking
 
-.PHONY: app test bench load speed tradeoff stability requires paper table2 uniform calibration results field large fuzz attack wheel clean
+.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform calibration results field large fuzz attack wheel clean
+
+help: ## list the commands
+	@sed -n 's/^\([a-z0-9]*\):.* ## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
 
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
