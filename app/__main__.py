@@ -22,20 +22,20 @@ import panel as pn
 
 import core
 from app.model import text as words
-from app.model.state import Illumination, Reading
+from app.model.state import Illumination
 from app.model.store import Source, built_in_sources, file_source
 from app.model.uploads import Uploads
 from app.pages.layout import build_page
 from app.server import garbage as collector
 from app.server.access import TOKEN_VARIABLE, Access
-from app.server.patches import latency
-from app.server.patches.documents import keep_tracebacks, send_early_changes
+from app.server.patches import apply_patches, scripts
 from app.server.ports import free_port, port_number
 from app.server.serve import server_of
+from app.server.tuning import tune
 from app.tasks.scheduler import STUDIES
 from app.widgets.connection import LINGER_S
 from app.widgets.controls import Sentence
-from core.io import SUFFIXES
+from core.io import SUFFIXES, ReadOptions
 
 log = logging.getLogger(__name__)
 
@@ -75,13 +75,14 @@ def main(arguments: list[str] | None = None) -> int:
     given = {f"path {n}": file_source(p, shared=True) for n, p in enumerate(chosen.captures)}
     for source in given.values():
         try:
-            print(source.load(Illumination(), Reading(), ()).source, flush=True)
+            print(source.load(Illumination(), ReadOptions(), ()).source, flush=True)
         except ValueError as error:  # unreadable, or more than is held as a whole
             parser.error(str(error))
     sources, uploads = given | built_in_sources(), Uploads()
     pn.extension("vtk")
     try:
         port = chosen.port or free_port(chosen.address)
+        scripts()  # refuses unknown names of patches
         token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
         access = Access.of(chosen.address, port, chosen.origin, token)
         server = server_of(
@@ -98,9 +99,8 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     print("Compiling what is not compiled yet ...", flush=True)
     core.warm_up()
-    latency.tune()
-    keep_tracebacks()
-    send_early_changes()
+    tune()
+    apply_patches()
     collector.spare()
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
@@ -117,6 +117,7 @@ def main(arguments: list[str] | None = None) -> int:
 def page_for(sources: Mapping[str, Source], uploads: Uploads) -> Any:
     """The page of a new session, or a sentence where it cannot be built."""
     if pn.state.curdoc is not None:
+        pn.state.curdoc.template_variables["scripts"] = scripts()
         pn.state.onload(collector.spare)
     try:
         return build_page(sources, uploads)

@@ -10,9 +10,11 @@ import numpy as np
 import param
 
 from app.model.address import defaults
-from app.model.state import CLOUDS, Comparison, Reading, State
-from core import ESTIMATORS, Pulse, Window
+from app.model.state import CLOUDS, Comparison, State
+from core import ESTIMATORS, Window
+from core.io import ReadOptions
 from core.parameters import Choice
+from core.tests.read_options import EXAMPLES
 
 OTHERWISE: dict[str, list[Any]] = {
     "source": ["building", "a b&c=d/é?#", "17"],
@@ -22,12 +24,7 @@ OTHERWISE: dict[str, list[Any]] = {
     "page": ["Inspect", "Compare", "Trade-off", "Paper"],
     "pins": [((1, 2),), ((1, 2), (3, 4), (0, 0), (9, 9))],
     "region": [((1, 2), (1, 9), (7, 5)), ((0.5, 1.25), (-3.0, 9.0), (7.0, 5.1))],
-    "reading": [
-        Reading(bin_width_s=1.1e-9, axes="bin, row col", shape=(3, 5), detection="all"),
-        Reading(pulse=Pulse.gaussian(3e-10), variable="a b&c", pixel_angle_rad=0.001),
-        Reading(time_unit_s=1e-12, gate_delay_s=-1e-9, n_bins=7, n_pulses=9, stop_s=1e-6),
-        Reading(no_trigger=-1, first_detections=3),
-    ],
+    "reading": [ReadOptions(**{name: value}) for name, value in EXAMPLES.items()],
 }
 """Other values of parameters whose kind does not tell which there are."""
 

@@ -10,10 +10,11 @@ import pytest
 
 from app.model import text as words
 from app.model.address import Wanted, defaults, query_of
-from app.model.state import Illumination, Less, Reading, State, Viewing
+from app.model.state import Illumination, Less, State, Viewing
 from app.model.store import built_in_sources
 from app.pages.session import Session
 from core import TrackingParameters
+from core.io import ReadOptions
 from tests.states import OTHERWISE, another, random_state
 
 # -- every parameter -------------------------------------------------------------------------------
@@ -47,7 +48,7 @@ def test_every_parameter_has_its_place_in_the_address(name):
 
 
 def test_every_word_on_a_file_is_among_what_the_tests_choose():
-    for each in fields(Reading):
+    for each in fields(ReadOptions):
         assert any(getattr(reading, each.name) is not None for reading in OTHERWISE["reading"])
 
 
@@ -113,7 +114,7 @@ def test_what_is_out_of_range_or_nonsense_is_refused_and_the_rest_kept(query, na
     found, refused = restored(f"{query}&light.ppp=0.5&reading.n_pulses=77")
     (sentence,) = refused
     assert named in sentence
-    expected = defaults() | {"light": Illumination(ppp=0.5), "reading": Reading(n_pulses=77)}
+    expected = defaults() | {"light": Illumination(ppp=0.5), "reading": ReadOptions(n_pulses=77)}
     assert found == expected
 
 

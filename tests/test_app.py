@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, fields, replace
+from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from bokeh.document import Document
 import core
 from app.model import colors as looks
 from app.model import text as words
-from app.model.address import Wanted
-from app.model.state import Illumination, Less, Reading, Viewing
+from app.model.address import Wanted, query_of
+from app.model.script import script_of
+from app.model.state import Illumination, Less, Viewing
 from app.model.store import (
     Request,
     built_in_sources,
@@ -33,8 +35,10 @@ from app.widgets.figures import Plot
 from app.widgets.image_view import ImageView
 from app.widgets.signal_plots import SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
+from core.io import ReadOptions, reading_options
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
+from core.tests.read_options import EXAMPLES
 from tests.threads import HeldLayout, control
 
 NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
@@ -43,7 +47,7 @@ NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
 def ask(source="car", **chosen):
     choices = {
         "light": Illumination(),
-        "reading": Reading(),
+        "reading": ReadOptions(),
         "tracking": TrackingParameters(),
         "less": Less(),
     } | chosen
@@ -111,36 +115,19 @@ def test_light_is_the_flux_and_the_pulses_of_an_acquisition():
     assert light.acquisition(gate) == replace(gate, n_pulses=77)
 
 
-def test_typed_text_tells_how_to_read_a_file():
-    typed = {
-        "time_unit_s": "",
-        "bin_width_s": " 1e-9 ",
-        "gate_delay_s": "0",
-        "n_bins": "200",
-        "n_pulses": "  ",
-        "variable": " Ts ",
-        "axes": "col row",
-        "shape": "32 x 64",
-    }
-    read = Reading.from_text(typed)
-    assert read == Reading(None, 1e-9, 0.0, 200, None, "Ts", axes="col row", shape=(32, 64))
-    assert read.as_text("shape") == "32 x 64"
-    assert Reading.from_text(dict.fromkeys(typed, "")) == Reading()
-
-
 @pytest.mark.parametrize(
     ("name", "text", "remedy"),
     [
         ("n_bins", "2.5", "a whole number"),
         ("n_pulses", "many", "a whole number"),
-        ("bin_width_s", "1 ns", "a number such as 1e-9"),
+        ("bin_width_s", "1 xs", "a time such as 64ps"),
         ("shape", "64", "rows and columns such as 64 x 64"),
         ("detection", "some", "'first' or 'all'"),
     ],
 )
 def test_text_that_is_no_number_is_refused_with_a_remedy(name, text, remedy):
     with pytest.raises(ValueError, match=rf"{name}.*{text}.*{remedy}"):
-        Reading.from_text({name: text})
+        ReadOptions.from_text({name: text})
 
 
 # -- what was computed -----------------------------------------------------------------------------
@@ -253,9 +240,9 @@ def test_a_file_is_a_source(small_file, small_capture):
     source = file_source(small_file)
     assert source.title == "small.npz"
     assert not source.is_scene
-    read = source.load(Illumination(), Reading(), ())
+    read = source.load(Illumination(), ReadOptions(), ())
     np.testing.assert_array_equal(read.cube, small_capture.cube)
-    again = source.load(Illumination(), Reading(bin_width_s=3e-9), ())
+    again = source.load(Illumination(), ReadOptions(bin_width_s=3e-9), ())
     assert again.acquisition.bin_width_s == 3e-9
 
 
@@ -627,7 +614,7 @@ def next_answer(layout):
 def open_file(layout, path):
     """Go to a file; what an upload does once its content is stored."""
     layout.session.sources[path.name] = file_source(path)
-    layout.session.state.param.update(source=path.name, reading=Reading())
+    layout.session.state.param.update(source=path.name, reading=ReadOptions())
 
 
 def told(facts):
@@ -704,7 +691,7 @@ def test_a_file_that_cannot_be_read_leaves_the_picture_and_says_why(layout, tmp_
 def test_a_failure_keeps_how_the_present_file_is_read(layout, small_file, tmp_path):
     open_file(layout, small_file)
     next_answer(layout)
-    layout.session.state.reading = Reading(bin_width_s=3e-9)
+    layout.session.state.reading = ReadOptions(bin_width_s=3e-9)
     assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9
     open_file(layout, tmp_path / "absent.npz")
     next_answer(layout)
@@ -744,6 +731,22 @@ def test_what_is_folded_away_is_built_when_it_is_first_opened(layout):
         assert on_page() == names
 
 
+def test_form_link_and_script_have_each_option_for_reading_a_file(layout, small_file):
+    given = ReadOptions(**EXAMPLES)
+    opened(layout, "How to read the file")
+    open_file(layout, small_file)
+    answer = next_answer(layout)
+    for name, option in reading_options().items():
+        control(layout, option.label).value = given.as_text(name)
+    control(layout, "Read again").clicks += 1
+    state = layout.session.state
+    assert state.reading == given
+    linked = Wanted(dict(parse_qsl(query_of(state, {})))).of({"reading": ReadOptions()})
+    assert linked == {"reading": given}
+    script = script_of(replace(answer, request=replace(answer.request, reading=given)), state)
+    assert [name for name in EXAMPLES if f" {name}=" not in script] == []
+
+
 def test_typed_text_changes_how_a_file_is_read(layout, small_file):
     opened(layout, "How to read the file")
     open_file(layout, small_file)
@@ -751,7 +754,7 @@ def test_typed_text_changes_how_a_file_is_read(layout, small_file):
     control(layout, "Bin width (s)").value = "wide"
     control(layout, "Read again").clicks += 1
     assert layout.session.answer is before
-    assert layout.session.state.reading == Reading()
+    assert layout.session.state.reading == ReadOptions()
     control(layout, "Bin width (s)").value = "3e-9"
     control(layout, "Read again").clicks += 1
     assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9

@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from app.model import budget
-from app.model.state import Illumination, Less, Reading
+from app.model.state import Illumination, Less
 from app.model.store import Request, compute, file_source
 from app.pages.compare.ranking import Task, run_task
 from app.pages.inspect.results import capture_known, pixel_lit
@@ -21,6 +21,7 @@ from app.pages.tradeoff.page import affordable
 from app.tasks.scheduler import GENERAL
 from core import ESTIMATORS, Acquisition, Capture, TrackingParameters, save_capture
 from core.cost import Cost
+from core.io import ReadOptions
 from core.studies.tradeoff.measure import candidates
 
 MB = 2**20
@@ -35,7 +36,7 @@ def source(tmp_path):
 
 
 def ask(source, less=None):
-    return Request(source, Illumination(), Reading(), TrackingParameters(), less or Less())
+    return Request(source, Illumination(), ReadOptions(), TrackingParameters(), less or Less())
 
 
 @pytest.fixture

@@ -20,12 +20,13 @@ from app.model import large
 from app.model.address import Wanted
 from app.model.colors import image_of
 from app.model.large import LIMIT, Grid, most_whole_bytes
-from app.model.state import Illumination, Less, Reading
+from app.model.state import Illumination, Less
 from app.model.store import built_in_sources, compute, file_source
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
 from core import Window
 from core.inference.flux import flux_prior_of
+from core.io import ReadOptions
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT, fact, serving
@@ -91,7 +92,7 @@ def never():
 
 
 def test_size_decides_what_is_held_as_a_whole(path, building, monkeypatch):
-    reading = Reading()
+    reading = ReadOptions()
     assert file_source(path).large(reading) is not None
     monkeypatch.setenv(LIMIT, str(building.cube.nbytes))
     source = file_source(path)
@@ -104,10 +105,10 @@ def test_size_decides_what_is_held_as_a_whole(path, building, monkeypatch):
 def test_a_format_without_windows_is_refused_with_a_remedy_that_works(building, small, tmp_path):
     core.save_capture(building, tmp_path / "b.npz")
     with pytest.raises(ValueError, match=r"python -m core export b\.npz b\.zarr") as refused:
-        file_source(tmp_path / "b.npz").load(Illumination(), Reading(), ())
+        file_source(tmp_path / "b.npz").load(Illumination(), ReadOptions(), ())
     assert f"= {building.cube.nbytes} " in str(refused.value)
     core.save_capture(core.read_capture(tmp_path / "b.npz"), tmp_path / "b.zarr")
-    assert file_source(tmp_path / "b.zarr").large(Reading()) is not None
+    assert file_source(tmp_path / "b.zarr").large(ReadOptions()) is not None
 
 
 # -- the preview -----------------------------------------------------------------------------------
@@ -143,7 +144,7 @@ def test_what_is_not_read_yet_is_blank(path, slow):
 
 
 def test_reading_ends_when_it_is_cancelled(path, slow):
-    file = file_source(path).large(Reading())
+    file = file_source(path).large(ReadOptions())
     first = file.preview
     with pytest.raises(Cancelled):
         file.read_on(lambda *_: None, lambda: True)
@@ -168,7 +169,7 @@ def test_a_window_is_read_once_and_says_what_the_whole_says(path, building, slow
 
 
 def test_a_window_beyond_its_limits_is_refused(path):
-    file = file_source(path).large(Reading())
+    file = file_source(path).large(ReadOptions())
     with pytest.raises(ValueError, match=r"pixels of a window = 12288 .* at most 3,072"):
         file.cutout(Window((0, ROWS), (0, COLS)))
     with pytest.raises(ValueError, match=r"rows = \(90, 97\) .*some of 0 to 96"):
@@ -177,7 +178,7 @@ def test_a_window_beyond_its_limits_is_refused(path):
 
 
 def test_only_one_window_is_kept(path):
-    file = file_source(path).large(Reading())
+    file = file_source(path).large(ReadOptions())
     one, other = (file.cutout(Window((0, 9), (0, end))) for end in (9, 10))
     assert file.cutout(other.window) is other
     assert file.cutout(one.window) is not one

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from app.model.state import Illumination, Reading
+from app.model.state import Illumination
 from app.model.uploads import Bounds, Uploads, harmless
 from core import Acquisition, Capture, save_capture
+from core.io import ReadOptions
 from tests.browser import serving
 
 
@@ -48,7 +49,7 @@ def test_a_file_is_there_for_who_has_its_key_until_the_last_one_leaves(folder, c
     key = uploads.add("mine.npz", content, first)
     assert held(folder) == ["mine.npz"]
     source = uploads.use(key, other)
-    capture = source.load(Illumination(), Reading(), ())
+    capture = source.load(Illumination(), ReadOptions(), ())
     assert capture.shape == (4, 6)
     assert source.title == "mine.npz"
     uploads.leave(first)
@@ -78,9 +79,11 @@ def test_all_files_go_with_the_process(folder, content):
 def test_what_one_page_has_loaded_is_not_loaded_again_for_the_next(folder, content):
     uploads, first, other = Uploads(), Session(), Session()
     key = uploads.add("mine.npz", content, first)
-    one = uploads.use(key, first).load(Illumination(), Reading(), ())
-    assert uploads.use(key, other).load(Illumination(), Reading(), ()) is one
-    assert uploads.use(key, other).load(Illumination(), Reading(bin_width_s=1e-9), ()) is not one
+    one = uploads.use(key, first).load(Illumination(), ReadOptions(), ())
+    assert uploads.use(key, other).load(Illumination(), ReadOptions(), ()) is one
+    assert (
+        uploads.use(key, other).load(Illumination(), ReadOptions(bin_width_s=1e-9), ()) is not one
+    )
 
 
 def test_keys_cannot_be_guessed(folder, content):

@@ -35,7 +35,7 @@ READY = {
 }
 """What a page says once it is drawn; until then the server keeps what it has to tell."""
 
-RULES = (ROOT / "app" / "pages" / "bokeh.js").read_text("utf-8")
+RULES = (ROOT / "app" / "server" / "patches" / "latest_value.js").read_text("utf-8")
 LONGEST_PAUSE_S = int(re.findall(r"const LONGEST_PAUSE_MS = (\d+);", RULES)[0]) / 1000
 """The browser's own."""
 

@@ -1,25 +1,24 @@
-"""What is chosen, as the query of the page's address, and back: only what differs from its default.
+"""The state of a page as the query of its address, and back: only what differs from the default.
 
 A parameter of the `State` is written under its name, a field of one under both names, such as
-``light.sbr``: a string as it is, anything else as JSON. An address comes from outside: each value
-is refused in words unless the parameter or the dataclass takes it, and the rest is kept.
+``light.sbr``: a string verbatim, anything else as JSON. An address comes from outside: a value that
+the parameter or the dataclass does not accept is refused with a sentence, and the rest is used.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
-from functools import partial
 from typing import Any
 from urllib.parse import urlencode
 
 import param
 
-from app.model.state import Reading, State
-from app.widgets.component import Component
+from app.model.state import State
 from core.checks import require
+from core.io import ReadOptions
 
 Entries = Mapping[str, str]
 """Of an address, the text by its name."""
@@ -29,73 +28,6 @@ MOST_LETTERS = 20_000
 
 NOT_OURS = ("bokeh-session-id", "bokeh-token", "theme", "token")
 """Entries of an address that the server reads."""
-
-
-REST_MS = 250
-"""The address follows when nothing has changed for so long: a slider under way has better to do."""
-
-
-class AddressBar(Component):
-    """Keeps the address of the page, in place: nothing is loaded anew, no history grows."""
-
-    query = param.String(default="", doc="What follows the question mark.")
-
-    _esm = """
-    export function render({ model }) {
-      const show = () => {
-        const query = model.query ? `?${model.query}` : "";
-        history.replaceState(history.state, "", location.pathname + query + location.hash);
-      };
-      model.on("query", show);
-      show();
-      return document.createElement("span");
-    }
-    """
-
-    def follow(
-        self,
-        state: State,
-        query: Callable[[], str],
-        wait: Callable[[int, Callable[[], None]], None],
-        tell: Callable[[Callable[[], None]], None],
-    ) -> None:
-        """Say what the state is, whenever it has come to rest.
-
-        Parameters
-        ----------
-        state : State
-        query : callable
-            Tells what the address should say now.
-        wait, tell : callable
-            Of the `app.pages.session.Session`.
-        """
-        changes = 0
-        is_waiting = False
-
-        def write() -> None:
-            self.query = query()
-
-        def changed(*_events: Any) -> None:
-            nonlocal changes
-            changes += 1
-            if not is_waiting:
-                look_later()
-
-        def look_later() -> None:
-            nonlocal is_waiting
-            is_waiting = True
-            wait(REST_MS, partial(look, changes))
-
-        def look(seen: int) -> None:
-            nonlocal is_waiting
-            if seen != changes:
-                look_later()
-            else:
-                is_waiting = False
-                tell(write)
-
-        write()
-        state.param.watch(changed, list(defaults()))
 
 
 def defaults() -> dict[str, Any]:
@@ -139,7 +71,7 @@ def _written(name: str, value: Any, default: Any) -> dict[str, str]:
 
 def _inner(value: Any) -> dict[str, Any] | None:
     """What a value consists of, by name; None where it is one piece."""
-    if isinstance(value, Reading):
+    if isinstance(value, ReadOptions):
         return {each.name: value.as_text(each.name) for each in fields(value)}
     if is_dataclass(value):
         return {each.name: getattr(value, each.name) for each in fields(value)}
@@ -200,7 +132,7 @@ class Wanted:
 
     def _changed(self, name: str, base: Any) -> Any:
         """A value with the parts that its entries tell."""
-        if isinstance(base, Reading):
+        if isinstance(base, ReadOptions):
             return self._reading(name, base)
         inner = _inner(base)
         if inner is None:
@@ -229,13 +161,13 @@ class Wanted:
             self.refused.append(f"{name} = {told} is not accepted.")
             return None
 
-    def _reading(self, name: str, base: Reading) -> Reading:
+    def _reading(self, name: str, base: ReadOptions) -> ReadOptions:
         typed = {each.name: base.as_text(each.name) for each in fields(base)}
         for each in typed:
             text = self._text(f"{name}.{each}")
             if text is not None:
                 try:
-                    base = Reading.from_text(typed | {each: text})
+                    base = ReadOptions.from_text(typed | {each: text})
                 except ValueError as error:
                     self.refused.append(str(error))
                 else:

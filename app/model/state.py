@@ -9,10 +9,10 @@ from typing import Any
 
 import param
 
-from core import ESTIMATORS, Acquisition, Flux, Pulse, TrackingParameters, Window
+from core import ESTIMATORS, Acquisition, Flux, TrackingParameters, Window
 from core.checks import require
 from core.estimators import FALSE_ALARM
-from core.io import Request
+from core.io import ReadOptions
 from core.parameters import Number, check_fields, parameter
 from core.reductions import Reduction
 from core.studies.ablation import TITLES
@@ -149,60 +149,6 @@ class Less:
         )
 
 
-def _gaussian(text: str) -> Pulse:
-    return Pulse.gaussian(float(text))
-
-
-def _shape(text: str) -> tuple[int, int]:
-    rows, cols = text.replace("×", " ").replace("x", " ").split()
-    return int(rows), int(cols)
-
-
-_CONVERT: dict[str, tuple[Callable[[str], Any], str]] = {
-    "variable": (str, "a name"),
-    "detection": (str, "first or all"),
-    "axes": (str, "names"),
-    "n_bins": (int, "a whole number"),
-    "n_pulses": (int, "a whole number"),
-    "no_trigger": (int, "a whole number"),
-    "first_detections": (int, "a whole number"),
-    "shape": (_shape, "rows and columns such as 64 x 64"),
-    "pulse": (_gaussian, "a number such as 1e-9"),
-}
-_NUMBER: tuple[Callable[[str], Any], str] = (float, "a number such as 1e-9")
-
-
-class Reading(Request):
-    """How a file is to be read; None lets the reader guess."""
-
-    @classmethod
-    def from_text(cls, typed: Mapping[str, str]) -> Reading:
-        """What was typed into one field each; an empty field leaves the reader to guess.
-
-        Raises
-        ------
-        ValueError
-            If something that should be a number is not: names the field and the text.
-        """
-        values: dict[str, Any] = {}
-        for name, text in typed.items():
-            convert, kind = _CONVERT.get(name, _NUMBER)
-            try:
-                values[name] = convert(text.strip()) if text.strip() else None
-            except ValueError:
-                require(name, text, False, f"{kind}, or nothing to let the reader guess")
-        return cls(**values)
-
-    def as_text(self, name: str) -> str:
-        """A field as it would be typed."""
-        value = getattr(self, name)
-        if isinstance(value, Pulse):
-            value = value.tau_s
-        if isinstance(value, tuple):
-            value = " x ".join(map(str, value))
-        return "" if value is None else str(value)
-
-
 FIRST_METHODS = ("peak", "coates", "likelihood", "tracking", "oracle")
 
 CLOUDS = "3D clouds"
@@ -310,7 +256,7 @@ class State(param.Parameterized):
 
     source = param.String(default="car", doc="Key of the catalogue.")
     light = param.ClassSelector(class_=Illumination, default=Illumination())
-    reading = param.ClassSelector(class_=Reading, default=Reading())
+    reading = param.ClassSelector(class_=ReadOptions, default=ReadOptions())
     window = param.ClassSelector(
         class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
-from app.model.state import Illumination, Less, Reading
+from app.model.state import Illumination, Less
 from core import (
     CORRECTIONS,
     PARTS,
@@ -37,6 +37,7 @@ from core import (
 )
 from core.cost import Cost, predicted
 from core.inference import has_posterior, posterior_of
+from core.io import ReadOptions
 
 ASSETS = Path(str(resources.files("assets")))
 
@@ -46,11 +47,11 @@ class Source:
     """Something to look at: a built-in scene to simulate, or a file to read."""
 
     title: str
-    load: Callable[[Illumination, Reading, Collection[str]], Capture]
+    load: Callable[[Illumination, ReadOptions, Collection[str]], Capture]
     """Makes the capture, parts of some names left out of a scene."""
     scene: Callable[[], Scene] | None = None
     """None for a file."""
-    large: Callable[[Reading], LargeFile | None] = lambda _reading: None
+    large: Callable[[ReadOptions], LargeFile | None] = lambda _reading: None
     """Opens a file of which only windows are read; None where all of it is."""
     name: str = ""
     """Of the scene in `core.scenes`, or of the file."""
@@ -76,7 +77,7 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
 
     build = cache(partial(scenes[name], **arguments))
 
-    def load(light: Illumination, _reading: Reading, absent: Collection[str]) -> Capture:
+    def load(light: Illumination, _reading: ReadOptions, absent: Collection[str]) -> Capture:
         scene = bare(build(), absent)
         return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
@@ -86,17 +87,17 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
 def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
     """A capture file; one that all sessions share is kept once it is read."""
 
-    def read(reading: Reading) -> Capture:
+    def read(reading: ReadOptions) -> Capture:
         capture = read_capture(path, **vars(reading))
         require_small(path, capture.cube.nbytes)
         return capture
 
-    def load(_light: Illumination, reading: Reading, _absent: Collection[str]) -> Capture:
+    def load(_light: Illumination, reading: ReadOptions, _absent: Collection[str]) -> Capture:
         large = opened(reading)
         return get(reading) if large is None else large.preview.capture
 
     @lru_cache(maxsize=1)
-    def opened(reading: Reading) -> LargeFile | None:
+    def opened(reading: ReadOptions) -> LargeFile | None:
         return open_large(path, vars(reading))
 
     get = lru_cache(maxsize=1)(read) if shared else read
@@ -125,7 +126,7 @@ class Request:
 
     source: Source
     light: Illumination
-    reading: Reading
+    reading: ReadOptions
     tracking: TrackingParameters
     less: Less
     absent: frozenset[str] = frozenset()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import panel as pn
@@ -14,10 +13,10 @@ from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
 from app.model import text as words
-from app.model.address import AddressBar, Wanted
+from app.model.address import Wanted
 from app.model.restore import parameters_of
 from app.model.script import script_of
-from app.model.state import Illumination, Less, Reading
+from app.model.state import Illumination, Less
 from app.model.store import Answer, Request, Source
 from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
 from app.pages.catalog import PAGES
@@ -25,31 +24,17 @@ from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
 from app.tasks.page import PageTasks
 from app.theme import DARK, LIGHT, STYLES
+from app.widgets.address_bar import AddressBar
 from app.widgets.cards import choice, part, select
 from app.widgets.connection import Connection
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import FileInput
 from app.widgets.share import TakeAway
 from core import PRESETS, TrackingParameters
-from core.io import SUFFIXES
+from core.io import SUFFIXES, ReadOptions, reading_options
 
 CUSTOM = "custom"
 
-READING_LABELS = {
-    "time_unit_s": "Time unit (s)",
-    "bin_width_s": "Bin width (s)",
-    "gate_delay_s": "Gate opens after (s)",
-    "n_bins": "Bins",
-    "n_pulses": "Pulses sent",
-    "pulse": "Echo's standard deviation (s)",
-    "variable": "Variable",
-    "detection": "Photons of a pulse (first, all)",
-    "axes": "Axes (such as bin row col)",
-    "stop_s": "Common stop after (s)",
-    "shape": "Rows x columns",
-    "first_detections": "First detections only",
-    "no_trigger": "Frames: no trigger is",
-}
 THEME = {
     mode: {
         "palette": {"primary": {"main": main}, "background": {"default": page, "paper": paper}},
@@ -92,13 +77,12 @@ IN_THE_BAR = {
 
 
 TEMPLATE = (
-    '{% extends "base.html" %}{% block postamble %}{{ super() }}<script>{% raw %}'
-    + Path(__file__).with_name("bokeh.js").read_text(encoding="utf-8")
-    + "{% endraw %}"
-    # The widgets' module, which would be asked for when the page is there.
+    '{% extends "base.html" %}{% block postamble %}{{ super() }}<script>{{ scripts | safe }}'
+    # The widgets' module, which would otherwise be requested when the page has loaded.
     + f'importShim("{pmui.Button._render_esm(server=True)}");'
     + "</script>{% endblock %}"
 )
+"""Template of the page; ``scripts`` is JavaScript to run before anything is drawn."""
 
 
 class Template(pmui.Page):
@@ -110,7 +94,7 @@ class Template(pmui.Page):
 
     is_narrow = param.Boolean(
         default=False,
-        doc="Whether the sidebar would cover the page, as on a phone; told by ``bokeh.js``.",
+        doc="Whether the sidebar would cover the page, as on a phone; set in the browser.",
     )
 
     def __init__(self, **params: Any) -> None:
@@ -233,13 +217,14 @@ class Layout:
         )
         self._reading = {
             name: pmui.TextInput(
-                label=label,
+                label=option.label,
+                description=f"{option.label}: {option.help}",
                 placeholder="guess",
                 size="small",
                 sizing_mode="stretch_width",
                 margin=(6, 8, 2, 8),
             )
-            for name, label in READING_LABELS.items()
+            for name, option in reading_options().items()
         }
         unit = choice(words.UNIT_HELP, state.param.unit)
         unit.param.update(
@@ -262,7 +247,7 @@ class Layout:
             "How to read the file",
             *self._reading.values(),
             read_again,
-            is_open=self.session.answer.request.reading != Reading(),
+            is_open=self.session.answer.request.reading != ReadOptions(),
             is_shown=False,
         )
         self._shared = {
@@ -372,7 +357,9 @@ class Layout:
     def _go_to(self, key: str) -> None:
         session, state = self.session, self.session.state
         if key != state.source:
-            request = Request(session.sources[key], state.light, Reading(), state.tracking, Less())
+            request = Request(
+                session.sources[key], state.light, ReadOptions(), state.tracking, Less()
+            )
             state.param.update(parameters_of(request, session.sources))
 
     def _preset_changed(self, name: str) -> None:
@@ -394,7 +381,7 @@ class Layout:
 
     def _read_again(self) -> None:
         try:
-            self.session.state.reading = Reading.from_text(
+            self.session.state.reading = ReadOptions.from_text(
                 {name: field.value for name, field in self._reading.items()}
             )
         except ValueError as error:

@@ -17,7 +17,6 @@ from core.capture import Capture, Seen
 from core.checks import printable, require, shown
 from core.cli.options import (
     LIGHT_NAMES,
-    READING_NAMES,
     add_light,
     add_reading,
     flux,
@@ -31,7 +30,7 @@ from core.inspection import FluxEstimate, capture_report, pixel_report
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 from core.io.scene_files import read_scene
 from core.io.writers import (
     CAPTURE_SUFFIXES,
@@ -86,7 +85,7 @@ def _info(chosen: argparse.Namespace) -> None:
         show(_of_pixel(capture, *chosen.pixel), chosen.json)
         return
     counts = open_capture(chosen.capture, **reading(chosen))
-    acquisition, pulse, detection, source = describe(counts, Request())
+    acquisition, pulse, detection, source = describe(counts, ReadOptions())
     rows, cols, n_bins = counts.shape
     begin_m, end_m = acquisition.bin_to_range_m([0, n_bins])
     facts: dict[str, Any] = {
@@ -265,7 +264,7 @@ def _ranged_in_parts(
         raise ValueError("scheduler takes a --capture: a scene is simulated and ranged here.")
     counts = open_capture(chosen.capture, **reading(chosen))
     print(counts.attrs.get("source", ""), file=sys.stderr)
-    _require_angle(chosen, describe(counts, Request()).acquisition)
+    _require_angle(chosen, describe(counts, ReadOptions()).acquisition)
     started = perf_counter()
     parts = large.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)
     seen, image = large.as_image(large.computed(parts, chosen.scheduler))
@@ -412,7 +411,8 @@ def _capture(chosen: argparse.Namespace) -> Capture:
     if chosen.capture:
         require_none(vars(chosen), LIGHT_NAMES, "a capture is lit already")
         return read_capture(chosen.capture, **reading(chosen))
-    require_none(reading(chosen), READING_NAMES, "a scene is not read from a file")
+    told = reading(chosen)
+    require_none(told, list(told), "a scene is not read from a file")
     scene = scenes[chosen.scene]()
     return _simulated(scene, scene.acquisition, chosen)
 

@@ -1,4 +1,4 @@
-"""What several commands take and show alike."""
+"""Options and output that commands share."""
 
 from __future__ import annotations
 
@@ -13,28 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from core.acquisition import Flux, Pulse
+from core.acquisition import Flux
 from core.checks import require
-from core.io.readers.wording import UNITS_S
-
-_MOST_WITHOUT_UNIT_S = 1e-3
-
-
-def seconds(text: str) -> float:
-    """A time such as ``64ps``, ``4.43 us`` or, in seconds and below a millisecond, ``1e-9``."""
-    parts = re.fullmatch(r"([-+.\deE]+) *([a-zµ]*)", text.strip())
-    try:
-        number, unit = parts.groups() if parts else ("", "")
-        time_s = float(number) * UNITS_S[unit or "s"]
-        # A forgotten unit would make nanoseconds of light years.
-        if not unit and abs(time_s) > _MOST_WITHOUT_UNIT_S:
-            raise ValueError
-    except (KeyError, ValueError):
-        known = ", ".join(UNITS_S)
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not accepted: give a time such as 64ps or 1e-9; units are {known}."
-        ) from None
-    return time_s
+from core.io import ReadOptions, reading_options
 
 
 def whole_from_to(least: int, most: int) -> Callable[[str], int]:
@@ -48,55 +29,14 @@ def whole_from_to(least: int, most: int) -> Callable[[str], int]:
     return whole
 
 
-READING: dict[str, dict[str, Any]] = {
-    "time-unit": {"type": seconds, "dest": "time_unit_s", "help": "of arrival times, such as 8ps"},
-    "bin-width": {"type": seconds, "dest": "bin_width_s", "help": "such as 64ps"},
-    "gate-delay": {
-        "type": seconds,
-        "dest": "gate_delay_s",
-        "help": "from the pulse to the first bin, such as 280ns or, before it, =-5ns",
-    },
-    "bins": {"type": int, "dest": "n_bins", "help": "in the gate"},
-    "pulses": {"type": int, "dest": "n_pulses", "help": "sent for each pixel"},
-    "variable": {"help": "name of the array, where the file holds several"},
-    "pulse-sigma": {
-        "type": seconds,
-        "dest": "pulse",
-        "help": "standard deviation of an echo, taken for a Gaussian",
-    },
-    "pixel-angle": {
-        "type": float,
-        "dest": "pixel_angle_rad",
-        "help": "between neighbouring pixels, in radians",
-    },
-    "detection": {"choices": ("first", "all"), "help": "photons of a pulse that are recorded"},
-    "axes": {"help": "the file's order, such as 'bin row col'"},
-    "shape": {
-        "type": int,
-        "nargs": 2,
-        "metavar": ("ROWS", "COLS"),
-        "help": "of a file that lists its pixels",
-    },
-    "stop": {
-        "type": seconds,
-        "dest": "stop_s",
-        "help": "common stop: times count backwards from this time after the pulse",
-    },
-    "no-trigger": {"type": int, "help": "raw frames: what stands where nothing fired"},
-    "first-detections": {"type": int, "help": "keep so many of each pixel"},
-}
-"""How a file is to be read, as `core.read_capture` takes it; guessed where not told."""
-
-
-READING_NAMES = [kind.get("dest", name.replace("-", "_")) for name, kind in READING.items()]
-"""Names of these arguments, in the same order."""
-
-
 def add_reading(command: Any) -> None:
-    """Add the options that tell how a file is to be read."""
-    group = command.add_argument_group("how to read the file; what is not told is guessed")
-    for name, kind in READING.items():
-        group.add_argument(f"--{name}", **kind)
+    """Add the options for reading a file, one for each field of `core.io.ReadOptions`."""
+    group = command.add_argument_group("how to read the file; what is not specified is guessed")
+    for name, option in reading_options().items():
+        parts = option.kind.words
+        # One string for each option: `reading` parses them as the app's form does.
+        several = {"nargs": len(parts), "metavar": parts} if parts else {}
+        group.add_argument(f"--{option.flag}", dest=name, help=option.help, **several)
 
 
 def add_processes(command: Any) -> None:
@@ -108,13 +48,12 @@ def add_processes(command: Any) -> None:
 
 
 def reading(chosen: argparse.Namespace) -> dict[str, Any]:
-    """The arguments of `core.read_capture`."""
-    told = {name: getattr(chosen, name) for name in READING_NAMES}
-    if told["pulse"] is not None:
-        told["pulse"] = Pulse.gaussian(told["pulse"])
-    if told["shape"] is not None:
-        told["shape"] = tuple(told["shape"])
-    return told
+    """Return the arguments of `core.read_capture`."""
+    given = {name: getattr(chosen, name) or "" for name in reading_options()}
+    joined = {
+        name: each if isinstance(each, str) else " ".join(each) for name, each in given.items()
+    }
+    return vars(ReadOptions.from_text(joined))
 
 
 LIGHT_NAMES = ("sbr", "ppp", "seed")
@@ -145,10 +84,10 @@ def require_none(told: Mapping[str, Any], names: Sequence[str], why: str) -> Non
 
 
 def as_options(message: str) -> str:
-    """A message of `core` in the words of the command line."""
-    for name, argument in zip(READING, READING_NAMES, strict=True):
-        if "_" in argument:
-            message = re.sub(rf"\b{argument}\b", f"--{name}", message)
+    """Return a message of `core` with the names of the command line's options."""
+    for name, option in reading_options().items():
+        if "_" in name:
+            message = re.sub(rf"\b{name}\b", f"--{option.flag}", message)
     return message
 
 

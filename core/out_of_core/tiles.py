@@ -28,7 +28,7 @@ from core.inference.flux import flux_prior_of
 from core.inference.flux_model import FluxPrior
 from core.io.readers.dense import AXES, whole_counts
 from core.io.readers.labelled import Description, describe
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 from core.io.readers.sample import sample_of
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def estimate_large(
     told = " or ".join(map(repr, apart)) + ", which range a pixel without the whole image"
     require("method", method, not estimator.whole_image, told)
     require("axes", counts.dims, counts.dims == AXES, "row, col and bin")
-    description = describe(counts, Request())
+    description = describe(counts, ReadOptions())
     array = da.asarray(counts.data).rechunk({2: -1})
     flux_prior, calibration, remark = learned(array, description, method, settings, false_alarm)
     margin = estimator.reach(settings) // 2

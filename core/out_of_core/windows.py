@@ -21,7 +21,7 @@ from core.checks import require
 from core.inference.flux import flux_prior_of
 from core.inference.flux_model import FluxPrior
 from core.io.readers.labelled import describe
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 from core.io.readers.sample import sample_of
 from core.out_of_core.tiles import captured
 from core.reductions import coarser
@@ -126,7 +126,7 @@ class WindowReader:
             bounds = getattr(window, name)
             require(name, bounds, bounds[1] <= size, f"some of 0 to {size}")
         self.window = window
-        self._description = describe(counts, Request())
+        self._description = describe(counts, ReadOptions())
         self._shape = counts.shape[:2]
         data = da.from_array(counts.data, name=False) if counts.chunks is None else counts.data
         rows, cols = (slice(each.start, each.stop, each.step) for each in window.picked)
@@ -219,7 +219,7 @@ def read_window(
 
 def sampled_flux_prior(counts: xr.DataArray) -> FluxPrior:
     """Return the flux prior of an image, as `core.estimate_large` learns it."""
-    return flux_prior_of(captured(sample_of(counts.data), describe(counts, Request())))
+    return flux_prior_of(captured(sample_of(counts.data), describe(counts, ReadOptions())))
 
 
 def _spread(chunks: tuple[tuple[int, ...], ...]) -> list[tuple[slice, slice]]:

@@ -15,7 +15,6 @@ import tifffile
 
 from core.acquisition import Acquisition, Flux
 from core.cli import main
-from core.cli.options import seconds
 from core.estimators import estimate
 from core.io import readers
 from core.io.readers import Reader, read_capture
@@ -51,24 +50,6 @@ def frames(tmp_path: Path) -> Path:
     path = tmp_path / "counts.npy"
     np.save(path, counts)
     return path
-
-
-@pytest.mark.parametrize(
-    ("text", "expected_s"),
-    [("64ps", 64e-12), ("4.43 us", 4.43e-6), ("1e-9", 1e-9), ("0.5ns", 5e-10), ("2µs", 2e-6)],
-)
-def test_times_carry_units(text: str, expected_s: float) -> None:
-    assert seconds(text) == pytest.approx(expected_s, rel=1e-12)
-
-
-@pytest.mark.parametrize("text", ["", "ps", "64 pc", "1e-9 s s", "one ns", "64Ps", "64", "1\n2"])
-def test_times_that_are_none_are_refused(
-    text: str, frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["info", str(frames), "--bin-width", text])
-    assert ended.value.code == 2
-    assert "give a time such as 64ps" in capsys.readouterr().err
 
 
 def test_info_tells_what_is_known_and_guessed(
@@ -237,6 +218,7 @@ def test_a_capture_is_exported_in_another_layout(
             2,
             "--first-detections",
         ),
+        (("info", "{frames}", "--bin-width", "64"), 2, "give a time such as 64ps"),
         (("field", "nowhere"), 2, "data_face.mat"),
     ],
 )

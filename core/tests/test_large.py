@@ -18,7 +18,7 @@ from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
 from core.io.readers import open_capture, read_capture, sample
 from core.io.readers.labelled import dataset, describe
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 from core.out_of_core import tiles as large
 from core.out_of_core.tiles import IMAGES, as_image, computed, estimate_large
 from core.scene import Scene, scenes
@@ -130,7 +130,7 @@ def test_what_is_guessed_does_not_depend_on_the_way_in(tmp_path: Path, suffix: s
     else:
         named.to_netcdf(path, engine="h5netcdf")
     read, opened = read_capture(path), open_capture(path)
-    acquisition, pulse, detection, source = describe(opened, Request())
+    acquisition, pulse, detection, source = describe(opened, ReadOptions())
     assert (acquisition, pulse) == (read.acquisition, read.pulse)
     assert (detection, source) == (read.detection, read.source) and detection == "all"
     assert pulse.tau_s == pytest.approx(3e-9, rel=0.2)

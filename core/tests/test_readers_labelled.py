@@ -26,7 +26,7 @@ from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
 from core.io.readers import guards, isolation, open_capture, read_capture
 from core.io.readers.labelled import dataset, describe, oriented
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 from core.io.readers.stored import Stored, choose
 from core.tests.formats import Content, bare, put
 from core.tests.labelled_files import Reads, hdf5_bytes, netcdf_bytes, zarr_files
@@ -64,7 +64,7 @@ def test_our_own_layout_keeps_everything(name: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.truth_range_m, CAPTURE.truth_range_m)
     np.testing.assert_array_equal(read.signal, CAPTURE.signal)
     opened = open_capture(path)
-    assert describe(opened, Request()) == (ACQUISITION, CAPTURE.pulse, "first", "a wall")
+    assert describe(opened, ReadOptions()) == (ACQUISITION, CAPTURE.pulse, "first", "a wall")
     assert opened.attrs["background"] == 1.5
     again = read_capture(put(tmp_path / "again.nc", netcdf_bytes(opened.to_dataset())))
     np.testing.assert_array_equal(again.cube, CAPTURE.cube)
@@ -96,7 +96,7 @@ def test_axes_and_times_are_known_by_their_names(tmp_path: Path) -> None:
         assert opened.dims == ("row", "col", "bin") and opened.dtype == np.uint16
         assert opened.chunks is not None and opened.chunks[2] == (100,)
         np.testing.assert_array_equal(opened, CUBE)
-        found = describe(opened, Request())
+        found = describe(opened, ReadOptions())
         assert found.acquisition == Acquisition(100, *_timing(capture), 500, None)
         assert found.source.endswith(f"guessed: {guessed}, first photons only")
 
@@ -134,7 +134,7 @@ def test_common_stop_counts_backwards(tmp_path: Path) -> None:
     capture, opened = read_capture(path, **told), open_capture(path, **told)
     for counts, acquisition in (
         (capture.cube, capture.acquisition),
-        (opened.values, describe(opened, Request()).acquisition),
+        (opened.values, describe(opened, ReadOptions()).acquisition),
     ):
         np.testing.assert_array_equal(counts, CUBE)
         assert acquisition.gate_delay_s == pytest.approx(1e-6, rel=1e-12)
@@ -261,7 +261,7 @@ def test_counts_are_checked_when_they_are_read(tmp_path: Path) -> None:
 def test_other_files_are_opened_by_reading_them(tmp_path: Path) -> None:
     opened = open_capture(put(tmp_path / "c.npy", npy_bytes(CUBE)), bin_width_s=2e-9)
     np.testing.assert_array_equal(opened, CUBE)
-    assert describe(opened, Request()).acquisition.bin_width_s == 2e-9
+    assert describe(opened, ReadOptions()).acquisition.bin_width_s == 2e-9
     assert opened.attrs["source"].startswith("c.npy; guessed: axes")
     with pytest.raises(CaptureError, match=r"c.npy: n_bins = 99"):
         open_capture(tmp_path / "c.npy", n_bins=99)
@@ -274,15 +274,15 @@ def test_other_files_are_opened_by_reading_them(tmp_path: Path) -> None:
 def test_any_labelled_array_is_described() -> None:
     array = xr.DataArray(CUBE, dims=("y", "x", "t"), coords={"t": 5.0 + np.arange(100)})
     array.t.attrs["units"] = "ns"
-    known = describe(oriented(array, Request()), Request(), "mine")
+    known = describe(oriented(array, ReadOptions()), ReadOptions(), "mine")
     assert known.acquisition.gate_delay_s == pytest.approx(5e-9)
     guessed = "t is when a bin opens, pulse Gaussian of 1 ns, all photons of a pulse"
     assert known.source == f"mine; guessed: {guessed}"
     array.t.attrs["units"] = "furlongs"
-    known = describe(oriented(array, Request()), Request(), "mine")
+    known = describe(oriented(array, ReadOptions()), ReadOptions(), "mine")
     assert "guessed: t, of unit 'furlongs', left out, bin width 1 ns" in known.source
     array.t.attrs["units"] = "nanoseconds"
-    assert describe(oriented(array, Request()), Request()).acquisition.bin_width_s == 1e-9
+    assert describe(oriented(array, ReadOptions()), ReadOptions()).acquisition.bin_width_s == 1e-9
 
 
 # -- filters and codecs ----------------------------------------------------------------------------
@@ -549,7 +549,7 @@ def test_external_data_is_never_touched(tmp_path: Path) -> None:
 def test_what_repeats_or_swells_is_refused(tmp_path: Path) -> None:
     twice = [Stored("counts"), Stored("counts")]
     with pytest.raises(ValueError, match="arrays named 'counts' = 2"):
-        choose(twice, Request())
+        choose(twice, ReadOptions())
 
     def told(file: h5py.File) -> None:
         for k in range(600):

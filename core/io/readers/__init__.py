@@ -6,17 +6,20 @@ A new format is a module with ``read(path, request) -> Capture`` and a line in `
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from textwrap import fill
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from core.acquisition import Pulse
-from core.capture import Capture, CaptureError, Detection
+from core.capture import Capture, CaptureError
 from core.checks import refusing, require, shown
 from core.io.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820, zarr
 from core.io.readers.content import Reader, decompressed, is_gzip, reader_of, suffixes_of
 from core.io.readers.guards import MAX_CUBE_BYTES, FileVersion
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions, reading_options
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,6 +33,8 @@ __all__ = [
     "open_capture",
     "read_capture",
 ]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 _LABELLED = (labelled.read, labelled.recognizes, labelled.open_counts)
 
@@ -50,24 +55,26 @@ SUFFIXES: Mapping[str, str] = suffixes_of(READERS)
 """One-line description of the format of each suffix."""
 
 
-def read_capture(
-    path: str | os.PathLike[str],
-    *,
-    time_unit_s: float | None = None,
-    bin_width_s: float | None = None,
-    gate_delay_s: float | None = None,
-    n_bins: int | None = None,
-    n_pulses: int | None = None,
-    variable: str | None = None,
-    pulse: Pulse | None = None,
-    pixel_angle_rad: float | None = None,
-    detection: Detection | None = None,
-    axes: str | None = None,
-    shape: tuple[int, int] | None = None,
-    stop_s: float | None = None,
-    no_trigger: int | None = None,
-    first_detections: int | None = None,
-) -> Capture:
+def _with_options(function: Function) -> Function:
+    """Add the fields of `ReadOptions` to the signature and the documentation of a function."""
+    indent = " " * 8
+    entries = []
+    for name, option in reading_options().items():
+        entries.append(f"    {name} : {option.kind.annotation}, optional")
+        entries.append(fill(option.help, 92, initial_indent=indent, subsequent_indent=indent))
+    function.__doc__ = str(function.__doc__).replace("    **given", "\n".join(entries), 1)
+    given = signature(function)
+    named = [
+        Parameter(each.name, Parameter.KEYWORD_ONLY, default=None, annotation=each.type)
+        for each in fields(ReadOptions)
+    ]
+    positional = [each for each in given.parameters.values() if each.name != "given"]
+    function.__signature__ = given.replace(parameters=[*positional, *named])  # type: ignore[attr-defined]
+    return function
+
+
+@_with_options
+def read_capture(path: str | os.PathLike[str], **given: Any) -> Capture:
     """Read a capture from a file; the content determines the format, and any may be gzipped.
 
     None takes a value from the file, or guesses it where the file does not specify it; ``.source``
@@ -78,39 +85,7 @@ def read_capture(
     ----------
     path : path-like
         A file of one of the `READERS`, or a Zarr directory.
-    time_unit_s : float, optional
-        Unit of the arrival times in seconds; only for a file that holds such.
-    bin_width_s : float, optional
-        Width of a bin in seconds.
-    gate_delay_s : float, optional
-        Time from the pulse to the first bin in seconds. Photons before are dropped.
-    n_bins : int, optional
-        Bins in the gate. Photons after are dropped; a cube must have just as many.
-    n_pulses : int, optional
-        Pulses sent for each pixel. Never guessed.
-    variable : str, optional
-        Name of the array to read, where the file holds several.
-    pulse : Pulse, optional
-        Shape of an echo.
-    pixel_angle_rad : float, optional
-        Angle between neighbouring pixels in radians.
-    detection : str, optional
-        ``"first"`` or ``"all"``, see `Capture`. Guessed to be first photons where the number of
-        pulses is known and no pixel has more photons.
-    axes : str, optional
-        Names of the file's axes in its own order, such as ``"bin row col"`` or, for raw frames,
-        ``"pulse col row"``, or for lists of photons ``"col row"``.
-    shape : tuple of int, optional
-        Rows and columns of a file that lists its pixels one after the other.
-    stop_s : float, optional
-        For common-stop instruments: times count backwards from this time after the pulse, often
-        the laser's period.
-    no_trigger : int, optional
-        For raw frames (pulse, row, col) of trigger bins: value that marks no
-        trigger. Declares the array of a ``.npy`` or ``.npz`` file as such frames.
-    first_detections : int, optional
-        Keep so many detections of each pixel, in the order of the file; only for a file that lists
-        photons.
+    **given
 
     Returns
     -------
@@ -119,31 +94,16 @@ def read_capture(
     Raises
     ------
     CaptureError
-        Whatever is wrong with the file or its description: names the file, the field, its value
-        and the remedy.
+        If the file or an option is refused: names the file, the field, its value and the remedy.
     """
     path = Path(path)
+    request = _request_of("read_capture", path, given)
     with refusing(path, CaptureError):
-        request = Request(
-            time_unit_s=time_unit_s,
-            bin_width_s=bin_width_s,
-            gate_delay_s=gate_delay_s,
-            n_bins=n_bins,
-            n_pulses=n_pulses,
-            variable=variable,
-            pulse=pulse,
-            pixel_angle_rad=pixel_angle_rad,
-            detection=detection,
-            axes=axes,
-            shape=shape,
-            stop_s=stop_s,
-            no_trigger=no_trigger,
-            first_detections=first_detections,
-        )
         return _read(path, request)
 
 
-def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
+@_with_options
+def open_capture(path: str | os.PathLike[str], **given: Any) -> xr.DataArray:
     """Open a capture without reading its counts, as one larger than memory must be.
 
     Parameters
@@ -151,8 +111,7 @@ def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
     path : path-like
         As for `read_capture`. Parts of HDF5, netCDF and Zarr are read when they are needed,
         whatever the size of the file; other files are read at once.
-    **options
-        As for `read_capture`.
+    **given
 
     Returns
     -------
@@ -168,11 +127,8 @@ def open_capture(path: str | os.PathLike[str], **options: Any) -> xr.DataArray:
         As `read_capture`.
     """
     path = Path(path)
-    unknown = sorted(options.keys() - Request.__dataclass_fields__.keys())
-    if unknown:
-        raise TypeError(f"open_capture() got unexpected arguments: {', '.join(unknown)}")
+    request = _request_of("open_capture", path, given)
     with refusing(path, CaptureError):
-        request = Request(**options)
         _require_exists(path)
         open_counts = None if is_gzip(path) else reader_of(path, READERS).open_counts
         if open_counts is None:
@@ -197,7 +153,15 @@ def bytes_of(path: str | os.PathLike[str], **options: Any) -> int | None:
     return int(open_capture(path, **options | {"pulse": Pulse(), "detection": "all"}).nbytes)
 
 
-def _read(path: Path, request: Request) -> Capture:
+def _request_of(function: str, path: Path, given: Mapping[str, Any]) -> ReadOptions:
+    """Return a request with the options given to a function."""
+    if unknown := sorted(given.keys() - reading_options().keys()):
+        raise TypeError(f"{function}() got unexpected arguments: {', '.join(unknown)}")
+    with refusing(path, CaptureError):
+        return ReadOptions(**given)
+
+
+def _read(path: Path, request: ReadOptions) -> Capture:
     """Read a file, which must not change meanwhile."""
     _require_exists(path)
     with FileVersion.of(path).unchanged(), decompressed(path) as plain:

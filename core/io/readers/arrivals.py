@@ -37,9 +37,10 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import count_dtype, guess_detection
 from core.io.readers.guards import require_fits
+from core.io.readers.options import ReadOptions
 from core.io.readers.pulse_guess import guessed_pulse
-from core.io.readers.request import Request
-from core.io.readers.wording import guesses, sentence, time_text
+from core.io.readers.times import time_text
+from core.io.readers.wording import guesses, sentence
 
 NATIVE_BIN_S = 8e-12
 PICOSECONDS_ABOVE = 100_000
@@ -60,7 +61,7 @@ def arrivals_capture(
     shape: tuple[int, int],
     name: str,
     origin: str,
-    request: Request,
+    request: ReadOptions,
 ) -> Capture:
     """A capture from the arrival time of each photon.
 
@@ -163,7 +164,7 @@ def guess_ticks_per_bin(
     return per_bin
 
 
-def _gate(ticks: Floats, tick_s: float, request: Request) -> tuple[float, float, int]:
+def _gate(ticks: Floats, tick_s: float, request: ReadOptions) -> tuple[float, float, int]:
     """Width of a bin and opening of the gate, both in ticks, and the number of bins."""
     delay_s, width_s = request.gate_delay_s, request.bin_width_s
     delay = None if delay_s is None else float(_snapped(delay_s / tick_s))

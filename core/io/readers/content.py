@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.guards import decoding, require_fits
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -66,9 +66,9 @@ class Reader:
 
     title: str
     suffixes: tuple[str, ...]
-    read: Callable[[Path, Request], Capture]
+    read: Callable[[Path, ReadOptions], Capture]
     recognizes: Callable[[bytes], bool] = never
-    open_counts: Callable[[Path, Request], xr.DataArray] | None = None
+    open_counts: Callable[[Path, ReadOptions], xr.DataArray] | None = None
     folder_marks: tuple[str, ...] = ()
 
 

@@ -18,9 +18,10 @@ from core.acquisition import MOST_BINS, SHORTEST_PULSE_S, Acquisition, Pulse, re
 from core.capture import COUNT_TYPES, Capture, Detection
 from core.checks import require
 from core.io.readers.guards import require_fits
+from core.io.readers.options import ReadOptions
 from core.io.readers.pulse_guess import guessed_pulse
-from core.io.readers.request import Request
-from core.io.readers.wording import guesses, sentence, time_text
+from core.io.readers.times import time_text
+from core.io.readers.wording import guesses, sentence
 
 AXES = ("row", "col", "bin")
 
@@ -119,7 +120,7 @@ def cube_capture(
     cube: NDArray[Any],
     name: str,
     origin: str,
-    request: Request,
+    request: ReadOptions,
     axes: str | None = None,
     guessed_bin_width_s: float | None = None,
 ) -> Capture:
@@ -153,7 +154,7 @@ def cube_capture(
 def dense_capture(
     counts: NDArray[np.unsignedinteger],
     origin: str,
-    request: Request,
+    request: ReadOptions,
     assumed_pulse: Pulse | None = None,
     also_guessed: Sequence[str] = (),
     guessed_bin_width_s: float | None = None,

@@ -23,7 +23,7 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import count_dtype, dense_capture
 from core.io.readers.guards import decoding, require_fits
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 AXES = ("pulse", "row", "col")
 STRETCH = 2**20
@@ -39,7 +39,7 @@ def frames_capture(
     no_trigger: int,
     name: str,
     origin: str,
-    request: Request,
+    request: ReadOptions,
     first_bin: int | None = None,
     bin_width_s: float | None = None,
     also_guessed: Sequence[str] = (),
@@ -133,7 +133,7 @@ def stretches_of(
     file: IO[bytes],
     shape: tuple[int, ...],
     dtype: np.dtype[Any],
-    request: Request,
+    request: ReadOptions,
     fortran_order: bool = False,
 ) -> tuple[Iterable[Stretch], tuple[int, int, int]]:
     """Frames from an open file, and their number, rows and columns.
@@ -145,7 +145,7 @@ def stretches_of(
     shape : tuple of int
         Of that array.
     dtype : dtype
-    request : Request
+    request : ReadOptions
         May give the order of the axes.
     fortran_order : bool
         Whether the first axis of the array is the fastest.

@@ -19,7 +19,7 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers.frames import AXES, STRETCH, Stretch, frames_capture
 from core.io.readers.guards import decoding
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 N_BINS = 153
 BIN_WIDTH_S = 250e-12
@@ -31,7 +31,7 @@ _FRAME_BYTES = _FRAME[0] * _FRAME[1] * 2
 _NO_TRIGGER = 0
 
 
-def read(path: Path, request: Request) -> Capture:
+def read(path: Path, request: ReadOptions) -> Capture:
     """Read the frames of a camera."""
     request.refuse(["variable"], "a .bin file holds frames alone")
     request.refuse(["no_trigger"], "0 stands where nothing fired")

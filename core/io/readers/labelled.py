@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from core.acquisition import SPEED_OF_LIGHT_M_S, Acquisition, Floats, Pulse
 from core.capture import COUNT_TYPES, Capture, CaptureError, Detection
 from core.checks import require
-from core.io.readers import hdf5, wording, zarr
+from core.io.readers import hdf5, zarr
 from core.io.readers.dense import (
     AXES,
     PULSE,
@@ -40,10 +40,11 @@ from core.io.readers.dense import (
     whole_counts,
 )
 from core.io.readers.guards import require_fits
+from core.io.readers.options import ReadOptions
 from core.io.readers.pulse_guess import guessed_pulse
-from core.io.readers.request import Request
 from core.io.readers.sample import sample_of
 from core.io.readers.stored import Numbers, Stored, choose, whole
+from core.io.readers.times import UNITS_S as TIME_UNITS_S
 from core.io.readers.wording import guesses, sentence
 
 if TYPE_CHECKING:
@@ -57,8 +58,8 @@ NAMES = {
 """Names by which each axis is known, in small letters."""
 
 _SECONDS = {"": "s", "milli": "ms", "micro": "us", "nano": "ns", "pico": "ps"}
-UNITS_S = wording.UNITS_S | {
-    f"{name}second{s}": wording.UNITS_S[unit] for s in ("", "s") for name, unit in _SECONDS.items()
+UNITS_S = TIME_UNITS_S | {
+    f"{name}second{s}": TIME_UNITS_S[unit] for s in ("", "s") for name, unit in _SECONDS.items()
 }
 UNITS_S |= dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 2 / SPEED_OF_LIGHT_M_S)
 UNITS_S["km"] = 1e3 * UNITS_S["m"]
@@ -175,7 +176,7 @@ class _File:
         missing = {name: value for name, value in told.items() if value is not None}
         return Counts(chosen.numbers, chosen.name, self.path.name, missing)
 
-    def labelled(self, chosen: Stored, data: Any, request: Request) -> xr.DataArray:
+    def labelled(self, chosen: Stored, data: Any, request: ReadOptions) -> xr.DataArray:
         """Counts with the names, coordinates and attributes that the file gives them."""
         import xarray as xr  # noqa: PLC0415
 
@@ -206,7 +207,7 @@ class _File:
         coords = xr.Coordinates(beside, indexes={})
         return xr.DataArray(data, coords=coords, dims=dims, name=name, attrs=known)
 
-    def image(self, chosen: Stored, name: str, request: Request) -> Floats | None:
+    def image(self, chosen: Stored, name: str, request: ReadOptions) -> Floats | None:
         """Read an image (row, col) that accompanies the counts; None if the file has none."""
         prefix = chosen.name.removesuffix("counts")
         dims = _named_axes(chosen, request)
@@ -231,7 +232,7 @@ def recognizes(start: bytes) -> bool:
     return start[:4] in hdf5.CLASSIC_SIGNATURES or (is_hdf5 and not start.startswith(b"MATLAB"))
 
 
-def read(path: Path, request: Request) -> Capture:
+def read(path: Path, request: ReadOptions) -> Capture:
     """Read counts and, from a file of our own layout, the ground truth."""
     file = _File(path)
     chosen = choose(file.arrays, request)
@@ -253,14 +254,14 @@ def read(path: Path, request: Request) -> Capture:
     )
 
 
-def open_counts(path: Path, request: Request) -> xr.DataArray:
+def open_counts(path: Path, request: ReadOptions) -> xr.DataArray:
     """Open counts lazily; `describe` then has nothing left to guess.
 
     Parameters
     ----------
     path : Path
         Of an HDF5 or netCDF file, or a Zarr directory.
-    request : Request
+    request : ReadOptions
 
     Returns
     -------
@@ -285,14 +286,14 @@ def open_counts(path: Path, request: Request) -> xr.DataArray:
     return completed(counts, known)
 
 
-def _named_axes(chosen: Stored, request: Request) -> tuple[str, ...]:
+def _named_axes(chosen: Stored, request: ReadOptions) -> tuple[str, ...]:
     """Return the names of an array's axes, guessed if the file gives none."""
     if _guessed(chosen, request):
         return AXES
     return tuple(name or f"axis_{k}" for k, name in enumerate(chosen.axes))
 
 
-def _guessed(chosen: Stored, request: Request) -> list[str]:
+def _guessed(chosen: Stored, request: ReadOptions) -> list[str]:
     """Return the guess of the axes if neither the file nor the request names any."""
     nameless = chosen.n_axes == len(AXES) and not any(chosen.axes) and request.axes is None
     return [f"axes ({', '.join(AXES)})"] if nameless else []
@@ -356,7 +357,7 @@ def completed(counts: xr.DataArray, known: Description) -> xr.DataArray:
     return labelled
 
 
-def oriented(counts: xr.DataArray, request: Request) -> xr.DataArray:
+def oriented(counts: xr.DataArray, request: ReadOptions) -> xr.DataArray:
     """The array with its axes named and ordered (row, col, bin).
 
     The bins of a common-stop instrument (``stop_s``) are reversed.
@@ -386,7 +387,7 @@ def oriented(counts: xr.DataArray, request: Request) -> xr.DataArray:
     return labelled if request.stop_s is None else labelled.isel(bin=slice(None, None, -1))
 
 
-def _places(dims: tuple[str, ...], request: Request, name: str) -> tuple[int, ...]:
+def _places(dims: tuple[str, ...], request: ReadOptions, name: str) -> tuple[int, ...]:
     """Return the positions of row, col and bin among the axes of an array."""
     require(f"axes of {name}", dims, len(dims) == 3, "three: row, col and bin")
     order = request.order(AXES)
@@ -406,7 +407,7 @@ def _with_unit(name: str, known: Mapping[Any, Any]) -> dict[Any, Any]:
 
 
 def describe(
-    counts: xr.DataArray, request: Request, origin: str = "", also_guessed: Sequence[str] = ()
+    counts: xr.DataArray, request: ReadOptions, origin: str = "", also_guessed: Sequence[str] = ()
 ) -> Description:
     """Describe counts by the request, the attributes and the coordinates; guess the rest.
 
@@ -414,7 +415,7 @@ def describe(
     ----------
     counts : DataArray, shape (row, col, bin)
         As `oriented` gives them; a sample is looked at where pulse or detection must be guessed.
-    request : Request
+    request : ReadOptions
         Takes precedence over the attributes of the array.
     origin : str
         Origin of the capture if its attributes name none.
@@ -458,7 +459,7 @@ def describe(
         told["n_pulses"] = int(told["n_pulses"]) or None
     pulse = request.pulse or _pulse(known)
     detection = request.detection or known.get("detection")
-    complete = Request(**told, n_bins=n_bins, pulse=pulse, detection=detection)
+    complete = ReadOptions(**told, n_bins=n_bins, pulse=pulse, detection=detection)
     acquisition = Acquisition(
         n_bins=n_bins,
         bin_width_s=1e-9 if complete.bin_width_s is None else complete.bin_width_s,

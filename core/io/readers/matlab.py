@@ -27,7 +27,7 @@ from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
 from core.io.readers.dense import cube_capture
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 from core.io.readers.sparse import Sparse, sparse_capture
 from core.io.readers.stored import Numbers, Stored, whole
 
@@ -166,7 +166,7 @@ def recognizes(start: bytes) -> bool:
     return start[124:128] in _VERSIONS_5 or hdf5.SIGNATURE in (start[:8], start[512:520])
 
 
-def read(path: Path, request: Request) -> Capture:
+def read(path: Path, request: ReadOptions) -> Capture:
     """Read a cell array of arrival times, a cube, or a sparse matrix."""
     with path.open("rb") as opened:
         start = opened.read(_USER_BLOCK + len(hdf5.SIGNATURE))

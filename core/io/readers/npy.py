@@ -19,7 +19,7 @@ from core.checks import require
 from core.io.readers.dense import cube_capture
 from core.io.readers.frames import AXES, frames_capture, require_frames, stretches_of
 from core.io.readers.guards import decoding, require_fits
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 
 class Header(NamedTuple):
@@ -35,7 +35,7 @@ def recognizes(start: bytes) -> bool:
     return start.startswith(npy_format.MAGIC_PREFIX)
 
 
-def read(path: Path, request: Request) -> Capture:
+def read(path: Path, request: ReadOptions) -> Capture:
     """Read a cube, or frames; everything else is given or guessed."""
     require("variable", request.variable, request.variable is None, "None: .npy holds one array")
     size = path.stat().st_size
@@ -46,7 +46,7 @@ def read(path: Path, request: Request) -> Capture:
     return cube_capture(cube, "the array", path.name, request)
 
 
-def frames_in(file: IO[bytes], size: int, name: str, origin: str, request: Request) -> Capture:
+def frames_in(file: IO[bytes], size: int, name: str, origin: str, request: ReadOptions) -> Capture:
     """A capture from an array of frames in a file of `size` bytes, counted as they are read.
 
     Parameters are those of `read_array` and `core.io.readers.frames.frames_capture`; the request's

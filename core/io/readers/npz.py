@@ -56,7 +56,7 @@ from core.io.readers.dense import (
 )
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.npy import Header, frames_in, read_array, read_header
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 FORMAT = "firstphoton-capture-1"
 
@@ -94,7 +94,7 @@ def recognizes(start: bytes) -> bool:
     return start.startswith((b"PK\x03\x04", b"PK\x05\x06"))
 
 
-def read(path: Path, request: Request) -> Capture:
+def read(path: Path, request: ReadOptions) -> Capture:
     """Read our own layout, the one cube of an archive, or raw frames."""
     with decoding("the archive"):
         archive = ZipFile(path)
@@ -121,7 +121,7 @@ def _frames(
     name: str,
     stored: Mapping[str, NDArray[Any]],
     origin: str,
-    request: Request,
+    request: ReadOptions,
 ) -> Capture:
     """A capture from frames, which are counted as they are unpacked."""
     no_trigger = request.no_trigger
@@ -138,7 +138,7 @@ def _frames(
     return _completed(capture, archive, stored, request)
 
 
-def _known(stored: Mapping[str, NDArray[Any]], request: Request) -> Request:
+def _known(stored: Mapping[str, NDArray[Any]], request: ReadOptions) -> ReadOptions:
     """The request, completed by the fields of our layout."""
     version = _text(stored, "format", FORMAT)
     require("format", version, version == FORMAT, FORMAT)
@@ -155,7 +155,7 @@ def _known(stored: Mapping[str, NDArray[Any]], request: Request) -> Request:
 
 
 def _completed(
-    capture: Capture, archive: ZipFile, stored: Mapping[str, NDArray[Any]], request: Request
+    capture: Capture, archive: ZipFile, stored: Mapping[str, NDArray[Any]], request: ReadOptions
 ) -> Capture:
     """Add the ground truth to a capture after checking the length of its pulse."""
     if request.pulse is None:
@@ -228,7 +228,7 @@ def _names(archive: ZipFile) -> list[str]:
     return [name.removesuffix(".npy") for name in counted if name.endswith(".npy")]
 
 
-def _choose(archive: ZipFile, names: list[str], request: Request) -> str:
+def _choose(archive: ZipFile, names: list[str], request: ReadOptions) -> str:
     """The array asked for, or ``cube``, or ``frames``, or the only array with three axes."""
     listed, variable = ", ".join(names) or "none", request.variable
     if variable is not None:

@@ -25,7 +25,7 @@ from core.checks import require
 from core.io.readers.dense import AXES, cube_capture
 from core.io.readers.guards import MAX_CUBE_BYTES, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 _BYTES_A_RECORD = 4
 _BYTES_A_COUNT = 4
@@ -48,7 +48,7 @@ def recognizes(start: bytes) -> bool:
     return start.startswith(b"PQTTTR")
 
 
-def read(path: Path, request: Request) -> Capture:
+def read(path: Path, request: ReadOptions) -> Capture:
     """Read the histograms of an image."""
     told, _ = isolated(path, "the header", "list_ptu")
     tags = told["tags"]

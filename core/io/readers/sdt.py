@@ -23,7 +23,7 @@ from core.checks import require
 from core.io.readers.dense import AXES, cube_capture
 from core.io.readers.guards import MAX_CUBE_BYTES, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 _HISTOGRAMS = {0x00: "decay curves", 0x10: "pages", 0x60: "an image"}
 _CONTENT = 0xF0
@@ -35,7 +35,7 @@ def recognizes(start: bytes) -> bool:
     return start[_VALID_AT : _VALID_AT + 2] == _VALID
 
 
-def read(path: Path, request: Request) -> Capture:
+def read(path: Path, request: ReadOptions) -> Capture:
     """Read the histograms of a block."""
     memory = 2 * MAX_CUBE_BYTES
     told, _ = isolated(path, "the list of blocks", "list_sdt", memory)

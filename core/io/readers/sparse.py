@@ -18,7 +18,7 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import LARGEST_COUNT, count_dtype, dense_capture
 from core.io.readers.guards import require_fits
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 
 class Sparse(NamedTuple):
@@ -35,7 +35,7 @@ class Sparse(NamedTuple):
 
 
 def sparse_capture(
-    matrix: Sparse, name: str, origin: str, request: Request, bin_width_s: float | None = None
+    matrix: Sparse, name: str, origin: str, request: ReadOptions, bin_width_s: float | None = None
 ) -> Capture:
     """A capture from a sparse matrix (pixel, bin).
 
@@ -44,7 +44,7 @@ def sparse_capture(
     matrix : Sparse
     name, origin : str
         Name of the matrix in errors, and origin of the capture in its source.
-    request : Request
+    request : ReadOptions
     bin_width_s : float, optional
         Used if none is given.
 

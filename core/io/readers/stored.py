@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from core.checks import require
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 
 _SMALL_CHUNK = 2**24  # bytes, however small the array
 _MOST_CHUNKS = 2**24  # of one array
@@ -136,7 +136,7 @@ class Stored:
         return 0 if self.numbers is None else len(self.numbers.shape)
 
 
-def choose(arrays: Sequence[Stored], request: Request) -> Stored:
+def choose(arrays: Sequence[Stored], request: ReadOptions) -> Stored:
     """Choose the requested array, else ``counts``, else the only one with three axes.
 
     Raises

@@ -42,8 +42,8 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import AXES, dense_capture, require_pulse_in_gate, whole_counts
 from core.io.readers.guards import decoding, require_fits
-from core.io.readers.request import Request
-from core.io.readers.wording import time_text
+from core.io.readers.options import ReadOptions
+from core.io.readers.times import time_text
 
 BIN_WIDTH_S = 91e-12
 PEAK_AT_0_M_S = 1.1e-9
@@ -59,7 +59,7 @@ def recognizes(start: bytes) -> bool:
     return start.lstrip().startswith(b"[") and b"\0" not in start
 
 
-def read(path: Path, request: Request) -> Capture:
+def read(path: Path, request: ReadOptions) -> Capture:
     """Read all records, or one."""
     require_fits("the records", path.stat().st_size * _MEMORY_A_BYTE)
     records = _records(path.read_bytes())
@@ -82,7 +82,7 @@ def read(path: Path, request: Request) -> Capture:
 
 
 def _capture(
-    cube: NDArray[Any], reference: Floats | None, origin: str, request: Request
+    cube: NDArray[Any], reference: Floats | None, origin: str, request: ReadOptions
 ) -> Capture:
     """Build a capture with this sensor's default times."""
     counts = whole_counts(cube, "hists")

@@ -7,23 +7,12 @@ from collections.abc import Iterable
 from core.acquisition import Acquisition, Pulse
 from core.capture import Detection
 from core.checks import printable
-from core.io.readers.request import Request
-
-UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15}
-"""Seconds of each unit of time, by its symbol."""
-
-
-def time_text(time_s: float) -> str:
-    """A time in the unit that suits it: 6.4e-11 is "64 ps"."""
-    for unit in ("s", "ms", "µs", "ns"):
-        scale = UNITS_S[unit]
-        if time_s >= scale * (1 - 1e-9):
-            return f"{time_s / scale:.6g} {unit}"
-    return f"{time_s * 1e12:.6g} ps"
+from core.io.readers.options import ReadOptions
+from core.io.readers.times import time_text
 
 
 def guesses(
-    request: Request,
+    request: ReadOptions,
     acquisition: Acquisition,
     pulse: Pulse,
     detection: Detection,

@@ -25,7 +25,7 @@ from core.estimators import settings_of
 from core.io.readers import open_capture
 from core.io.readers.dense import AXES
 from core.io.readers.labelled import dataset, describe
-from core.io.readers.request import Request
+from core.io.readers.options import ReadOptions
 from core.io.writers.whole import whole_folder
 from core.out_of_core.tiles import IMAGES, estimate_large, learned, range_part
 from core.scene import Scene, scenes
@@ -135,7 +135,7 @@ def study(path: Path, workers: int, memory_bytes: int, progress: Progress) -> It
 
 def _one_by_one(path: Path, progress: Progress) -> tuple[NDArray[Any], int]:
     counts = open_capture(path)
-    description, settings = describe(counts, Request()), settings_of(METHOD)
+    description, settings = describe(counts, ReadOptions()), settings_of(METHOD)
     flux_prior, calibration, _ = learned(counts.data, description, METHOD, settings, None)
     images = np.empty((*counts.shape[:2], len(IMAGES)))
     parts = list(da.core.slices_from_chunks(counts.data.chunks[:2]))

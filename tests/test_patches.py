@@ -1,87 +1,71 @@
-"""What is done in the place of Panel and Bokeh gives what they give."""
+"""Patches of Panel and Bokeh: they can be left out, and give what the libraries give."""
 
 from __future__ import annotations
 
 import gc
 import json
 import weakref
-from importlib import import_module
+from pathlib import Path
 
 import numpy as np
-import panel as pn
 import pytest
 from bokeh.core.property.descriptors import PropertyDescriptor
 from bokeh.core.serialization import Deserializer, Serializer, UnknownReferenceError
 from bokeh.document import Document
-from bokeh.document.events import ModelChangedEvent
 from bokeh.models import ColumnDataSource, Line, Range1d
 from bokeh.plotting import figure
-from bokeh.protocol import Protocol
-from panel.io.document import _destroy_document
+from playwright.sync_api import expect
 
+import app.server.patches
 from app.server.garbage import collect_all, spare
-from app.server.patches.latency import (
-    FEW_BYTES,
-    REPLACED,
-    QuickDeserializer,
-    QuickSerializer,
-    _kept,
-)
-from app.widgets.component import Component
-from app.widgets.controls import Knob, PixelKeys
+from app.server.patches import OFF_VARIABLE, PATCHES, Patch, in_use
+from app.server.patches.default_values import cached
+from app.server.patches.incoming_messages import QuickDeserializer
+from app.server.patches.outgoing_messages import INLINE_BYTES, QuickSerializer
+from tests.browser import fact, open_page, serving
+from tests.test_browser import slider
 
-# -- components ------------------------------------------------------------------------------------
+FOLDER = Path(app.server.patches.__file__).parent
 
-
-def shown(component):
-    """A component's model in a page of its own."""
-    component.server_doc(Document())
-    ((model, _),) = component._models.values()
-    return model
+# -- switches --------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def knob():
-    return Knob(label="l", value=0.5, low=0.0, high=1.0)
+def test_each_patch_is_a_file_that_states_its_upstream_issue():
+    files = [*FOLDER.glob("*.js"), *(f for f in FOLDER.glob("*.py") if f.stem != "__init__")]
+    assert sorted(f.stem for f in files) == sorted(patch.name for patch in PATCHES)
+    for file in files:
+        assert "Upstream:" in file.read_text(encoding="utf-8"), file.name
 
 
-def test_a_value_goes_to_the_page_and_no_other_does(knob):
-    model = shown(knob)
-    before = model.data.properties_with_values()
-    knob.value = 0.25
-    knob.param.update(high=2.0, label="L")
-    after = model.data.properties_with_values()
-    changed = {name: after[name] for name in after if after[name] != before[name]}
-    assert changed == {"value": 0.25, "high": 2.0, "label": "L"}
+def test_patches_are_left_out_by_name(monkeypatch):
+    monkeypatch.setenv(OFF_VARIABLE, "debounce, legend_items")
+    assert len(list(in_use())) == len(PATCHES) - 2
+    assert not {"debounce", "legend_items"} & {patch.name for patch in in_use()}
+    monkeypatch.setenv(OFF_VARIABLE, "all")
+    assert not list(in_use())
+    monkeypatch.setenv(OFF_VARIABLE, "debonce")
+    with pytest.raises(ValueError, match="debonce"):
+        list(in_use())
 
 
-def test_a_value_comes_from_the_page_and_is_not_sent_back(knob):
-    model, heard, changes = shown(knob), [], []
-    knob.param.watch(lambda event: heard.append(event.new), "value")
-    model.document.on_change(lambda event: changes.append((event.attr, event.new)))
-    model.data.value = 0.75
-    assert heard == [knob.value] == [0.75]
-    assert changes == [("value", 0.75)]  # the page's own
+def test_a_patch_for_another_version_is_left_out_with_a_warning(caplog):
+    newer, present = Patch("newer", {"bokeh": "99.1"}), Patch("present", {"bokeh": "3"})
+    assert list(in_use((newer, present))) == [present]
+    assert "newer is left out: bokeh" in caplog.text
 
 
-def test_what_is_made_of_a_value_from_the_page_is_sent(knob):
-    model = shown(knob)
-    knob.param.watch(lambda event: setattr(knob, "value", round(event.new, 1)), "value")
-    model.data.value = 0.777
-    assert knob.value == model.data.value == 0.8
-
-
-def test_what_is_no_value_of_its_own_goes_as_panel_has_it(knob):
-    model = shown(knob)
-    knob.param.update(visible=False, value=0.1)
-    assert not model.visible
-    assert model.data.value == 0.1
-
-
-def test_a_child_is_no_plain_value():
-    assert PixelKeys._are_plain({"pixel": [1, 2], "shape": [3, 3]})
-    assert not PixelKeys._are_plain({"child": None})
-    assert not Component._are_plain({"visible": True})
+@pytest.mark.browser
+def test_the_app_works_with_all_patches_off(browser):
+    with serving(**{OFF_VARIABLE: "all"}) as address:
+        page = open_page(browser, address)
+        rmse = fact(page, "RMSE").inner_text()
+        for _ in range(5):
+            slider(page, "SBR").press("ArrowRight")
+        expect(fact(page, "RMSE")).not_to_have_text(rmse)
+        for name in ("Inspect", "Compare"):
+            page.get_by_role("button", name=name, exact=True).click()
+            expect(page.locator(".bk-Figure").filter(visible=True).first).to_be_visible()
+        page.close()
 
 
 # -- messages --------------------------------------------------------------------------------------
@@ -99,7 +83,7 @@ def document():
 def test_a_message_names_known_models_and_spells_out_new_ones(document):
     (plot,) = document.roots
     known, new = plot.x_range, Range1d(0, 5)
-    told = [known, new, [known, {"a": plot.y_range}], np.zeros(FEW_BYTES)]
+    told = [known, new, [known, {"a": plot.y_range}], np.zeros(INLINE_BYTES)]
     written = []
     for serializer in (Serializer, QuickSerializer):
         made = serializer(references=set(document.models))
@@ -114,7 +98,7 @@ def test_a_message_names_known_models_and_spells_out_new_ones(document):
 
 
 def test_few_numbers_travel_within_the_message():
-    few, many = np.arange(5, dtype=np.float32), np.zeros(FEW_BYTES + 1, np.uint8)
+    few, many = np.arange(5, dtype=np.float32), np.zeros(INLINE_BYTES + 1, np.uint8)
     serializer = QuickSerializer()
     message = json.loads(json.dumps(serializer.encode(few)))
     assert serializer.buffers == []
@@ -130,7 +114,7 @@ def test_defaults_are_found_once_for_all_models_of_a_kind(document):
         found.append((type(model), descriptor.name))
         return get(descriptor, model)
 
-    kept = _kept(counting)
+    kept = cached(counting)
     for model in document.models:
         for name in model.properties() - model._property_values.keys():
             descriptor = model.lookup(name)
@@ -142,7 +126,7 @@ def test_defaults_are_found_once_for_all_models_of_a_kind(document):
 
 
 def test_defaults_that_may_be_changed_in_place_are_each_models_own():
-    kept = _kept(PropertyDescriptor._get_default)
+    kept = cached(PropertyDescriptor._get_default)
     one, other = (kept(each.lookup("tags"), each) for each in (Range1d(), Range1d()))
     one.append("x")
     assert other == []
@@ -194,34 +178,6 @@ def test_what_is_said_of_others_than_of_a_model_that_is_gone_is_heard(document, 
     with pytest.raises(UnknownReferenceError, match="never-there"):
         document.apply_json_patch(patch(**{there.id: 6, "never-there": 7}))
     assert there.start == 4
-
-
-# -- where it is put -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("place", REPLACED, ids=" ".join)
-def test_what_is_replaced_is_what_the_libraries_use(place, document, monkeypatch):
-    """Under another name it would stand there in vain."""
-    used, (module, name) = [], place
-
-    def standing_in(*arguments, **options):
-        used.append(place)
-        return REPLACED[place](*arguments, **options)
-
-    assert name in vars(import_module(module))
-    monkeypatch.setitem(vars(import_module(module)), name, standing_in)
-    (plot,) = document.roots
-    event = ModelChangedEvent(document, plot, "width", 300)
-    message = Protocol().create("PATCH-DOC", [event])
-    document.apply_json_patch(message.payload)
-    assert plot.width == 300
-    scheduled = []
-    monkeypatch.setattr(pn.state, "schedule_task", lambda _, act, **_at: scheduled.append(act))
-    document.destroy = None
-    _destroy_document(document, None)
-    for act in scheduled:
-        act()
-    assert used == [place]
 
 
 def test_all_in_use_is_passed_over_and_all_is_looked_through():

@@ -1,0 +1,278 @@
+"""Options for reading a file: one field each, from which all interfaces follow.
+
+`core.read_capture`, its documentation, the options of the command line, the form in the app, links
+and scripts are made from the fields of `ReadOptions` and their `Option`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, get_args
+
+import numpy as np
+
+from core.acquisition import LONGEST_S, MOST_BINS, MOST_PULSES, SHORTEST_BIN_S, Pulse, require_time
+from core.capture import Detection
+from core.checks import require, require_whole
+from core.io.readers.times import EXAMPLE, parsed_time, time_as_typed
+
+Check = Callable[[str, Any], None]
+"""Called with the name of a field and its value; raises ``ValueError``."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a value is typed, written, and checked."""
+
+    annotation: str
+    """Type in the documentation."""
+    parse: Callable[[str], Any]
+    """From text; raises ``ValueError``."""
+    accepts: str
+    check: Check
+    write: Callable[[Any], str] = str
+    """As text from which `parse` returns the same value."""
+    words: tuple[str, ...] = ()
+    """Names of the parts, where a value is given as several arguments of the command line."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """How a field of `ReadOptions` is presented."""
+
+    label: str
+    """In a form."""
+    flag: str
+    """Of the command line, without the dashes."""
+    kind: Kind
+    help: str
+    """What the option is, as a sentence."""
+
+
+def _option(label: str, flag: str, kind: Kind, help: str) -> Any:
+    return field(default=None, metadata={"option": Option(label, flag, kind, help)})
+
+
+def _time(least_s: float) -> Kind:
+    def check(name: str, value: Any) -> None:
+        require_time(name, value, least_s)
+
+    return Kind("float", parsed_time, EXAMPLE, check, time_as_typed)
+
+
+def _count(most: int) -> Kind:
+    def check(name: str, value: Any) -> None:
+        require_whole(name, value, most)
+
+    return Kind("int", int, "a whole number", check)
+
+
+def _check_angle(name: str, value: Any) -> None:
+    require(name, value, 0 < value < 1, "between 0 and 1 radian")
+
+
+def _check_whole(name: str, value: Any) -> None:
+    require(name, value, isinstance(value, int | np.integer), "a whole number")
+
+
+def _check_detection(name: str, value: Any) -> None:
+    require(name, value, value in get_args(Detection), " or ".join(map(repr, get_args(Detection))))
+
+
+def _check_shape(name: str, value: Any) -> None:
+    pair = (
+        isinstance(value, tuple)
+        and len(value) == 2
+        and all(isinstance(size, int | np.integer) and size >= 1 for size in value)
+    )
+    require(name, value, pair, "rows and columns, each at least 1")
+
+
+def _check_pulse(name: str, value: Any) -> None:
+    require(name, value, isinstance(value, Pulse), "a Pulse")
+
+
+def _accept(_name: str, _value: Any) -> None:
+    """Accept any text: the file determines which names exist."""
+
+
+def _parsed_shape(text: str) -> tuple[int, int]:
+    rows, cols = re.split(r"[\s,x×]+", text.strip())
+    return int(rows), int(cols)
+
+
+_TEXT = Kind("str", str, "a name", _accept)
+_AXES = Kind("str", str, "names", _accept)
+_ANGLE = Kind("float", float, "a number such as 1e-3", _check_angle, repr)
+_WHOLE = Kind("int", int, "a whole number", _check_whole)
+_DETECTION = Kind("str", str, "first or all", _check_detection)
+_SHAPE = Kind(
+    "tuple of int",
+    _parsed_shape,
+    "rows and columns such as 64 x 64",
+    _check_shape,
+    lambda shape: " x ".join(map(str, shape)),
+    ("ROWS", "COLS"),
+)
+_PULSE = Kind(
+    "Pulse",
+    lambda text: Pulse.gaussian(parsed_time(text)),
+    EXAMPLE,
+    _check_pulse,
+    lambda pulse: time_as_typed(pulse.tau_s),
+)
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What the user specifies about a file. None takes a value from the file, or guesses it.
+
+    Raises
+    ------
+    ValueError
+        If a field is out of its range.
+    """
+
+    time_unit_s: float | None = _option(
+        "Time unit (s)",
+        "time-unit",
+        _time(SHORTEST_BIN_S),
+        "Unit of the arrival times, such as 8ps; only for a file that holds such.",
+    )
+    bin_width_s: float | None = _option(
+        "Bin width (s)", "bin-width", _time(SHORTEST_BIN_S), "Width of a bin, such as 64ps."
+    )
+    gate_delay_s: float | None = _option(
+        "Gate opens after (s)",
+        "gate-delay",
+        _time(-LONGEST_S),
+        "Time from the pulse to the first bin, such as 280ns; earlier photons are dropped.",
+    )
+    n_bins: int | None = _option(
+        "Bins",
+        "bins",
+        _count(MOST_BINS),
+        "Bins in the gate; later photons are dropped. A cube must have just as many.",
+    )
+    n_pulses: int | None = _option(
+        "Pulses sent", "pulses", _count(MOST_PULSES), "Pulses sent for each pixel; never guessed."
+    )
+    variable: str | None = _option(
+        "Variable", "variable", _TEXT, "Name of the array, where the file holds several."
+    )
+    pulse: Pulse | None = _option(
+        "Echo's standard deviation (s)",
+        "pulse-sigma",
+        _PULSE,
+        "Shape of an echo; as text, the standard deviation of a Gaussian, such as 150ps.",
+    )
+    pixel_angle_rad: float | None = _option(
+        "Pixel angle (rad)", "pixel-angle", _ANGLE, "Angle between neighbouring pixels in radians."
+    )
+    detection: Detection | None = _option(
+        "Photons of a pulse (first, all)",
+        "detection",
+        _DETECTION,
+        "Photons of a pulse that are recorded, first or all; guessed to be first photons where the "
+        "number of pulses is known and no pixel has more photons.",
+    )
+    axes: str | None = _option(
+        "Axes (such as bin row col)",
+        "axes",
+        _AXES,
+        "Names of the file's axes in its own order, such as 'bin row col', for raw frames 'pulse "
+        "col row', for lists of photons 'col row'.",
+    )
+    shape: tuple[int, int] | None = _option(
+        "Rows x columns",
+        "shape",
+        _SHAPE,
+        "Rows and columns of a file that lists its pixels one after the other.",
+    )
+    stop_s: float | None = _option(
+        "Common stop after (s)",
+        "stop",
+        _time(-LONGEST_S),
+        "For common-stop instruments: times count backwards from this time after the pulse, often "
+        "the laser's period.",
+    )
+    no_trigger: int | None = _option(
+        "Frames: no trigger is",
+        "no-trigger",
+        _WHOLE,
+        "Value in raw frames (pulse, row, col) of trigger bins that marks no trigger; declares the "
+        "array of a .npy or .npz file as such frames.",
+    )
+    first_detections: int | None = _option(
+        "First detections only",
+        "first-detections",
+        _count(MOST_PULSES),
+        "Number of detections to keep of each pixel, in the order of the file; only for a file "
+        "that lists photons.",
+    )
+
+    def __post_init__(self) -> None:
+        for name, option in reading_options().items():
+            if (value := getattr(self, name)) is not None:
+                option.kind.check(name, value)
+
+    @classmethod
+    def from_text(cls, typed: Mapping[str, str]) -> ReadOptions:
+        """Return the request for typed fields; an empty one leaves the value to the reader.
+
+        Raises
+        ------
+        ValueError
+            If a text cannot be parsed, or a value is out of its range: names the field, the text
+            and what would be accepted.
+        """
+        values: dict[str, Any] = {}
+        for name, text in typed.items():
+            kind = reading_options()[name].kind
+            try:
+                values[name] = kind.parse(text.strip()) if text.strip() else None
+            except ValueError:
+                require(name, text, False, f"{kind.accepts}, or nothing to let the reader guess")
+        return cls(**values)
+
+    def as_text(self, name: str) -> str:
+        """Return a field as it would be typed."""
+        value = getattr(self, name)
+        return "" if value is None else reading_options()[name].kind.write(value)
+
+    def order(self, canonical: tuple[str, ...]) -> tuple[int, ...] | None:
+        """Return the position in the file of each axis that a reader wants, for `numpy.transpose`.
+
+        Parameters
+        ----------
+        canonical : tuple of str
+            Names of the axes as the reader wants them, such as ``("row", "col", "bin")``.
+
+        Returns
+        -------
+        tuple of int or None
+            None where `axes` is not specified.
+
+        Raises
+        ------
+        ValueError
+            If `axes` names others, or not each of them once.
+        """
+        if self.axes is None:
+            return None
+        named = re.split(r"[\s,]+", self.axes.strip())
+        fits = sorted(named) == sorted(canonical)
+        require("axes", self.axes, fits, f"{' '.join(canonical)!r} in the order of the file")
+        return tuple(named.index(name) for name in canonical)
+
+    def refuse(self, names: Iterable[str], why: str) -> None:
+        """Raise ``ValueError`` if a field is specified that does not apply to the file."""
+        for name in names:
+            require(name, getattr(self, name), getattr(self, name) is None, f"None: {why}")
+
+
+def reading_options() -> dict[str, Option]:
+    """Return the option of each field of `ReadOptions`."""
+    return {each.name: each.metadata["option"] for each in fields(ReadOptions)}

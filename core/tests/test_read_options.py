@@ -1,0 +1,80 @@
+"""Options for reading a file: all interfaces follow from the fields of `core.io.ReadOptions`."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from dataclasses import fields
+
+import pytest
+
+import core
+from core.cli.options import add_reading, reading
+from core.io import ReadOptions, reading_options
+from core.io.readers.times import parsed_time
+from core.tests.read_options import EXAMPLES
+
+NAMES = [each.name for each in fields(ReadOptions)]
+
+
+def test_each_field_has_an_example_a_flag_a_label_and_a_sentence_of_help() -> None:
+    assert list(EXAMPLES) == NAMES == list(reading_options())
+    options = reading_options().values()
+    assert len({option.flag for option in options}) == len({option.label for option in options})
+    for option in options:
+        assert option.label
+        assert option.help.endswith(".")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_value_is_parsed_from_the_text_it_is_written_as(name: str) -> None:
+    given = ReadOptions(**{name: EXAMPLES[name]})
+    assert given.as_text(name)
+    assert ReadOptions.from_text({name: f" {given.as_text(name)} "}) == given
+    assert ReadOptions.from_text({name: " "}) == ReadOptions()
+
+
+@pytest.mark.parametrize("function", [core.read_capture, core.open_capture])
+def test_functions_document_each_field(function: object) -> None:
+    assert list(inspect.signature(function).parameters) == ["path", *NAMES]  # type: ignore[arg-type]
+    text = inspect.getdoc(function) or ""
+    assert [name for name in NAMES if f"\n{name} : " not in text] == []
+
+
+def test_the_command_line_has_an_option_for_each_field() -> None:
+    parser, all_of_them = argparse.ArgumentParser(), ReadOptions(**EXAMPLES)
+    add_reading(parser)
+    arguments = []
+    for name, option in reading_options().items():
+        text = all_of_them.as_text(name)
+        words = [text] if not option.kind.words else text.split(" x ")
+        arguments += (
+            [f"--{option.flag}={text}"] if len(words) == 1 else [f"--{option.flag}", *words]
+        )
+    assert reading(parser.parse_args(arguments)) == EXAMPLES
+    assert reading(parser.parse_args([])) == dict.fromkeys(NAMES)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("variable", "axes")])
+def test_text_that_is_no_value_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name} = 'x, y' is not accepted"):
+        ReadOptions.from_text({name: "x, y"})
+
+
+def test_unknown_options_are_refused() -> None:
+    with pytest.raises(TypeError, match="bin_width"):
+        core.read_capture("x.npz", bin_width=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected_s"),
+    [("64ps", 64e-12), ("4.43 us", 4.43e-6), ("1e-9", 1e-9), ("0.5ns", 5e-10), ("2µs", 2e-6)],
+)
+def test_times_carry_units(text: str, expected_s: float) -> None:
+    assert parsed_time(text) == pytest.approx(expected_s, rel=1e-12)
+
+
+@pytest.mark.parametrize("text", ["", "ps", "64 pc", "1e-9 s s", "one ns", "64Ps", "64", "1\n2"])
+def test_text_that_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(ValueError):
+        parsed_time(text)
