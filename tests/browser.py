@@ -14,8 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
 from urllib.error import HTTPError
+from urllib.parse import urlsplit
 from urllib.request import urlopen
 
+import psutil
 from playwright.sync_api import Browser, BrowserType, Locator, Page, sync_playwright
 
 from app.server.ports import free_port
@@ -134,6 +136,17 @@ def fact(page: Page, name: str) -> Locator:
     """The value of a figure or of a pixel's number on the page that is shown."""
     term = page.locator("dt").filter(has_text=re.compile(f"^{re.escape(name)}$"))
     return page.locator("dl div", has=term).locator("dd").filter(visible=True)
+
+
+def server_process(address: str) -> psutil.Process:
+    """Process of a server that this one has started, by its address."""
+    port = str(urlsplit(address).port)
+    alive = (
+        each
+        for each in psutil.Process().children(recursive=True)
+        if each.status() != psutil.STATUS_ZOMBIE
+    )
+    return next(each for each in alive if port in each.cmdline())
 
 
 def _gone(server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 60.0) -> None:

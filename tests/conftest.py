@@ -70,7 +70,7 @@ def open_watched(
 
 @pytest.fixture
 def page(open_watched: Callable[..., Page], troubles: list[str]) -> Iterator[Callable[..., Page]]:
-    """Opens pages of sessions of their own; none of them may have had a trouble."""
+    """Open pages with sessions of their own; a page that reports an error fails the test."""
     opened: list[Page] = []
 
     def open_(*arguments: Any, **options: Any) -> Page:
@@ -80,24 +80,16 @@ def page(open_watched: Callable[..., Page], troubles: list[str]) -> Iterator[Cal
     yield open_
     found, troubles[:] = list(troubles), []
     for each in opened:
-        each.close()
+        if not each.is_closed():
+            each.evaluate("localStorage.clear(), sessionStorage.clear()")
+            each.close()
     assert found == []
-
-
-@pytest.fixture(scope="module")
-def lasting_page(open_watched: Callable[..., Page]) -> Iterator[Page]:
-    """The page that a module's tests share, because a page costs seconds; see `one_page`."""
-    opened = open_watched()
-    yield opened
-    opened.close()
 
 
 @pytest.fixture
-def one_page(lasting_page: Page, troubles: list[str]) -> Iterator[Page]:
-    """A shared page that may have had no trouble in this test, which leaves it as it found it."""
-    yield lasting_page
-    found, troubles[:] = list(troubles), []
-    assert found == []
+def start_page(page: Callable[..., Page]) -> Page:
+    """The start page, just opened."""
+    return page()
 
 
 @pytest.fixture

@@ -24,11 +24,10 @@ from random import Random
 from typing import Any
 
 import numpy as np
-import psutil
 
 from app.model.state import Illumination
 from app.plots.elements import ENHANCED_LAYERS, HISTOGRAM_LAYERS
-from tests.browser import serving
+from tests.browser import server_process, serving
 from tests.wire import Wire
 
 MOVES_A_SECOND = 20
@@ -357,9 +356,9 @@ def as_markdown(found: Sequence[tuple[str, str, str, bool]]) -> str:
     return "\n".join(lines)
 
 
-def server_mb() -> Callable[[], float]:
-    """Tells the resident memory of the server that this process has started."""
-    (server,) = (each for each in psutil.Process().children() if "app" in each.cmdline())
+def server_mb(address: str) -> Callable[[], float]:
+    """Return a function that measures the resident memory of a server."""
+    server = server_process(address)
     return lambda: server.memory_info().rss / MEGA
 
 
@@ -374,9 +373,9 @@ def main(arguments: list[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
 
     with serving() as address:
-        used = asyncio.run(load(address, server_mb(), chosen.sessions, chosen.seconds))
+        used = asyncio.run(load(address, server_mb(address), chosen.sessions, chosen.seconds))
     with serving() as address:  # another: what many sessions left would hide what one adds
-        grown = asyncio.run(growth(address, server_mb(), chosen.interactions))
+        grown = asyncio.run(growth(address, server_mb(address), chosen.interactions))
     found = verdicts(used, grown, Bounds())
     print(as_markdown(found))
     for trouble in sorted({*used.troubles, *grown.troubles}):

@@ -6,7 +6,7 @@ The numbers to be seen then are computed here by `core`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,10 +33,10 @@ CAPTURE = "21km_K11_night.mat"
 
 
 @dataclass(frozen=True, eq=False)
-class Inspected:
-    """A page, and what it shows."""
+class Subject:
+    """A capture, and where the app shows it."""
 
-    page: Page
+    address: str
     capture: Capture
     image: RangeImage
     name: str
@@ -45,41 +45,47 @@ class Inspected:
     """One with a surface, and others to its right."""
 
 
-@pytest.fixture(scope="module", params=["21 km", "facade"])
-def opened(request, open_watched) -> Iterator[Inspected]:
-    """A page that the module's tests share, because a page costs seconds."""
-    if request.param == "21 km":  # as ``make app CAPTURE=path`` opens it
-        path = real_capture_path(CAPTURE)
-        capture = core.read_capture(path)
-        with serving(path) as address:
-            page = open_watched(address)
-            yield Inspected(page, capture, ranged(capture), path.stem, (100, 190))
-            page.close()
-    else:
-        scene, light = core.scenes["building"](), Illumination()
-        acquisition = light.acquisition(scene.acquisition)
-        capture = core.simulate(scene, acquisition, light.flux, seed=light.seed)
-        address = request.getfixturevalue("address")
-        page = open_watched(f"{address}?source=building&page=Inspect")
-        yield Inspected(page, capture, ranged(capture), "building", (30, 20))
-        page.close()
+@dataclass(frozen=True, eq=False)
+class Inspected(Subject):
+    """A subject on a page of its own."""
+
+    page: Page
+
+
+@pytest.fixture(scope="module")
+def at_21_km() -> Iterator[Subject]:
+    """The real capture, opened as ``make app CAPTURE=path`` does."""
+    path = real_capture_path(CAPTURE)
+    capture = core.read_capture(path)
+    with serving(path) as address:
+        yield Subject(address, capture, ranged(capture), path.stem, (100, 190))
+
+
+@pytest.fixture(scope="module")
+def facade(address: str) -> Subject:
+    """The simulated building."""
+    scene, illumination = core.scenes["building"](), Illumination()
+    acquisition = illumination.acquisition(scene.acquisition)
+    capture = core.simulate(scene, acquisition, illumination.flux, seed=illumination.seed)
+    address = f"{address}?source=building&page=Inspect"
+    return Subject(address, capture, ranged(capture), "building", (30, 20))
 
 
 def ranged(capture: Capture) -> RangeImage:
     return core.run(capture, "tracking", core.TrackingParameters()).image
 
 
-@pytest.fixture
-def here(opened, troubles) -> Iterator[Inspected]:
-    """The shared page, which may have had no trouble in this test."""
-    yield opened
-    found, troubles[:] = list(troubles), []
-    assert found == []
+BOTH = pytest.mark.parametrize("here", ["at_21_km", "facade"], indirect=True)
+"""Run on a real capture, too; the other tests use the simulated building."""
 
 
 @pytest.fixture
-def page(here) -> Page:
-    return here.page
+def here(request: pytest.FixtureRequest, page: Callable[..., Page]) -> Inspected:
+    """The Inspect page on a capture, just opened."""
+    subject = request.getfixturevalue(getattr(request, "param", "facade"))
+    shown = page(subject.address)
+    expect(button(shown, "Inspect")).to_have_attribute("aria-pressed", "true")
+    return Inspected(**vars(subject), page=shown)
 
 
 # -- parts of the page -----------------------------------------------------------------------------
@@ -191,6 +197,7 @@ def region_in(page: Page) -> tuple[tuple[float, float], ...]:
 # -- the pixel -------------------------------------------------------------------------------------
 
 
+@BOTH
 def test_a_pixel_is_shown_with_all_that_is_known_of_it(here):
     page, (row, col) = here.page, here.pixel
     expect(button(page, "Inspect")).to_have_attribute("aria-pressed", "true")
@@ -256,14 +263,13 @@ def test_a_move_paints_each_plot_once_and_then_tells_the_numbers(here):
         seen.push(this.model.id);
         paint.call(this);
       };
-      window.forget = () => (plot._actual_paint = paint);
     }""")
     fact(page, "Pixel").locator("xpath=ancestor::dl").evaluate(
         "list => new MutationObserver(() => seen.push('told')).observe(list, { childList: true })"
     )
     page.keyboard.press("ArrowRight")
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 1}")
-    *painted, told = page.evaluate("forget(), seen")
+    *painted, told = page.evaluate("seen")
     assert told == "told"
     assert len(painted) == len(set(painted)) == 4  # the picture, and three plots
 
@@ -275,6 +281,7 @@ EACH = 17
 """Every so many-th pixel of a map is read back: all of them take a browser a second."""
 
 
+@BOTH
 def test_every_map_is_shown(here):
     page, capture, image = here.page, here.capture, here.image
     visible = image.valid & (image.confidence >= 0.9)
@@ -328,17 +335,15 @@ def test_zoom_stays_when_map_and_pixel_change(here):
     eventually(shows_all)
 
 
-def test_what_a_drag_does_is_chosen_before_the_server_hears_of_it(page):
+def test_what_a_drag_does_is_chosen_before_the_server_hears_of_it(here):
+    page = here.page
     page.evaluate("""() => {
-      const { send } = WebSocket.prototype;
       WebSocket.prototype.send = () => {};
-      window.tell = () => { WebSocket.prototype.send = send; };
     }""")
     tools = {"Rectangle": "BoxSelectTool", "Lasso": "LassoSelectTool", "Zoom": "BoxZoomTool"}
     for mode, tool in tools.items():
         button(page, mode).click()
         eventually(lambda t=tool: of_picture(page, "found.toolbar.active_drag.type") == t)
-    page.evaluate("tell()")
 
 
 # -- regions and pins ------------------------------------------------------------------------------
@@ -418,13 +423,13 @@ def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
         button(page, f"Remove {names.pop()}").press("Enter")
         expect(headers).to_have_text(names)
     expect(page.get_by_text(inspector_words.NO_PINS)).to_be_visible()
-    button(page, "Pixel").click()
 
 
 # -- units -----------------------------------------------------------------------------------------
 
 
-def test_units_change_axes_and_tables_and_the_pointer_reads_all(page):
+def test_units_change_axes_and_tables_and_the_pointer_reads_all(here):
+    page = here.page
     for unit, title, other in (
         ("ns", "Time (ns)", "Range (m)"),
         ("m", "Range (m)", "Bin"),
@@ -442,14 +447,13 @@ def test_units_change_axes_and_tables_and_the_pointer_reads_all(page):
     expect(tip).to_contain_text("Large scale")
     expect(tip).to_contain_text(re.compile(r"\d ns"))
     expect(tip).to_contain_text(re.compile(r"\d m"))
-    page.mouse.move(5, 5)
 
 
 # -- a phone ---------------------------------------------------------------------------------------
 
 
-def test_a_phone_shows_all_parts_below_each_other(open_watched, address, troubles):
-    page = open_watched(f"{address}?source=building&page=Inspect", width=390, height=844)
+def test_a_phone_shows_all_parts_below_each_other(page, facade):
+    page = page(facade.address, width=390, height=844)
     told = page.get_by_text("64 × 64 pixels, 334 bins")
     for subject, n_plots in (("Capture", 3), ("Region", 1), ("Pins", 3), ("Pixel", 4)):
         button(page, subject).click()
@@ -460,30 +464,16 @@ def test_a_phone_shows_all_parts_below_each_other(open_watched, address, trouble
             assert 0 <= box["x"] < box["x"] + box["width"] <= 390
             assert box["y"] >= bottom
             bottom = box["y"] + box["height"]
-    page.close()
-    assert troubles == []
 
 
 # -- the capture as a whole ------------------------------------------------------------------------
 
 
 @pytest.fixture
-def whole(here) -> Iterator[Inspected]:
-    """The shared page on its capture, all of which it looks at again afterwards."""
-    page = here.page
-    button(page, "Capture").click()
-    yield here
-    fold = button(page, "Less data, faster")
-    fold.click()
-    expect(slider(page, "Gate from (of the gate)").filter(visible=True)).to_be_visible()
-    for name in ("Gate from", "Gate to", "Pulses accumulated", "T_n"):
-        reset = page.get_by_role("button", name=re.compile(f"^Reset {name} ")).filter(visible=True)
-        if reset.count():
-            reset.first.click()
-        expect(reset).to_have_count(0)
-    fold.click()
-    button(page, "Pixel").click()
-    expect(bins_told(here)).to_be_visible()
+def whole(here) -> Inspected:
+    """The page on its capture as a whole."""
+    button(here.page, "Capture").click()
+    return here
 
 
 def bins_told(here: Inspected, n_bins: int | None = None) -> Locator:
@@ -493,6 +483,7 @@ def bins_told(here: Inspected, n_bins: int | None = None) -> Locator:
     return here.page.get_by_text(f"{rows} × {cols} pixels, {bins} bins")
 
 
+@BOTH
 def test_the_capture_is_reported(whole):
     report = inspection.capture_report(whole.capture)
     for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.flux, strict=True):
@@ -503,6 +494,7 @@ def test_the_capture_is_reported(whole):
     np.testing.assert_array_equal(counts, report.histogram)
 
 
+@BOTH
 def test_accuracy_is_studied_and_a_bar_tells_how_far(whole):
     page, has_truth = whole.page, whole.capture.truth_range_m is not None
     done = page.get_by_text(re.compile("^Done: 8"))
@@ -528,6 +520,7 @@ def test_accuracy_is_studied_and_a_bar_tells_how_far(whole):
     np.testing.assert_allclose(taken, np.multiply(SHARES, whole.capture.acquisition.n_pulses or 1))
 
 
+@BOTH
 def test_fewer_pulses_are_taken_live(whole):
     page, slide = whole.page, slider(whole.page, "Pulses accumulated (of all)").filter(visible=True)
     for _ in range(3):
@@ -540,6 +533,7 @@ def test_fewer_pulses_are_taken_live(whole):
     eventually(lambda: np.array_equal(drawn(page, "Counts of all pixels", "raw", "raw"), counts))
 
 
+@BOTH
 def test_what_is_suggested_is_told_with_its_reason_and_taken(whole):
     page, suggested = whole.page, inspection.capture_report(whole.capture).suggestion
     first, end = suggested.gate

@@ -6,13 +6,12 @@ import socket
 import time
 from urllib.parse import urlencode
 
-import psutil
 import pytest
 
 from app.__main__ import main
 from app.server.access import TOKEN_VARIABLE
 from app.server.limits import HTTP_LIMITS, MOST_CONNECTIONS, WrongTokens
-from tests.browser import eventually, serving
+from tests.browser import eventually, server_process, serving
 from tests.test_serving import NAME, TOKEN, Site
 
 FORM = {"Content-Type": "application/x-www-form-urlencoded", "Host": NAME}
@@ -30,8 +29,8 @@ def away():
 @pytest.fixture
 def resident_bytes(away):
     """How much memory the server has."""
-    named = [p for p in psutil.Process().children(recursive=True) if str(away.port) in p.cmdline()]
-    return lambda: named[0].memory_info().rss
+    server = server_process(away.address)
+    return lambda: server.memory_info().rss
 
 
 def sending(site, text):
@@ -159,4 +158,4 @@ def test_a_port_that_is_none_is_refused_in_one_sentence(port, capsys):
     with pytest.raises(SystemExit):
         main(["--port", port])
     said = capsys.readouterr().err.splitlines()[-1]
-    assert f"{port!r} is not accepted: give 0 to 65535." in said
+    assert f"{port!r} is not a port: give 0 to 65535." in said

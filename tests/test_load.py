@@ -20,14 +20,14 @@ def address():
 
 
 def test_sessions_at_once_are_all_answered_and_none_wrongly(address):
-    used = asyncio.run(load(address, server_mb(), sessions=3, seconds=2.0, forgotten_s=0.0))
+    used = asyncio.run(load(address, server_mb(address), sessions=3, seconds=2.0, forgotten_s=0.0))
     assert used.troubles == []
     assert used.latencies_s.size > 40
     assert used.session_mb <= Bounds().session_mb
 
 
 def test_interactions_do_not_pile_up(address):
-    grown = asyncio.run(growth(address, server_mb(), interactions=150, warm=40))
+    grown = asyncio.run(growth(address, server_mb(address), interactions=150, warm=40))
     assert grown.troubles == []
     assert grown.after_mb - grown.before_mb < 15
 

@@ -323,12 +323,11 @@ def titles(page: Page) -> dict[str, str]:
 
 
 @pytest.fixture
-def paper_page(one_page):
-    """The shared page, the first figures of Paper on screen."""
-    one_page.get_by_role("button", name="Paper", exact=True).click()
-    go(one_page, "Figures 1, 2")
-    expect(figure(one_page, "background alone")).to_be_visible(timeout=SOON_MS)
-    return one_page
+def paper_page(start_page):
+    """The Paper page with its first figures."""
+    start_page.get_by_role("button", name="Paper", exact=True).click()
+    expect(figure(start_page, "background alone")).to_be_visible(timeout=SOON_MS)
+    return start_page
 
 
 @pytest.mark.browser
@@ -396,7 +395,6 @@ def test_the_page_is_dark_where_the_app_is(paper_page):
     eventually(lambda: sum(text.startswith(figures) for text in titles(paper_page)) == 3)
     colors = {color for text, color in titles(paper_page).items() if text.startswith(figures)}
     assert colors == {DARK.text}
-    paper_page.get_by_role("button", name="Toggle theme").click()
 
 
 @pytest.mark.browser

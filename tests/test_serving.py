@@ -263,7 +263,7 @@ STOPPED_AT_A_BAD_MOMENT = """
 import os, signal, sys, time
 from types import SimpleNamespace
 from app import __main__ as started
-from app.pages.shared.studies import OnePiece
+from app.tasks.scheduler import LongWork
 
 def nothing(*_):
     pass
@@ -280,8 +280,8 @@ class Last:
         os.kill(os.getpid(), signal.SIGTERM)
 
 def page_for(*_):
-    session = SimpleNamespace(on_page=nothing, recover=nothing, is_gone=False)
-    OnePiece(session, nothing, nothing, "parts").start(long_work)
+    page = SimpleNamespace(queue=nothing, is_gone=False)
+    LongWork(page, lambda: None, nothing).start_piece(long_work, nothing)
     Last()
 
 started.page_for = page_for

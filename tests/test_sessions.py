@@ -7,14 +7,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
-import psutil
 import pytest
 from bokeh.util.token import generate_jwt_token, generate_session_id
 from playwright.sync_api import expect
 from tornado.httpclient import HTTPClientError
 
 from app.server.sessions import LOOK_S, RETRY_S, Bounds, Sessions
-from tests.browser import eventually, serving
+from tests.browser import eventually, server_process, serving
 from tests.crowded import BOUNDS
 from tests.test_serving import Site
 from tests.wire import Wire, connected
@@ -130,11 +129,7 @@ def test_requests_of_pages_that_nobody_looks_at_wait_or_are_refused(crowded):
 
 
 def test_requests_of_pages_that_nobody_looks_at_do_not_fill_the_memory(crowded):
-    server = next(
-        process
-        for process in psutil.Process().children(recursive=True)
-        if str(crowded.port) in process.cmdline()
-    )
+    server = server_process(crowded.address)
     eventually(lambda: has_room(crowded))
     before = server.memory_info().rss
     built = 0

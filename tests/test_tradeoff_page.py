@@ -324,18 +324,20 @@ def test_every_setting_of_a_method_is_swept():
 
 
 @pytest.mark.browser
-def test_what_is_recommended_is_opened_by_a_click(one_page):
-    one_page.get_by_role("button", name="Trade-off", exact=True).click()
+def test_what_is_recommended_is_opened_by_a_click(start_page):
+    start_page.get_by_role("button", name="Trade-off", exact=True).click()
     for name, text in (("Repetitions", "2"), ("Rounds of timing", "6")):
-        field = one_page.get_by_role("textbox", name=name, exact=True)
+        field = start_page.get_by_role("textbox", name=name, exact=True)
         field.fill(text)
         field.press("Enter")
-    one_page.get_by_role("button", name=re.compile("^Compute")).press("Enter")
-    expect(one_page.get_by_text(re.compile("^Best within 10 ms: "))).to_be_visible()
-    expect(one_page.get_by_text(re.compile("^Done: "))).to_be_visible()
-    rows = one_page.locator("tbody tr")
+    start_page.get_by_role("button", name=re.compile("^Compute")).press("Enter")
+    expect(start_page.get_by_text(re.compile("^Best within 10 ms: "))).to_be_visible()
+    expect(start_page.get_by_text(re.compile("^Done: "))).to_be_visible()
+    rows = start_page.locator("tbody tr")
     expect(rows).to_have_count(3 * len(ESTIMATORS))
     title = ESTIMATORS["tracking"].title
-    one_page.get_by_role("button", name=f"Open: {title}, 2 bins merged", exact=True).press("Enter")
-    expect(one_page.get_by_text("50 bins of 2 ns")).to_be_visible()
-    expect(one_page.get_by_role("textbox", name="T_n", exact=True)).to_have_value("10")
+    start_page.get_by_role("button", name=f"Open: {title}, 2 bins merged", exact=True).press(
+        "Enter"
+    )
+    expect(start_page.get_by_text("50 bins of 2 ns")).to_be_visible()
+    expect(start_page.get_by_role("textbox", name="T_n", exact=True)).to_have_value("10")
