@@ -23,10 +23,10 @@ from app.model.store import built_in_sources, scene_source
 from app.model.uploads import Uploads
 from app.pages.compare import text as ranking_words
 from app.pages.compare.page import Compare
-from app.pages.inspect.capture import Whole
-from app.pages.inspect.page import Inspector
-from app.pages.inspect.pins import Pins
-from app.pages.inspect.pixel import Sight
+from app.pages.inspect.capture import CaptureSection
+from app.pages.inspect.page import Inspect
+from app.pages.inspect.pins import PinsSection
+from app.pages.inspect.pixel import PixelSection
 from app.pages.inspect.views import rectangle
 from app.pages.layout import Layout, Template
 from app.pages.navigation import Pages, View
