@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from app.model import text as words
-from app.model.address import Wanted, defaults, query_of
-from app.model.state import Illumination, Less, State, Viewing
+from app.model.address import Link, defaults, query_of
+from app.model.state import Illumination, ReductionSettings, State, Viewing
 from app.model.store import built_in_sources
 from app.pages.session import Session
 from core import TrackingParameters
@@ -22,7 +22,7 @@ from tests.states import OTHERWISE, another, random_state
 
 def restored(query: str, **own) -> tuple[dict, list[str]]:
     """All parameters, as the query of an address gives them, and what was refused."""
-    wanted = Wanted(dict(parse_qsl(query, keep_blank_values=True)))
+    wanted = Link(dict(parse_qsl(query, keep_blank_values=True)))
     before = defaults() | own
     found = before | wanted.of(before)
     wanted.refuse_others()
@@ -122,7 +122,7 @@ def test_what_is_out_of_range_or_nonsense_is_refused_and_the_rest_kept(query, na
 
 
 def opened(query: str) -> Session:
-    return Session(built_in_sources(), Wanted(dict(parse_qsl(query))))
+    return Session(built_in_sources(), Link(dict(parse_qsl(query))))
 
 
 def test_a_session_opens_on_what_its_address_asks_for():
@@ -130,7 +130,7 @@ def test_a_session_opens_on_what_its_address_asks_for():
     assert first.answer.request.source.title.startswith("Building")
     assert first.answer.request.light == Illumination(sbr=0.2)
     assert first.answer.request.tracking == TrackingParameters(l=0.006)
-    assert first.answer.request.less == Less(merge=2, pool=2)
+    assert first.answer.request.less == ReductionSettings(merge=2, pool=2)
     first.state.param.update(pixel=(3, 5), viewing=Viewing(0.5, 1.5), image="Counts")
     again = opened(first.query())
     assert again.refused == []

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import core
-from app.model.address import Wanted, defaults, query_of
+from app.model.address import Link, defaults, query_of
 from app.model.colors import image_of
 from app.model.large import LIMIT
 from app.model.script import ELSEWHERE, script_of
@@ -56,7 +56,7 @@ for folder in sys.argv[1:]:
 
 def opened(query: str, **files: Path) -> Session:
     sources = built_in_sources() | {name: file_source(path) for name, path in files.items()}
-    session = Session(sources, Wanted(dict(parse_qsl(query))))
+    session = Session(sources, Link(dict(parse_qsl(query))))
     assert session.refused == []
     return session
 
@@ -139,7 +139,7 @@ def test_random_states_are_found_again(tmp_path):
         state = random_state(np.random.default_rng(seed))
         state.param.update(source="car", page="Explore", pixel=(5, 6), region=(), pins=())
         state.param.update(window=None, image="Counts", comparison=State().comparison)
-        session = Session(built_in_sources(), Wanted(dict(parse_qsl(query_of(state, {})))))
+        session = Session(built_in_sources(), Link(dict(parse_qsl(query_of(state, {})))))
         sessions[str(seed)] = session
     for name, found in run(tmp_path, sessions).items():
         same(found, "image", sessions[name].answer.run.image)

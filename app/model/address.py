@@ -78,7 +78,7 @@ def _inner(value: Any) -> dict[str, Any] | None:
     return dict(value) if isinstance(value, Mapping) else None
 
 
-class Wanted:
+class Link:
     """What an address asks for.
 
     Parameters
