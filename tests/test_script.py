@@ -18,7 +18,7 @@ import core
 from app.model.address import Link, defaults, query_of
 from app.model.colors import image_of
 from app.model.large import LIMIT
-from app.model.script import ELSEWHERE, script_of
+from app.model.script import COMMANDS, script_of
 from app.model.state import State
 from app.model.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
 from app.pages.catalog import PAGES
@@ -204,11 +204,11 @@ def car() -> Answer:
     return opened("").answer
 
 
-@pytest.mark.parametrize(("page", "command"), ELSEWHERE.items())
+@pytest.mark.parametrize(("page", "command"), COMMANDS.items())
 def test_pages_of_commands_name_them(page, command, car):
     script, usual = (script_of(car, State(page=each)) for each in (page, "Explore"))
     first, *rest = script.splitlines()
-    assert first == f'"""What firstphoton shows on Explore ({page}: {command}), found again."""'
+    assert first == f'"""Explore view of firstphoton ({page}: {command})."""'
     assert rest == usual.splitlines()[1:]
 
 
