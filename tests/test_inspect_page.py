@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.model.colors import map_of
-from app.model.state import MAPS, NEED_TRUTH, Less
+from app.model.state import MAPS, NEED_TRUTH, ReductionSettings
 from app.model.store import built_in_sources, compute, file_source
 from app.pages.inspect import text as inspector_words
 from app.pages.inspect.capture import Whole
@@ -214,11 +214,11 @@ def test_pixel_pins_and_region_stay_while_the_capture_keeps_its_pixels(page, fie
     page._pin_pixel()
     page._select(rectangle((10, 20), (5, 8)))
     kept = (field.state.pixel, field.state.pins, field.state.region)
-    for less in (Less(gate_from=0.1), Less(pulses=0.5)):
+    for less in (ReductionSettings(gate_from=0.1), ReductionSettings(pulses=0.5)):
         field.state.less = less
         eventually(lambda less=less: field.answer.request.less == less)
         assert (field.state.pixel, field.state.pins, field.state.region) == kept
-    field.state.less = Less(pool=2)
+    field.state.less = ReductionSettings(pool=2)
     eventually(lambda: field.answer.capture.shape == (128, 128))
     eventually(lambda: (field.state.pins, field.state.region) == ((), ()))
 
@@ -438,7 +438,7 @@ def test_what_is_no_longer_known_of_a_capture_is_taken_back(facade, monkeypatch)
         raise MemoryError("no more")
 
     monkeypatch.setattr("core.inspection.capture_report", fail)
-    facade.state.less = Less(merge=2)
+    facade.state.less = ReductionSettings(merge=2)
     eventually(lambda: facade.answer.request.less.merge == 2)
     part._follow()
     eventually(lambda: any(told))
@@ -447,11 +447,11 @@ def test_what_is_no_longer_known_of_a_capture_is_taken_back(facade, monkeypatch)
     assert {sentence.text for sentence in (part._light, *part._advice)} == {""}
     assert all(each.disabled for each in part._apply)
     part._apply_gate()
-    assert facade.answer.request.less == Less(merge=2)
+    assert facade.answer.request.less == ReductionSettings(merge=2)
 
 
 def test_a_gate_is_applied_to_what_is_left_of_the_whole(facade):
-    facade.state.less = Less(merge=2, gate_from=0.1)
+    facade.state.less = ReductionSettings(merge=2, gate_from=0.1)
     eventually(lambda: facade.answer.request.less.merge == 2)
     answer = facade.answer
     suggestion = replace(inspection.capture_report(answer.capture).suggestion, gate=(4, 90))
@@ -489,7 +489,7 @@ def test_an_answer_to_pulses_chosen_before_takes_nothing_back(facade):
         part._pulses.value = share
     eventually(lambda: facade.answer is not before)
     facade.estimate.answer = replace(
-        facade.answer, request=replace(facade.answer.request, less=Less(pulses=0.5))
+        facade.answer, request=replace(facade.answer.request, less=ReductionSettings(pulses=0.5))
     )
     part._follow()
     assert (part._pulses.value, facade.state.less.pulses) == (0.25, 0.25)
@@ -510,7 +510,7 @@ def test_pulses_that_cannot_be_had_are_taken_back(facade, monkeypatch):
     facade.estimate.changed.subscribe(lambda answer: part._follow())
     part._pulses.value = 0.5
     eventually(lambda: part._pulses.value == 1.0)
-    assert facade.state.less == Less()
+    assert facade.state.less == ReductionSettings()
     part.view.show(False)
 
 

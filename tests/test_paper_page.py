@@ -12,7 +12,7 @@ import pytest
 from bokeh.models import Range1d
 from playwright.sync_api import Locator, Page, expect
 
-from app.model.address import Wanted
+from app.model.address import Link
 from app.model.store import built_in_sources
 from app.pages.layout import Layout
 from app.pages.paper import page as page_of_paper
@@ -223,7 +223,7 @@ def test_the_page_puts_the_sidebar_away_and_brings_it_back():
 
 
 def test_a_link_opens_on_paper_without_the_sidebar():
-    layout = Layout(built_in_sources(), Wanted({"page": "Paper"}))
+    layout = Layout(built_in_sources(), Link({"page": "Paper"}))
     assert layout.pages.choice.value == "Paper"
     assert not layout.page.sidebar_open
     layout.pages.choice.value = "Explore"

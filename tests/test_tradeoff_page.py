@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from app.model.store import built_in_sources
 from app.pages.layout import CUSTOM, Layout
 from app.pages.session import Session
@@ -204,7 +204,7 @@ def test_another_capture_makes_it_outdated(ways):
 def test_opening_the_papers_method_sets_the_sliders(measured):
     layout = Layout(built_in_sources())
     (point,) = (p for p in measured if p.candidate.method.estimator == "tracking")
-    less = replace(point.candidate, reduction=Less(merge=2).reduction(100))
+    less = replace(point.candidate, reduction=ReductionSettings(merge=2).reduction(100))
     measured_on = layout.session.answer.request
     changed = Illumination(sbr=1.0)
     layout.session.state.param.update(light=changed, source="staircase", page="Trade-off")
@@ -212,7 +212,7 @@ def test_opening_the_papers_method_sets_the_sliders(measured):
     assert (layout.session.state.source, layout.session.state.light) == ("car", Illumination())
     assert control(layout, "SBR").value == Illumination().sbr
     assert layout.pages.choice.value == "Explore"
-    assert layout.session.state.less == Less(merge=2)
+    assert layout.session.state.less == ReductionSettings(merge=2)
     assert layout.session.state.tracking == less.settings
     assert control(layout, "Preset").value == CUSTOM
     assert control(layout, "T_n").value == less.settings.t_n == 10

@@ -12,7 +12,7 @@ from bokeh.models import FixedTicker, Range1d
 
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import facts_file, plot_file
-from app.model.state import Less
+from app.model.state import ReductionSettings
 from app.model.store import Answer
 from app.model.text import COMPUTING
 from app.pages.inspect import text as inspector_words
@@ -71,7 +71,7 @@ class Whole:
         self._study = Study(session, self._steps, "shares of the pulses")
         self._facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")
         self._light = Sentence(sizing_mode="stretch_width", margin=0)
-        (pulses,) = (each for each in fields(Less) if each.name == "pulses")
+        (pulses,) = (each for each in fields(ReductionSettings) if each.name == "pulses")
         self._pulses = Knob.of(cast(Number, spec_of(pulses)), 1.0, inspector_words.PULSES_HELP)
         self._pulses.param.watch(lambda event: self._take(event.new), "value")
         self._advice = [Sentence(sizing_mode="stretch_width", margin=(2, 0)) for _ in range(2)]

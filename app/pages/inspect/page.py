@@ -10,7 +10,7 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 
-from app.model.colors import Look, map_of
+from app.model.colors import ColorScale, map_of
 from app.model.state import MOST_PINS
 from app.model.store import Answer
 from app.pages.inspect import text as inspector_words
@@ -316,7 +316,7 @@ class Inspector:
             fail = partial(session.failures.report, part=self)
             self._jobs.submit(work, partial(self._draw_map, session.answer), fail)
 
-    def _draw_map(self, answer: Answer, drawn: tuple[Any, Look]) -> None:
+    def _draw_map(self, answer: Answer, drawn: tuple[Any, ColorScale]) -> None:
         self._session.failures.resolve(self)
         if answer is self._session.answer:
             with pn.io.hold(self._session.page):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.model.budget import spending
-from app.model.state import Less
+from app.model.state import ReductionSettings
 from app.model.store import Answer, Pixel, inspect, reduced
 from app.pages.inspect.views import Corners, Curves
 from core import inspection
@@ -100,7 +100,7 @@ def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:
     return [step] * len(SHARES)
 
 
-def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[Less, int]:
+def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[ReductionSettings, int]:
     """The reduction of an answer with the suggested gate instead, and T_n at its old place."""
     less, n_bins = answer.request.less, answer.whole.acquisition.n_bins
     opens, _ = less.reduction(n_bins).gate or (0, n_bins)

@@ -21,7 +21,7 @@ import panel as pn
 import param
 
 from app.model import download_text as words
-from app.model.colors import Look
+from app.model.colors import ColorScale
 from app.model.exports import Write, image_files, plot_file
 from app.model.state import Viewing
 from app.model.store import Answer, Request
@@ -144,7 +144,7 @@ class Shown:
         What writes each format that is no picture of the screen, by suffix without the point.
     heading : str
         What stands above a picture that tells it nowhere itself.
-    scale : Look, optional
+    scale : ColorScale, optional
         Colours of a picture that has no colour bar of its own.
     """
 
@@ -152,7 +152,7 @@ class Shown:
     what: str
     files: Mapping[str, Write] = field(default_factory=dict)
     heading: str = ""
-    scale: Look | None = None
+    scale: ColorScale | None = None
 
 
 class Download(Component):
