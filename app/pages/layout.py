@@ -29,7 +29,7 @@ from app.widgets.cards import choice, part, select
 from app.widgets.connection import Connection
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import FileInput
-from app.widgets.share import TakeAway
+from app.widgets.share import Share
 from core import PRESETS, TrackingParameters
 from core.io import SUFFIXES, ReadOptions, reading_options
 
@@ -279,11 +279,7 @@ class Layout:
 
     def _sidebar(self) -> list[Any]:
         session, asides = self.session, self.pages.asides
-        script = TakeAway(
-            lambda: script_of(session.answer, session.state),
-            sizing_mode="stretch_width",
-            margin=8,
-        )
+        share = Share(lambda: script_of(session.answer, session.state))
         return [
             self._source,
             self._file,
@@ -293,7 +289,7 @@ class Layout:
             self._reading_part,
             self._shared[Shared.TRACKING],
             self._shared[Shared.REDUCTION],
-            part("Take it away", script),
+            part("Share", share.layout),
             *(aside for name, aside in asides.items() if self._pages[name].sidebar_last),
         ]
 
