@@ -133,7 +133,9 @@ def test_plots_and_cloud_come_back_where_the_browser_lost_its_graphics(browser, 
 
     page.locator(".stage canvas").evaluate(LOSE_AND_REFUSE)
     told = page.get_by_text("The 3D cloud cannot be drawn")
-    expect(told).to_have_text(re.compile("offers no WebGL 2. Its next change tries again."))
+    expect(told).to_have_text(
+        re.compile("offers no WebGL 2. It is tried again at the next change.")
+    )
     page.evaluate("refused = undefined")
     slider(page, "Seed").press("ArrowRight")
     expect(told).to_have_count(0)
@@ -209,7 +211,7 @@ def test_a_session_that_is_gone_begins_anew_and_its_file_is_removed(
         assert [path.name for path in held()] == ["21km.mat"]
         cut(page)
         eventually(lambda: not held())
-        mend(page, "had to begin anew")
+        mend(page, "the session had expired")
         expect(page.get_by_role("alert").filter(has_text="There is no scene")).to_be_visible()
         rests(page, "?tracking.l=0.006")
         upload(page, "again.mat", real_capture("21km_K11_night.mat").read_bytes())
