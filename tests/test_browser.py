@@ -545,7 +545,7 @@ def test_a_real_capture_is_ranged_and_its_guesses_are_told(page, real_capture):
     expect(inspect).to_have_attribute("aria-pressed", "true")
     new.get_by_role("button", name="Explore", exact=True).click()
     expect_the_building_at_21_km(new)
-    new.get_by_role("button", name="How to read the file").click()
+    new.get_by_role("button", name="Reading options").click()
     field(new, "Bin width (s)").fill("2e-9")
     new.get_by_role("button", name="Read again").click()
     expect(new.get_by_text("256 × 256 pixels, 100 bins of 2 ns")).to_be_visible()
