@@ -183,8 +183,8 @@ def describe(cutout: Cutout) -> str:
     if not cutout.is_preview:
         return f"Shown: {window}, of {rows} × {cols} pixels."
     sentence = (
-        f"Preview of {rows} × {cols} pixels, 1 of each {window.step} × {window.step}. Zoom into the "
-        "picture, then press Read window."
+        f"Preview of {rows} × {cols} pixels, 1 of each {window.step} × {window.step}. Zoom into "
+        "the picture, then press Read window."
     )
     if cutout.read < 1:
         sentence += f" {cutout.read:.0%} has been read; blank pixels have not."
