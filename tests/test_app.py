@@ -727,7 +727,7 @@ def test_what_is_folded_away_is_built_when_it_is_first_opened(layout):
         return [each.label for each in layout.page.select(Knob) if each.label in names]
 
     assert on_page() == []
-    part = opened(layout, "Less data, faster")
+    part = opened(layout, "Data reduction")
     for collapsed in (False, True, False):
         part.collapsed = collapsed
         assert on_page() == names
@@ -735,7 +735,7 @@ def test_what_is_folded_away_is_built_when_it_is_first_opened(layout):
 
 def test_form_link_and_script_have_each_option_for_reading_a_file(layout, small_file):
     given = ReadOptions(**EXAMPLES)
-    opened(layout, "How to read the file")
+    opened(layout, "Reading options")
     open_file(layout, small_file)
     answer = next_answer(layout)
     for name, option in reading_options().items():
@@ -750,7 +750,7 @@ def test_form_link_and_script_have_each_option_for_reading_a_file(layout, small_
 
 
 def test_typed_text_changes_how_a_file_is_read(layout, small_file):
-    opened(layout, "How to read the file")
+    opened(layout, "Reading options")
     open_file(layout, small_file)
     before = next_answer(layout)
     control(layout, "Bin width (s)").value = "wide"
@@ -763,7 +763,7 @@ def test_typed_text_changes_how_a_file_is_read(layout, small_file):
 
 
 def test_less_of_a_capture_is_another_view_of_it(layout):
-    opened(layout, "Less data, faster")
+    opened(layout, "Data reduction")
     control(layout, "Pixels added").value = 4
     assert next_answer(layout).capture.shape == (16, 16)
     assert max(layout.session.state.pixel) < 16

@@ -340,7 +340,7 @@ def test_curves_that_fail_are_told_and_those_of_the_next_pixel_are_drawn(monkeyp
 
 def test_what_is_typed_in_vain_is_told_and_the_next_reading_works():
     layout = Layout({"sample": built_in_sources()["sample"]})
-    opened(layout, "How to read the file")
+    opened(layout, "Reading options")
     width, alert, again = (
         control(layout, "Bin width (s)"),
         layout.alert,

@@ -136,7 +136,7 @@ def test_a_tables_interval_and_difference_are_said_in_words():
     assert [line["note"] for line in lines] == ["", paper_words.RECONSTRUCTION, "", ""]
     assert lines[0]["name"] == "Peak of the histogram"
     assert lines[0]["cells"][0] == ["0.3000", 0.30, "0.2800 to 0.3200"]
-    assert [line["cells"][2][2] for line in lines] == ["better", "chance may do", "worse", ""]
+    assert [line["cells"][2][2] for line in lines] == ["better", "within chance", "worse", ""]
     assert [line["cells"][2][1] for line in lines] == [0.04, -0.01, -0.08, None]
 
 

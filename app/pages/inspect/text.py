@@ -211,7 +211,7 @@ PULSES_HELP = (
     "fewer is a part of what is taken with more."
 )
 GATE_HELP = (
-    "Apply the gate: bins outside are left out; T_n stays at its place. “Less data, faster” tells "
+    "Apply the gate: bins outside are left out; T_n stays at its place. “Data reduction” tells "
     "the gate, and takes it back."
 )
 T_N_HELP = "Apply T_n: bins before are noise to the tracking differentiator."
