@@ -67,6 +67,7 @@ class ChiParameters:
             3.0,
             log=True,
             unit="bins",
+            merge_power=0,  # a kernel narrower than a bin would not smooth
             least=0.01,
             most=100.0,
             doubtful=(

@@ -54,6 +54,7 @@ class KdeParameters:
             3.0,
             log=True,
             unit="bins",
+            merge_power=0,  # a kernel narrower than a bin would not smooth
             least=0.01,
             most=100.0,
             doubtful=(
