@@ -12,7 +12,7 @@ from PIL import Image
 from playwright.sync_api import expect
 
 import core
-from app.model.state import CLOUDS, FIRST_METHODS, Illumination, Less
+from app.model.state import CLOUDS, FIRST_METHODS, Illumination, ReductionSettings
 from app.model.store import Request, built_in_sources, compute
 from app.pages.compare import ranking, text
 from app.pages.compare.page import MAX_PICTURES, Compare
@@ -29,7 +29,11 @@ from tests.threads import HeldTasks
 
 def answer_to(source):
     request = Request(
-        built_in_sources()[source], Illumination(), ReadOptions(), TrackingParameters(), Less()
+        built_in_sources()[source],
+        Illumination(),
+        ReadOptions(),
+        TrackingParameters(),
+        ReductionSettings(),
     )
     return compute(request, None)
 

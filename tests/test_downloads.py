@@ -22,7 +22,7 @@ from playwright.sync_api import expect
 
 from app.model.colors import image_of, map_of, shown
 from app.model.exports import drawn, facts_file, image_files, shown_table_file, table_file
-from app.model.state import MAPS, Illumination, Less
+from app.model.state import MAPS, Illumination, ReductionSettings
 from app.model.store import built_in_sources, inspect
 from app.pages.layout import Layout
 from app.pages.shared import downloads
@@ -66,7 +66,7 @@ def columns_of(content):
 
 def test_a_name_tells_capture_estimator_and_what_is_not_the_default():
     chosen = TrackingParameters(l=0.01, t_n=15)
-    subject = Subject("21km_K11_night", "tracking", (Less(), chosen))
+    subject = Subject("21km_K11_night", "tracking", (ReductionSettings(), chosen))
     assert subject.file_name("range image", "png") == (
         "21km_K11_night_tracking_l0.01_Tn15_range-image.png"
     )
@@ -97,7 +97,7 @@ def test_a_name_harms_no_system_whatever_the_capture_is_called(capture):
     subject = Subject(
         capture,
         "log_matched_filter",
-        (Illumination(1.0, 1.0, 77, 5), Less(2, 0.1, 0.9), everything),
+        (Illumination(1.0, 1.0, 77, 5), ReductionSettings(2, 0.1, 0.9), everything),
     )
     name = subject.file_name("enhanced row1000 col1000", "csv")
     assert re.fullmatch(r"[\w.+-]+", name, re.ASCII)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.model.colors import map_of
-from app.model.state import MAPS, NEED_TRUTH, Less
+from app.model.state import MAPS, NEED_TRUTH, ReductionSettings
 from app.model.store import built_in_sources, file_source
 from app.pages.inspect import text
 from app.pages.inspect.capture import CaptureSection
@@ -202,10 +202,10 @@ def test_pixel_pins_and_region_are_kept_while_the_capture_keeps_its_pixels(far):
     far.choose_pixel(100, 131)
     far.state.param.update(pins=((100, 131),), region=rectangle((10, 20), (5, 8)))
     kept = (far.state.pixel, far.state.pins, far.state.region)
-    for less in (Less(gate_from=0.1), Less(pulses=0.5)):
+    for less in (ReductionSettings(gate_from=0.1), ReductionSettings(pulses=0.5)):
         change(far, less=less)
         assert (far.state.pixel, far.state.pins, far.state.region) == kept
-    change(far, less=Less(pool=2))
+    change(far, less=ReductionSettings(pool=2))
     assert (far.state.pins, far.state.region) == ((), ())
 
 
@@ -386,7 +386,7 @@ def test_a_report_that_fails_removes_the_previous_one(capture, building, monkeyp
         raise MemoryError("no more")
 
     monkeypatch.setattr("core.inspection.capture_report", fail)
-    building.state.less = Less(merge=2)
+    building.state.less = ReductionSettings(merge=2)
     building.tasks.run_until(lambda: "MemoryError" in "".join(shown))
     assert capture.report is None
     assert capture.facts.facts == []
@@ -395,7 +395,7 @@ def test_a_report_that_fails_removes_the_previous_one(capture, building, monkeyp
 
 
 def test_a_gate_is_applied_to_an_already_reduced_capture(building):
-    change(building, less=Less(merge=2, gate_from=0.1))
+    change(building, less=ReductionSettings(merge=2, gate_from=0.1))
     answer = building.answer
     suggestion = replace(inspection.capture_report(answer.capture).suggestion, gate=(4, 90))
     less, t_n = with_gate(answer, suggestion)
@@ -423,7 +423,7 @@ def test_an_estimate_for_an_earlier_setting_does_not_reset_the_slider(capture, b
     for share in (0.5, 0.25):
         capture.pulses.value = share
     building.tasks.run_until(lambda: building.answer is not before)
-    earlier = replace(building.answer.request, less=Less(pulses=0.5))
+    earlier = replace(building.answer.request, less=ReductionSettings(pulses=0.5))
     capture.follow(replace(building.answer, request=earlier))
     assert (capture.pulses.value, building.state.less.pulses) == (0.25, 0.25)
 
@@ -435,7 +435,7 @@ def test_a_share_of_pulses_that_fails_is_reset(capture, building, monkeypatch):
     monkeypatch.setattr("app.pages.shared.estimate.compute", fail)
     capture.pulses.value = 0.5
     building.tasks.run_until(lambda: capture.pulses.value == 1.0)
-    assert building.state.less == Less()
+    assert building.state.less == ReductionSettings()
 
 
 def test_without_truth_accuracy_is_called_agreement(far):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from app.model.store import built_in_sources
 from app.pages.layout import CUSTOM, Layout
 from app.pages.session import Session
@@ -187,14 +187,14 @@ def test_another_capture_makes_the_study_outdated(section, session):
 def test_opening_the_papers_method_sets_the_sliders(measured):
     layout = Layout(built_in_sources())
     (point,) = (p for p in measured if p.candidate.method.estimator == "tracking")
-    merged = replace(point.candidate, reduction=Less(merge=2).reduction(100))
+    merged = replace(point.candidate, reduction=ReductionSettings(merge=2).reduction(100))
     measured_on = layout.session.answer.request
     changed = Illumination(sbr=1.0)
     layout.session.state.param.update(light=changed, source="staircase", page="Trade-off")
     show_point(layout.session, replace(point, candidate=merged), measured_on)
     state = layout.session.state
     assert (state.source, state.light) == ("car", Illumination())
-    assert (state.less, state.tracking) == (Less(merge=2), merged.settings)
+    assert (state.less, state.tracking) == (ReductionSettings(merge=2), merged.settings)
     assert layout.pages.choice.value == "Explore"
     assert control(layout, "SBR").value == Illumination().sbr
     assert control(layout, "Preset").value == CUSTOM

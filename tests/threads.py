@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from queue import SimpleQueue
 from typing import Any
 
-from app.model.address import Wanted
+from app.model.address import Link
 from app.model.store import Answer, Source
 from app.pages.layout import Layout
 from app.tasks.page import PageTasks
@@ -51,7 +51,7 @@ class HeldLayout(Layout):
         Every sentence on failures, the latest last; empty ones where all works.
     """
 
-    def __init__(self, sources: Mapping[str, Source], wanted: Wanted | None = None) -> None:
+    def __init__(self, sources: Mapping[str, Source], wanted: Link | None = None) -> None:
         self.tasks = HeldTasks()
         super().__init__(sources, wanted, tasks=self.tasks)
         self.heard = [""]

@@ -29,7 +29,7 @@ FREE_BYTES = 2**26
 """A request that needs less is not counted: it never waits for others."""
 
 REMEDY = (
-    "Crop the gate, merge bins or keep fewer pixels under Less data, faster; or range all of it "
+    "Crop the gate, merge bins or keep fewer pixels under Data reduction; or range all of it "
     "without this page: python -m core estimate"
 )
 

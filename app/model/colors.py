@@ -29,7 +29,7 @@ FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"
 
 
 @dataclass(frozen=True)
-class Look:
+class ColorScale:
     """A colour scale and its words; values beyond it are drawn in `outside`, if given."""
 
     title: str
@@ -70,7 +70,7 @@ def shown(answer: Answer, least_confidence: float) -> NDArray[np.bool_]:
     return np.asarray(image.valid & (image.confidence >= least_confidence))
 
 
-def image_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array, Look]:
+def image_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array, ColorScale]:
     """The image (row, col) of a kind, NaN where there is nothing, and its look.
 
     Parameters
@@ -88,18 +88,22 @@ def image_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array,
     if kind == "Confidence":
         # All of it: what is hidden elsewhere is hidden for want of it.
         sure = np.where(image.valid, image.confidence, np.nan)
-        return sure, Look("Confidence: probability of being right", "", 0.0, 1.0, COUNT_COLORS)
+        return sure, ColorScale(
+            "Confidence: probability of being right", "", 0.0, 1.0, COUNT_COLORS
+        )
     if kind == "Error" and truth_m is not None:
         reach_m = ERROR_SCALE_BINS * capture.acquisition.bin_length_m
         error_m = np.where(shown(answer, least_confidence), image.range_m - truth_m, np.nan)
-        return error_m, Look("Error: estimate minus truth", "m", -reach_m, reach_m, ERROR_COLORS)
+        return error_m, ColorScale(
+            "Error: estimate minus truth", "m", -reach_m, reach_m, ERROR_COLORS
+        )
     if kind == "Truth" and truth_m is not None:
         return truth_m, _range_look(answer, "True range")
     range_m = np.where(shown(answer, least_confidence), image.range_m, np.nan)
     return range_m, _range_look(answer, "Estimated range")
 
 
-def map_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array, Look]:
+def map_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array, ColorScale]:
     """Return the image (row, col) of one of `MAPS`, NaN without a value, and its look."""
     if kind not in inspection.maps:
         return image_of(answer, kind, least_confidence)
@@ -108,10 +112,10 @@ def map_of(answer: Answer, kind: str, least_confidence: float) -> tuple[Array, L
     low, high = np.percentile(known, [1, 99]).tolist() if known.size else (0.0, 1.0)
     is_unknown = kind == "Fired" and answer.capture.gated_pulses is None
     title = FIRED_UNKNOWN if is_unknown else MAP_TITLES[kind]
-    return values, Look(title, "", low, max(high, low + 1e-6), COUNT_COLORS)
+    return values, ColorScale(title, "", low, max(high, low + 1e-6), COUNT_COLORS)
 
 
-def color_values(answer: Answer, kind: str) -> tuple[Array, Look]:
+def color_values(answer: Answer, kind: str) -> tuple[Array, ColorScale]:
     """Values (row, col) that colour a cloud by "Range", "Error" or "Counts", and their look."""
     return image_of(answer, "Estimate" if kind == "Range" else kind, 0.0)
 
@@ -133,7 +137,7 @@ def cloud_of(
     )
 
 
-def _range_look(answer: Answer, title: str) -> Look:
+def _range_look(answer: Answer, title: str) -> ColorScale:
     """The scale that truth and estimate share: that of the scene, or of confident answers."""
     truth_m, image = answer.capture.truth_range_m, answer.run.image
     bin_m = answer.capture.acquisition.bin_length_m
@@ -143,9 +147,9 @@ def _range_look(answer: Answer, title: str) -> Look:
         sure = image.range_m[image.confidence >= 0.9]
         sure = sure if sure.size else image.range_m[image.valid]
         low, high = np.percentile(sure, [2, 98]).tolist() if sure.size else (0.0, 1.0)
-    return Look(title, "m", low - bin_m, high + bin_m, RANGE_COLORS, OUTSIDE_COLOR)
+    return ColorScale(title, "m", low - bin_m, high + bin_m, RANGE_COLORS, OUTSIDE_COLOR)
 
 
-def _count_look(counts: Array) -> Look:
+def _count_look(counts: Array) -> ColorScale:
     low, high = float(counts.min()), float(counts.max())
-    return Look("Detections of each pixel", "counts", low, max(high, low + 1), COUNT_COLORS)
+    return ColorScale("Detections of each pixel", "counts", low, max(high, low + 1), COUNT_COLORS)

@@ -16,7 +16,7 @@ import numpy as np
 from bokeh.models import Axis, GlyphRenderer
 from numpy.typing import NDArray
 
-from app.model.colors import Look, cloud_of, map_of, shown
+from app.model.colors import ColorScale, cloud_of, map_of, shown
 from app.model.download_text import NO_POINTS, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.state import UNITS, Viewing
@@ -181,7 +181,7 @@ def image_files(
     return {"csv": image_file(values, look, figure, answer.grid), **files}
 
 
-def image_file(values: Array, look: Look, figure: Any, grid: Grid) -> Write:
+def image_file(values: Array, look: ColorScale, figure: Any, grid: Grid) -> Write:
     """The pixels in view of an image (row, col), one line each, as CSV.
 
     Rows and columns are those of the file, as on the axes; `grid` tells them.

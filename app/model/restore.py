@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from app.model import text
-from app.model.address import Wanted, defaults
+from app.model.address import Link, defaults
 from app.model.capture_defaults import FROM_CAPTURE, defaults_of, enter
 from app.model.state import State
 from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def restore(
-    state: State, sources: Mapping[str, Source], wanted: Wanted, own: Mapping[str, Any]
+    state: State, sources: Mapping[str, Source], wanted: Link, own: Mapping[str, Any]
 ) -> Answer:
     """Set a state to what a link asks for, as far as that can be computed, and compute it.
 
@@ -26,7 +26,7 @@ def restore(
     ----------
     state : State
     sources : mapping of str to Source
-    wanted : Wanted
+    wanted : Link
         The link.
     own : mapping
         Defaults of this session that differ from the state's.
@@ -47,7 +47,7 @@ def restore(
 
 
 def _first_answer(
-    state: State, sources: Mapping[str, Source], wanted: Wanted, own: Mapping[str, Any]
+    state: State, sources: Mapping[str, Source], wanted: Link, own: Mapping[str, Any]
 ) -> Answer:
     before = {**defaults(), **own}
     asked = wanted.of({name: before[name] for name in before if name not in FROM_CAPTURE})

@@ -77,7 +77,7 @@ class Viewing:
 
 
 @dataclass(frozen=True)
-class Less:
+class ReductionSettings:
     """Less of a capture than there is: quicker to range, or clearer, and never as fine."""
 
     merge: int = parameter(
@@ -127,7 +127,7 @@ class Less:
         check_fields(self)
 
     @classmethod
-    def of(cls, reduction: Reduction, n_bins: int) -> Less:
+    def of(cls, reduction: Reduction, n_bins: int) -> ReductionSettings:
         """The settings that reduce a capture of so many bins like this."""
         first, end = reduction.gate or (0, n_bins)
         return cls(
@@ -260,7 +260,7 @@ class State(param.Parameterized):
     window = param.ClassSelector(
         class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."
     )
-    less = param.ClassSelector(class_=Less, default=Less())
+    less = param.ClassSelector(class_=ReductionSettings, default=ReductionSettings())
     absent: Any = Checked(
         frozenset(), _check_absent, doc="Parts and corrections that are switched off."
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from core import (
     CORRECTIONS,
     PARTS,
@@ -128,7 +128,7 @@ class Request:
     light: Illumination
     reading: ReadOptions
     tracking: TrackingParameters
-    less: Less
+    less: ReductionSettings
     absent: frozenset[str] = frozenset()
     """Parts of the scene and corrections of the estimators that are switched off."""
     window: Window | None = None
@@ -151,7 +151,7 @@ class Answer:
     """What the capture that was ranged is a part of, or that capture itself."""
     cutout: Cutout | None = None
     """Of a file larger than memory, what is in memory."""
-    asked: Less = field(default_factory=Less)
+    asked: ReductionSettings = field(default_factory=ReductionSettings)
     """The reduction that was asked for; that of `request` leaves out more where this would take
     more than the server gives to a request."""
 
@@ -225,7 +225,7 @@ def _cost(whole: Capture, request: Request) -> Cost:
     return predicted(_reduced_shape(whole, request), "tracking", request.tracking)
 
 
-def _fitting(whole: Capture, request: Request) -> Less:
+def _fitting(whole: Capture, request: Request) -> ReductionSettings:
     """The reduction asked for, or the least that is more of it and that one request may take."""
     if fits(_cost(whole, request)):
         return request.less

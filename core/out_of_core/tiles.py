@@ -96,7 +96,7 @@ def estimate_large(
     description = describe(counts, ReadOptions())
     array = da.asarray(counts.data).rechunk({2: -1})
     flux_prior, calibration, remark = learned(array, description, method, settings, false_alarm)
-    margin = estimator.reach(settings) // 2
+    margin = estimator.window_size(settings) // 2
     around = {0: margin, 1: margin, 2: 0}
     # Chunks of an edge may be narrower than the margin: Dask joins them.
     parts = da.overlap.overlap(array, depth=around, boundary="none")

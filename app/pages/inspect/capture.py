@@ -12,7 +12,7 @@ from bokeh.models import FixedTicker, Range1d
 
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import plot_file
-from app.model.state import Less
+from app.model.state import ReductionSettings
 from app.model.store import Answer
 from app.model.text import COMPUTING
 from app.pages.inspect import text
@@ -76,7 +76,7 @@ class CaptureSection(Section):
         self.study = Study(session, self._steps, "shares of the pulses")
         self.facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")
         self.flux = Sentence(sizing_mode="stretch_width", margin=0)
-        (pulses,) = (each for each in fields(Less) if each.name == "pulses")
+        (pulses,) = (each for each in fields(ReductionSettings) if each.name == "pulses")
         self.pulses = Knob.of(cast(Number, spec_of(pulses)), 1.0, text.PULSES_HELP)
         self.pulses.param.watch(lambda event: self._reduce(event.new), "value")
         self.advice = [Sentence(sizing_mode="stretch_width", margin=(2, 0)) for _ in range(2)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.model.budget import spending
-from app.model.state import Less
+from app.model.state import ReductionSettings
 from app.model.store import Answer, Pixel, inspect, reduced
 from core import inspection
 from core.cost import predicted_flux_time
@@ -92,7 +92,7 @@ def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:
     return [step] * len(SHARES)
 
 
-def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[Less, int]:
+def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[ReductionSettings, int]:
     """Return the reduction that crops to the suggested gate, and T_n at its old place."""
     less, n_bins = answer.request.less, answer.whole.acquisition.n_bins
     opens, _ = less.reduction(n_bins).gate or (0, n_bins)

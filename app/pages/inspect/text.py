@@ -198,7 +198,7 @@ PULSES_HELP = (
     "subset of a larger one."
 )
 GATE_HELP = (
-    "Apply the gate: bins outside it are cut, and T_n moves with it. Undo it under “Reduce data”."
+    "Apply the gate: bins outside it are cut, and T_n moves with it. Undo it under “Data reduction”."
 )
 T_N_HELP = "Apply T_n: the tracking differentiator ignores the bins before it."
 

@@ -14,7 +14,7 @@ from app.model.budget import fits, require_fitting
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import table_file
 from app.model.restore import parameters_of
-from app.model.state import Less
+from app.model.state import ReductionSettings
 from app.model.store import Answer, Request, bare, same_capture
 from app.pages.session import Session
 from app.pages.shared.downloads import TABLE, Shown, Subject, below, looked_at
@@ -259,7 +259,7 @@ def show_point(session: Session, point: Point, measured_on: Request) -> None:
     """Show a measured configuration: the paper's method on Explore, others on Compare."""
     state, candidate = session.state, point.candidate
     method, settings = candidate.method.estimator, candidate.settings
-    request = replace(measured_on, less=Less.of(candidate.reduction, point.shape[2]))
+    request = replace(measured_on, less=ReductionSettings.of(candidate.reduction, point.shape[2]))
     if method == "tracking":
         page, comparison = "Explore", state.comparison
         request = replace(request, tracking=settings)

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from core.capture import Capture, Seen
+from core.capture import Capture, CaptureInfo
 from core.checks import require
 from core.estimators import RangeImage
 from core.io.readers.labelled import dataset
@@ -103,7 +103,7 @@ def save_capture(
 
 
 def save_image(
-    capture: Seen,
+    capture: CaptureInfo,
     image: RangeImage,
     path: str | os.PathLike[str],
     *,

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.capture import Seen
+from core.capture import CaptureInfo
 from core.checks import require
 from core.estimators import RangeImage
 from core.geometry import Points, points_m
@@ -32,7 +32,7 @@ class Product:
 
     Parameters
     ----------
-    capture : Seen
+    capture : CaptureInfo
         Source of the range image.
     image : RangeImage
         Range image of the capture's shape.
@@ -52,7 +52,7 @@ class Product:
         angle is not between 0 and π/2.
     """
 
-    capture: Seen
+    capture: CaptureInfo
     image: RangeImage
     pixel_angle_rad: float | None = None
     title: str = ""
