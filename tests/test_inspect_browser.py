@@ -522,7 +522,7 @@ def test_accuracy_is_studied_and_a_bar_tells_how_far(whole):
 
 @BOTH
 def test_fewer_pulses_are_taken_live(whole):
-    page, slide = whole.page, slider(whole.page, "Pulses accumulated (of all)").filter(visible=True)
+    page, slide = whole.page, slider(whole.page, "Pulses used (of all)").filter(visible=True)
     for _ in range(3):
         slide.press("PageDown")
     share = float(slide.get_attribute("aria-valuetext").split()[0])
