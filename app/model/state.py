@@ -271,9 +271,7 @@ class State(param.Parameterized):
     page: Any = Checked("Explore", _check_page, doc="Name of a page of `app.pages.catalog`.")
     unit = param.Selector(default="bins", objects=list(UNITS), doc="Unit of axes along the gate.")
     map = param.Selector(default="Estimate", objects=list(MAPS), doc="Quantity of the map.")
-    subject = param.Selector(
-        default="Pixel", objects=list(SUBJECTS), doc="Section of Inspect."
-    )
+    subject = param.Selector(default="Pixel", objects=list(SUBJECTS), doc="Section of Inspect.")
     pins: Any = Checked((), _check_pins, doc="Up to four pixels (row, col) to compare.")
     region: Any = Checked(
         (),

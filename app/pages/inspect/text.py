@@ -197,7 +197,9 @@ PULSES_HELP = (
     "Share of the pulses to use, as if the recording had ended earlier. A smaller share is a "
     "subset of a larger one."
 )
-GATE_HELP = "Apply the gate: bins outside it are cut, and T_n moves with it. Undo it under “Data reduction”."
+GATE_HELP = (
+    "Apply the gate: bins outside it are cut, and T_n moves with it. “Data reduction” undoes it."
+)
 T_N_HELP = "Apply T_n: the tracking differentiator ignores the bins before it."
 
 

@@ -24,7 +24,6 @@ from app.pages.shared.downloads import (
     explored,
 )
 from app.pages.shared.studies import aside
-from app.tasks.scheduler import Latest
 from app.theme import Palette, palette
 from app.widgets.controls import Facts, SettingsPanel, Table
 from core.parameters import check_fields
@@ -110,7 +109,6 @@ class Section:
         work: Callable[[], Result],
         draw: Callable[[Result], None],
         failed: Callable[[Exception], None] | None = None,
-        jobs: Latest | None = None,
     ) -> None:
         """Run `work` in the background and draw its result, unless it is outdated by then."""
         session, answer = self.session, self.session.answer
@@ -121,7 +119,7 @@ class Section:
                 with session.tasks.hold():
                     draw(result)
 
-        (jobs or self._jobs).submit(work, arrived, failed or self.report_error)
+        self._jobs.submit(work, arrived, failed or self.report_error)
 
     def report_error(self, error: Exception) -> None:
         """Show an error until this section works again."""
