@@ -265,7 +265,7 @@ def test_a_move_paints_each_plot_once_and_then_writes_the_numbers(here):
       };
     }""")
     fact(page, "Pixel").locator("xpath=ancestor::dl").evaluate(
-        "list => new MutationObserver(() => seen.push('numbers')).observe(list, { childList: true })"
+        "l => new MutationObserver(() => seen.push('numbers')).observe(l, { childList: true })"
     )
     page.keyboard.press("ArrowRight")
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 1}")
