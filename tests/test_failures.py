@@ -30,10 +30,11 @@ from app.pages.inspect.pixel import PixelSection
 from app.pages.inspect.views import rectangle
 from app.pages.layout import Layout, Template
 from app.pages.navigation import Pages, View
-from app.pages.paper.page import Jump, LiveFigures, RangeImages, Repeated, RepeatedTable, jump
+from app.pages.paper.page import Jump, LiveFigures, RangeImages, RepeatedTable, jump
 from app.pages.session import Session
 from app.pages.shared.failures import FailureLog
-from app.pages.tradeoff.ablation import Ablated, AblationSection
+from app.pages.shared.section import Repetitions
+from app.pages.tradeoff.ablation import AblationSection
 from app.pages.tradeoff.acquisition import AcquisitionSection
 from app.pages.tradeoff.sensitivity import SensitivitySection, Swept
 from app.pages.tradeoff.speed import Effort, SpeedSection
@@ -157,14 +158,14 @@ def live(session):
 
 def repeated(session):
     plan, table = {Condition("car", 0.06): paper.COMPARED[:1]}, paper.arithmetic()
-    settings = Repeated(repetitions=2)
+    settings = Repetitions()
     return by_compute(
         RepeatedTable(session, settings, "", lambda _: plan, lambda *_: table), settings
     )
 
 
 def ablation(session):
-    return by_compute(AblationSection(session), Ablated(repetitions=2))
+    return by_compute(AblationSection(session), Repetitions())
 
 
 def speed(session):

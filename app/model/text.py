@@ -9,11 +9,16 @@ from concurrent.futures import BrokenExecutor
 
 import numpy as np
 
-from app.model.store import Answer
+from app.model.store import Answer, Pixel
+from app.units import Scale
+from core.metrics import Interval
 from core.studies.ablation import TITLES
 
 Fact = tuple[str, str, str]
 """Name, value and help."""
+
+Cell = tuple[str, float | None, str]
+"""Text of a table's cell, the value to sort by, and a smaller second line."""
 
 FIELD_OF_VIEW_UNKNOWN = (
     " The file does not state the field of view: the width of the cloud is a guess (see View)."
@@ -22,6 +27,8 @@ FIELD_OF_VIEW_UNKNOWN = (
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
 
 CONFIDENCE_HELP = "Probability of a surface within 3 bins of the estimate."
+
+TRUTH_HELP = "True range of the surface."
 
 COMPUTING = "Computing …"
 
@@ -118,6 +125,43 @@ def number(value: float, unit: str, sign: bool = False) -> str:
 def share(value: float) -> str:
     """Format a share in percent; a dash for NaN."""
     return "–" if math.isnan(value) else f"{100 * value:.1f} %"
+
+
+def cell(value: float, form: str = "{:.4g}", below: str = "") -> Cell:
+    """Return a table's cell; a dash if the value is not finite."""
+    return (form.format(value), value, below) if math.isfinite(value) else ("–", None, below)
+
+
+def percent_cell(value: float, below: str = "") -> Cell:
+    """Return a share as a table's cell, sorted by the share."""
+    return share(value), value if math.isfinite(value) else None, below
+
+
+def interval_cell(found: Interval, form: str) -> Cell:
+    """Return an estimate as a table's cell, with its interval below."""
+    if math.isnan(found.value):
+        return "–", None, ""
+    low, high = (form.removesuffix(" %").format(end) for end in (found.low, found.high))
+    return cell(found.value, form, f"{low} to {high}")
+
+
+def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
+    """Return name, value and help of a pixel's estimate, compared with the truth if it is known."""
+    facts = [("Estimate", number(pixel.range_m, "m"), "Range of the surface, lag removed.")]
+    if along.name != "m":
+        facts.append(("Position", along.place(pixel.answer_bin), "The estimate along the gate."))
+    if has_truth:
+        error = number(pixel.range_m - pixel.truth_m, "m", sign=True)
+        facts += [
+            ("Truth", target(pixel.truth_m), TRUTH_HELP),
+            ("Error", error, "Estimate minus truth."),
+        ]
+    return [*facts, ("Confidence", share(pixel.confidence), CONFIDENCE_HELP)]
+
+
+def target(truth_m: float) -> str:
+    """Format the true range of a pixel, which may have no target."""
+    return "no target" if math.isnan(truth_m) else number(truth_m, "m")
 
 
 def milliseconds(seconds: float) -> str:
