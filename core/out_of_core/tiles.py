@@ -26,8 +26,8 @@ from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.estimators.base import Calibration
 from core.inference.flux import flux_prior_of
 from core.inference.flux_model import FluxPrior
-from core.io.readers.dense import AXES, whole_counts
-from core.io.readers.labelled import Description, describe
+from core.io.readers.dense import AXES, Description, capture_of, whole_counts
+from core.io.readers.labelled import describe
 from core.io.readers.options import ReadOptions
 from core.io.readers.sample import sample_of
 
