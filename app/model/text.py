@@ -21,6 +21,8 @@ FIELD_OF_VIEW_UNKNOWN = (
 
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
 
+CONFIDENCE_HELP = "Probability of a surface within 3 bins of the estimate."
+
 COMPUTING = "Computing …"
 
 NOT_COMPUTED = "Not computed yet."
