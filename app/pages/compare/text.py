@@ -11,6 +11,7 @@ import numpy as np
 from app.model.store import Answer
 from app.model.text import NOT_COMPUTED, Fact, cause, number, reason, share
 from app.pages.compare.ranking import TOLERANCES_BINS, Result, Task, Yardstick, agreement
+from app.units import count
 from core import ESTIMATORS, Capture
 
 Column = tuple[str, str, int]
@@ -181,7 +182,7 @@ def pixel_facts(answer: Answer, measure: Yardstick | None, row: int, col: int) -
         *facts,
         ("Limit: found", found, "Probability of finding this echo that no method can beat."),
         ("Limit: spread", spread, "Cramér–Rao: least standard deviation around the echo."),
-        ("Detections", f"{int(capture.counts[row, col]):,}", "Counts in this pixel's histogram."),
+        ("Detections", count(int(capture.counts[row, col])), "Counts in this pixel's histogram."),
     ]
 
 

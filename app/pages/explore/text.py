@@ -6,7 +6,7 @@ import math
 
 from app.model.store import Answer, Pixel
 from app.model.text import Fact, milliseconds, number, share
-from app.units import scale
+from app.units import count, scale
 
 IMAGE_HELP = "What the image shows"
 
@@ -32,7 +32,7 @@ where targets are: as printed that they are far, as recommended (exponential, α
 def figure_strip(answer: Answer) -> list[Fact]:
     """Name, value and help of each figure; those that need a truth only where there is one."""
     figures = answer.run.figures
-    strip = []
+    strip: list[Fact] = []
     if figures:
         strip = [
             (
@@ -87,7 +87,7 @@ def pixel_numbers(answer: Answer, pixel: Pixel, unit: str = "bins") -> list[Fact
         ("σ", number(sigma, "counts"), "Standard deviation of the histogram."),
         ("r small", number(r_small, ""), "l·σ, bound of the small scale's acceleration."),
         ("r large", number(tracking.n * r_small, ""), "n·l·σ, that of the large scale."),
-        ("Detections", f"{pixel.counts:,}", "Counts in this pixel's histogram."),
+        ("Detections", count(pixel.counts), "Counts in this pixel's histogram."),
     ]
     if n_pulses is not None:
         fired = share(pixel.counts / n_pulses)

@@ -10,7 +10,8 @@ from app.model.large import Grid
 from app.model.store import Answer
 from app.model.text import Fact, number, share
 from app.pages.inspect.results import Seen
-from app.units import AXIS_TITLES, OPPOSITE_UNIT, Scale, scale
+from app.units import AXIS_TITLES, OPPOSITE_UNIT, Quantity, Scale, count, scale
+from app.units import interval as format_interval
 from core.inspection import Accuracy, Candidate, CaptureReport, FluxEstimate
 from core.metrics import Interval
 
@@ -51,16 +52,9 @@ CANDIDATE_COLUMNS = (
 PINS = "Pinned pixels beside each other."
 
 
-def interval(found: Interval) -> str:
+def interval(found: Interval) -> Quantity:
     """An estimate with its 95 % interval; a dash where there is none."""
-    if math.isnan(found.value):
-        return "–"
-    low, high = (_short(end) for end in (found.low, found.high))
-    return f"{_short(found.value)} [{low}, {high}]"
-
-
-def _short(value: float) -> str:
-    return "∞" if math.isinf(value) else f"{value:.3g}"
+    return format_interval(found.value, found.low, found.high)
 
 
 def facts(answer: Answer, seen: Seen, unit: str) -> list[Fact]:
@@ -85,9 +79,9 @@ def _pixel_facts(answer: Answer, seen: Seen, unit: str) -> list[Fact]:
             ("Truth", truth, "Where the surface is."),
             ("Error", error, "Estimate minus truth."),
         ]
-    counts, fired = f"{pixel.counts:,}", "Counts in this pixel's histogram"
+    counts, fired = count(pixel.counts), "Counts in this pixel's histogram"
     if answer.capture.gated_pulses is not None:
-        counts += f" ({share(pixel.counts / answer.capture.gated_pulses)})"
+        counts = count(pixel.counts, share(pixel.counts / answer.capture.gated_pulses))
         fired += ", and their share of the pulses"
     return [
         *found,
@@ -101,7 +95,7 @@ def _region_facts(seen: Seen, unit: str) -> list[Fact]:
     assert region is not None
     spread = "Half the range of the middle 68 % of the answers, as one standard deviation."
     return [
-        ("Pixels", f"{region.n_pixels:,}", "Pixels whose centre lies in the region."),
+        ("Pixels", count(region.n_pixels), "Pixels whose centre lies in the region."),
         *_estimate(seen, scale(unit, region.summed.acquisition)),
         ("Median of answers", number(region.median_m, "m"), "Of its pixels, one by one."),
         ("Spread of answers", number(region.spread_m, "m"), spread),
@@ -222,16 +216,16 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
     rows, cols = answer.capture.shape
     n_pulses = answer.capture.acquisition.n_pulses
     light, per = report.flux, f", in {report.flux_unit}, with 95 % interval."
-    narrow = "–" if report.n_hot is None else None
+    hot, dead = ("–" if n is None else count(n) for n in (report.n_hot, report.n_dead))
     return [
         ("Pixels", f"{rows} × {cols}", "Rows and columns."),
-        ("Pulses", "not known" if n_pulses is None else f"{n_pulses:,}", "Sent for each pixel."),
-        ("Detections", f"{answer.capture.counts.mean():.4g}", "Mean of a pixel."),
+        ("Pulses", "not known" if n_pulses is None else count(n_pulses), "Sent for each pixel."),
+        ("Detections", number(float(answer.capture.counts.mean()), ""), "Mean of a pixel."),
         ("Signal (PPP)", interval(light.signal), f"Photons of the echo, mean of all pixels{per}"),
         ("Background", interval(light.background), f"Over the whole gate, mean of all pixels{per}"),
         ("SBR", interval(light.sbr), "Signal over background, with 95 % interval."),
-        ("Hot pixels", narrow or f"{report.n_hot:,}", "More detections than all neighbours."),
-        ("Dead pixels", narrow or f"{report.n_dead:,}", "Fewer detections than all neighbours."),
+        ("Hot pixels", hot, "More detections than all neighbours."),
+        ("Dead pixels", dead, "Fewer detections than all neighbours."),
     ]
 
 
