@@ -11,6 +11,7 @@ import numpy as np
 from app.model.store import Answer
 from app.model.text import NOT_COMPUTED, Fact, cause, number, reason, share
 from app.pages.compare.ranking import TOLERANCES_BINS, Reference, Result, Task, agreement
+from app.units import count
 from core import ESTIMATORS, Capture
 
 Column = tuple[str, str, int]
@@ -183,7 +184,7 @@ def pixel_facts(answer: Answer, reference: Reference | None, row: int, col: int)
         *facts,
         ("Limit: found", found, "Largest possible probability of finding this echo."),
         ("Limit: spread", spread, "Cramér–Rao bound: smallest possible standard deviation."),
-        ("Detections", f"{int(capture.counts[row, col]):,}", "Counts in this pixel's histogram."),
+        ("Detections", count(int(capture.counts[row, col])), "Counts in this pixel's histogram."),
     ]
 
 
