@@ -194,8 +194,10 @@ PULSES_HELP = (
     "Share of the pulses to use, as if the recording had ended earlier. A smaller share is a "
     "subset of a larger one."
 )
-GATE_HELP = "Apply the gate: bins outside it are cut, and T_n moves with it. Undo it under “Data "
+GATE_HELP = (
+    "Apply the gate: bins outside it are cut, and T_n moves with it. Undo it under “Data "
     "reduction”."
+)
 T_N_HELP = "Apply T_n: the tracking differentiator ignores the bins before it."
 
 
