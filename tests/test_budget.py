@@ -54,7 +54,7 @@ def test_a_capture_too_costly_opens_reduced_and_says_so(source, tight):
     assert less.merge * less.skip > 1
     assert answer.asked == ReductionSettings()
     assert answer.capture.cube.size < answer.whole.cube.size
-    assert "no more than this server allows" in answer.capture.source
+    assert "limits of this server" in answer.capture.source
     # As few as will do: one step less is refused.
     for name in ("merge", "skip"):
         if getattr(less, name) > 1:

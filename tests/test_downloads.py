@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import re
 import time
 from base64 import b64encode
@@ -28,6 +29,7 @@ from app.pages.layout import Layout
 from app.pages.shared import downloads
 from app.pages.shared.downloads import Download, Shown, Subject
 from app.theme import RANGE_COLORS
+from app.units import count, interval, number, share
 from core import TrackingParameters
 from core.studies.outputs import Table
 from tests.browser import VIEWS, fact, server_process
@@ -302,14 +304,14 @@ def test_tables_leave_with_every_digit_and_without_units_in_their_cells():
         {
             "name": "peak, or so",
             "note": "",
-            "cells": [["98.2 %", 0.982, "97 to 99"], ["1,234.5", 1234.5, ""]],
+            "cells": [[share(0.9825), 0.9825, "97 to 99"], ["1,234.5", 1234.5, ""]],
         },
         {"name": "other", "note": "", "cells": [["–", None, ""], ["2.0", 2.0, ""]]},
         {"name": "failed", "message": "Not computed yet.", "cells": []},
     ]
     assert written(shown_table_file(columns, rows)).decode() == (
         'Method,Right (%),"Right, more",Time,note\r\n'
-        '"peak, or so",98.2,97 to 99,1234.5,\r\n'
+        '"peak, or so",98.25,97 to 99,1234.5,\r\n'
         "other,,,2.0,\r\n"
         "failed,,,,Not computed yet.\r\n"
     )
@@ -348,21 +350,23 @@ def offering(write):
 def test_numbers_leave_with_the_ends_of_their_intervals():
     facts = [
         ("Pixel", "129, 131", "Row, and column."),
-        ("SBR", "0.732 [0.291, ∞]", "Interval."),
-        ("Estimate", "–", ""),
-        ("Error", "-0.0123 m", ""),
-        ("Detections", "1,234 (12.3 %)", ""),
-        ("r small", "1.2e-05", ""),
+        ("SBR", interval(0.7321, 0.2914, math.inf), "Interval."),
+        ("Estimate", number(math.nan, "m"), ""),
+        ("Truth", "–", ""),
+        ("Error", number(-0.0123, "m", sign=True), ""),
+        ("Detections", count(1234, "12.3 %"), ""),
+        ("Confidence", share(0.125), ""),
     ]
     table = list(DictReader(io.StringIO(written(facts_file(facts)).decode())))
     columns = ("quantity", "value", "low", "high", "unit", "more", "meaning")
     assert [tuple(line[name] for name in columns) for line in table] == [
         ("Pixel", "129, 131", "", "", "", "", "Row, and column."),
-        ("SBR", "0.732", "0.291", "inf", "", "", "Interval."),
-        ("Estimate", "", "", "", "", "", ""),
+        ("SBR", "0.7321", "0.2914", "inf", "", "", "Interval."),
+        ("Estimate", "", "", "", "m", "", ""),
+        ("Truth", "", "", "", "", "", ""),
         ("Error", "-0.0123", "", "", "m", "", ""),
         ("Detections", "1234", "", "", "", "12.3 %", ""),
-        ("r small", "1.2e-05", "", "", "", "", ""),
+        ("Confidence", "12.5", "", "", "%", "", ""),
     ]
     with pytest.raises(ValueError, match="nothing is drawn here yet"):
         facts_file([])
@@ -532,14 +536,14 @@ def test_a_cloud_leaves_as_a_picture_and_as_its_points(start_page):
     assert picture.height > box["height"]  # with heading and colour scale
     colors = {f"#{r:02x}{g:02x}{b:02x}" for _, (r, g, b) in picture.getcolors(2**24)}
     assert len(colors & set(RANGE_COLORS)) > 100
-    for suffix, count in (
+    for suffix, count_points in (
         ("ply", lambda content: len(trimesh.load(io.BytesIO(content), file_type="ply").vertices)),
         ("las", lambda content: len(laspy.read(io.BytesIO(content)).x)),
         ("csv", lambda content: len(columns_of(content)["x_m"])),
     ):
         name, content = download(start_page, "3D cloud", suffix)
         assert name == f"car_tracking_cloud.{suffix}"
-        assert count(content) == shown_points
+        assert count_points(content) == shown_points
 
 
 @pytest.mark.browser

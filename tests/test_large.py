@@ -72,7 +72,7 @@ def path(building, small, tmp_path):
 @pytest.fixture
 def slow(monkeypatch):
     """Nothing more than the first few pieces is read before a preview is shown."""
-    monkeypatch.setattr(large, "AT_ONCE_S", 0.0)
+    monkeypatch.setattr(large, "FIRST_READ_S", 0.0)
     read_some = core.out_of_core.windows.WindowReader.read_some
     steps = []
 

@@ -7,15 +7,16 @@ import re
 from collections.abc import Iterable
 from concurrent.futures import BrokenExecutor
 
-import numpy as np
-
 from app.model.store import Answer, Pixel
 from app.units import Scale
+from app.units import milliseconds as milliseconds  # noqa: PLC0414
+from app.units import number as number  # noqa: PLC0414
+from app.units import share as share  # noqa: PLC0414
 from core.metrics import Interval
 from core.studies.ablation import TITLES
 
 Fact = tuple[str, str, str]
-"""Name, value and help."""
+"""Name, value and help; a value that is a number is an `app.units.Quantity`."""
 
 Cell = tuple[str, float | None, str]
 """Text of a table's cell, the value to sort by, and a smaller second line."""
@@ -114,19 +115,6 @@ def without_folders(text: str) -> str:
     return re.sub(r"(?<![\w.:/])/(?:[^\s/'\"]+/)+", "", text)
 
 
-def number(value: float, unit: str, sign: bool = False) -> str:
-    """Format a number with its unit; a dash if it is not finite."""
-    if not np.isfinite(value):
-        return "–"
-    text = f"{value:+.4g}" if sign else f"{value:.4g}" if abs(value) < 1000 else f"{value:,.2f}"
-    return f"{text} {unit}".strip()
-
-
-def share(value: float) -> str:
-    """Format a share in percent; a dash for NaN."""
-    return "–" if math.isnan(value) else f"{100 * value:.1f} %"
-
-
 def cell(value: float, form: str = "{:.4g}", below: str = "") -> Cell:
     """Return a table's cell; a dash if the value is not finite."""
     return (form.format(value), value, below) if math.isfinite(value) else ("–", None, below)
@@ -147,7 +135,8 @@ def interval_cell(found: Interval, form: str) -> Cell:
 
 def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
     """Return name, value and help of a pixel's estimate, compared with the truth if it is known."""
-    facts = [("Estimate", number(pixel.range_m, "m"), "Range of the surface, lag removed.")]
+    help = "Range of the surface, lag removed."
+    facts: list[Fact] = [("Estimate", number(pixel.range_m, "m"), help)]
     if along.name != "m":
         facts.append(("Position", along.place(pixel.answer_bin), "The estimate along the gate."))
     if has_truth:
@@ -162,11 +151,6 @@ def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
 def target(truth_m: float) -> str:
     """Format the true range of a pixel, which may have no target."""
     return "no target" if math.isnan(truth_m) else number(truth_m, "m")
-
-
-def milliseconds(seconds: float) -> str:
-    """Format a duration."""
-    return f"{1000 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
 
 
 def progress(done: int, of: int, noun: str, is_running: bool) -> str:

@@ -23,6 +23,7 @@ from app.model.text import (
     target,
 )
 from app.pages.compare.ranking import TOLERANCES_BINS, Reference, Result, Task, agreement
+from app.units import count
 from core import ESTIMATORS, Capture
 
 Column = tuple[str, str, int]
@@ -190,7 +191,7 @@ def pixel_facts(answer: Answer, reference: Reference | None, row: int, col: int)
         *facts,
         ("Limit: found", found, "Largest possible probability of finding this echo."),
         ("Limit: spread", spread, "Cramér–Rao bound: smallest possible standard deviation."),
-        ("Detections", f"{int(capture.counts[row, col]):,}", "Counts in this pixel's histogram."),
+        ("Detections", count(int(capture.counts[row, col])), "Counts in this pixel's histogram."),
     ]
 
 

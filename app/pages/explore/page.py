@@ -37,7 +37,7 @@ from app.widgets.controls import FACTS_PX, HEADLINE_PX, Facts, PixelKeys, Settin
 from app.widgets.image_view import ImageView
 from app.widgets.signal_plots import SignalPlots
 
-BOARD = board(720, 125, BREAK_PX)
+BOARD = board(780, 125, BREAK_PX)
 COLUMN = column(8, BREAK_PX)
 
 PICTURES_DELAY_MS = 60

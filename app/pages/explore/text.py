@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from app.model.store import Answer, Pixel
 from app.model.text import Fact, estimate_facts, milliseconds, number, share
-from app.units import scale
+from app.units import count, scale
 
 IMAGE_HELP = "Quantity shown in the image"
 
@@ -32,7 +32,7 @@ reported ones. **As printed** takes the paper's text literally.
 def figure_strip(answer: Answer) -> list[Fact]:
     """Return name, value and help of each figure; those that need the truth only if it is known."""
     figures = answer.run.figures
-    strip = []
+    strip: list[Fact] = []
     if figures:
         within_3 = "Share of target pixels within 3 bins of the truth, probably the paper's RD."
         strip = [
@@ -72,7 +72,7 @@ def pixel_numbers(answer: Answer, pixel: Pixel, unit: str = "bins") -> list[Fact
         ("σ", number(sigma, "counts"), "Standard deviation of the histogram."),
         ("r small", number(r_small, ""), "l·σ: limit of the small scale's acceleration."),
         ("r large", number(tracking.n * r_small, ""), "n·l·σ: limit for the large scale."),
-        ("Detections", f"{pixel.counts:,}", "Counts in this pixel's histogram."),
+        ("Detections", count(pixel.counts), "Counts in this pixel's histogram."),
     ]
     if n_pulses is not None:
         fired = share(pixel.counts / n_pulses)

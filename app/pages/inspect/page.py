@@ -29,7 +29,7 @@ from app.widgets.controls import Chips, PixelKeys, Sentence
 from core.checks import require
 
 # The map with a table below on the left, plots on the right.
-BOARD = board(600, 92, BREAK_PX)
+BOARD = board(600, 88, BREAK_PX)
 TABLES = f"""
 :host {{ flex: 0 1 auto !important; min-height: 0; min-width: 0; max-height: 34%;
   overflow-y: auto; }}

@@ -10,7 +10,8 @@ from app.model.large import Grid
 from app.model.store import Answer
 from app.model.text import CONFIDENCE_HELP, Fact, cell, estimate_facts, number, percent_cell, share
 from app.pages.inspect.results import Inspected
-from app.units import AXIS_TITLES, OPPOSITE_UNIT, Scale, scale
+from app.units import AXIS_TITLES, OPPOSITE_UNIT, Quantity, Scale, count, scale
+from app.units import interval as format_interval
 from core.inspection import Accuracy, Candidate, CaptureReport, FluxEstimate
 from core.metrics import Interval
 
@@ -46,13 +47,9 @@ CANDIDATES = "Candidates: peaks of the estimator's score, best first."
 PINS = "Pinned pixels."
 
 
-def interval(found: Interval) -> str:
+def interval(found: Interval) -> Quantity:
     """Format an estimate with its 95 % interval; a dash for NaN."""
-    if math.isnan(found.value):
-        return "–"
-    ends = (found.value, found.low, found.high)
-    value, low, high = ("∞" if math.isinf(end) else f"{end:.3g}" for end in ends)
-    return f"{value} [{low}, {high}]"
+    return format_interval(found.value, found.low, found.high)
 
 
 def facts(found: Inspected, unit: str) -> list[Fact]:
@@ -66,9 +63,9 @@ def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
     along = scale(unit, answer.capture.acquisition)
     has_truth = answer.capture.truth_range_m is not None
     facts = [("Pixel", place, "Row and column."), *estimate_facts(pixel, along, has_truth)]
-    counts, help = f"{pixel.counts:,}", "Counts in the histogram of this pixel"
+    counts, help = count(pixel.counts), "Counts in the histogram of this pixel"
     if answer.capture.gated_pulses is not None:
-        counts += f" ({share(pixel.counts / answer.capture.gated_pulses)})"
+        counts = count(pixel.counts, share(pixel.counts / answer.capture.gated_pulses))
         help += ", and as a share of the pulses"
     return [*facts, ("Detections", counts, f"{help}."), *_flux(found.report)]
 
@@ -78,7 +75,7 @@ def _region_facts(found: Inspected, unit: str) -> list[Fact]:
     assert region is not None
     spread = "Half the central 68 % range of the estimates, which is one standard deviation."
     return [
-        ("Pixels", f"{region.n_pixels:,}", "Pixels whose centre lies in the region."),
+        ("Pixels", count(region.n_pixels), "Pixels whose centre lies in the region."),
         *estimate_facts(found.pixel, along, has_truth=False),
         ("Median range", number(region.median_m, "m"), "Median of the estimates of its pixels."),
         ("Spread", number(region.spread_m, "m"), spread),
@@ -195,11 +192,11 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
     rows, cols = answer.capture.shape
     n_pulses = answer.capture.acquisition.n_pulses
     flux, per = report.flux, f"mean of all pixels in {report.flux_unit}, with 95 % interval."
-    hot, dead = ("–" if count is None else f"{count:,}" for count in (report.n_hot, report.n_dead))
+    hot, dead = ("–" if n is None else count(n) for n in (report.n_hot, report.n_dead))
     return [
         ("Pixels", f"{rows} × {cols}", "Rows and columns."),
-        ("Pulses", "not known" if n_pulses is None else f"{n_pulses:,}", "Pulses per pixel."),
-        ("Detections", f"{answer.capture.counts.mean():.4g}", "Mean of a pixel."),
+        ("Pulses", "not known" if n_pulses is None else count(n_pulses), "Pulses per pixel."),
+        ("Detections", number(float(answer.capture.counts.mean()), ""), "Mean of a pixel."),
         ("Signal (PPP)", interval(flux.signal), f"Signal flux, {per}"),
         ("Background", interval(flux.background), f"Background flux over the gate, {per}"),
         ("SBR", interval(flux.sbr), "Signal divided by background, with 95 % interval."),
