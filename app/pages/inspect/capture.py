@@ -40,10 +40,6 @@ ADVICE = """
 class CaptureSection(Section):
     """Counts of all pixels, their flux, suggestions, and the accuracy from fewer pulses.
 
-    Parameters
-    ----------
-    session : Session
-
     Attributes
     ----------
     report : CaptureReport or None

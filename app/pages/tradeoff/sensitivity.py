@@ -50,10 +50,6 @@ class Swept(Checked):
 class SensitivitySection(StudySection[Swept]):
     """A sweep over each numeric setting of a method; the session's capture is not used.
 
-    Parameters
-    ----------
-    session : Session
-
     Attributes
     ----------
     found : list of Sweep
