@@ -228,7 +228,7 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "limit: probability of the right bin": ("text", [2, 4]),
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
-    "answer, lag included": ("answer", []),
+    "estimate, lag included": ("answer", []),
     "the echo above": ("answer", []),
 }
 METHOD_PLACES = {method.name: place for place, method in enumerate(paper.COMPARED)}

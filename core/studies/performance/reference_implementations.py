@@ -1,8 +1,7 @@
-"""The tracking estimator as one writes it at first: what the fast kernel is measured against.
+"""Straightforward implementations of tracking that the fast kernel is compared with.
 
-As exact as the numbers given (float64, mostly), the equations as they stand. Each gives the
-position of the echo in every pixel, as `core.tracking.track` does, for settings whose start is
-"mean", whose σ is that of the gate and whose weight all pixels share; others are the estimator's.
+Each returns the position of the echo in every pixel as `core.tracking.track` does, in the precision
+of its input, for settings with start "mean", σ from the gate and a weight common to all pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ Pixels = NDArray[np.floating]
 
 
 def numpy_over_bins(pixels: Pixels, settings: TrackingParameters) -> Pixels:
-    """All pixels at once by numpy, one bin after the other, as exact as the numbers given."""
+    """Advance all pixels together with numpy, bin by bin."""
     r_small = settings.l * pixels.std(axis=1)
     first = pixels[:, :START_BINS].mean(axis=1)
     floor = ROUNDING_32 * pixels.max(axis=1)
@@ -40,7 +39,7 @@ def numpy_over_bins(pixels: Pixels, settings: TrackingParameters) -> Pixels:
 def _numpy_step(
     x1: Pixels, x2: Pixels, s: Pixels, r: Pixels, settings: TrackingParameters
 ) -> tuple[Pixels, Pixels]:
-    """`core.kernels.tracking.differentiator_step` of many pixels."""
+    """Apply `core.kernels.tracking.differentiator_step` to many pixels."""
     h, h0 = settings.h, settings.m * settings.h
     d = r * h0
     y = x1 - s + h0 * x2
@@ -51,14 +50,14 @@ def _numpy_step(
 
 
 def plain_loop(pixels: Pixels, settings: TrackingParameters) -> Floats:
-    """Pixel after pixel, compiled; each signal of a pixel is stored before the next is made."""
+    """Compiled loop over pixels that stores each signal before it computes the next."""
     weight = common_weight(pixels.shape[1], settings)
     position: Floats = _plain_loop(pixels, weight, settings.l, settings.n, settings.h, settings.m)
     return position
 
 
 def fused_loop(pixels: Pixels, settings: TrackingParameters) -> Floats:
-    """Pixel after pixel, compiled; both scales and the maximum in one pass, nothing stored."""
+    """Compiled loop over pixels with both scales and the maximum in one pass."""
     weight = common_weight(pixels.shape[1], settings)
     position: Floats = _fused_loop(pixels, weight, settings.l, settings.n, settings.h, settings.m)
     return position

@@ -1,10 +1,11 @@
-"""What the machine can do at all: square roots and bytes, the floors beneath every kernel."""
+"""Limits of the machine: time of a square root and of a byte read from memory."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import partial
 
 import numba
 import numpy as np
@@ -12,68 +13,67 @@ from numba import njit, prange
 
 from core.kernels.parallel import PARALLEL
 from core.metrics import Interval
-from core.studies.timing import interleaved, median_interval
+from core.studies.outputs import Table
+from core.studies.statistics import median_interval
+from core.studies.timing import interleaved, kernel_threads
 
-_ROW = 4096  # float32, which stay in the nearest cache
+_ROW = 4096  # float32 numbers that stay in the nearest cache
 _ROOTS_OF_EACH = 500
-_ROWS = 16  # of roots, as many for each of several threads
+_ROWS = 16
+_BYTES_OF_A_COUNT = 2
 
 
-class Floors(NamedTuple):
-    """What one or more threads reach together."""
+@dataclass(frozen=True)
+class Roofline:
+    """Limits of one thread and of all threads, by number of threads."""
 
-    threads: int
-    root_ns: Interval
+    root_ns: dict[int, Interval]
     """Time of one independent float32 square root."""
-    copied_gb_per_s: Interval
-    """Bytes read and bytes written, both counted."""
-    read_gb_per_s: Interval
+    read_gb_per_s: dict[int, Interval]
+
+    def seconds(self, n_counts: int, threads: int) -> float:
+        """Return the time of tracking's two square roots per count, or of reading the counts."""
+        threads = threads if threads in self.root_ns else 1
+        roots_s = 2e-9 * n_counts * self.root_ns[threads].value
+        read_s = _BYTES_OF_A_COUNT * n_counts / (1e9 * self.read_gb_per_s[threads].value)
+        return max(roots_s, read_s)
+
+    def table(self) -> Table:
+        """Return the limits as a table."""
+        rows = [
+            (name, threads, each)
+            for name, known in (
+                ("ns per float32 square root", self.root_ns),
+                ("GB/s read from memory", self.read_gb_per_s),
+            )
+            for threads, each in known.items()
+        ]
+        columns = ("limit", "threads", "median [95 %]")
+        return Table("roofline", "Roofline of this machine", columns, tuple(rows))
 
 
-def floors(threads: int, rounds: int, n_bytes: int) -> Floors:
-    """Measure the floors on some threads.
-
-    Parameters
-    ----------
-    threads, rounds : int
-    n_bytes : int
-        Of memory that is read and copied: several times what the caches hold.
-    """
+def roofline(rounds: int, n_bytes: int) -> Roofline:
+    """Measure the limits; `n_bytes` should be several times what the caches hold."""
     numbers = np.random.default_rng(0).uniform(1, 2, (_ROWS, _ROW)).astype(np.float32)
     source = np.ones((n_bytes // (8 * _ROW), _ROW), np.uint64)
-    target, sums = np.zeros_like(source), np.empty(len(source), np.uint64)
-    calls: dict[str, Callable[[], object]] = {
-        "roots": lambda: _take_roots(numbers, _ROOTS_OF_EACH),
-        "copy": lambda: _copy(source, target),
-        "read": lambda: _read(source, sums),
-    }
-    calls = {name: on_threads(threads, call) for name, call in calls.items()}
-    taken = interleaved(calls, rounds)
-    giga = source.nbytes / 1e9
-    return Floors(
-        threads,
-        median_interval(taken["roots"] * 1e9 / (numbers.size * _ROOTS_OF_EACH)),
-        median_interval(2 * giga / taken["copy"]),
-        median_interval(giga / taken["read"]),
-    )
-
-
-def on_threads(threads: int, call: Callable[[], object]) -> Callable[[], object]:
-    """The call, its kernels on so many threads."""
-
-    def limited() -> object:
-        before = numba.get_num_threads()
-        numba.set_num_threads(threads)
-        try:
-            return call()
-        finally:
-            numba.set_num_threads(before)
-
-    return limited
+    sums = np.empty(len(source), np.uint64)
+    root_ns, read_gb_per_s = {}, {}
+    for threads in sorted({1, numba.get_num_threads()}):
+        calls: dict[str, Callable[[], object]] = {
+            "roots": partial(take_roots, numbers, _ROOTS_OF_EACH),
+            "read": partial(add_rows, source, sums),
+        }
+        with kernel_threads(threads):
+            taken = interleaved(calls, rounds)
+        one_root_ns = taken["roots"] * 1e9 / (numbers.size * _ROOTS_OF_EACH)
+        root_ns[threads] = median_interval(one_root_ns)
+        read_gb_per_s[threads] = median_interval(source.nbytes / 1e9 / taken["read"])
+    return Roofline(root_ns, read_gb_per_s)
 
 
 @njit(**PARALLEL)
-def _take_roots(numbers, times):  # type: ignore[no-untyped-def]
+def take_roots(numbers, times):  # type: ignore[no-untyped-def]
+    """Replace each number by its root, a number of times."""
     for row in prange(numbers.shape[0]):
         x = numbers[row]
         for _ in range(times):
@@ -82,14 +82,8 @@ def _take_roots(numbers, times):  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def _copy(source, target):  # type: ignore[no-untyped-def]
-    for row in prange(source.shape[0]):
-        for i in range(source.shape[1]):
-            target[row, i] = source[row, i]
-
-
-@njit(**PARALLEL)
-def _read(source, sums):  # type: ignore[no-untyped-def]
+def add_rows(source, sums):  # type: ignore[no-untyped-def]
+    """Sum each row of unsigned integers."""
     for row in prange(source.shape[0]):
         total = np.uint64(0)
         for i in range(source.shape[1]):
