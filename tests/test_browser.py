@@ -480,7 +480,7 @@ def test_what_the_server_says_twice_at_once_is_what_it_said_last(start_page):
 
 def test_typed_values_are_taken_or_refused_with_a_sentence(start_page):
     enter(start_page, "SBR", "99")
-    refusal = start_page.get_by_role("alert").filter(has_text="99 is not possible here")
+    refusal = start_page.get_by_role("alert").filter(has_text="“99” is not accepted")
     expect(refusal).to_contain_text("from 0.01 to 10")
     expect(field(start_page, "SBR")).to_have_attribute("aria-invalid", "true")
     expect(fact(start_page, "RMSE")).to_have_text(rmse(car()))
@@ -488,7 +488,7 @@ def test_typed_values_are_taken_or_refused_with_a_sentence(start_page):
     expect(refusal).to_be_hidden()
     expect(fact(start_page, "RMSE")).to_have_text(rmse(car(Illumination(sbr=0.5))))
     enter(start_page, "Pulses", "12.5")
-    expect(start_page.get_by_text("12.5 is not possible here: give a whole number")).to_be_visible()
+    expect(start_page.get_by_text("“12.5” is not accepted: enter a whole number")).to_be_visible()
     field(start_page, "Pulses").press("Escape")
     expect(field(start_page, "Pulses")).to_have_value("1000")
     start_page.get_by_role("button", name="Reset SBR to 0.06").click()
@@ -545,7 +545,7 @@ def test_a_real_capture_is_ranged_and_its_guesses_are_told(page, real_capture):
     expect(inspect).to_have_attribute("aria-pressed", "true")
     new.get_by_role("button", name="Explore", exact=True).click()
     expect_the_building_at_21_km(new)
-    new.get_by_role("button", name="How to read the file").click()
+    new.get_by_role("button", name="Reading options").click()
     field(new, "Bin width (s)").fill("2e-9")
     new.get_by_role("button", name="Read again").click()
     expect(new.get_by_text("256 × 256 pixels, 100 bins of 2 ns")).to_be_visible()

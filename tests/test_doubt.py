@@ -72,8 +72,8 @@ def test_a_slider_shows_its_doubtful_zone_and_says_why_while_it_is_there(page):
 
     # What a screen reader is told of the slider includes the sentence, and the help the zones.
     assert knob.locator(".track").get_attribute("aria-describedby") == "help doubt"
-    knob.get_by_role("button", name="What is m?").click()
-    expect(knob.locator(".help")).to_contain_text("In doubt from 0.8 to 1: It smooths nothing")
+    knob.get_by_role("button", name="Help on m").click()
+    expect(knob.locator(".help")).to_contain_text("Unreliable from 0.8 to 1: It smooths nothing")
 
     # In both modes it can be told from what is behind it.
     for _ in ("light", "dark"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import re
 import time
 from base64 import b64encode
@@ -22,12 +23,13 @@ from playwright.sync_api import expect
 
 from app.model.colors import image_of, map_of, shown
 from app.model.exports import drawn, facts_file, image_files, shown_table_file, table_file
-from app.model.state import MAPS, Illumination, Less
+from app.model.state import MAPS, Illumination, ReductionSettings
 from app.model.store import built_in_sources, inspect
 from app.pages.layout import Layout
 from app.pages.shared import downloads
 from app.pages.shared.downloads import Download, Shown, Subject
 from app.theme import RANGE_COLORS
+from app.units import count, interval, number, share
 from core import TrackingParameters
 from core.studies.outputs import Table
 from tests.browser import VIEWS, fact, server_process
@@ -66,7 +68,7 @@ def columns_of(content):
 
 def test_a_name_tells_capture_estimator_and_what_is_not_the_default():
     chosen = TrackingParameters(l=0.01, t_n=15)
-    subject = Subject("21km_K11_night", "tracking", (Less(), chosen))
+    subject = Subject("21km_K11_night", "tracking", (ReductionSettings(), chosen))
     assert subject.file_name("range image", "png") == (
         "21km_K11_night_tracking_l0.01_Tn15_range-image.png"
     )
@@ -97,7 +99,7 @@ def test_a_name_harms_no_system_whatever_the_capture_is_called(capture):
     subject = Subject(
         capture,
         "log_matched_filter",
-        (Illumination(1.0, 1.0, 77, 5), Less(2, 0.1, 0.9), everything),
+        (Illumination(1.0, 1.0, 77, 5), ReductionSettings(2, 0.1, 0.9), everything),
     )
     name = subject.file_name("enhanced row1000 col1000", "csv")
     assert re.fullmatch(r"[\w.+-]+", name, re.ASCII)
@@ -274,14 +276,14 @@ def test_a_methods_picture_leaves_as_its_answer(layout, kind):
     layout.pages.choice.value = "Compare"
     compare = layout.contents["Compare"]
     limit = time.monotonic() + 60
-    while "peak" not in compare._answers():
+    while "peak" not in compare.answers:
         assert time.monotonic() < limit
         time.sleep(0.01)
-    compare._kind.value = kind
-    place = compare._pictured().index("peak")
-    found = compare._picture_shown(place)
+    compare.kind.value = kind
+    place = compare.pictured.index("peak")
+    found = compare.picture_shown(place)
     layout.pages.choice.value = "Explore"
-    image = compare._answers()["peak"].run.image
+    image = compare.answers["peak"].run.image
     assert (found.heading, found.subject.estimator) == ("Peak of the histogram", "peak")
     if kind == "3D clouds":
         points = laspy.read(io.BytesIO(written(found.files["las"])))
@@ -302,14 +304,14 @@ def test_tables_leave_with_every_digit_and_without_units_in_their_cells():
         {
             "name": "peak, or so",
             "note": "",
-            "cells": [["98.2 %", 0.982, "97 to 99"], ["1,234.5", 1234.5, ""]],
+            "cells": [[share(0.9825), 0.9825, "97 to 99"], ["1,234.5", 1234.5, ""]],
         },
         {"name": "other", "note": "", "cells": [["–", None, ""], ["2.0", 2.0, ""]]},
         {"name": "failed", "message": "Not computed yet.", "cells": []},
     ]
     assert written(shown_table_file(columns, rows)).decode() == (
         'Method,Right (%),"Right, more",Time,note\r\n'
-        '"peak, or so",98.2,97 to 99,1234.5,\r\n'
+        '"peak, or so",98.25,97 to 99,1234.5,\r\n'
         "other,,,2.0,\r\n"
         "failed,,,,Not computed yet.\r\n"
     )
@@ -348,21 +350,23 @@ def offering(write):
 def test_numbers_leave_with_the_ends_of_their_intervals():
     facts = [
         ("Pixel", "129, 131", "Row, and column."),
-        ("SBR", "0.732 [0.291, ∞]", "Interval."),
-        ("Estimate", "–", ""),
-        ("Error", "-0.0123 m", ""),
-        ("Detections", "1,234 (12.3 %)", ""),
-        ("r small", "1.2e-05", ""),
+        ("SBR", interval(0.7321, 0.2914, math.inf), "Interval."),
+        ("Estimate", number(math.nan, "m"), ""),
+        ("Truth", "–", ""),
+        ("Error", number(-0.0123, "m", sign=True), ""),
+        ("Detections", count(1234, "12.3 %"), ""),
+        ("Confidence", share(0.125), ""),
     ]
     table = list(DictReader(io.StringIO(written(facts_file(facts)).decode())))
     columns = ("quantity", "value", "low", "high", "unit", "more", "meaning")
     assert [tuple(line[name] for name in columns) for line in table] == [
         ("Pixel", "129, 131", "", "", "", "", "Row, and column."),
-        ("SBR", "0.732", "0.291", "inf", "", "", "Interval."),
-        ("Estimate", "", "", "", "", "", ""),
+        ("SBR", "0.7321", "0.2914", "inf", "", "", "Interval."),
+        ("Estimate", "", "", "", "m", "", ""),
+        ("Truth", "", "", "", "", "", ""),
         ("Error", "-0.0123", "", "", "m", "", ""),
         ("Detections", "1234", "", "", "", "12.3 %", ""),
-        ("r small", "1.2e-05", "", "", "", "", ""),
+        ("Confidence", "12.5", "", "", "%", "", ""),
     ]
     with pytest.raises(ValueError, match="nothing is drawn here yet"):
         facts_file([])
@@ -532,14 +536,14 @@ def test_a_cloud_leaves_as_a_picture_and_as_its_points(start_page):
     assert picture.height > box["height"]  # with heading and colour scale
     colors = {f"#{r:02x}{g:02x}{b:02x}" for _, (r, g, b) in picture.getcolors(2**24)}
     assert len(colors & set(RANGE_COLORS)) > 100
-    for suffix, count in (
+    for suffix, count_points in (
         ("ply", lambda content: len(trimesh.load(io.BytesIO(content), file_type="ply").vertices)),
         ("las", lambda content: len(laspy.read(io.BytesIO(content)).x)),
         ("csv", lambda content: len(columns_of(content)["x_m"])),
     ):
         name, content = download(start_page, "3D cloud", suffix)
         assert name == f"car_tracking_cloud.{suffix}"
-        assert count(content) == shown_points
+        assert count_points(content) == shown_points
 
 
 @pytest.mark.browser
@@ -614,6 +618,6 @@ def test_every_page_gives_what_it_shows(start_page):
     assert Image.open(io.BytesIO(png)).height > 216  # with heading and colour scale
     name, table = download(start_page, "table", "csv")
     assert name == "car_methods.csv"
-    assert b"Physics" in table
+    assert b"Physical limit" in table
     go("Paper")
     assert download(start_page, "curves", "csv")[0] == "paper_figure_1.csv"

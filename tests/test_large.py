@@ -17,10 +17,10 @@ from playwright.sync_api import Page, expect
 import core
 from app.__main__ import main
 from app.model import large
-from app.model.address import Wanted
+from app.model.address import Link
 from app.model.colors import image_of
 from app.model.large import LIMIT, Grid, most_whole_bytes
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from app.model.store import built_in_sources, compute, file_source
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
@@ -72,7 +72,7 @@ def path(building, small, tmp_path):
 @pytest.fixture
 def slow(monkeypatch):
     """Nothing more than the first few pieces is read before a preview is shown."""
-    monkeypatch.setattr(large, "AT_ONCE_S", 0.0)
+    monkeypatch.setattr(large, "FIRST_READ_S", 0.0)
     read_some = core.out_of_core.windows.WindowReader.read_some
     steps = []
 
@@ -184,7 +184,15 @@ def test_only_one_window_is_kept(path):
     assert file.cutout(one.window) is not one
 
 
-@pytest.mark.parametrize("less", [Less(), Less(skip=2), Less(pool=3), Less(skip=3, pool=2)])
+@pytest.mark.parametrize(
+    "less",
+    [
+        ReductionSettings(),
+        ReductionSettings(skip=2),
+        ReductionSettings(pool=3),
+        ReductionSettings(skip=3, pool=2),
+    ],
+)
 def test_pixels_know_their_places_in_the_file(path, less):
     window = Window((8, 90), (5, 120), 3)
     answer = compute(ask(file_source(path), window=window, less=less), None)
@@ -233,7 +241,7 @@ def test_other_bounds_are_refused(text):
 @pytest.fixture
 def looking(path):
     """A page on a large file, its thread in the hands of the test."""
-    return HeldLayout({"file": file_source(path)} | built_in_sources(), Wanted({"page": "Explore"}))
+    return HeldLayout({"file": file_source(path)} | built_in_sources(), Link({"page": "Explore"}))
 
 
 def settle(page, holds):
@@ -285,7 +293,7 @@ def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
         "30 to 69",
         "20 to 79",
     )
-    control(looking, "Look closer").clicks += 1
+    control(looking, "Read window").clicks += 1
     assert not control(looking, "Cancel").disabled
     settle(looking, lambda: not session.answer.cutout.is_preview)
     assert session.state.window == session.answer.cutout.window == Window((30, 70), (20, 80))
@@ -299,14 +307,14 @@ def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
     assert "_rows30-69_cols20-79_" in name
     at = "row{} col{}".format(*place)
     assert downloads.pixel_plot(session, explore.signals.histogram.figure, "h").what == f"h {at}"
-    control(looking, "The whole").clicks += 1
+    control(looking, "Show all").clicks += 1
     settle(looking, lambda: session.answer.cutout.is_preview)
     assert session.state.window is None
 
 
 def test_reading_ends_when_something_else_is_looked_at(looking):
     session = looking.session
-    control(looking, "Look closer").clicks += 1
+    control(looking, "Read window").clicks += 1
     session.state.param.update(source="car")
     settle(looking, lambda: session.answer.request.source.is_scene)
     settle(looking, lambda: control(looking, "Cancel").disabled)
@@ -318,7 +326,7 @@ def test_wrong_bounds_are_told_and_nothing_is_read(looking):
     settle(looking, lambda: control(looking, "Cancel").disabled)
     control(looking, "Rows shown").value = "90 to 200"
     with pytest.raises(ValueError, match=r"rows = '90 to 200'"):  # Panel hands it to the page
-        control(looking, "Look closer").clicks += 1
+        control(looking, "Read window").clicks += 1
     assert looking.session.state.window is None
 
 
@@ -332,13 +340,13 @@ def test_a_damaged_part_is_told_and_the_page_goes_on(looking, path):
         "0 to 9",
         "0 to 9",
     )
-    control(looking, "Look closer").clicks += 1
+    control(looking, "Read window").clicks += 1
     settle(looking, lambda: complaint(looking))
     assert "counts cannot be read" in complaint(looking)
     assert str(path.parent) not in complaint(looking)
     assert session.answer is before and session.state.window is None
     shutil.rmtree(path)
-    control(looking, "Look closer").clicks += 1
+    control(looking, "Read window").clicks += 1
     settle(looking, lambda: "has not gone" in complaint(looking))
     control(looking, "l").value = 0.01
     settle(looking, lambda: session.answer is not before)
@@ -406,7 +414,7 @@ def endless(chunk: Path) -> Iterator[None]:
 def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     path, address, capture = served
     opened = page(address)
-    closer = opened.get_by_role("button", name="Look closer")
+    closer = opened.get_by_role("button", name="Read window")
     cancel = opened.get_by_role("button", name="Cancel").filter(visible=True)
     preview = opened.get_by_text(f"Preview of {SIDE} × {SIDE} pixels, 1 of each 2 × 2")
     expect(preview).to_be_visible()
@@ -414,9 +422,9 @@ def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     shows(opened, "0 to 511", "0 to 511")
     zoom(opened)
     closer.click()
-    told = opened.get_by_text(re.compile("^Seen: rows"))
+    told = opened.get_by_text(re.compile("^Shown: rows"))
     expect(told).to_be_visible()
-    seen = re.fullmatch(r"Seen: rows (.*), columns (.*), of 512 × 512 pixels\.", told.inner_text())
+    seen = re.fullmatch(r"Shown: rows (.*), columns (.*), of 512 × 512 pixels\.", told.inner_text())
     shows(opened, *seen.groups())
     first, last = map(int, seen[1].split(" to "))
     assert 0 < first < last < SIDE - 1
@@ -444,7 +452,7 @@ def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     expect(told).to_have_text(seen[0])
     chunk.write_bytes(kept)
     closer.click()
-    expect(told).to_have_text("Seen: rows 0 to 63, columns 0 to 63, of 512 × 512 pixels.")
-    opened.get_by_role("button", name="The whole").click()
+    expect(told).to_have_text("Shown: rows 0 to 63, columns 0 to 63, of 512 × 512 pixels.")
+    opened.get_by_role("button", name="Show all").click()
     expect(preview).to_be_visible()
     shows(opened, "0 to 511", "0 to 511")

@@ -93,7 +93,12 @@ def test_nonsense_in_an_address_is_told_and_the_rest_is_there(page, address):
     trap = "<img src=x onerror=window.trapped=1>"
     new = page(f"{address}?source={trap}&light.sbr=-1&light.seed=1&page={trap}&{trap}=1")
     told = new.get_by_role("alert").filter(has_text="The address asks for what cannot be had")
-    for said in ("sbr = -1", "no scene or capture '<img", "page = '<img", "nothing called <img"):
+    for said in (
+        "sbr = -1",
+        "no scene or capture '<img",
+        "page = '<img",
+        "Unknown parameter: <img",
+    ):
         expect(told).to_contain_text(said)
     assert new.evaluate("window.trapped") is None
     rests(new, "?light.seed=1")
@@ -133,7 +138,9 @@ def test_plots_and_cloud_come_back_where_the_browser_lost_its_graphics(browser, 
 
     page.locator(".stage canvas").evaluate(LOSE_AND_REFUSE)
     told = page.get_by_text("The 3D cloud cannot be drawn")
-    expect(told).to_have_text(re.compile("offers no WebGL 2. Its next change tries again."))
+    expect(told).to_have_text(
+        re.compile("offers no WebGL 2. It is tried again at the next change.")
+    )
     page.evaluate("refused = undefined")
     slider(page, "Seed").press("ArrowRight")
     expect(told).to_have_count(0)
@@ -209,7 +216,7 @@ def test_a_session_that_is_gone_begins_anew_and_its_file_is_removed(
         assert [path.name for path in held()] == ["21km.mat"]
         cut(page)
         eventually(lambda: not held())
-        mend(page, "had to begin anew")
+        mend(page, "the session had expired")
         expect(page.get_by_role("alert").filter(has_text="There is no scene")).to_be_visible()
         rests(page, "?tracking.l=0.006")
         upload(page, "again.mat", real_capture("21km_K11_night.mat").read_bytes())
@@ -218,24 +225,26 @@ def test_a_session_that_is_gone_begins_anew_and_its_file_is_removed(
     page.close()
 
 
-def test_the_script_and_the_link_are_taken_away(page, address, tmp_path):
+def test_the_script_and_the_link_can_be_copied_and_saved(page, address, tmp_path):
     new = page(f"{address}?source=building&light.seed=3&tracking.l=0.006&less.pool=2")
     new.context.grant_permissions(["clipboard-read", "clipboard-write"])
-    new.get_by_role("button", name="Link", exact=True).click()
-    expect(new.get_by_role("status").filter(has_text="The link is copied.")).to_be_visible()
+    new.get_by_role("button", name="Copy link").click()
+    expect(new.get_by_role("status").filter(has_text="Link copied.")).to_be_visible()
     assert new.evaluate("navigator.clipboard.readText()") == here(new)
-    new.get_by_role("button", name="Python script").click()
-    dialog = new.get_by_role("dialog", name="What is on the screen, as Python")
+    opener = new.get_by_role("button", name="Python script")
+    opener.click()
+    dialog = new.get_by_role("dialog", name="Python script of this view")
     with new.expect_download() as saved:
         dialog.get_by_role("button", name="Download").click()
     assert saved.value.suggested_filename == "firstphoton.py"
     script = saved.value.path().read_text("utf-8")
     dialog.get_by_role("button", name="Copy").click()
-    expect(dialog.get_by_role("status")).to_have_text("The script is copied.")
+    expect(dialog.get_by_text("Script copied.")).to_be_visible()
     assert new.evaluate("navigator.clipboard.readText()") == script
-    assert dialog.get_by_label("Script").text_content() == script
+    assert dialog.get_by_text("import core").text_content() == script
     new.keyboard.press("Escape")
     expect(dialog).to_have_count(0)
+    expect(opener).to_be_focused()
     more = "print(f'{core.metrics.rmse_m(image.range_m, capture.truth_range_m):.4g} m')"
     done = subprocess.run(
         [sys.executable, "-c", script + more],

@@ -13,7 +13,7 @@ from app.model.state import State
 from app.widgets.component import Component
 
 REST_MS = 250
-"""Time without a change after which the address is updated: moving sliders are not delayed."""
+"""Time without a change after which the address is updated: slider moves are not delayed."""
 
 
 class AddressBar(Component):
@@ -44,7 +44,7 @@ class AddressBar(Component):
         wait: Callable[[int, Callable[[], None]], None],
         run_on_page: Callable[[Callable[[], None]], None],
     ) -> None:
-        """Update the address whenever the state has come to rest.
+        """Update the address whenever the state has not changed for `REST_MS`.
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class AddressBar(Component):
         query : callable
             Returns the query of the present state.
         wait, run_on_page : callable
-            Of the `app.pages.session.Session`.
+            ``call_later`` and ``run_next`` of `app.tasks.page.PageTasks`.
         """
         changes = 0
         is_waiting = False

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from core.acquisition import Acquisition
-from core.capture import Capture, Seen
+from core.capture import Capture, CaptureInfo
 from core.checks import printable, require, shown
 from core.cli.options import (
     FLUX_OPTIONS,
@@ -220,7 +220,7 @@ def _exceeds_memory(chosen: argparse.Namespace) -> bool:
 
 def _range_at_once(
     chosen: argparse.Namespace, settings: Any
-) -> tuple[Seen, RangeImage, dict[str, Any]]:
+) -> tuple[CaptureInfo, RangeImage, dict[str, Any]]:
     capture = _capture(chosen)
     print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
     _require_angle(chosen, capture.acquisition)
@@ -237,7 +237,7 @@ def _range_at_once(
 
 def _range_in_tiles(
     chosen: argparse.Namespace, settings: Any
-) -> tuple[Seen, RangeImage, dict[str, Any]]:
+) -> tuple[CaptureInfo, RangeImage, dict[str, Any]]:
     from core.out_of_core import tiles  # noqa: PLC0415 - loads Dask, which small captures do not need
 
     if chosen.capture is None:

@@ -202,7 +202,7 @@ ESTIMATOR = Estimator(
     ChiParameters,
     _curve,
     _locate,
-    reach=lambda _: 3,
+    window_size=lambda _: 3,
     reconstructed="the abstract of Chi et al. (2025)",
     whole_image=True,
 )

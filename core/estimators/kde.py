@@ -85,6 +85,6 @@ ESTIMATOR = Estimator(
     "Kernel density of the neighbourhood",
     KdeParameters,
     _curve,
-    reach=lambda parameters: REACH[parameters.neighbourhood],
+    window_size=lambda parameters: REACH[parameters.neighbourhood],
     reconstructed="its name in the paper: neighbourhood and bandwidth are not printed",
 )

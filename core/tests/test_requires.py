@@ -19,7 +19,7 @@ from core.effects import Backscatter, FaultyPixels, Motion, SecondSurface
 from core.estimators import ESTIMATORS
 from core.inference.flux import detailed_flux_prior_of, flux_prior_of
 from core.inference.limits import cramer_rao_bins
-from core.inference.resolution import HIDDEN, TOLD, Difference
+from core.inference.resolution import HIDDEN, RESOLVED, Difference
 from core.metrics import Interval
 from core.scene import Scene
 from core.simulation import simulate
@@ -51,28 +51,28 @@ MORE, LESS = Interval(0.2, 0.1, 0.3), Interval(-0.2, -0.3, -0.1)
 @pytest.mark.parametrize(
     ("part", "evidence", "rd", "rmse_m", "verdict"),
     [
-        ("motion", TOLD, STAY, STAY, "needed"),
-        ("motion", TOLD / 2, STAY, STAY, "not needed"),
-        ("motion", TOLD / 2, LESS, STAY, "needed"),
-        ("motion", TOLD / 2, STAY, MORE, "needed"),
-        ("motion", TOLD / 2, WIDE, STAY, "cannot tell"),
+        ("motion", RESOLVED, STAY, STAY, "needed"),
+        ("motion", RESOLVED / 2, STAY, STAY, "not needed"),
+        ("motion", RESOLVED / 2, LESS, STAY, "needed"),
+        ("motion", RESOLVED / 2, STAY, MORE, "needed"),
+        ("motion", RESOLVED / 2, WIDE, STAY, "cannot tell"),
         ("motion", HIDDEN / 2, WIDE, WIDE, "not needed"),
-        ("motion", TOLD, UNKNOWN, UNKNOWN, "needed"),
-        ("motion", TOLD / 2, UNKNOWN, UNKNOWN, "cannot tell"),
+        ("motion", RESOLVED, UNKNOWN, UNKNOWN, "needed"),
+        ("motion", RESOLVED / 2, UNKNOWN, UNKNOWN, "cannot tell"),
         ("motion", HIDDEN / 2, UNKNOWN, UNKNOWN, "not needed"),
-        ("pile_up", TOLD, MORE, STAY, "needed"),
-        ("pile_up", TOLD, STAY, LESS, "needed"),
-        ("pile_up", TOLD, LESS, STAY, "not needed"),  # it harms
-        ("pile_up", TOLD, STAY, STAY, "not needed"),
-        ("pile_up", TOLD, WIDE, STAY, "cannot tell"),
-        ("pile_up", TOLD, UNKNOWN, UNKNOWN, "needed"),
+        ("pile_up", RESOLVED, MORE, STAY, "needed"),
+        ("pile_up", RESOLVED, STAY, LESS, "needed"),
+        ("pile_up", RESOLVED, LESS, STAY, "not needed"),  # it harms
+        ("pile_up", RESOLVED, STAY, STAY, "not needed"),
+        ("pile_up", RESOLVED, WIDE, STAY, "cannot tell"),
+        ("pile_up", RESOLVED, UNKNOWN, UNKNOWN, "needed"),
     ],
 )
 def test_the_rule(part: str, evidence: float, rd: Interval, rmse_m: Interval, verdict: str) -> None:
     found = judged(part, Difference(np.full(50, 0.1), np.full(50, evidence)), 0.15, rd, rmse_m)
     assert found.verdict == verdict
     assert found.why
-    assert found.detectable_share == (evidence >= TOLD)
+    assert found.detectable_share == (evidence >= RESOLVED)
 
 
 # -- Scenes ----------------------------------------------------------------------------------------

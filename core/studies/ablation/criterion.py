@@ -93,7 +93,7 @@ def judged(
         float(np.mean(difference.total_variation)),
         float(np.max(difference.total_variation)),
         float(np.median(known)) if known.size else math.nan,
-        float(np.mean(difference.told)),
+        float(np.mean(difference.is_resolved)),
         rd_change,
         rmse_change_m,
         time_ratio,
@@ -119,7 +119,7 @@ def _judge_correction(difference: Difference, rd: Interval, rmse: Interval) -> t
 
 def _judge_part(difference: Difference, rd: Interval, rmse: Interval) -> tuple[Verdict, str]:
     """Judge by changes in units of their margins, NaN where unknown."""
-    share, changes = float(np.mean(difference.told)), (rd, rmse)
+    share, changes = float(np.mean(difference.is_resolved)), (rd, rmse)
     shown = f"histograms reveal it in {share:.0%} of the pixels"
     if share > FEW:
         return "needed", shown

@@ -8,7 +8,7 @@ import numpy as np
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.scene import PARTS, Scene, without
-from core.simulation import add_echo, triggered_by_each_edge
+from core.simulation import add_echo, cumulative_trigger_probability
 from core.studies.outputs import Table
 from core.studies.timing import time_ratio
 
@@ -16,8 +16,8 @@ from core.studies.timing import time_ratio
 def plain_triggered(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse) -> Floats:
     """Return the probability of a trigger before each bin edge, shape (pixel, n_bins + 1).
 
-    For one echo over uniform background: `core.simulation.triggered_by_each_edge` without the code
-    of any part.
+    `core.simulation.cumulative_trigger_probability` for one echo over uniform background, without
+    the code of any part.
     """
     onset_bin = np.ravel(acquisition.range_m_to_bin(scene.range_m))
     signal = np.where(np.isfinite(onset_bin), flux.signal, 0.0)
@@ -39,9 +39,9 @@ def table(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse) -> T
     """Return the time of the model over that of the plain code, and whether results are equal."""
     given = (bare(scene), acquisition, flux, pulse)
     ratio = time_ratio(
-        partial(triggered_by_each_edge, *given), partial(plain_triggered, *given), 41
+        partial(cumulative_trigger_probability, *given), partial(plain_triggered, *given), 41
     )
-    same = np.array_equal(triggered_by_each_edge(*given), plain_triggered(*given))
+    same = np.array_equal(cumulative_trigger_probability(*given), plain_triggered(*given))
     columns = ("absent parts", "time, ratio to code without them", "bit for bit equal")
     row = (", ".join(PARTS.values()), ratio, "yes" if same else "NO")
     return Table("absent", "Cost of absent parts", columns, (row,), formats={columns[1]: ".3f"})

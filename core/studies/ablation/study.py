@@ -16,7 +16,7 @@ from core.estimators import ESTIMATORS
 from core.inference import resolution
 from core.inference.resolution import Difference, difference
 from core.scene import Scene, parts_of, without
-from core.simulation import pulses_sent, simulate, triggered_by_each_edge
+from core.simulation import cumulative_trigger_probability, pulses_sent, simulate
 from core.studies.ablation import capture_parts, corrections
 from core.studies.ablation.criterion import MARGIN_RD, TITLES, Requirement, judged
 from core.studies.outputs import Table, table
@@ -106,7 +106,7 @@ class _Study:
     @cached_property
     def probability(self) -> Floats:
         """Trigger probability of each bin, shape (pixel, bin)."""
-        edges = triggered_by_each_edge(self.scene, self.acquisition, self.flux, self.pulse)
+        edges = cumulative_trigger_probability(self.scene, self.acquisition, self.flux, self.pulse)
         return np.maximum(np.diff(edges), 0.0)  # rounding may make it negative
 
     def capture(self, seed: int) -> Capture:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators import RangeImage, estimate
 from core.inference.posterior import TOLERANCE_BINS
-from core.metrics import calibration_error, reliability
+from core.metrics import ReliabilityBin, calibration_error, reliability
 from core.studies.outputs import Table, table
 from core.studies.paper.printed import TABLE_2
 from core.studies.trials import Condition
@@ -44,7 +43,7 @@ class Report:
     scene: str
     sbr: float | None
     method: str
-    tenths: list[Any]
+    tenths: list[ReliabilityBin]
     """Estimates by tenths of confidence, from `core.metrics.reliability`."""
 
     @property

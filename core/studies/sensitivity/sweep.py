@@ -124,7 +124,7 @@ def _span(low: float, high: float) -> str:
 def tile(method: str) -> int:
     """Return the side of tiles of equal depth: above 1 for methods that use neighbours."""
     each = ESTIMATORS[method]
-    return 8 if each.whole_image or each.reach(each.parameters()) > 1 else 1
+    return 8 if each.whole_image or each.window_size(each.parameters()) > 1 else 1
 
 
 @dataclass(frozen=True)
