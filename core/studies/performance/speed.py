@@ -1,4 +1,4 @@
-"""Speed of the tracking estimator: against plain code, as captures grow, from a cold start.
+"""Speed of the tracking estimator: against plain code, over sizes, from a cold start.
 
 Only ratios of calls that were timed in turn make the study fail: they hold on any machine, loaded
 or not, which milliseconds do not.
@@ -7,8 +7,9 @@ or not, which milliseconds do not.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numba
@@ -24,14 +25,13 @@ from core.scene import scenes
 from core.simulation import simulate
 from core.studies.outputs import Table, table
 from core.studies.performance.reference_implementations import (
-    fused_loop,
     numpy_over_bins,
     plain_loop,
+    take_roots,
 )
-from core.studies.performance.roofline import Roofline, roofline
 from core.studies.performance.start import STAGES, first_image
 from core.studies.statistics import MIN_REPEATS, median_interval
-from core.studies.timing import interleaved, kernel_threads, machine
+from core.studies.timing import interleaved, machine
 from core.tracking import TrackingParameters, track, tracking_signals
 
 SETTINGS = TrackingParameters()
@@ -54,24 +54,28 @@ INTRODUCTION = (
     "fail.",
 )
 _IN_A_ROW = 10  # short calls are repeated, as when a slider is dragged
+_ROW, _ROOTS = 4096, 5000  # float32 numbers that stay in the nearest cache; roots of each
 
 
 @dataclass(frozen=True)
 class Extent:
-    """What is measured: rounds, square images of `side` pixels, gates of `bins`."""
+    """What is measured: rounds of timing, starts, images of `side` x `side` pixels, gates."""
 
     rounds: int = 21
-    growth_rounds: int = 7
     starts: int = 7
     side: int = 64
     bins: int = 100
-    sides: tuple[int, ...] = (64, 128, 256, 512, 1024)
-    gates: tuple[int, ...] = (100, 256, 512, 1024, 2048, 4096)
-    side_of_threads: int = 512
-    roofline_bytes: int = 2**28
+    sizes: tuple[tuple[int, int], ...] = (
+        (64, 100),
+        (256, 100),
+        (1024, 100),
+        (64, 1024),
+        (64, 4096),
+    )
+    """Side and bins of the captures over which the cost per count is compared."""
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "growth_rounds", "starts"):
+        for name in ("rounds", "starts"):
             repeats = getattr(self, name)
             require(name, repeats, repeats >= MIN_REPEATS, f"at least {MIN_REPEATS}")
 
@@ -81,20 +85,19 @@ def study(
 ) -> tuple[list[Table], list[str]]:
     """Measure everything; return the tables and a sentence for each speed-up that was lost."""
     progress(0, 4)
-    limit = roofline(extent.rounds, extent.roofline_bytes)
+    root_ns = square_root_ns(extent.rounds)
     progress(1, 4)
     seconds = variants(extent)
     progress(2, 4)
-    grown = list(growth(extent))
+    sizes = sizes_table(extent, root_ns)
     progress(3, 4)
     compiled, starts = _starts(extent.starts)
     progress(4, 4)
     return [
         targets_table(seconds, starts),
-        variants_table(seconds, extent.side**2 * extent.bins, limit),
-        growth_table(grown, limit),
+        variants_table(seconds, extent.side**2 * extent.bins, root_ns),
+        sizes,
         start_table(starts, compiled),
-        limit.table(),
         machine(),
     ], regressions(seconds)
 
@@ -107,14 +110,11 @@ def variants(extent: Extent) -> dict[str, Floats]:
     scene, acquisition = scenes["uniform"](size=extent.side), _gate(extent.bins)
     capture = simulate(scene, acquisition, FLUX, seed=1)
     counts = capture.cube.reshape(-1, extent.bins)
-    numbers, numbers_32 = counts.astype(float), counts.astype(np.float32)
-    blocks, estimator = to_blocks(counts), ESTIMATORS["tracking"]
+    numbers, blocks, estimator = counts.astype(float), to_blocks(counts), ESTIMATORS["tracking"]
     estimate(capture, "tracking")  # estimates its flux
     once: dict[str, Callable[[], object]] = {
         "numpy over bins": lambda: numpy_over_bins(numbers, SETTINGS),
-        "numpy over bins, float32": lambda: numpy_over_bins(numbers_32, SETTINGS),
         PLAIN: lambda: plain_loop(numbers, SETTINGS),
-        "the same, fused": lambda: fused_loop(numbers, SETTINGS),
         "all signals": lambda: tracking_signals(counts, SETTINGS),
         "tracking, once in blocks, caches cold": lambda: track(blocks, SETTINGS),
         "core.estimate of a new capture": lambda: estimate(replace(capture), "tracking"),
@@ -171,8 +171,8 @@ def targets_table(seconds: Mapping[str, Floats], starts: Floats) -> Table:
     return Table("targets", "Targets", columns, tuple(rows), formats={columns[2]: ".3g"})
 
 
-def variants_table(seconds: Mapping[str, Floats], n_counts: int, limit: Roofline) -> Table:
-    """Compare all variants with each other and with the roofline of one thread."""
+def variants_table(seconds: Mapping[str, Floats], n_counts: int, root_ns: Interval) -> Table:
+    """Compare all variants with each other and with the square roots that they need."""
     return table(
         "variants",
         "64 x 64 x 100 counts, dual-scale tracking",
@@ -180,111 +180,59 @@ def variants_table(seconds: Mapping[str, Floats], n_counts: int, limit: Roofline
         {
             "variant": str,
             "ms [95 %]": lambda name: median_interval(1e3 * seconds[name]),
-            "ns per count": lambda name: 1e9 * float(np.median(seconds[name])) / n_counts,
             "speed-up": lambda name: speedup(seconds, name).value,
-            "over roofline": lambda name: (
-                float(np.median(seconds[name])) / limit.seconds(n_counts, 1)
-            ),
+            **_per_count(lambda name: (float(np.median(seconds[name])), n_counts), root_ns),
         },
         "One thread, except for the simulation and the flux of a new capture. Speed-up: over the "
-        f"{PLAIN}. Roofline: the time of the two float32 square roots of each count.",
-        {"ms [95 %]": ".3g", "ns per count": ".3g", "speed-up": ".2f", "over roofline": ".2f"},
+        f"{PLAIN}. {_ROOFLINE}",
+        _FORMATS,
     )
 
 
-# -- Growth ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Growth:
-    """Times of one step of the work along one axis, shape (size, round)."""
-
-    step: str
-    axis: str
-    sizes: Sequence[int]
-    n_counts: Sequence[int]
-    threads: Sequence[int]
-    seconds: Floats
-
-
-def growth(extent: Extent) -> Iterator[Growth]:
-    """Time simulation, block layout and tracking over pixels, bins and threads."""
-    most = numba.get_num_threads()
-    side, bins = extent.side, extent.bins
-    axes = {
-        "pixels": [(s * s, s, bins, most) for s in extent.sides],
-        "bins": [(n, side, n, most) for n in extent.gates],
-        "threads": [(n, extent.side_of_threads, bins, n) for n in range(1, most + 1)],
-    }
-    for axis, cases in axes.items():
-        if len(cases) < 2:
-            continue
-        calls = {(step, i): f for i, case in enumerate(cases) for step, f in _work(*case[1:])}
-        taken = interleaved({f"{s} {i}": f for (s, i), f in calls.items()}, extent.growth_rounds)
-        n_counts = [side * side * n_bins for _, side, n_bins, _ in cases]
-        # Small captures are ranged on one thread.
-        threads = [n if c > SERIAL_BELOW else 1 for c, (*_, n) in zip(n_counts, cases, strict=True)]
-        for step in dict.fromkeys(step for step, _ in calls):
-            seconds = np.array([taken[f"{step} {i}"] for i in range(len(cases))])
-            yield Growth(step, axis, [case[0] for case in cases], n_counts, threads, seconds)
-
-
-def _work(side: int, n_bins: int, threads: int) -> list[tuple[str, Callable[[], object]]]:
-    scene, acquisition = scenes["uniform"](size=side), _gate(n_bins)
-    cube = simulate(scene, acquisition, FLUX, seed=1).cube
-    blocks = to_blocks(cube)
-
-    def tracked() -> None:
-        with kernel_threads(threads):
-            track(blocks, SETTINGS)
-
-    def simulated() -> None:
-        with kernel_threads(threads):
-            simulate(scene, acquisition, FLUX, seed=1)
-
-    return [
-        ("simulation", simulated),
-        ("block layout", lambda: to_blocks(cube)),
-        ("tracking", tracked),
-    ]
-
-
-def exponent(sizes: Sequence[int], seconds: Floats) -> Interval:
-    """Return the power of the size with which a time (size, round) grows, by least squares."""
-    slopes = np.polynomial.polynomial.polyfit(np.log(sizes), np.log(seconds), 1)[1]
-    return median_interval(slopes)
-
-
-def growth_table(grown: Sequence[Growth], limit: Roofline) -> Table:
-    """Show the exponent of each step along each axis, and the cost at both ends."""
-
-    def cost(each: Growth, i: int) -> float:
-        return 1e9 * float(np.median(each.seconds[i])) / each.n_counts[i]
-
-    def over_roofline(each: Growth) -> float | str:
-        if each.step != "tracking":
-            return ""
-        seconds = float(np.median(each.seconds[-1]))
-        return seconds / limit.seconds(each.n_counts[-1], each.threads[-1])
-
+def sizes_table(extent: Extent, root_ns: Interval) -> Table:
+    """Compare the cost of tracking over image sizes and gates."""
+    calls, n_counts = {}, {}
+    for side, bins in extent.sizes:
+        name = f"{side} x {side} x {bins}"
+        capture = simulate(scenes["uniform"](size=side), _gate(bins), FLUX, seed=1)
+        calls[name] = partial(track, to_blocks(capture.cube), SETTINGS)
+        n_counts[name] = capture.cube.size
+    seconds = interleaved(calls, extent.rounds)
     return table(
-        "growth",
-        "Growth: time as a power of the size",
-        grown,
+        "sizes",
+        f"Tracking over sizes, on up to {numba.get_num_threads()} threads",
+        seconds,
         {
-            "step": lambda each: each.step,
-            "over": lambda each: each.axis,
-            "from": lambda each: each.sizes[0],
-            "to": lambda each: each.sizes[-1],
-            "exponent [95 %]": lambda each: exponent(each.sizes, each.seconds),
-            "ns per count at first": lambda each: cost(each, 0),
-            "at last": lambda each: cost(each, -1),
-            "over roofline at last": over_roofline,
+            "counts": str,
+            "ms [95 %]": lambda name: median_interval(1e3 * seconds[name]),
+            **_per_count(lambda name: (float(np.median(seconds[name])), n_counts[name]), root_ns),
         },
-        "1 is linear growth, 0 none, -1 an ideal gain by threads. Up to two million counts are "
-        "ranged on one thread. Block layout always takes one thread.",
-        {"exponent [95 %]": ".2f", "ns per count at first": ".3g", "at last": ".3g"},
+        f"Up to {SERIAL_BELOW / 1e6:.0f} million counts are ranged on one thread. {_ROOFLINE}",
+        _FORMATS,
     )
+
+
+_ROOFLINE = "Roofline: time of the two float32 square roots of each count on one thread."
+_FORMATS = {"ms [95 %]": ".3g", "ns per count": ".3g", "speed-up": ".2f", "over roofline": ".2f"}
+
+
+def _per_count(
+    cost: Callable[[str], tuple[float, int]], root_ns: Interval
+) -> dict[str, Callable[[str], float]]:
+    """Return the columns that divide a time by a number of counts."""
+
+    def ns(name: str) -> float:
+        seconds, n_counts = cost(name)
+        return 1e9 * seconds / n_counts
+
+    return {"ns per count": ns, "over roofline": lambda name: ns(name) / (2 * root_ns.value)}
+
+
+def square_root_ns(rounds: int) -> Interval:
+    """Return the time of one independent float32 square root in the nearest cache."""
+    numbers = np.random.default_rng(0).uniform(1, 2, _ROW).astype(np.float32)
+    (seconds,) = interleaved({"": lambda: take_roots(numbers, _ROOTS)}, rounds).values()
+    return median_interval(1e9 * seconds / (_ROW * _ROOTS))
 
 
 # -- Start -----------------------------------------------------------------------------------------
