@@ -169,7 +169,7 @@ def test_a_cluster_gives_the_same_and_loses_nothing_with_a_worker(tmp_path: Path
     shown: list[tuple[int, int]] = []
     found = list(study.study(path, 2, 2 * 10**9, lambda *done: shown.append(done)))
     assert [each.title for each in found] == [
-        "part after part, without Dask",
+        "tile by tile, without Dask",
         "1 worker",
         "2 workers",
         "2 workers, one killed",
