@@ -169,7 +169,7 @@ def test_floats_are_metres(write: Write) -> None:
     depths = np.array([[0, 1.5], [np.nan, 800.25]], np.float32)
     scene = read_scene(write("a.tif", tiff_bytes(depths)))
     np.testing.assert_array_equal(scene.range_m, [[np.nan, 1.5], [np.nan, 800.25]])
-    pages = np.stack([depths, np.ones((2, 2), np.float32)])  # as this package saves its answers
+    pages = np.stack([depths, np.ones((2, 2), np.float32)])  # as this package saves range images
     several = read_scene(write("b.tif", tiff_bytes(pages, photometric="minisblack")))
     np.testing.assert_array_equal(several.range_m, scene.range_m)
 

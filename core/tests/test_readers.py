@@ -1,4 +1,4 @@
-"""One contract for every reader; the guesses; what must be refused; and the way back to a file."""
+"""One contract for every reader; guesses; refusals; and captures written and read back."""
 
 from __future__ import annotations
 

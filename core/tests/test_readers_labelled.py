@@ -155,7 +155,7 @@ def test_unwritten_chunks_hold_the_fill_value(tmp_path: Path) -> None:
     assert cube[0, 0, 0] == 9 and cube.sum() == 9 + 3 * (cube.size - 1)
 
 
-# -- nothing is read before it is asked for --------------------------------------------------------
+# -- lazy reading ----------------------------------------------------------------------------------
 
 
 LARGE = np.random.default_rng(5).poisson(0.05, (64, 48, 200)).astype(np.uint16)

@@ -1,4 +1,4 @@
-"""The reader for a file, chosen by its content; the suffix decides where several or none fit."""
+"""Choice of the reader by the content of a file; the suffix decides where several or none fit."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def suffixes_of(readers: Sequence[Reader]) -> dict[str, str]:
 
 
 def is_gzip(path: Path) -> bool:
-    """Whether a file is compressed by gzip, whatever its name."""
+    """Return whether a file is compressed by gzip, regardless of its name."""
     return path.is_file() and _start(path).startswith(_GZIP_MAGIC)
 
 

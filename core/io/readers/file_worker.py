@@ -41,11 +41,11 @@ Reply = tuple[dict[str, Any], list[Any]]
 
 
 class Refused(ValueError):
-    """The file is refused; the message is a sentence for the user."""
+    """Refusal of a file; the message is a sentence for the user."""
 
 
 def require(name: str, value: object, accepted: bool, what: str) -> None:
-    """Refuse a value in the words of `core.checks.require`."""
+    """Refuse a value with the message of `core.checks.require`."""
     if not accepted:
         raise Refused(f"{name} = {value!r} is not accepted: give {what}.")
 
@@ -362,7 +362,7 @@ def _missing(array: Any, known: dict[str, Any]) -> dict[str, float]:
 
 
 def read_zarr(path: str, name: str, box: list[list[int]]) -> Reply:
-    """Read the numbers in a box of the array in a folder; tell whether a chunk is absent."""
+    """Read the numbers in a box of the array in a folder, and whether a chunk is absent."""
     folder = Path(path) / name if (Path(path) / name).is_dir() else Path(path)
     array = _open_zarr(folder)
     found = np.asarray(array[_slices(box)])
@@ -553,7 +553,7 @@ def read_mesh(path: str, suffix: str, most_faces: int) -> Reply:
     """Read vertices (vertex, 3) and faces (face, 3) of all parts of a mesh, each in its place."""
     import trimesh  # noqa: PLC0415
 
-    # From memory and without a resolver of names, a loader cannot reach another file.
+    # From memory and without a resolver of names, a loader cannot open another file.
     data = Path(path).read_bytes()
     if b"\0" not in data:  # text: do not guess its encoding
         data = data.decode(errors="replace").encode()

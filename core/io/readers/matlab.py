@@ -40,7 +40,7 @@ _SHORTEST_S, _LONGEST_S = 1e-13, 1e-6
 
 
 class Variable(NamedTuple):
-    """A variable of a file.
+    """Variable of a file.
 
     ``shape`` is MATLAB's, ``kind`` the class of its elements, or ``"sparse"``; ``parts`` are its
     arrays in version 7.3.
@@ -69,7 +69,7 @@ class Variable(NamedTuple):
 
 
 class _Version5:
-    """The variables of a file of version 5."""
+    """Variables of a file of version 5."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._version = path, FileVersion.of(path)
@@ -101,7 +101,7 @@ class _Version5:
 
 
 class _Version73:
-    """The variables of a file of version 7.3."""
+    """Variables of a file of version 7.3."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -24,7 +24,7 @@ Check = Callable[[str, Any], None]
 
 @dataclass(frozen=True)
 class Kind:
-    """How a value is typed, written, and checked."""
+    """Type of an option: how its values are parsed, written and checked."""
 
     annotation: str
     """Type in the documentation."""
@@ -34,21 +34,21 @@ class Kind:
     check: Check
     write: Callable[[Any], str] = str
     """As text from which `parse` returns the same value."""
-    words: tuple[str, ...] = ()
-    """Names of the parts, where a value is given as several arguments of the command line."""
+    metavars: tuple[str, ...] = ()
+    """Names of the parts of a value that takes several arguments of the command line."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """How a field of `ReadOptions` is presented."""
+    """Presentation of a field of `ReadOptions`."""
 
     label: str
-    """In a form."""
+    """Label in a form."""
     flag: str
-    """Of the command line, without the dashes."""
+    """Option of the command line, without the dashes."""
     kind: Kind
     help: str
-    """What the option is, as a sentence."""
+    """Description, as a sentence."""
 
 
 def _option(label: str, flag: str, kind: Kind, help: str) -> Any:
@@ -127,7 +127,7 @@ _PULSE = Kind(
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the user specifies about a file. None takes a value from the file, or guesses it.
+    """User overrides for a file; None takes the value from the file, or guesses it.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""MATLAB's sparse matrices (pixel, bin) of counts, as published simulated captures are kept.
+"""MATLAB's sparse matrices (pixel, bin) of counts, the format of published simulated captures.
 
-The pixels of the image lie one after the other, column by column unless ``axes`` says ``"row col"``
+The pixels of the image follow each other column by column unless ``axes`` says ``"row col"``
 instead of ``"col row"``: MATLAB's ``reshape`` makes such a list of an image. Rows and columns come
 from ``shape``; without it the image is guessed to be square.
 """
@@ -22,7 +22,7 @@ from core.io.readers.options import ReadOptions
 
 
 class Sparse(NamedTuple):
-    """A matrix as MATLAB keeps it.
+    """Sparse matrix as MATLAB stores it.
 
     The ``values`` are in column order, ``rows`` gives the row of each, and ``starts`` where each
     column begins, followed by the end of the last one.
@@ -75,7 +75,7 @@ def sparse_capture(
 def _entries(
     matrix: Sparse, name: str
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return row, column and value of each entry, once they proved valid."""
+    """Return row, column and value of each entry, after checking them."""
     n_rows, n_cols = matrix.shape
     found = len(matrix.starts)
     require(f"columns of {name}", found - 1, found == n_cols + 1, f"{n_cols}, as its shape says")
