@@ -429,19 +429,6 @@ def test_long_pulses_are_kept_and_longer_ones_refused(tmp_path: Path) -> None:
         read_capture(put(tmp_path / "l.h5", written(longer)))
 
 
-def test_arrays_beyond_the_limit_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(guards, "MAX_CUBE_BYTES", 2**20)
-    pixels = xr.Dataset({"counts": (("row", "col", "bin"), np.zeros((512, 512, 1), np.int8))})
-    for name, content in {
-        "whole.nc": bytes(pixels.astype("i4").isel(bin=[0] * 2).to_netcdf(engine="scipy")),
-        "sums.nc": bytes(pixels.to_netcdf(engine="scipy")),
-    }.items():
-        with pytest.raises(CaptureError, match=rf"{name}: bytes of .* at most 1,048,576 bytes"):
-            read_capture(put(tmp_path / name, content))
-
-
 def test_external_data_is_never_opened(tmp_path: Path) -> None:
     """Opening a pipe that nobody writes to would block until the time is up."""
     pipe = tmp_path / "pipe.h5"

@@ -238,7 +238,9 @@ def _vector(array: Any, most: int) -> Any:
     if n_values != max(shape, default=1):
         raise ValueError(f"array of shape {shape[::-1]} is not accepted: give a vector.")
     if n_values > most:
-        raise ValueError(f"{n_values:,} photons, too many with those before: give fewer.")
+        raise ValueError(
+            f"{n_values:,} photons is not accepted: give {most:,}, the rest of the limit."
+        )
     values = np.empty(n_values, dtype)
     if n_values:
         array.read(h5py.h5s.ALL, h5py.h5s.ALL, values.reshape(shape))
