@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.acquisition import Acquisition, Flux, Pulse
+from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
-from core.io.readers import open_capture, read_capture, sample
-from core.io.readers.labelled import dataset, describe
-from core.io.readers.options import ReadOptions
+from core.io.readers import sample
+from core.io.readers.labelled import dataset
 from core.out_of_core import tiles
 from core.out_of_core.tiles import IMAGES, as_image, computed, estimate_large
 from core.scene import Scene, scenes
@@ -115,27 +114,6 @@ def test_a_sample_represents_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
     assert changed.mean() < 0.01
     difference = np.abs(parts["confidence"].to_numpy() - whole.confidence)[~changed]
     assert np.quantile(difference, 0.99) < 0.1
-
-
-@pytest.mark.parametrize("suffix", [".nc", ".zarr", ".h5"])
-def test_guesses_are_the_same_for_reading_and_opening(tmp_path: Path, suffix: str) -> None:
-    scene = scenes["uniform"](32)
-    known = simulate(scene, scene.acquisition, Flux(signal=0.5, sbr=1.0), Pulse.gaussian(3e-9))
-    path = tmp_path / f"bare{suffix}"
-    counts = dataset(known).counts.drop_attrs().drop_vars(["time_s", "range_m"])
-    counts = counts.assign_attrs(n_pulses=int(known.counts.max()) - 1)
-    named = counts.to_dataset(name="counts")
-    if suffix == ".zarr":
-        named.to_zarr(path, consolidated=False)
-    else:
-        named.to_netcdf(path, engine="h5netcdf")
-    read, opened = read_capture(path), open_capture(path)
-    acquisition, pulse, detection, source = describe(opened, ReadOptions())
-    assert (acquisition, pulse) == (read.acquisition, read.pulse)
-    assert (detection, source) == (read.detection, read.source) and detection == "all"
-    assert pulse.tau_s == pytest.approx(3e-9, rel=0.2)
-    whole, parts = estimate(read, "likelihood"), estimate_large(opened, "likelihood").compute()
-    np.testing.assert_array_equal(parts["range_m"], whole.range_m)
 
 
 def test_a_result_of_tiles_is_an_image_with_metadata(

@@ -24,7 +24,9 @@ from hypothesis.extra import numpy as hnp
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture, CaptureError
-from core.io.readers import MAX_CUBE_BYTES, SUFFIXES, guards, read_capture
+from core.io import ReadOptions
+from core.io.readers import MAX_CUBE_BYTES, SUFFIXES, guards, open_capture, read_capture
+from core.io.readers.labelled import describe
 from core.io.writers import save_capture
 from core.tests.formats import FORMATS, Format, damaged, put
 from core.tests.refusing import assert_refused
@@ -86,8 +88,12 @@ def test_contract_nothing_to_guess(kept: Format, tmp_path: Path) -> None:
 
 @every_format
 def test_contract_everything_guessed(kept: Format, tmp_path: Path) -> None:
-    capture = read_capture(saved(kept, tmp_path), **kept.needs)
+    path = saved(kept, tmp_path)
+    capture, opened = read_capture(path, **kept.needs), open_capture(path, **kept.needs)
     np.testing.assert_array_equal(capture.cube, kept.cube)
+    np.testing.assert_array_equal(opened, kept.cube)
+    known = capture.acquisition, capture.pulse, capture.detection, capture.source
+    assert describe(opened, ReadOptions()) == known
     assert capture.acquisition.bin_width_s == pytest.approx(kept.acquisition.bin_width_s)
     assert ("guessed: " in capture.source) == bool(kept.guesses)
     for guessed in kept.guesses:

@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.acquisition import LONGEST_S, MOST_BINS, Floats
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import capture_of, count_dtype, described
+from core.io.readers.dense import capture_of, count_dtype, description_of
 from core.io.readers.guards import require_fits
 from core.io.readers.options import ReadOptions
 from core.io.readers.times import time_text
@@ -112,7 +112,7 @@ def arrivals_capture(
     require(name, f"photons from {found}", n_dropped < inside.size, remedy)
     cube = _cube(bins[inside].astype(np.int64), pixel[inside], shape, n_bins, name)
     dropped = f"dropped: {n_dropped:,} of {inside.size:,} photons, outside the gate"
-    known = described(
+    known = description_of(
         request,
         n_bins,
         lambda: cube,

@@ -32,7 +32,7 @@ MOST_REPLY_CHARACTERS = 2**24
 IDLE_SECONDS = 60
 _NETCDF_ATTRIBUTES = ("CLASS", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_NCProperties")
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
-_ZARR_METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs")
+_ZARR_MARKS = ("zarr.json", ".zarray", ".zgroup")
 _ZARR_CODECS = {"zlib", "gzip", "zstd", "blosc", "shuffle", "fletcher32", "crc32c", "delta", "lz4"}
 _DEPTH_MODES = ("I;16", "I;16L", "I;16B", "I;16N", "F")
 
@@ -285,13 +285,14 @@ def list_zarr(path: str) -> Reply:
         return place.relative_to(root).as_posix(), status.st_size, status.st_mtime_ns
 
     for folder, files in _walk_zarr(root):
-        described = [folder / name for name in _ZARR_METADATA if name in files]
+        described = [folder / name for name in _ZARR_MARKS if name in files]
         inside = folder.relative_to(root).as_posix().removeprefix(".")
         if not described:
             if arrays and folder.is_relative_to(root / arrays[-1]["folders"][0][0]):
                 arrays[-1]["folders"].append(version(folder))
             continue
-        n_bytes += sum(file.stat().st_size for file in described)
+        metadata = [folder / name for name in (*_ZARR_MARKS, ".zattrs") if name in files]
+        n_bytes += sum(file.stat().st_size for file in metadata)
         most = f"up to {MOST_METADATA_BYTES:,}"
         require("bytes of metadata", n_bytes, n_bytes <= MOST_METADATA_BYTES, most)
         mixed = "zarr.json" in files and bool(files & {".zarray", ".zgroup"})

@@ -31,7 +31,7 @@ from core.io.readers.dense import (
     AXES,
     Description,
     capture_of,
-    described,
+    description_of,
     require_sums,
     stored_counts,
     whole_counts,
@@ -397,7 +397,7 @@ def describe(
         what = f"None: bins open {known.gate_delay_s} s after a pulse"
         require("stop_s", stop_s, known.gate_delay_s is None, what)
         known = replace(known, gate_delay_s=stop_s - n_bins * (known.bin_width_s or 1e-9))
-    found = described(
+    found = description_of(
         replace(known, n_bins=n_bins),
         n_bins,
         lambda: sample_of(counts.data),  # in memory or not: both lead to the same guess
