@@ -36,6 +36,7 @@ from core.tests.samples import (
     CUBE,
     MATRIX,
     OWN_FIELDS,
+    PHOTON_CELL,
     UINT16_CLASS,
     arrival_cells,
     cells_of,
@@ -45,7 +46,6 @@ from core.tests.samples import (
     matrix,
     npy_bytes,
     npz_bytes,
-    photon_cell,
 )
 
 pytestmark = pytest.mark.files
@@ -446,22 +446,22 @@ def zipped(content: bytes, method: int = zipfile.ZIP_DEFLATED) -> bytes:
 
 def claims_more_inflated() -> bytes:
     """A compressed variable of MATLAB's that claims 3 GiB."""
-    start = struct.pack("<II", MATRIX, 3 << 30) + matrix("<", CELL, (1, 1), b"Ts", b"")[8:]
+    start = struct.pack("<II", MATRIX, 3 << 30) + matrix(CELL, (1, 1), b"Ts", b"")[8:]
     packed = zlib.compress(start)
-    return mat_file("<", struct.pack("<II", 15, len(packed)) + packed)
+    return mat_file(struct.pack("<II", 15, len(packed)) + packed)
 
 
 def nested_cells(depth: int) -> bytes:
     """A cell in a cell in a cell: SciPy alone ends the process at some ten thousand of them."""
-    outer = matrix("<", CELL, (1, 1), b"", b"")
-    inner = len(photon_cell("<", 5))
+    outer = matrix(CELL, (1, 1), b"", b"")
+    inner = len(PHOTON_CELL)
     sizes = inner + len(outer) * np.arange(depth)
     layers = (outer[:4] + struct.pack("<I", size + len(outer) - 8) + outer[8:] for size in sizes)
-    return b"".join(reversed(list(layers))) + photon_cell("<", 5)
+    return b"".join(reversed(list(layers))) + PHOTON_CELL
 
 
 def cell_file(shape: tuple[int, int], body: bytes) -> bytes:
-    return mat_file("<", matrix("<", CELL, shape, b"Ts", body))
+    return mat_file(matrix(CELL, shape, b"Ts", body))
 
 
 def own(**fields: Any) -> bytes:
@@ -554,12 +554,12 @@ REFUSED: tuple[tuple[str, bytes, str], ...] = (
     ("a.mat", cell_bytes([0, 1e300]), r"largest time of Ts = 1e\+288"),
     # Files that crash SciPy or exhaust its memory
     ("a.mat", cell_file((1, 1), nested_cells(50_000)), "Ts cannot be read"),
-    ("a.mat", cell_file((10**6, 10**6), photon_cell("<", 5)), "more memory"),
-    ("a.mat", cell_file((1000, 1000), photon_cell("<", 5)), "Ts cannot be read"),
+    ("a.mat", cell_file((10**6, 10**6), PHOTON_CELL), "more memory"),
+    ("a.mat", cell_file((1000, 1000), PHOTON_CELL), "Ts cannot be read"),
     ("a.mat", claims_more_inflated(), "Ts cannot be read"),
     (
         "a.mat",
-        mat_file("<", matrix("<", UINT16_CLASS, (1, 1, 2), b"Ts", element("<", 2000, b"abcd"))),
+        mat_file(matrix(UINT16_CLASS, (1, 1, 2), b"Ts", element(2000, b"abcd"))),
         "Ts cannot be read",
     ),
 )
