@@ -21,9 +21,11 @@ that reaches a hundredth of the highest; that bin is its time zero. An echo from
 count.
 
 The truth is the distance of the plane for every zone. The lines of sight of the outer zones are
-oblique, so that their ranges are up to 3 % longer. In the published records, ranges of the middle zone come out 6 mm too
-far (1.14 ns would fit) and those of the others 0 to 21 mm: each zone has its own delay. The
-sensor's clock is not corrected. The records are parsed in an isolated process.
+oblique, so that their ranges are up to 3 % longer. In the published records, ranges of the middle
+zone are 6 mm too long (1.14 ns would fit) and those of the others 0 to 21 mm: each zone has its own
+delay. The sensor's clock is not corrected.
+
+The records are parsed in an isolated process (`core.io.readers.isolation`).
 """
 
 from __future__ import annotations
