@@ -48,7 +48,7 @@ class Verdict:
     within: tuple[metrics.Interval, ...]
     """Share of target pixels within each of `TOLERANCES_BINS`, with its 95 % Wilson interval;
     empty where there is no target."""
-    detection: metrics.Detection | None
+    detection: metrics.DetectionRates | None
     """None where every pixel has a target."""
     told: Array
     """Mean confidence of each step that holds enough pixels."""
