@@ -51,7 +51,9 @@ class TrackingParameters(Settings):
             log=True,
             least=0.0,
             most=1e9,
-            doubtful=(Zone(0.0, 70.0, "The scales are too similar; at n = 1 the residual is 0."),),
+            doubtful=(
+                Zone(0.0, 70.0, "The scales are too much alike; at n = 1 the residual is 0."),
+            ),
         ),
         "Large scale over small scale, r_large = n·r_small: larger follows the echo's jump faster.",
     )
@@ -82,7 +84,7 @@ class TrackingParameters(Settings):
             least=1e-3,
             most=1e6,
             doubtful=(
-                Zone(1e-3, 0.5, "It never settles: at ½ and below it oscillates indefinitely."),
+                Zone(1e-3, 0.5, "It never settles: at ½ and below it cycles for ever."),
                 Zone(
                     0.5,
                     CALM_M,
@@ -91,7 +93,7 @@ class TrackingParameters(Settings):
                 Zone(
                     CALM_M,
                     1.0,
-                    "No smoothing: a pure delay at 1, overshoot below.",
+                    "It smooths nothing: at 1 a pure delay, below it overshoots.",
                 ),
             ),
         ),
@@ -144,12 +146,12 @@ class TrackingParameters(Settings):
             )
         if self.start == "zero" and self.weight != "cubic":
             found.append(
-                "From zero both scales first jump to the background; only the cubic weight "
+                "From zero both scales first jump up to the background; only the cubic weight "
                 "suppresses that jump."
             )
         if self.sigma_from == "before T_n" and self.t_n < FEW_BINS:
             found.append(
-                f"σ of the {self.t_n} bins before T_n, fewer than {FEW_BINS}, is unreliable; for "
+                f"σ of the {self.t_n} bins before T_n, fewer than {FEW_BINS}, is chance; for "
                 "one bin or none it is 0, and no pixel gets an estimate."
             )
         return found

@@ -154,7 +154,7 @@ class Estimator:
         clauses = [self.omits(capture)]
         if self.undoes_pile_up and capture.gated_pulses is None:
             known = capture.detection == "all"
-            why = "the capture holds all photons" if known else "the number of pulses is unknown"
+            why = "the capture holds all photons" if known else "the number of pulses is not known"
             clauses.append(f"no pile-up is undone: {why}")
         return "; ".join(filter(None, clauses))
 
