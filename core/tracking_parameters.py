@@ -51,9 +51,7 @@ class TrackingParameters(Settings):
             log=True,
             least=0.0,
             most=1e9,
-            doubtful=(
-                Zone(0.0, 70.0, "The scales are too much alike; at n = 1 the residual is 0."),
-            ),
+            doubtful=(Zone(0.0, 70.0, "The scales are too much alike; at n = 1 nothing remains."),),
         ),
         "Large scale over small scale, r_large = n·r_small: larger follows the echo's jump faster.",
     )
@@ -136,8 +134,8 @@ class TrackingParameters(Settings):
         found = []
         if linear >= LINEAR:
             found.append(
-                f"(m·h)²·l = {linear:.2g}: from about {LINEAR:g} both scales are linear and nearly "
-                "equal, which leaves little residual or none."
+                f"(m·h)²·l = {linear:.2g}: from about {LINEAR:g} on both scales are linear and "
+                "nearly equal, which leaves little residual or none."
             )
         if self.weight == "exponential" and self.alpha >= STEEP_ALPHA:
             found.append(
