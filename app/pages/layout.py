@@ -218,7 +218,7 @@ class Layout:
         self._reading = {
             name: pmui.TextInput(
                 label=option.label,
-                description=f"{option.label}: {option.help}",
+                description=option.help,
                 placeholder="guess",
                 size="small",
                 sizing_mode="stretch_width",
