@@ -150,7 +150,7 @@ class Capture:
         return max(1, math.ceil((end_s - begin_s) / self.acquisition.bin_width_s))
 
 
-class Seen(Protocol):
+class CaptureInfo(Protocol):
     """What is known of a capture, though its cube may not be in memory; a `Capture` is one."""
 
     @property

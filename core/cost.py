@@ -102,7 +102,7 @@ def predicted(
     *,
     false_alarm: float | None = None,
     n_taps: int = 16,
-    is_lit: bool = False,
+    posterior_is_cached: bool = False,
 ) -> Cost:
     """Working memory and time of `core.estimate`, without computing anything.
 
@@ -118,7 +118,7 @@ def predicted(
         As `core.estimate` takes it.
     n_taps : int
         Bins that an echo fills (`core.Pulse.taps`).
-    is_lit : bool
+    posterior_is_cached : bool
         Whether the posterior is known already, and kept with the capture.
     """
     rows, cols, n_bins = shape
@@ -134,14 +134,14 @@ def predicted(
     n_bytes += (_PIXEL_BYTES + rates.pixel_bytes) * n_pixels
     seconds = _FIXED_S + (_PIXEL_S + rates.pixel_s) * n_pixels + rates.count_s * n_counts
     lanes = lanes_of(levels, n_bins)
-    if not is_lit:
+    if not posterior_is_cached:
         learned = min(sampled_numbers(levels, n_bins), n_sampled * levels * n_bins)
         table = 4 * lanes * levels * n_bins * min(1.0, n_pixels / 4)
         n_bytes += 4 * n_counts + max(table, 4 * learned + _SAMPLE_COUNT_BYTES * n_sampled * n_bins)
         seconds += _LEARNED_S * learned
         seconds += (entry_s + _LANE_S / lanes) * n_bins * levels * _filled(n_sampled, lanes)
         seconds += (entry_s + _LANE_S / lanes) * n_bins * _USUAL_LEVELS * _filled(n_pixels, lanes)
-    if method == "tracking" or (not is_lit and lanes == LANES):
+    if method == "tracking" or (not posterior_is_cached and lanes == LANES):
         n_bytes += 2 * n_bins * _filled(n_pixels, LANES)
     if steps:
         lanes = lanes_of(_USUAL_LEVELS, n_bins * steps)
@@ -190,7 +190,7 @@ def cost_of(
         settings,
         false_alarm=false_alarm,
         n_taps=echo.size,
-        is_lit=has_posterior(capture),
+        posterior_is_cached=has_posterior(capture),
     )
 
 
@@ -209,9 +209,13 @@ def require_memory(
     ValueError
         If it does.
     """
-    is_lit = has_posterior(capture)
+    posterior_is_cached = has_posterior(capture)
     needed = predicted(
-        _shape(capture), method, settings, false_alarm=false_alarm, is_lit=is_lit
+        _shape(capture),
+        method,
+        settings,
+        false_alarm=false_alarm,
+        posterior_is_cached=posterior_is_cached,
     ).working_bytes
     if needed > _UNCHECKED_BYTES:
         free = psutil.virtual_memory().available

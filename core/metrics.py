@@ -22,6 +22,7 @@ from core.checks import require
 __all__ = [
     "Detection",
     "Interval",
+    "ReliabilityBin",
     "Told",
     "bias_m",
     "calibration_error",
@@ -241,7 +242,7 @@ def _root_mean_square(values: Floats) -> float:
 
 
 @dataclass(frozen=True)
-class Told:
+class ReliabilityBin:
     """The answers whose confidence falls in one tenth (of a reliability diagram)."""
 
     confidence: float
@@ -251,7 +252,10 @@ class Told:
     count: int
 
 
-def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[Told]:
+Told = ReliabilityBin  # deprecated name, to be removed after the next release
+
+
+def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[ReliabilityBin]:
     """Answers by tenths of confidence; tenths without answers are left out.
 
     Parameters
@@ -262,7 +266,7 @@ def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[Told]:
     """
     tenth = np.minimum((confidence * 10).astype(int), 9)
     return [
-        Told(
+        ReliabilityBin(
             float(confidence[tenth == k].mean()),
             wilson(int(right[tenth == k].sum()), int((tenth == k).sum())),
             int((tenth == k).sum()),
@@ -272,7 +276,7 @@ def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[Told]:
     ]
 
 
-def calibration_error(told: Sequence[Told]) -> float:
+def calibration_error(told: Sequence[ReliabilityBin]) -> float:
     """Expected calibration error: mean distance of confidence from the share that is right."""
     count = sum(each.count for each in told)
     return sum(each.count * abs(each.confidence - each.right.value) for each in told) / count

@@ -55,7 +55,11 @@ class Number:
     whole : bool
         Whether only integers make sense.
     unit : str
-        Empty for a pure number.
+        Empty for a pure number. A value in ``bins``, or per bin, is rescaled where bins are merged.
+    merge_power : int, optional
+        Power of the merging factor by which it is rescaled; None takes that of the unit.
+    is_bin_index : bool
+        Whether the value is a bin of the gate, which moves with the start of a cut gate.
     least, most : float
         Smallest and largest value accepted at all.
     open_below : bool
@@ -70,6 +74,8 @@ class Number:
     log: bool = False
     whole: bool = False
     unit: str = ""
+    merge_power: int | None = None
+    is_bin_index: bool = False
     least: float = -math.inf
     most: float = math.inf
     open_below: bool = False

@@ -72,7 +72,7 @@ def simulate(
     require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
     _require_seed(seed)
     shape = np.shape(scene.range_m)
-    triggered = triggered_by_each_edge(scene, acquisition, flux, pulse)
+    triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
     cube = np.zeros(
         (len(triggered), acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32
     )
@@ -172,7 +172,7 @@ def _signal(scene: Scene, flux: Flux) -> Floats:
     return np.where(np.isfinite(scene.range_m), flux.signal * reflectivity, 0.0)
 
 
-def triggered_by_each_edge(
+def cumulative_trigger_probability(
     scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse
 ) -> Floats:
     """Probability that a pulse is recorded to have fired before each bin edge.

@@ -38,6 +38,7 @@ class TrackingParameters:
             1e-4,
             1.0,
             log=True,
+            merge_power=2,  # an acceleration: counts per square bin
             least=0.0,
             most=1e6,
             doubtful=(
@@ -73,6 +74,7 @@ class TrackingParameters:
             most=1e6,
             open_below=True,
             unit="bins",
+            merge_power=0,  # l is rescaled instead
             doubtful=(
                 Zone(0.0, 0.42, "As too small an l: dim pixels are left without an answer."),
                 Zone(2.6, 1e6, "As too large an l: the small scale follows the echo, too."),
@@ -112,7 +114,7 @@ class TrackingParameters:
     )
     t_n: int = parameter(
         20,
-        Number("T_n", 0, 99, whole=True, least=0, most=2**31 - 1, unit="bins"),
+        Number("T_n", 0, 99, whole=True, least=0, most=2**31 - 1, unit="bins", is_bin_index=True),
         "First bin in which the residual may peak, about two bins behind the echo's onset: what "
         "comes before is taken for noise.",
     )

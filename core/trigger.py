@@ -64,10 +64,10 @@ def no_trigger_probability(rate: ArrayLike) -> Floats:
     return np.asarray(np.exp(-_checked_rate(rate).sum(axis=-1)))
 
 
-def drawn(
+def draw_counts(
     rate: ArrayLike, n_pulses: int | None, rng: np.random.Generator
 ) -> NDArray[np.unsignedinteger]:
-    """Histograms drawn from rates, shape (..., bin): the multinomial of Eq. 1.
+    """Draw histograms from rates, shape (..., bin): the multinomial of Eq. 1.
 
     Parameters
     ----------

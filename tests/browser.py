@@ -52,6 +52,10 @@ def browser_path() -> str | None:
     return named or next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
+READY = ".stage[data-camera], [aria-label='Pinned pixels']"
+"""Part of a page that is drawn late: Explore's cloud, or the pins of Inspect."""
+
+
 @contextmanager
 def chromium() -> Iterator[Browser]:
     """Start a browser without a window; raise where there is none."""
@@ -100,6 +104,7 @@ def open_page(
     height: int = 900,
     prepare: str = "",
     watch: Callable[[Page], None] = lambda page: None,
+    ready: str = READY,
 ) -> Page:
     """Open a tab with a session of its own, and wait until it is drawn and ready for input.
 
@@ -110,10 +115,7 @@ def open_page(
     watch(page)
     page.add_init_script(prepare)
     page.goto(address)
-    # Explore's cloud or the pins of Inspect, where a capture opens.
-    page.locator(".stage[data-camera], [aria-label='Pinned pixels']").first.wait_for(
-        state="attached"
-    )
+    page.locator(ready).first.wait_for(state="attached")
     page.wait_for_function("Bokeh.documents[0].is_idle")
     return page
 

@@ -12,9 +12,9 @@ from bokeh.document import Document
 import core
 from app.model import colors as looks
 from app.model import text as words
-from app.model.address import Wanted, query_of
+from app.model.address import Link, query_of
 from app.model.script import script_of
-from app.model.state import Illumination, Less, Viewing
+from app.model.state import Illumination, ReductionSettings, Viewing
 from app.model.store import (
     Request,
     built_in_sources,
@@ -49,7 +49,7 @@ def ask(source="car", **chosen):
         "light": Illumination(),
         "reading": ReadOptions(),
         "tracking": TrackingParameters(),
-        "less": Less(),
+        "less": ReductionSettings(),
     } | chosen
     known = built_in_sources()
     return Request(known[source] if isinstance(source, str) else source, **choices)
@@ -148,7 +148,7 @@ def test_only_what_changed_is_computed_again(car):
 def test_the_page_computes_what_takes_less_than_to_draw_it(car):
     other = {"tracking": PRESETS["as printed"]}
     assert lane_of(replace(car.request, **other), car) is PAGE
-    for again in ({"light": Illumination(seed=1)}, {"less": Less(skip=2)}):
+    for again in ({"light": Illumination(seed=1)}, {"less": ReductionSettings(skip=2)}):
         assert lane_of(replace(car.request, **again, **other), car) is SHORT
     for new in ({"source": built_in_sources()["staircase"]}, {"absent": frozenset(["jitter"])}):
         assert lane_of(replace(car.request, **new, **other), car) is GENERAL
@@ -157,11 +157,11 @@ def test_the_page_computes_what_takes_less_than_to_draw_it(car):
         assert lane_of(replace(large.request, **change), large) is GENERAL
     file = compute(ask("sample"), None)
     assert lane_of(replace(file.request, **other), file) is PAGE
-    assert lane_of(replace(file.request, less=Less(skip=2)), file) is GENERAL
+    assert lane_of(replace(file.request, less=ReductionSettings(skip=2)), file) is GENERAL
 
 
 def test_less_of_a_capture_is_taken_from_the_whole_of_it(car):
-    less = Less(merge=2, gate_from=0.2, gate_to=0.9, pool=2, pulses=0.5)
+    less = ReductionSettings(merge=2, gate_from=0.2, gate_to=0.9, pool=2, pulses=0.5)
     reduced = compute(replace(car.request, less=less), car)
     assert reduced.whole is car.whole is car.capture
     assert reduced.capture.cube.shape == (32, 32, 35)
@@ -178,11 +178,11 @@ def test_less_of_a_capture_is_taken_from_the_whole_of_it(car):
 )
 def test_a_reduction_is_what_its_settings_say(reduction):
     for n_bins in (100, 334, 876):
-        assert Less.of(reduction, n_bins).reduction(n_bins) == reduction
+        assert ReductionSettings.of(reduction, n_bins).reduction(n_bins) == reduction
 
 
 def test_a_gate_is_never_empty():
-    assert Less(gate_from=1.0, gate_to=0.0).reduction(10) == Reduction(gate=(9, 10))
+    assert ReductionSettings(gate_from=1.0, gate_to=0.0).reduction(10) == Reduction(gate=(9, 10))
 
 
 def test_an_answer_is_what_core_computes(car):
@@ -306,7 +306,7 @@ def test_without_truth_the_scale_fits_confident_answers(sample):
 
 
 def test_a_colour_for_every_value():
-    look = looks.Look("", "", 0.0, 1.0, ["#000000", "#808080", "#ffffff"], OUTSIDE_COLOR)
+    look = looks.ColorScale("", "", 0.0, 1.0, ["#000000", "#808080", "#ffffff"], OUTSIDE_COLOR)
     grey = [int(OUTSIDE_COLOR[at : at + 2], 16) for at in (1, 3, 5)]
     rgb = look.rgb(np.array([-0.01, 0.0, 0.5, 1.0, 1.01]))
     np.testing.assert_array_equal(rgb, [grey, [0] * 3, [128] * 3, [255] * 3, grey])
@@ -550,7 +550,9 @@ def test_plots_follow_the_page_into_the_dark():
 # -- controls --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("settings", [TrackingParameters(), Illumination(), Less(), Viewing()])
+@pytest.mark.parametrize(
+    "settings", [TrackingParameters(), Illumination(), ReductionSettings(), Viewing()]
+)
 def test_every_field_has_a_control_made_from_its_metadata(settings):
     controls = SettingsPanel(settings, lambda new: None).controls
     assert list(controls) == [each.name for each in fields(settings)]
@@ -719,7 +721,7 @@ def opened(layout, title):
 
 
 def test_what_is_folded_away_is_built_when_it_is_first_opened(layout):
-    names = [spec_of(each).symbol for each in fields(Less)]
+    names = [spec_of(each).symbol for each in fields(ReductionSettings)]
 
     def on_page():
         return [each.label for each in layout.page.select(Knob) if each.label in names]
@@ -741,7 +743,7 @@ def test_form_link_and_script_have_each_option_for_reading_a_file(layout, small_
     control(layout, "Read again").clicks += 1
     state = layout.session.state
     assert state.reading == given
-    linked = Wanted(dict(parse_qsl(query_of(state, {})))).of({"reading": ReadOptions()})
+    linked = Link(dict(parse_qsl(query_of(state, {})))).of({"reading": ReadOptions()})
     assert linked == {"reading": given}
     script = script_of(replace(answer, request=replace(answer.request, reading=given)), state)
     assert [name for name in EXAMPLES if f" {name}=" not in script] == []
@@ -861,7 +863,7 @@ def test_controls_fit_the_capture_they_are_for(layout, small_file):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_page_can_be_the_first_one(page):
-    layout = Layout(built_in_sources(), Wanted({"page": page.name}))
+    layout = Layout(built_in_sources(), Link({"page": page.name}))
     assert (layout.pages.choice.value, [*layout.contents]) == (page.name, [page.name])
     assert layout.page.sidebar_open != page.is_standalone
     assert layout.page.get_root().references()
@@ -873,7 +875,7 @@ def test_every_page_can_be_the_first_one(page):
 
 
 def test_a_page_that_does_not_exist_is_refused_by_name():
-    layout = Layout(built_in_sources(), Wanted({"page": "Nowhere"}))
+    layout = Layout(built_in_sources(), Link({"page": "Nowhere"}))
     assert layout.pages.choice.value == "Explore"
     assert "page = 'Nowhere' is not accepted: give Explore, Inspect" in layout.alert.text
 

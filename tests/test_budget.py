@@ -11,13 +11,13 @@ import psutil
 import pytest
 
 from app.model import budget
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from app.model.store import Request, compute, file_source
 from app.pages.compare.ranking import Task, run_task
-from app.pages.inspect.results import capture_known, pixel_lit
+from app.pages.inspect.results import inspect_capture, inspect_pixel_with_flux
 from app.pages.session import Session
 from app.pages.shared.estimate import FEW_COUNTS, lane_of
-from app.pages.tradeoff.page import affordable
+from app.pages.tradeoff.speed import affordable
 from app.tasks.scheduler import GENERAL
 from core import ESTIMATORS, Acquisition, Capture, TrackingParameters, save_capture
 from core.cost import Cost
@@ -36,7 +36,9 @@ def source(tmp_path):
 
 
 def ask(source, less=None):
-    return Request(source, Illumination(), ReadOptions(), TrackingParameters(), less or Less())
+    return Request(
+        source, Illumination(), ReadOptions(), TrackingParameters(), less or ReductionSettings()
+    )
 
 
 @pytest.fixture
@@ -50,9 +52,9 @@ def test_a_capture_too_costly_opens_reduced_and_says_so(source, tight):
     answer = compute(ask(source), None)
     less = answer.request.less
     assert less.merge * less.skip > 1
-    assert answer.asked == Less()
+    assert answer.asked == ReductionSettings()
     assert answer.capture.cube.size < answer.whole.cube.size
-    assert "no more than this server allows" in answer.capture.source
+    assert "limits of this server" in answer.capture.source
     # As few as will do: one step less is refused.
     for name in ("merge", "skip"):
         if getattr(less, name) > 1:
@@ -63,13 +65,13 @@ def test_a_capture_too_costly_opens_reduced_and_says_so(source, tight):
 
 def test_a_capture_that_fits_is_left_as_it_is(source):
     answer = compute(ask(source), None)
-    assert answer.request.less == answer.asked == Less()
+    assert answer.request.less == answer.asked == ReductionSettings()
     assert answer.capture.cube.shape == (120, 120, 100)
 
 
 def test_the_controls_show_what_was_left_out(source, tight):
     session = Session({"wide": source})
-    assert session.state.less == session.answer.request.less != Less()
+    assert session.state.less == session.answer.request.less != ReductionSettings()
     assert session.answer.request == session.estimate.request  # the next request asks for the same
 
 
@@ -83,7 +85,7 @@ def test_more_of_it_is_refused_with_a_remedy(source, tight):
 def test_time_is_bounded_as_memory_is(source, monkeypatch):
     monkeypatch.setattr(budget, "REQUEST_S", 0.04)
     answer = compute(ask(source), None)
-    assert answer.request.less != Less()
+    assert answer.request.less != ReductionSettings()
     with pytest.raises(ValueError, match="estimated time of 'tracking'"):
         compute(ask(source), answer)
 
@@ -94,7 +96,7 @@ def test_what_other_pages_compute_is_refused_too(source, monkeypatch):
     for method in ("unmixing", "likelihood"):
         with pytest.raises(ValueError, match=f"estimated time of '{method}'"):
             run_task(Task(method, ESTIMATORS[method].parameters()), answer)
-    for work in (capture_known, lambda each: pixel_lit(each, 0, 0)):
+    for work in (inspect_capture, lambda each: inspect_pixel_with_flux(each, 0, 0)):
         with pytest.raises(ValueError, match="estimated time of 'light'"):
             work(answer)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import re
 import tempfile
 from base64 import b64encode
@@ -23,12 +24,13 @@ from playwright.sync_api import expect
 import core
 from app.model.colors import image_of, map_of, shown
 from app.model.exports import drawn, facts_file, image_files, shown_table_file, table_file
-from app.model.state import MAPS, Illumination, Less
+from app.model.state import MAPS, Illumination, ReductionSettings
 from app.model.store import built_in_sources, inspect
 from app.pages.layout import Layout
 from app.pages.shared import downloads
 from app.pages.shared.downloads import Download, Shown, Subject
 from app.theme import RANGE_COLORS
+from app.units import count, interval, number, share
 from core import TrackingParameters
 from core.studies.outputs import Table
 from tests.browser import VIEWS, eventually, fact, server_process
@@ -74,7 +76,11 @@ def columns_of(content):
     [
         (Subject("car"), "cloud.ply", "car_cloud.ply"),
         (
-            Subject("21km_K11_night", "tracking", (Less(), TrackingParameters(l=0.01, t_n=15))),
+            Subject(
+                "21km_K11_night",
+                "tracking",
+                (ReductionSettings(), TrackingParameters(l=0.01, t_n=15)),
+            ),
             "range image.png",
             "21km_K11_night_tracking_l0.01_Tn15_range-image.png",
         ),
@@ -103,7 +109,7 @@ def test_a_name_lists_capture_estimator_and_settings_that_are_not_the_default(su
 )
 def test_a_name_is_safe_for_every_system_whatever_the_capture_is_called(capture):
     everything = TrackingParameters(0.1, 3.0, 2.0, 1.1, 7.0, 5, "none", "zero", "before T_n")
-    settings = (Illumination(1.0, 1.0, 77, 5), Less(2, 0.1, 0.9), everything)
+    settings = (Illumination(1.0, 1.0, 77, 5), ReductionSettings(2, 0.1, 0.9), everything)
     subject = Subject(capture, "log_matched_filter", settings)
     name = subject.file_name("enhanced row1000 col1000", "csv")
     assert re.fullmatch(r"[\w+][\w.+-]+", name, re.ASCII)
@@ -240,11 +246,32 @@ def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(explore, sess
     np.testing.assert_array_equal(ply.vertices.astype(np.float32), xyz_m)
 
 
+@pytest.mark.parametrize("kind", ["Range", "Confidence", "3D clouds"])
+def test_a_methods_picture_is_saved_as_its_estimate(layout, kind):
+    layout.pages.choice.value = "Compare"
+    compare = layout.contents["Compare"]
+    eventually(lambda: "peak" in compare.answers)
+    compare.kind.value = kind
+    found = compare.picture_shown(compare.pictured.index("peak"))
+    layout.pages.choice.value = "Explore"
+    image = compare.answers["peak"].run.image
+    assert (found.heading, found.subject.estimator) == ("Peak of the histogram", "peak")
+    if kind == "3D clouds":
+        points = laspy.read(io.BytesIO(written(found.files["las"])))
+        assert len(points.x) == image.valid.sum()
+        return
+    arrays = np.load(io.BytesIO(written(found.files["npz"])))
+    np.testing.assert_array_equal(arrays["range_m"], image.range_m)
+    values = columns_of(written(found.files["csv"]))[found.scale.legend]
+    if kind == "Range":
+        np.testing.assert_array_equal(values, image.range_m.ravel())
+
+
 def test_tables_hold_every_digit_and_no_units_in_their_cells():
     item = Table("t", "T", ("method", "RD"), (("peak", 1 / 3), ("tracking", float("nan"))))
     assert written(table_file(item)).decode() == f"method,RD\r\npeak,{1 / 3!r}\r\ntracking,\r\n"
     columns = [("Method", "", 1), ("Right", "", 1), ("Time", "", 1)]
-    cells = [["98.2 %", 0.982, "97 to 99"], ["1,234.5", 1234.5, ""]]
+    cells = [[share(0.9825), 0.9825, "97 to 99"], ["1,234.5", 1234.5, ""]]
     rows = [
         {"name": "peak, or so", "note": "", "cells": cells},
         {"name": "other", "note": "", "cells": [["–", None, ""], ["2.0", 2.0, ""]]},
@@ -252,7 +279,7 @@ def test_tables_hold_every_digit_and_no_units_in_their_cells():
     ]
     assert written(shown_table_file(columns, rows)).decode() == (
         'Method,Right (%),"Right, more",Time,note\r\n'
-        '"peak, or so",98.2,97 to 99,1234.5,\r\n'
+        '"peak, or so",98.25,97 to 99,1234.5,\r\n'
         "other,,,2.0,\r\n"
         "failed,,,,Not computed yet.\r\n"
     )
@@ -261,20 +288,22 @@ def test_tables_hold_every_digit_and_no_units_in_their_cells():
 def test_facts_hold_the_ends_of_their_intervals():
     facts = [
         ("Pixel", "129, 131", "Row, and column."),
-        ("SBR", "0.732 [0.291, ∞]", "Interval."),
-        ("Estimate", "–", ""),
-        ("Error", "-0.0123 m", ""),
-        ("Detections", "1,234 (12.3 %)", ""),
-        ("r small", "1.2e-05", ""),
+        ("SBR", interval(0.7321, 0.2914, math.inf), "Interval."),
+        ("Estimate", number(math.nan, "m"), ""),
+        ("Truth", "–", ""),
+        ("Error", number(-0.0123, "m", sign=True), ""),
+        ("Detections", count(1234, "12.3 %"), ""),
+        ("Confidence", share(0.125), ""),
     ]
     assert written(facts_file(facts)).decode().splitlines() == [
         "quantity,value,low,high,unit,more,meaning",
         'Pixel,"129, 131",,,,,"Row, and column."',
-        "SBR,0.732,0.291,inf,,,Interval.",
-        "Estimate,,,,,,",
+        "SBR,0.7321,0.2914,inf,,,Interval.",
+        "Estimate,,,,m,,",
+        "Truth,,,,,,",
         "Error,-0.0123,,,m,,",
         "Detections,1234,,,,12.3 %,",
-        "r small,1.2e-05,,,,,",
+        "Confidence,12.5,,,%,,",
     ]
     with pytest.raises(ValueError, match="nothing is drawn here yet"):
         facts_file([])
@@ -468,14 +497,14 @@ def test_a_cloud_is_saved_as_a_picture_and_as_points(start_page):
     assert picture.height > box["height"]  # with heading and colour scale
     colors = {f"#{r:02x}{g:02x}{b:02x}" for _, (r, g, b) in picture.getcolors(2**24)}
     assert len(colors & set(RANGE_COLORS)) > 100
-    for suffix, count in (
+    for suffix, count_points in (
         ("ply", lambda content: len(trimesh.load(io.BytesIO(content), file_type="ply").vertices)),
         ("las", lambda content: len(laspy.read(io.BytesIO(content)).x)),
         ("csv", lambda content: len(columns_of(content)["x_m"])),
     ):
         name, content = download(start_page, "3D cloud", suffix)
         assert name == f"car_tracking_cloud.{suffix}"
-        assert count(content) == shown_points
+        assert count_points(content) == shown_points
 
 
 @pytest.mark.browser
@@ -556,6 +585,6 @@ def test_every_page_saves_what_it_shows(start_page):
     np.testing.assert_array_equal(np.load(io.BytesIO(arrays))["range_m"], peak.range_m)
     name, table = download(start_page, "table", "csv")
     assert name == "car_methods.csv"
-    assert b"Physics" in table
+    assert b"Physical limit" in table
     go("Paper")
     assert download(start_page, "curves", "csv")[0] == "paper_figure_1.csv"

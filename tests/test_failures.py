@@ -17,7 +17,7 @@ import pytest
 from app import __main__ as started
 from app.model import download_text as download_words
 from app.model import text as words
-from app.model.address import Wanted
+from app.model.address import Link
 from app.model.state import Illumination
 from app.model.store import built_in_sources, scene_source
 from app.model.uploads import Uploads
@@ -359,7 +359,7 @@ def test_what_is_typed_in_vain_is_told_and_the_next_reading_works():
 
 
 def test_an_address_that_asks_for_an_unreadable_file_names_no_folder(monkeypatch):
-    raised, wanted = breaking(monkeypatch, "app.model.restore.compute"), Wanted({"seed": "3"})
+    raised, wanted = breaking(monkeypatch, "app.model.restore.compute"), Link({"seed": "3"})
     for error in RAISED:
         raised[:] = [error]
         with pytest.raises(type(error)):

@@ -16,7 +16,7 @@ from playwright.sync_api import Locator, Page, expect
 
 import core
 from app.model.state import Illumination
-from app.pages.inspect import text as inspector_words
+from app.pages.inspect import text
 from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
 from core.tests.captures import real_capture_path
@@ -205,7 +205,7 @@ def test_a_pixel_is_shown_with_all_that_is_known_of_it(here):
     tracking = core.TrackingParameters()
     report = inspection.pixel_report(here.capture, here.image, row, col, "tracking", tracking)
     for name, found in zip(("Signal S", "Background B", "SBR"), report.flux, strict=True):
-        expect(fact(page, name)).to_have_text(inspector_words.interval(found))
+        expect(fact(page, name)).to_have_text(text.interval(found))
     name, table = download(page, "numbers", "csv")
     assert name == f"{here.name}_tracking_numbers-row{row}-col{col}.csv"
     sbr = report.flux.sbr
@@ -412,7 +412,7 @@ def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
         page.keyboard.press("ArrowRight")
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 4}")
     page.keyboard.press("p")
-    expect(page.get_by_text(inspector_words.TOO_MANY_PINS)).to_be_visible()
+    expect(page.get_by_text(text.TOO_MANY_PINS)).to_be_visible()
     button(page, "Pins").click()
     headers = page.get_by_role("rowheader").filter(visible=True)
     expect(headers).to_have_text(names)
@@ -422,7 +422,7 @@ def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
     while names:
         button(page, f"Remove {names.pop()}").press("Enter")
         expect(headers).to_have_text(names)
-    expect(page.get_by_text(inspector_words.NO_PINS)).to_be_visible()
+    expect(page.get_by_text(text.NO_PINS)).to_be_visible()
 
 
 # -- units -----------------------------------------------------------------------------------------
@@ -487,7 +487,7 @@ def bins_told(here: Inspected, n_bins: int | None = None) -> Locator:
 def test_the_capture_is_reported(whole):
     report = inspection.capture_report(whole.capture)
     for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.flux, strict=True):
-        expect(fact(whole.page, name)).to_have_text(inspector_words.interval(found))
+        expect(fact(whole.page, name)).to_have_text(text.interval(found))
     told = whole.page.get_by_text(f"Signal, background and SBR: {report.flux_method}")
     expect(told).to_be_visible()
     counts = drawn(whole.page, "Counts of all pixels", "raw", "raw")
@@ -511,7 +511,7 @@ def test_accuracy_is_studied_and_a_bar_tells_how_far(whole):
     assert told == sorted(told)
     assert any(0 < each < 100 for each in told)
     expect(done).to_be_visible()
-    title = "Accuracy against pulses" if has_truth else "Agreement with all pulses"
+    title = "Accuracy against number" if has_truth else "Agreement with the estimate"
     near, taken = (drawn(page, title, "points", column) for column in ("value", "pulses"))
     expected = inspection.accuracy_over_pulses(
         whole.capture, (SHARES[4], 1.0), "tracking", core.TrackingParameters()

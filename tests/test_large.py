@@ -17,10 +17,10 @@ from playwright.sync_api import Page, expect
 import core
 from app.__main__ import main
 from app.model import large
-from app.model.address import Wanted
+from app.model.address import Link
 from app.model.colors import image_of
 from app.model.large import LIMIT, Grid, most_whole_bytes
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from app.model.store import built_in_sources, compute, file_source
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
@@ -72,7 +72,7 @@ def path(building, small, tmp_path):
 @pytest.fixture
 def slow(monkeypatch):
     """Nothing more than the first few pieces is read before a preview is shown."""
-    monkeypatch.setattr(large, "AT_ONCE_S", 0.0)
+    monkeypatch.setattr(large, "FIRST_READ_S", 0.0)
     read_some = core.out_of_core.windows.WindowReader.read_some
     steps = []
 
@@ -184,7 +184,15 @@ def test_only_one_window_is_kept(path):
     assert file.cutout(one.window) is not one
 
 
-@pytest.mark.parametrize("less", [Less(), Less(skip=2), Less(pool=3), Less(skip=3, pool=2)])
+@pytest.mark.parametrize(
+    "less",
+    [
+        ReductionSettings(),
+        ReductionSettings(skip=2),
+        ReductionSettings(pool=3),
+        ReductionSettings(skip=3, pool=2),
+    ],
+)
 def test_pixels_know_their_places_in_the_file(path, less):
     window = Window((8, 90), (5, 120), 3)
     answer = compute(ask(file_source(path), window=window, less=less), None)
@@ -233,7 +241,7 @@ def test_other_bounds_are_refused(text):
 @pytest.fixture
 def looking(path):
     """A page on a large file, its thread in the hands of the test."""
-    return HeldLayout({"file": file_source(path)} | built_in_sources(), Wanted({"page": "Explore"}))
+    return HeldLayout({"file": file_source(path)} | built_in_sources(), Link({"page": "Explore"}))
 
 
 def settle(page, holds):

@@ -97,7 +97,7 @@ def test_invalid_settings_in_an_address_are_reported_and_the_others_restored(pag
     trap = "<img src=x onerror=window.trapped=1>"
     new = page(f"{address}?source={trap}&light.sbr=-1&light.seed=1&page={trap}&{trap}=1")
     alert = new.get_by_role("alert").filter(has_text="sbr = -1")
-    for text in ("no scene or capture '<img", "page = '<img", "nothing called <img"):
+    for text in ("no scene or capture '<img", "page = '<img", "Unknown parameter: <img"):
         expect(alert).to_contain_text(text)
     assert new.evaluate("window.trapped") is None
     rests(new, "?light.seed=1")

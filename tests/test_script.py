@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 import core
-from app.model.address import Wanted, defaults, query_of
+from app.model.address import Link, defaults, query_of
 from app.model.colors import image_of
 from app.model.large import LIMIT
-from app.model.script import ELSEWHERE, script_of
+from app.model.script import COMMANDS, script_of
 from app.model.state import State
 from app.model.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
 from app.pages.catalog import PAGES
@@ -56,7 +56,7 @@ for folder in sys.argv[1:]:
 
 def opened(query: str, **files: Path) -> Session:
     sources = built_in_sources() | {name: file_source(path) for name, path in files.items()}
-    session = Session(sources, Wanted(dict(parse_qsl(query))))
+    session = Session(sources, Link(dict(parse_qsl(query))))
     assert session.refused == []
     return session
 
@@ -139,7 +139,7 @@ def test_random_states_are_found_again(tmp_path):
         state = random_state(np.random.default_rng(seed))
         state.param.update(source="car", page="Explore", pixel=(5, 6), region=(), pins=())
         state.param.update(window=None, image="Counts", comparison=State().comparison)
-        session = Session(built_in_sources(), Wanted(dict(parse_qsl(query_of(state, {})))))
+        session = Session(built_in_sources(), Link(dict(parse_qsl(query_of(state, {})))))
         sessions[str(seed)] = session
     for name, found in run(tmp_path, sessions).items():
         same(found, "image", sessions[name].answer.run.image)
@@ -204,11 +204,11 @@ def car() -> Answer:
     return opened("").answer
 
 
-@pytest.mark.parametrize(("page", "command"), ELSEWHERE.items())
+@pytest.mark.parametrize(("page", "command"), COMMANDS.items())
 def test_pages_of_commands_name_them(page, command, car):
     script, usual = (script_of(car, State(page=each)) for each in (page, "Explore"))
     first, *rest = script.splitlines()
-    assert first == f'"""What firstphoton shows on Explore ({page}: {command}), found again."""'
+    assert first == f'"""Explore view of firstphoton ({page}: {command})."""'
     assert rest == usual.splitlines()[1:]
 
 

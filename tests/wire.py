@@ -57,6 +57,8 @@ class Wire:
         What the server complained of.
     is_closed : bool
         Whether the server has ended the connection.
+    n_messages, n_bytes : int
+        Parts of messages received so far, and their size.
     """
 
     def __init__(self) -> None:
@@ -65,6 +67,7 @@ class Wire:
         self.news = asyncio.Condition()
         self.troubles: list[str] = []
         self.is_closed = False
+        self.n_messages = self.n_bytes = 0
         self._numbers: defaultdict[str, int] = defaultdict(int)
         self._waiting: dict[tuple[str, str], Any] = {}
         self._pause: asyncio.Future[None] | None = None
@@ -169,6 +172,8 @@ class Wire:
         part = await self._socket.read_message()
         if part is None:
             raise ConnectionError("the server has closed the connection")
+        self.n_messages += 1
+        self.n_bytes += len(part)
         return part
 
     async def _read(self) -> None:

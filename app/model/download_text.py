@@ -1,4 +1,4 @@
-"""What downloads say: their formats, and why one failed."""
+"""Texts of downloads: their formats, and reasons for failures."""
 
 from __future__ import annotations
 

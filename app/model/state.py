@@ -1,4 +1,4 @@
-"""What a session's user has chosen: parameters only, each already a frozen object of `core`."""
+"""Everything that a user can choose in a session, as frozen objects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from core.studies.ablation import TITLES
 
 @dataclass(frozen=True)
 class Illumination:
-    """How a built-in scene is lit and recorded."""
+    """Illumination and recording of a built-in scene."""
 
     sbr: float = parameter(
         0.06,
@@ -52,13 +52,13 @@ class Illumination:
         return Flux(self.ppp, self.sbr)
 
     def acquisition(self, of_scene: Acquisition) -> Acquisition:
-        """The scene's instrument setting, with this number of pulses."""
+        """Return a scene's acquisition with this number of pulses."""
         return replace(of_scene, n_pulses=self.n_pulses)
 
 
 @dataclass(frozen=True)
 class Viewing:
-    """How the answer is shown; changes no figure."""
+    """Display of the estimate; does not affect it."""
 
     least_confidence: float = parameter(
         0.9,
@@ -77,8 +77,8 @@ class Viewing:
 
 
 @dataclass(frozen=True)
-class Less:
-    """Less of a capture than there is: quicker to range, or clearer, and never as fine."""
+class ReductionSettings:
+    """Reduction of a capture: faster to process, or with more photons per pixel, but coarser."""
 
     merge: int = parameter(
         1,
@@ -127,8 +127,8 @@ class Less:
         check_fields(self)
 
     @classmethod
-    def of(cls, reduction: Reduction, n_bins: int) -> Less:
-        """The settings that reduce a capture of so many bins like this."""
+    def of(cls, reduction: Reduction, n_bins: int) -> ReductionSettings:
+        """Return the settings that make this reduction of a capture with `n_bins` bins."""
         first, end = reduction.gate or (0, n_bins)
         return cls(
             reduction.merge,
@@ -140,7 +140,7 @@ class Less:
         )
 
     def reduction(self, n_bins: int) -> Reduction:
-        """What is to be done to a capture of so many bins."""
+        """Return the reduction for a capture with `n_bins` bins."""
         first = min(round(self.gate_from * n_bins), n_bins - 1)
         end = max(round(self.gate_to * n_bins), first + 1)
         gate = None if (first, end) == (0, n_bins) else (first, end)
@@ -154,14 +154,14 @@ FIRST_METHODS = ("peak", "coates", "likelihood", "tracking", "oracle")
 CLOUDS = "3D clouds"
 
 KINDS = ("Range", "Error", "Confidence", CLOUDS)
-"""What the pictures of methods may show."""
+"""Kinds of pictures of methods."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Which methods are compared, how they are set, and what their pictures show.
+    """The methods that are compared, their settings, and the kind of their pictures.
 
-    The tracking differentiator has the settings that it has on every page.
+    The tracking differentiator has the same settings as on other pages.
     """
 
     methods: tuple[str, ...] = tuple(each for each in ESTIMATORS if each in FIRST_METHODS)
@@ -201,9 +201,9 @@ MOST_CORNERS = 1000
 
 
 class Checked(param.Parameter):
-    """A parameter of which a function knows what is acceptable, and raises ``ValueError`` if not.
+    """A parameter whose values are checked by a function of its name and a value.
 
-    It is called with the parameter's name and a value.
+    The function raises ``ValueError``.
     """
 
     __slots__ = ("check",)
@@ -248,36 +248,40 @@ def _check_absent(name: str, value: Any) -> None:
 
 
 class State(param.Parameterized):
-    """Everything a user can choose.
+    """Everything that a user can choose.
 
-    `app.model.address` writes all of it into the address of the page, and `app.model.script` what
-    concerns `core` into a script: both know a new parameter, or a new field of one, by its default.
+    `app.model.address` and `app.model.script` follow from the parameters and from the fields of
+    their values. Those of `app.model.store.Request` are what an estimate is computed from.
     """
 
-    source = param.String(default="car", doc="Key of the catalogue.")
+    source = param.String(default="car", doc="Key of a scene or capture.")
     light = param.ClassSelector(class_=Illumination, default=Illumination())
     reading = param.ClassSelector(class_=ReadOptions, default=ReadOptions())
     window = param.ClassSelector(
-        class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."
+        class_=Window,
+        default=None,
+        doc="Part of a capture larger than memory; None for its preview.",
     )
-    less = param.ClassSelector(class_=Less, default=Less())
+    less = param.ClassSelector(class_=ReductionSettings, default=ReductionSettings())
     absent: Any = Checked(
         frozenset(), _check_absent, doc="Parts and corrections that are switched off."
     )
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
-    pixel: Any = Checked((31, 24), _check_pixel, doc="Row and column on show.")
+    pixel: Any = Checked((31, 24), _check_pixel, doc="Selected row and column.")
     image = param.Selector(default="Estimate", objects=list(IMAGES))
     cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
     viewing = param.ClassSelector(class_=Viewing, default=Viewing())
     difference = param.Boolean(default=False, doc="Whether the first difference is drawn.")
     page: Any = Checked("Explore", _check_page, doc="Name of a page of `app.pages.catalog`.")
-    unit = param.Selector(default="bins", objects=list(UNITS), doc="Of each axis along the gate.")
-    map = param.Selector(default="Estimate", objects=list(MAPS), doc="What one navigates by.")
-    subject = param.Selector(default="Pixel", objects=list(SUBJECTS), doc="What is inspected.")
+    unit = param.Selector(default="bins", objects=list(UNITS), doc="Unit of axes along the gate.")
+    map = param.Selector(default="Estimate", objects=list(MAPS), doc="Image of the Inspect page.")
+    subject = param.Selector(
+        default="Pixel", objects=list(SUBJECTS), doc="Subject of the Inspect page."
+    )
     pins: Any = Checked((), _check_pins, doc="Up to four pixels (row, col) to compare.")
     region: Any = Checked(
         (),
         _check_region,
-        doc="Corners (row, col) of a polygon of pixels that are looked at as one; none if empty.",
+        doc="Corners (row, col) of a polygon of pixels whose counts are added.",
     )
     comparison = param.ClassSelector(class_=Comparison, default=Comparison())

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable
 from concurrent.futures import BrokenExecutor
 
-import numpy as np
-
 from app.model.store import Answer
+from app.units import milliseconds as milliseconds  # noqa: PLC0414
+from app.units import number as number  # noqa: PLC0414
+from app.units import share as share  # noqa: PLC0414
 from core.studies.ablation import TITLES
 
 Fact = tuple[str, str, str]
-"""Name, value, and a line of help."""
+"""Name, value and a line of help; a value that is a number is an `app.units.Quantity`."""
 
 FIELD_OF_VIEW_UNKNOWN = (
     " The file does not tell the field of view: widths and heights of the cloud are a guess (View)."
 )
 
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
+
+CONFIDENCE_HELP = "Probability of a surface within 3 bins of the estimate."
 
 COMPUTING = "Computing …"
 
@@ -98,24 +100,6 @@ def without_folders(text: str) -> str:
     """
     text = re.sub(r"(['\"])/[^'\"\n]*/([^'\"/\n]*)\1", r"\1\2\1", text)
     return re.sub(r"(?<![\w.:/])/(?:[^\s/'\"]+/)+", "", text)
-
-
-def number(value: float, unit: str, sign: bool = False) -> str:
-    """A number with its unit; a dash where there is none."""
-    if not np.isfinite(value):
-        return "–"
-    text = f"{value:+.4g}" if sign else f"{value:.4g}" if abs(value) < 1000 else f"{value:,.2f}"
-    return f"{text} {unit}".strip()
-
-
-def share(value: float) -> str:
-    """A share in percent; a dash where there is none."""
-    return "–" if math.isnan(value) else f"{100 * value:.1f} %"
-
-
-def milliseconds(seconds: float) -> str:
-    """A duration as one reads it."""
-    return f"{1000 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
 
 
 def progress(done: int, of: int, noun: str, is_running: bool) -> str:

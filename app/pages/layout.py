@@ -13,10 +13,10 @@ from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
 from app.model import text as words
-from app.model.address import Wanted
+from app.model.address import Link
 from app.model.restore import parameters_of
 from app.model.script import script_of
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from app.model.store import Answer, Request, Source
 from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
 from app.pages.catalog import PAGES
@@ -118,7 +118,7 @@ def build_page(sources: Mapping[str, Source], uploads: Uploads) -> pmui.Page:
     query = {
         name: texts[-1].decode(errors="replace") for name, texts in pn.state.session_args.items()
     }
-    return Layout(sources, Wanted(query), uploads).page
+    return Layout(sources, Link(query), uploads).page
 
 
 class Layout:
@@ -131,7 +131,7 @@ class Layout:
     ----------
     sources : mapping of str to Source
         Scenes and captures to choose from.
-    wanted : Wanted, optional
+    wanted : Link, optional
         Settings from the link of the page.
     uploads : Uploads, optional
         Where uploaded files are stored.
@@ -151,11 +151,11 @@ class Layout:
     def __init__(
         self,
         sources: Mapping[str, Source],
-        wanted: Wanted | None = None,
+        wanted: Link | None = None,
         uploads: Uploads | None = None,
         tasks: PageTasks | None = None,
     ) -> None:
-        wanted, self._uploads = wanted or Wanted({}), uploads or Uploads()
+        wanted, self._uploads = wanted or Link({}), uploads or Uploads()
         session = self.session = Session(self._with_upload(sources, wanted.source), wanted, tasks)
         state = session.state
         self._pages = {each.name: each for each in PAGES}
@@ -208,7 +208,7 @@ class Layout:
         )
         self._light = SettingsPanel(Illumination(), partial(setattr, state, "light"))
         self._tracking = SettingsPanel(TrackingParameters(), partial(setattr, state, "tracking"))
-        self._less = SettingsPanel(Less(), partial(setattr, state, "less"))
+        self._less = SettingsPanel(ReductionSettings(), partial(setattr, state, "less"))
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
@@ -352,7 +352,11 @@ class Layout:
         session, state = self.session, self.session.state
         if key != state.source:
             request = Request(
-                session.sources[key], state.light, ReadOptions(), state.tracking, Less()
+                session.sources[key],
+                state.light,
+                ReadOptions(),
+                state.tracking,
+                ReductionSettings(),
             )
             state.param.update(parameters_of(request, session.sources))
 

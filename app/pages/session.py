@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from app.model.address import Wanted, query_of
+from app.model.address import Link, query_of
 from app.model.capture_defaults import defaults_of
 from app.model.restore import restore
 from app.model.state import State
@@ -23,7 +23,7 @@ class Session:
     ----------
     sources : mapping of str to Source
         Scenes and captures to choose from; copied, so that an upload belongs to this session only.
-    wanted : Wanted, optional
+    wanted : Link, optional
         Settings from the link of the page.
     tasks : PageTasks, optional
         The page's thread; by default that of the page being built.
@@ -45,10 +45,10 @@ class Session:
     def __init__(
         self,
         sources: Mapping[str, Source],
-        wanted: Wanted | None = None,
+        wanted: Link | None = None,
         tasks: PageTasks | None = None,
     ) -> None:
-        wanted = wanted or Wanted({})
+        wanted = wanted or Link({})
         self.sources = dict(sources)
         key, first = next(iter(self.sources.items()))
         # A session started with a file opens on Inspect.

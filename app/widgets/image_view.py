@@ -10,7 +10,7 @@ from bokeh.events import Tap
 from bokeh.models import BoxZoomTool, CustomJS, DataRange1d
 from numpy.typing import NDArray
 
-from app.model.colors import Look
+from app.model.colors import ColorScale
 from app.model.large import Grid
 from app.plots import elements as plots
 from app.theme import Palette
@@ -33,7 +33,7 @@ class ImageView:
             plots.range_image(np.zeros((2, 2)), 0.0, 1.0), ("picture", "shadow", "frame")
         )
         self._shape, self._grid = (0, 0), Grid()
-        self._look: Look | None = None
+        self._look: ColorScale | None = None
         self.figure = self._plot.figure
         self.pane = pane_of(self.figure)
         self.figure.match_aspect = True
@@ -89,7 +89,7 @@ class ImageView:
         self._plot.source("picture").data = {"image": blank, "x": [left], "y": [above], **size}
         self.figure.tags = [*grid.first, grid.step, rows, cols]  # resets the zoom, see above
 
-    def update(self, image: Array, look: Look) -> None:
+    def update(self, image: Array, look: ColorScale) -> None:
         """Show an image (row, col); NaN is blank."""
         self._plot.source("picture").data["image"] = [np.asarray(image, np.float32)]
         if look == self._look:

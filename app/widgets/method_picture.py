@@ -11,7 +11,7 @@ from bokeh.models import ColorBar, LinearColorMapper, Range1d
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from app.model.colors import Look
+from app.model.colors import ColorScale
 from app.theme import WRONG_COLOR, Palette
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import Sentence
@@ -68,7 +68,7 @@ class Picture:
         )
         self.resize(height)
 
-    def draw_image(self, values: Array, look: Look) -> None:
+    def draw_image(self, values: Array, look: ColorScale) -> None:
         """Show an image (row, col) in place of the cloud."""
         self.image.pane.visible = True
         if self.cloud is not None:
@@ -118,7 +118,7 @@ class ScaleBar:
         self.pane = pane_of(self.figure)
         self.pane.sizing_mode = "stretch_width"
 
-    def update(self, look: Look) -> None:
+    def update(self, look: ColorScale) -> None:
         """Show another scale."""
         self._mapper.update(low=look.low, high=look.high, palette=look.colors)
         self._bar.title = look.legend

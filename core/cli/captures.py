@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from core.acquisition import Acquisition
-from core.capture import Capture, Seen
+from core.capture import Capture, CaptureInfo
 from core.checks import printable, require, shown
 from core.cli.options import (
     LIGHT_NAMES,
@@ -240,7 +240,7 @@ def _exceeds_memory(chosen: argparse.Namespace) -> bool:
 
 def _ranged_at_once(
     chosen: argparse.Namespace, settings: Any
-) -> tuple[Seen, RangeImage, dict[str, Any]]:
+) -> tuple[CaptureInfo, RangeImage, dict[str, Any]]:
     capture = _capture(chosen)
     print(capture.source, file=sys.stderr)  # with the guesses, before anything rests on them
     _require_angle(chosen, capture.acquisition)
@@ -257,7 +257,7 @@ def _ranged_at_once(
 
 def _ranged_in_parts(
     chosen: argparse.Namespace, settings: Any
-) -> tuple[Seen, RangeImage, dict[str, Any]]:
+) -> tuple[CaptureInfo, RangeImage, dict[str, Any]]:
     from core.out_of_core import tiles as large  # noqa: PLC0415 - brings Dask, for which small captures need not wait
 
     if chosen.capture is None:

@@ -19,7 +19,7 @@ from core.inference.likelihood import Conditions
 from core.inference.neighbours import patches, pooled_at, pooled_in
 from core.inference.posterior import tolerance_probability
 from core.parameters import Number
-from core.trigger import drawn, rate_per_bin, trigger_probability
+from core.trigger import draw_counts, rate_per_bin, trigger_probability
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Estimator:
     locate : callable, optional
         ``(capture, light, parameters) -> (position_bin, score)``, each of shape (row, col), NaN
         where there is none: a quicker way to the largest of the curve, or a finer one.
-    reach : callable, optional
+    window_size : callable, optional
         ``parameters -> pixels``, odd: rows and columns of the neighbourhood whose counts are added
         before `curve` sees them.
     first_bin : callable, optional
@@ -111,7 +111,7 @@ class Estimator:
     parameters: type[Any]
     curve: Callable[[Floats, Conditions, Any], Floats]
     locate: Callable[[Capture, FluxModel, Any], tuple[Floats, Floats]] | None = None
-    reach: Callable[[Any], int] = lambda _: 1
+    window_size: Callable[[Any], int] = lambda _: 1
     first_bin: Callable[[Any], int] = lambda _: 0
     finds_delay: bool = False
     flux_model: Callable[[Capture], FluxModel] = flux_model_of
@@ -122,6 +122,7 @@ class Estimator:
     whole_image: bool = False
 
     light = renamed("flux_model")
+    reach = renamed("window_size")
 
     def __call__(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
@@ -193,7 +194,7 @@ class Estimator:
 
     def curves(self, capture: Capture, row: int, col: int, parameters: Any) -> Floats:
         """The score of each bin for one pixel, shape (bin,)."""
-        flux, reach = self.flux_model(capture), self.reach(parameters)
+        flux, reach = self.flux_model(capture), self.window_size(parameters)
         around = pooled_at(capture.cube, row, col, reach)
         given = conditions_of(capture, flux, reach)
         here = np.s_[row : row + 1, col : col + 1]
@@ -227,7 +228,7 @@ class Estimator:
             Lag in bins; 0 where no echo can be found at all (every bin excluded, say).
         """
         n_bins = capture.acquisition.n_bins
-        given = conditions_of(capture, self.flux_model(capture), self.reach(parameters))
+        given = conditions_of(capture, self.flux_model(capture), self.window_size(parameters))
         given = given._replace(
             signal=np.asarray(given.signal.mean()), background=np.asarray(given.background.mean())
         )
@@ -257,7 +258,7 @@ class Estimator:
         return np.where(seen, position, np.nan), np.where(seen, score, 0.0)
 
     def _largest(self, capture: Capture, flux: FluxModel, parameters: Any) -> tuple[Floats, Floats]:
-        reach = self.reach(parameters)
+        reach = self.window_size(parameters)
         given = conditions_of(capture, flux, reach)
         position, score = np.empty((2, *capture.shape))
         for patch in patches(capture.cube.shape, _AT_ONCE):
@@ -338,5 +339,5 @@ def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     rows_at_once = max(1, _AT_ONCE // (pixels.shape[1] * n_bins))
     for first in range(0, len(pixels), rows_at_once):
         rate = background[first : first + rows_at_once, :, np.newaxis] / n_bins
-        cubes.append(drawn(np.repeat(rate, n_bins, axis=2), n_pulses, rng))
+        cubes.append(draw_counts(np.repeat(rate, n_bins, axis=2), n_pulses, rng))
     return np.concatenate(cubes)

@@ -67,6 +67,7 @@ class ChiParameters:
             3.0,
             log=True,
             unit="bins",
+            merge_power=0,  # a kernel narrower than a bin would not smooth
             least=0.01,
             most=100.0,
             doubtful=(
@@ -201,7 +202,7 @@ ESTIMATOR = Estimator(
     ChiParameters,
     _curve,
     _locate,
-    reach=lambda _: 3,
+    window_size=lambda _: 3,
     reconstructed="the abstract of Chi et al. (2025)",
     whole_image=True,
 )

@@ -54,6 +54,7 @@ class KdeParameters:
             3.0,
             log=True,
             unit="bins",
+            merge_power=0,  # a kernel narrower than a bin would not smooth
             least=0.01,
             most=100.0,
             doubtful=(
@@ -84,6 +85,6 @@ ESTIMATOR = Estimator(
     "Kernel density of the neighbourhood",
     KdeParameters,
     _curve,
-    reach=lambda parameters: REACH[parameters.neighbourhood],
+    window_size=lambda parameters: REACH[parameters.neighbourhood],
     reconstructed="its name in the paper: neighbourhood and bandwidth are not printed",
 )

@@ -44,7 +44,7 @@ class ShiParameters:
 
     width_bins: float = parameter(
         2.0,
-        Number("w", 1.0, 4.0, unit="bins", least=0.5, most=12.0),
+        Number("w", 1.0, 4.0, unit="bins", merge_power=0, least=0.5, most=12.0),
         "From the sample function's middle to its first zero; wider smooths more.",
     )
 

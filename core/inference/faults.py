@@ -14,7 +14,7 @@ from core.capture import Capture, cached_per_capture
 NEIGHBOURS = 3
 """Rows and columns that an image needs for a pixel to have any."""
 
-BY_CHANCE = 1e-6
+SIGNIFICANCE = 1e-6
 """Probability of counts that are taken for no chance."""
 
 _AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
@@ -22,7 +22,7 @@ _AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 Health = Literal["ordinary", "hot", "dead", "cannot tell"]
 
 
-class StandingOut(NamedTuple):
+class OutlierPixels(NamedTuple):
     """Which pixels stand out, and from what; each of shape (row, col)."""
 
     hot: NDArray[np.bool_]
@@ -35,7 +35,7 @@ class StandingOut(NamedTuple):
     """Counts of the neighbour that has fewest."""
 
 
-class Verdict(NamedTuple):
+class PixelVerdict(NamedTuple):
     """What is to be thought of a pixel."""
 
     health: Health
@@ -44,7 +44,7 @@ class Verdict(NamedTuple):
 
 
 @cached_per_capture
-def standing_out(capture: Capture) -> StandingOut | None:
+def outlier_pixels(capture: Capture) -> OutlierPixels | None:
     """Pixels that stand out among their eight neighbours; None where an image has no neighbours.
 
     Beyond the image's edge neighbours are those on the other side, mirrored.
@@ -55,41 +55,43 @@ def standing_out(capture: Capture) -> StandingOut | None:
     of_neighbours = (scipy.ndimage.maximum_filter, scipy.ndimage.minimum_filter)
     most, least = (find(counts, footprint=_AROUND, mode="mirror") for find in of_neighbours)
     hot, dead = counts > most, counts < least
-    hot[hot] = more_by_chance(counts[hot], most[hot], n_pulses) < BY_CHANCE
-    dead[dead] = fewer_by_chance(counts[dead], least[dead], n_pulses) < BY_CHANCE
-    return StandingOut(hot, dead, most, least)
+    hot[hot] = probability_of_more(counts[hot], most[hot], n_pulses) < SIGNIFICANCE
+    dead[dead] = probability_of_fewer(counts[dead], least[dead], n_pulses) < SIGNIFICANCE
+    return OutlierPixels(hot, dead, most, least)
 
 
-def usual_counts(capture: Capture) -> NDArray[np.int64]:
+def neighbour_median(capture: Capture) -> NDArray[np.int64]:
     """Median of each pixel's neighbours, shape (row, col)."""
     found = scipy.ndimage.median_filter(capture.counts, footprint=_AROUND, mode="mirror")
     return np.asarray(found)
 
 
-def verdict(capture: Capture, row: int, col: int) -> Verdict:
+def pixel_verdict(capture: Capture, row: int, col: int) -> PixelVerdict:
     """Whether a pixel is hot or dead, as far as its neighbours tell.
 
     A hot pixel beside another one does not stand out, and a bright surface that fills a single
     pixel does: its photons are an echo's, those of a hot pixel are spread over the gate.
     """
-    found = standing_out(capture)
+    found = outlier_pixels(capture)
     if found is None:
-        return Verdict("cannot tell", "An image so narrow has no neighbours to compare it with.")
+        return PixelVerdict(
+            "cannot tell", "An image so narrow has no neighbours to compare it with."
+        )
     counts, n_pulses = int(capture.counts[row, col]), capture.gated_pulses
     most, least = int(found.most[row, col]), int(found.least[row, col])
     seen = f"It detected {counts:,}, its eight neighbours {least:,} to {most:,}"
     if found.hot[row, col]:
-        return Verdict("hot", f"{seen}: more than any of them, and by more than chance.")
+        return PixelVerdict("hot", f"{seen}: more than any of them, and by more than chance.")
     if found.dead[row, col]:
-        return Verdict("dead", f"{seen}: fewer than any of them, and by more than chance.")
+        return PixelVerdict("dead", f"{seen}: fewer than any of them, and by more than chance.")
     if counts == 0:
-        return Verdict("cannot tell", f"{seen}: too few to tell a dead pixel from a dark one.")
-    if n_pulses is not None and more_by_chance(n_pulses, most, n_pulses) > BY_CHANCE:
-        return Verdict("cannot tell", f"{seen}: nearly every pulse fires there, hot or not.")
-    return Verdict("ordinary", f"{seen}: nothing beyond chance.")
+        return PixelVerdict("cannot tell", f"{seen}: too few to tell a dead pixel from a dark one.")
+    if n_pulses is not None and probability_of_more(n_pulses, most, n_pulses) > SIGNIFICANCE:
+        return PixelVerdict("cannot tell", f"{seen}: nearly every pulse fires there, hot or not.")
+    return PixelVerdict("ordinary", f"{seen}: nothing beyond chance.")
 
 
-def more_by_chance(
+def probability_of_more(
     counts: NDArray[np.int64] | int, expected: NDArray[np.int64] | int, n_pulses: int | None
 ) -> Floats:
     """Probability of so many counts, or more."""
@@ -99,7 +101,7 @@ def more_by_chance(
     return np.asarray(scipy.special.bdtrc(np.subtract(counts, 1), n_pulses, share))
 
 
-def fewer_by_chance(
+def probability_of_fewer(
     counts: NDArray[np.int64] | int, expected: NDArray[np.int64] | int, n_pulses: int | None
 ) -> Floats:
     """Probability of so few counts, or fewer."""

@@ -61,7 +61,7 @@ def flux_prior_of(capture: Capture) -> FluxPrior:
     if n_pulses is not None:
         is_hidden = pile_up(capture.counts / n_pulses, n_pulses).is_hidden
         found = found._replace(pile_up=not is_hidden)
-    told = level_differences(found, capture).told
+    told = level_differences(found, capture).is_resolved
     return found.with_one_level() if found.share[1:] @ told <= FEW else found
 
 

@@ -29,8 +29,8 @@ from core.acquisition import Floats
 
 ERROR = 0.05
 
-TOLD = NormalDist().inv_cdf(ERROR) ** 2 / 2
-"""Evidence from which a difference is told: 1.35."""
+RESOLVED = NormalDist().inv_cdf(ERROR) ** 2 / 2
+"""Evidence from which a difference is resolved: 1.35."""
 
 HIDDEN = NormalDist().inv_cdf((1 + ERROR) / 2) ** 2 / 2
 """Evidence up to which it is hidden: 0.002."""
@@ -48,9 +48,9 @@ class Difference(NamedTuple):
     """``-n ln ρ``."""
 
     @property
-    def told(self) -> NDArray[np.bool_]:
+    def is_resolved(self) -> NDArray[np.bool_]:
         """Whether the pulses tell the models apart, shape (...)."""
-        return np.asarray(self.evidence >= TOLD)
+        return np.asarray(self.evidence >= RESOLVED)
 
     @property
     def is_hidden(self) -> bool:
@@ -59,12 +59,12 @@ class Difference(NamedTuple):
 
     @property
     def resolvable(self) -> Floats:
-        """Total variation from which a difference of this shape would be told.
+        """Total variation from which a difference of this shape would be resolved.
 
         ``-ln ρ`` grows with the square of a small difference. NaN where there is none.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self.total_variation * np.sqrt(TOLD / self.evidence))
+            return np.asarray(self.total_variation * np.sqrt(RESOLVED / self.evidence))
 
 
 def difference(one: ArrayLike, other: ArrayLike, n_pulses: int | None) -> Difference:

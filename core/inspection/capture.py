@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from core.capture import Capture, cached_per_capture
 from core.deprecation import renamed
-from core.inference.faults import standing_out
+from core.inference.faults import outlier_pixels
 from core.inference.posterior import TOLERANCE_BINS
 from core.inspection.maps import likeliest
 from core.inspection.mean_flux import METHOD, estimate_mean_flux
@@ -58,7 +58,7 @@ class CaptureReport:
 
 def capture_report(capture: Capture) -> CaptureReport:
     """All that is known of a capture as a whole; the first time it takes as long as ranging it."""
-    faulty = standing_out(capture)
+    faulty = outlier_pixels(capture)
     return CaptureReport(
         histogram=aggregate(capture),
         flux=estimate_mean_flux(capture),

@@ -21,7 +21,7 @@ import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
-from core.inference.faults import standing_out
+from core.inference.faults import outlier_pixels
 from core.inference.flux import detailed_flux_prior_of, level_likelihoods, total_rates
 from core.inspection.flux import estimate_flux
 from core.inspection.profile import LEVEL, Box, FluxEstimate, spans, zoomed
@@ -79,7 +79,7 @@ def estimate_mean_flux(capture: Capture) -> FluxEstimate:
 
 def _ordinary(capture: Capture) -> Capture:
     """The pixels that are neither hot nor dead, in one row; all of them where none is ordinary."""
-    faulty = standing_out(capture)
+    faulty = outlier_pixels(capture)
     kept = np.ones(capture.shape, bool) if faulty is None else ~(faulty.hot | faulty.dead)
     if not kept.any():
         kept[:] = True

@@ -15,7 +15,7 @@ from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
-from core.inference.faults import Verdict, verdict
+from core.inference.faults import PixelVerdict, pixel_verdict
 from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import posterior_of
 from core.inspection.flux import METHOD, estimate_flux
@@ -69,7 +69,7 @@ class PixelReport:
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
     """How they are found."""
-    verdict: Verdict
+    verdict: PixelVerdict
     """Whether the pixel is hot or dead."""
 
     light = renamed("flux")
@@ -138,7 +138,7 @@ def pixel_report(
         find_flux=find_flux,
         flux_unit=flux_unit(capture),
         flux_method=METHOD,
-        verdict=verdict(capture, row, col),
+        verdict=pixel_verdict(capture, row, col),
     )
 
 

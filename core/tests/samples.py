@@ -1,4 +1,4 @@
-"""The counts that every format keeps, and how to write them."""
+"""The counts of all sample files, and builders of NumPy and MATLAB files."""
 
 from __future__ import annotations
 
@@ -128,15 +128,15 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
     changed = bytearray(content)
     for _ in range(rng.choice([1, 1, 2, 4])):
         place = rng.randrange(len(changed))
-        way = rng.random()
-        if way < 0.6:
+        kind = rng.random()
+        if kind < 0.6:
             changed[place] = rng.randrange(256)
-        elif way < 0.8:
+        elif kind < 0.8:
             word = rng.choice([0, 1, 14, 2**16, 2**31 - 1, 2**31, 2**32 - 1])
             changed[place : place + 4] = word.to_bytes(4, "little")
-        elif way < 0.87:
+        elif kind < 0.87:
             changed[place:place] = rng.randbytes(4)
-        elif way < 0.94 and len(changed) > 100:
+        elif kind < 0.94 and len(changed) > 100:
             del changed[place : place + 4]
         else:
             changed = changed[: max(place, 1)]

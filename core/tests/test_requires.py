@@ -20,7 +20,8 @@ from core.estimators import ESTIMATORS
 from core.estimators.base import Calibration
 from core.inference.flux import detailed_flux_prior_of, flux_prior_of
 from core.inference.limits import cramer_rao_bins
-from core.inference.resolution import HIDDEN, TOLD, Difference
+from core.inference.resolution import HIDDEN, Difference
+from core.inference.resolution import RESOLVED as TOLD
 from core.metrics import Interval
 from core.scene import Scene, scenes
 from core.simulation import simulate

@@ -8,7 +8,7 @@ import math
 import pickle
 import tracemalloc
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numba
@@ -26,6 +26,7 @@ from core.estimators import ESTIMATORS
 from core.io.writers import save_capture
 from core.kernels.parallel import SERIAL_BELOW
 from core.metrics import Interval
+from core.parameters import Number, spec_of
 from core.reductions import Reduction
 from core.scene import Scene, scenes
 from core.simulation import simulate
@@ -293,14 +294,36 @@ def within_3_bins(capture: Capture, range_m: np.ndarray) -> float:
     return float((error <= 3 * capture.acquisition.bin_length_m).mean())
 
 
-def test_settings_are_fitted_to_the_reduced_bins() -> None:
-    both = Reduction(merge=2, gate=(7, 90))
-    tracking = tradeoff.fitted(ESTIMATORS["tracking"].parameters(l=0.004, t_n=20), both)
+BOTH = Reduction(merge=2, gate=(7, 90))
+KEPT = {
+    ("tracking", "h"),
+    ("kde", "bandwidth_bins"),
+    ("chi", "bandwidth_bins"),
+    ("shi", "width_bins"),
+}
+"""Settings in bins that reductions leave as they are."""
+
+
+def test_settings_are_rescaled_to_the_reduced_bins() -> None:
+    tracking = tradeoff.rescaled(ESTIMATORS["tracking"].parameters(l=0.004, t_n=20), BOTH)
     assert (tracking.l, tracking.t_n) == (pytest.approx(0.016), 7)
-    cfar = tradeoff.fitted(ESTIMATORS["cfar"].parameters(), both)
+    cfar = tradeoff.rescaled(ESTIMATORS["cfar"].parameters(), BOTH)
     assert (cfar.smoothing_bins, cfar.guard_bins, cfar.training_bins) == (0.5, 2, 4)
-    shi = ESTIMATORS["shi"].parameters()
-    assert tradeoff.fitted(shi, both) is shi
+    unmixing = tradeoff.rescaled(ESTIMATORS["unmixing"].parameters(smoothness=0.5), BOTH)
+    assert unmixing.smoothness == 1.0
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_setting_in_bins_is_rescaled_or_says_that_it_is_kept(name: str) -> None:
+    settings = ESTIMATORS[name].parameters()
+    found = tradeoff.rescaled(settings, BOTH)
+    for each in fields(settings):
+        spec = spec_of(each)
+        if each.name.endswith("_bins"):
+            assert isinstance(spec, Number) and spec.unit == "bins", each.name
+        in_bins = isinstance(spec, Number) and bool("bin" in spec.unit or spec.merge_power)
+        changed = getattr(found, each.name) != getattr(settings, each.name)
+        assert changed == (in_bins and (name, each.name) not in KEPT), each.name
 
 
 @pytest.mark.compiled

@@ -25,7 +25,7 @@ import panel as pn
 import param
 
 from app.model import download_text as words
-from app.model.colors import Look
+from app.model.colors import ColorScale
 from app.model.exports import Write, image_files, plot_file
 from app.model.state import Viewing
 from app.model.store import Answer, Request
@@ -147,7 +147,7 @@ class Shown:
         A writer for each format that is not a picture, by suffix without the point.
     heading : str
         Heading of a picture without a title.
-    scale : Look, optional
+    scale : ColorScale, optional
         Colour scale of a picture without a colour bar.
     """
 
@@ -155,7 +155,7 @@ class Shown:
     what: str
     files: Mapping[str, Write] = field(default_factory=dict)
     heading: str = ""
-    scale: Look | None = None
+    scale: ColorScale | None = None
 
 
 class Download(Component):

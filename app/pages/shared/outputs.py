@@ -13,7 +13,7 @@ import panel_material_ui as pmui
 from bokeh.events import Tap
 from bokeh.models import Range1d
 
-from app.model.colors import Look
+from app.model.colors import ColorScale
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import image_file, plot_file, table_file
 from app.model.large import Grid
@@ -276,9 +276,9 @@ def layers_of(drawing: Any) -> Layers:
     return Layers(drawing, found)
 
 
-def _look(item: items.Pictures) -> Look:
+def _look(item: items.Pictures) -> ColorScale:
     """Return the colour scale of all pictures."""
-    return Look(item.label, "", item.low, item.high, RANGE_COLORS)
+    return ColorScale(item.label, "", item.low, item.high, RANGE_COLORS)
 
 
 def _frame(item: items.Pictures) -> tuple[Any, ...]:

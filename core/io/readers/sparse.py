@@ -37,14 +37,12 @@ class Sparse(NamedTuple):
 def sparse_capture(
     matrix: Sparse, name: str, origin: str, request: ReadOptions, bin_width_s: float | None = None
 ) -> Capture:
-    """A capture from a sparse matrix (pixel, bin).
+    """Return a capture from a sparse matrix (pixel, bin).
 
     Parameters
     ----------
-    matrix : Sparse
     name, origin : str
         Name of the matrix in errors, and origin of the capture in its source.
-    request : ReadOptions
     bin_width_s : float, optional
         Used if none is given.
 
@@ -57,8 +55,8 @@ def sparse_capture(
     by_row = request.order(("row", "col")) == (0, 1)
     side = isqrt(n_pixels)
     shape = request.shape or (side, side)
-    product = f"rows and columns of {n_pixels} pixels in all"
-    require("shape", request.shape, shape[0] * shape[1] == n_pixels, product)
+    accepted = f"rows and columns of {n_pixels} pixels in all"
+    require("shape", request.shape, shape[0] * shape[1] == n_pixels, accepted)
     guessed = [] if request.shape else [f"shape {shape[0]} x {shape[1]}"]
     guessed += [] if request.axes else ["pixels column by column"]
     pixel, bins, counts = _entries(matrix, name)
@@ -69,20 +67,15 @@ def sparse_capture(
     require_fits(f"the cube of {name}", n_pixels * n_bins * dtype.itemsize)
     cube = np.zeros((n_pixels, n_bins), dtype)
     cube[pixel, bins] = counts
-    told = replace(request, shape=None, axes=None)
-    return dense_capture(
-        cube.reshape(*shape, n_bins),
-        origin,
-        told,
-        also_guessed=guessed,
-        guessed_bin_width_s=bin_width_s,
-    )
+    known = replace(request, shape=None, axes=None)
+    cube = cube.reshape(*shape, n_bins)
+    return dense_capture(cube, origin, known, guessed=guessed, bin_width_s=bin_width_s)
 
 
 def _entries(
     matrix: Sparse, name: str
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Row, column and value of each entry, once they proved to be what they should."""
+    """Return row, column and value of each entry, once they proved valid."""
     n_rows, n_cols = matrix.shape
     found = len(matrix.starts)
     require(f"columns of {name}", found - 1, found == n_cols + 1, f"{n_cols}, as its shape says")

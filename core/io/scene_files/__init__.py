@@ -77,8 +77,7 @@ def read_scene(
     Raises
     ------
     SceneError
-        Whatever is wrong with the file or its description: names the file, the field, its value
-        and the remedy.
+        If the file or an argument is refused: names the file, the field, its value and the remedy.
     """
     path = Path(path)
     view = mesh.View(size, pixel_angle_rad, distance_m, position_m, direction)
@@ -93,14 +92,13 @@ def read_scene(
         if suffix in mesh.SUFFIXES:
             range_m, pixel_angle_rad = mesh.read(path, unit_m or 1.0, view)
         else:
-            for name, value in view.of_a_mesh.items():
-                require(name, value, value is None, "None: a depth map has a view of its own")
+            view.refuse("a depth map has a view of its own")
             range_m = depth.read(path, unit_m)
         return Scene(range_m, acquisition=suitable_acquisition(range_m, pixel_angle_rad))
 
 
 def suitable_acquisition(range_m: Floats, pixel_angle_rad: float | None) -> Acquisition:
-    """The gate for surfaces at these ranges, by the rule above.
+    """Return the gate for surfaces at these ranges, by the rule above.
 
     Parameters
     ----------

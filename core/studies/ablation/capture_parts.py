@@ -25,7 +25,7 @@ from core.inference.resolution import FEW, Difference, difference
 from core.metrics import Interval
 from core.studies.ablation import corrections
 from core.studies.ablation.criterion import UNKNOWN, Requirement, judged
-from core.trigger import drawn, trigger_probability
+from core.trigger import draw_counts, trigger_probability
 
 _SURE = 0.95  # confidence of answers that are taken for the surface
 _SAMPLE = 2048  # pixels, at most, that are looked at closely
@@ -114,7 +114,7 @@ def _sample_of(capture: Capture) -> _Sample | None:
     """None where too few pixels are sure of their surface."""
     bins = corrections.delays(capture, "likelihood")
     sure = tolerance_probability(capture, bins) >= _SURE
-    faulty = faults.standing_out(capture)
+    faulty = faults.outlier_pixels(capture)
     if faulty is not None:
         sure &= ~(faulty.hot | faulty.dead)
     pixels = np.random.default_rng(0).permutation(np.flatnonzero(sure))[:_SAMPLE]
@@ -205,7 +205,7 @@ def _twin(capture: Capture, sample: _Sample) -> tuple[NDArray[np.unsignedinteger
     seen = np.where(sample.beside, 0.0, sample.armed * echo).sum(axis=1, keepdims=True)
     signal = np.maximum(excess.sum(axis=1, keepdims=True), 0.0) / np.maximum(seen, 1e-9)
     rate, rng = signal * echo + sample.background, np.random.default_rng(0)
-    counts = drawn(rate, capture.gated_pulses, rng)
+    counts = draw_counts(rate, capture.gated_pulses, rng)
     twin = replace(
         capture,
         cube=counts[np.newaxis],
@@ -258,7 +258,7 @@ def second_surface(capture: Capture) -> Requirement:
     whole = _windows(beside.astype(float), width) > width - 0.5
     chance = np.where(whole, pdtrc(np.maximum(seen - 1, 0), expected), 1.0)
     chance[seen < 1] = 1.0
-    shows = chance.min(axis=1) * whole.sum(axis=1) < faults.BY_CHANCE
+    shows = chance.min(axis=1) * whole.sum(axis=1) < faults.SIGNIFICANCE
     excess = np.where(shows, (seen - expected).max(axis=1), 0.0)
     sent = capture.gated_pulses or sample.counts.sum(axis=1)
     return _found("second_surface", shows, excess / sent, f"{shows.size} of them looked at")
@@ -275,12 +275,12 @@ def _windows(values: Floats, width: int) -> Floats:
 
 def faulty_pixels(capture: Capture) -> Requirement:
     """Whether single pixels detect more, or less, than all their neighbours by more than chance."""
-    found = faults.standing_out(capture)
+    found = faults.outlier_pixels(capture)
     if found is None:
         return _unknown("faulty_pixels", "an image so narrow has no neighbours")
     counts, n_pulses = capture.counts, capture.gated_pulses
-    usual, faulty = faults.usual_counts(capture), found.hot | found.dead
-    too_dark = faults.fewer_by_chance(0, int(np.median(usual)), n_pulses) > faults.BY_CHANCE
+    usual, faulty = faults.neighbour_median(capture), found.hot | found.dead
+    too_dark = faults.probability_of_fewer(0, int(np.median(usual)), n_pulses) > faults.SIGNIFICANCE
     if not faulty.any() and too_dark:
         return _unknown("faulty_pixels", "too few photons to tell a dead pixel")
     sent = n_pulses or np.maximum(np.maximum(counts, usual), 1)

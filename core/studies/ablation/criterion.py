@@ -95,7 +95,7 @@ def judged(
         float(np.mean(apart.total_variation)),
         float(np.max(apart.total_variation)),
         float(np.median(known)) if known.size else math.nan,
-        float(np.mean(apart.told)),
+        float(np.mean(apart.is_resolved)),
         rd_change,
         rmse_change_m,
         time_ratio,
@@ -121,7 +121,7 @@ def _verdict_on_correction(apart: Difference, rd: Interval, rmse: Interval) -> t
 
 def _verdict_on_part(apart: Difference, rd: Interval, rmse: Interval) -> tuple[Verdict, str]:
     """Of changes in units of their margins, NaN where not known."""
-    told_share, changes = float(np.mean(apart.told)), (rd, rmse)
+    told_share, changes = float(np.mean(apart.is_resolved)), (rd, rmse)
     shown = f"histograms show it in {told_share:.0%} of the pixels"
     if told_share > FEW:
         return "needed", shown

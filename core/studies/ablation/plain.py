@@ -1,6 +1,6 @@
 """One echo over uniform background and nothing else: what absent parts are compared with.
 
-It is `core.simulate.triggered_by_each_edge` with every part left out of its code.
+It is `core.simulate.cumulative_trigger_probability` with every part left out of its code.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.scene import PARTS, Scene, without
-from core.simulation import add_echo, triggered_by_each_edge
+from core.simulation import add_echo, cumulative_trigger_probability
 from core.studies.ablation.corrections import time_ratio
 from core.studies.outputs import Table
 
@@ -39,9 +39,9 @@ def table(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse) -> T
     numbers are the same."""
     given = (bare(scene), acquisition, flux, pulse)
     ratio = time_ratio(
-        partial(triggered_by_each_edge, *given), partial(plain_triggered, *given), 41
+        partial(cumulative_trigger_probability, *given), partial(plain_triggered, *given), 41
     )
-    same = np.array_equal(triggered_by_each_edge(*given), plain_triggered(*given))
+    same = np.array_equal(cumulative_trigger_probability(*given), plain_triggered(*given))
     told = f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
     return Table(
         "absent",

@@ -17,7 +17,7 @@ from core.inference import resolution
 from core.inference.resolution import Difference, difference
 from core.metrics import Interval
 from core.scene import Scene, parts_of, without
-from core.simulation import pulses_sent, simulate, triggered_by_each_edge
+from core.simulation import cumulative_trigger_probability, pulses_sent, simulate
 from core.studies.ablation import capture_parts, corrections
 from core.studies.ablation.criterion import MARGIN_RD, TITLES, Requirement, judged
 from core.studies.outputs import Table
@@ -109,7 +109,7 @@ class _Study:
     @cached_property
     def probability(self) -> Floats:
         """Of a pulse to trigger in each bin, shape (pixel, bin)."""
-        edges = triggered_by_each_edge(self.scene, self.acquisition, self.flux, self.pulse)
+        edges = cumulative_trigger_probability(self.scene, self.acquisition, self.flux, self.pulse)
         return np.maximum(np.diff(edges), 0.0)  # but for rounding
 
     def captured(self, seed: int) -> Capture:

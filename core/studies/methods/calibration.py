@@ -12,7 +12,7 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators import ESTIMATORS, RangeImage
 from core.inference.posterior import TOLERANCE_BINS
-from core.metrics import Told, calibration_error, reliability
+from core.metrics import ReliabilityBin, calibration_error, reliability
 from core.studies.outputs import Table
 from core.studies.paper.printed import TABLE_2
 from core.studies.trials import Condition
@@ -42,7 +42,7 @@ class Report:
     scene: str
     sbr: float | None
     method: str
-    told: list[Told]
+    told: list[ReliabilityBin]
 
     @property
     def error(self) -> float:
@@ -69,7 +69,7 @@ def reports(seeds: Sequence[int]) -> Iterator[Report]:
             yield Report(scene, None, method, _pooled(pooled[method]))
 
 
-def _pooled(pairs: Sequence[tuple[Floats, NDArray[np.bool_]]]) -> list[Told]:
+def _pooled(pairs: Sequence[tuple[Floats, NDArray[np.bool_]]]) -> list[ReliabilityBin]:
     confidence, right = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     return reliability(confidence, right)
 

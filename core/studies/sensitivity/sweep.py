@@ -121,7 +121,7 @@ def _span(low: float, high: float) -> str:
 def tile(method: str) -> int:
     """Rows and columns that see the same depth: more than one for what looks at neighbours."""
     each = ESTIMATORS[method]
-    return 8 if each.whole_image or each.reach(each.parameters()) > 1 else 1
+    return 8 if each.whole_image or each.window_size(each.parameters()) > 1 else 1
 
 
 @dataclass(frozen=True)
