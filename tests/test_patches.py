@@ -22,8 +22,7 @@ from app.server.garbage import collect_all, freeze_all
 from app.server.patches import OFF_VARIABLE, PATCHES, Patch, in_use
 from app.server.patches.default_values import cached
 from app.server.patches.outgoing_messages import INLINE_BYTES, QuickSerializer
-from tests.browser import fact, open_page, serving
-from tests.test_browser import slider
+from tests.browser import fact, open_page, serving, slider
 
 FOLDER = Path(app.server.patches.__file__).parent
 
