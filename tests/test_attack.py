@@ -18,7 +18,10 @@ def test_the_exit_status_tells_whether_all_attacks_held(monkeypatch, capsys):
     def failed(_folder):
         raise ConnectionError("the server hung up")
 
-    attacks = [Attack("one that holds", survived, None), Attack("one that does not", failed, None)]
+    attacks = [
+        Attack("one that holds", survived, False),
+        Attack("one that does not", failed, False),
+    ]
     monkeypatch.setattr(attack, "ATTACKS", attacks)
     assert attack.main(["--only", "HOLDS"]) == 0
     assert "| one that holds | 3 | refused with 403 |  | 5 MiB | 0 s | held |" in (
