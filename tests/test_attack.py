@@ -1,4 +1,4 @@
-"""``python -m tests.attack`` in short: what holds is said to hold, and what does not is not."""
+"""``python -m tests.attack`` in short: its verdicts are right."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests import attack
 from tests.attacks.attack import MIB, Attack, Outcome, command
 
 
-def test_the_exit_status_tells_whether_all_attacks_held(monkeypatch, capsys):
+def test_the_exit_status_is_0_if_all_attacks_held(monkeypatch, capsys):
     def survived(_folder):
         return Outcome(3, "refused with 403", True, 5 * MIB)
 
