@@ -182,12 +182,13 @@ def test_a_suspended_worker_is_reported_and_loses_nothing(
             return True
 
         caplog.handler.addFilter(resume_if_reported)
-        unreported = threading.Timer(20, resume)
+        unreported = threading.Timer(120, resume)
         unreported.start()
         os.kill(worker.pid, signal.SIGSTOP)
         found = computed(estimate_large(COUNTS.chunk(row=9), "peak"), cluster.scheduler_address)
         unreported.cancel()
         caplog.handler.removeFilter(resume_if_reported)
-    (report,) = [each.getMessage() for each in caplog.records if each.name == tiles.__name__]
-    assert address in report and "worker-ttl" in report
+    reports = [each.getMessage() for each in caplog.records if each.name == tiles.__name__]
+    assert reports  # several where a busy machine delays the resumed worker, too
+    assert all(address in report and "worker-ttl" in report for report in reports)
     np.testing.assert_array_equal(found["range_m"], estimate(CAPTURE, "peak").range_m)
