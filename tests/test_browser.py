@@ -45,7 +45,7 @@ def chosen(page: Page, name: str) -> Locator:
 
 def warning(page: Page) -> Locator:
     """The sentence about what failed."""
-    return page.get_by_role("alert").filter(has_text="The picture still shows")
+    return page.get_by_role("alert").filter(has_text="The page still shows")
 
 
 def image(page: Page) -> Locator:

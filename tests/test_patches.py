@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from app.server.patches.incoming_messages import QuickDeserializer
 from bokeh.core.property.descriptors import PropertyDescriptor
 from bokeh.core.serialization import Deserializer, Serializer, UnknownReferenceError
 from bokeh.document import Document
@@ -17,10 +18,9 @@ from bokeh.plotting import figure
 from playwright.sync_api import expect
 
 import app.server.patches
-from app.server.garbage import collect_all, spare
+from app.server.garbage import collect_all, freeze_all
 from app.server.patches import OFF_VARIABLE, PATCHES, Patch, in_use
 from app.server.patches.default_values import cached
-from app.server.patches.incoming_messages import QuickDeserializer
 from app.server.patches.outgoing_messages import INLINE_BYTES, QuickSerializer
 from tests.browser import fact, open_page, serving
 from tests.test_browser import slider
@@ -187,7 +187,7 @@ def test_all_in_use_is_passed_over_and_all_is_looked_through():
 
     left = Loop()
     gone = weakref.ref(left)
-    spare()
+    freeze_all()
     try:
         assert gc.get_freeze_count() > 0
         del left

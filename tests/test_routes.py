@@ -1,4 +1,4 @@
-"""No request runs code, ends the server or leaves a traceback."""
+"""No request runs code, ends the server or causes a traceback."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.wire import token_in
 
 REMOVED = {
     ("/metadata$", "MetadataHandler"),
-    ("/autoload.js$", "AutoloadJsHandler"),  # lends a session to any page
+    ("/autoload.js$", "AutoloadJsHandler"),  # gives a session to any page
     ("/?$", "RootHandler"),
     ("/static/(.*)$", "StaticHandler"),
 }
@@ -28,10 +28,7 @@ MARKER = "from pathlib import Path\nPath({!r}).touch()\n"
 
 @pytest.fixture(scope="module")
 def marked(tmp_path_factory):
-    """A server on whose path lies a module that leaves a file when it is run.
-
-    Also that file, and the one into which the server prints.
-    """
+    """A server that finds a module which writes a file when it is run; that file, and the log."""
     folder = tmp_path_factory.mktemp("modules")
     mark, log = folder / "mark", folder / "log"
     (folder / "leaves_a_mark.py").write_text(MARKER.format(str(mark)))
@@ -46,7 +43,6 @@ def routes(server) -> Iterator[tuple[str, type]]:
 
 
 def test_every_route_of_the_libraries_is_known():
-    """A route that a later version adds is not served; here it is seen, and can be judged."""
     options = {"port": 0, "show": False, "start": False, "verbose": False}
     server = pn.serve({"/": pn.Column}, **options)
     found = {(path, handler.__name__) for path, handler in routes(server)}
@@ -56,7 +52,7 @@ def test_every_route_of_the_libraries_is_known():
 
 @pytest.mark.parametrize("module", ["unittest.__main__", "this", "leaves_a_mark", "..", "", "core"])
 @pytest.mark.parametrize("site", [None, "cross-site"])
-def test_no_module_is_run_that_an_address_names(marked, module, site):
+def test_an_address_runs_no_module(marked, module, site):
     server, mark, _ = marked
     said = {} if site is None else {"Sec_Fetch_Site": site, "Sec_Fetch_Mode": "no-cors"}
     status, _, text = server.ask(RUN.format(module), **said)

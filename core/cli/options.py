@@ -33,7 +33,7 @@ def add_reading(command: Any) -> None:
     """Add the options for reading a file, one for each field of `core.io.ReadOptions`."""
     group = command.add_argument_group("reading the file; what is not given is guessed")
     for name, option in reading_options().items():
-        parts = option.kind.words
+        parts = option.kind.metavars
         # One string for each option: `reading` parses them as the app's form does.
         several = {"nargs": len(parts), "metavar": parts} if parts else {}
         group.add_argument(f"--{option.flag}", dest=name, help=option.help, **several)

@@ -56,7 +56,7 @@ PATCHES = (
     Patch("default_values", _BOKEH),
     Patch("early_changes", _BOKEH | _PANEL),
     Patch("freed_memory", _PANEL),
-    Patch("incoming_messages", _BOKEH),
+    Patch("removed_models", _BOKEH),
     Patch("outgoing_messages", _BOKEH),
     Patch("whole_messages", _BOKEH),
     # In the browser

@@ -8,7 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from core.acquisition import Acquisition, Floats, Flux, Pulse
+from core.acquisition import Acquisition, Floats, Flux, Pulse, pulses_sent
 from core.capture import Capture
 from core.checks import require
 from core.corrections import CORRECTIONS, without_correction
@@ -16,7 +16,7 @@ from core.estimators import ESTIMATORS
 from core.inference import resolution
 from core.inference.resolution import Difference, difference
 from core.scene import Scene, parts_of, without
-from core.simulation import cumulative_trigger_probability, pulses_sent, simulate
+from core.simulation import cumulative_trigger_probability, simulate
 from core.studies.ablation import capture_parts, corrections
 from core.studies.ablation.criterion import MARGIN_RD, TITLES, Requirement, judged
 from core.studies.outputs import Table, table
