@@ -215,7 +215,7 @@ SECTIONS = {
     "app.pages.paper.page.trials": repeated,
     "core.studies.paper.figures.figure_8": lambda session: by_compute(RangeImages(session)),
     "app.pages.tradeoff.speed.study": speed,
-    "app.pages.tradeoff.acquisition.acquired": lambda session: by_compute(
+    "app.pages.tradeoff.acquisition.acquisition_sweeps": lambda session: by_compute(
         AcquisitionSection(session)
     ),
     "app.pages.tradeoff.ablation.requirements": ablation,

@@ -26,7 +26,7 @@ from app.theme import DARK, LIGHT
 from core import ESTIMATORS
 from core.scene import parts_of
 from core.studies.sensitivity import numbers
-from core.studies.tradeoff import Cancelled, best_within, cheapest_reaching, front
+from core.studies.tradeoff import Cancelled, best_within, cheapest_reaching, pareto_front
 from tests.browser import eventually
 from tests.threads import HeldTasks, control
 
@@ -135,7 +135,7 @@ def test_the_page_shows_what_core_recommends(section, measured):
     for sentence, each in zip(section.advice, recommended, strict=True):
         assert text.name_of(each.point.candidate) in sentence.text
     assert len(section.plot.source("points").data["x"]) == len(measured) == len(ESTIMATORS)
-    pareto = [point.milliseconds.value for point in front(measured)]
+    pareto = [point.milliseconds.value for point in pareto_front(measured)]
     np.testing.assert_allclose(section.plot.source("front").data["x"], pareto)
 
 
@@ -226,7 +226,7 @@ def test_a_simulation_like_a_file_is_acquired_in_other_ways(session):
     assert "the capture has no truth" in section.subject.text
     for each in section.cards:
         drawn = {renderer.name for renderer in each.figure.renderers}
-        assert {"theory, light known", "likelihood, simulated band"} <= drawn
+        assert {"theory, flux known", "likelihood, simulated band"} <= drawn
     section.paint(True)
     assert section.cards[0].figure.title.text_color == DARK.text
 

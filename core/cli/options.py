@@ -31,7 +31,7 @@ def whole_from_to(least: int, most: int) -> Callable[[str], int]:
 
 def add_reading(command: Any) -> None:
     """Add the options for reading a file, one for each field of `core.io.ReadOptions`."""
-    group = command.add_argument_group("how to read the file; what is not specified is guessed")
+    group = command.add_argument_group("reading the file; what is not given is guessed")
     for name, option in reading_options().items():
         parts = option.kind.metavars
         # One string for each option: `reading` parses them as the app's form does.

@@ -6,13 +6,9 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -388,29 +384,3 @@ def test_no_delay_is_likelier_in_float64_than_the_one_found_in_float32(
     there = np.take_along_axis(log, np.clip(at, 0, delay.size - 1), axis=2).max(axis=2)
     lost = np.where(found.valid, log.max(axis=2) - there, 0.0)
     assert (lost <= np.maximum(ROUNDINGS * EPS_32 * size, 0.0)).all()
-
-
-def plain_estimates() -> dict[str, Floats]:
-    """Bin and confidence of a few pixels by every method; uncompiled kernels are slow."""
-    gate = Acquisition(20, n_pulses=1000)
-    onset = np.linspace(3, 15, 16).reshape(2, 8)
-    few = simulate(Scene(gate.bin_to_range_m(onset)), gate, Flux(SIGNAL, 0.2))
-    images = {method: estimate(few, method) for method in ESTIMATORS}
-    return {method: np.stack([each.bin, each.confidence]) for method, each in images.items()}
-
-
-def test_compiled_and_plain_kernels_agree(tmp_path: Path) -> None:
-    path = tmp_path / "plain.npz"
-    script = (
-        "import sys, numpy, core.tests.test_extremes as t; "
-        "numpy.savez(sys.argv[1], **t.plain_estimates())"
-    )
-    subprocess.run(
-        [sys.executable, "-c", script, str(path)],
-        check=True,
-        cwd=Path(__file__).parents[2],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONWARNINGS": "ignore"},
-    )
-    with np.load(path) as plain:
-        for method, compiled in plain_estimates().items():
-            np.testing.assert_allclose(plain[method], compiled, atol=1e-3, err_msg=method)

@@ -271,26 +271,6 @@ def test_coates_corrects_pile_up_only_where_it_is_detectable() -> None:
     assert ESTIMATORS["coates"].remark(bright) == ""
 
 
-@pytest.mark.compiled
-@pytest.mark.parametrize("method", ["likelihood", "coates"])
-def test_tiles_use_the_model_of_the_whole_image(method: str) -> None:
-    whole, estimator = seen(), ESTIMATORS[method]
-    settings = estimator.parameters()
-    calibration = estimator.calibration(whole, settings)
-    expected = estimator.ranged(whole, settings, calibration)
-    for rows in (slice(0, 5), slice(5, 32)):
-        tile = replace(
-            whole,
-            cube=whole.cube[rows].copy(),
-            truth_range_m=None,
-            signal=None,
-            flux_prior=flux_prior_of(whole),
-        )
-        found = estimator.ranged(tile, settings, calibration)
-        np.testing.assert_array_equal(found.bin, expected.bin[rows])
-        np.testing.assert_array_equal(found.confidence, expected.confidence[rows])
-
-
 # -- The command -----------------------------------------------------------------------------------
 
 

@@ -97,25 +97,6 @@ def test_presets_and_defaults_are_not_doubtful() -> None:
         assert doubts(each) == []
 
 
-@pytest.mark.parametrize(
-    ("changed", "n_doubts"),
-    [
-        ({"m": 0.45}, 1),
-        ({"m": 1.0}, 1),
-        ({"n": 1.0}, 1),
-        ({"l": 0.6}, 2),
-        ({"l": 0.1, "m": 3.0, "h": 2.0}, 2),
-        ({"alpha": 5.0}, 1),
-        ({"start": "zero"}, 1),
-        ({"sigma_from": "before T_n", "t_n": 2}, 1),
-    ],
-)
-def test_doubts_are_sentences(changed: dict[str, Any], n_doubts: int) -> None:
-    found = doubts(TrackingParameters(**changed))
-    assert len(found) == n_doubts
-    assert all(sentence.endswith(".") for sentence in found)
-
-
 def test_zones_lie_within_accepted_values() -> None:
     for _, name, spec, default in sensitivity.numbers():
         for zone in spec.doubtful:

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -24,7 +23,6 @@ from core.capture import Capture
 from core.cli import main
 from core.estimators import ESTIMATORS
 from core.io.writers import save_capture
-from core.kernels.parallel import SERIAL_BELOW
 from core.metrics import Interval
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
@@ -309,23 +307,6 @@ def test_a_study_can_be_cancelled_and_refuses_what_it_cannot_measure(stairs: Sim
         study([(sky, CONFIGURATIONS[:1])])
     with pytest.raises(ValueError, match="kernel = 'float64, by rows' is not accepted"):
         Candidate(method("peak"), kernel="float64, by rows")
-
-
-def test_the_plan_has_every_method_and_every_variation() -> None:
-    plan = plans.over_pulses(plans.simulated("car", 0.06, 0.1041))
-    assert [source.acquisition.n_pulses for source, _ in plan] == list(acquiring.PULSES)
-    for source, configurations in plan:
-        assert {each.method.estimator for each in configurations} == set(ESTIMATORS)
-        merges = {each.reduction.merge for each in configurations}
-        assert merges == ({1, 2, 4} if source.acquisition.n_pulses in (100, 1000, 10_000) else {1})
-    everything = plan[acquiring.PULSES.index(1000)][1]
-    assert {each.kernel for each in everything} == set(measure.KERNELS)
-    assert {each.reduction.gate for each in everything} == {None, plan[4][0].window}
-    assert len(set(everything)) == len(everything)
-    ((large, configurations),) = plans.threaded(0.2, 0.1)
-    assert large.acquisition.n_bins * 256**2 > SERIAL_BELOW
-    threads = set(range(1, numba.config.NUMBA_NUM_THREADS + 1))
-    assert {each.threads for each in configurations} == threads
 
 
 # -- Captures and their surrogates -----------------------------------------------------------------

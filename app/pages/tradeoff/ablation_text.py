@@ -53,7 +53,7 @@ def row(name: str, found: Requirement | None, can_switch: bool, is_off: bool) ->
             (found.verdict, found.verdict, ""),
             cell(found.total_variation, "{:.2g}", worst),
             cell(found.resolvable, "{:.2g}"),
-            percent_cell(found.told_share),
+            percent_cell(found.detectable_share),
             interval_cell(found.rd_change, "{:+.4f}"),
             interval_cell(found.rmse_change_m, "{:+.3f}"),
             interval_cell(found.time_ratio, "{:.2f}"),

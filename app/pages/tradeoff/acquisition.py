@@ -17,7 +17,13 @@ from app.pages.tradeoff.speed import affordable, source_of
 from app.tasks.scheduler import Work
 from app.widgets.cards import part
 from app.widgets.controls import Sentence
-from core.studies.tradeoff import Cancelled, Simulation, acquired, acquiring_items, like
+from core.studies.tradeoff import (
+    Cancelled,
+    Simulation,
+    acquisition_items,
+    acquisition_sweeps,
+    surrogate_of,
+)
 
 CURVES = """
 :host { display: grid !important; gap: 8px; flex: none !important; height: 668px !important;
@@ -87,9 +93,11 @@ class AcquisitionSection(SettingsSection[Repetitions]):
                 progress(done, of)
 
             affordable(source, ())
-            simulation = source if isinstance(source, Simulation) else like(source, source.source)
-            found = acquired([simulation], range(repetitions), progress=report)
-            return simulation.note, list(acquiring_items(found))
+            simulation = (
+                source if isinstance(source, Simulation) else surrogate_of(source, source.source)
+            )
+            found = acquisition_sweeps([simulation], range(repetitions), progress=report)
+            return simulation.note, list(acquisition_items(found))
 
         return work
 

@@ -40,12 +40,12 @@ from core.studies.tradeoff import (
     best_within,
     candidates,
     cheapest_reaching,
-    front,
+    including_flux_time,
+    pareto_front,
     points_table,
     study,
-    with_light,
 )
-from core.studies.trials import Method, as_they_come
+from core.studies.trials import Method, default_methods
 
 Array = NDArray[Any]
 
@@ -203,8 +203,8 @@ class SpeedSection(SettingsSection[Effort]):
         if not self.measured:
             return
         goal = self._goal
-        points = with_light(self.measured) if goal.flux == "included" else self.measured
-        pareto = front(points)
+        points = including_flux_time(self.measured) if goal.flux == "included" else self.measured
+        pareto = pareto_front(points)
         best = best_within(points, goal.milliseconds)
         cheapest = cheapest_reaching(points, goal.rd)
         with self.session.tasks.hold():
@@ -317,4 +317,4 @@ def affordable(source: Source, chosen: Sequence[Candidate]) -> list[Candidate]:
 def methods(answer: Answer) -> list[Method]:
     """Return all methods with their defaults, tracking with the settings of the session."""
     tracking = Method("tracking", "tracking", answer.request.tracking)
-    return [tracking if each.name == "tracking" else each for each in as_they_come()]
+    return [tracking if each.name == "tracking" else each for each in default_methods()]

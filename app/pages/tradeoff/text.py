@@ -70,7 +70,7 @@ def rows(points: Sequence[Point], pareto: Sequence[Point]) -> list[dict[str, obj
 
 
 def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
-    is_bound = point.candidate.is_told_the_light
+    is_bound = point.candidate.knows_flux
     note = "Pareto front" if is_pareto else "knows the true fluxes: a bound" if is_bound else ""
     return {
         "key": key,
@@ -82,7 +82,7 @@ def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
             interval_cell(_percent(point.rd(1)), "{:.2f} %"),
             interval_cell(point.rmse_m, "{:.3g}"),
             interval_cell(point.milliseconds, "{:.3g}"),
-            cell(point.light_ms.value, "{:.3g}"),
+            cell(point.flux_ms.value, "{:.3g}"),
             cell(point.ns_per_pixel_bin, "{:.3g}"),
             cell(point.peak_bytes / 1e6, "{:.3g}"),
         ],
