@@ -155,7 +155,7 @@ def chosen(page: Page, name: str) -> Locator:
 
 def warning(page: Page) -> Locator:
     """Return the sentence about a failed request."""
-    return page.get_by_role("alert").filter(has_text="The picture still shows")
+    return page.get_by_role("alert").filter(has_text="The page still shows")
 
 
 def image(page: Page) -> Locator:

@@ -86,7 +86,7 @@ def test_a_file_that_is_too_large_is_refused_by_its_limit(page, tmp_path, troubl
     opened = page()
     opened.locator("input[type=file]").set_input_files(large)
     alert = opened.get_by_role("alert").filter(has_text="large.npz")
-    expect(alert).to_contain_text("Files of up to 100 MiB can be uploaded")
+    expect(alert).to_contain_text("The limit is 100 MiB")
     (trouble,) = troubles
     assert "exceeds maximum file size" in trouble  # the widget's own line in the console
     troubles.clear()

@@ -30,9 +30,9 @@ from core.io import ReadOptions
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT, fact, serving
-from tests.test_app import ask, complaint, control, told
+from tests.test_app import alert_of, ask, values_of
 from tests.test_downloads import columns_of, written
-from tests.threads import HeldLayout
+from tests.threads import HeldLayout, control
 
 ROWS, COLS, CHUNK = 96, 128, 16
 PIECES = ROWS * COLS // CHUNK**2
@@ -299,9 +299,9 @@ def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
     assert session.state.window == session.answer.cutout.window == Window((30, 70), (20, 80))
     assert session.answer.grid.place(*session.state.pixel) == place
     np.testing.assert_array_equal(session.answer.capture.cube[session.state.pixel], histogram)
-    assert told(explore.numbers)["Pixel"] == "row {}, col {}".format(*place)
-    picture = explore.image._plot.source("picture").data
-    assert (picture["x"][0], picture["dw"][0]) == (19.5, 60)
+    assert values_of(explore.numbers)["Pixel"] == "row {}, col {}".format(*place)
+    (picture,) = (r for r in explore.image.figure.renderers if "image" in r.data_source.data)
+    assert [picture.data_source.data[name][0] for name in ("x", "dw")] == [19.5, 60]
     assert taken_away(looking) == ((30, 69), (20, 79), 40 * 60)
     name = downloads.explored(session).file_name("range image", "csv")
     assert "_rows30-69_cols20-79_" in name
@@ -341,13 +341,13 @@ def test_a_damaged_part_is_told_and_the_page_goes_on(looking, path):
         "0 to 9",
     )
     control(looking, "Read window").clicks += 1
-    settle(looking, lambda: complaint(looking))
-    assert "counts cannot be read" in complaint(looking)
-    assert str(path.parent) not in complaint(looking)
+    settle(looking, lambda: alert_of(looking))
+    assert "counts cannot be read" in alert_of(looking)
+    assert str(path.parent) not in alert_of(looking)
     assert session.answer is before and session.state.window is None
     shutil.rmtree(path)
     control(looking, "Read window").clicks += 1
-    settle(looking, lambda: "has not gone" in complaint(looking))
+    settle(looking, lambda: "has not gone" in alert_of(looking))
     control(looking, "l").value = 0.01
     settle(looking, lambda: session.answer is not before)
     assert session.answer.request.tracking.l == 0.01

@@ -14,9 +14,10 @@ from app.model.state import Illumination, ReductionSettings
 from app.model.store import built_in_sources
 from app.pages.layout import CUSTOM, Layout
 from app.pages.session import Session
+from app.pages.shared.section import Repetitions
 from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import ablation_text, text
-from app.pages.tradeoff.ablation import Ablated, AblationSection
+from app.pages.tradeoff.ablation import AblationSection
 from app.pages.tradeoff.acquisition import AcquisitionSection
 from app.pages.tradeoff.sensitivity import SensitivitySection
 from app.pages.tradeoff.speed import Effort, SpeedSection, show_point, source_of
@@ -243,7 +244,7 @@ def ablation(session):
     """The ablation of a car seen by a worn instrument."""
     change(session, source="worn")
     section = AblationSection(session)
-    section.change(Ablated(repetitions=2))
+    section.change(Repetitions())
     session.estimate.changed.subscribe(section.follow)
     return section
 

@@ -113,7 +113,7 @@ class Compare(Section):
 
     def __init__(self, session: Session) -> None:
         super().__init__(session)
-        self._curve_jobs = session.tasks.latest()
+        self._method_jobs = session.tasks.latest()
         self._capture = session.answer.capture
         self.results: dict[Task, Result | str] = {}
         self.reference: Reference | None = None
@@ -363,7 +363,7 @@ class Compare(Section):
     def _run(self, work: Callable[[], Any], task: Task | None) -> None:
         self._is_busy = True
         arrived = partial(self._arrived, self._capture, task)
-        self._jobs.submit(work, arrived, arrived)
+        self._method_jobs.submit(work, arrived, arrived)
 
     def _arrived(self, capture: Capture, task: Task | None, result: Any) -> None:
         """Keep and show a result, or why there is none, and continue."""
@@ -388,7 +388,6 @@ class Compare(Section):
         self.submit(
             partial(score_curves, self._capture, tasks, *pixel),
             partial(self._draw_curves, answers, pixel),
-            jobs=self._curve_jobs,
         )
 
     # Downloads

@@ -9,16 +9,25 @@ from typing import Any
 import numpy as np
 
 from app.model.store import Answer
-from app.model.text import NOT_COMPUTED, Fact, cause, number, reason, share
+from app.model.text import (
+    NOT_COMPUTED,
+    TRUTH_HELP,
+    Cell,
+    Fact,
+    cause,
+    cell,
+    number,
+    percent_cell,
+    reason,
+    share,
+    target,
+)
 from app.pages.compare.ranking import TOLERANCES_BINS, Reference, Result, Task, agreement
 from app.units import count
 from core import ESTIMATORS, Capture
 
 Column = tuple[str, str, int]
 """Title, help, and sort order of the first click: 1 ascending, -1 descending."""
-
-Cell = tuple[str, float | None, str]
-"""Text, value to sort by, and a smaller second line."""
 
 EXPLANATION = """
 **Pictures.** All chosen methods use the same capture: the scene with its flux and seed, or the
@@ -128,25 +137,25 @@ def rows(
 
 def _cells(result: Result, reference: Reference | None) -> list[Cell]:
     run, accuracy = result.answer.run, result.accuracy
-    milliseconds = 1e3 * run.estimate_s
-    time: Cell = (f"{milliseconds:,.1f}", milliseconds, "")
+    time = cell(1e3 * run.estimate_s, "{:,.1f}")
     if accuracy is None:
         image, likelihood = run.image, reference and reference.likelihood
         agrees = agreement(image, likelihood) if likelihood else math.nan
         confidence = image.confidence[image.valid]
         mean = float(confidence.mean()) if confidence.size else math.nan
-        return [*map(_percent, (agrees, float(image.valid.mean()), mean)), time]
+        return [*map(percent_cell, (agrees, float(image.valid.mean()), mean)), time]
     figures, detection = run.figures, accuracy.detection
-    within: list[Cell] = [
-        (share(each.value), each.value, f"{100 * each.low:.1f}–{100 * each.high:.1f}")
+    within = [
+        percent_cell(each.value, f"{100 * each.low:.1f} to {100 * each.high:.1f}")
         for each in accuracy.within
     ] or [("–", None, "")] * len(TOLERANCES_BINS)
+    bias = figures["bias_m"]
     return [
         *within,
-        *(_metres(figures[name]) for name in ("rmse_m", "mae_m", "inlier_rmse_m")),
-        _bias(figures["bias_m"]),
-        _percent(figures["coverage"]),
-        *map(_percent, [] if detection is None else [detection.precision, detection.recall]),
+        *(cell(figures[name]) for name in ("rmse_m", "mae_m", "inlier_rmse_m")),
+        (number(bias, "", sign=True), abs(bias) if math.isfinite(bias) else None, ""),
+        percent_cell(figures["coverage"]),
+        *map(percent_cell, [] if detection is None else [detection.precision, detection.recall]),
         time,
     ]
 
@@ -161,8 +170,8 @@ def _limit_row(capture: Capture, reference: Reference | None) -> dict[str, Any]:
     floor = math.sqrt(float(np.mean(finite**2))) if finite.size else math.nan
     mean = float(np.nanmean(right)) if np.isfinite(right).any() else math.nan
     known = {
-        "Within 3 bins": (share(mean), mean, "mean probability"),
-        "Inlier RMSE (m)": (number(floor, ""), floor, "Cramér–Rao"),
+        "Within 3 bins": percent_cell(mean, "mean probability"),
+        "Inlier RMSE (m)": cell(floor, below="Cramér–Rao"),
     }
     return {"cells": [known.get(title, ("", None, "")) for title, *_ in columns(capture)[1:]]}
 
@@ -173,9 +182,7 @@ def pixel_facts(answer: Answer, reference: Reference | None, row: int, col: int)
     place = "row {}, col {}".format(*answer.grid.place(row, col))
     facts = [("Pixel", place, "Arrow keys on the pictures move it.")]
     if capture.truth_range_m is not None:
-        truth_m = float(capture.truth_range_m[row, col])
-        truth = number(truth_m, "m") if math.isfinite(truth_m) else "no target"
-        facts.append(("Truth", truth, "True range of the surface."))
+        facts.append(("Truth", target(float(capture.truth_range_m[row, col])), TRUTH_HELP))
     found = spread = "–" if reference is None else "not known"
     if reference is not None and reference.limit is not None:
         found = share(float(reference.limit.right_bin_probability[row, col]))
@@ -232,15 +239,3 @@ def remarks(capture: Capture, n_working: int, n_pictures: int) -> str:
             f"Pictures show the first {n_pictures} methods; plots and table show all {n_working}."
         )
     return " ".join(remarks)
-
-
-def _percent(value: float) -> Cell:
-    return share(value), value if math.isfinite(value) else None, ""
-
-
-def _metres(value: float) -> Cell:
-    return number(value, ""), value if math.isfinite(value) else None, ""
-
-
-def _bias(value: float) -> Cell:
-    return number(value, "", sign=True), abs(value) if math.isfinite(value) else None, ""

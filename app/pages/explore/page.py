@@ -50,10 +50,6 @@ MAX_PICTURES_DELAY_S = 1.0
 class Explore(Section):
     """The page.
 
-    Parameters
-    ----------
-    session : Session
-
     Attributes
     ----------
     figures, numbers : Facts

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 from app.model.store import Answer, Pixel
-from app.model.text import CONFIDENCE_HELP, Fact, milliseconds, number, share
+from app.model.text import Fact, estimate_facts, milliseconds, number, share
 from app.units import count, scale
 
 IMAGE_HELP = "Quantity shown in the image"
@@ -67,22 +65,10 @@ def pixel_numbers(answer: Answer, pixel: Pixel, unit: str = "bins") -> list[Fact
     n_pulses = answer.capture.gated_pulses
     r_small = tracking.l * sigma
     row, col = answer.grid.place(pixel.row, pixel.col)
+    has_truth = answer.capture.truth_range_m is not None
     numbers = [
         ("Pixel", f"row {row}, col {col}", "Arrow keys on the image move it."),
-        ("Estimate", number(pixel.range_m, "m"), "Range of the surface, lag removed."),
-    ]
-    if unit != "m":
-        place = scale(unit, answer.capture.acquisition).place(pixel.answer_bin)
-        numbers.append(("Position", place, "The estimate along the gate."))
-    if answer.capture.truth_range_m is not None:
-        truth = "no target" if math.isnan(pixel.truth_m) else number(pixel.truth_m, "m")
-        error = number(pixel.range_m - pixel.truth_m, "m", sign=True)
-        numbers += [
-            ("Truth", truth, "True range of the surface."),
-            ("Error", error, "Estimate minus truth."),
-        ]
-    numbers += [
-        ("Confidence", share(pixel.confidence), CONFIDENCE_HELP),
+        *estimate_facts(pixel, scale(unit, answer.capture.acquisition), has_truth),
         ("σ", number(sigma, "counts"), "Standard deviation of the histogram."),
         ("r small", number(r_small, ""), "l·σ: limit of the small scale's acceleration."),
         ("r large", number(tracking.n * r_small, ""), "n·l·σ: limit for the large scale."),

@@ -40,10 +40,6 @@ ADVICE = """
 class CaptureSection(Section):
     """Counts of all pixels, their flux, suggestions, and the accuracy from fewer pulses.
 
-    Parameters
-    ----------
-    session : Session
-
     Attributes
     ----------
     report : CaptureReport or None
@@ -126,8 +122,8 @@ class CaptureSection(Section):
         if self._reported is None or answer.capture is not self._reported.capture:
             self.flux.text = COMPUTING
         # Counts come at once, the flux later.
-        counts = partial(answer.capture.cube.sum, axis=(0, 1))
-        self.submit(counts, self._draw_counts, jobs=self._count_jobs)
+        counts, drawn = partial(answer.capture.cube.sum, axis=(0, 1)), self._draw_counts
+        self._count_jobs.submit(counts, partial(drawn, answer), self.report_error)
         self.submit(partial(inspect_capture, answer), partial(self._arrived, answer), self._failed)
         if self._studied is not None and self._study_settings != self._studied:
             self.study.start()
@@ -194,12 +190,15 @@ class CaptureSection(Section):
 
     # Report
 
-    def _draw_counts(self, counts: Any) -> None:
-        acquisition = self.session.answer.capture.acquisition
-        cover(self._bins, acquisition.n_bins)
-        self.counts.follow(self.session.state.unit, acquisition)
-        self.counts.show_curves(raw=counts)
-        self.counts.frame(counts)
+    def _draw_counts(self, answer: Answer, counts: Any) -> None:
+        if answer is not self.session.answer:
+            return  # outdated
+        acquisition = answer.capture.acquisition
+        with self.session.tasks.hold():
+            cover(self._bins, acquisition.n_bins)
+            self.counts.follow(self.session.state.unit, acquisition)
+            self.counts.show_curves(raw=counts)
+            self.counts.frame(counts)
 
     def _arrived(self, answer: Answer, report: CaptureReport) -> None:
         self.report, self._reported = report, answer
@@ -224,7 +223,7 @@ class CaptureSection(Section):
             return
         acquisition, suggestion = answer.capture.acquisition, report.suggestion
         with self.session.tasks.hold():
-            self._draw_counts(report.histogram)
+            self._draw_counts(answer, report.histogram)
             first, end = suggestion.gate
             self.counts.source("window").data = {"left": [first], "right": [end]}
             self.counts.mark("t_n", answer.request.tracking.t_n)

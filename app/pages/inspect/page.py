@@ -44,10 +44,6 @@ ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; g
 class Inspect(Section):
     """The page: the map, and sections about the pixel, the region, the pins and the capture.
 
-    Parameters
-    ----------
-    session : Session
-
     Attributes
     ----------
     navigator : Navigator

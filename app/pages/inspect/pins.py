@@ -24,10 +24,6 @@ from app.widgets.figures import cover, pane_of
 class PinsSection(Section):
     """Histograms and enhanced signals of the pinned pixels, and a table.
 
-    Parameters
-    ----------
-    session : Session
-
     Attributes
     ----------
     found : list of Inspected

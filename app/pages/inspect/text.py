@@ -8,7 +8,7 @@ from typing import Any
 
 from app.model.large import Grid
 from app.model.store import Answer
-from app.model.text import CONFIDENCE_HELP, Fact, number, share
+from app.model.text import CONFIDENCE_HELP, Fact, cell, estimate_facts, number, percent_cell, share
 from app.pages.inspect.results import Inspected
 from app.units import AXIS_TITLES, OPPOSITE_UNIT, Quantity, Scale, count, scale
 from app.units import interval as format_interval
@@ -60,14 +60,9 @@ def facts(found: Inspected, unit: str) -> list[Fact]:
 def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
     answer, pixel = found.answer, found.pixel
     place = pixel_name((pixel.row, pixel.col), answer.grid)
-    facts = [("Pixel", place, "Row and column."), *_estimate(found, unit)]
-    if answer.capture.truth_range_m is not None:
-        truth = "no target" if math.isnan(pixel.truth_m) else number(pixel.truth_m, "m")
-        error = number(pixel.range_m - pixel.truth_m, "m", sign=True)
-        facts += [
-            ("Truth", truth, "True range of the surface."),
-            ("Error", error, "Estimate minus truth."),
-        ]
+    along = scale(unit, answer.capture.acquisition)
+    has_truth = answer.capture.truth_range_m is not None
+    facts = [("Pixel", place, "Row and column."), *estimate_facts(pixel, along, has_truth)]
     counts, help = count(pixel.counts), "Counts in the histogram of this pixel"
     if answer.capture.gated_pulses is not None:
         counts = count(pixel.counts, share(pixel.counts / answer.capture.gated_pulses))
@@ -76,12 +71,12 @@ def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
 
 
 def _region_facts(found: Inspected, unit: str) -> list[Fact]:
-    region = found.region
+    region, along = found.region, scale(unit, found.answer.capture.acquisition)
     assert region is not None
     spread = "Half the central 68 % range of the estimates, which is one standard deviation."
     return [
         ("Pixels", count(region.n_pixels), "Pixels whose centre lies in the region."),
-        *_estimate(found, unit),
+        *estimate_facts(found.pixel, along, has_truth=False),
         ("Median range", number(region.median_m, "m"), "Median of the estimates of its pixels."),
         ("Spread", number(region.spread_m, "m"), spread),
         ("Coverage", share(region.share_answered), "Share of its pixels with an estimate."),
@@ -89,14 +84,6 @@ def _region_facts(found: Inspected, unit: str) -> list[Fact]:
         ("Mean detections", number(region.mean_counts, ""), "Mean over the pixels."),
         *_flux(region),
     ]
-
-
-def _estimate(found: Inspected, unit: str) -> list[Fact]:
-    pixel, along = found.pixel, scale(unit, found.answer.capture.acquisition)
-    facts = [("Estimate", number(pixel.range_m, "m"), "Range of the surface, lag removed.")]
-    if unit != "m":
-        facts.append(("Position", along.place(pixel.answer_bin), "The estimate along the gate."))
-    return [*facts, ("Confidence", share(pixel.confidence), CONFIDENCE_HELP)]
 
 
 def _flux(report: Any) -> list[Fact]:
@@ -136,9 +123,9 @@ def candidate_rows(candidates: Sequence[Candidate], along: Scale, other: Scale) 
         {
             "name": str(n + 1),
             "cells": [
-                [along.number(each.bin), each.bin, other.place(each.bin)],
-                [f"{each.score:.4g}", each.score, share(each.relative)],
-                [share(each.probability), each.probability, ""],
+                (along.number(each.bin), each.bin, other.place(each.bin)),
+                cell(each.score, below=share(each.relative)),
+                percent_cell(each.probability),
             ],
         }
         for n, each in enumerate(candidates)
@@ -174,10 +161,10 @@ def pin_row(found: Inspected, name: str, color: str, along: Scale, other: Scale)
         "color": color,
         "dash": [],
         "cells": [
-            [along.number(pixel.answer_bin), pixel.answer_bin if known else None, below],
-            [share(pixel.confidence), pixel.confidence, ""],
-            [value, sbr.value if math.isfinite(sbr.value) else None, "".join(ends)],
-            [report.verdict.health, report.verdict.health, ""],
+            (along.number(pixel.answer_bin), pixel.answer_bin if known else None, below),
+            percent_cell(pixel.confidence),
+            (value, sbr.value if math.isfinite(sbr.value) else None, "".join(ends)),
+            (report.verdict.health, report.verdict.health, ""),
         ],
     }
 
@@ -195,8 +182,7 @@ PULSES_HELP = (
     "subset of a larger one."
 )
 GATE_HELP = (
-    "Apply the gate: bins outside it are cut, and T_n moves with it. Undo it under “Data "
-    "reduction”."
+    "Apply the gate: bins outside it are cut, and T_n moves with it. “Data reduction” undoes it."
 )
 T_N_HELP = "Apply T_n: the tracking differentiator ignores the bins before it."
 

@@ -17,8 +17,7 @@ from app.pages.paper import text
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject
 from app.pages.shared.outputs import CurveCard, Gallery, TableCard
-from app.pages.shared.section import Checked, Settings, SettingsSection
-from app.pages.shared.studies import Study
+from app.pages.shared.section import Checked, Repetitions, Settings, SettingsSection, StudySection
 from app.tasks.scheduler import Step
 from app.widgets.controls import Sentence
 from core import PRESETS, Flux
@@ -50,8 +49,6 @@ STACK = """
 _SBR = Number("SBR", 0.02, 0.2, log=True, least=0.0, open_below=True)
 _SBR_HELP = "Signal divided by background flux. The paper has 0.03 to 0.08."
 _ECHO = Number("Echo's bin", 20, 99, whole=True, least=0, most=99)
-_REPETITIONS = Number("Repetitions", 2, 100, log=True, whole=True, least=2)
-_REPETITIONS_HELP = "Captures of the same scene with other noise: more narrow the intervals."
 
 
 @dataclass(frozen=True)
@@ -89,18 +86,10 @@ class Weights(Checked):
 
 
 @dataclass(frozen=True)
-class Repeated(Checked):
-    """Settings of Table 2."""
-
-    repetitions: int = parameter(5, _REPETITIONS, _REPETITIONS_HELP)
-
-
-@dataclass(frozen=True)
-class RepeatedAt(Checked):
+class RepeatedAt(Repetitions):
     """Settings of Table 3."""
 
     sbr: float = parameter(0.06, _SBR, _SBR_HELP)
-    repetitions: int = parameter(5, _REPETITIONS, _REPETITIONS_HELP)
 
 
 @dataclass(frozen=True)
@@ -132,7 +121,7 @@ class Paper:
     """
 
     def __init__(self, session: Session) -> None:
-        def table_2(results: Results, _: Repeated) -> outputs.Table:
+        def table_2(results: Results, _: Repetitions) -> outputs.Table:
             return paper.table_2(results, TABLE_2_METHODS)
 
         def table_3(results: Results, settings: RepeatedAt) -> outputs.Table:
@@ -150,10 +139,10 @@ class Paper:
                     LiveFigures(session, Weights(), text.WEIGHTS, weights, count=1).view
                 ),
                 "Table 2: six SBRs": lambda: (
-                    RepeatedTable(session, Repeated(), text.TABLE_2, plan_2, table_2).view
+                    RepeatedTable(session, Repetitions(5), text.TABLE_2, plan_2, table_2).view
                 ),
                 "Table 3: all methods": lambda: (
-                    RepeatedTable(session, RepeatedAt(), text.TABLE_3, plan_3, table_3).view
+                    RepeatedTable(session, RepeatedAt(5), text.TABLE_3, plan_3, table_3).view
                 ),
                 "Figures 8, 9, 12: images": lambda: RangeImages(session).view,
                 "What the paper does not report": lambda: NotReported(session).view,
@@ -209,7 +198,7 @@ Plan = Mapping[Condition, Sequence[Method]]
 """The methods to run under each condition."""
 
 
-def plan_2(settings: Repeated) -> Plan:
+def plan_2(settings: Repetitions) -> Plan:
     """Return the plan of Table 2."""
     return dict.fromkeys(paper.NEAR.values(), TABLE_2_METHODS)
 
@@ -228,22 +217,6 @@ class PaperSection(SettingsSection[Settings]):
     def about(self) -> Subject:
         """Return what the section's files are about."""
         return Subject("paper", "", (self.settings,))
-
-
-class StudySection(PaperSection[Settings]):
-    """A section whose content is a study, started when it first comes on screen."""
-
-    def __init__(self, session: Session, settings: Settings, explanation: str, noun: str) -> None:
-        super().__init__(session, settings, explanation)
-        self.study = Study(session, self.steps, noun)
-
-    def steps(self) -> list[Step[Any]]:
-        """Return the steps of the study, from the present settings."""
-        raise NotImplementedError
-
-    def show(self, is_on_screen: bool) -> None:
-        """Come on screen, or leave it."""
-        self.study.show(is_on_screen)
 
 
 class LiveFigures(PaperSection[Settings]):
@@ -302,7 +275,7 @@ class LiveFigures(PaperSection[Settings]):
         self.shown = plots
 
 
-class RepeatedTable(StudySection[Settings]):
+class RepeatedTable(PaperSection[Settings], StudySection[Settings]):
     """A table over repetitions that is refined with each of them.
 
     Parameters
@@ -363,7 +336,7 @@ class RepeatedTable(StudySection[Settings]):
         self.shown = table
 
 
-class RangeImages(StudySection[Images]):
+class RangeImages(PaperSection[Images], StudySection[Images]):
     """Figures 8, 9 and 12.
 
     Attributes
@@ -402,7 +375,7 @@ class RangeImages(StudySection[Images]):
             self.gallery.show(pictures)
 
 
-class NotReported(StudySection[AtSBR]):
+class NotReported(PaperSection[AtSBR], StudySection[AtSBR]):
     """False alarms, dependence on the echo's bin, limits, and the paper's inconsistent sums."""
 
     def __init__(self, session: Session) -> None:

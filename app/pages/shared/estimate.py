@@ -13,7 +13,7 @@ from app.model.capture_defaults import enter, own_field_of_view_deg
 from app.model.restore import parameters_of, request_of
 from app.model.state import State
 from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute, same_view
-from app.model.text import lack
+from app.model.text import no_estimates
 from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane
@@ -98,7 +98,7 @@ class CurrentEstimate:
             self.own_field_of_view_deg = own_field_of_view_deg(answer)
             enter(self._state, answer, previous)
         with self._tasks.hold():  # one message for all consequences
-            self._failures.clear(lack(answer))
+            self._failures.clear(no_estimates(answer))
             self._end()
             self.changed.emit(answer)
 

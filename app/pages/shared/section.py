@@ -23,11 +23,11 @@ from app.pages.shared.downloads import (
     downloadable_facts,
     explored,
 )
-from app.pages.shared.studies import aside
-from app.tasks.scheduler import Latest
+from app.pages.shared.studies import Study, aside
+from app.tasks.scheduler import Step
 from app.theme import Palette, palette
 from app.widgets.controls import Facts, SettingsPanel, Table
-from core.parameters import check_fields
+from core.parameters import Number, check_fields, parameter
 
 Result = TypeVar("Result")
 
@@ -48,6 +48,18 @@ class Checked:
 
 
 Settings = TypeVar("Settings", bound=Checked)
+
+
+@dataclass(frozen=True)
+class Repetitions(Checked):
+    """How much is simulated."""
+
+    repetitions: int = parameter(
+        2,
+        Number("Repetitions", 2, 100, log=True, whole=True, least=2),
+        "Captures of the same scene with other noise, the same for all methods. More repetitions "
+        "narrow the intervals.",
+    )
 
 
 class Section:
@@ -110,7 +122,6 @@ class Section:
         work: Callable[[], Result],
         draw: Callable[[Result], None],
         failed: Callable[[Exception], None] | None = None,
-        jobs: Latest | None = None,
     ) -> None:
         """Run `work` in the background and draw its result, unless it is outdated by then."""
         session, answer = self.session, self.session.answer
@@ -121,7 +132,7 @@ class Section:
                 with session.tasks.hold():
                     draw(result)
 
-        (jobs or self._jobs).submit(work, arrived, failed or self.report_error)
+        self._jobs.submit(work, arrived, failed or self.report_error)
 
     def report_error(self, error: Exception) -> None:
         """Show an error until this section works again."""
@@ -205,3 +216,30 @@ class SettingsSection(Section, Generic[Settings]):
     def controls(self, *more: Any) -> pn.Column:
         """Return the explanation and the settings, with further controls below."""
         return aside(self._explanation, self.panel.layout, *more)
+
+
+class StudySection(SettingsSection[Settings]):
+    """A section whose content is a study in steps, started when it first comes on screen.
+
+    Parameters
+    ----------
+    session : Session
+    settings : Checked
+        Initial settings.
+    explanation : str
+        Text above the controls.
+    noun : str
+        Name of the steps.
+    """
+
+    def __init__(self, session: Session, settings: Settings, explanation: str, noun: str) -> None:
+        super().__init__(session, settings, explanation)
+        self.study = Study(session, self.steps, noun)
+
+    def steps(self) -> list[Step[Any]]:
+        """Return the steps of the study, from the present settings."""
+        raise NotImplementedError
+
+    def show(self, is_on_screen: bool) -> None:
+        """Come on screen, or leave it."""
+        self.study.show(is_on_screen)

@@ -3,33 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from app.model.store import Answer, same_subject
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
-from app.pages.shared.section import Checked, SettingsSection
+from app.pages.shared.section import Repetitions, SettingsSection
 from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import ablation_text as text
 from app.tasks.scheduler import Work
 from app.widgets.cards import part
 from app.widgets.controls import Sentence, Table
 from core import CORRECTIONS, parts_of
-from core.parameters import Number, parameter
 from core.studies.ablation import Requirement, requirements
 
 
-@dataclass(frozen=True)
-class Ablated(Checked):
-    """How much is simulated."""
-
-    repetitions: int = parameter(
-        8, Number("Repetitions", 2, 50, log=True, whole=True, least=2), text.REPETITIONS_HELP
-    )
-
-
-class AblationSection(SettingsSection[Ablated]):
+class AblationSection(SettingsSection[Repetitions]):
     """A verdict on each part and correction, with a button that switches it off or on.
 
     Parameters
@@ -45,7 +34,7 @@ class AblationSection(SettingsSection[Ablated]):
     """
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session, Ablated(), text.EXPLANATION)
+        super().__init__(session, Repetitions(8), text.EXPLANATION)
         self._found: dict[str, Requirement] = {}
         self._studied = session.answer.request
         self.study = OnePiece(session, self.work, self.draw, "parts")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 
-from core.metrics import Interval
+from app.model.text import cell, interval_cell, percent_cell
 from core.studies.ablation import NOTE, TITLES, Requirement
 
-__all__ = ["COLUMNS", "EXPLANATION", "NOTE", "REPETITIONS_HELP", "TITLE", "row", "subject"]
+__all__ = ["COLUMNS", "EXPLANATION", "NOTE", "TITLE", "row", "subject"]
 
 TITLE = "Parts and corrections: whether the model needs them."
 
@@ -16,10 +16,6 @@ EXPLANATION = """
 Each part of the scene and each correction of the likelihood is left out in turn, and the change is
 compared with what the pulses can resolve. A button switches a part off, or on again, on all pages.
 """
-
-REPETITIONS_HELP = (
-    "Captures of the scene with and without each part; a capture from a file is used as it is."
-)
 
 COLUMNS = (
     ("Part or correction", "Part of the model, and why it is needed or not.", 1),
@@ -54,23 +50,12 @@ def row(name: str, found: Requirement | None, can_switch: bool, is_off: bool) ->
     return made | {
         "note": f"{made['note']}; {found.why}".removeprefix("; "),
         "cells": [
-            [found.verdict, found.verdict, ""],
-            _cell(found.total_variation, "{:.2g}", worst),
-            _cell(found.resolvable, "{:.2g}"),
-            _cell(found.told_share, "{:.0%}"),
-            _change(found.rd_change, "{:+.4f}"),
-            _change(found.rmse_change_m, "{:+.3f}"),
-            _change(found.time_ratio, "{:.2f}"),
+            (found.verdict, found.verdict, ""),
+            cell(found.total_variation, "{:.2g}", worst),
+            cell(found.resolvable, "{:.2g}"),
+            percent_cell(found.told_share),
+            interval_cell(found.rd_change, "{:+.4f}"),
+            interval_cell(found.rmse_change_m, "{:+.3f}"),
+            interval_cell(found.time_ratio, "{:.2f}"),
         ],
     }
-
-
-def _cell(value: float, form: str, below: str = "") -> list[object]:
-    if math.isnan(value):
-        return ["–", None, below]
-    return [form.format(value).replace("%", " %"), value, below]
-
-
-def _change(found: Interval, form: str) -> list[object]:
-    below = f"{form.format(found.low)} to {form.format(found.high)}"
-    return _cell(found.value, form, "" if math.isnan(found.value) else below)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import panel as pn
@@ -11,14 +10,13 @@ import panel as pn
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
 from app.pages.shared.outputs import CurveCard, TableCard
-from app.pages.shared.section import Checked, SettingsSection
+from app.pages.shared.section import Repetitions, SettingsSection
 from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import text
 from app.pages.tradeoff.speed import affordable, source_of
 from app.tasks.scheduler import Work
 from app.widgets.cards import part
 from app.widgets.controls import Sentence
-from core.parameters import Number, parameter
 from core.studies.tradeoff import Cancelled, Simulation, acquired, acquiring_items, like
 
 CURVES = """
@@ -30,16 +28,7 @@ CURVES = """
 """
 
 
-@dataclass(frozen=True)
-class Simulated(Checked):
-    """How much is simulated."""
-
-    repetitions: int = parameter(
-        2, Number("Repetitions", 2, 50, log=True, whole=True, least=2), text.REPETITIONS_HELP
-    )
-
-
-class AcquisitionSection(SettingsSection[Simulated]):
+class AcquisitionSection(SettingsSection[Repetitions]):
     """Restoration degree against number of pulses, flux and length of the gate.
 
     Parameters
@@ -56,7 +45,7 @@ class AcquisitionSection(SettingsSection[Simulated]):
     """
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session, Simulated(), text.ACQUISITION)
+        super().__init__(session, Repetitions(), text.ACQUISITION)
         self.study = OnePiece(session, self.work, self.draw, "captures")
         self.subject = Sentence(
             text=text.NOT_SIMULATED, live=True, sizing_mode="stretch_width", margin=(4, 8)

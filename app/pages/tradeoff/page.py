@@ -16,12 +16,7 @@ WHOLE = ":host { height: auto !important; flex: none !important; }"
 
 
 class Tradeoff:
-    """The page.
-
-    Parameters
-    ----------
-    session : Session
-    """
+    """The page."""
 
     def __init__(self, session: Session) -> None:
         self._sections = Pages(

@@ -12,8 +12,7 @@ from app.model.methods import METHOD_TITLES
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject
 from app.pages.shared.outputs import CurveCard, TableCard
-from app.pages.shared.section import Checked, SettingsSection
-from app.pages.shared.studies import Study
+from app.pages.shared.section import Checked, StudySection
 from app.pages.tradeoff import text
 from app.tasks.scheduler import Step
 from app.widgets.cards import part
@@ -48,12 +47,8 @@ class Swept(Checked):
     )
 
 
-class SensitivitySection(SettingsSection[Swept]):
+class SensitivitySection(StudySection[Swept]):
     """A sweep over each numeric setting of a method; the session's capture is not used.
-
-    Parameters
-    ----------
-    session : Session
 
     Attributes
     ----------
@@ -64,10 +59,9 @@ class SensitivitySection(SettingsSection[Swept]):
     """
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session, Swept(), text.SENSITIVITY)
+        super().__init__(session, Swept(), text.SENSITIVITY, "settings")
         self.found: list[Sweep] = []
         self.cards: list[CurveCard] = []
-        self.study = Study(session, self._steps, "settings")
         self._grid = pn.Column(sizing_mode="stretch_width", margin=0)
         self._table = TableCard()
         self._table.offer(session, self.about)
@@ -81,16 +75,13 @@ class SensitivitySection(SettingsSection[Swept]):
         """Return what the section's files are about."""
         return Subject("settings swept", METHODS[self.settings.method])
 
-    def show(self, is_on_screen: bool) -> None:
-        """Come on screen, or leave it."""
-        self.study.show(is_on_screen)
-
     def change(self, settings: Swept) -> None:
         """Sweep the settings of another method."""
         super().change(settings)
         self.study.start()
 
-    def _steps(self) -> list[Step[Sweep]]:
+    def steps(self) -> list[Step[Sweep]]:
+        """Return a sweep of each setting."""
         method = METHODS[self.settings.method]
         swept = [(field, spec, default) for of, field, spec, default in numbers() if of == method]
         self.found = []

@@ -19,7 +19,7 @@ from app.model.store import Answer, Request, bare, same_capture
 from app.pages.session import Session
 from app.pages.shared.downloads import TABLE, Shown, Subject, below, looked_at
 from app.pages.shared.outputs import layers_of, spelled
-from app.pages.shared.section import Checked, SettingsSection
+from app.pages.shared.section import Checked, Repetitions, SettingsSection
 from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import text
 from app.plots import elements as plots
@@ -54,12 +54,9 @@ ANY_MERGE = "1, 2 and 4"
 
 
 @dataclass(frozen=True)
-class Effort(Checked):
+class Effort(Repetitions):
     """How much is measured."""
 
-    repetitions: int = parameter(
-        4, Number("Repetitions", 2, 50, log=True, whole=True, least=2), text.REPETITIONS_HELP
-    )
     repeats: int = parameter(
         7, Number("Timing rounds", 6, 50, log=True, whole=True, least=6), text.REPEATS_HELP
     )
@@ -109,7 +106,7 @@ class SpeedSection(SettingsSection[Effort]):
     """
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session, Effort(), text.EXPLANATION)
+        super().__init__(session, Effort(4), text.EXPLANATION)
         self.measured: list[Point] = []
         self._measured_on = session.answer.request
         self._colors = LIGHT

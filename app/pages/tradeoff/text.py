@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from app.model.methods import METHOD_TITLES
+from app.model.text import cell, interval_cell
 from core.metrics import Interval
 from core.parameters import Number
 from core.studies.tradeoff import Candidate, Point, Recommendation
@@ -13,11 +14,6 @@ SECTIONS_HELP = (
     "Speed and accuracy: computing time and accuracy of each method. Acquisition: pulses, flux and "
     "gate that a restoration degree requires. Ablation: parts of the model that the data require. "
     "Sensitivity: accuracy as a function of each setting."
-)
-
-REPETITIONS_HELP = (
-    "Captures of the same scene with other noise, the same for all methods. More repetitions "
-    "narrow the intervals."
 )
 
 # Speed and accuracy
@@ -82,26 +78,19 @@ def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
         "name": name_of(point.candidate),
         "note": note,
         "cells": [
-            _share(point.rd(3)),
-            _share(point.rd(1)),
-            _cell(point.rmse_m, "{:.3g}"),
-            _cell(point.milliseconds, "{:.3g}"),
-            [f"{point.light_ms.value:.3g}", point.light_ms.value, ""],
-            [f"{point.ns_per_pixel_bin:.3g}", point.ns_per_pixel_bin, ""],
-            [f"{point.peak_bytes / 1e6:.3g}", point.peak_bytes, ""],
+            interval_cell(_percent(point.rd(3)), "{:.2f} %"),
+            interval_cell(_percent(point.rd(1)), "{:.2f} %"),
+            interval_cell(point.rmse_m, "{:.3g}"),
+            interval_cell(point.milliseconds, "{:.3g}"),
+            cell(point.light_ms.value, "{:.3g}"),
+            cell(point.ns_per_pixel_bin, "{:.3g}"),
+            cell(point.peak_bytes / 1e6, "{:.3g}"),
         ],
     }
 
 
-def _share(found: Interval) -> list[object]:
-    percent = Interval(100 * found.value, 100 * found.low, 100 * found.high)
-    return _cell(percent, "{:.2f} %")
-
-
-def _cell(found: Interval, form: str) -> list[object]:
-    number = form.removesuffix(" %")
-    below = f"{number.format(found.low)} to {number.format(found.high)}"
-    return [form.format(found.value), found.value, below]
+def _percent(found: Interval) -> Interval:
+    return Interval(100 * found.value, 100 * found.low, 100 * found.high)
 
 
 def tip(point: Point) -> str:
