@@ -559,9 +559,11 @@ def test_every_page_saves_what_it_shows(start_page):
 
     name, table = download(start_page, "numbers", "csv")
     assert name == "car_tracking_numbers-row32-col32.csv"
+    lines = {line["quantity"]: line for line in DictReader(io.StringIO(table.decode()))}
     for each in ("RMSE", "Confidence"):
         value, unit = fact(start_page, each).inner_text().split()
-        assert f"\n{each},{value},,,{unit},".encode() in table
+        assert float(lines[each]["value"]) == pytest.approx(float(value), rel=1e-3)
+        assert lines[each]["unit"] == unit
     go("Inspect")
     expect(start_page.get_by_role("rowheader", name="1", exact=True)).to_be_visible()
     for what, suffix, name in (
@@ -573,7 +575,7 @@ def test_every_page_saves_what_it_shows(start_page):
     ):
         assert download(start_page, what, suffix)[0] == name
     go("Compare")
-    expect(start_page.get_by_text("% sure").nth(1)).to_be_visible()
+    expect(start_page.get_by_text(re.compile(r", confidence \d+ %")).nth(1)).to_be_visible()
     name, png = download(start_page, "Peak of the histogram", "png")
     assert name == "car_peak_least-confidence0_range-image.png"
     assert Image.open(io.BytesIO(png)).height > 216  # with heading and colour scale
