@@ -24,7 +24,7 @@ from playwright.sync_api import Browser, Page
 
 from app.server import patches
 from app.server.patches import OFF_VARIABLE, PATCHES
-from tests.browser import chromium, open_page, server_process, serving
+from tests.browser import VIEWS, chromium, open_page, server_process, serving
 from tests.load import opened
 from tests.wire import Wire
 
@@ -55,10 +55,9 @@ def server_costs(address: str) -> Costs:
 
     async def use() -> Costs:
         start_ms = cpu_ms(address)
-        for _ in range(OPENINGS):
-            wire, hand = await opened(address, seed=0)
-            if _ + 1 < OPENINGS:
-                wire.close()
+        for wire, _ in [await opened(address, seed=0) for _ in range(OPENINGS - 1)]:
+            wire.close()
+        wire, hand = await opened(address, seed=0)
         opened_ms = cpu_ms(address)
         n_messages, n_bytes, waits_ms = wire.n_messages, wire.n_bytes, []
         for _ in range(WIRE_STEPS):
@@ -92,7 +91,7 @@ class Meter:
         """Follow a page that has not loaded anything yet."""
         self._page = page
         self._session = page.context.new_cdp_session(page)
-        self._session.send("Performance.enable")
+        self._session.send("Performance.enable", {"timeDomain": "threadTicks"})
         page.on("websocket", self._follow)
 
     def settle(self) -> None:
@@ -134,7 +133,8 @@ def browser_costs(browser: Browser, address: str) -> Costs:
     meter = Meter(address)
     page = open_page(browser, address, watch=meter.watch)
     meter.settle()
-    opened = meter.totals()
+    start = meter.totals()
+    views = page.evaluate(f"(() => {{ {VIEWS} return views.length }})()")
     slider = page.get_by_role("slider", name="l", exact=True)
     response = page.locator("dl.timed dd").last
     responses_ms = []
@@ -149,10 +149,11 @@ def browser_costs(browser: Browser, address: str) -> Costs:
     dragged = meter.totals()
     page.close()
     return {
-        **{f"opening: {name}": value for name, value in opened.items()},
-        **{f"step: {name}": (stepped[name] - opened[name]) / BROWSER_STEPS for name in opened},
+        **{f"opening: {name}": value for name, value in start.items()},
+        **{f"step: {name}": (stepped[name] - start[name]) / BROWSER_STEPS for name in start},
         "step: response, ms": float(np.median(responses_ms)),
-        **{f"drag: {name}": (dragged[name] - stepped[name]) / DRAG_MOVES for name in opened},
+        "views": float(views),
+        **{f"drag: {name}": (dragged[name] - stepped[name]) / DRAG_MOVES for name in start},
     }
 
 

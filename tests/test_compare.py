@@ -363,7 +363,7 @@ def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all(here):
     pictures(here).focus()
     here.keyboard.press("ArrowDown")
     expect(fact(here, "Pixel")).to_have_text(f"row {row + 1}, col {col}")
-    curves = here.locator(".bk-Figure").filter(has_text="answer, own lag removed")
+    curves = here.locator(".bk-Figure").filter(has_text="estimate, own lag removed")
     hues = {method_style(place, LIGHT)[0] for place in range(5)}
     eventually(lambda: hues <= colors_of(curves))
 
@@ -398,7 +398,7 @@ def test_clouds_turn_together(here):
 @pytest.mark.browser
 def test_it_follows_the_page_into_the_dark(here):
     press(here, "Toggle theme")
-    curves = here.locator(".bk-Figure").filter(has_text="answer, own lag removed")
+    curves = here.locator(".bk-Figure").filter(has_text="estimate, own lag removed")
     eventually(lambda: {method_style(0, DARK)[0], DARK.paper} <= colors_of(curves))
 
 

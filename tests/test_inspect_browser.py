@@ -20,9 +20,8 @@ from app.pages.inspect import text
 from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
 from core.tests.captures import real_capture_path
-from tests.browser import VIEWS, eventually, fact, serving
-from tests.test_browser import chosen, enter, slider
-from tests.test_browser import image as picture
+from tests.browser import VIEWS, chosen, enter, eventually, fact, serving, slider
+from tests.browser import image as picture
 from tests.test_downloads import columns_of, download
 from tests.test_lasting import here as address_of
 from tests.test_lasting import rests

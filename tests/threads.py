@@ -1,4 +1,4 @@
-"""A page's thread in the hands of a test."""
+"""A page's thread under control of a test."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.tasks.scheduler import Act
 
 
 class HeldTasks(PageTasks):
-    """Callbacks of a page wait until the test runs them, as if it were the page's thread.
+    """Holds callbacks of a page until the test runs them.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class HeldTasks(PageTasks):
 
 
 class HeldLayout(Layout):
-    """The app without a browser, its page's thread in the hands of the test.
+    """The app without a browser, its page's thread under control of the test.
 
     Attributes
     ----------

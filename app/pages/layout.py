@@ -16,7 +16,7 @@ from app.model import text as words
 from app.model.address import Link
 from app.model.restore import parameters_of
 from app.model.script import script_of
-from app.model.state import Illumination, ReductionSettings
+from app.model.state import ReductionSettings
 from app.model.store import Answer, Request, Source
 from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
 from app.pages.catalog import PAGES
@@ -206,9 +206,10 @@ class Layout:
             sizing_mode="stretch_width",
             margin=(4, 8),
         )
-        self._light = SettingsPanel(Illumination(), partial(setattr, state, "light"))
-        self._tracking = SettingsPanel(TrackingParameters(), partial(setattr, state, "tracking"))
-        self._less = SettingsPanel(ReductionSettings(), partial(setattr, state, "less"))
+        self._panels: dict[str, SettingsPanel[Any]] = {
+            name: SettingsPanel(type(getattr(state, name))(), partial(setattr, state, name))
+            for name in ("light", "tracking", "less")
+        }
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
@@ -218,7 +219,7 @@ class Layout:
         self._reading = {
             name: pmui.TextInput(
                 label=option.label,
-                description=f"{option.label}: {option.help}",
+                description=option.help,
                 placeholder="guess",
                 size="small",
                 sizing_mode="stretch_width",
@@ -241,7 +242,7 @@ class Layout:
         """Make the parts of the sidebar that pages share; `_show_answer` shows one of the first."""
         read_again = pmui.Button(label="Read again", size="small", margin=(6, 8))
         read_again.on_click(lambda _: self._read_again())
-        self._light_part = part("Simulation", self._light.layout, is_shown=False)
+        self._light_part = part("Simulation", self._panels["light"].layout, is_shown=False)
         self._reading_part = part(
             "Reading options",
             *self._reading.values(),
@@ -249,10 +250,11 @@ class Layout:
             is_open=self.session.answer.request.reading != ReadOptions(),
             is_shown=False,
         )
+        tracking = self._panels["tracking"]
         self._shared = {
             Shared.UNIT: unit,
-            Shared.TRACKING: part("Tracking differentiator", self._preset, self._tracking.layout),
-            Shared.REDUCTION: part("Data reduction", self._less.layout, is_open=False),
+            Shared.TRACKING: part("Tracking differentiator", self._preset, tracking.layout),
+            Shared.REDUCTION: part("Data reduction", self._panels["less"].layout, is_open=False),
         }
 
     def _template(self) -> Template:
@@ -302,7 +304,9 @@ class Layout:
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._file.param.watch(lambda event: self._upload(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
-        state.param.watch(lambda *_: self._show_settings(), ["light", "tracking"])
+        state.param.watch(
+            lambda *_: self._show_settings("light", "tracking"), ["light", "tracking"]
+        )
         self.pages.choice.link(state, value="page", bidirectional=True)
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
         self._fit_sidebar()
@@ -334,16 +338,17 @@ class Layout:
                 field.value = answer.request.reading.as_text(name)
         self._light_part.visible, self._reading_part.visible = is_scene, not is_scene
         self._provenance.text = words.provenance(answer)[:2000]
-        self._less.show(self.session.state.less)
         self._show_settings()
-        self._tracking.controls["t_n"].high = max(answer.capture.acquisition.n_bins - 1, 1)
+        self._panels["tracking"].controls["t_n"].high = max(
+            answer.capture.acquisition.n_bins - 1, 1
+        )
         self.pages.follow(answer)
 
-    def _show_settings(self) -> None:
-        """Show settings that were changed by a page or a preset."""
+    def _show_settings(self, *names: str) -> None:
+        """Show settings that were changed by a page, a preset or an estimate; all by default."""
         state = self.session.state
-        self._light.show(state.light)
-        self._tracking.show(state.tracking)
+        for name in names or self._panels:
+            self._panels[name].show(getattr(state, name))
         self._preset.value = _preset_of(state.tracking)
 
     # Actions of the user

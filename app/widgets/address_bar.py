@@ -55,7 +55,6 @@ class AddressBar(Component):
             ``call_later`` and ``run_next`` of `app.tasks.page.PageTasks`.
         """
         changes = 0
-        is_waiting = False
 
         def write() -> None:
             self.query = query()
@@ -63,20 +62,10 @@ class AddressBar(Component):
         def changed(*_events: Any) -> None:
             nonlocal changes
             changes += 1
-            if not is_waiting:
-                check_later()
-
-        def check_later() -> None:
-            nonlocal is_waiting
-            is_waiting = True
             wait(REST_MS, partial(check, changes))
 
         def check(seen: int) -> None:
-            nonlocal is_waiting
-            if seen != changes:
-                check_later()
-            else:
-                is_waiting = False
+            if seen == changes:
                 run_on_page(write)
 
         write()

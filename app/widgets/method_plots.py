@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.model.methods import METHOD_TITLES
 from app.plots import elements as plots
-from app.plots.gate import GateAxes
+from app.plots.gate_axes import GateAxes
 from app.theme import LIGHT, Palette
 from app.widgets.figures import Plot, paint_frame, pane_of
 from core import Acquisition

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.model.store import Pixel
 from app.plots import elements as plots
-from app.plots.gate import GateAxes, GateReadOut
+from app.plots.gate_axes import GateAxes, GateReadOut
 from app.theme import LIGHT, Palette
 from app.widgets.figures import Plot, cover, pane_of, round_up
 from core import Acquisition

@@ -38,16 +38,8 @@ def zarr_files(dataset: Any, version: int, **encoding: Any) -> dict[str, bytes]:
         dataset.to_zarr(
             folder, zarr_format=version, consolidated=False, encoding={"counts": encoding}
         )
-        return files_of(Path(folder))
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    """The files of a directory by their paths in it."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+        files = sorted(file for file in Path(folder).rglob("*") if file.is_file())
+        return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
 
 
 class Matlab73:

@@ -538,7 +538,7 @@ def test_las_is_of_version_1_4(tmp_path: Path, suffix: str, compressed: int) -> 
     assert header[:4] == b"LASF"
     assert header[24:26] == bytes([1, 4])
     assert header[104] == 6 | compressed
-    assert struct.unpack_from("<H", header, 6)[0] & 16  # coordinates would be told as WKT
+    assert struct.unpack_from("<H", header, 6)[0] & 16  # coordinate systems are WKT
     assert struct.unpack_from("<Q", header, 247)[0] == VALID.sum()
     scales = struct.unpack_from("<3d", header, 131)
     assert all(STEP_M / 10 < scale <= STEP_M for scale in scales)

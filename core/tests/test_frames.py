@@ -69,15 +69,6 @@ def test_frames_are_first_photons(write: Write) -> None:
     )
 
 
-def test_bins_count_backwards_from_a_common_stop(write: Write) -> None:
-    backwards = np.where(FRAMES >= 0, 99 - FRAMES, -1)
-    capture = read_capture(
-        write("b.npy", npy_bytes(backwards)), no_trigger=-1, stop_s=1.1e-6, n_bins=100
-    )
-    np.testing.assert_array_equal(capture.cube, CUBE)
-    assert capture.acquisition.gate_delay_s == pytest.approx(1e-6, rel=1e-12)
-
-
 def test_many_pulses_widen_the_cube(write: Write) -> None:
     stack = np.zeros((70_000, 1, 1), np.uint8)
     capture = read_capture(write("m.npy", npy_bytes(stack)), no_trigger=255)

@@ -75,13 +75,6 @@ def test_shape_and_order_of_the_pixels(save: Save, write: Write) -> None:
         read_capture(path, shape=(3, 4), axes="row col bin")
 
 
-def test_common_stop(save: Save, write: Write) -> None:
-    path = write(save(spad=list_of(SQUARE[:, :, ::-1])))
-    capture = read_capture(path, stop_s=1e-6)
-    np.testing.assert_array_equal(capture.cube, SQUARE)
-    assert capture.acquisition.gate_delay_s == pytest.approx(1e-6 - 64e-9)
-
-
 @pytest.mark.parametrize(
     ("value", "message"), [(-1.0, "= -1.0"), (0.5, "= 0.5"), (np.nan, "= nan")]
 )
@@ -264,10 +257,3 @@ def test_cells_refused(
     with pytest.raises(CaptureError, match=message) as caught:
         read_capture(write(cell_with(change)))
     assert str(caught.value).startswith("a.mat: ")
-
-
-def test_cells_must_fit(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(matlab73(Ts=cells_of([np.ones(900), np.ones(900)], (1, 2))))
-    monkeypatch.setattr(guards, "MAX_CUBE_BYTES", 64 * 1000)
-    with pytest.raises(CaptureError, match=r"Ts in pixel \(0, 1\) = 900 photons, too many"):
-        read_capture(path)

@@ -303,7 +303,7 @@ def test_edges_see_two_surfaces_apart_by_area() -> None:
     scene, coarse = scenes["edges"](), scenes["building"]()
     other = scene.second_surface
     assert other is not None
-    share = other.seen_share
+    share = other.effective_share
     assert 0.05 < (share > 0).mean() < 0.5
     assert share.max() <= 0.5
     apart_m = np.abs(other.range_m - scene.range_m)[share > 0]

@@ -259,7 +259,7 @@ def test_impossible_seeds_are_refused(seed: int) -> None:
 
 
 def test_an_unknown_number_of_pulses_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"n_pulses = None .*number of pulses to simulate"):
+    with pytest.raises(ValueError, match=r"n_pulses = None .*give the number of pulses"):
         simulate(wall(1), Acquisition(n_pulses=None), Flux())
 
 

@@ -48,7 +48,7 @@ class Accuracy:
     within: tuple[metrics.Interval, ...]
     """Share of target pixels within each of `TOLERANCES_BINS`, with its 95 % Wilson interval;
     empty without targets."""
-    detection: metrics.Detection | None
+    detection: metrics.DetectionRates | None
     """None where every pixel has a target."""
     confidence: Array
     """Mean confidence of each tenth with enough pixels."""

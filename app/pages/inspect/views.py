@@ -23,7 +23,7 @@ from app.pages.inspect.results import Corners, Inspected
 from app.pages.shared.outputs import layers_of
 from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
-from app.plots.gate import GateAxes, GateReadOut
+from app.plots.gate_axes import GateAxes, GateReadOut
 from app.theme import Palette
 from app.widgets.figures import Layers, cover, paint_frame, pane_of, round_up
 from app.widgets.image_view import ImageView

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import panel as pn
@@ -36,6 +36,8 @@ from app.widgets.figures import Layers, paint_frame, pane_of, round_up
 from app.widgets.method_picture import ScaleBar
 from core.parameters import Number
 from core.studies import outputs as items
+
+Item = TypeVar("Item", items.Plot, items.Table, items.Pictures)
 
 GRID = """
 :host { display: grid !important; gap: 8px; width: 100%;
@@ -76,9 +78,8 @@ class CurveCard:
         """Add a download button."""
 
         def show() -> Shown:
-            if self._item is None:
-                raise ValueError(NOTHING_DRAWN)
-            return Shown(subject(), self._item.key, {"csv": plot_file(self.figure)})
+            item = _required(self._item)
+            return Shown(subject(), item.key, {"csv": plot_file(self.figure)})
 
         downloadable(self.card, session, "curves", show, PLOT)
 
@@ -155,9 +156,8 @@ class TableCard:
         """Add a download button."""
 
         def show() -> Shown:
-            if self._item is None:
-                raise ValueError(NOTHING_DRAWN)
-            return Shown(subject(), self._item.key, {"csv": table_file(self._item)})
+            item = _required(self._item)
+            return Shown(subject(), item.key, {"csv": table_file(item)})
 
         downloadable(self.layout, session, "table", show, TABLE)
 
@@ -199,9 +199,7 @@ class Gallery:
         self, session: Session, subject: Callable[[], Subject], pane: Any, name: str
     ) -> pn.Column:
         def show() -> Shown:
-            item = self._item
-            if item is None:
-                raise ValueError(NOTHING_DRAWN)
+            item = _required(self._item)
             look = _look(item)
             files = {"csv": image_file(item.images[name], look, pane.object, Grid())}
             return Shown(subject(), f"{item.key} {name}", files, scale=look)
@@ -265,6 +263,12 @@ class Gallery:
             for layer in ("shadow", "frame"):
                 drawn.write(layer, **{side: [at] for side, at in sides.items()})
             drawn.figure.title.text = f"{spelled(name)}: {text}"
+
+
+def _required(item: Item | None) -> Item:
+    if item is None:
+        raise ValueError(NOTHING_DRAWN)
+    return item
 
 
 def layers_of(drawing: Any) -> Layers:

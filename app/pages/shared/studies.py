@@ -12,6 +12,7 @@ import panel_material_ui as pmui
 from app.model.text import progress, unfinished
 from app.pages.session import Session
 from app.tasks.scheduler import Step, Work
+from app.widgets.cards import button
 from app.widgets.controls import Sentence
 
 Result = TypeVar("Result")
@@ -39,21 +40,15 @@ class _ControlledWork:
         self._session, self._noun = session, noun
         fail = partial(session.failures.report, describe=unfinished, part=self)
         self._work = session.tasks.long_work(self._show_progress, fail)
-        self._start = pmui.Button(label=label, description=help, size="small", margin=(6, 4, 6, 8))
-        self._cancel = pmui.Button(
-            label="Cancel",
-            description="Cancel: stops the work and keeps its results so far.",
-            variant="outlined",
-            size="small",
-            disabled=True,
-            margin=(6, 4),
-        )
+        self._start = button(label, help, self.start, margin=(6, 4, 6, 8))
+        self._start.variant = "contained"
+        cancel_help = "Cancel: stops the work and keeps its results so far."
+        self._cancel = button("Cancel", cancel_help, self.cancel, margin=(6, 4))
+        self._cancel.disabled = True
         self._bar = pmui.LinearProgress(
             variant="determinate", value=0, sizing_mode="stretch_width", margin=(4, 8)
         )
         self._sentence = Sentence(sizing_mode="stretch_width", margin=(0, 8, 8, 8))
-        self._start.on_click(lambda _: self.start())
-        self._cancel.on_click(lambda _: self.cancel())
 
     @property
     def controls(self) -> list[Any]:

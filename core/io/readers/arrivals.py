@@ -1,27 +1,27 @@
-"""Photon arrival times to a histogram cube, with a guess at whatever is not given.
+"""Histogram cubes from photon arrival times; settings that are not given are guessed.
 
-The time unit. Whole numbers, the largest above 100,000: picoseconds. Fractions, all below 0.001:
-seconds. Other whole numbers: bins of the instrument, 8 ps as in published captures. Other fractions
-are refused, since microseconds and nanoseconds cannot be distinguished.
+Time unit. Whole numbers of which the largest exceeds 100,000 are picoseconds; other whole numbers
+are bins of the instrument, 8 ps as in published captures. Fractions below 0.001 are seconds. Other
+fractions are refused, since microseconds and nanoseconds cannot be distinguished.
 
-The bin width. 1 ns (the nearest multiple of the unit) if that gives 100 to 65,536 bins from the
-gate's opening to the last photon; else the smallest power-of-two multiple of the unit that gives at
-most 1024 bins for a shorter gate, at most 65,536 for a longer one. Where ``n_bins`` is given both
-must fit in it. A multiple of the unit, because any other width would hold more units in one bin
-than in the next. Times that are fractions have 1 ps for a unit here.
+Bin width. 1 ns (the nearest multiple of the unit) if that gives 100 to 65,536 bins from the opening
+of the gate to the last photon. Otherwise the smallest power-of-two multiple of the unit that gives
+at most 1024 bins for a shorter gate, at most 65,536 for a longer one. Both must fit in ``n_bins``
+where it is given. The width is a multiple of the unit, since otherwise some bins would hold more
+units than others; for fractions the unit is 1 ps here.
 
-The gate. From the first photon, rounded down to a multiple of the bin width, to the last. All
-photons count, however far from the others, as long as the gate has no more than 65,536 bins of
-1 ns, 10 km (of ``bin_width_s`` where that is longer; ``n_bins`` where that is more). If it would
-have more, the stretch of that length with the most photons is found. The gate covers only this
-stretch if it holds at least nine in ten of all photons; the others are dropped, and the source
-gives their number. Otherwise the gate covers all photons, in wider bins.
+Gate. From the first photon, rounded down to a multiple of the bin width, to the last. All photons
+count as long as the gate has at most 65,536 bins of 1 ns, 10 km (of ``bin_width_s`` where that is
+longer; ``n_bins`` where that is more). For a longer gate, the stretch of that length with the most
+photons is found. If it holds at least nine tenths of all photons, the gate covers only this
+stretch, and the source gives the number of dropped photons. Otherwise the gate covers all photons,
+in wider bins.
 
-The pulse. A Gaussian as wide as `core.io.readers.pulse_guess` finds the echoes, or of one bin
-width. The number of pulses stays unknown.
+Pulse. A Gaussian of the width that `core.io.readers.pulse_guess` estimates, or of one bin. The
+number of pulses stays unknown.
 
-A common-stop instrument's times count backwards from ``stop_s``; a time in whole units stands for
-all of its unit, so the last one before the stop becomes the first after the pulse.
+Times of a common-stop instrument count backwards from ``stop_s``. A time in whole units covers all
+of its unit, so the last one before the stop becomes the first after the pulse.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.acquisition import LONGEST_S, MOST_BINS, Floats
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import capture_of, count_dtype, described
+from core.io.readers.dense import capture_of, count_dtype, description_of
 from core.io.readers.guards import require_fits
 from core.io.readers.options import ReadOptions
 from core.io.readers.times import time_text
@@ -112,7 +112,7 @@ def arrivals_capture(
     require(name, f"photons from {found}", n_dropped < inside.size, remedy)
     cube = _cube(bins[inside].astype(np.int64), pixel[inside], shape, n_bins, name)
     dropped = f"dropped: {n_dropped:,} of {inside.size:,} photons, outside the gate"
-    known = described(
+    known = description_of(
         request,
         n_bins,
         lambda: cube,

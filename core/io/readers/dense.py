@@ -37,7 +37,7 @@ class Description(NamedTuple):
     source: str
 
 
-def described(
+def description_of(
     request: ReadOptions,
     n_bins: int,
     sample: Callable[[], Counts],
@@ -149,7 +149,7 @@ def dense_capture(
 ) -> Capture:
     """Build a capture from counts (row, col, bin), which are reversed for a common stop.
 
-    Parameters are those of `described`.
+    Parameters are those of `description_of`.
     """
     n_bins = counts.shape[2]
     require_sums(counts.shape)
@@ -162,7 +162,7 @@ def dense_capture(
     opens_s = 0.0
     if request.stop_s is not None:
         counts, opens_s = counts[:, :, ::-1].copy(), request.stop_s - n_bins * bin_width_s
-    known = described(
+    known = description_of(
         replace(request, n_bins=n_bins),
         n_bins,
         lambda: counts,

@@ -32,7 +32,7 @@ MOST_REPLY_CHARACTERS = 2**24
 IDLE_SECONDS = 60
 _NETCDF_ATTRIBUTES = ("CLASS", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_NCProperties")
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
-_ZARR_METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs")
+_ZARR_MARKS = ("zarr.json", ".zarray", ".zgroup")
 _ZARR_CODECS = {"zlib", "gzip", "zstd", "blosc", "shuffle", "fletcher32", "crc32c", "delta", "lz4"}
 _DEPTH_MODES = ("I;16", "I;16L", "I;16B", "I;16N", "F")
 
@@ -41,11 +41,11 @@ Reply = tuple[dict[str, Any], list[Any]]
 
 
 class Refused(ValueError):
-    """The file is refused; the message is a sentence for the user."""
+    """Refusal of a file; the message is a sentence for the user."""
 
 
 def require(name: str, value: object, accepted: bool, what: str) -> None:
-    """Refuse a value in the words of `core.checks.require`."""
+    """Refuse a value with the message of `core.checks.require`."""
     if not accepted:
         raise Refused(f"{name} = {value!r} is not accepted: give {what}.")
 
@@ -238,7 +238,9 @@ def _vector(array: Any, most: int) -> Any:
     if n_values != max(shape, default=1):
         raise ValueError(f"array of shape {shape[::-1]} is not accepted: give a vector.")
     if n_values > most:
-        raise ValueError(f"{n_values:,} photons, too many with those before: give fewer.")
+        raise ValueError(
+            f"{n_values:,} photons is not accepted: give {most:,}, the rest of the limit."
+        )
     values = np.empty(n_values, dtype)
     if n_values:
         array.read(h5py.h5s.ALL, h5py.h5s.ALL, values.reshape(shape))
@@ -283,13 +285,14 @@ def list_zarr(path: str) -> Reply:
         return place.relative_to(root).as_posix(), status.st_size, status.st_mtime_ns
 
     for folder, files in _walk_zarr(root):
-        described = [folder / name for name in _ZARR_METADATA if name in files]
+        described = [folder / name for name in _ZARR_MARKS if name in files]
         inside = folder.relative_to(root).as_posix().removeprefix(".")
         if not described:
             if arrays and folder.is_relative_to(root / arrays[-1]["folders"][0][0]):
                 arrays[-1]["folders"].append(version(folder))
             continue
-        n_bytes += sum(file.stat().st_size for file in described)
+        metadata = [folder / name for name in (*_ZARR_MARKS, ".zattrs") if name in files]
+        n_bytes += sum(file.stat().st_size for file in metadata)
         most = f"up to {MOST_METADATA_BYTES:,}"
         require("bytes of metadata", n_bytes, n_bytes <= MOST_METADATA_BYTES, most)
         mixed = "zarr.json" in files and bool(files & {".zarray", ".zgroup"})
@@ -362,7 +365,7 @@ def _missing(array: Any, known: dict[str, Any]) -> dict[str, float]:
 
 
 def read_zarr(path: str, name: str, box: list[list[int]]) -> Reply:
-    """Read the numbers in a box of the array in a folder; tell whether a chunk is absent."""
+    """Read the numbers in a box of the array in a folder, and whether a chunk is absent."""
     folder = Path(path) / name if (Path(path) / name).is_dir() else Path(path)
     array = _open_zarr(folder)
     found = np.asarray(array[_slices(box)])
@@ -553,7 +556,7 @@ def read_mesh(path: str, suffix: str, most_faces: int) -> Reply:
     """Read vertices (vertex, 3) and faces (face, 3) of all parts of a mesh, each in its place."""
     import trimesh  # noqa: PLC0415
 
-    # From memory and without a resolver of names, a loader cannot reach another file.
+    # From memory and without a resolver of names, a loader cannot open another file.
     data = Path(path).read_bytes()
     if b"\0" not in data:  # text: do not guess its encoding
         data = data.decode(errors="replace").encode()

@@ -1,8 +1,8 @@
 """Raw frames of a Geiger-mode camera: for each pulse and pixel the bin that triggered, or none.
 
 Frames are counted as they are read, a stretch of the file at a time. So only the cube must fit in
-`core.io.readers.guards.MAX_CUBE_BYTES`, never the frames: besides the cube, and a second one while
-the number of bins is still being found, a stretch of `STRETCH` values takes some 40 bytes for each.
+`core.io.readers.guards.MAX_CUBE_BYTES`, never the frames: in addition to the cube, and a second one
+while the number of bins is still unknown, a stretch of `STRETCH` values takes 40 bytes for each.
 
 Each frame is one pulse, and each pixel triggers once in it or never: these are first photons, as
 many pulses as frames. Without ``n_bins`` the gate ends with the last trigger, which may lie in one

@@ -43,18 +43,18 @@ WORKER = Path(__file__).with_name("file_worker.py")
 _MOST_REPLY_BYTES = 2**27
 
 Reply = tuple[dict[str, Any], list[NDArray[Any]]]
-"""A description and arrays."""
+"""Description and arrays."""
 
 _idle: list[_Process] = []
 _lock = Lock()
 
 
 class _Ended(Exception):
-    """A process ended in place of a reply."""
+    """The process ended without a reply."""
 
 
 class _Process:
-    """A process that reads files."""
+    """Process that reads files."""
 
     def __init__(self) -> None:
         # No BLAS threads, which reserve memory; no plugins that a file may name.

@@ -31,7 +31,7 @@ from core.io.readers.dense import (
     AXES,
     Description,
     capture_of,
-    described,
+    description_of,
     require_sums,
     stored_counts,
     whole_counts,
@@ -57,7 +57,7 @@ NAMES = {
     "col": ("col", "cols", "column", "columns", "x", "pixel"),
     "bin": ("bin", "bins", "time", "time_s", "t", "tof", "delay", "range", "range_m", "h"),
 }
-"""Names by which each axis is known, in small letters."""
+"""Accepted names of each axis, in lower case."""
 
 _SECONDS = {"": "s", "milli": "ms", "micro": "us", "nano": "ns", "pico": "ps"}
 UNITS_S = TIME_UNITS_S | {
@@ -65,7 +65,7 @@ UNITS_S = TIME_UNITS_S | {
 }
 UNITS_S |= dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 2 / SPEED_OF_LIGHT_M_S)
 UNITS_S["km"] = 1e3 * UNITS_S["m"]
-"""Seconds of the light's way there and back, for each unit of a coordinate along the bins."""
+"""Seconds (two-way, for lengths) of each unit of a coordinate along the bins."""
 
 BLOCK_BYTES = 2**24
 """Approximate size of a block of an array that is opened lazily."""
@@ -78,7 +78,7 @@ _ENCODING = (*_MISSING, "scale_factor", "add_offset", "coordinates", "_ARRAY_DIM
 
 @dataclass(frozen=True)
 class CheckedCounts:
-    """An array of a file as counts, checked as they are read.
+    """Counts in a file, checked as they are read.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class CheckedCounts:
 
     @property
     def dtype(self) -> np.dtype[np.unsignedinteger]:
-        """The file's own where it is one for counts, uint32 elsewhere."""
+        """Type in the file where it is one for counts, else uint32."""
         stored = self.stored.dtype.newbyteorder("=")
         return stored if stored in COUNT_TYPES else np.dtype(np.uint32)
 
@@ -137,7 +137,7 @@ def _box(key: int | slice, size: int) -> tuple[slice, int | slice]:
 
 
 class _File:
-    """The counts that a user chooses from a file, and the arrays that accompany them."""
+    """Counts that the user chooses from a file, and the arrays that accompany them."""
 
     def __init__(self, path: Path, request: ReadOptions) -> None:
         self._arrays, self._groups = arrays(path)
@@ -397,7 +397,7 @@ def describe(
         what = f"None: bins open {known.gate_delay_s} s after a pulse"
         require("stop_s", stop_s, known.gate_delay_s is None, what)
         known = replace(known, gate_delay_s=stop_s - n_bins * (known.bin_width_s or 1e-9))
-    found = described(
+    found = description_of(
         replace(known, n_bins=n_bins),
         n_bins,
         lambda: sample_of(counts.data),  # in memory or not: both lead to the same guess

@@ -1,9 +1,13 @@
 """MATLAB ``.mat`` of version 5 (saved with ``-v6`` or ``-v7``) and 7.3 (``-v7.3``, HDF5).
 
 Either a cell array (row, col) holding each pixel's photon arrival times as a vector, or a cube
-(row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts as in `core.io.readers.sparse`.
-The file may have other variables if only one fits; a number named like ``bin_width`` or
-``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
+(row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts, as published simulated
+captures are stored. The file may have other variables if only one fits; a number named like
+``bin_width`` or ``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
+
+The pixels of a sparse matrix follow each other column by column, as MATLAB's ``reshape`` lists
+them, or row by row with ``axes="row col"``. Rows and columns come from ``shape``; without it the
+image is guessed to be square.
 
 SciPy and h5py read the variables in an isolated process (`core.io.readers.isolation`). In version
 7.3 the axes are reversed, a cell array is an array of references, and a sparse matrix a group of
@@ -13,6 +17,8 @@ three arrays.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from math import isqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,11 +29,10 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers import guards
 from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
-from core.io.readers.dense import cube_capture
+from core.io.readers.dense import LARGEST_COUNT, count_dtype, cube_capture, dense_capture
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
 from core.io.readers.options import ReadOptions
-from core.io.readers.sparse import Sparse, sparse_capture
 from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
 
 _USER_BLOCK = 512  # before the HDF5 of version 7.3
@@ -40,7 +45,7 @@ _SHORTEST_S, _LONGEST_S = 1e-13, 1e-6
 
 
 class Variable(NamedTuple):
-    """A variable of a file.
+    """Variable of a file.
 
     ``shape`` is MATLAB's, ``kind`` the class of its elements, or ``"sparse"``; ``parts`` are its
     arrays in version 7.3.
@@ -69,7 +74,7 @@ class Variable(NamedTuple):
 
 
 class _Version5:
-    """The variables of a file of version 5."""
+    """Variables of a file of version 5."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._version = path, FileVersion.of(path)
@@ -101,7 +106,7 @@ class _Version5:
 
 
 class _Version73:
-    """The variables of a file of version 7.3."""
+    """Variables of a file of version 7.3."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -177,9 +182,8 @@ def read(path: Path, request: ReadOptions) -> Capture:
         float(file.array(one).item()) for one in file.variables if one.may_be_bin_width
     )
     if variable.kind == "sparse":
-        values, rows, starts = file.sparse(variable)
-        matrix = Sparse(values, rows, starts, (variable.shape[0], variable.shape[1]))
-        return sparse_capture(matrix, name, origin, request, width_s)
+        parts = file.sparse(variable)
+        return _sparse_capture(parts, variable.shape, name, origin, request, width_s)
     return cube_capture(file.array(variable), name, origin, request, bin_width_s=width_s)
 
 
@@ -203,3 +207,59 @@ def _bin_width(values: Iterable[float]) -> float | None:
     """Return the one number that can be the width of a bin in seconds; None if not just one."""
     found = {value for value in values if _SHORTEST_S <= value <= _LONGEST_S}
     return found.pop() if len(found) == 1 else None
+
+
+def _sparse_capture(
+    parts: list[NDArray[Any]],
+    shape: tuple[int, ...],
+    name: str,
+    origin: str,
+    request: ReadOptions,
+    bin_width_s: float | None,
+) -> Capture:
+    """Return a capture from a sparse matrix (pixel, bin) of counts.
+
+    Its `parts` are the values column by column, the row of each, and the start of each column,
+    followed by the end of the last one.
+    """
+    n_pixels, n_bins = shape
+    by_row = request.order(("row", "col")) == (0, 1)
+    side = isqrt(n_pixels)
+    rows, cols = request.shape or (side, side)
+    accepted = f"rows and columns of {n_pixels} pixels in all"
+    require("shape", request.shape, rows * cols == n_pixels, accepted)
+    guessed = [] if request.shape else [f"shape {rows} x {cols}"]
+    guessed += [] if request.axes else ["pixels column by column"]
+    pixel, bins, counts = _entries(parts, n_pixels, n_bins, name)
+    if not by_row:
+        col, row = np.divmod(pixel, rows)
+        pixel = row * cols + col
+    dtype = count_dtype(int(counts.max(initial=0)))
+    require_fits(f"the cube of {name}", n_pixels * n_bins * dtype.itemsize)
+    cube = np.zeros((n_pixels, n_bins), dtype)
+    cube[pixel, bins] = counts
+    known = replace(request, shape=None, axes=None)
+    cube = cube.reshape(rows, cols, n_bins)
+    return dense_capture(cube, origin, known, guessed=guessed, bin_width_s=bin_width_s)
+
+
+def _entries(
+    parts: list[NDArray[Any]], n_rows: int, n_cols: int, name: str
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return row, column and value of each entry of a sparse matrix after checking them."""
+    values, rows, starts = parts[0], parts[1], parts[2].astype(np.int64)
+    n_found = len(starts) - 1
+    require(f"columns of {name}", n_found, n_found == n_cols, f"{n_cols}, as its shape says")
+    steps: NDArray[np.int64] = np.diff(starts)
+    n_entries, most = int(starts[-1]), min(len(values), len(rows))
+    rising = starts[0] == 0 and bool((steps >= 0).all()) and n_entries <= most
+    require(f"entries of {name}", n_entries, rising, f"columns one after the other, up to {most}")
+    values, row = values[:n_entries], rows[:n_entries].astype(np.int64)
+    col = np.repeat(np.arange(n_cols), steps)
+    inside = bool(((row >= 0) & (row < n_rows)).all())
+    once = bool((np.diff(col * n_rows + row) > 0).all())
+    require(f"rows of {name}", "out of order", inside and once, f"rising ones below {n_rows}")
+    odd = ~((values >= 0) & (values <= LARGEST_COUNT) & (values == np.floor(values)))
+    if odd.any():
+        require(name, values[odd][0].item(), False, f"whole counts from 0 to {LARGEST_COUNT:,}")
+    return row, col, values.astype(np.int64)

@@ -45,7 +45,7 @@ def frames_in(file: IO[bytes], size: int, name: str, origin: str, request: ReadO
 
 
 def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
-    """Read one array from a seekable file of `size` bytes, after its header proved true.
+    """Read one array from a seekable file of `size` bytes, after checking its header.
 
     Raises
     ------

@@ -168,7 +168,7 @@ def _array(archive: ZipFile, name: str) -> NDArray[Any]:
 
 
 def _opened(archive: ZipFile, name: str, *, may_be_large: bool = False) -> IO[bytes]:
-    """Open an array, once its size and compression proved harmless.
+    """Open an array after checking its size and compression.
 
     What is stored as it is can be no larger than the archive; a few bytes may unpack to any size.
     """

@@ -95,7 +95,7 @@ def _positive(tags: Mapping[str, Any], name: str) -> float:
 
 
 def _require_image(tags: Mapping[str, Any], size: int, n_bins: int) -> tuple[int, int]:
-    """Return rows and columns, once the header proved that of an image no larger than its file."""
+    """Return rows and columns of a header that describes an image no larger than its file."""
     found = {"ImgHdr_Dimensions": 3, "ImgHdr_Frame": 3, **tags}  # these may be missing
     for name, (lowest, highest, what) in _ACCEPTED.items():
         value = found.get(name)

@@ -3,8 +3,8 @@
 A file holds one block or several, one for each detector or measurement; ``variable`` picks one,
 such as ``"block 0"``. A block is an image (row, col, bin), or curves of one pixel each, which make
 an image of one row; the images of several routing channels in one block are summed. The bin's width
-follows from the measurement's TAC range and gain. The gate opens with the pulse by
-default. All photons of a pulse count.
+follows from the measurement's TAC range and gain. The gate opens with the pulse by default.
+All photons of a pulse count.
 
 `sdtfile` reads the blocks in an isolated process (`core.io.readers.isolation`).
 """

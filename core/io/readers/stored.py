@@ -23,7 +23,7 @@ from core.io.readers.options import ReadOptions
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 CLASSIC_SIGNATURES = (b"CDF\x01", b"CDF\x02")
 ZARR_MARKS = ("zarr.json", ".zarray", ".zgroup")
-"""Names of files, one of which a Zarr directory contains."""
+"""File names, one of which a Zarr directory contains."""
 
 _SMALL_CHUNK = 2**24  # bytes, however small the array
 _MOST_CHUNKS = 2**24  # of one array
@@ -31,7 +31,7 @@ _MOST_CHUNKS = 2**24  # of one array
 
 @dataclass(frozen=True)
 class Stored:
-    """An array in a file.
+    """Array in a file.
 
     Parameters
     ----------

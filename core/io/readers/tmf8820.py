@@ -6,24 +6,26 @@ The file is a list of records, each one measurement of all zones:
 field                shape           meaning
 ===================  ==============  ==============================================================
 ``hists``            (zone, bin)     counts; the only field that must be there
-``reference_hist``   (bin,)          the pulse, as a detector inside of the sensor sees it; all of
-                                     the records have it, or none
+``reference_hist``   (bin,)          the pulse, recorded by a detector inside the sensor; in all
+                                     records or in none
 ``dist_to_plane``    number          distance in metres of the plane in front; null: not known
 ===================  ==============  ==============================================================
 
-Other fields are left alone. The capture is the image (record, zone): one row for each measurement.
-``variable="record 17"`` takes that one alone, its zones as the square that they see.
+Other fields are ignored. The capture is the image (record, zone): one row for each measurement.
+``variable="record 17"`` reads that record alone, its zones arranged as a square.
 
 Defaults: a bin is 91 ps. The pulse is the sum of the reference histograms from the first bin
 that reaches a hundredth of the highest; that bin is its time zero. An echo from 0 m has its peak
 1.1 ns after the histogram begins (both times are those published with the data), so the gate opens
-as much before the pulse, less the time from the pulse's zero to its peak. All photons of a pulse
+1.1 ns minus the time from the pulse's zero to its peak before the pulse. All photons of a pulse
 count.
 
-The truth is the distance of the plane for every zone. Zones next to the middle one see it at an
-angle, up to 3 % further away. In the published records, ranges of the middle zone come out 6 mm too
-far (1.14 ns would fit) and those of the others 0 to 21 mm: each zone has its own delay. The
-sensor's clock is not corrected.
+The truth is the distance of the plane for every zone. The lines of sight of the outer zones are
+oblique, so that their ranges are up to 3 % longer. In the published records, ranges of the middle
+zone are 6 mm too long (1.14 ns would fit) and those of the others 0 to 21 mm: each zone has its own
+delay. The sensor's clock is not corrected.
+
+The records are parsed in an isolated process (`core.io.readers.isolation`).
 """
 
 from __future__ import annotations

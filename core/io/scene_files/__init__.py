@@ -27,7 +27,7 @@ _N_PULSES = 1000
 
 
 class SceneError(ValueError):
-    """A file that cannot be read as a scene: names the file, the field, the value, the remedy."""
+    """File that cannot be read as a scene: names the file, the field, the value, the remedy."""
 
 
 def read_scene(
@@ -64,10 +64,10 @@ def read_scene(
         From the sensor to the nearest point of a mesh, along `direction`, the middle of its
         bounding box in the middle of the image; 50 m by default.
     position_m : sequence of 3 floats, optional
-        Where the sensor stands instead, in metres.
+        Position of the sensor, in place of `distance_m`, in metres.
     direction : sequence of 3 floats, optional
-        Where the sensor looks at a mesh, (0, 1, 0) by default. What is up in the image is up, or
-        for a look straight up or down, the y axis.
+        Line of sight of the sensor, (0, 1, 0) by default. The z axis points up in the image, or
+        for a view straight up or down, the y axis.
 
     Returns
     -------

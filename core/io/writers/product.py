@@ -75,12 +75,12 @@ class Product:
 
     @property
     def heading(self) -> str:
-        """The title, or a general one."""
+        """Title, or a general one."""
         return _plain(self.title) or "Range image"
 
     @property
     def planes(self) -> dict[str, Plane]:
-        """The images, by name."""
+        """Images by name."""
         image, shown = self.image, dict(self.shown)
         known = {
             "range_m": Plane(image.range_m, "m", "range of the surface, NaN without an estimate"),

@@ -21,7 +21,7 @@ _REMEDIES |= dict.fromkeys(
 
 
 class _Watched(io.FileIO):
-    """A file that keeps the first failure to write to it: some libraries report it as their own."""
+    """File that keeps its first failure to write: some libraries raise errors of their own."""
 
     failure: OSError | None = None
 
