@@ -97,7 +97,7 @@ def test_what_other_pages_compute_is_refused_too(source, monkeypatch):
         with pytest.raises(ValueError, match=f"estimated time of '{method}'"):
             run_task(Task(method, ESTIMATORS[method].parameters()), answer)
     for work in (inspect_capture, lambda each: inspect_pixel_with_flux(each, 0, 0)):
-        with pytest.raises(ValueError, match="estimated time of 'light'"):
+        with pytest.raises(ValueError, match="estimated time of 'flux'"):
             work(answer)
 
 

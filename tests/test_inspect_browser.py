@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from csv import DictReader
 from dataclasses import dataclass
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -207,8 +209,10 @@ def test_everything_about_a_pixel_is_shown(here):
         expect(fact(page, name)).to_have_text(text.interval(found))
     name, table = download(page, "numbers", "csv")
     assert name == f"{here.name}_tracking_numbers-row{row}-col{col}.csv"
+    saved = {row["quantity"]: row for row in DictReader(StringIO(table.decode()))}["SBR"]
     sbr = report.flux.sbr
-    assert f"\nSBR,{sbr.value:.3g},{sbr.low:.3g},{sbr.high:.3g},".encode() in table
+    ends = [float(saved[end]) for end in ("value", "low", "high")]
+    assert ends == pytest.approx([sbr.value, sbr.low, sbr.high])
     told = fact(page, "Detections")
     expect(told).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
     verdict = f"Verdict: {report.verdict.health}. {report.verdict.why}"

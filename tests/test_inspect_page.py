@@ -440,6 +440,7 @@ def test_a_share_of_pulses_that_fails_is_reset(capture, building, monkeypatch):
 
 def test_without_truth_accuracy_is_called_agreement(far):
     (work, *_) = accuracy_steps(far.answer)
-    title, across, _ = text.accuracy_titles(work())
+    assert work().against != "truth"
+    title, across, _ = text.accuracy_titles(far.answer.whole)
     assert "not accuracy" in title
     assert across == "Share of the pulses"

@@ -163,6 +163,8 @@ class CaptureSection(Section):
         self._studied, self.accuracies = self._study_settings, []
         ticks = [share * self._all_pulses for share in SHARES]
         figure = self.accuracy.figure
+        titles = text.accuracy_titles(self.session.answer.whole)
+        figure.title.text, figure.xaxis.axis_label, figure.yaxis.axis_label = titles
         figure.xaxis.ticker = FixedTicker(ticks=ticks)
         figure.x_range.update(start=0.8 * ticks[0], end=1.25 * ticks[-1])
         self._mark_present()
@@ -170,7 +172,6 @@ class CaptureSection(Section):
 
     def _add(self, found: Accuracy) -> None:
         known = [(n, within) for n in (*self.accuracies, found) if (within := n.within) is not None]
-        figure = self.accuracy.figure
         with self.session.tasks.hold():
             self.accuracy.source("points").data = {
                 "pulses": [each.share * self._all_pulses for each, _ in known],
@@ -179,8 +180,6 @@ class CaptureSection(Section):
                 "high": [within.high for _, within in known],
                 "rmse_m": [each.rmse_m.value if each.rmse_m else np.nan for each, _ in known],
             }
-            titles = text.accuracy_titles(found)
-            figure.title.text, figure.xaxis.axis_label, figure.yaxis.axis_label = titles
             self._mark_present()
         self.accuracies.append(found)
 

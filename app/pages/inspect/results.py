@@ -44,7 +44,7 @@ def inspect_pixel(answer: Answer, row: int, col: int) -> Inspected:
 def inspect_pixel_with_flux(answer: Answer, row: int, col: int) -> Inspected:
     """Inspect one pixel and estimate its flux, for a worker thread."""
     n_bins = answer.capture.acquisition.n_bins
-    with spending((1, 1, n_bins), "light", predicted_flux_time(1, n_bins)):
+    with spending((1, 1, n_bins), "flux", predicted_flux_time(1, n_bins)):
         found = inspect_pixel(answer, row, col)
         _ = found.report.flux
         return found
@@ -60,7 +60,7 @@ def inspect_region(answer: Answer, region: Corners) -> Inspected:
     """
     mask = inspection.pixels_in(region, answer.capture.shape)
     n_pixels, n_bins = int(np.count_nonzero(mask)), answer.capture.acquisition.n_bins
-    with spending((1, n_pixels, n_bins), "light", predicted_flux_time(n_pixels, n_bins)):
+    with spending((1, n_pixels, n_bins), "flux", predicted_flux_time(n_pixels, n_bins)):
         report = inspection.region_report(
             answer.capture, answer.run.image, mask, "tracking", answer.request.tracking
         )
@@ -71,7 +71,7 @@ def inspect_region(answer: Answer, region: Corners) -> Inspected:
 def inspect_capture(answer: Answer) -> CaptureReport:
     """Inspect the capture of an estimate as a whole."""
     rows, cols, n_bins = answer.capture.cube.shape
-    with spending((rows, cols, n_bins), "light", predicted_flux_time(rows * cols, n_bins)):
+    with spending((rows, cols, n_bins), "flux", predicted_flux_time(rows * cols, n_bins)):
         return inspection.capture_report(answer.capture)
 
 

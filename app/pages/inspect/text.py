@@ -12,7 +12,8 @@ from app.model.text import CONFIDENCE_HELP, Fact, cell, estimate_facts, number, 
 from app.pages.inspect.results import Inspected
 from app.units import AXIS_TITLES, OPPOSITE_UNIT, Quantity, Scale, count, scale
 from app.units import interval as format_interval
-from core.inspection import Accuracy, Candidate, CaptureReport, FluxEstimate
+from core import Capture
+from core.inspection import Candidate, CaptureReport, FluxEstimate
 from core.metrics import Interval
 
 EXPLANATION = """
@@ -220,13 +221,10 @@ def advice(report: CaptureReport, along: Scale) -> tuple[str, str]:
     )
 
 
-def accuracy_titles(found: Accuracy) -> tuple[str, str, str]:
+def accuracy_titles(capture: Capture) -> tuple[str, str, str]:
     """Return title and axis labels of the plot of accuracy against pulses."""
-    across = "Share of the pulses" if found.n_pulses is None else "Pulses"
-    if found.against == "truth":
+    across = "Share of the pulses" if capture.acquisition.n_pulses is None else "Pulses"
+    if capture.truth_range_m is not None:
         return "Accuracy against number of pulses", across, "Within 3 bins of the truth"
-    return (
-        "Agreement with the estimate from all pulses (not accuracy)",
-        across,
-        "Within 3 bins of it",
-    )
+    title = "Agreement with the estimate from all pulses (not accuracy)"
+    return title, across, "Within 3 bins of it"
