@@ -422,7 +422,7 @@ def test_a_cloud_without_points_is_told(explore, layout):
         assert button.ask(suffix="ply") == {"failed": True}
     finally:
         session.estimate.answer = before
-    assert "nothing to save: no answer is confident enough" in complaint(layout)
+    assert "nothing to save: no estimate is confident enough" in complaint(layout)
 
 
 @pytest.mark.parametrize(
