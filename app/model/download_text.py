@@ -37,8 +37,8 @@ def not_saved(error: Exception) -> str:
         )
     if isinstance(error, MemoryError):
         return (
-            "Nothing was saved: not enough memory on the server for this file. Show fewer pixels or "
-            f"choose another format, then try again. {_GOES_ON}"
+            "Nothing was saved: not enough memory on the server for this file. Show fewer pixels, "
+            f"or choose another format, then try again. {_GOES_ON}"
         )
     if isinstance(error, ValueError):
         return cause(error)
