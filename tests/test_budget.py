@@ -14,10 +14,10 @@ from app.model import budget
 from app.model.state import Illumination, ReductionSettings
 from app.model.store import Request, compute, file_source
 from app.pages.compare.ranking import Task, run_task
-from app.pages.inspect.results import capture_known, pixel_lit
+from app.pages.inspect.results import inspect_capture, inspect_pixel_with_flux
 from app.pages.session import Session
 from app.pages.shared.estimate import FEW_COUNTS, lane_of
-from app.pages.tradeoff.page import affordable
+from app.pages.tradeoff.speed import affordable
 from app.tasks.scheduler import GENERAL
 from core import ESTIMATORS, Acquisition, Capture, TrackingParameters, save_capture
 from core.cost import Cost
@@ -77,7 +77,7 @@ def test_the_controls_show_the_reduction(source, tight):
 
 def test_a_weaker_reduction_is_refused_with_a_remedy(source, tight):
     answer = compute(ask(source), None)
-    with pytest.raises(ValueError, match="Less data, faster") as refused:
+    with pytest.raises(ValueError, match="Data reduction") as refused:
         compute(ask(source), answer)
     assert "120 x 120 pixels of 100 bins" in str(refused.value)
 
@@ -96,7 +96,7 @@ def test_computations_of_other_pages_are_limited(source, monkeypatch):
     for method in ("unmixing", "likelihood"):
         with pytest.raises(ValueError, match=f"estimated time of '{method}'"):
             run_task(Task(method, ESTIMATORS[method].parameters()), answer)
-    for work in (capture_known, lambda each: pixel_lit(each, 0, 0)):
+    for work in (inspect_capture, lambda each: inspect_pixel_with_flux(each, 0, 0)):
         with pytest.raises(ValueError, match="estimated time of 'light'"):
             work(answer)
 

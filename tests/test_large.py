@@ -30,9 +30,9 @@ from core.io import ReadOptions
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT, fact, serving
-from tests.test_app import ask, complaint, control, told
+from tests.test_app import alert_of, ask, values_of
 from tests.test_downloads import columns_of, written
-from tests.threads import HeldLayout
+from tests.threads import HeldLayout, control
 
 ROWS, COLS, CHUNK = 96, 128, 16
 PIECES = ROWS * COLS // CHUNK**2
@@ -293,28 +293,28 @@ def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
         "30 to 69",
         "20 to 79",
     )
-    control(looking, "Look closer").clicks += 1
+    control(looking, "Read window").clicks += 1
     assert not control(looking, "Cancel").disabled
     settle(looking, lambda: not session.answer.cutout.is_preview)
     assert session.state.window == session.answer.cutout.window == Window((30, 70), (20, 80))
     assert session.answer.grid.place(*session.state.pixel) == place
     np.testing.assert_array_equal(session.answer.capture.cube[session.state.pixel], histogram)
-    assert told(explore.numbers)["Pixel"] == "row {}, col {}".format(*place)
-    picture = explore.image._plot.source("picture").data
-    assert (picture["x"][0], picture["dw"][0]) == (19.5, 60)
+    assert values_of(explore.numbers)["Pixel"] == "row {}, col {}".format(*place)
+    (picture,) = (r for r in explore.image.figure.renderers if "image" in r.data_source.data)
+    assert [picture.data_source.data[name][0] for name in ("x", "dw")] == [19.5, 60]
     assert taken_away(looking) == ((30, 69), (20, 79), 40 * 60)
     name = downloads.explored(session).file_name("range image", "csv")
     assert "_rows30-69_cols20-79_" in name
     at = "row{} col{}".format(*place)
     assert downloads.pixel_plot(session, explore.signals.histogram.figure, "h").what == f"h {at}"
-    control(looking, "The whole").clicks += 1
+    control(looking, "Show all").clicks += 1
     settle(looking, lambda: session.answer.cutout.is_preview)
     assert session.state.window is None
 
 
 def test_reading_ends_when_something_else_is_looked_at(looking):
     session = looking.session
-    control(looking, "Look closer").clicks += 1
+    control(looking, "Read window").clicks += 1
     session.state.param.update(source="car")
     settle(looking, lambda: session.answer.request.source.is_scene)
     settle(looking, lambda: control(looking, "Cancel").disabled)
@@ -326,7 +326,7 @@ def test_wrong_bounds_are_told_and_nothing_is_read(looking):
     settle(looking, lambda: control(looking, "Cancel").disabled)
     control(looking, "Rows shown").value = "90 to 200"
     with pytest.raises(ValueError, match=r"rows = '90 to 200'"):  # Panel hands it to the page
-        control(looking, "Look closer").clicks += 1
+        control(looking, "Read window").clicks += 1
     assert looking.session.state.window is None
 
 
@@ -340,14 +340,14 @@ def test_a_damaged_part_is_told_and_the_page_goes_on(looking, path):
         "0 to 9",
         "0 to 9",
     )
-    control(looking, "Look closer").clicks += 1
-    settle(looking, lambda: complaint(looking))
-    assert "counts cannot be read" in complaint(looking)
-    assert str(path.parent) not in complaint(looking)
+    control(looking, "Read window").clicks += 1
+    settle(looking, lambda: alert_of(looking))
+    assert "counts cannot be read" in alert_of(looking)
+    assert str(path.parent) not in alert_of(looking)
     assert session.answer is before and session.state.window is None
     shutil.rmtree(path)
-    control(looking, "Look closer").clicks += 1
-    settle(looking, lambda: "has not gone" in complaint(looking))
+    control(looking, "Read window").clicks += 1
+    settle(looking, lambda: "has not gone" in alert_of(looking))
     control(looking, "l").value = 0.01
     settle(looking, lambda: session.answer is not before)
     assert session.answer.request.tracking.l == 0.01
@@ -414,7 +414,7 @@ def endless(chunk: Path) -> Iterator[None]:
 def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     path, address, capture = served
     opened = page(address)
-    closer = opened.get_by_role("button", name="Look closer")
+    closer = opened.get_by_role("button", name="Read window")
     cancel = opened.get_by_role("button", name="Cancel").filter(visible=True)
     preview = opened.get_by_text(f"Preview of {SIDE} × {SIDE} pixels, 1 of each 2 × 2")
     expect(preview).to_be_visible()
@@ -422,9 +422,9 @@ def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     shows(opened, "0 to 511", "0 to 511")
     zoom(opened)
     closer.click()
-    told = opened.get_by_text(re.compile("^Seen: rows"))
+    told = opened.get_by_text(re.compile("^Shown: rows"))
     expect(told).to_be_visible()
-    seen = re.fullmatch(r"Seen: rows (.*), columns (.*), of 512 × 512 pixels\.", told.inner_text())
+    seen = re.fullmatch(r"Shown: rows (.*), columns (.*), of 512 × 512 pixels\.", told.inner_text())
     shows(opened, *seen.groups())
     first, last = map(int, seen[1].split(" to "))
     assert 0 < first < last < SIDE - 1
@@ -452,7 +452,7 @@ def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     expect(told).to_have_text(seen[0])
     chunk.write_bytes(kept)
     closer.click()
-    expect(told).to_have_text("Seen: rows 0 to 63, columns 0 to 63, of 512 × 512 pixels.")
-    opened.get_by_role("button", name="The whole").click()
+    expect(told).to_have_text("Shown: rows 0 to 63, columns 0 to 63, of 512 × 512 pixels.")
+    opened.get_by_role("button", name="Show all").click()
     expect(preview).to_be_visible()
     shows(opened, "0 to 511", "0 to 511")

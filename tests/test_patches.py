@@ -25,9 +25,8 @@ from app.server.patches.default_values import cached
 from app.server.patches.outgoing_messages import INLINE_BYTES, QuickSerializer
 from app.server.patches.removed_models import PartialDeserializer
 from tests.broken import WHEN_TAPPED
-from tests.browser import ROOT, fact, open_page, serving
+from tests.browser import ROOT, fact, open_page, serving, slider
 from tests.load import opened
-from tests.test_browser import slider
 
 FOLDER = Path(app.server.patches.__file__).parent
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from queue import SimpleQueue
 from typing import Any
 
@@ -35,6 +35,11 @@ class HeldTasks(PageTasks):
     def run_one(self) -> None:
         """Run the next callback; wait for it if necessary."""
         self.waiting.get(timeout=60)()
+
+    def run_until(self, holds: Callable[[], object]) -> None:
+        """Run callbacks until something is so."""
+        while not holds():
+            self.run_one()
 
 
 class HeldLayout(Layout):

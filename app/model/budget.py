@@ -30,8 +30,8 @@ FREE_BYTES = 2**26
 """Requests below this size are not counted and never wait."""
 
 REMEDY = (
-    "Crop the gate, merge bins or keep fewer pixels under Less data, faster; or process the whole "
-    "capture without this page: python -m core estimate"
+    "Crop the gate, merge bins or keep fewer pixels under Data reduction; or range all of it "
+    "without this page: python -m core estimate"
 )
 
 

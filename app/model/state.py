@@ -25,22 +25,22 @@ class Illumination:
     sbr: float = parameter(
         0.06,
         Number("SBR", 0.01, 10.0, log=True, least=0.0, open_below=True),
-        "Signal over background, both in photons per pulse over the whole gate. Daylight: < 0.1.",
+        "Signal flux divided by background flux over the whole gate. Daylight: below 0.1.",
     )
     ppp: float = parameter(
         0.1041,
         Number("PPP", 0.001, 10.0, log=True, least=0.0, unit="photons per pulse"),
-        "Signal photons detected per pulse, were the detector always armed.",
+        "Signal flux: detections per pulse if the detector were always armed.",
     )
     n_pulses: int = parameter(
         1000,
         Number("Pulses", 10, 50_000, log=True, whole=True, least=1),
-        "Pulses sent for each pixel: more make the histogram smoother, and take longer to record.",
+        "Pulses per pixel. More make the histogram smoother, and take longer to record.",
     )
     seed: int = parameter(
         0,
         Number("Seed", 0, 999, whole=True, least=0),
-        "Which throw of the dice: the same seed gives the same capture again.",
+        "Random seed: the same seed gives the same capture.",
     )
 
     def __post_init__(self) -> None:
@@ -63,13 +63,13 @@ class Viewing:
     least_confidence: float = parameter(
         0.9,
         Number("Show from confidence", 0.0, 1.0, least=0.0),
-        "Answers below are hidden in image and cloud, not in the figures. 0 shows what the "
-        "estimator makes of pure noise, too.",
+        "Estimates with less confidence are hidden in image and cloud, but count in the figures. "
+        "0 also shows estimates from noise alone.",
     )
     field_of_view_deg: float = parameter(
         5.0,
         Number("Field of view", 0.001, 120.0, log=True, unit="degrees", least=0.0, open_below=True),
-        "Width of the image as seen from the sensor: sets how wide the cloud is, in metres.",
+        "Horizontal field of view of the sensor; determines the width of the cloud in metres.",
     )
 
     def __post_init__(self) -> None:
@@ -83,34 +83,33 @@ class ReductionSettings:
     merge: int = parameter(
         1,
         Number("Bins merged", 1, 8, whole=True, least=1, unit="bins"),
-        "Neighbouring bins added to one: less to range, and a coarser answer. T_n counts the "
-        "merged ones.",
+        "Neighbouring bins summed to one: faster and coarser. T_n counts merged bins.",
     )
     gate_from: float = parameter(
         0.0,
         Number("Gate from", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
-        "Bins before are left out, and the pulses that fired in them.",
+        "Earlier bins are cut, with the pulses that fired in them.",
     )
     gate_to: float = parameter(
         1.0,
         Number("Gate to", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
-        "Bins behind are left out: an echo there is lost.",
+        "Later bins are cut, with the echoes in them.",
     )
     pool: int = parameter(
         1,
-        Number("Pixels added", 1, 8, whole=True, least=1, unit="rows and columns"),
-        "Histograms of so many rows and columns of neighbours added to one: more photons in each, "
-        "and a blurred image.",
+        Number("Pixels summed", 1, 8, whole=True, least=1, unit="rows and columns"),
+        "Histograms of this many rows and columns summed to one: more photons per pixel, and a "
+        "blurred image.",
     )
     skip: int = parameter(
         1,
-        Number("Pixels skipped to", 1, 8, whole=True, least=1, unit="rows and columns"),
-        "One pixel is kept of so many rows and columns.",
+        Number("Pixel step", 1, 8, whole=True, least=1, unit="rows and columns"),
+        "Keep one pixel of this many rows and columns.",
     )
     pulses: float = parameter(
         1.0,
         Number(
-            "Pulses accumulated",
+            "Pulses used",
             1e-3,
             1.0,
             log=True,
@@ -119,8 +118,8 @@ class ReductionSettings:
             most=1.0,
             open_below=True,
         ),
-        "Share of the pulses whose detections are kept, as if recording had ended sooner: fewer "
-        "are a part of more.",
+        "Share of the pulses to use, as if the recording had ended earlier. A smaller share is a "
+        "subset of a larger one.",
     )
 
     def __post_init__(self) -> None:

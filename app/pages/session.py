@@ -1,4 +1,4 @@
-"""One user's session: the state, its estimate, and the services that all pages share."""
+"""One user's session: the state, its estimate, and the services shared by all pages."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from app.tasks.page import PageTasks
 
 
 class Session:
-    """What the pages of one user share.
+    """State and services shared by the pages of one user.
 
     Parameters
     ----------
     sources : mapping of str to Source
-        Scenes and captures to choose from; copied, so that an upload belongs to this session alone.
+        Scenes and captures to choose from; copied, so that an upload belongs to this session only.
     wanted : Link, optional
-        What the link of the page asks for.
+        Settings from the link of the page.
     tasks : PageTasks, optional
-        The page's thread, where it is not that of the page being built.
+        The page's thread; by default that of the page being built.
 
     Attributes
     ----------
     state : State
-        All that the user has chosen.
+        Everything that the user has chosen.
     estimate : CurrentEstimate
-        The answer to the state's request.
+        The estimate for that state.
     tasks : PageTasks
         The page's thread.
     failures : FailureLog
-        What the page says about failures.
+        The error that the page shows.
     refused : list of str
         A sentence on each setting of the link that could not be restored.
     """
@@ -51,7 +51,7 @@ class Session:
         wanted = wanted or Link({})
         self.sources = dict(sources)
         key, first = next(iter(self.sources.items()))
-        # A session that is started with a file opens on Inspect.
+        # A session started with a file opens on Inspect.
         self._own = {"source": key, "page": "Explore" if first.is_scene else "Inspect"}
         self.state = State(**self._own)
         self.tasks = tasks or PageTasks()
@@ -65,7 +65,7 @@ class Session:
 
     @property
     def answer(self) -> Answer:
-        """The latest answer that could be computed."""
+        """The latest estimate that could be computed."""
         return self.estimate.answer
 
     @property
@@ -89,11 +89,11 @@ class Session:
     def choose_pixel(self, row: int, col: int) -> None:
         """Show another pixel, or the nearest one inside the image."""
         rows, cols = self.answer.capture.shape
-        with self.tasks.hold():  # all that follows reaches the browser at once
+        with self.tasks.hold():  # one message for all consequences
             self.state.pixel = (min(max(row, 0), rows - 1), min(max(col, 0), cols - 1))
 
     def pick(self, index: int) -> None:
-        """Show the pixel at this place in the flattened image; -1 is none."""
+        """Show the pixel with this index in the flattened image; -1 is none."""
         if index >= 0:
             self.choose_pixel(*divmod(index, self.answer.capture.shape[1]))
 

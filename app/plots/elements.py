@@ -230,7 +230,6 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
     "estimate, lag included": ("answer", []),
-    "answer, lag included": ("answer", []),
     "the echo above": ("answer", []),
 }
 METHOD_PLACES = {method.name: n for n, method in enumerate(paper.COMPARED)}

@@ -1,4 +1,4 @@
-"""Image or point cloud of one method, and the colour scale that several methods share."""
+"""Image or point cloud of one method, and the colour scale of several methods."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ PICTURE = """
   background: var(--mui-palette-background-paper, #fff); transition: opacity 0.2s 0.25s; }
 """
 
-# Titles of one line and of three: the pictures below them stand at one height.
+# Titles of one to three lines: the pictures below them are aligned.
 TITLE = ":host { flex: 1 !important } .note { font-weight: 600 }"
 CAPTION = ".note { white-space: nowrap; overflow: hidden; text-overflow: ellipsis }"
 
 
 class Picture:
-    """One method's image, or its cloud, with a line on the pixel below it.
+    """One method's image or cloud, with a line about the pixel below it.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Picture:
     ) -> None:
         self.image = ImageView(tapped)
         self.cloud: PointCloud | None = None
-        # On the right there is room for a download button.
+        # The margin leaves room for a download button.
         self.title = Sentence(
             stylesheets=[TITLE], sizing_mode="stretch_width", margin=(4, 30, 0, 8)
         )
@@ -69,22 +69,22 @@ class Picture:
         self.resize(height)
 
     def draw_image(self, values: Array, look: ColorScale) -> None:
-        """Show an image (row, col) on the common scale, in place of the cloud."""
+        """Show an image (row, col) in place of the cloud."""
         self.image.pane.visible = True
         if self.cloud is not None:
             self.cloud.visible = False
         self.image.update(values, replace(look, title=""))
 
     def resize(self, height: int) -> None:
-        """Make picture and cloud this high."""
+        """Set the height of image and cloud."""
         self._stage.height = height
 
     def dim(self, is_outdated: bool) -> None:
-        """Draw what is still to be replaced faintly."""
+        """Draw an outdated picture faintly."""
         self.card.styles = {"opacity": "0.35" if is_outdated else "1"}
 
     def show_cloud(self, dark: bool) -> PointCloud:
-        """Put the cloud in place of the image; it is made when it is first asked for."""
+        """Show the cloud in place of the image; it is made on demand."""
         if self.cloud is None:
             self.cloud = PointCloud(
                 wrong_color=WRONG_COLOR, link="methods", dark=dark, sizing_mode="stretch_both"
@@ -96,10 +96,10 @@ class Picture:
 
 
 class ScaleBar:
-    """The one colour scale of several pictures."""
+    """The common colour scale of several pictures."""
 
     def __init__(self) -> None:
-        # A colour bar needs a figure to stand in; nothing is drawn in this one.
+        # A colour bar needs a figure; this one is empty.
         self.figure = figure(
             height=52,
             sizing_mode="stretch_width",
@@ -124,5 +124,5 @@ class ScaleBar:
         self._bar.title = look.legend
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Apply the colours of a theme."""
         paint_frame(self.figure, colors)

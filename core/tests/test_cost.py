@@ -56,7 +56,10 @@ def test_the_memory_predicted_is_what_is_taken(method: str, shape: tuple[int, in
 
 def test_a_posterior_that_is_kept_is_not_counted_again() -> None:
     shape = (256, 256, 100)
-    whole, rest = (predicted(shape, "coates", is_lit=is_lit) for is_lit in (False, True))
+    whole, rest = (
+        predicted(shape, "coates", posterior_is_cached=posterior_is_cached)
+        for posterior_is_cached in (False, True)
+    )
     assert rest.working_bytes <= whole.working_bytes - 4 * 256 * 256 * 100
     assert rest.seconds < whole.seconds
 

@@ -33,7 +33,9 @@ SEES_NEIGHBOURS = {"chi": 7, "unmixing": 7}
 
 
 def reach_of(method: str) -> int:
-    return SEES_NEIGHBOURS.get(method, ESTIMATORS[method].reach(ESTIMATORS[method].parameters()))
+    return SEES_NEIGHBOURS.get(
+        method, ESTIMATORS[method].window_size(ESTIMATORS[method].parameters())
+    )
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -324,7 +324,7 @@ def test_a_gate_is_cut_in_front_where_that_costs_no_pulse() -> None:
     assert 90 + 8 < first.gate[1] == photons.gate[1] < 200
     assert photons.gate[0] < photons.t_n
     assert first.t_n == photons.t_n <= 92
-    assert "64 confident answers lie in bins 8" in first.why_gate
+    assert "64 confident estimates lie in bins 8" in first.why_gate
 
 
 # -- fewer pulses ----------------------------------------------------------------------------------

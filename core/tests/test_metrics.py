@@ -199,7 +199,7 @@ def test_detection_counts_answers_and_targets() -> None:
     truth_m = np.array([[50.0, 51.0, 52.0, 53.0], [np.nan, np.nan, np.nan, 54.0]])
     valid = np.array([[True, True, True, False], [True, False, False, False]])
     found = metrics.precision_recall(valid, truth_m)
-    assert found == metrics.Detection(precision=3 / 4, recall=3 / 5, false_alarm_rate=1 / 3)
+    assert found == metrics.DetectionRates(precision=3 / 4, recall=3 / 5, false_alarm_rate=1 / 3)
 
 
 def test_shares_of_nothing_are_nan() -> None:

@@ -131,7 +131,7 @@ def test_a_slope_is_ranged_without_lag(method: str, pulse: Pulse) -> None:
     flux = flux_model_of(capture.shape, 1.0)
     estimator = replace(ESTIMATORS[method], flux_model=lambda _: flux)
     settings = estimator.parameters()
-    position, _ = estimator._best(capture, flux, settings)
+    position, _ = estimator.positions(capture, flux, settings)
     lag = 0.0 if estimator.finds_delay else estimator.lag_bins(capture, settings)
     error = position - lag - onset
     assert abs(np.median(error)) < 0.7
@@ -192,7 +192,7 @@ def test_kde_adds_a_kernel_for_each_trigger_of_the_neighbourhood() -> None:
     estimator = ESTIMATORS["kde"]
     found = estimator.curve(pooled(capture.cube, 3)[1, 1].astype(float), CONDITIONS, settings)
     np.testing.assert_allclose(found, expected, atol=1e-5)
-    assert [estimator.reach(KdeParameters(name)) for name in kde.REACH] == [1, 3, 5]
+    assert [estimator.window_size(KdeParameters(name)) for name in kde.WINDOW_SIZE] == [1, 3, 5]
 
 
 def test_a_narrow_kde_is_the_histogram() -> None:

@@ -17,7 +17,7 @@ from core.capture import Capture
 from core.effects import LIDAR_RATIO_SR, Backscatter, FaultyPixels, Jitter, Motion, SecondSurface
 from core.estimators import estimate
 from core.scene import PARTS, Scene, parts_of, scenes, without
-from core.simulation import simulate, triggered_by_each_edge
+from core.simulation import cumulative_trigger_probability, simulate
 from core.studies.ablation.plain import bare, plain_triggered
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
@@ -28,7 +28,7 @@ SCENE = Scene(GATE.bin_to_range_m(ONSET_BIN))
 
 
 def edges(scene: Scene, acquisition: Acquisition = GATE, flux: Flux = FLUX) -> np.ndarray:
-    return triggered_by_each_edge(scene, acquisition, flux, PULSE)
+    return cumulative_trigger_probability(scene, acquisition, flux, PULSE)
 
 
 def second(onset_bin: Any, share: Any) -> SecondSurface:
@@ -78,7 +78,7 @@ def test_absent_parts_leave_the_plain_model_bit_for_bit(name: str) -> None:
     scene = bare(scenes[name]())
     assert parts_of(scene) == ()
     given = (scene, scene.acquisition, Flux(), Pulse())
-    np.testing.assert_array_equal(triggered_by_each_edge(*given), plain_triggered(*given))
+    np.testing.assert_array_equal(cumulative_trigger_probability(*given), plain_triggered(*given))
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_each_part_is_needed_by_a_built_in_scene() -> None:
 @pytest.mark.parametrize("flux", [Flux(), Flux(5.0, 10.0), Flux(0.0, 1.0)])
 def test_probabilities_are_probabilities(name: str, flux: Flux) -> None:
     scene = scenes[name]()
-    triggered = triggered_by_each_edge(scene, scene.acquisition, flux, Pulse())
+    triggered = cumulative_trigger_probability(scene, scene.acquisition, flux, Pulse())
     assert (triggered[:, 0] == 0).all()
     assert triggered.max() <= 1 + 1e-12  # what is left of 1 is that of no trigger
     assert np.diff(triggered).min() >= -1e-12
@@ -303,7 +303,7 @@ def test_edges_see_two_surfaces_apart_by_area() -> None:
     scene, coarse = scenes["edges"](), scenes["building"]()
     other = scene.second_surface
     assert other is not None
-    share = other.seen_share
+    share = other.effective_share
     assert 0.05 < (share > 0).mean() < 0.5
     assert share.max() <= 0.5
     apart_m = np.abs(other.range_m - scene.range_m)[share > 0]

@@ -16,7 +16,7 @@ from scipy import ndimage, stats
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import estimate
-from core.inference.flux import _SPREAD, LEVELS, _shares_and_depths, _totals, flux_model_of
+from core.inference.flux import LEVEL_SPAN, LEVELS, _totals, flux_model_of, shares_and_depths
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import (
     Conditions,
@@ -35,7 +35,7 @@ from core.inference.posterior import (
 )
 from core.io.readers.dense import guess_detection
 from core.kernels.blocks import LANES
-from core.kernels.posterior import _ALIKE, learn_shares, smoothed
+from core.kernels.posterior import UNIFORM_SHARE, learn_shares, smoothed
 from core.scene import Scene
 from core.simulation import simulate
 from core.trigger import coates_rate, rate_per_bin, trigger_probability
@@ -505,7 +505,7 @@ def columns(left: float, right: float) -> np.ndarray:
     return np.where(np.arange(SIZE) % 2 == 0, left, right)
 
 
-HALF_A_STEP = _SPREAD ** (0.5 / (LEVELS - 1))
+HALF_A_STEP = LEVEL_SPAN ** (0.5 / (LEVELS - 1))
 """A signal is found as the level next to it, or spread over the two."""
 
 
@@ -607,7 +607,7 @@ def test_depths_that_are_alike_are_found_alike() -> None:
     depth = flux_model_of(drawn(SIGNAL)).depth
     # Echoes begin in bins 0 to 21; a pixel or more in each, over five bins of smoothing.
     excess = 4 / math.sqrt(5 * SIZE**2 / (N_BINS - 8))
-    expected = (1 - _ALIKE) * N_BINS / (N_BINS - 8)
+    expected = (1 - UNIFORM_SHARE) * N_BINS / (N_BINS - 8)
     assert (np.abs(depth[3:18] / expected - 1) < 0.15 + excess).all()
     assert depth[-4:].mean() < 0.5
 
@@ -845,7 +845,7 @@ def any_densities(n_levels: int, n_bins: int) -> np.ndarray:
 
 @pytest.mark.parametrize("n_levels", [2, 5])
 @pytest.mark.parametrize("n_bins", [1, 7, 40])
-def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None:
+def testshares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None:
     density, told = any_densities(n_levels, n_bins), np.full(n_levels, 1 / n_levels)
     share, depth = told, np.full(n_bins, 1 / n_bins)
     for _ in range(30):
@@ -855,7 +855,7 @@ def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None
         share = np.maximum(share, 1e-12)
         learned = ndimage.gaussian_filter1d(joint[:, 1:].sum(axis=(0, 1)), 2.0, mode="nearest")
         depth = 0.9 * learned / learned.sum() + 0.1 / n_bins
-    found = _shares_and_depths(density, told)
+    found = shares_and_depths(density, told)
     np.testing.assert_allclose(found[0], share, rtol=1e-4)
     np.testing.assert_allclose(found[1], depth * n_bins, rtol=1e-4)
     assert (told == 1 / n_levels).all()
@@ -864,7 +864,7 @@ def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None
 def test_no_echo_at_all_leaves_depths_alike() -> None:
     density = any_densities(3, 9)
     density[:, 1:] = 0.0
-    share, depth = _shares_and_depths(density, np.full(3, 1 / 3))
+    share, depth = shares_and_depths(density, np.full(3, 1 / 3))
     np.testing.assert_allclose(share, [1, 1e-12, 1e-12])
     np.testing.assert_array_equal(depth, np.ones(9))
 

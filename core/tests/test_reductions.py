@@ -242,7 +242,7 @@ def test_what_is_left_out_takes_its_neighbours_answer(
         truth_range_m=(row + 0.01 * col).astype(float),
     )
     if min(shape) < skip or len(range((skip - 1) // 2, min(shape), skip)) < pool:
-        with pytest.raises(ValueError, match="an integer from 1 to"):
+        with pytest.raises(ValueError, match="a whole number from 1 to"):
             Reduction(skip=skip, pool=pool).of(marked)
         return
     reduction = Reduction(skip=skip, pool=pool)

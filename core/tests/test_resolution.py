@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.optimize import brentq
 
-from core.inference.resolution import ERROR, HIDDEN, TOLD, Difference, difference, pile_up
+from core.inference.resolution import ERROR, HIDDEN, RESOLVED, Difference, difference, pile_up
 from core.trigger import trigger_probability
 
 FLAT = np.full(20, 0.01)
@@ -24,7 +24,7 @@ def pulses_for(evidence: float) -> int:
 
 
 def test_the_best_test_errs_as_often_as_the_threshold_says() -> None:
-    n_pulses, draws = pulses_for(TOLD), 40_000
+    n_pulses, draws = pulses_for(RESOLVED), 40_000
     assert n_pulses > 500
     rng = np.random.default_rng(0)
     outcomes = [np.append(model, 1 - model.sum()) for model in (FLAT, TILTED)]
@@ -67,14 +67,14 @@ def test_evidence_adds_up_and_nothing_differs_from_itself() -> None:
     same = difference(FLAT, FLAT, 10**9)
     assert same.total_variation == same.evidence == 0
     assert same.is_hidden
-    assert not same.told.any()
+    assert not same.is_resolved.any()
     assert np.isnan(same.resolvable)
 
 
 def test_models_that_never_agree_are_told_at_once() -> None:
     sure = difference([1.0, 0.0], [0.0, 1.0], 1)
     assert sure.total_variation == 1
-    assert sure.told.all()
+    assert sure.is_resolved.all()
     assert sure.resolvable == 0
 
 

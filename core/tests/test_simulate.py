@@ -14,7 +14,7 @@ from scipy import stats
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.scene import Scene
-from core.simulation import add_echo, first_photons, simulate, triggered_by_each_edge
+from core.simulation import add_echo, cumulative_trigger_probability, first_photons, simulate
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
 module = import_module("core.simulation")  # the package's attribute of that name is the function
@@ -184,7 +184,7 @@ def test_draws_equal_a_plain_twin_bit_for_bit(
     onset_bin = np.array([np.nan, -1.5, 0.0, n_bins / 2, n_bins - 0.5])
     scene = Scene(acquisition.bin_to_range_m(onset_bin[np.newaxis]))
     capture = simulate(scene, acquisition, flux, seed=seed)
-    triggered = triggered_by_each_edge(scene, acquisition, flux, Pulse())
+    triggered = cumulative_trigger_probability(scene, acquisition, flux, Pulse())
     np.testing.assert_array_equal(capture.cube[0], twin_cube(triggered, n_pulses, seed))
 
 
@@ -215,7 +215,7 @@ def test_photons_that_have_arrived_stay(tau_bins: float) -> None:
 def test_distribution_of_the_first_photon_is_equation_1_summed() -> None:
     onset_bin, signal = np.array([ONSET_BIN, np.nan, -2.5]), np.array([2.0, 0.0, 2.0])
     scene = Scene(ACQUISITION.bin_to_range_m(onset_bin[np.newaxis]))
-    triggered = triggered_by_each_edge(scene, ACQUISITION, Flux(2.0, 2 / 3), Pulse())
+    triggered = cumulative_trigger_probability(scene, ACQUISITION, Flux(2.0, 2 / 3), Pulse())
     rate = rate_per_bin(onset_bin, signal, 3.0, Pulse(), ACQUISITION)
     expected = np.cumsum(trigger_probability(rate), axis=1)
     assert (triggered[:, 0] == 0).all()
@@ -259,7 +259,7 @@ def test_impossible_seeds_are_refused(seed: int) -> None:
 
 
 def test_an_unknown_number_of_pulses_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"n_pulses = None .*number of pulses to simulate"):
+    with pytest.raises(ValueError, match=r"n_pulses = None .*give the number of pulses"):
         simulate(wall(1), Acquisition(n_pulses=None), Flux())
 
 
