@@ -383,7 +383,7 @@ def test_a_cloud_without_points_is_reported(explore, layout):
         assert button.ask(suffix="ply") == {"failed": True}
     finally:
         session.estimate.answer = before
-    assert "nothing to save: no answer is confident enough" in layout.alert.text
+    assert "nothing to save: no estimate is confident enough" in layout.alert.text
 
 
 @pytest.mark.parametrize(

@@ -123,10 +123,20 @@ class Wire:
             return {"type": "bytes", "data": {"id": f"b{len(buffers) - 1}"}}
 
         data = {"type": "map", "entries": [[name, put(each)] for name, each in message.items()]}
-        values = {"type": "map", "entries": [["model", {"id": model}], ["data", data]]}
-        event = {"type": "event", "name": "data_event", "values": values}
-        said = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": event}
-        await self._send("PATCH-DOC", {"events": [said]}, buffers)
+        await self.emit("data_event", model, {"data": data}, buffers)
+
+    async def emit(
+        self,
+        event: str,
+        model: str,
+        values: Mapping[str, Any],
+        buffers: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:
+        """Send an event of a model, such as a tap on a plot."""
+        entries = [["model", {"id": model}], *map(list, values.items())]
+        data = {"type": "event", "name": event, "values": {"type": "map", "entries": entries}}
+        sent = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": data}
+        await self._send("PATCH-DOC", {"events": [sent]}, buffers)
 
     async def _send_waiting(self) -> None:
         events = [

@@ -23,7 +23,7 @@ ERROR_SCALE_BINS = 5
 MAP_TITLES = {
     "Peak": "Largest count of each pixel",
     "Fired": "Share of the pulses that fired",
-    "SBR": "Signal over background, as the counts tell",
+    "SBR": "Signal over background, estimated from the counts",
 }
 FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"
 

@@ -35,7 +35,7 @@ class Patch:
     """A file of this folder."""
 
     name: str
-    """Of the file, without ``.py`` or ``.js``."""
+    """Name of the file, without ``.py`` or ``.js``."""
     versions: Mapping[str, str]
     """Version of each patched library that it was read against."""
 
