@@ -1,4 +1,4 @@
-"""Captures: consistent by construction, and what is found in them found once."""
+"""Tests of the consistency of captures, and of results cached for them."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def capture_of(cube: Any, n_pulses: int | None = 1000, dtype: type = np.uint16) 
     ],
     ids=["signed", "float", "flat", "no rows", "no columns", "no bins"],
 )
-def test_other_than_unsigned_cubes_are_refused(cube: np.ndarray) -> None:
+def test_cubes_of_other_types_are_refused(cube: np.ndarray) -> None:
     with pytest.raises(
         ValueError, match=r"cube = .* is not accepted: give uint8, uint16 or uint32 counts"
     ):
         Capture(cube, Acquisition(n_bins=4))
 
 
-def test_a_gate_of_other_bins_is_refused() -> None:
+def test_a_gate_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match=r"n_bins = 5 .*give 4, the cube's last axis"):
         Capture(np.zeros((2, 3, 4), np.uint16), Acquisition(n_bins=5))
 
@@ -63,14 +63,8 @@ def test_counts_do_not_wrap() -> None:
     np.testing.assert_array_equal(capture.counts, np.full((2, 3), 400 * 255))
 
 
-def test_blocks_are_laid_out_once() -> None:
-    capture = capture_of(np.ones((2, 3, 4)))
-    assert capture.blocks is capture.blocks
-    assert capture.blocks.n_pixels == 6
-
-
 @pytest.mark.parametrize("n_pulses", [None, 8, 1000])
-def test_pulses_are_armed_for_first_photons_alone(n_pulses: int | None) -> None:
+def test_only_first_photons_have_gated_pulses(n_pulses: int | None) -> None:
     first = capture_of(np.full((2, 3, 4), 2), n_pulses)
     assert first.gated_pulses == n_pulses
     assert replace(first, detection="all").gated_pulses is None
