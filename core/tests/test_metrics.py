@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,11 +89,6 @@ def test_without_estimates_nothing_is_restored() -> None:
     assert metrics.restored(no_answer, np.ones((2, 2)), 1.0) == (0, 4)
 
 
-def test_images_of_different_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"range_m = 'shape \(2, 2\)' .*\(2, 3\)"):
-        metrics.rmse_m(np.ones((2, 2)), TRUTH_M)
-
-
 @pytest.mark.parametrize("level", [0.5, 0.95, 0.9999])
 @pytest.mark.parametrize(("hits", "trials"), [(0, 1), (1, 1), (0, 50), (7, 9), (4000, 4096)])
 def test_wilson_is_the_textbook_interval(hits: int, trials: int, level: float) -> None:
@@ -102,15 +98,6 @@ def test_wilson_is_the_textbook_interval(hits: int, trials: int, level: float) -
     # A dozen roundings of numbers below 1, and as many in the reference.
     np.testing.assert_allclose([found.low, found.high], expected, rtol=0, atol=1e-14)
     assert 0 <= found.low <= found.value <= found.high <= 1
-
-
-@pytest.mark.parametrize(
-    ("hits", "trials", "level", "name"),
-    [(0, 0, 0.95, "trials"), (-1, 5, 0.95, "hits"), (6, 5, 0.95, "hits"), (1, 5, 1.0, "level")],
-)
-def test_impossible_shares_are_refused(hits: int, trials: int, level: float, name: str) -> None:
-    with pytest.raises(ValueError, match=rf"{name} = .* is not accepted"):
-        metrics.wilson(hits, trials, level)
 
 
 @given(hnp.arrays(float, (3, 4), elements=st.floats(-50, 50)))
@@ -126,12 +113,6 @@ def test_errors_are_of_one_size(error_m: np.ndarray) -> None:
     assert rmse_m**2 == pytest.approx(metrics.bias_m(range_m, truth_m) ** 2 + spread**2, abs=1e-9)
 
 
-@pytest.mark.parametrize("rd", [[], [0.9], 0.9, [[0.9, 0.8]]])
-def test_variance_of_rd_needs_repetitions(rd: object) -> None:
-    with pytest.raises(ValueError, match=r"rd_per_repetition = .*2 or more"):
-        metrics.rd_variance(rd)  # type: ignore[arg-type]
-
-
 def test_variance_of_an_estimator_leaves_out_what_has_none() -> None:
     truth_m = np.array([[50.0, 50.0, 50.0, 50.0, np.nan]])
     answers = [
@@ -144,12 +125,6 @@ def test_variance_of_an_estimator_leaves_out_what_has_none() -> None:
     assert metrics.estimator_variance_m2(range_m, truth_m) == pytest.approx(1.0)
     assert math.isnan(metrics.estimator_variance_m2(range_m[:1], truth_m))
     assert math.isnan(metrics.estimator_variance_m2(range_m, np.full((1, 5), np.nan)))
-
-
-@pytest.mark.parametrize("shape", [(2, 3), (4, 3, 2), (4, 4, 2, 3)])
-def test_repetitions_must_fit_the_truth(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"range_m = 'shape .*\(repetition, \*\(2, 3\)\)"):
-        metrics.estimator_variance_m2(np.ones(shape), TRUTH_M)
 
 
 def test_detection_rates_count_estimates_and_targets() -> None:
@@ -170,11 +145,6 @@ def test_shares_of_nothing_are_nan() -> None:
     assert math.isnan(empty.recall)
 
 
-def test_decisions_of_another_shape_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"valid = 'shape \(3, 2\)' .*\(2, 3\)"):
-        metrics.precision_recall(np.ones((3, 2), bool), TRUTH_M)
-
-
 def test_reliability_compares_like_with_like() -> None:
     confidence = np.array([0.05, 0.95, 0.95, 0.95, 0.95, 1.0])
     right = np.array([False, True, True, True, False, True])
@@ -184,3 +154,27 @@ def test_reliability_compares_like_with_like() -> None:
     assert high.confidence == pytest.approx(0.96)
     expected = (1 * 0.05 + 5 * 0.16) / 6
     assert metrics.calibration_error([low, high]) == pytest.approx(expected)
+
+
+REFUSED = [
+    (metrics.rmse_m, (np.ones((2, 2)), TRUTH_M), r"range_m = 'shape \(2, 2\)' .*\(2, 3\)"),
+    (metrics.precision_recall, (np.ones((3, 2), bool), TRUTH_M), r"valid = 'shape .*\(2, 3\)"),
+    *(
+        (metrics.estimator_variance_m2, (np.ones(shape), TRUTH_M), r"\(repetition, \*\(2, 3\)\)")
+        for shape in ((2, 3), (4, 3, 2), (4, 4, 2, 3))
+    ),
+    *(
+        (metrics.rd_variance, (rd,), "rd_per_repetition = .*2 or more")
+        for rd in ([], [0.9], 0.9, [[0.9, 0.8]])
+    ),
+    (metrics.wilson, (0, 0), "trials = "),
+    (metrics.wilson, (-1, 5), "hits = "),
+    (metrics.wilson, (6, 5), "hits = "),
+    (metrics.wilson, (1, 5, 1.0), "level = "),
+]
+
+
+@pytest.mark.parametrize(("figure", "arguments", "message"), REFUSED)
+def test_wrong_arguments_are_refused(figure: Any, arguments: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        figure(*arguments)

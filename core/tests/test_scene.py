@@ -134,19 +134,19 @@ def test_uniform_depths_ignore_their_neighbours() -> None:
     assert abs(correlation) < 4 / np.sqrt(64 * 63)
 
 
-@pytest.mark.parametrize("size", [0, 63, 128])
-def test_car_of_another_size_is_refused(size: int) -> None:
-    with pytest.raises(ValueError, match=rf"size = {size} .*64 or 256"):
-        car(size)
+REFUSED = [
+    *((car, (size,), rf"size = {size} .*64 or 256") for size in (0, 63, 128)),
+    *((build, (7,), r"size = 7 .*8 or more") for build in (building, staircase, uniform)),
+    *(
+        (uniform, (64, 0, *bins), r"first_bin, last_bin = .*from 0 to 100")
+        for bins in ((-1, 50), (50, 50), (60, 50), (20, 101), (20, np.nan))
+    ),
+]
 
 
-@pytest.mark.parametrize("build", [building, staircase, uniform])
-def test_too_small_a_size_is_refused(build: Callable[[int], Scene]) -> None:
-    with pytest.raises(ValueError, match=r"size = 7 .*8 or more"):
-        build(7)
-
-
-@pytest.mark.parametrize(("first", "last"), [(-1, 50), (50, 50), (60, 50), (20, 101), (20, np.nan)])
-def test_bins_outside_the_gate_are_refused(first: float, last: float) -> None:
-    with pytest.raises(ValueError, match=r"first_bin, last_bin = .*from 0 to 100"):
-        uniform(first_bin=first, last_bin=last)
+@pytest.mark.parametrize(("build", "arguments", "message"), REFUSED)
+def test_wrong_arguments_are_refused(
+    build: Callable[..., Scene], arguments: tuple[float, ...], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(*arguments)
