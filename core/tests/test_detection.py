@@ -175,9 +175,9 @@ def test_strong_echoes_stay(strong: Capture, method: str) -> None:
 
 def with_fluxes(cube: np.ndarray, n_pulses: int | None = 1000) -> Capture:
     """Return a capture with true fluxes, which the oracle needs."""
-    light: dict[str, Any] = {"signal": np.full(cube.shape[:2], 0.1), "background": 1.7}
+    fluxes: dict[str, Any] = {"signal": np.full(cube.shape[:2], 0.1), "background": 1.7}
     setting = Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses)
-    return Capture(cube, setting, detection=guess_detection(cube, n_pulses), **light)
+    return Capture(cube, setting, detection=guess_detection(cube, n_pulses), **fluxes)
 
 
 CAPTURES = {

@@ -71,8 +71,8 @@ def assert_contract(capture: Capture, image: RangeImage) -> None:
     assert np.isfinite(image.score).all()
     assert ((image.confidence >= 0) & (image.confidence <= 1)).all()
     assert (image.confidence[~image.valid] == 0).all()
-    answered = image.bin[image.valid]
-    assert ((answered >= 0) & (answered <= capture.acquisition.n_bins)).all()
+    found = image.bin[image.valid]
+    assert ((found >= 0) & (found <= capture.acquisition.n_bins)).all()
     np.testing.assert_array_equal(image.range_m, capture.acquisition.bin_to_range_m(image.bin))
 
 
@@ -180,7 +180,7 @@ def test_a_later_echo_gives_a_later_estimate(method: str, later: int) -> None:
     assert near.valid.all()
     # Rounding, once of bins near a hundred in float64 and once of densities in float32.
     np.testing.assert_allclose(far.bin - near.bin, later, rtol=0, atol=1e-4)
-    if method in ("peak", "matched_filter", "cfar", "shi"):  # others know how late it is
+    if method in ("peak", "matched_filter", "cfar", "shi"):  # other scores depend on the delay
         np.testing.assert_allclose(far.score, near.score, rtol=1e-5)
 
 
@@ -223,12 +223,12 @@ def test_estimates_do_not_depend_on_threads(
 @single_pixel
 def test_pixels_are_ranged_one_by_one(method: str) -> None:
     capture = simulated(size=14)
-    capture = capture_of(capture.cube)  # a light that does not follow the pixels around
+    capture = capture_of(capture.cube)  # the same true fluxes in all pixels
     order = np.random.default_rng(1).permutation(14 * 14)
     shuffled = capture_of(capture.cube.reshape(1, 196, 100)[:, order])
     expected, found = estimate(capture, method), estimate(shuffled, method)
     for field in ("range_m", "bin", "score", "confidence", "valid"):
-        # The light is a mean over all pixels, which rounds as their order has it.
+        # The flux model is a mean over all pixels, whose rounding depends on their order.
         np.testing.assert_allclose(
             getattr(found, field)[0], getattr(expected, field).ravel()[order], rtol=0, atol=1e-3
         )

@@ -75,3 +75,13 @@ def test_public_names_exist(name: str) -> None:
     assert len(module.__all__) == len(set(module.__all__))
     for each in module.__all__:
         assert hasattr(module, each)
+
+
+def test_old_names_of_attributes_warn() -> None:
+    estimator = core.ESTIMATORS["coates"]
+    for old, new in (("light", "flux_model"), ("reach", "window_size"), ("spares", "omits")):
+        with pytest.warns(DeprecationWarning, match=f"is now called {new}"):
+            assert getattr(estimator, old) is getattr(estimator, new)
+    assert core.metrics.Told is core.metrics.ReliabilityBin
+    assert core.metrics.Detection is core.metrics.DetectionRates
+    assert core.inspection.Candidate is core.inspection.RangeCandidate

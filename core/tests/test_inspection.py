@@ -212,7 +212,7 @@ def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
     """Draw all photons of as many pulses, whose number is unknown."""
     fires = Flux(flux.signal / 1000, flux.sbr)
     many = replace(capture.acquisition, n_pulses=1000 * (capture.gated_pulses or 0))
-    # Of so dim a light next to no photon hides another.
+    # At this flux hardly any photon hides another.
     dim = simulate(scene, many, fires, seed=seed)
     unknown = replace(many, n_pulses=None)
     return replace(dim, acquisition=unknown, detection="all", signal=None, background=None)

@@ -115,13 +115,13 @@ def test_errors_are_of_one_size(error_m: np.ndarray) -> None:
 
 def test_variance_of_an_estimator_leaves_out_what_has_none() -> None:
     truth_m = np.array([[50.0, 50.0, 50.0, 50.0, np.nan]])
-    answers = [
+    estimates = [
         [50.0, 51.0, np.nan, np.nan, 1.0],
         [52.0, 51.0, 50.0, np.nan, 9.0],
         [np.nan, 51.0, np.nan, np.nan, 5.0],
     ]
-    range_m = np.array(answers)[:, np.newaxis]
-    # Variances 2 and 0; the third pixel has one answer, the fourth none, the last no target.
+    range_m = np.array(estimates)[:, np.newaxis]
+    # Variances 2 and 0; the third pixel has one estimate, the fourth none, the last no target.
     assert metrics.estimator_variance_m2(range_m, truth_m) == pytest.approx(1.0)
     assert math.isnan(metrics.estimator_variance_m2(range_m[:1], truth_m))
     assert math.isnan(metrics.estimator_variance_m2(range_m, np.full((1, 5), np.nan)))

@@ -295,9 +295,9 @@ def test_noise_seldom_makes_a_cluster(sbr: float, false_acceptance: float) -> No
 def test_superpixels_grow_until_there_is_a_cluster() -> None:
     cube = np.ones((9, 9, 100), np.uint16)
     cube[3:6, 3:6, 40:43] += 2  # 9 of a total of 106: alone no cluster, all nine together one
-    for growth, answered in ((0, 0), (1, 1), (2, 1)):
+    for growth, found in ((0, 0), (1, 1), (2, 1)):
         position, _ = locate("unmixing", cube, 0.06, UnmixingParameters(growth=growth))
-        assert np.isfinite(position[4, 4]) == answered
+        assert np.isfinite(position[4, 4]) == found
         if growth < 2:  # no superpixel reaches the corner
             assert np.isnan(position[0, 0])
     assert abs(position[4, 4] - 40) < 1.5

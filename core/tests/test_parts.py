@@ -200,7 +200,7 @@ def test_jitter_does_not_change_which_photon_is_first() -> None:
     assert clear - rate[0] / math.sqrt(2 * math.pi) < jittered < clear
 
 
-# -- what a capture of such a scene knows ----------------------------------------------------------
+# -- captures of scenes with parts -----------------------------------------------------------------
 
 
 def test_true_fluxes_are_known_only_for_one_echo_over_uniform_background() -> None:

@@ -39,9 +39,9 @@ from core.simulation import simulate
 from core.trigger import coates_rate, rate_per_bin, trigger_probability
 
 # Milliseconds a pixel where the kernels are plain Python.
-SIZE = 8 if numba.config.DISABLE_JIT else 32  # rows and columns where light is estimated
+SIZE = 8 if numba.config.DISABLE_JIT else 32  # rows and columns where fluxes are estimated
 CALIBRATION_SIZE = 8 if numba.config.DISABLE_JIT else 64
-N_BINS = 30  # in the gate where light is estimated
+N_BINS = 30  # in the gate where fluxes are estimated
 EPS_32 = float(np.finfo(np.float32).eps)
 BIN_S = 1e-9
 FOUR_SIGMA = float(stats.norm.sf(4))
@@ -407,7 +407,7 @@ def drawn(
 ) -> Capture:
     """Echoes of a signal over a background, each for all or per pixel.
 
-    Delays are drawn from all over the gate's front, so that nothing is lost behind it, if not told.
+    Delays are drawn from the front of the gate, so that it holds whole echoes, unless given.
     """
     shape = (SIZE, SIZE)
     rng = np.random.default_rng(seed)
@@ -446,7 +446,7 @@ def test_signal_and_background_are_found(signal: float, known: bool) -> None:
     photons = 1 if known else N_PULSES
     found = float(flux.typical_signal.mean()) / photons
     assert signal / HALF_A_STEP < found < signal * HALF_A_STEP
-    # Beside the one pixel that is added none is without an echo.
+    # Only the one additional pixel has no echo.
     assert flux.share[0] < 2 / SIZE**2
     total = float(flux.typical_background.mean()) / photons + (1 - flux.share[0]) * found
     expected = signal + BACKGROUND
@@ -629,22 +629,22 @@ def uniform_captures(quick_draws: None) -> list[tuple[Capture, np.ndarray]]:
     return captures
 
 
-def assert_calibrated(answers: list[tuple[Capture, np.ndarray, np.ndarray]]) -> None:
+def assert_calibrated(estimates: list[tuple[Capture, np.ndarray, np.ndarray]]) -> None:
     """Require confidences (capture, delay, true delay) to be calibrated."""
     chance = np.concatenate(
-        [tolerance_probability(capture, bins).ravel() for capture, bins, _ in answers]
+        [tolerance_probability(capture, bins).ravel() for capture, bins, _ in estimates]
     )
-    error = np.concatenate([np.abs(bins - truth).ravel() for _, bins, truth in answers])
+    error = np.concatenate([np.abs(bins - truth).ravel() for _, bins, truth in estimates])
     right = error <= TOLERANCE_BINS
-    # The posterior is made in whole bins: half a bin is more than it can tell.
+    # The posterior has a resolution of a bin.
     doubtful = np.abs(error - TOLERANCE_BINS) < 0.5
     variance = (chance * (1 - chance)).sum() + 0.25 * np.count_nonzero(doubtful)
     assert abs(chance.sum() - np.count_nonzero(right)) <= 4 * math.sqrt(variance)
     tenth = np.minimum((chance * 10).astype(int), 9)
     for i in range(10):
         some = (tenth == i) & ~doubtful
-        told = chance[some].mean() if some.any() else 0.0
-        low, high = stats.binom.ppf([FOUR_SIGMA, 1 - FOUR_SIGMA], np.count_nonzero(some), told)
+        expected = chance[some].mean() if some.any() else 0.0
+        low, high = stats.binom.ppf([FOUR_SIGMA, 1 - FOUR_SIGMA], np.count_nonzero(some), expected)
         assert low <= np.count_nonzero(right[some]) <= high or not some.any()
 
 
@@ -652,13 +652,13 @@ def assert_calibrated(answers: list[tuple[Capture, np.ndarray, np.ndarray]]) -> 
 def test_confidence_is_the_share_of_right_estimates(
     uniform_captures: list[tuple[Capture, np.ndarray]], method: str
 ) -> None:
-    answers = []
+    estimates = []
     for capture, truth in uniform_captures:
         image = estimate(capture, method)
         assert image.valid.all()
         np.testing.assert_array_equal(image.confidence, tolerance_probability(capture, image.bin))
-        answers.append((capture, image.bin, truth))
-    assert_calibrated(answers)
+        estimates.append((capture, image.bin, truth))
+    assert_calibrated(estimates)
 
 
 @pytest.mark.parametrize("bins", [50.0, 10.5, 1.0, 96.0])
@@ -675,8 +675,8 @@ def test_probability_of_a_surface_is_calibrated() -> None:
     surface = posterior_of(capture).surface
     assert surface[:, ::2].mean() > 0.8
     assert surface[:, 1::2].mean() < 0.2
-    n, told = surface.size, float(surface.mean())
-    low, high = stats.binom.ppf([FOUR_SIGMA, 1 - FOUR_SIGMA], n, told)
+    n, expected = surface.size, float(surface.mean())
+    low, high = stats.binom.ppf([FOUR_SIGMA, 1 - FOUR_SIGMA], n, expected)
     assert low <= n / 2 <= high
 
 
@@ -695,8 +695,8 @@ def any_densities(n_levels: int, n_bins: int) -> np.ndarray:
 @pytest.mark.parametrize("n_levels", [2, 5])
 @pytest.mark.parametrize("n_bins", [1, 7, 40])
 def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None:
-    density, told = any_densities(n_levels, n_bins), np.full(n_levels, 1 / n_levels)
-    share, depth = told, np.full(n_bins, 1 / n_bins)
+    density, initial = any_densities(n_levels, n_bins), np.full(n_levels, 1 / n_levels)
+    share, depth = initial, np.full(n_bins, 1 / n_bins)
     for _ in range(30):
         joint = density * share[:, np.newaxis] * depth
         joint /= joint.sum(axis=(1, 2), keepdims=True)
@@ -704,10 +704,10 @@ def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None
         share = np.maximum(share, 1e-12)
         learned = ndimage.gaussian_filter1d(joint[:, 1:].sum(axis=(0, 1)), 2.0, mode="nearest")
         depth = 0.9 * learned / learned.sum() + 0.1 / n_bins
-    found = shares_and_depths(density, told)
+    found = shares_and_depths(density, initial)
     np.testing.assert_allclose(found[0], share, rtol=1e-4)
     np.testing.assert_allclose(found[1], depth * n_bins, rtol=1e-4)
-    assert (told == 1 / n_levels).all()
+    assert (initial == 1 / n_levels).all()
 
 
 def test_no_echo_at_all_leaves_depths_alike() -> None:

@@ -78,7 +78,7 @@ def test_a_later_window_is_a_gate_that_opens_later(wall: Capture) -> None:
     assert f"{window.acquisition.n_pulses} pulses are armed" in window.source
     assert window.acquisition.bin_to_range_m(0) == pytest.approx(ACQUISITION.bin_to_range_m(20))
     assert fits(window, int(armed.sum()))
-    # As simulated with a gate that does open later: each pixel's counts are told the same share.
+    # The same as a simulation with a gate that opens later.
     later = simulate(
         Scene(np.asarray(wall.truth_range_m)),
         window.acquisition,

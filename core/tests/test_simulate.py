@@ -268,13 +268,13 @@ def test_first_photons_are_some_of_all() -> None:
     assert not np.array_equal(first.cube, first_photons(photons, 50, seed=1).cube)
     assert "first photons of 50 pulses" in first.source
     assert first.signal is None
-    lit = replace(
+    with_fluxes = replace(
         photons,
         acquisition=replace(photons.acquisition, n_pulses=500),
         signal=np.full(photons.shape, 0.1),
         background=0.2,
     )
-    first = first_photons(lit, 50)  # as many photons on a tenth of the pulses
+    first = first_photons(with_fluxes, 50)  # as many photons on a tenth of the pulses
     np.testing.assert_allclose(first.signal, 1.0)
     assert first.background == pytest.approx(2.0)
     many = first_photons(photons, 10**9)

@@ -389,8 +389,8 @@ def test_extreme_settings_are_refused_or_give_valid_positions(
         position, score = track(to_blocks(rows), settings)
         for found in (position, tracking_signals(rows, settings).position_bin):
             assert np.isnan(found[0])  # the empty pixel
-            answered = found[~np.isnan(found)]
-            assert np.isin(answered, range(settings.t_n, 100)).all()
+            positions = found[~np.isnan(found)]
+            assert np.isin(positions, range(settings.t_n, 100)).all()
         assert (np.isfinite(score) & (score >= 0)).all()
         assert ((score > 0) == np.isfinite(position)).all()
 
