@@ -159,12 +159,12 @@ def test_starved_pixels_take_in_more_neighbours() -> None:
     cube[0, 0, 7] = 2
     cube[2, 2, 30] = 1
     capture = Capture(cube, Acquisition(n_bins=40))
-    position, _ = chi._locate(capture, flux_model_of((5, 5), 0.06), ChiParameters())
+    position, _ = chi.ESTIMATOR.locate(capture, flux_model_of((5, 5), 0.06), ChiParameters())
     assert position[2, 2] == 7  # beyond 3 x 3
     cube = cube.copy()
     cube[2, 2, 20:] = 4
     capture = Capture(cube, Acquisition(n_bins=40))
-    position, _ = chi._locate(capture, flux_model_of((5, 5), 0.06), ChiParameters())
+    position, _ = chi.ESTIMATOR.locate(capture, flux_model_of((5, 5), 0.06), ChiParameters())
     assert position[2, 2] >= 20
 
 
