@@ -109,11 +109,7 @@ def predicted(
     ----------
     shape : tuple of int
         Rows, columns and bins.
-    method : str
-        A key of `core.ESTIMATORS`.
-    settings : object, optional
-        Settings of the method; its defaults if None.
-    false_alarm : float, optional
+    method, settings, false_alarm
         As for `core.estimate`.
     n_taps : int
         Bins that an echo fills (`core.Pulse.taps`).

@@ -211,11 +211,11 @@ class Estimator:
 
         The scores are those of an image drawn from the background of the capture alone.
         """
-        whole = tuple(_whole(self.null_side, size) for size in capture.shape)
+        whole = tuple(whole_patches(self.null_side, size) for size in capture.shape)
         some = np.s_[: whole[0], : whole[1]]
         cube = _null_cube(capture)[some].copy()
         null = Capture(cube, capture.acquisition, capture.pulse, detection=capture.detection)
-        flux = self.flux_model(capture).of_pixels(_null_pixels(capture)[some])
+        flux = self.flux_model(capture).of_pixels(null_pixels(capture)[some])
         _, score = self.positions(null, flux, parameters)
         return float(np.quantile(score, 1 - false_alarm))
 
@@ -244,7 +244,7 @@ class Estimator:
         no_echo = _expected(onset[:1], given._replace(signal=np.zeros(())))
         without = self.curve(no_echo, given, parameters)
         most, at = np.empty(onset.size), np.empty(onset.size, np.intp)
-        at_once = max(1, _AT_ONCE // n_bins)
+        at_once = max(1, NUMBERS_AT_ONCE // n_bins)
         for first in range(0, onset.size, at_once):
             some = slice(first, first + at_once)
             added = self.curve(_expected(onset[some], given), given, parameters) - without
@@ -270,7 +270,7 @@ class Estimator:
         size = self.window_size(parameters)
         given = conditions_of(capture, flux, size)
         position, score = np.empty((2, *capture.shape))
-        for patch in patches(capture.cube.shape, _AT_ONCE):
+        for patch in patches(capture.cube.shape, NUMBERS_AT_ONCE):
             cube = pooled_in(capture.cube, patch, size)
             # A few rows at a time, so that temporaries stay in the cache.
             rows_at_once = max(1, _IN_CACHE // cube[0].size)
@@ -307,25 +307,25 @@ def _expected(onset_bin: Floats, given: Conditions) -> Floats:
     return rate if given.n_pulses is None else trigger_probability(rate) * given.n_pulses
 
 
-_AT_ONCE = 2**20  # float64 numbers of a temporary: 8 MiB
+NUMBERS_AT_ONCE = 2**20  # float64 numbers of a temporary: 8 MiB
 _IN_CACHE = 2**16
 _PATCH = 64  # rows and columns that stay together, for methods that use neighbours
 
 
-def _whole(side: int, size: int) -> int:
+def whole_patches(side: int, size: int) -> int:
     """Round `side` rows or columns to whole patches of an image of `size`."""
     patch = min(_PATCH, size)
     return max(1, round(side / patch)) * patch
 
 
 @cached_per_capture
-def _null_pixels(capture: Capture) -> NDArray[np.intp]:
+def null_pixels(capture: Capture) -> NDArray[np.intp]:
     """Flat indices (row, col) of random patches whose background the echo-free image has."""
     rows, cols = capture.shape
     # Fewer pixels, and a less precise threshold, for a long gate.
     side = min(NULL_SIDE, math.isqrt(2**23 // capture.acquisition.n_bins))
     high, wide = min(_PATCH, rows), min(_PATCH, cols)
-    down, across = _whole(side, rows) // high, _whole(side, cols) // wide
+    down, across = whole_patches(side, rows) // high, whole_patches(side, cols) // wide
     rng = np.random.default_rng(0)
     top = rng.integers(rows - high + 1, size=(down, 1, across, 1))
     left = rng.integers(cols - wide + 1, size=(down, 1, across, 1))
@@ -339,10 +339,10 @@ def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     """Draw counts of pixels that see only the background of the capture, (row, col, bin)."""
     rng = np.random.default_rng(1)
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
-    pixels = _null_pixels(capture)
+    pixels = null_pixels(capture)
     background = flux_model_of(capture).of_pixels(pixels).typical_background
     cubes = []
-    rows_at_once = max(1, _AT_ONCE // (pixels.shape[1] * n_bins))
+    rows_at_once = max(1, NUMBERS_AT_ONCE // (pixels.shape[1] * n_bins))
     for first in range(0, len(pixels), rows_at_once):
         rate = background[first : first + rows_at_once, :, np.newaxis] / n_bins
         cubes.append(draw_counts(np.repeat(rate, n_bins, axis=2), n_pulses, rng))

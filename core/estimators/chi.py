@@ -44,7 +44,7 @@ from core.parameters import Settings, parameter
 NARROWEST, WIDEST = 0.5, 3.0
 """Bounds of a trigger's bandwidth, relative to that of the first density."""
 
-_AT_ONCE = 2**20  # counts processed together
+NUMBERS_AT_ONCE = 2**20  # counts processed together
 _LEVELS = 64  # bandwidths in the table of kernels, with interpolation between
 
 
@@ -153,7 +153,7 @@ def repaired(position: Floats, intensity: Floats) -> Floats:
 def _locate(capture: Capture, flux: FluxModel, parameters: ChiParameters) -> tuple[Floats, Floats]:
     """Return repaired positions and the density at the unrepaired ones."""
     position, height = np.empty((2, *capture.shape))
-    for here in patches(capture.cube.shape, _AT_ONCE):
+    for here in patches(capture.cube.shape, NUMBERS_AT_ONCE):
         counts = pooled_in(capture.cube, here, 3)
         starved = counts.sum(axis=2) < capture.acquisition.n_bins
         if starved.any():

@@ -58,7 +58,7 @@ from core.parameters import Number, Settings, parameter
 
 _LAGS = 65  # delays tried around a window
 _STEPS = 100  # of the smoothing
-_AT_ONCE = 2**20  # counts processed together, which bounds temporaries
+NUMBERS_AT_ONCE = 2**20  # counts processed together, which bounds temporaries
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ def find_clusters(capture: Capture, flux: FluxModel, parameters: UnmixingParamet
     templates, growth = _echo_templates(capture, flux), parameters.growth
     background = flux.typical_background
     rows, cols, n_bins = capture.cube.shape
-    for here in patches((rows, cols, n_bins + _LAGS), _AT_ONCE):
+    for here in patches((rows, cols, n_bins + _LAGS), NUMBERS_AT_ONCE):
         around, inner = widened(here, growth)  # with a margin for superpixels
         counts = capture.cube[around].astype(float)
         exposure = exposures(counts, background[around], capture.gated_pulses)

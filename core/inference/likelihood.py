@@ -29,11 +29,11 @@ from core.kernels.blocks import LANES, lane_counts
 from core.kernels.parallel import entering
 from core.kernels.posterior import fill_blocks
 
-_AT_ONCE = 2**19  # numbers that fit in the cache
+NUMBERS_AT_ONCE = 2**19  # numbers that fit in the cache
 _SAMPLE_NUMBERS = 2**25  # likelihoods of the levels and delays of the sample: 128 MiB
-_TABLE_NUMBERS = 2**22  # likelihoods of the levels and delays of a block: 16 MiB
+TABLE_NUMBERS = 2**22  # likelihoods of the levels and delays of a block: 16 MiB
 _FEWEST_LANES = 2  # numpy sums a single lane pairwise, which rounds differently
-_FLUX_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
+FLUX_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
 _LEAST_BACKGROUND = 1e-100  # photons; without any, the likelihood ratio of one count is infinite
 
 
@@ -156,9 +156,9 @@ def prepared_groups(
     """
     n_levels, n_pixels, n_bins = flux.share.size, capture.counts.size, capture.cube.shape[2]
     lanes = lanes_of(n_levels, n_bins * steps_per_bin)
-    at_once = lanes * max(1, _FLUX_NUMBERS // (n_levels * lanes))
+    at_once = lanes * max(1, FLUX_NUMBERS // (n_levels * lanes))
     if lanes < LANES:
-        at_once = lanes * max(1, _TABLE_NUMBERS // (n_bins * lanes))
+        at_once = lanes * max(1, TABLE_NUMBERS // (n_bins * lanes))
     flat = capture.cube.reshape(-1, n_bins)
     for first in range(0, n_pixels, at_once):
         some = slice(first, min(first + at_once, n_pixels))
@@ -178,7 +178,7 @@ def sampled_numbers(n_levels: int, n_bins: int) -> int:
 def lanes_of(n_levels: int, n_delays: int) -> int:
     """Pixels processed together, so that a table of their levels and delays stays small."""
     lanes = LANES
-    while lanes > _FEWEST_LANES and n_levels * n_delays * lanes > _TABLE_NUMBERS:
+    while lanes > _FEWEST_LANES and n_levels * n_delays * lanes > TABLE_NUMBERS:
         lanes //= 2
     return lanes
 
@@ -239,7 +239,7 @@ def level_evidence(prepared: LikelihoodInput, depth: NDArray[np.float32] | float
     evidence = np.empty((n_blocks, lanes, n_levels))
     # Some levels at a time, together with the first, to which the others are compared.
     table = prepared.depth.size * lanes
-    at_once = max(1, _TABLE_NUMBERS // table - 1)
+    at_once = max(1, TABLE_NUMBERS // table - 1)
     evidence[..., 0] = 0.0
     for first in range(1, n_levels, at_once):
         levels = [0, *range(first, min(first + at_once, n_levels))]
@@ -324,7 +324,7 @@ def _log_likelihoods(prepared: LikelihoodInput) -> Iterator[tuple[slice, NDArray
     """
     n_levels, n_blocks, lanes = prepared.signal.shape
     n_delays = prepared.counts.shape[1] * prepared.echo.shape[0]
-    at_once = max(1, _AT_ONCE // (n_levels * n_delays * lanes))
+    at_once = max(1, NUMBERS_AT_ONCE // (n_levels * n_delays * lanes))
     for first in range(0, n_blocks, at_once):
         some = slice(first, min(first + at_once, n_blocks))
         log = np.empty((some.stop - first, n_levels, n_delays, lanes), np.float32)

@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
+from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
@@ -82,7 +83,12 @@ def _ordinary(capture: Capture) -> Capture:
     kept = np.ones(capture.shape, bool) if faulty is None else ~(faulty.hot | faulty.dead)
     if not kept.any():
         kept[:] = True
-    cube = capture.cube[kept][np.newaxis]
+    return selected_pixels(capture, kept)
+
+
+def selected_pixels(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
+    """Return the pixels of a mask (row, col) in one row, without truth and flux prior."""
+    cube = capture.cube[mask][np.newaxis]
     return replace(capture, cube=cube, truth_range_m=None, signal=None, flux_prior=None)
 
 

@@ -100,10 +100,8 @@ def pixel_report(
     image : RangeImage
         Estimate of the capture with this method and these settings.
     row, col : int
-    method : str
-        A key of `core.ESTIMATORS`.
-    settings : object, optional
-        Settings of the method; its defaults if None.
+    method, settings
+        As for `core.estimate`.
 
     Raises
     ------

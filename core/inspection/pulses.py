@@ -52,10 +52,8 @@ def accuracy_over_pulses(
     capture : Capture
     shares : sequence of float
         Shares of the pulses, each above 0 and at most 1.
-    method : str
-        A key of `core.ESTIMATORS`.
-    settings : object, optional
-        Settings of the method; its defaults if None.
+    method, settings
+        As for `core.estimate`.
 
     Yields
     ------

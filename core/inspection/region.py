@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, estimate
-from core.inspection.mean_flux import METHOD, estimate_mean_flux
+from core.inspection.mean_flux import METHOD, estimate_mean_flux, selected_pixels
 from core.inspection.pixel import PixelReport, flux_unit, pixel_report
 from core.inspection.profile import FluxEstimate, OldFluxNames
 
@@ -90,10 +90,8 @@ def region_report(
         Estimate of the capture with this method and these settings.
     mask : ndarray of bool, shape (row, col)
         Pixels of the region, at least one.
-    method : str
-        A key of `core.ESTIMATORS`.
-    settings : object, optional
-        Settings of the method; its defaults if None.
+    method, settings
+        As for `core.estimate`.
 
     Raises
     ------
@@ -103,7 +101,7 @@ def region_report(
     require("mask", f"shape {mask.shape}", mask.shape == capture.shape, f"{capture.shape}")
     n_pixels = int(np.count_nonzero(mask))
     require("region", f"{n_pixels} pixels", n_pixels > 0, "one that contains the centre of a pixel")
-    own, summed = _own(capture, mask), _summed(capture, mask)
+    own, summed = selected_pixels(capture, mask), _summed(capture, mask)
     of_sum = estimate(summed, method, settings)
     range_m = image.range_m[mask & image.valid]
     low_m, median_m, high_m = (
@@ -122,18 +120,6 @@ def region_report(
         flux=estimate_mean_flux(own),
         flux_unit=flux_unit(own),
         flux_method=METHOD,
-    )
-
-
-def _own(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
-    """Return the pixels of the region in one row."""
-    return replace(
-        capture,
-        cube=capture.cube[mask][np.newaxis],
-        truth_range_m=None,
-        signal=None,
-        source=f"{capture.source}; a region of it",
-        flux_prior=None,
     )
 
 

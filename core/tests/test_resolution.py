@@ -1,4 +1,4 @@
-"""What so many pulses can tell: overlaps, their thresholds, and pile-up's closed form."""
+"""Tests of overlaps, their thresholds, and the closed form of pile-up."""
 
 from __future__ import annotations
 
@@ -71,14 +71,14 @@ def test_evidence_adds_up_and_nothing_differs_from_itself() -> None:
     assert np.isnan(same.resolvable)
 
 
-def test_models_that_never_agree_are_told_at_once() -> None:
+def test_disjoint_models_are_resolved_by_one_pulse() -> None:
     sure = difference([1.0, 0.0], [0.0, 1.0], 1)
     assert sure.total_variation == 1
     assert sure.is_resolved.all()
     assert sure.resolvable == 0
 
 
-def test_a_difference_as_large_as_is_resolvable_is_just_told() -> None:
+def test_the_least_resolvable_difference_does_not_depend_on_its_size() -> None:
     n_pulses = 200
     at = float(difference(FLAT, TILTED, n_pulses).resolvable)
     small = difference(FLAT, FLAT + (TILTED - FLAT) / 3, n_pulses)
@@ -98,9 +98,7 @@ def test_counts_of_photons_are_the_limit_of_many_faint_pulses() -> None:
     st.lists(st.floats(0.0, 0.5), min_size=2, max_size=30),
     st.integers(1, 5000),
 )
-def test_pile_up_of_any_light_is_at_most_that_of_fine_bins(
-    rate: list[float], n_pulses: int
-) -> None:
+def test_pile_up_of_any_flux_is_at_most_that_of_fine_bins(rate: list[float], n_pulses: int) -> None:
     rates = np.array(rate)
     fires = trigger_probability(rates)
     fired, photons = fires.sum(), rates.sum()
