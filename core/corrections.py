@@ -19,7 +19,7 @@ CORRECTIONS = {
     "pulse_shape": "shape of the pulse",
     "signal_levels": "levels of signal",
 }
-"""What estimators correct for, by key."""
+"""Effects that estimators correct for, by key."""
 
 
 def without_correction(capture: Capture, correction: str) -> Capture:

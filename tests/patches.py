@@ -79,7 +79,7 @@ def server_costs(address: str) -> Costs:
 
 
 class Meter:
-    """What a page costs from the moment at which it is created."""
+    """Cost of a page from its creation on."""
 
     def __init__(self, address: str) -> None:
         self._address = address

@@ -46,7 +46,7 @@ pytestmark = pytest.mark.browser
 
 
 def colors(picture: np.ndarray) -> Counter[str]:
-    """How often each colour occurs, by its #rrggbb."""
+    """Return the number of pixels of each colour, by its #rrggbb."""
     values, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
     names = ("#{:02x}{:02x}{:02x}".format(*value) for value in values.tolist())
     return Counter(dict(zip(names, counts.tolist(), strict=True)))
@@ -158,7 +158,7 @@ def tap(page: Page) -> np.ndarray:
 
 
 def marks(page: Page, before: dict[str, np.ndarray]) -> np.ndarray:
-    """Where the image differs from before, as (y, x): the old and new frame around the pixel."""
+    """Return changed pixels as (y, x): the old and the new frame around the selected pixel."""
     differs = np.any(look(page)["image"] != before["image"], axis=-1)
     differs[:4] = differs[-4:] = differs[:, :4] = differs[:, -4:] = False  # outline of the focus
     return np.argwhere(differs)
@@ -208,7 +208,7 @@ def test_arrow_keys_on_the_image_move_the_pixel(start_page):
 
 
 def on_stage(page: Page, point: np.ndarray) -> np.ndarray:
-    """Where the present camera shows a point, in pixels of the page."""
+    """Return the position of a point on the page, in pixels, with the present camera."""
     camera = np.array(stage(page).get_attribute("data-camera").split(), float)
     eye, focal, box = camera[:3], camera[3:], stage(page).bounding_box()
     forward = (focal - eye) / np.linalg.norm(focal - eye)

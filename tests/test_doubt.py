@@ -65,12 +65,12 @@ def test_a_slider_shows_its_doubtful_zone_and_says_why_while_it_is_there(page):
     thumb = track["x"] + 8 + position * (track["width"] - 16)
     assert abs(band["x"] + band["width"] - thumb) <= 1.5
 
-    # What a screen reader is told of the slider includes the sentence, and the help the zones.
+    # What a screen reader reads of the slider includes the sentence, and the help the zones.
     assert knob.locator(".track").get_attribute("aria-describedby") == "help doubt"
     knob.get_by_role("button", name="Help on m").click()
     expect(knob.locator(".help")).to_contain_text(f"Unreliable from 0.8 to 1: {reasons[-1]}")
 
-    # In both modes it can be told from what is behind it.
+    # In both modes it can be distinguished from what is behind it.
     for _ in ("light", "dark"):
         eventually(lambda: zones.nth(1).evaluate(CONTRAST) >= 3)  # once colours have faded over
         before = shown.evaluate(PAPER)

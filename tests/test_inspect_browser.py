@@ -213,8 +213,8 @@ def test_everything_about_a_pixel_is_shown(here):
     sbr = report.flux.sbr
     ends = [float(saved[end]) for end in ("value", "low", "high")]
     assert ends == pytest.approx([sbr.value, sbr.low, sbr.high])
-    told = fact(page, "Detections")
-    expect(told).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
+    shown = fact(page, "Detections")
+    expect(shown).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
     verdict = f"Verdict: {report.verdict.health}. {report.verdict.why}"
     expect(page.get_by_text(verdict)).to_be_visible()
     for title in ("Rank", "Bin", "Score", "Probability"):
@@ -451,13 +451,13 @@ def test_units_change_axes_and_table_and_the_pointer_reads_out_all(here):
 
 def test_a_phone_shows_all_parts_below_each_other(page, facade):
     page = page(facade.address, width=390, height=844)
-    told = page.get_by_text("64 × 64 pixels, 334 bins")
+    shown = page.get_by_text("64 × 64 pixels, 334 bins")
     for subject, n_plots in (("Capture", 3), ("Region", 1), ("Pins", 3), ("Pixel", 4)):
         button(page, subject).click()
         plots = page.locator(".bk-Figure").filter(visible=True)
         expect(plots).to_have_count(n_plots)
         bottom = 0.0
-        for box in [*(plot.bounding_box() for plot in plots.all()), told.bounding_box()]:
+        for box in [*(plot.bounding_box() for plot in plots.all()), shown.bounding_box()]:
             assert 0 <= box["x"] < box["x"] + box["width"] <= 390
             assert box["y"] >= bottom
             bottom = box["y"] + box["height"]
@@ -478,8 +478,8 @@ def test_the_capture_is_reported(whole):
     report = inspection.capture_report(whole.capture)
     for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.flux, strict=True):
         expect(fact(whole.page, name)).to_have_text(text.interval(found))
-    told = whole.page.get_by_text(f"Signal, background and SBR: {report.flux_method}")
-    expect(told).to_be_visible()
+    shown = whole.page.get_by_text(f"Signal, background and SBR: {report.flux_method}")
+    expect(shown).to_be_visible()
     counts = drawn(whole.page, "Counts of all pixels", "raw", "raw")
     np.testing.assert_array_equal(counts, report.histogram)
 
@@ -496,9 +496,9 @@ def test_accuracy_is_studied_and_a_bar_shows_the_progress(whole):
     }""")
     described_button(page, "Compute").click()
     eventually(lambda: page.evaluate("seen.at(-1)") == 100)
-    told = page.evaluate("seen")
-    assert told == sorted(told)
-    assert any(0 < each < 100 for each in told)
+    shares = page.evaluate("seen")
+    assert shares == sorted(shares)
+    assert any(0 < each < 100 for each in shares)
     expect(done).to_be_visible()
     title = "Accuracy against number"
     near, taken = (drawn(page, title, "points", column) for column in ("value", "pulses"))
@@ -525,11 +525,11 @@ def test_fewer_pulses_are_taken_live(whole):
 def test_suggestions_are_shown_with_reasons_and_applied(whole):
     page, suggested = whole.page, inspection.capture_report(whole.capture).suggestion
     first, end = suggested.gate
-    for told in (
+    for shown in (
         f"Suggested gate, in bins: {first} to {end}. {suggested.why_gate}",
         f"Suggested T_n: {suggested.t_n}. {suggested.why_t_n}",
     ):
-        expect(page.get_by_text(told)).to_be_visible()
+        expect(page.get_by_text(shown)).to_be_visible()
     apply_t_n, apply_gate = (
         described_button(page, f"Apply {name}") for name in ("T_n", "the gate")
     )

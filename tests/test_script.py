@@ -235,10 +235,10 @@ def script_with(answer: Answer, state: State, **of_source: str) -> str:
 def test_a_name_from_outside_is_never_code(car):
     name = 'a"b\'c\n\\"""; import os #{x}\u2028%s.npz'
     text = script_with(car, State(source="sample"), name=name)
-    (told,) = (
+    (path,) = (
         node.value.value
         for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "path"
     )
-    assert told == name
+    assert path == name
     assert text.replace("\n", "").isprintable()

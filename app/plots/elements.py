@@ -202,7 +202,7 @@ def score_curves(colors: Palette) -> hv.Overlay:
 
 def reliability(colors: Palette) -> hv.Overlay:
     """Plot the share of right pixels against the confidence, a line for each method."""
-    stated = hv.Dimension("told", label="Confidence")
+    stated = hv.Dimension("confidence", label="Confidence")
     right = hv.Dimension("right", label="Share right within 3 bins")
     ends, nothing = np.array([0.0, 1.0]), np.full(1, np.nan)
     layers = [
@@ -370,7 +370,7 @@ def tradeoff(colors: Palette) -> Any:
     points = drawing.scatter(
         "x",
         "y",
-        source=_empty("x", "y", "color", "marker", "method", "way", "told"),
+        source=_empty("x", "y", "color", "marker", "method", "way", "tip"),
         size=9,
         color="color",
         marker="marker",
@@ -380,7 +380,7 @@ def tradeoff(colors: Palette) -> Any:
     points.nonselection_glyph = points.selection_glyph = None
     drawing.add_tools(
         HoverTool(
-            renderers=[points], tooltips=[("", "@way"), ("", "@told")], point_policy="snap_to_data"
+            renderers=[points], tooltips=[("", "@way"), ("", "@tip")], point_policy="snap_to_data"
         )
     )
     legend = drawing.legend[0]

@@ -113,7 +113,7 @@ class ReliabilityPlot:
         self._plot = Plot(plots.reliability(LIGHT), ("honest", "lines", "dots"))
         self._lines = Lines(self._plot)
         self._dots = self._plot.source("dots")
-        self._dots.data = {"told": [], "right": [], "color": []}
+        self._dots.data = {"confidence": [], "right": [], "color": []}
         self._plot.layers["dots"]["glyph"].fill_color = {"field": "color"}
         drawing = self._plot.figure
         drawing.x_range, drawing.y_range = Range1d(0, 1.02), Range1d(0, 1.04)
@@ -126,7 +126,7 @@ class ReliabilityPlot:
         confidence, right = ([each[axis] for each in lines.values()] for axis in (0, 1))
         colors = [[styles[method][0]] * each[0].size for method, each in lines.items()]
         self._dots.data = {
-            "told": np.concatenate([*confidence, np.empty(0)]),
+            "confidence": np.concatenate([*confidence, np.empty(0)]),
             "right": np.concatenate([*right, np.empty(0)]),
             "color": [color for several in colors for color in several],
         }

@@ -43,7 +43,7 @@ class CaptureReport(OldFluxNames):
     flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
-    """How the fluxes are estimated."""
+    """Method by which the fluxes are estimated."""
     n_hot: int | None
     """Hot pixels; None if the image is too narrow to find them."""
     n_dead: int | None

@@ -69,7 +69,7 @@ class PixelReport(OldFluxNames):
     flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
-    """How the fluxes are estimated."""
+    """Method by which the fluxes are estimated."""
     verdict: PixelVerdict
     """Whether the pixel is hot or dead."""
 

@@ -132,7 +132,7 @@ class Summary:
     answered: float
     """Share of target pixels with an estimate."""
     rd_variance: float
-    """Of the restoration degree within 3 bins over captures: most plausibly the paper's Var."""
+    """Variance of the restoration degree within 3 bins over captures, probably the paper's Var."""
     milliseconds: float
     """Median over captures, on this machine."""
 

@@ -89,7 +89,7 @@ def test_every_format_has_the_same_axes(kind: str, write: Write) -> None:
 
 
 def test_the_cloud_lies_on_the_mesh(write: Write) -> None:
-    """What is seen, drawn by the package's own conventions, is where the mesh is."""
+    """Check that surfaces drawn by the package's conventions lie where the mesh is."""
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=2.0)
     scene = read_scene(write("s.ply", mesh_bytes("ply", sphere)), size=(63, 63))
     points = points_m(scene.range_m, scene.acquisition.pixel_angle_rad)

@@ -39,7 +39,7 @@ def wall(n_pixels: int, onset_bin: float = ONSET_BIN) -> Scene:
 
 
 def outcomes(capture: Capture) -> np.ndarray:
-    """How often each bin triggered over all pixels, and, last, how often none did."""
+    """Return the triggers of each bin over all pixels and, last, pulses without a trigger."""
     bins = capture.cube.sum(axis=(0, 1), dtype=np.int64)
     n_pulses = capture.acquisition.n_pulses or 0
     return np.append(bins, capture.cube[..., 0].size * n_pulses - bins.sum())

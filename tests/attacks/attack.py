@@ -190,7 +190,7 @@ class Bystander:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended."""
+    """Outcome of a command."""
 
     status: int | None
     """None if it was stopped for taking too long or too much."""

@@ -66,7 +66,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Reference:
-    """What methods are compared with, besides the truth."""
+    """Reference that methods are compared with, besides the truth."""
 
     limit: limits.Limit | None
     """The physical limit; None where truth, flux or number of pulses is not known."""

@@ -1,4 +1,4 @@
-"""What the Inspect page shows of an estimate, computed by `core`, without widgets."""
+"""Data of the Inspect page, computed by `core`, without widgets."""
 
 from __future__ import annotations
 

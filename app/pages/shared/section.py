@@ -33,7 +33,7 @@ Result = TypeVar("Result")
 
 
 class Paintable(Protocol):
-    """What follows the page between light and dark mode."""
+    """Parts that follow the page between light and dark mode."""
 
     def paint(self, colors: Palette) -> None:
         """Take on the colours of a mode."""
@@ -52,7 +52,7 @@ Settings = TypeVar("Settings", bound=Checked)
 
 @dataclass(frozen=True)
 class Repetitions(Checked):
-    """How much is simulated."""
+    """Amount of simulation."""
 
     repetitions: int = parameter(
         2,

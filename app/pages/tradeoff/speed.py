@@ -55,7 +55,7 @@ ANY_MERGE = "1, 2 and 4"
 
 @dataclass(frozen=True)
 class Effort(Repetitions):
-    """How much is measured."""
+    """Amount of measurement."""
 
     repeats: int = parameter(
         7, Number("Timing rounds", 6, 50, log=True, whole=True, least=6), text.REPEATS_HELP
@@ -65,7 +65,7 @@ class Effort(Repetitions):
 
 @dataclass(frozen=True)
 class Goal(Checked):
-    """What a configuration is required to reach."""
+    """Targets that a configuration has to reach."""
 
     milliseconds: float = parameter(
         10.0,
@@ -233,7 +233,7 @@ class SpeedSection(SettingsSection[Effort]):
             "marker": [plots.MARKERS[place // len(self._colors.methods)] for place in places],
             "method": [spelled(methods[place]) for place in places],
             "way": [text.name_of(point.candidate) for point in points],
-            "told": [text.tip(point) for point in points],
+            "tip": [text.tip(point) for point in points],
         }
         self.plot.source("times").data = {
             "x0": ms["low"],

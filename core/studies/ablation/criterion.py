@@ -27,10 +27,10 @@ from core.scene import PARTS
 Verdict = Literal["needed", "not needed", "cannot tell"]
 
 MARGIN_RD = 0.005
-"""Of the restoration degree within 3 bins: one pixel in 200."""
+"""Smallest relevant change of the restoration degree within 3 bins: one pixel in 200."""
 
 MARGIN_BINS = 0.5
-"""Of the RMSE, in bins: the largest error of rounding to whole bins."""
+"""Smallest relevant change of the RMSE, in bins: the largest error of rounding to whole bins."""
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
@@ -46,7 +46,7 @@ class Requirement:
     verdict: Verdict
     why: str
     total_variation: float = math.nan
-    """How far it changes the trigger probabilities of a pulse, mean over the pixels."""
+    """Mean change of the trigger probabilities of a pulse over the pixels."""
     worst: float = math.nan
     """The same in the pixel where it is largest."""
     resolvable: float = math.nan

@@ -49,7 +49,7 @@ class Candidate:
 
     @property
     def margin(self) -> float:
-        """What the search maximizes."""
+        """Return the quantity that the search maximizes."""
         known = zip(SBRS, EXPECTED["tracking"], strict=True)
         return min(self.rd[sbr] - least for sbr, least in known)
 

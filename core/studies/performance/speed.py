@@ -59,7 +59,7 @@ _ROW, _ROOTS = 4096, 5000  # float32 numbers that stay in the nearest cache; roo
 
 @dataclass(frozen=True)
 class Extent:
-    """What is measured: rounds of timing, starts, images of `side` x `side` pixels, gates."""
+    """Extent of the measurement: rounds of timing, starts, sides of square images, gates."""
 
     rounds: int = 21
     starts: int = 7

@@ -1,4 +1,4 @@
-"""How to acquire: pulses, exposure and gate length required for a restoration degree.
+"""Pulses, exposure and gate length required for a restoration degree.
 
 Two predictions side by side: the theoretical limit (`core.limits`) with known signal and
 background, in milliseconds per image, and simulated captures, ranged by the exact likelihood with

@@ -245,7 +245,7 @@ class Point:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What reproduces it, as JSON takes it."""
+        """Return the settings that reproduce it, as JSON."""
         return {
             "source": self.source,
             "sbr": self.sbr,
@@ -434,7 +434,7 @@ def _capture(source: Source, seed: int) -> Capture:
 
 
 class Piece(NamedTuple):
-    """What one process scores at once; `place` is that of its source in a plan."""
+    """Work of one process; `place` is that of its source in a plan."""
 
     place: int
     source: Source

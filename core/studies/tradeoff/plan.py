@@ -1,4 +1,4 @@
-"""Which candidates are measured on which built-in scenes."""
+"""Plan of a study: candidates to measure on built-in scenes."""
 
 from __future__ import annotations
 

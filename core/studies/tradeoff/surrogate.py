@@ -24,7 +24,7 @@ MARGIN_BINS = 5
 _AT_ONCE = 2**20  # counts whose rates are held in memory
 
 MIN_CONFIDENCE = 0.5
-"""Of an estimate that a surrogate takes for the truth."""
+"""Confidence from which a surrogate takes an estimate for the truth."""
 
 
 @dataclass(frozen=True, eq=False)
