@@ -52,7 +52,7 @@ def test_a_costly_capture_opens_reduced_and_says_so(source, tight):
     answer = compute(ask(source), None)
     less = answer.request.less
     assert less.merge * less.skip > 1
-    assert answer.asked == ReductionSettings()
+    assert answer.requested == ReductionSettings()
     assert answer.capture.cube.size < answer.whole.cube.size
     assert "limits of this server" in answer.capture.source
     # As few as will do: one step less is refused.
@@ -65,7 +65,7 @@ def test_a_costly_capture_opens_reduced_and_says_so(source, tight):
 
 def test_a_capture_that_fits_is_not_reduced(source):
     answer = compute(ask(source), None)
-    assert answer.request.less == answer.asked == ReductionSettings()
+    assert answer.request.less == answer.requested == ReductionSettings()
     assert answer.capture.cube.shape == (120, 120, 100)
 
 

@@ -150,7 +150,7 @@ class Answer:
     """The capture before its reduction."""
     cutout: Cutout | None = None
     """The part in memory of a file larger than memory."""
-    asked: ReductionSettings = field(default_factory=ReductionSettings)
+    requested: ReductionSettings = field(default_factory=ReductionSettings)
     """The reduction that was requested; `request` has a stronger one where the server requires
     it."""
 
@@ -189,7 +189,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
         whole = request.source.load(request.light, request.reading, request.absent)
     else:
         whole = previous.whole
-    asked = request.less
+    requested = request.less
     if is_new:
         request = replace(request, less=_fitting(whole, request))
     if (
@@ -201,7 +201,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
     else:
         require_fitting(_reduced_shape(whole, request), "tracking", _cost(whole, request))
         capture = reduced(whole, request)
-        if request.less != asked:
+        if request.less != requested:
             source = f"{capture.source}; reduced to fit the limits of this server"
             capture = replace(capture, source=source)
         capture_s = perf_counter() - started
@@ -211,7 +211,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
             posterior_of(capture)  # every confidence is computed from it, whatever the method
             capture_s += perf_counter() - started
         estimated = run(capture, "tracking", request.tracking)
-    return Answer(request, estimated, capture_s, whole, cutout, asked)
+    return Answer(request, estimated, capture_s, whole, cutout, requested)
 
 
 def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:

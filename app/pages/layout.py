@@ -12,7 +12,7 @@ import param
 from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
-from app.model import text as words
+from app.model import text
 from app.model.address import Link
 from app.model.restore import parameters_of
 from app.model.script import script_of
@@ -131,7 +131,7 @@ class Layout:
     ----------
     sources : mapping of str to Source
         Scenes and captures to choose from.
-    wanted : Link, optional
+    link : Link, optional
         Settings from the link of the page.
     uploads : Uploads, optional
         Where uploaded files are stored.
@@ -151,16 +151,16 @@ class Layout:
     def __init__(
         self,
         sources: Mapping[str, Source],
-        wanted: Link | None = None,
+        link: Link | None = None,
         uploads: Uploads | None = None,
         tasks: PageTasks | None = None,
     ) -> None:
-        wanted, self._uploads = wanted or Link({}), uploads or Uploads()
-        session = self.session = Session(self._with_upload(sources, wanted.source), wanted, tasks)
+        link, self._uploads = link or Link({}), uploads or Uploads()
+        session = self.session = Session(self._with_upload(sources, link.source), link, tasks)
         state = session.state
         self._pages = {each.name: each for each in PAGES}
         if state.page not in self._pages:
-            session.refused.append(words.no_page(state.page, self._pages))
+            session.refused.append(text.no_page(state.page, self._pages))
             state.page = "Explore" if session.answer.request.source.is_scene else "Inspect"
         self._make_controls()
         self.contents: dict[str, Content] = {}
@@ -175,7 +175,7 @@ class Layout:
         self._show_answer(session.answer)
         self._listen()
         if session.refused:
-            session.failures.show(words.not_restored(session.refused))
+            session.failures.show(text.not_restored(session.refused))
 
     def _view_of(self, page: Page) -> View:
         content = self.contents[page.name] = page.build(self.session)
@@ -197,7 +197,7 @@ class Layout:
             "A built-in scene to simulate, or a capture from a file.",
         )
         self._file = FileInput(
-            lambda reason: session.failures.show(words.not_uploaded(reason, MAX_UPLOAD_BYTES)),
+            lambda reason: session.failures.show(text.not_uploaded(reason, MAX_UPLOAD_BYTES)),
             label="Open a capture file",
             accept=",".join(SUFFIXES),
             max_file_size=MAX_UPLOAD_BYTES,
@@ -227,7 +227,7 @@ class Layout:
             )
             for name, option in reading_options().items()
         }
-        unit = choice(words.UNIT_HELP, state.param.unit)
+        unit = choice(text.UNIT_HELP, state.param.unit)
         unit.param.update(
             label="Gate axes in", sx=UNIT_BUTTONS, sizing_mode="stretch_width", margin=(4, 8)
         )
@@ -274,7 +274,7 @@ class Layout:
             main=[head, *self.pages.mains.values(), self._provenance],
             sidebar_width=330,
             theme_config=THEME,
-            meta=Meta(title="firstphoton", description=words.ONE_LINE),
+            meta=Meta(title="firstphoton", description=text.ONE_LINE),
         )
 
     def _sidebar(self) -> list[Any]:
@@ -337,7 +337,7 @@ class Layout:
             for name, field in self._reading.items():
                 field.value = answer.request.reading.as_text(name)
         self._light_part.visible, self._reading_part.visible = is_scene, not is_scene
-        self._provenance.text = words.provenance(answer)[:2000]
+        self._provenance.text = text.provenance(answer)[:2000]
         self._show_settings()
         self._panels["tracking"].controls["t_n"].high = max(
             answer.capture.acquisition.n_bins - 1, 1
@@ -376,7 +376,7 @@ class Layout:
         try:
             key = self._uploads.add(name, content, self)
         except (ValueError, OSError) as error:
-            self.session.failures.show(words.not_kept(error))
+            self.session.failures.show(text.not_kept(error))
             return
         self.session.sources.update(self._with_upload({}, key))
         self._source.options = self._titles()

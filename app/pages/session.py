@@ -23,7 +23,7 @@ class Session:
     ----------
     sources : mapping of str to Source
         Scenes and captures to choose from; copied, so that an upload belongs to this session only.
-    wanted : Link, optional
+    link : Link, optional
         Settings from the link of the page.
     tasks : PageTasks, optional
         The page's thread; by default that of the page being built.
@@ -45,10 +45,10 @@ class Session:
     def __init__(
         self,
         sources: Mapping[str, Source],
-        wanted: Link | None = None,
+        link: Link | None = None,
         tasks: PageTasks | None = None,
     ) -> None:
-        wanted = wanted or Link({})
+        link = link or Link({})
         self.sources = dict(sources)
         key, first = next(iter(self.sources.items()))
         # A session started with a file opens on Inspect.
@@ -57,8 +57,8 @@ class Session:
         self.tasks = tasks or PageTasks()
         self.failures = FailureLog()
         self.tasks.failed.subscribe(self.failures.report)
-        first_answer = restore(self.state, self.sources, wanted, self._own)
-        self.refused = wanted.refused
+        first_answer = restore(self.state, self.sources, link, self._own)
+        self.refused = link.refused
         self.estimate = CurrentEstimate(
             self.state, self.sources, self.tasks, self.failures, first_answer
         )

@@ -357,7 +357,7 @@ def tradeoff(colors: Palette) -> Any:
         tools="box_zoom,tap",
         toolbar_location=None,
     )
-    for name, dimension in _ASKED.items():
+    for name, dimension in _GOALS.items():
         drawing.add_layout(Span(name=name, dimension=dimension, line_dash=[6, 3]))
     drawing.step("x", "y", source=_empty("x", "y"), mode="after", line_width=2, name="front")
     for name in ("times", "degrees"):
@@ -390,13 +390,13 @@ def tradeoff(colors: Palette) -> Any:
     return drawing
 
 
-_ASKED = {"asked time": "height", "asked degree": "width"}
+_GOALS = {"goal time": "height", "goal degree": "width"}
 """Lines at the required time and restoration degree, and their direction."""
 
 
-def show_asked(drawing: Any, milliseconds: float, degree: float) -> None:
+def show_goals(drawing: Any, milliseconds: float, degree: float) -> None:
     """Draw the required time and restoration degree; a degree of 1 is off the log axis."""
-    for name, location in zip(_ASKED, (milliseconds, 1 - degree or None), strict=True):
+    for name, location in zip(_GOALS, (milliseconds, 1 - degree or None), strict=True):
         drawing.select_one({"name": name}).location = location
 
 
@@ -404,7 +404,7 @@ def paint_tradeoff(drawing: Any, colors: Palette) -> None:
     """Set the colours of lines; the points have their own."""
     for name, color in (("front", colors.text), ("chosen", colors.answer)):
         drawing.select_one({"name": name}).glyph.line_color = color
-    for name in _ASKED:
+    for name in _GOALS:
         drawing.select_one({"name": name}).line_color = colors.muted
 
 

@@ -24,7 +24,7 @@ from typing import IO, Any, BinaryIO, cast
 import panel as pn
 import param
 
-from app.model import download_text as words
+from app.model import download_text
 from app.model.colors import ColorScale
 from app.model.exports import Write, image_files, plot_file
 from app.model.state import Viewing
@@ -181,7 +181,7 @@ class Download(Component):
 
     def offer(self, formats: Iterable[str]) -> None:
         """Offer these formats, by their suffixes without the point."""
-        self.formats = [[suffix, words.FORMATS[suffix]] for suffix in formats]
+        self.formats = [[suffix, download_text.FORMATS[suffix]] for suffix in formats]
 
     def _handle_msg(self, message: Any) -> None:
         """Handle the browser's request for a format or for the next piece, or its failure."""
@@ -191,7 +191,7 @@ class Download(Component):
             elif "from" in message:
                 self._send_piece(message["from"])
             elif "failed" in message:
-                self._session.failures.show(words.no_picture(str(message["failed"])))
+                self._session.failures.show(download_text.no_picture(str(message["failed"])))
         except Exception as error:  # a message may be malformed in many ways
             self._fail(error)
 
@@ -233,7 +233,7 @@ class Download(Component):
     def _fail(self, error: Exception) -> None:
         log.warning("a download failed", exc_info=error)
         self._close()
-        self._session.failures.show(words.not_saved(error))
+        self._session.failures.show(download_text.not_saved(error))
         self._send_msg({"failed": True})
 
     def _close(self) -> None:

@@ -104,7 +104,7 @@ class CurrentEstimate:
 
     def _take_reduction(self, answer: Answer) -> None:
         """Show the reduction that was added to keep the request within its limits."""
-        if self._state.less == answer.asked != answer.request.less:
+        if self._state.less == answer.requested != answer.request.less:
             with param.discard_events(self._state):
                 self._state.less = answer.request.less
 

@@ -211,7 +211,7 @@ class SpeedSection(SettingsSection[Effort]):
             self._draw_points(points, pareto)
             chosen = [found.point for found in (best, cheapest) if found is not None]
             self.plot.source("chosen").data = _line(chosen)
-            plots.show_asked(self.plot.figure, goal.milliseconds, goal.rd)
+            plots.show_goals(self.plot.figure, goal.milliseconds, goal.rd)
             advice = text.advice(goal.milliseconds, goal.rd, best, cheapest)
             for sentence, line in zip(self.advice, advice, strict=True):
                 sentence.text = line
