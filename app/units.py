@@ -77,10 +77,20 @@ def milliseconds(seconds: float) -> Quantity:
     return Quantity(f"{seconds:.2f} s", seconds, "s")
 
 
+def three_digits(value: float) -> str:
+    """Format a number with three digits; a dash for NaN."""
+    return "–" if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.3g}"
+
+
+def bounds(low: float, high: float) -> str:
+    """Format the ends of an interval; empty for NaN."""
+    return "" if math.isnan(low) else f"[{three_digits(low)}, {three_digits(high)}]"
+
+
 def interval(value: float, low: float, high: float) -> Quantity:
     """Format a number with the ends of its interval."""
-    text, *ends = ("∞" if math.isinf(each) else f"{each:.3g}" for each in (value, low, high))
-    return Quantity(f"{text} [{', '.join(ends)}]", value, low=low, high=high)
+    text = f"{three_digits(value)} {bounds(low, high)}".strip()
+    return Quantity(text, value, low=low, high=high)
 
 
 @dataclass(frozen=True)

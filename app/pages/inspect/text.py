@@ -10,7 +10,16 @@ from app.model.large import Grid
 from app.model.store import Answer
 from app.model.text import CONFIDENCE_HELP, Fact, cell, estimate_facts, number, percent_cell, share
 from app.pages.inspect.results import Inspected
-from app.units import AXIS_TITLES, OPPOSITE_UNIT, Quantity, Scale, count, scale
+from app.units import (
+    AXIS_TITLES,
+    OPPOSITE_UNIT,
+    Quantity,
+    Scale,
+    bounds,
+    count,
+    scale,
+    three_digits,
+)
 from app.units import interval as format_interval
 from core import Capture
 from core.inspection import Candidate, CaptureReport, FluxEstimate
@@ -154,7 +163,6 @@ def pin_row(found: Inspected, name: str, color: str, along: Scale, other: Scale)
     """Return the row of a pinned pixel."""
     pixel, report = found.pixel, found.report
     sbr = report.flux.sbr
-    value, *ends = interval(sbr).split(" ", 1)
     known = not math.isnan(pixel.answer_bin)
     below = other.place(pixel.answer_bin) if known else "no estimate"
     return {
@@ -164,7 +172,11 @@ def pin_row(found: Inspected, name: str, color: str, along: Scale, other: Scale)
         "cells": [
             (along.number(pixel.answer_bin), pixel.answer_bin if known else None, below),
             percent_cell(pixel.confidence),
-            (value, sbr.value if math.isfinite(sbr.value) else None, "".join(ends)),
+            (
+                three_digits(sbr.value),
+                sbr.value if math.isfinite(sbr.value) else None,
+                bounds(sbr.low, sbr.high),
+            ),
             (report.verdict.health, report.verdict.health, ""),
         ],
     }
