@@ -1,4 +1,4 @@
-"""The Panel app; uses public names of `core` only."""
+"""The Panel app: everything that needs a screen. It uses `core` by its documented names only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colours of the light and the dark mode, and styles of all plots."""
+"""Colours and sizes, once for light and once for dark."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ import colorcet
 
 FONT = "Roboto, system-ui, sans-serif"
 
-# Perceptually uniform, without its white end, which would vanish on the page.
-RANGE_COLORS: list[str] = colorcet.palette["bgyw"][:-12]
+RANGE_COLORS: list[str] = colorcet.palette["bgyw"][
+    :-12
+]  # perceptually uniform; its white end would vanish
 ERROR_COLORS: list[str] = colorcet.palette["diverging_bwr_20_95_c54"]
 COUNT_COLORS: list[str] = colorcet.palette["fire"][30:-20]
 WRONG_COLOR = "#e8206a"
 OUTSIDE_COLOR = "#8d949c"
-"""Colour of values beyond the ends of a range image's scale."""
+"""Of answers beyond both ends of a range image's colour scale."""
 
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours of one mode; those of the signals are safe for colour blindness (Okabe and Ito)."""
+    """Colours of one mode; the signals' hues are those of Okabe and Ito, told apart by everyone."""
 
     text: str
     muted: str
@@ -35,7 +36,7 @@ class Palette:
     truth: str
     answer: str
     methods: tuple[str, ...]
-    """Colours of methods, none of them that of the truth; `method_style` adds dashes."""
+    """Of methods side by side, none of them the truth's; `method_style` adds dashes."""
 
 
 LIGHT = Palette(
@@ -73,7 +74,7 @@ DARK = Palette(
 
 
 def palette(dark: bool) -> Palette:
-    """Return the colours of a mode."""
+    """The colours of the mode."""
     return DARK if dark else LIGHT
 
 
@@ -81,19 +82,19 @@ DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2])
 
 
 def method_style(place: int, colors: Palette) -> tuple[str, list[int]]:
-    """Return colour and dashes of the n-th method's line, counted from 0."""
-    n_dash, n_color = divmod(place, len(colors.methods))
-    return colors.methods[n_color], DASHES[n_dash % len(DASHES)]
+    """Colour and dashes of the line of the method picked at a place, 0 being the first."""
+    again, hue = divmod(place, len(colors.methods))
+    return colors.methods[hue], DASHES[again % len(DASHES)]
 
 
 STYLES: dict[str, dict[str, object]] = {
-    # Transparent, so that the card's colour changes with the mode.
+    # The card shows through: it goes dark at once.
     "Plot": {
         "background_fill_color": None,
         "border_fill_color": None,
         "outline_line_color": None,
     },
-    "Grid": {},  # listed, so that the page's theme does not change its colour
+    "Grid": {},  # named, so that the page's theme leaves its colour alone
     "Title": {"text_font_size": "12px", "text_font": FONT, "standoff": 2},
     "Axis": {
         "axis_label_text_font": FONT,
@@ -126,4 +127,4 @@ STYLES: dict[str, dict[str, object]] = {
         "major_label_text_font_size": "11px",
     },
 }
-"""Styles of all plots by Bokeh's model; `paint_frame` sets the colours of a mode."""
+"""What all plots have in common, by Bokeh's model; a mode's colours are from `paint_frame`."""

@@ -1,4 +1,4 @@
-"""Checks of values, whose errors name the field, its value and what would be accepted."""
+"""One way to refuse a value: say which, what it was, and what would be accepted."""
 
 from __future__ import annotations
 
@@ -17,20 +17,9 @@ _MOST_SHOWN = 200  # characters of a file's path
 
 
 def require(name: str, value: object, accepted: bool, what: str) -> None:
-    """Raise ``ValueError`` unless a value is `accepted`.
+    """Raise ``ValueError`` naming the field, the value and what would be accepted.
 
-    Write the check as a comparison that accepted values satisfy: NaN then fails it.
-
-    Parameters
-    ----------
-    name : str
-        Field, as the message names it.
-    value : object
-        Shown with ``repr``.
-    accepted : bool
-        Result of the check.
-    what : str
-        Values that would be accepted, for the message.
+    A NaN fails every comparison, so a check written as what *is* accepted refuses it too.
     """
     if not accepted:
         raise ValueError(f"{name} = {value!r} is not accepted: give {what}.")
@@ -42,18 +31,18 @@ def require_whole(name: str, value: Any, most: int, also: str = "") -> None:
     Parameters
     ----------
     name, value
-        As for `require`.
+        As `require` takes them.
     most : int
-        Largest accepted number.
+        Largest number accepted.
     also : str
-        Other accepted values, for the message.
+        What else would be accepted, for the message.
     """
     accepted = isinstance(value, Integral) and 1 <= int(value) <= most
     require(name, value, accepted, f"a whole number from 1 to {most:,}{also}")
 
 
 def printable(text: str) -> str:
-    """Replace the bytes of a file name that are not valid text, so that it can be encoded."""
+    """Text that any encoding of Unicode can hold: a file name may have bytes that are no text."""
     try:
         found = text.encode("utf-8", "surrogateescape")  # the bytes of the name
     except UnicodeEncodeError:
@@ -62,7 +51,7 @@ def printable(text: str) -> str:
 
 
 def shown(path: Path | str) -> str:
-    """Return a file name for a message, with the middle of a very long one cut out."""
+    """A file name as messages show it, shortened in its middle where it is very long."""
     name = printable(str(path))
     if len(name) <= _MOST_SHOWN:
         return name
@@ -70,22 +59,22 @@ def shown(path: Path | str) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """Return the message of an error, without the file names that the system appends."""
+    """Message of an error, without the file names that a system's error repeats."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return printable(text)
 
 
 @contextmanager
 def refusing(path: Path, kind: type[ValueError]) -> Iterator[None]:
-    """Turn any error into one of type `kind` whose message begins with the file's name."""
+    """Turn whatever goes wrong with a file into one type of error that names the file."""
     name = shown(path.name)
     try:
         yield
     except ValueError as error:
         if isinstance(error, kind) and str(error).startswith((f"{path.name}: ", f"{name}: ")):
-            raise  # already names the file
+            raise  # said already, by what reads a part of the file
         raise kind(f"{name}: {error}") from error
-    except Exception as error:  # a missing permission, a lack of memory, ...
+    except Exception as error:  # from a closed folder to memory too small
         raise kind(
             f"{name}: cannot be read ({type(error).__name__}: {reason(error)}): "
             "give a whole file that may be opened and fits in memory."

@@ -1,6 +1,7 @@
-"""Metadata of settings: meaning, unit and bounds of the fields of a frozen dataclass.
+"""Settings as frozen dataclasses whose fields know their meaning, unit and bounds.
 
-The app builds its controls and the command line its options from this metadata.
+The app's controls are made from this metadata, so that a limit or a sentence of help is written
+once.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from core.checks import require
 __all__ = [
     "Choice",
     "Number",
-    "Settings",
     "Zone",
     "check_fields",
     "doubts",
@@ -27,9 +27,9 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Zone:
-    """Values from `low` to `high` that make estimates unreliable, with the reason as a sentence.
+    """Values, from `low` to `high`, with which an answer is in doubt, and a sentence that says why.
 
-    ``python -m core stability`` measures estimates in these zones.
+    ``python -m core stability`` measures what becomes of the answers there.
     """
 
     low: float
@@ -42,30 +42,26 @@ class Zone:
 
 @dataclass(frozen=True)
 class Number:
-    """A numeric setting.
+    """A number: its symbol, the range worth exploring, and what is refused.
 
     Parameters
     ----------
     symbol : str
-        Symbol in the literature.
+        As written in the literature.
     low, high : float
-        Useful range, that of a slider.
+        Sensible range, that of a slider.
     log : bool
-        Whether a slider is logarithmic.
+        Whether the range is best walked by factors.
     whole : bool
-        Whether only integers are accepted.
+        Whether only integers make sense.
     unit : str
-        Empty for a pure number. A value in ``bins``, or per bin, is rescaled where bins are merged.
-    merge_power : int, optional
-        Power of the merging factor by which it is rescaled; None takes that of the unit.
-    is_bin_index : bool
-        Whether the value is a bin of the gate, which moves with the start of a cut gate.
+        Empty for a pure number.
     least, most : float
-        Smallest and largest accepted value.
+        Smallest and largest value accepted at all.
     open_below : bool
         Whether `least` itself is refused.
     doubtful : tuple of Zone
-        Accepted values that make estimates unreliable.
+        Values that are accepted, but with which answers are in doubt.
     """
 
     symbol: str
@@ -74,8 +70,6 @@ class Number:
     log: bool = False
     whole: bool = False
     unit: str = ""
-    merge_power: int | None = None
-    is_bin_index: bool = False
     least: float = -math.inf
     most: float = math.inf
     open_below: bool = False
@@ -89,7 +83,7 @@ class Number:
         require(name, value, self.takes(value), bounds)
 
     def takes(self, value: Any) -> bool:
-        """Return whether `value` is acceptable."""
+        """Whether `value` is acceptable."""
         if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
             return False
         above: Any = value
@@ -99,7 +93,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Choice:
-    """A setting with a few named options."""
+    """One of a few named ways."""
 
     symbol: str
     options: tuple[str, ...]
@@ -110,21 +104,21 @@ class Choice:
 
 
 def parameter(default: Any, spec: Number | Choice, help: str) -> Any:
-    """Return a dataclass field with a specification and a sentence of help."""
+    """A dataclass field with its specification and a line of help."""
     return field(default=default, metadata={"spec": spec, "help": help})
 
 
 def spec_of(dataclass_field: Field[Any]) -> Number | Choice:
-    """Return the specification that `parameter` gave to a field."""
+    """The specification that `parameter` gave to a field."""
     spec: Number | Choice = dataclass_field.metadata["spec"]
     return spec
 
 
 def doubts(settings: Any) -> list[str]:
-    """Return the reasons why these settings make estimates unreliable, one sentence each.
+    """Why answers are in doubt with these settings, one sentence a reason.
 
-    Reasons that concern single fields come from their doubtful `Zone`, those that concern several
-    from the settings' own method ``joint_doubts``.
+    First those of single fields that lie in a doubtful `Zone`, then those that concern several, as
+    the settings' own ``joint_doubts`` tells them.
     """
     found = []
     for each in fields(settings):
@@ -135,32 +129,12 @@ def doubts(settings: Any) -> list[str]:
 
 
 def joint_doubts(settings: Any) -> list[str]:
-    """Return the `doubts` that concern several fields; empty if the settings define none."""
-    reasons: list[str] = settings.joint_doubts() if hasattr(settings, "joint_doubts") else []
-    return reasons
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Base of frozen dataclasses whose fields have specifications.
-
-    Raises
-    ------
-    ValueError
-        If a field is out of its bounds.
-    """
-
-    def __post_init__(self) -> None:
-        check_fields(self)
+    """`doubts` that no single field has, empty for settings that know of none."""
+    told: list[str] = settings.joint_doubts() if hasattr(settings, "joint_doubts") else []
+    return told
 
 
 def check_fields(settings: Any) -> None:
-    """Check every field of a settings object against its specification.
-
-    Raises
-    ------
-    ValueError
-        If a field is out of its bounds.
-    """
+    """Check every field of a settings object against its own specification."""
     for each in fields(settings):
         spec_of(each).check(each.name, getattr(settings, each.name))

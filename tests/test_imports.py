@@ -1,4 +1,4 @@
-"""The app imports public names of core, and its rooms import lower rooms only."""
+"""What the app imports: public names of core, and of its own rooms only lower ones."""
 
 from __future__ import annotations
 

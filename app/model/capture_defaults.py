@@ -1,4 +1,4 @@
-"""Defaults of the state that depend on the capture."""
+"""Values of the state that follow from a capture unless the user chooses others."""
 
 from __future__ import annotations
 

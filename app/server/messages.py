@@ -1,4 +1,4 @@
-"""Pages with a single sentence, for requests that are not served."""
+"""Pages of one sentence, for requests that are not served."""
 
 from __future__ import annotations
 
@@ -22,38 +22,36 @@ _FORM = """
 </label> <button>Enter</button>
 </form>"""
 
-TOKEN_REQUIRED = (
-    "This server requires a token. It is part of the link that was printed when the server started."
-)
-WRONG_TOKEN = "Wrong token. The token was printed when the server was started."
+ASK = "This server asks for a token. The link that was printed when it was started contains it."
+WRONG = "Wrong token. The token was printed when the server was started."
 FOREIGN = (
-    "This server does not accept requests for this address, or from pages of another site. To add "
-    "an address, start the server with --origin."
+    "This request names an address, or comes from another site's page, that this server does not "
+    "accept. To add an address, start the server with --origin."
 )
-MALFORMED = "This address contains characters that are not accepted."
+MALFORMED = "This address contains characters that no address of this server has."
 
 
 def refusal(sentence: str) -> str:
-    """Return a page with the reason why nothing is served."""
+    """A page that says why nothing is served."""
     return _PAGE.format(sentence=escape(sentence), form="", role="alert", meta="")
 
 
 def token_form(sentence: str) -> str:
-    """Return a page with a form for the token."""
-    role = "note" if sentence == TOKEN_REQUIRED else "alert"
+    """A page that asks for the token."""
+    role = "note" if sentence == ASK else "alert"
     return _PAGE.format(sentence=escape(sentence), form=_FORM, role=role, meta="")
 
 
 def too_many_tokens(delay_s: float) -> str:
-    """Return the sentence for a client that has sent too many wrong tokens."""
+    """Sentence for an address that has sent too many wrong tokens."""
     return f"Too many wrong tokens from your address. Try again in {delay_s:.0f} s."
 
 
 def full_page(retry_s: int) -> str:
-    """Return a page for a full server, which reloads itself."""
+    """A page that says that the server has no room, and tries again by itself."""
     sentence = (
-        "This server has no room for another session at the moment. This page tries again every "
-        f"{retry_s} s; closing another page makes room."
+        "This server has no room for another session at the moment. The page tries again by "
+        f"itself every {retry_s} s; room is made when someone closes a page."
     )
     meta = f'<meta http-equiv="refresh" content="{retry_s}">'
     return _PAGE.format(sentence=sentence, form="", role="status", meta=meta)

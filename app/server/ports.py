@@ -1,4 +1,4 @@
-"""TCP ports."""
+"""TCP ports: command-line values and free ports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Report on one pixel."""
+"""All that is known of one pixel."""
 
 from __future__ import annotations
 
@@ -15,72 +15,72 @@ from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
-from core.inference.faults import PixelVerdict, pixel_verdict
+from core.inference.faults import Verdict, verdict
 from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import posterior_of
 from core.inspection.flux import METHOD, estimate_flux
-from core.inspection.profile import FluxEstimate, OldFluxNames
+from core.inspection.profile import FluxEstimate
 
 MOST_CANDIDATES = 5
 
 
 @dataclass(frozen=True)
-class RangeCandidate:
-    """A possible delay of the surface: a peak of an estimator's score."""
+class Candidate:
+    """A place where the surface may be: a peak of an estimator's score."""
 
     bin: float
-    """Delay in fractional bins, corrected for the lag of the estimator."""
+    """Delay in fractional bins, the estimator's lag removed."""
     range_m: float
     score: float
     relative: float
     """Score over that of the best candidate; 1 for that one."""
     probability: float
-    """Probability of a surface within 3 bins (`core.inference.posterior`)."""
+    """That there is a surface within 3 bins of it (`core.inference.posterior`)."""
 
 
 @dataclass(frozen=True, eq=False)
-class PixelReport(OldFluxNames):
-    """Report on one pixel, or on the sum of the pixels of a region."""
+class PixelReport:
+    """All that is known of one pixel, or of a region's pixels added to one."""
 
     row: int
     col: int
     counts: Floats
     """Detections in each bin, shape (bin,)."""
     rate: Floats
-    """Photons per pulse in each bin with pile-up corrected (Coates 1968), shape (bin,). The counts
-    themselves for all photons or an unknown number of pulses."""
+    """Photons per pulse in each bin with the pile-up undone (Coates 1968), shape (bin,). The counts
+    themselves where that cannot be done: photons that hide none, or pulses that are not known."""
     rate_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     method: str
     """Key of `core.ESTIMATORS`."""
     curve: Floats
-    """Score of each bin, not corrected for the lag, shape (bin,)."""
+    """The estimator's score of each bin, its lag not removed; shape (bin,)."""
     lag_bins: float
-    """Distance from the delay of the surface to the maximum of the score."""
+    """How far behind the surface's delay the score is largest."""
     answer_bin: float
-    """Delay in the range image; NaN without an estimate."""
+    """The range image's answer; NaN where it has none."""
     answer_m: float
-    """Range in the range image, likewise."""
     confidence: float
-    candidates: tuple[RangeCandidate, ...]
-    """Highest peaks of the score, in descending order; empty without detections."""
+    candidates: tuple[Candidate, ...]
+    """The best peaks of the score, best first; none where the pixel is empty."""
     find_flux: Callable[[], FluxEstimate] = field(repr=False)
-    """Function that estimates `flux`."""
+    """Finds `flux`."""
     flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
-    """Method by which the fluxes are estimated."""
-    verdict: PixelVerdict
+    """How they are found."""
+    verdict: Verdict
     """Whether the pixel is hot or dead."""
 
+    light = renamed("flux")
+    light_unit = renamed("flux_unit")
+    light_method = renamed("flux_method")
     find_light = renamed("find_flux")
 
     @cached_property
     def flux(self) -> FluxEstimate:
-        """Signal, background and their ratio with 95 % intervals, estimated on first access.
-
-        In photons per pulse if the number of pulses is known, otherwise in photons.
-        """
+        """Signal, background and their ratio, with 95 % intervals, in photons per pulse where the
+        pulses are known. Found when first asked for: it takes longer than all else."""
         return self.find_flux()
 
 
@@ -92,21 +92,23 @@ def pixel_report(
     method: str = "tracking",
     settings: Any = None,
 ) -> PixelReport:
-    """Report on one pixel.
+    """All that is known of one pixel.
 
     Parameters
     ----------
     capture : Capture
     image : RangeImage
-        Estimate of the capture with this method and these settings.
+        The capture's, by this method and these settings.
     row, col : int
-    method, settings
-        As for `core.estimate`.
+    method : str
+        A key of `core.ESTIMATORS`.
+    settings : object, optional
+        The method's own settings; its defaults where None.
 
     Raises
     ------
     ValueError
-        If there is no such pixel, or the method or its settings are unknown.
+        If there is no such pixel, or the method or its settings are not known.
     """
     rows, cols = capture.shape
     inside = 0 <= row < rows and 0 <= col < cols
@@ -136,25 +138,25 @@ def pixel_report(
         find_flux=find_flux,
         flux_unit=flux_unit(capture),
         flux_method=METHOD,
-        verdict=pixel_verdict(capture, row, col),
+        verdict=verdict(capture, row, col),
     )
 
 
 def flux_unit(capture: Capture) -> str:
-    """Return the unit of fluxes: ``"photons"`` if the number of pulses is unknown."""
+    """In which light is told: ``"photons per pulse"``, or ``"photons"`` without known pulses."""
     return "photons" if capture.acquisition.n_pulses is None else "photons per pulse"
 
 
 @cached_per_capture
 def lag_bins(capture: Capture, method: str, settings: Any) -> float:
-    """Return `Estimator.lag_bins`, cached; 0 for an estimator without a lag."""
+    """Return the estimator's lag, in bins; see `Estimator.lag_bins`."""
     estimator = ESTIMATORS[method]
     return 0.0 if estimator.finds_delay else estimator.lag_bins(capture, settings)
 
 
 def _candidates(
     capture: Capture, row: int, col: int, curve: Floats, lag_bins: float
-) -> tuple[RangeCandidate, ...]:
+) -> tuple[Candidate, ...]:
     if not capture.counts[row, col]:
         return ()
     peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
@@ -163,9 +165,9 @@ def _candidates(
     if not peaks.size:
         return ()
     bins = np.clip(peaks - lag_bins, 0.0, capture.acquisition.n_bins)
-    table = posterior_of(capture).tolerance_probability[row, col]
-    probability = np.clip(np.interp(bins, np.arange(table.size), table), 0.0, 1.0)
+    near = posterior_of(capture).tolerance_probability[row, col]
+    probability = np.clip(np.interp(bins, np.arange(near.size), near), 0.0, 1.0)
     range_m = capture.acquisition.bin_to_range_m(bins)
     score = curve[peaks]
     columns = (bins, range_m, score, score / score[0], probability)
-    return tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
+    return tuple(Candidate(*map(float, each)) for each in zip(*columns, strict=True))

@@ -1,1 +1,1 @@
-"""Compiled code, its compilation options, data layout and thread locks."""
+"""Compiled code, and how it is compiled, laid out and entered."""

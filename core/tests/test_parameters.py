@@ -1,4 +1,4 @@
-"""Tests of the bounds of settings."""
+"""Settings know their bounds, and refuse the rest in words."""
 
 from __future__ import annotations
 

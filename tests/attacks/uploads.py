@@ -1,4 +1,4 @@
-"""Files and messages that a page sends while another session is used."""
+"""Files and messages that a page sends, while another session is at work."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ANSWERED_S = 60.0
 
 
 class Tab:
-    """A page in which files are opened."""
+    """A page that files are opened in."""
 
     def __init__(self, wire: Wire) -> None:
         self.wire = wire
@@ -32,7 +32,7 @@ class Tab:
 
     @property
     def alert(self) -> str:
-        """Error message of the page."""
+        """What the page complains of."""
         return str(self.wire.values.get((self._alert, "text"), ""))
 
     @property
@@ -64,7 +64,7 @@ class Tab:
         )
 
     async def until(self, name: str, limit_s: float = ANSWERED_S) -> str:
-        """Wait until a file has been opened or refused; return what happened."""
+        """What became of a file: opened, refused with a sentence, or nothing."""
         begun = time.monotonic()
 
         def is_open() -> bool:
@@ -90,7 +90,7 @@ def _id(reference: Any) -> str | None:
 async def opened(server: Server, query: str = "") -> Tab:
     """A new page."""
     wire = Wire()
-    await wire.open(server.address + query)
+    await wire.open(server.address + query, **server.headers)
     return Tab(wire)
 
 

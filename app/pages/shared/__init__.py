@@ -1,1 +1,1 @@
-"""Parts shared by several pages."""
+"""What several pages have in common."""

@@ -1,8 +1,7 @@
 // Rebuild the items of a legend only where they have changed.
 //
 // A legend rebuilds its items whenever anything below them changes, such as the data of a line; the
-// browser then lays out the page in the middle of a paint. Upstream: none found. Gain: a step of a
-// slider takes 3.8 instead of 6.6 layouts and 48 instead of 55 ms of the main thread.
+// browser then lays out the page in the middle of a paint. Upstream: none found.
 {
   const legend = Bokeh.Models.get("Legend").prototype.default_view.prototype;
   const { render, _render_items: build } = legend;
@@ -17,9 +16,9 @@
       item.visible,
       item.renderers.map(({ visible }) => visible),
     ]);
-    const current = JSON.stringify(items);
-    if (current === this.built) return;
-    this.built = current;
+    const wanted = JSON.stringify(items);
+    if (wanted === this.built) return;
+    this.built = wanted;
     build.call(this);
   };
 }

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.capture import CaptureInfo
+from core.capture import Seen
 from core.checks import require
 from core.estimators import RangeImage
 from core.geometry import Points, points_m
@@ -32,14 +32,14 @@ class Product:
 
     Parameters
     ----------
-    capture : CaptureInfo
+    capture : Seen
         Source of the range image.
     image : RangeImage
         Range image of the capture's shape.
     pixel_angle_rad : float, optional
         Angle between the lines of sight of neighbouring pixels, in radians.
     title : str
-        Title; see `heading`.
+        For people; see `heading`.
     rgb : ndarray of uint8, shape (row, col, 3), optional
         Colours of the points of a cloud.
     shown : mapping of str to Plane
@@ -52,7 +52,7 @@ class Product:
         angle is not between 0 and π/2.
     """
 
-    capture: CaptureInfo
+    capture: Seen
     image: RangeImage
     pixel_angle_rad: float | None = None
     title: str = ""
@@ -75,24 +75,22 @@ class Product:
 
     @property
     def heading(self) -> str:
-        """Title, or a general one."""
+        """The title, if there is one."""
         return _plain(self.title) or "Range image"
 
     @property
     def planes(self) -> dict[str, Plane]:
-        """Images by name."""
+        """The images, by name."""
         image, shown = self.image, dict(self.shown)
         known = {
-            "range_m": Plane(image.range_m, "m", "range of the surface, NaN without an estimate"),
+            "range_m": Plane(image.range_m, "m", "range of the surface, NaN without an answer"),
             "confidence": Plane(
-                image.confidence,
-                "1",
-                "probability that the estimate is right within 3 bins",
+                image.confidence, "1", "probability that the surface is within 3 bins of the answer"
             ),
             "counts": Plane(self.capture.counts, "1", "detections of the pixel"),
             "bin": Plane(image.bin, "1", "delay of the echo in bins, from the opening of the gate"),
-            "score": Plane(image.score, "1", "score of the estimate, of the estimator's own scale"),
-            "valid": Plane(image.valid, "1", "whether there is an estimate"),
+            "score": Plane(image.score, "1", "score at the answer, of the estimator's own scale"),
+            "valid": Plane(image.valid, "1", "whether there is an answer"),
         }
         return shown | {name: plane for name, plane in known.items() if name not in shown}
 
@@ -112,15 +110,15 @@ class Product:
         return facts
 
     def points(self) -> Points:
-        """Return the estimates in space.
+        """The answers in space.
 
         Raises
         ------
         ValueError
             If there are none, or the angle between pixels is not known.
         """
-        n_valid = int(self.image.valid.sum())
-        require("valid pixels", n_valid, n_valid > 0, "an image with some: a cloud needs points")
+        answers = int(self.image.valid.sum())
+        require("answers", answers, answers > 0, "an image with answers: a cloud needs points")
         angle_rad = self.pixel_angle_rad
         if angle_rad is None:
             raise ValueError(
@@ -144,5 +142,5 @@ class Product:
 
 
 def _plain(text: str) -> str:
-    """Return text on one line, of characters that every format can hold."""
+    """Text on one line, of characters that every format can hold."""
     return "".join(character if character.isprintable() else " " for character in text)

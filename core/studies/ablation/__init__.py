@@ -1,6 +1,11 @@
-"""Ablation: which parts of a model a scene needs."""
+"""Which parts of a model a scene requires."""
 
 from core.studies.ablation.criterion import TITLES, Requirement
 from core.studies.ablation.study import NOTE, requirements
 
-__all__ = ["NOTE", "TITLES", "Requirement", "requirements"]
+__all__ = [
+    "NOTE",
+    "TITLES",
+    "Requirement",
+    "requirements",
+]

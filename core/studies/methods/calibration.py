@@ -1,8 +1,8 @@
-"""Calibration of the confidence: is 0.9 right nine times in ten?"""
+"""Is a confidence of 0.9 right nine times in ten? For every method, on two scenes, at six SBRs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,19 +10,18 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture
-from core.estimators import RangeImage, estimate
+from core.estimators import ESTIMATORS, RangeImage
 from core.inference.posterior import TOLERANCE_BINS
-from core.metrics import ReliabilityBin, calibration_error, reliability
-from core.studies.outputs import Table, table
+from core.metrics import Told, calibration_error, reliability
+from core.studies.outputs import Table
 from core.studies.paper.printed import TABLE_2
 from core.studies.trials import Condition
 
 METHODS = ("likelihood", "tracking", "coates", "peak")
-SCENES = ("uniform", "car")
 
 
-def confidence_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the confidence of all estimates and whether each is right; wrong without a surface.
+def told_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, NDArray[np.bool_]]:
+    """Confidence of all answers, and whether each is right; where there is no surface it is wrong.
 
     Raises
     ------
@@ -43,50 +42,48 @@ class Report:
     scene: str
     sbr: float | None
     method: str
-    tenths: list[ReliabilityBin]
-    """Estimates by tenths of confidence, from `core.metrics.reliability`."""
+    told: list[Told]
 
     @property
     def error(self) -> float:
         """Expected calibration error."""
-        return calibration_error(self.tenths)
+        return calibration_error(self.told)
 
 
 def reports(seeds: Sequence[int]) -> Iterator[Report]:
-    """Yield a report per scene, SBR and method, and last of each scene one over all SBRs."""
-    for scene in SCENES:
-        found: dict[tuple[float, str], tuple[Floats, NDArray[np.bool_]]] = {}
+    """Compute the report, one method, scene and SBR at a time, and all SBRs together last."""
+    for scene in ("uniform", "car"):
+        pooled: dict[str, list[tuple[Floats, NDArray[np.bool_]]]] = {m: [] for m in METHODS}
         for sbr in TABLE_2:
-            captures = [Condition(scene, sbr).capture(seed) for seed in seeds]
+            here: dict[str, list[tuple[Floats, NDArray[np.bool_]]]] = {m: [] for m in METHODS}
+            for seed in seeds:
+                capture = Condition(scene, sbr).capture(seed)
+                for method in METHODS:
+                    estimator = ESTIMATORS[method]
+                    image = estimator(capture, estimator.parameters())
+                    here[method].append(told_and_right(capture, image))
             for method in METHODS:
-                pairs = [confidence_and_right(c, estimate(c, method)) for c in captures]
-                found[sbr, method] = _joined(pairs)
-                yield Report(scene, sbr, method, reliability(*found[sbr, method]))
+                yield Report(scene, sbr, method, _pooled(here[method]))
+                pooled[method] += here[method]
         for method in METHODS:
-            pooled = _joined([found[sbr, method] for sbr in TABLE_2])
-            yield Report(scene, None, method, reliability(*pooled))
+            yield Report(scene, None, method, _pooled(pooled[method]))
 
 
-def _joined(
-    pairs: Sequence[tuple[Floats, NDArray[np.bool_]]],
-) -> tuple[Floats, NDArray[np.bool_]]:
+def _pooled(pairs: Sequence[tuple[Floats, NDArray[np.bool_]]]) -> list[Told]:
     confidence, right = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    return confidence, right
+    return reliability(confidence, right)
 
 
-def calibration_table(seeds: Sequence[int]) -> Table:
-    """Return calibration error and share of right estimates by confidence of each report."""
-    return table(
+def table(reports: Iterable[Report]) -> Table:
+    """Return a row for each report: its calibration error, and the share right by confidence."""
+    rows = []
+    for report in reports:
+        bins = (f"{t.confidence:.2f}: {t.right.value:.2f} ({t.count})" for t in report.told)
+        sbr = "all six" if report.sbr is None else f"{report.sbr:g}"
+        rows.append((report.scene, sbr, report.method, report.error, ", ".join(bins)))
+    return Table(
         "calibration",
         "Calibration of confidence",
-        reports(seeds),
-        {
-            "scene": lambda report: report.scene,
-            "SBR": lambda report: "all six" if report.sbr is None else f"{report.sbr:g}",
-            "method": lambda report: report.method,
-            "calibration error": lambda report: report.error,
-            "confidence: share right (estimates)": lambda report: ", ".join(
-                f"{t.confidence:.2f}: {t.right.value:.2f} ({t.count})" for t in report.tenths
-            ),
-        },
+        ("scene", "SBR", "method", "calibration error", "confidence: share right (estimates)"),
+        tuple(rows),
     )

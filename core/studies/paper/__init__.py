@@ -1,4 +1,4 @@
-"""Figures and tables of the paper, reproduced."""
+"""The paper: its figures and tables beside ours."""
 
 from core.studies.paper import figures
 
