@@ -33,7 +33,7 @@ bench: $(VENV)/.test ## slider to changed pixels, through a real browser
 load: $(VENV)/.test ## twenty sessions at once, and ten thousand interactions in one
 	$(BIN)/python -m tests.load
 
-speed: $(VENV)/.app ## the kernels beside plain ones and the machine's floors; fails where a ratio is lost
+speed: $(VENV)/.app ## kernels compared with plain implementations; fails where a speed-up is lost
 	$(BIN)/python -m core speed
 
 tradeoff: $(VENV)/.app ## what accuracy costs, and what to choose; CAPTURE=path for your own

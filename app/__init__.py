@@ -1,4 +1,4 @@
-"""The Panel app: everything that needs a screen. It uses `core` by its documented names only."""
+"""The Panel app; uses public names of `core` only."""
 
 from __future__ import annotations
 

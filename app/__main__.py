@@ -1,9 +1,9 @@
 """Serve the app: ``python -m app [capture files]``.
 
-Only this machine reaches it, unless --address says otherwise. Then --origin must name the host
-that browsers will show, and everyone needs the token in the link that is printed; to choose it
-yourself, set FIRSTPHOTON_TOKEN in the environment (a command line is seen by all who are on the
-machine). What is sent over a network is not encrypted: keep to your own, or go by ssh -L.
+By default only this machine can connect. With another --address, --origin must name the host that
+browsers use, and every browser needs the token in the printed link. Set FIRSTPHOTON_TOKEN in the
+environment to choose it (other users of the machine can see command lines). Traffic is not
+encrypted: use a trusted network, or ssh -L.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from typing import Any
 import panel as pn
 
 import core
-from app.model import text as words
+from app.model import text
 from app.model.state import Illumination
 from app.model.store import Source, built_in_sources, file_source
 from app.model.uploads import Uploads
 from app.pages.layout import build_page
-from app.server import garbage as collector
+from app.server import garbage
 from app.server.access import TOKEN_VARIABLE, Access
 from app.server.patches import apply_patches, scripts
 from app.server.ports import free_port, port_number
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Serve until interrupted; returns the exit code."""
+    """Serve until interrupted; return the exit code."""
     parser = argparse.ArgumentParser(
         prog="firstphoton" if Path(sys.argv[0]).stem == "firstphoton" else "python -m app",
         description=__doc__,
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
         "captures", nargs="*", type=Path, help=f"capture files to open ({', '.join(SUFFIXES)})"
     )
     parser.add_argument(
-        "--port", type=port_number, default=5006, help="default: 5006; 0 takes a free one"
+        "--port", type=port_number, default=5006, help="default: 5006; 0 chooses a free one"
     )
     parser.add_argument("--address", default="127.0.0.1", help="default: this machine only")
     parser.add_argument(
@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
         action="append",
         default=[],
         metavar="HOST[:PORT]",
-        help="how browsers reach an --address that others reach; more than one is possible",
+        help="host that browsers use to reach --address; may be repeated",
     )
     parser.add_argument("--version", action="version", version=f"firstphoton {core.__version__}")
     parser.add_argument("--show", action="store_true", help="open a browser")
@@ -68,21 +68,21 @@ def main(arguments: list[str] | None = None) -> int:
         type=float,
         default=LINGER_S,
         metavar="SECONDS",
-        help="for how long a page that is closed or cut off is kept (default: %(default)s)",
+        help="time for which a closed or disconnected page is kept (default: %(default)s)",
     )
     chosen = parser.parse_args(arguments)
-    # The files given come first: the page opens on them.
-    given = {f"path {n}": file_source(p, shared=True) for n, p in enumerate(chosen.captures)}
-    for source in given.values():
+    # Files come first: the page opens on the first source.
+    files = {f"path {n}": file_source(p, shared=True) for n, p in enumerate(chosen.captures)}
+    for source in files.values():
         try:
             print(source.load(Illumination(), ReadOptions(), ()).source, flush=True)
-        except ValueError as error:  # unreadable, or more than is held as a whole
+        except ValueError as error:  # unreadable or too large
             parser.error(str(error))
-    sources, uploads = given | built_in_sources(), Uploads()
+    sources, uploads = files | built_in_sources(), Uploads()
     pn.extension("vtk")
     try:
         port = chosen.port or free_port(chosen.address)
-        scripts()  # refuses unknown names of patches
+        scripts()  # raises for unknown names of patches
         token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
         access = Access.of(chosen.address, port, chosen.origin, token)
         server = server_of(
@@ -92,38 +92,38 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(str(error))
     except OSError as error:
         print(f"Cannot serve at {chosen.address}, port {chosen.port}: {error.strerror}.")
-        print("Give another --port, or --port 0 for any that is free.")
+        print("Choose another --port, or --port 0 for a free one.")
         return 1
-    # An exit that is raised wherever the thread happens to be can be lost there: like Ctrl+C, by
-    # Panel, this ends the loop below.
+    # An exception raised at an arbitrary place can be lost: handle SIGTERM like Ctrl+C, for which
+    # Panel stops the loop below.
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
-    print("Compiling what is not compiled yet ...", flush=True)
+    print("Compiling kernels that are not cached ...", flush=True)
     core.warm_up()
     tune()
     apply_patches()
-    collector.spare()
+    garbage.freeze_all()
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
     if chosen.show:
         server.io_loop.add_callback(webbrowser.open, link)
     server.start()
     server.io_loop.start()  # until Ctrl+C
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # the next waits for nothing
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl+C exits at once
     server.stop()
     STUDIES.is_closed = True
     return 0
 
 
 def page_for(sources: Mapping[str, Source], uploads: Uploads) -> Any:
-    """The page of a new session, or a sentence where it cannot be built."""
+    """Return the page of a new session, or a sentence if it cannot be built."""
     if pn.state.curdoc is not None:
         pn.state.curdoc.template_variables["scripts"] = scripts()
-        pn.state.onload(collector.spare)
+        pn.state.onload(garbage.freeze_all)
     try:
         return build_page(sources, uploads)
     except Exception:
-        log.exception("a page could not be built")
-        return Sentence(text=words.NO_PAGE, warning=True)
+        log.exception("could not build a page")
+        return Sentence(text=text.NO_PAGE, warning=True)
 
 
 if __name__ == "__main__":

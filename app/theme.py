@@ -1,4 +1,4 @@
-"""Colours and sizes, once for light and once for dark."""
+"""Colours of the light and the dark mode, and styles of all plots."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ import colorcet
 
 FONT = "Roboto, system-ui, sans-serif"
 
-RANGE_COLORS: list[str] = colorcet.palette["bgyw"][
-    :-12
-]  # perceptually uniform; its white end would vanish
+# Perceptually uniform, without its white end, which would vanish on the page.
+RANGE_COLORS: list[str] = colorcet.palette["bgyw"][:-12]
 ERROR_COLORS: list[str] = colorcet.palette["diverging_bwr_20_95_c54"]
 COUNT_COLORS: list[str] = colorcet.palette["fire"][30:-20]
 WRONG_COLOR = "#e8206a"
 OUTSIDE_COLOR = "#8d949c"
-"""Of answers beyond both ends of a range image's colour scale."""
+"""Colour of values beyond the ends of a range image's scale."""
 
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours of one mode; the signals' hues are those of Okabe and Ito, told apart by everyone."""
+    """Colours of one mode; those of the signals are safe for colour blindness (Okabe and Ito)."""
 
     text: str
     muted: str
@@ -36,7 +35,7 @@ class Palette:
     truth: str
     answer: str
     methods: tuple[str, ...]
-    """Of methods side by side, none of them the truth's; `method_style` adds dashes."""
+    """Colours of methods, none of them that of the truth; `method_style` adds dashes."""
 
 
 LIGHT = Palette(
@@ -74,7 +73,7 @@ DARK = Palette(
 
 
 def palette(dark: bool) -> Palette:
-    """The colours of the mode."""
+    """Return the colours of a mode."""
     return DARK if dark else LIGHT
 
 
@@ -82,19 +81,19 @@ DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2])
 
 
 def method_style(place: int, colors: Palette) -> tuple[str, list[int]]:
-    """Colour and dashes of the line of the method picked at a place, 0 being the first."""
-    again, hue = divmod(place, len(colors.methods))
-    return colors.methods[hue], DASHES[again % len(DASHES)]
+    """Return colour and dashes of the n-th method's line, counted from 0."""
+    n_dash, n_color = divmod(place, len(colors.methods))
+    return colors.methods[n_color], DASHES[n_dash % len(DASHES)]
 
 
 STYLES: dict[str, dict[str, object]] = {
-    # The card shows through: it goes dark at once.
+    # Transparent, so that the card's colour changes with the mode.
     "Plot": {
         "background_fill_color": None,
         "border_fill_color": None,
         "outline_line_color": None,
     },
-    "Grid": {},  # named, so that the page's theme leaves its colour alone
+    "Grid": {},  # listed, so that the page's theme does not change its colour
     "Title": {"text_font_size": "12px", "text_font": FONT, "standoff": 2},
     "Axis": {
         "axis_label_text_font": FONT,
@@ -127,4 +126,4 @@ STYLES: dict[str, dict[str, object]] = {
         "major_label_text_font_size": "11px",
     },
 }
-"""What all plots have in common, by Bokeh's model; a mode's colours are from `paint_frame`."""
+"""Styles of all plots by Bokeh's model; `paint_frame` sets the colours of a mode."""

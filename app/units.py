@@ -1,4 +1,4 @@
-"""Units of positions along the gate: bins, nanoseconds and metres.
+"""Numbers on screen: formatted quantities, and positions along the gate in a chosen unit.
 
 Data stay in bins; only displayed numbers are converted.
 """
@@ -14,6 +14,83 @@ OPPOSITE_UNIT = {"bins": "m", "ns": "m", "m": "bins"}
 """Unit of the axis opposite to the chosen one."""
 
 AXIS_TITLES = {"bins": "Bin", "ns": "Time (ns)", "m": "Range (m)"}
+
+
+class Quantity(str):
+    """Text of a number that keeps the number, which tables and downloads use.
+
+    Parameters
+    ----------
+    text : str
+        As shown on screen; a dash if `value` is NaN.
+    value : float
+    unit : str
+    low, high : float, optional
+        Ends of an interval.
+    note : str
+        Remark in the text.
+    """
+
+    value: float
+    unit: str
+    low: float | None
+    high: float | None
+    note: str
+
+    def __new__(
+        cls,
+        text: str,
+        value: float,
+        unit: str = "",
+        low: float | None = None,
+        high: float | None = None,
+        note: str = "",
+    ) -> Quantity:
+        """Attach a number to its text."""
+        quantity = super().__new__(cls, "–" if math.isnan(value) else text)
+        quantity.value, quantity.unit, quantity.note = value, unit, note
+        quantity.low, quantity.high = low, high
+        return quantity
+
+
+def number(value: float, unit: str, sign: bool = False) -> Quantity:
+    """Format a number with its unit; a dash if it is not finite."""
+    value = value if math.isfinite(value) else math.nan
+    text = f"{value:+.4g}" if sign else f"{value:.4g}" if abs(value) < 1000 else f"{value:,.2f}"
+    return Quantity(f"{text} {unit}".strip(), value, unit)
+
+
+def count(value: int, note: str = "") -> Quantity:
+    """Format an integer, with a remark in brackets."""
+    return Quantity(f"{value:,} ({note})" if note else f"{value:,}", value, note=note)
+
+
+def share(value: float) -> Quantity:
+    """Format a share in percent."""
+    return Quantity(f"{100 * value:.1f} %", 100 * value, "%")
+
+
+def milliseconds(seconds: float) -> Quantity:
+    """Format a duration."""
+    if seconds < 1:
+        return Quantity(f"{1000 * seconds:.1f} ms", 1000 * seconds, "ms")
+    return Quantity(f"{seconds:.2f} s", seconds, "s")
+
+
+def three_digits(value: float) -> str:
+    """Format a number with three digits; a dash for NaN."""
+    return "–" if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.3g}"
+
+
+def bounds(low: float, high: float) -> str:
+    """Format the ends of an interval; empty for NaN."""
+    return "" if math.isnan(low) else f"[{three_digits(low)}, {three_digits(high)}]"
+
+
+def interval(value: float, low: float, high: float) -> Quantity:
+    """Format a number with the ends of its interval."""
+    text = f"{three_digits(value)} {bounds(low, high)}".strip()
+    return Quantity(text, value, low=low, high=high)
 
 
 @dataclass(frozen=True)
@@ -43,17 +120,16 @@ class Scale:
         """Number of decimals that resolves a hundredth of a bin."""
         return max(0, 2 - math.floor(math.log10(self.step)))
 
-    def number(self, position_bin: float) -> str:
+    def number(self, position_bin: float) -> Quantity:
         """Format a position without its unit; a dash for NaN."""
-        is_known = math.isfinite(position_bin)
-        return f"{self.at(position_bin):,.{self.decimals}f}" if is_known else "–"
+        value = self.at(position_bin)
+        return Quantity(f"{value:,.{self.decimals}f}", value)
 
-    def place(self, position_bin: float) -> str:
+    def place(self, position_bin: float) -> Quantity:
         """Format a position with its unit; a dash for NaN."""
         number = self.number(position_bin)
-        if number == "–":
-            return number
-        return f"bin {number}" if self.name == "bins" else f"{number} {self.name}"
+        text = f"bin {number}" if self.name == "bins" else f"{number} {self.name}"
+        return Quantity(text, number.value, self.name)
 
 
 def scale(unit: str, acquisition: Acquisition) -> Scale:

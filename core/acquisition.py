@@ -1,4 +1,4 @@
-"""The instrument: gate, bins, pulse, and the only place where bins become time and metres."""
+"""Gate, bins, pulse and flux, and the conversion of bins to time and range."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from core.checks import require, require_whole
 
 Floats = NDArray[np.float64]
 
-SPEED_OF_LIGHT_M_S = 299_792_458.0  # exactly: this is what a metre is
+SPEED_OF_LIGHT_M_S = 299_792_458.0  # exact by definition
 
 LONGEST_S = 10.0
-"""Longest time that any part of an acquisition may take: light needs 2.6 s to the Moon and back."""
+"""Upper bound of every time in an acquisition; light takes 2.6 s to the Moon and back."""
 
 SHORTEST_BIN_S, SHORTEST_PULSE_S = 1e-18, 1e-21
-"""Smallest bin width and pulse time constant: far below what any detector resolves."""
+"""Smallest bin width and pulse time constant, far below what any detector resolves."""
 
 MOST_BINS = 2**24
 """Largest number of bins in a gate."""
@@ -29,7 +29,7 @@ MOST_BINS = 2**24
 _MOST_SHOWN = 10  # samples in a message
 
 MOST_PULSES = 2**53
-"""Largest number of pulses: every whole number up to here is exact as a float."""
+"""Largest number of pulses: integers up to here are exact as float64."""
 
 
 def require_time(name: str, value_s: float, least_s: float) -> None:
@@ -40,7 +40,7 @@ def require_time(name: str, value_s: float, least_s: float) -> None:
 
 @dataclass(frozen=True)
 class Acquisition:
-    """How a capture was, or is to be, recorded.
+    """Settings with which a capture was, or will be, recorded.
 
     Bin ``k`` covers the time ``gate_delay_s + [k, k + 1) * bin_width_s`` after the pulse leaves.
 
@@ -52,13 +52,11 @@ class Acquisition:
         Width of one bin in seconds, from `SHORTEST_BIN_S` to `LONGEST_S`; the whole gate lasts at
         most `LONGEST_S`.
     gate_delay_s : float
-        Time from the pulse to the opening of the gate in seconds, at most `LONGEST_S` in either
-        direction.
+        Time from the pulse to the opening of the gate in seconds, from -`LONGEST_S` to `LONGEST_S`.
     n_pulses : int or None
-        Pulses sent for each pixel, from 1 to `MOST_PULSES`; None where a file does not say.
+        Pulses sent for each pixel, from 1 to `MOST_PULSES`; None if unknown.
     pixel_angle_rad : float or None
-        Angle between the lines of sight of neighbouring pixels, in radians; None where a file does
-        not say.
+        Angle between the lines of sight of neighbouring pixels, in radians; None if unknown.
 
     Raises
     ------
@@ -81,12 +79,12 @@ class Acquisition:
         )
         require_time("gate_delay_s", self.gate_delay_s, -LONGEST_S)
         if self.n_pulses is not None:
-            require_whole("n_pulses", self.n_pulses, MOST_PULSES, ", or None where it is not known")
+            require_whole("n_pulses", self.n_pulses, MOST_PULSES, ", or None if unknown")
         require(
             "pixel_angle_rad",
             self.pixel_angle_rad,
             self.pixel_angle_rad is None or 0 < self.pixel_angle_rad < 1,
-            "between 0 and 1 radian, or None where it is not known",
+            "between 0 and 1 radian, or None if unknown",
         )
 
     def bin_to_range_m(self, bins: ArrayLike) -> Floats:
@@ -108,20 +106,36 @@ class Acquisition:
         return float(self.bin_width_s * SPEED_OF_LIGHT_M_S / 2)
 
 
+def pulses_sent(acquisition: Acquisition) -> int:
+    """Return the number of pulses of an acquisition.
+
+    Raises
+    ------
+    ValueError
+        If it is unknown.
+    """
+    if acquisition.n_pulses is None:
+        raise ValueError("n_pulses = None is not accepted: give the number of pulses.")
+    return acquisition.n_pulses
+
+
 @dataclass(frozen=True)
 class Pulse:
-    """Shape in time of a returned echo, normalised to one photon.
+    """Temporal shape of an echo, normalised to one photon.
 
-    ``Pulse(tau_s)`` is the pulse of the paper, ``t / tau² · exp(-t / tau)`` for ``t >= 0``, whose
-    time zero is its onset. `gaussian` has its time zero at its centre, `measured` at its first
-    sample.
+    ``Pulse(tau_s)`` is the paper's pulse, ``t / tau² · exp(-t / tau)`` for ``t >= 0``. Its time
+    zero is the onset; that of `gaussian` is the centre, and that of `measured` the first sample.
 
     Parameters
     ----------
     tau_s : float
-        Time constant in seconds, from `SHORTEST_PULSE_S` to `LONGEST_S`: the peak comes ``tau``
-        after the onset, the full width at half maximum is 2.446 ``tau``. (Standard deviation of a
-        Gaussian, sample spacing of a measured pulse.)
+        Time constant in seconds, from `SHORTEST_PULSE_S` to `LONGEST_S`: the peak lies ``tau``
+        after the onset, the full width at half maximum is 2.446 ``tau``. For a Gaussian the
+        standard deviation, for a measured pulse the sample spacing.
+    shape : str
+        ``"gamma"``, ``"gaussian"`` or ``"measured"``.
+    samples : tuple of float
+        Samples of a measured pulse, in any unit.
 
     Raises
     ------
@@ -149,12 +163,12 @@ class Pulse:
 
     @classmethod
     def gaussian(cls, sigma_s: float) -> Pulse:
-        """A Gaussian pulse of standard deviation `sigma_s` seconds around its delay."""
+        """Return a Gaussian pulse of standard deviation `sigma_s` seconds, centred on its delay."""
         return cls(sigma_s, shape="gaussian")
 
     @classmethod
     def measured(cls, samples: ArrayLike, bin_width_s: float) -> Pulse:
-        """A recorded pulse: non-negative `samples` (n,), each `bin_width_s` seconds wide."""
+        """Return a pulse of non-negative `samples` (n,), each `bin_width_s` seconds wide."""
         return cls(
             bin_width_s,
             shape="measured",
@@ -162,13 +176,13 @@ class Pulse:
         )
 
     def cdf(self, time_s: ArrayLike) -> Floats:
-        """Share of the pulse's photons that arrived before `time_s` (any shape) after time zero."""
+        """Share of the photons that arrive before `time_s` seconds after time zero, any shape."""
         t = np.divide(time_s, self.tau_s)
         if self.shape == "gaussian":
             return np.asarray(scipy.special.ndtr(t))
         if self.shape == "measured":
             return np.asarray(np.interp(t, *self._measured_cdf))
-        # In place: a fresh array for each step costs more, in page faults, than the exponential.
+        # In place: page faults of new arrays cost more than the exponential.
         t = np.maximum(t, 0.0, out=t) if isinstance(t, np.ndarray) else np.maximum(t, 0.0)
         decay = np.exp(-t)
         t += 1.0
@@ -176,9 +190,9 @@ class Pulse:
         return np.asarray(np.subtract(1.0, t))
 
     def density(self, time_s: ArrayLike) -> Floats:
-        """Photons per second at `time_s` (any shape) after time zero: the slope of `cdf`.
+        """Photons per second at `time_s` seconds after time zero, any shape: the slope of `cdf`.
 
-        Where a measured pulse steps from one sample to the next it is that of the sample before.
+        At the boundary of two samples of a measured pulse, that of the earlier one.
         """
         t = np.divide(time_s, self.tau_s)
         if self.shape == "gaussian":
@@ -194,19 +208,19 @@ class Pulse:
 
     @cached_property
     def _measured_cdf(self) -> tuple[Floats, Floats]:
-        """Edges of the samples and the share of the photons before each; shape (sample + 1,)."""
+        """Edges of the samples and the share of the photons before each, shape (sample + 1,)."""
         share = np.concatenate([[0.0], np.cumsum(self.samples)])
         return np.arange(share.size, dtype=float), share / share[-1]
 
     @cached_property
     def _measured_density(self) -> tuple[Floats, float]:
-        """The samples between two zeros, shape (sample + 2,), and their sum."""
+        """Samples padded with a zero on either side, shape (sample + 2,), and their sum."""
         samples = np.concatenate([[0.0], self.samples, [0.0]])
         return samples, samples.sum()
 
     @cached_property
     def span_s(self) -> tuple[float, float]:
-        """Times after time zero by which a tenth and nine tenths of the photons have arrived."""
+        """Times after time zero by which 10 % and 90 % of the photons have arrived."""
         return self.quantile_s(0.1), self.quantile_s(0.9)
 
     def quantile_s(self, share: float) -> float:
@@ -216,13 +230,14 @@ class Pulse:
     def taps(
         self, n_bins: int, bin_width_s: float, delay_bin: ArrayLike = 0.0
     ) -> tuple[Floats, int]:
-        """An echo as a filter sees it: all but a thousandth of its photons on either side.
+        """Return an echo as a filter, without the first and the last thousandth of its photons.
 
         Parameters
         ----------
         n_bins : int
-            Bins in the gate: no more of them before or after the delay count.
+            Bins in the gate; taps farther than this from the delay are left out.
         bin_width_s : float
+            Width of one bin in seconds.
         delay_bin : array_like, any shape
             Delays from 0 to 1, in bins after the beginning of bin 0.
 
@@ -231,9 +246,9 @@ class Pulse:
         share : ndarray, shape (..., tap)
             Share of the echo's photons in each bin.
         first : int
-            The bin of the first tap.
+            Bin of the first tap.
         """
-        # In a gate that closes before that much has arrived, its last bin is what there is to see.
+        # If the gate closes before the echo arrives, its last bin is the only tap.
         first = math.floor(min(max(self.quantile_s(1e-3) / bin_width_s, -n_bins), n_bins - 1))
         end = math.ceil(min(self.quantile_s(1 - 1e-3) / bin_width_s, n_bins)) + 1
         delay = np.asarray(delay_bin, float) - first
@@ -245,12 +260,14 @@ class Pulse:
         Parameters
         ----------
         onset_bin : array_like, any shape
-            Delay of the echo in fractional bins; one that is not finite means no echo.
+            Delay of the echo in fractional bins; not finite means no echo.
+        n_bins, bin_width_s
+            As in `taps`.
 
         Returns
         -------
         ndarray, shape (..., n_bins + 1)
-            From the gate's opening edge to its closing edge.
+            From the opening edge of the gate to its closing edge.
         """
         onset = np.asarray(onset_bin, float)
         before = self.cdf((np.arange(n_bins + 1) - onset[..., np.newaxis]) * bin_width_s)
@@ -258,31 +275,20 @@ class Pulse:
         return before
 
     def bin_probability(self, onset_bin: ArrayLike, n_bins: int, bin_width_s: float) -> Floats:
-        """Share of the echo's photons in each bin (the pulse integrated over the bin).
+        """Share of the echo's photons in each bin: the pulse integrated over the bin.
 
-        Parameters
-        ----------
-        onset_bin : array_like, any shape
-            Delay of the echo in fractional bins, also outside the gate; NaN means no echo.
-        n_bins : int
-            Bins in the gate.
-        bin_width_s : float
-            Width of one bin in seconds.
-
-        Returns
-        -------
-        ndarray, shape (..., n_bins)
-            Sums to at most 1: what falls outside the gate is missing.
+        Takes the parameters of `cumulative` and returns shape (..., n_bins), which sums to at most
+        1: photons outside the gate are missing.
         """
         return np.diff(self.cumulative(onset_bin, n_bins, bin_width_s), axis=-1)
 
 
 @lru_cache(maxsize=256)
 def _quantile_s(pulse: Pulse, share: float) -> float:
-    """As `Pulse.quantile_s`, found once: every capture of a session asks for the same few."""
+    """Return `Pulse.quantile_s`, cached: captures share a few pulses."""
     high = len(pulse.samples) + 40.0
     low = -high
-    for _ in range(64):  # halvings: less is left than between two floats
+    for _ in range(64):  # bisection to the spacing of floats
         middle = 0.5 * (low + high)
         low, high = (low, middle) if pulse.cdf(middle * pulse.tau_s) > share else (middle, high)
     return pulse.tau_s * high
@@ -297,15 +303,21 @@ class Flux:
     signal : float
         Signal photons per pulse from a surface of reflectivity 1 (the paper's PPP), non-negative.
     sbr : float
-        Signal divided by the background over the *whole* gate, positive: it depends on the gate's
-        width, so always quote it with the number of bins. Infinity means no background.
+        Signal divided by the background over the *whole* gate, positive. It depends on the width of
+        the gate, so quote it with the number of bins. Infinity means no background.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range, or the background is not finite.
     """
 
     signal: float = 0.1041
     sbr: float = 0.06
 
     def __post_init__(self) -> None:
-        require("signal", self.signal, 0 <= self.signal < np.inf, "photons per pulse, 0 or more")
+        finite = 0 <= self.signal < np.inf
+        require("signal", self.signal, finite, "finite and non-negative photons per pulse")
         require("sbr", self.sbr, self.sbr > 0, "positive")
         background = self.signal / self.sbr
         require("background, signal / sbr", background, background < np.inf, "a finite number")

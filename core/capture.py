@@ -1,4 +1,4 @@
-"""A capture: what a simulation and a file both give, and what every estimator takes."""
+"""Captures: histograms of trigger times with their acquisition, simulated or read from a file."""
 
 from __future__ import annotations
 
@@ -33,13 +33,11 @@ if TYPE_CHECKING:
 COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
 
 Detection = Literal["first", "all"]
-"""What a pulse leaves in a histogram: its first photon alone, as in a Geiger-mode pixel that fires
-once and is blind until the next pulse; or all its photons, as in photon counting (TCSPC).
-"""
+"""``"first"``: at most one detection per pulse (Geiger mode); ``"all"``: every photon (TCSPC)."""
 
 
 class CaptureError(ValueError):
-    """A file that cannot be read as a capture: names the file, the field, the value, the remedy."""
+    """A file that cannot be read as a capture; names file, field, value and remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,23 +55,23 @@ class Capture:
     truth_range_m : ndarray, shape (row, col), optional
         True range in metres, NaN where there is no target; None for a capture without truth.
     signal : ndarray, shape (row, col), optional
-        True signal photons per pulse, where known.
+        True signal photons per pulse, if known.
     background : float, optional
-        True background photons per pulse over the gate, where known.
+        True background photons per pulse over the gate, if known.
     source : str
-        Where it came from and, for a file, what was guessed.
+        Origin of the capture and, for a file, what was assumed about it.
     detection : str
-        ``"first"`` where a pulse fires a pixel at most once, so that what comes first hides what
-        comes later (pile-up); ``"all"`` where every photon counts.
+        ``"first"`` if a pulse fires a pixel at most once, so that early photons hide later ones
+        (pile-up); ``"all"`` if every photon is counted.
     flux_prior : FluxPrior, optional
-        Flux parameters of the image that these pixels are a part of; estimated from these pixels
-        where None. ``replace`` keeps it: pass ``flux_prior=None`` along with counts of another
-        image, gate or number of pulses.
+        Flux parameters of the image that these pixels belong to; estimated from these pixels if
+        None. ``dataclasses.replace`` keeps it: pass ``flux_prior=None`` together with counts of
+        another image, gate or number of pulses.
 
     Raises
     ------
     ValueError
-        If shapes or types do not fit each other, or first photons outnumber the pulses.
+        If shapes or types do not match, or a pixel has more first photons than pulses.
     """
 
     cube: NDArray[np.unsignedinteger]
@@ -107,19 +105,17 @@ class Capture:
                 require(name, f"shape {image.shape}", fits, f"shape {self.shape}, that of the cube")
         if self.signal is not None:
             low, high = float(np.min(self.signal)), float(np.max(self.signal))
-            require("signal", (low, high), 0 <= low <= high < np.inf, "finite photons, 0 or more")
+            require("signal", (low, high), 0 <= low <= high < np.inf, "finite and non-negative")
         if self.background is not None:
             finite = 0 <= self.background < np.inf
-            require("background", self.background, finite, "finite photons, 0 or more")
+            require("background", self.background, finite, "finite and non-negative")
         kinds = get_args(Detection)
         require("detection", self.detection, self.detection in kinds, " or ".join(map(repr, kinds)))
         cube.setflags(write=False)
         if self.gated_pulses is not None:
-            most = int(self.counts.max())
-            once = "no more first photons than pulses in a pixel, or 'all' for its detection"
-            require(
-                f"n_pulses = {self.gated_pulses}, counts", most, most <= self.gated_pulses, once
-            )
+            most, name = int(self.counts.max()), f"n_pulses = {self.gated_pulses}, counts"
+            accepted = "no more first photons than pulses in a pixel, or 'all' for its detection"
+            require(name, most, most <= self.gated_pulses, accepted)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -133,25 +129,25 @@ class Capture:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """The cube laid out for kernels that treat many pixels at once; made once."""
+        """The cube in the layout of the kernels, cached."""
         return to_blocks(self.cube)
 
     @property
     def gated_pulses(self) -> int | None:
-        """Pulses sent, where these are first photons; None where pulses are not known, too."""
+        """Pulses sent, for first photons; None for all photons and if the number is unknown."""
         return self.acquisition.n_pulses if self.detection == "first" else None
 
     armed_pulses = renamed("gated_pulses")
 
     @property
     def echo_bins(self) -> int:
-        """Whole bins that hold the middle four fifths of an echo, at least 1."""
+        """Whole bins that hold the middle 80 % of an echo, at least 1."""
         begin_s, end_s = self.pulse.span_s
         return max(1, math.ceil((end_s - begin_s) / self.acquisition.bin_width_s))
 
 
-class Seen(Protocol):
-    """What is known of a capture, though its cube may not be in memory; a `Capture` is one."""
+class CaptureInfo(Protocol):
+    """The part of a `Capture` that is available even if its cube is not in memory."""
 
     @property
     def counts(self) -> NDArray[Any]:
@@ -159,7 +155,7 @@ class Seen(Protocol):
 
     @property
     def acquisition(self) -> Acquisition:
-        """How it was recorded."""
+        """Settings of the recording."""
 
     @property
     def detection(self) -> Detection:
@@ -167,11 +163,11 @@ class Seen(Protocol):
 
     @property
     def source(self) -> str:
-        """Where it came from."""
+        """Origin of the capture."""
 
     @property
     def gated_pulses(self) -> int | None:
-        """As `Capture.gated_pulses`."""
+        """`Capture.gated_pulses`."""
 
 
 _Arguments = ParamSpec("_Arguments")
@@ -179,10 +175,10 @@ _Result = TypeVar("_Result")
 
 
 class cached_per_capture(Generic[_Arguments, _Result]):
-    """Decorator: compute a function of a capture once and keep the result while the capture lives.
+    """Decorator that caches the results of a function of a capture for the capture's lifetime.
 
-    The function must be deterministic, its further arguments hashable, and its result must not
-    refer to the capture, which could then never be freed.
+    The function must be deterministic and its other arguments hashable. Its result must not refer
+    to the capture, which could then never be freed.
     """
 
     def __init__(self, compute: Callable[Concatenate[Capture, _Arguments], _Result]) -> None:
@@ -201,5 +197,5 @@ class cached_per_capture(Generic[_Arguments, _Result]):
         return results[key]
 
     def is_cached(self, capture: Capture) -> bool:
-        """Return whether there is any result for a capture."""
+        """Return whether any result of a capture is cached."""
         return bool(self._results.get(capture))

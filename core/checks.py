@@ -1,4 +1,4 @@
-"""One way to refuse a value: say which, what it was, and what would be accepted."""
+"""Checks of values, whose errors name the field, its value and what would be accepted."""
 
 from __future__ import annotations
 
@@ -17,9 +17,20 @@ _MOST_SHOWN = 200  # characters of a file's path
 
 
 def require(name: str, value: object, accepted: bool, what: str) -> None:
-    """Raise ``ValueError`` naming the field, the value and what would be accepted.
+    """Raise ``ValueError`` unless a value is `accepted`.
 
-    A NaN fails every comparison, so a check written as what *is* accepted refuses it too.
+    Write the check as a comparison that accepted values satisfy: NaN then fails it.
+
+    Parameters
+    ----------
+    name : str
+        Field, as the message names it.
+    value : object
+        Shown with ``repr``.
+    accepted : bool
+        Result of the check.
+    what : str
+        Values that would be accepted, for the message.
     """
     if not accepted:
         raise ValueError(f"{name} = {value!r} is not accepted: give {what}.")
@@ -31,18 +42,18 @@ def require_whole(name: str, value: Any, most: int, also: str = "") -> None:
     Parameters
     ----------
     name, value
-        As `require` takes them.
+        As for `require`.
     most : int
-        Largest number accepted.
+        Largest accepted number.
     also : str
-        What else would be accepted, for the message.
+        Other accepted values, for the message.
     """
     accepted = isinstance(value, Integral) and 1 <= int(value) <= most
     require(name, value, accepted, f"a whole number from 1 to {most:,}{also}")
 
 
 def printable(text: str) -> str:
-    """Text that any encoding of Unicode can hold: a file name may have bytes that are no text."""
+    """Replace the bytes of a file name that are not valid text, so that it can be encoded."""
     try:
         found = text.encode("utf-8", "surrogateescape")  # the bytes of the name
     except UnicodeEncodeError:
@@ -51,7 +62,7 @@ def printable(text: str) -> str:
 
 
 def shown(path: Path | str) -> str:
-    """A file name as messages show it, shortened in its middle where it is very long."""
+    """Return a file name for a message, with the middle of a very long one cut out."""
     name = printable(str(path))
     if len(name) <= _MOST_SHOWN:
         return name
@@ -59,22 +70,22 @@ def shown(path: Path | str) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """Message of an error, without the file names that a system's error repeats."""
+    """Return the message of an error, without the file names that the system appends."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return printable(text)
 
 
 @contextmanager
 def refusing(path: Path, kind: type[ValueError]) -> Iterator[None]:
-    """Turn whatever goes wrong with a file into one type of error that names the file."""
+    """Turn any error into one of type `kind` whose message begins with the file's name."""
     name = shown(path.name)
     try:
         yield
     except ValueError as error:
         if isinstance(error, kind) and str(error).startswith((f"{path.name}: ", f"{name}: ")):
-            raise  # said already, by what reads a part of the file
+            raise  # already names the file
         raise kind(f"{name}: {error}") from error
-    except Exception as error:  # from a closed folder to memory too small
+    except Exception as error:  # a missing permission, a lack of memory, ...
         raise kind(
             f"{name}: cannot be read ({type(error).__name__}: {reason(error)}): "
             "give a whole file that may be opened and fits in memory."

@@ -1,12 +1,11 @@
 """Working memory and time of an estimate, predicted from its shape before anything is computed.
 
-Working memory is what an estimate allocates at its peak, the cube itself not counted. It is a sum
-of what grows with the counts (the blocks of `core.kernels.blocks` and the table of the posterior),
-with the pixels (images of a few float64 each), with the gate (`core.inference.posterior` holds a
-table of all levels and delays of a few pixels) and of buffers of a fixed size. Time is that of one
-thread. The constants below were measured; ``python -m core.studies.performance.costs`` measures
-again, and prints what is predicted beside it. Both are right within a factor of 3 for the shapes
-listed there.
+Working memory is the peak allocation of an estimate, without the cube itself. It has terms that
+grow with the counts (the blocks of `core.kernels.blocks` and the table of the posterior), with the
+pixels (images of a few float64 each) and with the gate (`core.inference.posterior` holds a table of
+all levels and delays of a few pixels), and buffers of fixed size. Time is that of one thread. The
+constants are measured; ``python -m core.studies.performance.costs`` repeats the measurement and
+compares it with the prediction. Both are right within a factor of 3 for the shapes listed there.
 """
 
 from __future__ import annotations
@@ -37,23 +36,23 @@ REMEDY = (
     "(core.open_capture, core.estimate_large)"
 )
 
-_UNCHECKED_BYTES = 2**26  # any machine has these; looking up what is free takes longer
+_UNCHECKED_BYTES = 2**26  # not worth a query of the free memory
 
 _FIXED_BYTES = 12e6
-_PIXEL_BYTES = 120.0  # images of the answer, and of the light
+_PIXEL_BYTES = 120.0  # range image and flux model
 _SAMPLE_COUNT_BYTES = 6.0
 _NULL_COUNT_BYTES = 12.0
 
 _FIXED_S = 0.01
 _PIXEL_S = 0.4e-6
-_ENTRY_S, _LANE_S, _TAP_S = 4e-9, 40e-9, 0.15e-9  # of a level and delay; of a row of lanes
-_LEARNED_S = 30e-9  # of a level and delay of the sample, all steps of the maximisation
-_ECHO_S = 25e-9  # of a bin of an expected echo
+_ENTRY_S, _LANE_S, _TAP_S = 4e-9, 40e-9, 0.15e-9  # per level and delay; per row of lanes
+_LEARNED_S = 30e-9  # per level and delay of the sample, for all steps of the maximisation
+_ECHO_S = 25e-9  # per bin of an expected echo
 _NULL_S = 60e-9
-_FEW_PIXELS = 24  # of which each is asked for its own light (`core.inspection.mean_flux`)
-_LIGHT_S, _MIXTURE_S = 20e-6, 5e-6  # of a bin of a pixel
-_ECHOES = 64  # noise-free echoes of the calibration
-_USUAL_LEVELS = 4  # that a capture keeps
+_FEW_PIXELS = 24  # whose fluxes are estimated one by one (`core.inspection.mean_flux`)
+_FLUX_S, _MIXTURE_S = 20e-6, 5e-6  # per bin of a pixel
+_ECHOES = 64  # noise-free echoes of the lag calibration
+_USUAL_LEVELS = 4  # signal levels of a capture
 
 
 @dataclass(frozen=True)
@@ -63,9 +62,9 @@ class Cost:
     Parameters
     ----------
     working_bytes : int
-        Memory at its peak, in bytes, besides the capture.
+        Peak memory in bytes, without the capture.
     seconds : float
-        On one thread.
+        Time on one thread.
     """
 
     working_bytes: int
@@ -74,7 +73,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class _Rates:
-    """Memory and time of a method besides the posterior."""
+    """Memory and time of a method, without the posterior."""
 
     count_s: float
     pixel_s: float = 0.0
@@ -102,24 +101,24 @@ def predicted(
     *,
     false_alarm: float | None = None,
     n_taps: int = 16,
-    is_lit: bool = False,
+    posterior_is_cached: bool = False,
 ) -> Cost:
-    """Working memory and time of `core.estimate`, without computing anything.
+    """Predict working memory and time of `core.estimate`.
 
     Parameters
     ----------
     shape : tuple of int
         Rows, columns and bins.
-    method : str
-        A key of `core.ESTIMATORS`.
-    settings : object, optional
-        The method's settings; its defaults where None.
-    false_alarm : float, optional
-        As `core.estimate` takes it.
+    method, settings, false_alarm
+        As for `core.estimate`.
     n_taps : int
         Bins that an echo fills (`core.Pulse.taps`).
-    is_lit : bool
-        Whether the posterior is known already, and kept with the capture.
+    posterior_is_cached : bool
+        Whether the posterior of the capture has been computed.
+
+    Returns
+    -------
+    Cost
     """
     rows, cols, n_bins = shape
     n_pixels, rates = rows * cols, _RATES.get(method, _USUAL)
@@ -134,14 +133,14 @@ def predicted(
     n_bytes += (_PIXEL_BYTES + rates.pixel_bytes) * n_pixels
     seconds = _FIXED_S + (_PIXEL_S + rates.pixel_s) * n_pixels + rates.count_s * n_counts
     lanes = lanes_of(levels, n_bins)
-    if not is_lit:
+    if not posterior_is_cached:
         learned = min(sampled_numbers(levels, n_bins), n_sampled * levels * n_bins)
         table = 4 * lanes * levels * n_bins * min(1.0, n_pixels / 4)
         n_bytes += 4 * n_counts + max(table, 4 * learned + _SAMPLE_COUNT_BYTES * n_sampled * n_bins)
         seconds += _LEARNED_S * learned
         seconds += (entry_s + _LANE_S / lanes) * n_bins * levels * _filled(n_sampled, lanes)
         seconds += (entry_s + _LANE_S / lanes) * n_bins * _USUAL_LEVELS * _filled(n_pixels, lanes)
-    if method == "tracking" or (not is_lit and lanes == LANES):
+    if method == "tracking" or (not posterior_is_cached and lanes == LANES):
         n_bytes += 2 * n_bins * _filled(n_pixels, LANES)
     if steps:
         lanes = lanes_of(_USUAL_LEVELS, n_bins * steps)
@@ -159,67 +158,63 @@ def predicted(
 
 
 def predicted_flux_time(n_pixels: int, n_bins: int) -> Cost:
-    """Working memory and time of a light with its intervals (`core.inspection`), likewise.
+    """Predict memory and time of flux intervals (`core.inspection`) of a pixel, region or capture.
 
     Parameters
     ----------
-    n_pixels : int
-        Of the capture or the region; 1 for a pixel.
-    n_bins : int
+    n_pixels, n_bins : int
+
+    Returns
+    -------
+    Cost
     """
     if n_pixels < _FEW_PIXELS:
-        return Cost(int(80e6 + 160 * n_bins * n_pixels), _LIGHT_S * n_pixels * n_bins)
+        return Cost(int(80e6 + 160 * n_bins * n_pixels), _FLUX_S * n_pixels * n_bins)
     n_sampled = min(n_pixels, SAMPLE)
     n_bytes = 20e6 + 4 * n_pixels * n_bins + _SAMPLE_COUNT_BYTES * n_sampled * n_bins
     return Cost(int(n_bytes), _MIXTURE_S * n_sampled * n_bins)
 
 
 def _filled(n_pixels: int, lanes: int) -> int:
-    """Pixels of whole blocks."""
+    """Round up to whole blocks."""
     return -(-n_pixels // lanes) * lanes
 
 
 def cost_of(
     capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
 ) -> Cost:
-    """`predicted` of a capture, with what it keeps of earlier estimates."""
+    """Predict working memory and time of an estimate of a capture; see `predicted`."""
     echo, _ = capture.pulse.taps(capture.acquisition.n_bins, capture.acquisition.bin_width_s)
+    rows, cols, n_bins = capture.cube.shape
     return predicted(
-        _shape(capture),
+        (rows, cols, n_bins),
         method,
         settings,
         false_alarm=false_alarm,
         n_taps=echo.size,
-        is_lit=has_posterior(capture),
+        posterior_is_cached=has_posterior(capture),
     )
-
-
-def _shape(capture: Capture) -> tuple[int, int, int]:
-    rows, cols, n_bins = capture.cube.shape
-    return rows, cols, n_bins
 
 
 def require_memory(
     capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
 ) -> None:
-    """Refuse an estimate whose working memory exceeds what the machine has free.
+    """Refuse an estimate that needs more working memory than the machine has free.
 
     Raises
     ------
     ValueError
         If it does.
     """
-    is_lit = has_posterior(capture)
-    needed = predicted(
-        _shape(capture), method, settings, false_alarm=false_alarm, is_lit=is_lit
-    ).working_bytes
+    needed = cost_of(capture, method, settings, false_alarm).working_bytes
     if needed > _UNCHECKED_BYTES:
         free = psutil.virtual_memory().available
-        what = f"at most {free / 1e9:.2f} GB, which are free: {REMEDY}"
-        require(needs(capture.cube.shape, method), f"{needed / 1e9:.2f} GB", needed <= free, what)
+        accepted = f"at most {free / 1e9:.2f} GB, which are free: {REMEDY}"
+        name = needs(capture.cube.shape, method)
+        require(name, f"{needed / 1e9:.2f} GB", needed <= free, accepted)
 
 
 def needs(shape: tuple[int, ...], what: str) -> str:
-    """The name of a computation's working memory, as errors give it."""
+    """Return how errors call the working memory of a computation."""
     rows, cols, n_bins = shape
     return f"working memory of {what!r} for {rows} x {cols} pixels of {n_bins} bins"

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def renamed(new: str) -> Any:
-    """Return a read-only attribute that warns and reads the attribute of the new name."""
+    """Return a property that warns and reads the attribute called `new`."""
 
     def read(self: Any) -> Any:
         message = f"This attribute of {type(self).__name__} is now called {new}."

@@ -1,4 +1,4 @@
-"""Where the answers of a range image lie in space.
+"""Conversion of range images to points in space.
 
 Coordinates are right-handed, in metres, with the sensor at the origin: x to the right of the
 image, y away from the sensor along the optical axis, z up. Distances are thus positive and the
@@ -34,7 +34,7 @@ class Points(NamedTuple):
 
 
 def sight_lines(shape: tuple[int, int], pixel_angle_rad: float) -> Floats:
-    """Direction in which each pixel looks, by the pinhole model with square pixels.
+    """Return the line of sight of each pixel of a pinhole camera with square pixels.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ def sight_lines(shape: tuple[int, int], pixel_angle_rad: float) -> Floats:
 
 
 def points_m(range_m: ArrayLike, pixel_angle_rad: float) -> Points:
-    """Turn a range image into one point for each pixel that has a range.
+    """Return one point for each pixel of a range image that has a range.
 
     Parameters
     ----------
     range_m : array_like, shape (row, col)
-        Range along each line of sight in metres; pixels that are not finite are left out.
+        Range along each line of sight in metres; pixels that are not finite have no point.
     pixel_angle_rad : float
         Angle between the lines of sight of neighbouring pixels, in radians.
 
@@ -82,7 +82,7 @@ def points_m(range_m: ArrayLike, pixel_angle_rad: float) -> Points:
     Raises
     ------
     ValueError
-        If `range_m` is no image, or the angle is not between 0 and π/2.
+        If `range_m` is not an image, or the angle is not between 0 and π/2.
     """
     ranges = np.asarray(range_m, float)
     require("range_m", f"shape {ranges.shape}", ranges.ndim == 2, "an image (row, col)")

@@ -1,8 +1,9 @@
-"""How far an answer is from the truth.
+"""Errors of range images against the truth, and intervals of shares.
 
-Metrics look at target pixels, those with a finite truth. A target pixel without an answer counts as
-not restored; errors and their means are over answered pixels, which is why `coverage` belongs
-beside them.
+Metrics consider target pixels, those with a finite true range. A target pixel without an estimate
+counts as not restored; errors and their means are over estimated pixels, so quote `coverage` with
+them. Ranges and truth are array_like of the same shape (row, col), in metres; NaN means no estimate
+or no target. All functions raise ``ValueError`` if the shapes differ.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from core.checks import require
 
 __all__ = [
     "Detection",
+    "DetectionRates",
     "Interval",
+    "ReliabilityBin",
     "Told",
     "bias_m",
     "calibration_error",
@@ -42,61 +45,55 @@ __all__ = [
 
 
 def errors_m(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
-    """Errors in metres of all target pixels, flat; NaN where a target has no answer.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ.
-    """
-    answer, truth = np.asarray(range_m, float), np.asarray(truth_m, float)
-    require("range_m", f"shape {answer.shape}", answer.shape == truth.shape, f"{truth.shape}")
+    """Errors in metres of all target pixels, flat; NaN where a target has no estimate."""
+    found, truth = np.asarray(range_m, float), np.asarray(truth_m, float)
+    require("range_m", f"shape {found.shape}", found.shape == truth.shape, f"{truth.shape}")
     target = np.isfinite(truth)
-    return np.asarray(answer[target] - truth[target])
+    return np.asarray(found[target] - truth[target])
 
 
 def rmse_m(range_m: ArrayLike, truth_m: ArrayLike) -> float:
-    """Root mean square error in metres over answered target pixels; NaN where there are none."""
-    return _root_mean_square(_answered(range_m, truth_m))
+    """Root mean square error in metres over estimated target pixels; NaN without any."""
+    return _root_mean_square(_found_errors_m(range_m, truth_m))
 
 
 def mae_m(range_m: ArrayLike, truth_m: ArrayLike) -> float:
-    """Mean absolute error in metres over answered target pixels; NaN where there are none."""
-    return _mean(np.abs(_answered(range_m, truth_m)))
+    """Mean absolute error in metres over estimated target pixels; NaN without any."""
+    return _mean(np.abs(_found_errors_m(range_m, truth_m)))
 
 
 def inlier_rmse_m(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: float) -> float:
     """Root mean square error in metres over target pixels within `tolerance_m` of the truth.
 
-    How well an echo is placed once it is found; `restoration_degree` says how often it is. NaN
-    where no pixel is within the tolerance.
+    This is the precision of echoes that are found; `restoration_degree` is the share that is. NaN
+    if no pixel is within the tolerance.
     """
-    error = _answered(range_m, truth_m)
+    error = _found_errors_m(range_m, truth_m)
     return _root_mean_square(error[_within(error, tolerance_m)])
 
 
 def bias_m(range_m: ArrayLike, truth_m: ArrayLike) -> float:
-    """Mean error in metres over answered target pixels; NaN where there are none.
+    """Mean error in metres over estimated target pixels; NaN without any.
 
-    A few answers at the other end of the gate move it; `median_error_m` is the shift of the many.
+    A few estimates at the other end of the gate move it; `median_error_m` is robust to them.
     """
-    return _mean(_answered(range_m, truth_m))
+    return _mean(_found_errors_m(range_m, truth_m))
 
 
 def median_error_m(range_m: ArrayLike, truth_m: ArrayLike) -> float:
-    """Median error in metres over answered target pixels; NaN where there are none."""
-    error = _answered(range_m, truth_m)
+    """Median error in metres over estimated target pixels; NaN without any."""
+    error = _found_errors_m(range_m, truth_m)
     return float(np.median(error)) if error.size else math.nan
 
 
 def coverage(range_m: ArrayLike, truth_m: ArrayLike) -> float:
-    """Share of target pixels that have an answer; NaN where there are no targets."""
+    """Share of target pixels that have an estimate; NaN without targets."""
     error = errors_m(range_m, truth_m)
     return float(np.mean(np.isfinite(error))) if error.size else math.nan
 
 
 def restored(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: float) -> tuple[int, int]:
-    """How many target pixels lie within `tolerance_m` of the truth, and how many there are."""
+    """Number of target pixels within `tolerance_m` of the truth, and number of target pixels."""
     error = errors_m(range_m, truth_m)
     return int(np.count_nonzero(_within(error, tolerance_m))), error.size
 
@@ -104,7 +101,7 @@ def restored(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: float) -> tupl
 def restoration_degree(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: float) -> float:
     """Share of target pixels within `tolerance_m` metres of the truth (the paper's RD).
 
-    The paper does not print its tolerance; 3 bins reproduce its tables. NaN without targets.
+    The paper does not state its tolerance; 3 bins reproduce its tables. NaN without targets.
     """
     hits, targets = restored(range_m, truth_m, tolerance_m)
     return hits / targets if targets else math.nan
@@ -113,13 +110,13 @@ def restoration_degree(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: floa
 def rd_variance(rd_per_repetition: ArrayLike) -> float:
     """Variance of the restoration degree over Monte-Carlo repetitions.
 
-    The paper does not define its "Var"; this reading fits the size of its numbers. Where pixels are
-    independent and equally hard it is ``RD (1 - RD) / pixels``.
+    The paper does not define its "Var"; this definition matches its magnitude. For independent
+    pixels of equal difficulty it is ``RD (1 - RD) / pixels``.
 
     Parameters
     ----------
     rd_per_repetition : array_like, shape (repetition,)
-        At least 2.
+        At least 2 values.
 
     Raises
     ------
@@ -132,69 +129,63 @@ def rd_variance(rd_per_repetition: ArrayLike) -> float:
 
 
 def estimator_variance_m2(range_m: ArrayLike, truth_m: ArrayLike) -> float:
-    """Variance in square metres of a pixel's answers over repetitions, averaged over target pixels.
+    """Variance over repetitions of a pixel's estimates, averaged over target pixels, in m².
 
     Parameters
     ----------
     range_m : array_like, shape (repetition, row, col)
-        Answers to captures of one scene that differ in their seed; NaN where there is none.
+        Estimates from captures of one scene with different seeds; NaN where there is none.
     truth_m : array_like, shape (row, col)
         NaN where there is no target.
 
     Returns
     -------
     float
-        Pixels with fewer than 2 answers have no variance and are left out; NaN where all are.
+        Pixels with fewer than 2 estimates have no variance and are left out; NaN if all are.
 
     Raises
     ------
     ValueError
-        If the shapes do not fit each other.
+        If the shapes do not match.
     """
-    answer, truth = np.asarray(range_m, float), np.asarray(truth_m, float)
-    fits = answer.ndim == truth.ndim + 1 and answer.shape[1:] == truth.shape
-    require("range_m", f"shape {answer.shape}", fits, f"(repetition, *{truth.shape})")
-    answer = answer[:, np.isfinite(truth)]
-    answer = answer[:, np.isfinite(answer).sum(axis=0) >= 2]
-    return _mean(np.nanvar(answer, axis=0, ddof=1))
+    found, truth = np.asarray(range_m, float), np.asarray(truth_m, float)
+    fits = found.ndim == truth.ndim + 1 and found.shape[1:] == truth.shape
+    require("range_m", f"shape {found.shape}", fits, f"(repetition, *{truth.shape})")
+    found = found[:, np.isfinite(truth)]
+    found = found[:, np.isfinite(found).sum(axis=0) >= 2]
+    return _mean(np.nanvar(found, axis=0, ddof=1))
 
 
 @dataclass(frozen=True)
-class Detection:
-    """How well an estimator tells target from no target; NaN where a share is of nothing."""
+class DetectionRates:
+    """Quality of the decision whether there is a target; NaN where no pixel is of that kind."""
 
     precision: float
-    """Share of answered pixels that have a target."""
+    """Share of estimated pixels that have a target."""
     recall: float
-    """Share of target pixels that are answered."""
+    """Share of target pixels with an estimate."""
     false_alarm_rate: float
-    """Share of pixels without a target that are answered."""
+    """Share of pixels without a target with an estimate."""
 
 
-def precision_recall(valid: ArrayLike, truth_m: ArrayLike) -> Detection:
-    """Judge the decision whether there is a target, not where.
+def precision_recall(valid: ArrayLike, truth_m: ArrayLike) -> DetectionRates:
+    """Evaluate the decision whether there is a target, regardless of its range.
 
     Parameters
     ----------
     valid : array_like of bool, shape (row, col)
-        Where the estimator answers.
+        Where the estimator gives a range.
     truth_m : array_like, shape (row, col)
         NaN where there is no target.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ.
     """
-    answered, target = np.asarray(valid, bool), np.isfinite(np.asarray(truth_m, float))
-    fits = answered.shape == target.shape
-    require("valid", f"shape {answered.shape}", fits, f"{target.shape}")
-    return Detection(_mean(target[answered]), _mean(answered[target]), _mean(answered[~target]))
+    found, target = np.asarray(valid, bool), np.isfinite(np.asarray(truth_m, float))
+    require("valid", f"shape {found.shape}", found.shape == target.shape, f"{target.shape}")
+    return DetectionRates(_mean(target[found]), _mean(found[target]), _mean(found[~target]))
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and where it may lie."""
+    """An estimate with its interval."""
 
     value: float
     low: float
@@ -210,6 +201,11 @@ def wilson(hits: int, trials: int, level: float = 0.95) -> Interval:
         ``0 <= hits <= trials``, at least one trial.
     level : float
         Probability that the interval covers the true share.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of its range.
     """
     require("trials", trials, trials >= 1, "at least 1")
     require("hits", hits, 0 <= hits <= trials, f"0 to {trials}")
@@ -222,13 +218,13 @@ def wilson(hits: int, trials: int, level: float = 0.95) -> Interval:
     return Interval(share, min(max(centre - half, 0.0), share), max(min(centre + half, 1.0), share))
 
 
-def _answered(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
+def _found_errors_m(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
     error = errors_m(range_m, truth_m)
     return error[np.isfinite(error)]
 
 
 def _within(error_m: Floats, tolerance_m: float) -> NDArray[np.bool_]:
-    # Half a micrometre of grace: a tolerance of whole bins is met by an error of whole bins.
+    # Half a micrometre of slack, so that an error of whole bins meets a tolerance of whole bins.
     return np.asarray(np.abs(error_m) <= tolerance_m + 5e-7)
 
 
@@ -241,38 +237,40 @@ def _root_mean_square(values: Floats) -> float:
 
 
 @dataclass(frozen=True)
-class Told:
-    """The answers whose confidence falls in one tenth (of a reliability diagram)."""
+class ReliabilityBin:
+    """Estimates whose confidence falls in one tenth, a point of a reliability diagram."""
 
     confidence: float
-    """Their mean confidence."""
+    """Mean confidence."""
     right: Interval
-    """Share of them within 3 bins of a surface."""
+    """Share within 3 bins of a surface."""
     count: int
 
 
-def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[Told]:
-    """Answers by tenths of confidence; tenths without answers are left out.
+# Deprecated names, to be removed after the next release.
+Told, Detection = ReliabilityBin, DetectionRates
+
+
+def reliability(confidence: Floats, right: NDArray[np.bool_]) -> list[ReliabilityBin]:
+    """Group estimates by tenths of confidence; empty tenths are left out.
 
     Parameters
     ----------
-    confidence : ndarray, shape (answer,)
-        What was told, in [0, 1].
-    right : ndarray of bool, shape (answer,)
+    confidence : ndarray, shape (estimate,)
+        From 0 to 1.
+    right : ndarray of bool, shape (estimate,)
+        Whether the estimate lies within 3 bins of a surface.
     """
     tenth = np.minimum((confidence * 10).astype(int), 9)
-    return [
-        Told(
-            float(confidence[tenth == k].mean()),
-            wilson(int(right[tenth == k].sum()), int((tenth == k).sum())),
-            int((tenth == k).sum()),
-        )
-        for k in range(10)
-        if (tenth == k).any()
-    ]
+    found = []
+    for members in (tenth == k for k in np.unique(tenth)):
+        count = int(members.sum())
+        share = wilson(int(right[members].sum()), count)
+        found.append(ReliabilityBin(float(confidence[members].mean()), share, count))
+    return found
 
 
-def calibration_error(told: Sequence[Told]) -> float:
-    """Expected calibration error: mean distance of confidence from the share that is right."""
-    count = sum(each.count for each in told)
-    return sum(each.count * abs(each.confidence - each.right.value) for each in told) / count
+def calibration_error(bins: Sequence[ReliabilityBin]) -> float:
+    """Expected calibration error: mean distance between confidence and share of right estimates."""
+    count = sum(each.count for each in bins)
+    return sum(each.count * abs(each.confidence - each.right.value) for each in bins) / count

@@ -1,7 +1,6 @@
-"""Settings as frozen dataclasses whose fields know their meaning, unit and bounds.
+"""Metadata of settings: meaning, unit and bounds of the fields of a frozen dataclass.
 
-The app's controls are made from this metadata, so that a limit or a sentence of help is written
-once.
+The app builds its controls and the command line its options from this metadata.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from core.checks import require
 __all__ = [
     "Choice",
     "Number",
+    "Settings",
     "Zone",
     "check_fields",
     "doubts",
@@ -27,9 +27,9 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Zone:
-    """Values, from `low` to `high`, with which an answer is in doubt, and a sentence that says why.
+    """Values from `low` to `high` that make estimates unreliable, with the reason as a sentence.
 
-    ``python -m core stability`` measures what becomes of the answers there.
+    ``python -m core stability`` measures estimates in these zones.
     """
 
     low: float
@@ -42,26 +42,30 @@ class Zone:
 
 @dataclass(frozen=True)
 class Number:
-    """A number: its symbol, the range worth exploring, and what is refused.
+    """A numeric setting.
 
     Parameters
     ----------
     symbol : str
-        As written in the literature.
+        Symbol in the literature.
     low, high : float
-        Sensible range, that of a slider.
+        Useful range, that of a slider.
     log : bool
-        Whether the range is best walked by factors.
+        Whether a slider is logarithmic.
     whole : bool
-        Whether only integers make sense.
+        Whether only integers are accepted.
     unit : str
-        Empty for a pure number.
+        Empty for a pure number. A value in ``bins``, or per bin, is rescaled where bins are merged.
+    merge_power : int, optional
+        Power of the merging factor by which it is rescaled; None takes that of the unit.
+    is_bin_index : bool
+        Whether the value is a bin of the gate, which moves with the start of a cut gate.
     least, most : float
-        Smallest and largest value accepted at all.
+        Smallest and largest accepted value.
     open_below : bool
         Whether `least` itself is refused.
     doubtful : tuple of Zone
-        Values that are accepted, but with which answers are in doubt.
+        Accepted values that make estimates unreliable.
     """
 
     symbol: str
@@ -70,6 +74,8 @@ class Number:
     log: bool = False
     whole: bool = False
     unit: str = ""
+    merge_power: int | None = None
+    is_bin_index: bool = False
     least: float = -math.inf
     most: float = math.inf
     open_below: bool = False
@@ -83,7 +89,7 @@ class Number:
         require(name, value, self.takes(value), bounds)
 
     def takes(self, value: Any) -> bool:
-        """Whether `value` is acceptable."""
+        """Return whether `value` is acceptable."""
         if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
             return False
         above: Any = value
@@ -93,7 +99,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of a few named ways."""
+    """A setting with a few named options."""
 
     symbol: str
     options: tuple[str, ...]
@@ -104,21 +110,21 @@ class Choice:
 
 
 def parameter(default: Any, spec: Number | Choice, help: str) -> Any:
-    """A dataclass field with its specification and a line of help."""
+    """Return a dataclass field with a specification and a sentence of help."""
     return field(default=default, metadata={"spec": spec, "help": help})
 
 
 def spec_of(dataclass_field: Field[Any]) -> Number | Choice:
-    """The specification that `parameter` gave to a field."""
+    """Return the specification that `parameter` gave to a field."""
     spec: Number | Choice = dataclass_field.metadata["spec"]
     return spec
 
 
 def doubts(settings: Any) -> list[str]:
-    """Why answers are in doubt with these settings, one sentence a reason.
+    """Return the reasons why these settings make estimates unreliable, one sentence each.
 
-    First those of single fields that lie in a doubtful `Zone`, then those that concern several, as
-    the settings' own ``joint_doubts`` tells them.
+    Reasons that concern single fields come from their doubtful `Zone`, those that concern several
+    from the settings' own method ``joint_doubts``.
     """
     found = []
     for each in fields(settings):
@@ -129,12 +135,32 @@ def doubts(settings: Any) -> list[str]:
 
 
 def joint_doubts(settings: Any) -> list[str]:
-    """`doubts` that no single field has, empty for settings that know of none."""
-    told: list[str] = settings.joint_doubts() if hasattr(settings, "joint_doubts") else []
-    return told
+    """Return the `doubts` that concern several fields; empty if the settings define none."""
+    reasons: list[str] = settings.joint_doubts() if hasattr(settings, "joint_doubts") else []
+    return reasons
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Base of frozen dataclasses whose fields have specifications.
+
+    Raises
+    ------
+    ValueError
+        If a field is out of its bounds.
+    """
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def check_fields(settings: Any) -> None:
-    """Check every field of a settings object against its own specification."""
+    """Check every field of a settings object against its specification.
+
+    Raises
+    ------
+    ValueError
+        If a field is out of its bounds.
+    """
     for each in fields(settings):
         spec_of(each).check(each.name, getattr(settings, each.name))

@@ -1,4 +1,4 @@
-"""The path from a capture to an answer and its figures."""
+"""Estimate a capture and compare the estimate with its truth."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from core.inference.posterior import posterior_of
 
 @dataclass(frozen=True)
 class Run:
-    """One capture ranged by one method.
+    """An estimate of a capture with its error figures and times.
 
     Parameters
     ----------
+    capture : Capture
+    image : RangeImage
     figures : dict
         ``rmse_m``, ``mae_m``, ``inlier_rmse_m`` (within 3 bins), ``bias_m``, ``median_error_m``,
-        ``coverage``, ``rd_1_bin``, ``rd_2_bins``, ``rd_3_bins``; empty where the capture has no
-        truth: nothing is shown rather than nonsense.
+        ``coverage``, ``rd_1_bin``, ``rd_2_bins``, ``rd_3_bins``; empty if the capture has no truth.
     flux_time_s : float
-        Seconds spent on what all methods share and a capture keeps: its light and its posterior.
+        Seconds for what all methods share and the capture caches: flux model and posterior.
     estimate_s : float
-        Seconds spent by the method itself.
+        Seconds for the method itself.
     """
 
     capture: Capture
@@ -42,17 +43,16 @@ class Run:
 def run(
     capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
 ) -> Run:
-    """Range a capture and compare the answer with its truth, if it has one.
+    """Estimate a capture and compare the estimate with the truth, if known.
 
     Parameters
     ----------
-    capture : Capture
-    method : str
-        A key of `ESTIMATORS`.
-    settings : object, optional
-        The method's own settings; its defaults where None.
-    false_alarm : float, optional
-        As `core.estimate` takes it.
+    capture, method, settings, false_alarm
+        As for `core.estimate`.
+
+    Returns
+    -------
+    Run
 
     Raises
     ------
@@ -63,25 +63,24 @@ def run(
     require_memory(capture, method, settings, false_alarm)
     started = perf_counter()
     posterior_of(capture)
-    lit = perf_counter()
+    flux_done = perf_counter()
     image = estimate(capture, method, settings, false_alarm=false_alarm)
     done = perf_counter()
-    return Run(capture, image, _figures(capture, image), lit - started, done - lit)
+    return Run(capture, image, _figures(capture, image), flux_done - started, done - flux_done)
 
 
 def _figures(capture: Capture, image: RangeImage) -> dict[str, float]:
-    truth_m = capture.truth_range_m
-    if truth_m is None:
+    if capture.truth_range_m is None:
         return {}
-    bin_m = capture.acquisition.bin_length_m
+    ranges, bin_m = (image.range_m, capture.truth_range_m), capture.acquisition.bin_length_m
     return {
-        "rmse_m": metrics.rmse_m(image.range_m, truth_m),
-        "mae_m": metrics.mae_m(image.range_m, truth_m),
-        "inlier_rmse_m": metrics.inlier_rmse_m(image.range_m, truth_m, 3 * bin_m),
-        "bias_m": metrics.bias_m(image.range_m, truth_m),
-        "median_error_m": metrics.median_error_m(image.range_m, truth_m),
-        "coverage": metrics.coverage(image.range_m, truth_m),
-        "rd_1_bin": metrics.restoration_degree(image.range_m, truth_m, bin_m),
-        "rd_2_bins": metrics.restoration_degree(image.range_m, truth_m, 2 * bin_m),
-        "rd_3_bins": metrics.restoration_degree(image.range_m, truth_m, 3 * bin_m),
+        "rmse_m": metrics.rmse_m(*ranges),
+        "mae_m": metrics.mae_m(*ranges),
+        "inlier_rmse_m": metrics.inlier_rmse_m(*ranges, 3 * bin_m),
+        "bias_m": metrics.bias_m(*ranges),
+        "median_error_m": metrics.median_error_m(*ranges),
+        "coverage": metrics.coverage(*ranges),
+        "rd_1_bin": metrics.restoration_degree(*ranges, bin_m),
+        "rd_2_bins": metrics.restoration_degree(*ranges, 2 * bin_m),
+        "rd_3_bins": metrics.restoration_degree(*ranges, 3 * bin_m),
     }

@@ -1,7 +1,8 @@
-"""Less of a capture: fewer bins, a shorter gate, fewer pixels or fewer pulses.
+"""Reductions of a capture: merged bins, a shorter gate, fewer pixels or fewer pulses.
 
-What costs less to range tells less. Each reduction gives a `Capture` that says in its acquisition
-what it is now, so that every estimator takes it as it takes any other.
+Reduced captures take less time to estimate and hold less information. Each reduction returns a
+`Capture` with the acquisition of the reduced data, so that every estimator accepts it. All raise
+``ValueError`` if an argument does not fit the capture.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats
 from core.capture import Capture
-from core.checks import require
+from core.checks import require, require_whole
 from core.kernels.parallel import PARALLEL, entering
 from core.kernels.streams import pixel_key, uniform_at
 
@@ -33,27 +34,20 @@ __all__ = [
 ]
 
 DRAWN_ONE_BY_ONE = 2**27
-"""Detections up to which fewer pulses are drawn detection by detection; more take less time bin by
-bin."""
+"""Most detections that are drawn one by one; for more, drawing bin by bin is faster."""
 
 MOST_PULSES = 10**9 - 1
-"""Of which `first_pulses` can draw some bin by bin: numpy's hypergeometric law ends there."""
+"""Most pulses of a capture that is drawn bin by bin, the limit of numpy's hypergeometric."""
 
 
 def merge_bins(capture: Capture, factor: int) -> Capture:
-    """Add the counts of each `factor` neighbouring bins.
+    """Add the counts of each `factor` neighbouring bins, from 1 to the number of bins.
 
-    Exact for first photons: a pulse fires in the merged bin where it fires in one of its parts.
-    Bins left over at the end of the gate are dropped, which is exact, too: what would have come
-    later hides nothing.
-
-    Raises
-    ------
-    ValueError
-        If `factor` is not an integer from 1 to the number of bins.
+    Exact for first photons: a pulse fires in the merged bin if it fires in one of its parts.
+    Remaining bins at the end of the gate are dropped; they hide no others.
     """
     before = capture.acquisition
-    _require_whole("factor", factor, before.n_bins)
+    require_whole("factor", factor, before.n_bins)
     n_bins = before.n_bins // factor
     end = n_bins * factor
     return replace(
@@ -69,21 +63,15 @@ def merge_bins(capture: Capture, factor: int) -> Capture:
 def cut_gate(capture: Capture, first_bin: int, end_bin: int) -> Capture:
     """Keep the bins from `first_bin` to before `end_bin`.
 
-    Of first photons, pulses that fired before the window are no longer armed in it: the window of a
-    pixel is an exact capture of ``A`` pulses, ``A`` being those still armed at its opening, which
-    differs from pixel to pixel. A `Capture` knows one number for all. It is told the mean of ``A``
-    over the image, rounded, or the most detections of a pixel where these are more. Expected counts
-    then stand to this number of pulses as those of a gate that opens later do to its own; a single
-    pixel's rates are off by the factor that its own ``A`` differs by (2 % where 700 of 1000 pulses
-    are left), alike in all bins. A gate that begins where the old one does, and a capture of all
-    photons, lose nothing.
+    In first-photon data, pulses that fired before the window are not armed in it: the window of a
+    pixel is an exact capture of ``A`` pulses, those armed at its opening, which differ from pixel
+    to pixel. A `Capture` has one number of pulses, here the rounded mean of ``A`` over the image,
+    or the most detections of a pixel if these are more. The mean expected counts are then those of
+    a gate that opens later; the rates of a single pixel are off in all bins by the factor between
+    its ``A`` and the mean (2 % if 700 of 1000 pulses are left). With ``first_bin=0``, and for all
+    photons, the window is exact.
 
-    The truth stays: a target whose echo falls outside the window is one that is lost.
-
-    Raises
-    ------
-    ValueError
-        If the window is empty or not within the gate.
+    The truth stays: targets whose echoes fall outside the window are lost.
     """
     before = capture.acquisition
     window = (first_bin, end_bin)
@@ -113,14 +101,11 @@ def cut_gate(capture: Capture, first_bin: int, end_bin: int) -> Capture:
 
 
 def skip_pixels(capture: Capture, step: int) -> Capture:
-    """Keep one pixel of each `step` x `step`, the middle one (left and up of it where even).
+    """Keep the middle pixel of each `step` x `step` (left and above the middle for even `step`).
 
-    Raises
-    ------
-    ValueError
-        If `step` is not an integer from 1 to the smaller side of the image.
+    `step` is from 1 to the smaller side of the image.
     """
-    _require_whole("step", step, min(capture.shape))
+    require_whole("step", step, min(capture.shape))
     kept = np.ix_(*(_kept(size, step) for size in capture.shape))
     return replace(
         capture,
@@ -136,16 +121,11 @@ def skip_pixels(capture: Capture, step: int) -> Capture:
 def pool_pixels(capture: Capture, side: int) -> Capture:
     """Add the histograms of each `side` x `side` neighbouring pixels.
 
-    That many times the pulses look where all of these pixels look: exact where they see the same.
-    Where they do not, there is more than one surface. The truth told is the median of theirs, the
-    signal their mean. Rows and columns left over at the end are dropped.
-
-    Raises
-    ------
-    ValueError
-        If `side` is not an integer from 1 to the smaller side of the image.
+    The sum is that of one pixel with as many times the pulses: exact if the pixels see the same,
+    otherwise it holds several surfaces. Its truth is the median of theirs, its signal their mean.
+    Remaining rows and columns are dropped. `side` is from 1 to the smaller side of the image.
     """
-    _require_whole("side", side, min(capture.shape))
+    require_whole("side", side, min(capture.shape))
     acquisition, n_pulses = coarser(capture.acquisition, side), capture.acquisition.n_pulses
     truth_m, signal = capture.truth_range_m, capture.signal
     return replace(
@@ -160,27 +140,21 @@ def pool_pixels(capture: Capture, side: int) -> Capture:
 
 
 def first_pulses(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
-    """What the capture would have been with fewer pulses, an exact draw.
+    """Draw the capture that fewer pulses would have given, exactly.
 
-    Which of its pulses fired when is not kept in a histogram, and does not matter: the pulses are
-    exchangeable, and any of them are as good as the first. Of first photons, `n_pulses` of a
-    pixel's pulses are drawn without replacement (multivariate hypergeometric, "no trigger" being
-    one of the outcomes). Of all photons, each one falls in any pulse alike, and is kept with
-    probability ``n_pulses / sent``.
+    A histogram does not keep which pulse fired when, but pulses are exchangeable, so that any of
+    them can stand for the first. For first photons, `n_pulses` of a pixel's pulses are drawn
+    without replacement (multivariate hypergeometric, with "no trigger" as an outcome). For all
+    photons, each photon is kept with probability ``n_pulses / sent``.
 
-    Of one seed, the detections of fewer pulses are a part of those of more, unless detections are
-    more than `DRAWN_ONE_BY_ONE`.
-
-    Raises
-    ------
-    ValueError
-        If the capture does not know its number of pulses, or sent fewer; or if detections are more
-        than `DRAWN_ONE_BY_ONE` and pulses more than `MOST_PULSES`.
+    With the same seed, the detections of fewer pulses are a subset of those of more, unless there
+    are more than `DRAWN_ONE_BY_ONE`. The number of pulses must be known, and at most `MOST_PULSES`
+    in that case.
     """
     sent = capture.acquisition.n_pulses
     if sent is None:
         raise ValueError("n_pulses = None is not accepted: give a capture that knows its pulses.")
-    _require_whole("n_pulses", n_pulses, sent)
+    require_whole("n_pulses", n_pulses, sent)
     if capture.detection == "all":
         cube = _thinned(capture.cube, n_pulses / sent, seed)
     else:
@@ -195,19 +169,11 @@ def first_pulses(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
 
 
 def share_of_pulses(capture: Capture, share: float, seed: int = 0) -> Capture:
-    """What the capture would have been with a share of its pulses, an exact draw.
+    """Draw the capture that a share of its pulses, above 0 and at most 1, would have given.
 
-    Where the number of pulses is known these are so many as come nearest to the share, at least
-    one: `first_pulses`. Where it is not, each pulse is taken by chance, with probability `share`,
-    and with it what it left in the histogram: each detection is kept likewise. That assumes nothing
-    but pulses (or, of all photons, photons) that are independent of each other; the number of
-    pulses taken is then not the same in all pixels. True light in photons of all pulses together,
-    where a capture without pulses knows it, is that share of it.
-
-    Raises
-    ------
-    ValueError
-        If the share is not above 0 and at most 1; as `first_pulses`.
+    If the number of pulses is known, this is `first_pulses` with the nearest number, at least one.
+    Otherwise each detection is kept with probability `share`, as if each pulse were: the number of
+    pulses then varies between pixels, and true fluxes, if known, are multiplied by `share`.
     """
     require("share", share, 0 < share <= 1, "above 0 and at most 1")
     sent = capture.acquisition.n_pulses
@@ -226,7 +192,7 @@ def share_of_pulses(capture: Capture, share: float, seed: int = 0) -> Capture:
 def _of_pulses(
     capture: Capture, sent: int, n_pulses: int, seed: int
 ) -> NDArray[np.unsignedinteger]:
-    """First photons of some of the pulses."""
+    """First photons of `n_pulses` of the pulses."""
     if _are_few(capture.cube):
         drawn = np.empty(capture.cube.shape, capture.cube.dtype)
         with entering(drawn.size):
@@ -235,8 +201,8 @@ def _of_pulses(
     require("n_pulses of the capture", sent, sent <= MOST_PULSES, f"{MOST_PULSES} or fewer")
     rng = np.random.default_rng(seed)
     cube = np.empty(capture.cube.shape, capture.cube.dtype)
-    rest = np.full(capture.shape, sent)  # pulses of which it is not decided yet
-    left = np.full(capture.shape, n_pulses)  # that are still to be drawn among them
+    rest = np.full(capture.shape, sent)  # pulses not decided yet
+    left = np.full(capture.shape, n_pulses)  # still to be drawn among them
     for k in range(cube.shape[2]):
         fired = capture.cube[:, :, k].astype(np.int64)
         rest -= fired
@@ -249,7 +215,7 @@ def _of_pulses(
 def _thinned(
     cube: NDArray[np.unsignedinteger], share: float, seed: int
 ) -> NDArray[np.unsignedinteger]:
-    """Each detection kept with probability `share`."""
+    """Keep each detection with probability `share`."""
     if not _are_few(cube):
         return np.random.default_rng(seed).binomial(cube, share).astype(cube.dtype)
     kept = np.empty(cube.shape, cube.dtype)
@@ -262,16 +228,15 @@ def _are_few(cube: NDArray[np.unsignedinteger]) -> bool:
     return int(cube.sum(dtype=np.int64)) <= DRAWN_ONE_BY_ONE
 
 
-_BATCH = 64  # random numbers: drawn apart from their use, they are computed several at a time
+_BATCH = 64  # random numbers in a loop of their own, which vectorises
 
 
 @njit(**PARALLEL)
 def _draw_pulses(fired, sent, n_pulses, seed, drawn):  # type: ignore[no-untyped-def]
-    """Selection sampling (Fan, Muller & Rezucha 1962), of a pixel's detections one by one.
+    """Selection sampling of a pixel's detections, one by one (Fan, Muller & Rezucha 1962).
 
-    Each is drawn with the probability that `left` of the `rest` are, which are not decided yet.
-    With the same random numbers a larger `n_pulses` never has fewer of them left, and so draws
-    whatever a smaller one does.
+    A detection is drawn with probability ``left / (sent - draw)``. With the same random numbers a
+    larger `n_pulses` never has fewer of them left, and so draws a superset.
     """
     rows, cols, n_bins = fired.shape
     for row in prange(rows):
@@ -305,7 +270,7 @@ def _keep_by_chance(photons, share, seed, kept):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class Reduction:
-    """Several reductions of a capture, and the way back to its own pixels.
+    """A combination of reductions, with the mapping back to the pixels of the capture.
 
     Parameters
     ----------
@@ -318,7 +283,7 @@ class Reduction:
     pool : int
         Rows and columns of pixels that are added.
     pulses : float
-        Share of the pulses that are left, above 0 and at most 1.
+        Share of the pulses that is kept, above 0 and at most 1.
     """
 
     merge: int = 1
@@ -328,25 +293,25 @@ class Reduction:
     pulses: float = 1.0
 
     def fits(self, shape: tuple[int, int, int]) -> bool:
-        """Whether a capture of these rows, columns and bins holds enough for it."""
+        """Return whether a capture of `shape` (rows, columns, bins) is large enough."""
         side, n_bins = min(shape[:2]), shape[2]
         first, end = self.gate or (0, n_bins)
         enough_pixels = self.skip <= side and self.pool <= len(_kept(side, self.skip))
         return enough_pixels and 0 <= first < end <= n_bins and self.merge <= end - first
 
     def shape(self, shape: tuple[int, int, int]) -> tuple[int, int, int]:
-        """Rows, columns and bins that are left of those of a capture, which it must fit."""
+        """Return rows, columns and bins of a reduced capture; `shape` must fit."""
         rows, cols = (len(_kept(size, self.skip)) // self.pool for size in shape[:2])
         first, end = self.gate or (0, shape[2])
         return rows, cols, (end - first) // self.merge
 
     def of(self, capture: Capture) -> Capture:
-        """The capture with the reductions done: pixels first, then pulses, the gate, the bins.
+        """Reduce a capture: skipped pixels first, then pulses, pooled pixels, gate and bins.
 
         Raises
         ------
         ValueError
-            If one of them does not fit the capture.
+            If a reduction does not fit the capture.
         """
         if self.skip != 1:
             capture = skip_pixels(capture, self.skip)
@@ -359,20 +324,20 @@ class Reduction:
         return merge_bins(capture, self.merge) if self.merge != 1 else capture
 
     def spread(self, image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
-        """An image of the reduced capture at full resolution: what is missing takes its neighbour.
+        """Expand an image of the reduced capture to full resolution, with the nearest pixels.
 
         Parameters
         ----------
         image : ndarray, shape (row, col) of the reduced capture
         shape : tuple of int
-            Rows and columns of the capture itself.
+            Rows and columns of the unreduced capture.
         """
-        rows = self._taken_from(shape[0], image.shape[0])
-        cols = self._taken_from(shape[1], image.shape[1])
+        rows = self._source_of(shape[0], image.shape[0])
+        cols = self._source_of(shape[1], image.shape[1])
         return image[np.ix_(rows, cols)]
 
-    def _taken_from(self, full: int, own: int) -> NDArray[np.intp]:
-        """Row (or column) of the reduced image that each of the full one's is taken from."""
+    def _source_of(self, full: int, own: int) -> NDArray[np.intp]:
+        """Row (or column) of the reduced image for each one of the full image."""
         after_skipping = np.minimum(np.arange(full) // self.skip, len(_kept(full, self.skip)) - 1)
         return np.asarray(np.minimum(after_skipping // self.pool, own - 1))
 
@@ -391,13 +356,8 @@ class Reduction:
         return ", ".join(done) or "whole"
 
 
-def _require_whole(name: str, value: object, most: int) -> None:
-    accepted = isinstance(value, Integral) and 1 <= int(value) <= most
-    require(name, value, accepted, f"an integer from 1 to {most}")
-
-
 def _kept(size: int, step: int) -> range:
-    """Rows (or columns) left where one of each `step` is kept: the middle one."""
+    """Rows (or columns) that remain if the middle one of each `step` is kept."""
     return range((step - 1) // 2, size, step)
 
 
@@ -406,9 +366,9 @@ def _share(background: float | None, share: float) -> float | None:
 
 
 def _sum(cubes: Sequence[NDArray[np.unsignedinteger]]) -> NDArray[np.unsignedinteger]:
-    """Their sum, in a type that holds it.
+    """Add cubes, in a type that holds the sum.
 
-    One array after the other: numpy's sum over a short axis takes ten times as long.
+    In a loop: numpy's sum over a short axis takes ten times as long.
     """
     most = sum(int(cube.max(initial=0)) for cube in cubes)
     require("counts", most, most < 2**32, "a capture whose sums are below 2**32")
@@ -419,20 +379,20 @@ def _sum(cubes: Sequence[NDArray[np.unsignedinteger]]) -> NDArray[np.unsignedint
 
 
 def coarser(acquisition: Acquisition, step: int) -> Acquisition:
-    """An acquisition with pixels `step` times as far apart."""
+    """Return an acquisition with pixels `step` times as far apart."""
     angle_rad = acquisition.pixel_angle_rad
     wider_rad = None if angle_rad is None or angle_rad * step >= 1 else angle_rad * step
     return replace(acquisition, pixel_angle_rad=wider_rad)
 
 
 def _each_of_tile(image: NDArray[Any], side: int) -> list[NDArray[Any]]:
-    """The first pixel of each `side` x `side`, the second, ...; each of shape (row, col, ...)."""
+    """The first pixel of each `side` x `side` tile, the second, ..., each (row, col, ...)."""
     rows, cols = (size - size % side for size in image.shape[:2])
     return [image[i:rows:side, j:cols:side] for i in range(side) for j in range(side)]
 
 
 def _median(images: Sequence[Floats]) -> Floats:
-    """Median of what is finite, pixel by pixel, NaN where nothing is."""
+    """Median of the finite values, pixel by pixel; NaN without any."""
     ordered = np.sort(images, axis=0)  # NaN last
     known = np.isfinite(ordered).sum(axis=0, keepdims=True)
     middle = np.concatenate([np.maximum(known - 1, 0) // 2, known // 2])

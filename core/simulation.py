@@ -1,14 +1,14 @@
-"""From a scene to a capture: exact draws of what a first-photon detector records.
+"""Simulation of captures: exact draws of what a first-photon detector records of a scene.
 
-The first photon of a pulse arrives after time ``t`` with probability ``exp(-Λ(t))``, ``Λ`` being
-the expected photons before ``t``. So ``1 - exp(-Λ)`` at the bin edges is the distribution of the
-trigger bin, and one uniform number a pulse, looked up in it, is an exact draw: over the pulses of a
-pixel exactly the multinomial of Eq. 1, "no trigger" included. The parts that a scene may have
-(`core.effects`) change Λ or that distribution, and nothing else.
+The first photon of a pulse arrives after time ``t`` with probability ``exp(-Λ(t))``, where ``Λ`` is
+the expected number of photons before ``t``. So ``1 - exp(-Λ)`` at the bin edges is the cumulative
+distribution of the trigger bin, and one uniform number per pulse, looked up in it, is an exact
+draw: over the pulses of a pixel the multinomial of Eq. 1, "no trigger" included. The optional parts
+of a scene (`core.effects`) change Λ or that distribution, and nothing else.
 
-Each pixel has its own stream of random numbers, keyed by (seed, pixel): the cube is the same for
-any number of threads, and neighbouring settings share their randomness, so that a slider moves the
-scene and not the dice.
+Each pixel has its own random stream, keyed by (seed, pixel). The cube is therefore the same for any
+number of threads, and similar settings share their random numbers, so that a slider changes the
+scene and not the noise.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from core.acquisition import Acquisition, Floats, Flux, Pulse
+from core.acquisition import Acquisition, Floats, Flux, Pulse, pulses_sent
 from core.capture import Capture
 from core.checks import require
 from core.kernels.parallel import KERNEL_LOCK
 from core.kernels.simulate import SHAPE_CODES, add_echo_photons, draw_pulses, fire_once
 from core.scene import Scene, parts_of
 
-_Light = TypeVar("_Light", float, Floats)
+_Flux = TypeVar("_Flux", float, Floats)
 
-# Beyond this many pulses numpy's multinomial is faster: its time does not grow with them.
+# With more pulses numpy's multinomial is faster: its time does not depend on their number.
 PULSES_DRAWN_ONE_BY_ONE = 8192
 
 
@@ -46,33 +46,33 @@ def simulate(
     Parameters
     ----------
     scene : Scene
-        Ranges and, maybe, parts; a pixel without a target sees no echo.
+        Ranges and optional parts; a pixel without a target sees no echo.
     acquisition : Acquisition
         Gate, bins and pulses.
     flux : Flux
         Signal photons per pulse at reflectivity 1, and background.
     pulse : Pulse
-        Shape of the echo; its time zero lies at the surface.
+        Shape of the echo; its time zero is the delay of the surface.
     seed : int
         The same seed gives the same capture, for any number of threads.
 
     Returns
     -------
     Capture
-        With its truth: range and, where the light is one echo over uniform background and nothing
-        else, signal and background.
+        With the true range and, if pixels see only one echo over uniform background, signal and
+        background.
 
     Raises
     ------
     ValueError
-        If the number of pulses is not known or 2**32 or more, or the seed is not an integer from 0
-        to 2**63 - 1.
+        If the number of pulses is unknown or 2**32 or more, or the seed is not an integer from 0 to
+        2**63 - 1.
     """
     n_pulses = pulses_sent(acquisition)
     require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
     _require_seed(seed)
     shape = np.shape(scene.range_m)
-    triggered = triggered_by_each_edge(scene, acquisition, flux, pulse)
+    triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
     cube = np.zeros(
         (len(triggered), acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32
     )
@@ -94,40 +94,39 @@ def simulate(
 
 
 def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
-    """What a first-photon detector would have recorded of the photons that a capture holds.
+    """Draw what a first-photon detector would have recorded of the photons of a capture.
 
-    Photons fall on the pulses at random, each on any of them alike, and a pulse fires by the first
-    that falls on it. Taken in the order of their arrival, a photon fires with probability
-    ``armed / n_pulses``, armed being the pulses that have not fired: which ones these are does not
-    matter. For light whose photons are independent that is exact.
+    Photons are assigned to pulses uniformly at random, and the first one of a pulse triggers. In
+    order of arrival, a photon triggers with probability ``armed / n_pulses``, with the number of
+    armed pulses, those that have not fired. This is exact if photons are independent.
 
     Parameters
     ----------
     capture : Capture
-        One that holds all photons.
+        A capture of all photons.
     n_pulses : int
-        Pulses on which its photons fall, at least 1.
+        Pulses to which the photons are assigned, at least 1.
     seed : int
         The same seed gives the same capture, for any number of threads.
 
     Returns
     -------
     Capture
-        First photons, `n_pulses` sent for each pixel; the light is known only where that of a pulse
-        of the capture's own was.
+        First photons of `n_pulses` pulses per pixel; true fluxes are kept only if the capture knows
+        its number of pulses.
 
     Raises
     ------
     ValueError
-        If the capture holds first photons already, or an argument is out of its range.
+        If the capture holds first photons, or an argument is out of its range.
     """
     kind = capture.detection
-    require("detection", kind, kind == "all", "a capture of all photons, which still has others")
+    require("detection", kind, kind == "all", "a capture of all photons")
     whole = isinstance(n_pulses, Integral)
     require("n_pulses", n_pulses, whole and 1 <= n_pulses < 2**32, "an integer, 1 to 2**32 - 1")
     _require_seed(seed)
     before = capture.acquisition.n_pulses
-    share = None if before is None else before / n_pulses  # of the old pulses on each new one
+    share = None if before is None else before / n_pulses  # old pulses per new pulse
     cube = np.zeros_like(capture.cube)
     with KERNEL_LOCK:
         fire_once(capture.cube, n_pulses, np.uint64(seed), cube)
@@ -144,26 +143,13 @@ def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
     )
 
 
-def _times(light: _Light | None, share: float | None) -> _Light | None:
-    return None if light is None or share is None else light * share
+def _times(flux: _Flux | None, share: float | None) -> _Flux | None:
+    return None if flux is None or share is None else flux * share
 
 
 def _require_seed(seed: int) -> None:
     whole = isinstance(seed, Integral)
     require("seed", seed, whole and 0 <= seed < 2**63, "an integer from 0 to 2**63 - 1")
-
-
-def pulses_sent(acquisition: Acquisition) -> int:
-    """Pulses of an acquisition to be simulated.
-
-    Raises
-    ------
-    ValueError
-        If that number is not known.
-    """
-    if acquisition.n_pulses is None:
-        raise ValueError("n_pulses = None is not accepted: give the number of pulses to simulate.")
-    return acquisition.n_pulses
 
 
 def _signal(scene: Scene, flux: Flux) -> Floats:
@@ -172,23 +158,22 @@ def _signal(scene: Scene, flux: Flux) -> Floats:
     return np.where(np.isfinite(scene.range_m), flux.signal * reflectivity, 0.0)
 
 
-def triggered_by_each_edge(
+def cumulative_trigger_probability(
     scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse
 ) -> Floats:
-    """Probability that a pulse is recorded to have fired before each bin edge.
+    """Probability that a detection is recorded before each bin edge.
 
-    ``1 - exp(-Λ)`` of the photons ``Λ`` expected before the edge, but for what motion and jitter
-    make of it.
+    ``1 - exp(-Λ)``, with the photons ``Λ`` expected before the edge, modified by motion and jitter.
 
     Returns
     -------
     ndarray, shape (pixel, n_bins + 1)
-        From 0 at the gate's opening to ``1 - P_none``; differences are trigger probabilities.
+        From 0 at the opening of the gate to ``1 - P_none``; differences are trigger probabilities.
 
     Raises
     ------
     ValueError
-        If the scene moves and the number of pulses is not known.
+        If the scene moves and the number of pulses is unknown.
     """
     n_edges = acquisition.n_bins + 1
     share_of_gate = np.linspace(0.0, 1.0, n_edges)
@@ -226,11 +211,11 @@ def triggered_by_each_edge(
 
 
 def _echoes(scene: Scene, flux: Flux) -> Iterator[tuple[Floats, Floats]]:
-    """Range and signal photons per pulse of each surface that pixels see, shape (row, col)."""
+    """Range and signal photons per pulse of each surface, both of shape (row, col)."""
     signal, second, fog = _signal(scene, flux), scene.second_surface, scene.backscatter
     surfaces = [(scene.range_m, signal)]
     if second is not None:
-        share = second.seen_share
+        share = second.effective_share
         surfaces = [(scene.range_m, (1 - share) * signal), (second.range_m, share * signal)]
     for range_m, photons in surfaces:
         dimmed = photons if fog is None else photons * np.nan_to_num(fog.transmission(range_m))
@@ -240,18 +225,18 @@ def _echoes(scene: Scene, flux: Flux) -> Iterator[tuple[Floats, Floats]]:
 def add_echo(
     onset_bin: Floats, signal: Floats, pulse: Pulse, bin_width_s: float, before: Floats
 ) -> None:
-    """Add the photons of an echo before each edge, within the gate, to those of other light.
+    """Add the photons of an echo before each bin edge, within the gate, to `before`.
 
     Parameters
     ----------
     onset_bin : ndarray, shape (pixel,)
-        Delay in fractional bins; one that is not finite means no echo.
+        Delay in fractional bins; not finite means no echo.
     signal : ndarray, shape (pixel,)
         Photons per pulse.
     pulse : Pulse
     bin_width_s : float
     before : ndarray, shape (pixel, n_bins + 1)
-        Added to in place.
+        Expected photons before each edge, modified in place.
     """
     samples = np.cumsum((0.0, *pulse.samples))
     share = samples / (samples[-1] or 1.0)

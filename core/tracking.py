@@ -1,4 +1,4 @@
-"""Echo detection by two tracking differentiators, the paper's method.
+"""Echo detection with two tracking differentiators, the paper's method.
 
 A tracking differentiator (TD) follows a signal ``s`` as fast as a bound ``r`` on its acceleration
 allows (Xie et al., Electronics 2026, 15, 2816, Eqs. 4-5; the control function is Han's ``fhan``)::
@@ -10,12 +10,12 @@ allows (Xie et al., Electronics 2026, 15, 2816, Eqs. 4-5; the control function i
     x1' = x1 + h·x2                  x2' = x2 + h·fh
 
 The small scale ``r_small = l·σ`` follows the trend, the large one ``r_large = n·r_small`` the jump.
-Their positive difference is the residual; the residual times a weight is the enhanced signal, and
-the largest enhanced signal marks the echo (Eqs. 6-15).
+Their positive difference is the residual; the residual times a weight is the enhanced signal, whose
+maximum is the position of the echo (Eqs. 6-15).
 
-`tracking_signals` computes these equations as written, in float64; its signals hold the ``x1'`` of
-each step. `track` computes only the position, for whole captures, in float32 and with the units
-divided out (`core.kernels.tracking`).
+`tracking_signals` computes these equations as written, in float64, with ``x1'`` of each step as the
+signals. `track` computes only the position, for whole captures, in float32 and in scaled units
+(`core.kernels.tracking`).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ START_BINS = 5
 
 
 class Signals(NamedTuple):
-    """Every stage of the estimator, each of the histogram's shape (..., bin), in counts."""
+    """Signals of all stages of the estimator, each of shape (..., bin), in counts."""
 
     raw: Floats
     small: Floats
@@ -85,7 +85,7 @@ class Signals(NamedTuple):
 def tracking_signals(
     histogram: ArrayLike, parameters: TrackingParameters, n_pulses: int | None = None
 ) -> Signals:
-    """Every stage of the estimator, as written in the paper and in float64.
+    """Compute all stages of the estimator as written in the paper, in float64.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def tracking_signals(
         Counts, or expected counts.
     parameters : TrackingParameters
     n_pulses : int, optional
-        Pulses sent; needed by the weight "survival" only.
+        Pulses sent; required by the weight "survival".
 
     Returns
     -------
@@ -141,22 +141,27 @@ def tracking_signals(
 def track(
     blocks: Blocks, parameters: TrackingParameters, n_pulses: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Position of the echo in every pixel, without the signals that lead there.
+    """Compute only the position of the echo, for every pixel of a capture.
 
     Parameters
     ----------
     blocks : Blocks
-        Counts, as `to_blocks` lays them out.
+        Counts, from `core.kernels.blocks.to_blocks`.
     parameters : TrackingParameters
     n_pulses : int, optional
-        Pulses sent; needed by the weight "survival" only.
+        Pulses sent; required by the weight "survival".
 
     Returns
     -------
     position_bin : ndarray, shape (pixel,)
-        As `Signals.position_bin`; NaN where there is none.
+        `Signals.position_bin`; NaN where there is none.
     score : ndarray, shape (pixel,)
-        The enhanced signal there, in counts; 0 where there is none.
+        Enhanced signal at the position, in counts; 0 where there is none.
+
+    Raises
+    ------
+    ValueError
+        If the weight "survival" lacks `n_pulses`.
     """
     n_blocks, n_bins, _ = blocks.counts.shape
     weight = common_weight(n_bins, parameters)
@@ -193,22 +198,22 @@ def _pulses_for_survival(parameters: TrackingParameters, n_pulses: int | None) -
         return None
     if n_pulses is None:
         raise ValueError(
-            "weight = 'survival' needs the number of pulses, which is not known here, or smaller "
-            "than a pixel's detections: give n_pulses, or choose another weight."
+            "weight = 'survival' needs the number of pulses, which is unknown or smaller than a "
+            "pixel's detections: give n_pulses, or choose another weight."
         )
     return n_pulses
 
 
 def common_weight(n_bins: int, parameters: TrackingParameters) -> Floats:
-    """The part of the weight that is the same for every pixel (Eq. 13), shape (bin,)."""
+    """Compute the part of the weight that all pixels share (Eq. 13), shape (bin,)."""
     bins = np.arange(n_bins)
     rise = (bins / n_bins) ** 3
     if parameters.weight == "cubic":
-        # A strength that has lost its digits would give its shape to the weight: it is none.
+        # A subnormal strength would distort the weight; treat it as 0.
         weight = (parameters.alpha if parameters.alpha >= np.finfo(float).tiny else 0.0) * rise
     elif parameters.weight == "exponential":
-        # Where it spans more than float32 does, the last bins win, as they should, and the others
-        # are still something; times a count it is finite.
+        # Clipped to the range of float32: the last bins keep the largest weight, the others stay
+        # positive, and products with counts stay finite.
         power = parameters.alpha * rise
         weight = np.exp(np.maximum(power, power[-1] - 60.0) - max(power[-1] - 600.0, 0.0))
     else:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from core.parameters import Choice, Number, Zone, check_fields, parameter
+from core.parameters import Choice, Number, Settings, Zone, parameter
 
 Weight = Literal["cubic", "exponential", "survival", "none"]
 Start = Literal["zero", "mean"]
 SigmaFrom = Literal["gate", "before T_n"]
 
 
-# Where settings are in doubt, as ``python -m core stability`` measures it.
+# Limits of reliable settings, measured by ``python -m core stability``.
 CALM_M = 0.8  # chaotic below
 LINEAR = 1.0
 STEEP_ALPHA = 1.6
@@ -20,15 +20,10 @@ FEW_BINS = 4
 
 
 @dataclass(frozen=True)
-class TrackingParameters:
-    """Settings of the dual-scale tracking differentiator; the defaults are the recommended preset.
+class TrackingParameters(Settings):
+    """Settings of the dual-scale tracking differentiator, by default the recommended preset.
 
-    Each field's meaning, unit and bounds are in its metadata (`core.parameters`).
-
-    Raises
-    ------
-    ValueError
-        If a value lies outside its bounds.
+    Meaning, unit and bounds of each field are in its metadata (`core.parameters`).
     """
 
     l: float = parameter(  # noqa: E741 - the paper's letter
@@ -38,11 +33,12 @@ class TrackingParameters:
             1e-4,
             1.0,
             log=True,
+            merge_power=2,  # an acceleration: counts per square bin
             least=0.0,
             most=1e6,
             doubtful=(
-                Zone(0.0, 7e-4, "So slow a small scale leaves dim pixels without an answer."),
-                Zone(0.03, 1e6, "So fast a small scale follows the echo, too: it is lost in it."),
+                Zone(0.0, 7e-4, "The small scale is too slow: dim pixels get no estimate."),
+                Zone(0.03, 1e6, "The small scale is so fast that it follows the echo."),
             ),
         ),
         "Speed of the small scale, r_small = l·σ: smaller follows only the slow trend.",
@@ -56,9 +52,7 @@ class TrackingParameters:
             log=True,
             least=0.0,
             most=1e9,
-            doubtful=(
-                Zone(0.0, 70.0, "The scales are too much alike; at n = 1 nothing is left of them."),
-            ),
+            doubtful=(Zone(0.0, 70.0, "The scales are too much alike; at n = 1 nothing remains."),),
         ),
         "Large scale over small scale, r_large = n·r_small: larger follows the echo's jump faster.",
     )
@@ -73,12 +67,13 @@ class TrackingParameters:
             most=1e6,
             open_below=True,
             unit="bins",
+            merge_power=0,  # l is rescaled instead
             doubtful=(
-                Zone(0.0, 0.42, "As too small an l: dim pixels are left without an answer."),
-                Zone(2.6, 1e6, "As too large an l: the small scale follows the echo, too."),
+                Zone(0.0, 0.42, "Same effect as too small an l: dim pixels get no estimate."),
+                Zone(2.6, 1e6, "Same effect as too large an l: the small scale follows the echo."),
             ),
         ),
-        "Step of the integration. Only (m·h)²·l counts: h and l are one knob.",
+        "Step of the integration. Only (m·h)²·l matters: h and l are one setting.",
     )
     m: float = parameter(
         1.4,
@@ -89,7 +84,7 @@ class TrackingParameters:
             least=1e-3,
             most=1e6,
             doubtful=(
-                Zone(1e-3, 0.5, "It never comes to rest: at ½ and below it cycles for ever."),
+                Zone(1e-3, 0.5, "It never settles: at ½ and below it cycles for ever."),
                 Zone(
                     0.5,
                     CALM_M,
@@ -107,26 +102,26 @@ class TrackingParameters:
     alpha: float = parameter(
         0.15,
         Number("α", 0.1, 30.0, log=True, least=0.0, most=1e6),
-        "Strength of the weight. With the cubic weight, as printed, it scales every bin alike and "
-        "cannot move a range; with the exponential weight it can.",
+        "Strength of the weight. With the cubic weight, as printed, it scales all bins equally and "
+        "cannot change a range; with the exponential weight it can.",
     )
     t_n: int = parameter(
         20,
-        Number("T_n", 0, 99, whole=True, least=0, most=2**31 - 1, unit="bins"),
-        "First bin in which the residual may peak, about two bins behind the echo's onset: what "
-        "comes before is taken for noise.",
+        Number("T_n", 0, 99, whole=True, least=0, most=2**31 - 1, unit="bins", is_bin_index=True),
+        "First bin in which the residual may peak, about two bins after the echo's onset; earlier "
+        "peaks count as noise.",
     )
     weight: Weight = parameter(
         "exponential",
         Choice("Weight", ("none", "survival", "cubic", "exponential")),
-        "What the residual is multiplied by: nothing, 1 / share of pulses still armed (undoes the "
-        "decay by pile-up), α·(k/N)³ as printed, or exp(α·(k/N)³).",
+        "Factor of the residual: none, 1 / share of armed pulses (corrects the decay by pile-up), "
+        "α·(k/N)³ as printed, or exp(α·(k/N)³).",
     )
     start: Start = parameter(
         "mean",
         Choice("Start", ("mean", "zero")),
-        "First value of both scales: the mean of the first five bins, or zero, whose start-up jump "
-        "T_n must hide.",
+        "Initial value of both scales: the mean of the first five bins, or zero, whose initial "
+        "jump T_n must exclude.",
     )
     sigma_from: SigmaFrom = parameter(
         "gate",
@@ -135,17 +130,14 @@ class TrackingParameters:
         "(Algorithm 1). The paper prints both.",
     )
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
     def joint_doubts(self) -> list[str]:
-        """Why answers are in doubt with settings that are sound one by one."""
+        """Return reasons why this combination of settings makes estimates unreliable."""
         linear = (self.m * self.h) ** 2 * self.l
         found = []
         if linear >= LINEAR:
             found.append(
-                f"(m·h)²·l = {linear:.2g}: from about {LINEAR:g} on both scales turn linear and "
-                "move alike, which leaves little residual or none."
+                f"(m·h)²·l = {linear:.2g}: from about {LINEAR:g} on both scales are linear and "
+                "nearly equal, which leaves little residual or none."
             )
         if self.weight == "exponential" and self.alpha >= STEEP_ALPHA:
             found.append(
@@ -154,13 +146,13 @@ class TrackingParameters:
             )
         if self.start == "zero" and self.weight != "cubic":
             found.append(
-                "From zero both scales must first jump up to the background; only the cubic weight "
-                "hides that jump."
+                "From zero both scales first jump up to the background; only the cubic weight "
+                "suppresses that jump."
             )
         if self.sigma_from == "before T_n" and self.t_n < FEW_BINS:
             found.append(
-                f"σ of the {self.t_n} bins before T_n, fewer than {FEW_BINS}, is chance; of one "
-                "bin or none it is 0, and nothing is answered."
+                f"σ of the {self.t_n} bins before T_n, fewer than {FEW_BINS}, is chance; for "
+                "one bin or none it is 0, and no pixel gets an estimate."
             )
         return found
 

@@ -1,4 +1,4 @@
-"""From photon rates to first-photon trigger probabilities, and back."""
+"""Conversion between photon rates and first-photon trigger probabilities."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def rate_per_bin(
     pulse: Pulse,
     acquisition: Acquisition,
 ) -> Floats:
-    """Expected detections in each bin per pulse, were the detector always armed.
+    """Expected detections per bin and pulse of a detector that is always armed.
 
     ``λ_k = S p_k(d) + B / n_bins``.
 
@@ -28,6 +28,8 @@ def rate_per_bin(
         Signal photons per pulse, ``S``.
     background : float
         Background photons per pulse over the whole gate, ``B``.
+    pulse : Pulse
+    acquisition : Acquisition
 
     Returns
     -------
@@ -51,7 +53,12 @@ def trigger_probability(rate: ArrayLike) -> Floats:
     Returns
     -------
     ndarray, shape (..., bin)
-        Sums with `no_trigger_probability` to 1.
+        Adds up with `no_trigger_probability` to 1.
+
+    Raises
+    ------
+    ValueError
+        If a rate is negative or NaN.
     """
     rate = _checked_rate(rate)
     before = np.zeros_like(rate)
@@ -64,17 +71,18 @@ def no_trigger_probability(rate: ArrayLike) -> Floats:
     return np.asarray(np.exp(-_checked_rate(rate).sum(axis=-1)))
 
 
-def drawn(
+def draw_counts(
     rate: ArrayLike, n_pulses: int | None, rng: np.random.Generator
 ) -> NDArray[np.unsignedinteger]:
-    """Histograms drawn from rates, shape (..., bin): the multinomial of Eq. 1.
+    """Draw histograms from rates, shape (..., bin): the multinomial of Eq. 1.
 
     Parameters
     ----------
     rate : array_like, shape (..., bin)
-        As for `trigger_probability`; where `n_pulses` is None, photons expected in each bin.
+        As for `trigger_probability`; if `n_pulses` is None, expected photons in each bin.
     n_pulses : int or None
-        Pulses sent; where None, counts are Poisson.
+        Pulses sent; counts are Poisson if None.
+    rng : numpy.random.Generator
     """
     if n_pulses is None:
         return rng.poisson(np.asarray(rate, float)).astype(np.uint32)
@@ -85,16 +93,16 @@ def drawn(
 
 
 def first_difference(probability: ArrayLike) -> Floats:
-    """Change from bin to bin, ``ΔP_k = P_k - P_{k-1}`` (the paper's Eq. 3).
+    """Change from bin to bin, ``ΔP_k = P_k - P_{k-1}`` (the paper's Eq. 3), shape (..., bin).
 
-    The first bin has no predecessor; its difference is 0. Shape (..., bin), as given.
+    The difference of the first bin is 0.
     """
     probability = np.asarray(probability, float)
     return np.diff(probability, axis=-1, prepend=probability[..., :1])
 
 
 def coates_rate(counts: ArrayLike, n_pulses: int) -> Floats:
-    """Undo the pile-up: the rate per bin that explains the counts best (Coates 1968).
+    """Correct pile-up: maximum-likelihood rate of each bin (Coates 1968).
 
     ``λ̂_k = ln(A_k / (A_k - n_k))`` with ``A_k = n_pulses - Σ_{i<k} n_i`` pulses still armed.
 
@@ -108,20 +116,19 @@ def coates_rate(counts: ArrayLike, n_pulses: int) -> Floats:
     Returns
     -------
     ndarray, shape (..., bin)
-        Infinite where every armed pulse fired (any high rate explains that), NaN behind such a bin
-        (no pulse was left to tell).
+        Infinite where every armed pulse fired, NaN in later bins, where no pulse is armed.
 
     Raises
     ------
     ValueError
-        If a pixel fired more often than pulses were sent: that is not first-photon data.
+        If a pixel fired more often than pulses were sent.
     """
     counts = np.asarray(counts).astype(np.int64)
     total = int(counts.sum(axis=-1).max(initial=0))
     require("n_pulses", n_pulses, n_pulses >= total, f"at least {total}, the detections of a pixel")
     armed = n_pulses - (np.cumsum(counts, axis=-1) - counts)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # ln(1 + n / (A - n)) keeps its digits where few of the armed pulses fire, and where all do.
+        # ln(1 + n / (A - n)) is accurate if few of the armed pulses fire, and if all do.
         return np.asarray(np.log1p(counts / (armed - counts)))
 
 

@@ -1,4 +1,4 @@
-"""Compile ahead of the first use."""
+"""Compilation ahead of the first use."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from core.tracking import PRESETS, track, tracking_signals
 
 
 def warm_up() -> None:
-    """Enter every kernel once, so that no later call pays for its compilation.
+    """Compile every kernel, so that no later call has to.
 
-    Seconds on a new machine; compiled code is then kept on disk, and a second start takes a tenth.
+    Takes seconds on a new machine. Compiled code is cached on disk; later starts take a tenth.
     """
     acquisition = Acquisition(n_pulses=1)
     scene = Scene(np.full((1, 1), 50.0), acquisition=acquisition)

@@ -1,10 +1,11 @@
 """Attacks on the app and the command line: ``python -m tests.attack``, or `make attack`.
 
-Each attack of `tests.attacks` is tried on a server of its own on this machine, bounded in count and
-time, while another session moves its sliders. A row says what was tried, how often, what came of
-it, how long the other session had to wait at most, and the memory of the attacked process with its
-children. An attack holds if the server refuses or survives it within bounds, and goes on serving
-the other session. The command returns 1 if one did not hold.
+Attacks of `tests.attacks` are tried on a server on this machine, limited in number and time, while
+another session moves its sliders. A row has the attempts, the observation, the longest wait of the
+other session, and the memory of the attacked process with its children. An attack holds if the
+server refuses or survives it within limits, and goes on serving the other session. The command
+returns 1 if one did not hold. Requests of strangers and of other sites are tested in
+`tests.test_limits`, `tests.test_routes` and `tests.test_serving`.
 """
 
 from __future__ import annotations
@@ -15,63 +16,21 @@ import inspect
 import logging
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from urllib.error import HTTPError
-from urllib.parse import urlencode
-from urllib.request import HTTPRedirectHandler, build_opener
 
-from tests.attacks import cuts, files, routes, sessions, strangers, uploads
-from tests.attacks.attack import (
-    MIB,
-    PATIENCE_S,
-    TOKEN,
-    Attack,
-    Bystander,
-    Outcome,
-    Served,
-    Server,
-    last_line,
-    running,
-)
+from tests.attacks import cuts, files, sessions, uploads
+from tests.attacks.attack import MIB, Attack, Bystander, Outcome, Server, last_line, running
 
-ATTACKS: list[Attack] = [
-    *routes.ATTACKS,
-    *strangers.ATTACKS,
-    *uploads.ATTACKS,
-    *files.ATTACKS,
-    *cuts.ATTACKS,
-    *sessions.ATTACKS,
-]
+ATTACKS: list[Attack] = [*uploads.ATTACKS, *files.ATTACKS, *cuts.ATTACKS, *sessions.ATTACKS]
+
+LONGEST_WAIT_S = 5.0
+"""Another session must never wait longer."""
 
 SETTLED_BYTES = 1024 * MIB
-"""A server that holds more is replaced, so that the next attack starts from little."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A row of the table."""
-
-    title: str
-    outcome: Outcome
-    seconds: float
-    waited_s: float | None = None
-    """Longest wait of another session; None where no server was attacked."""
-
-    @property
-    def line(self) -> str:
-        """A line of the table."""
-        waited = "" if self.waited_s is None else f"{self.waited_s:.1f} s"
-        outcome = self.outcome
-        return (
-            f"| {self.title} | {outcome.times} | {outcome.said.replace('|', '/')} | {waited} "
-            f"| {outcome.peak_bytes / MIB:.0f} MiB | {self.seconds:.0f} s "
-            f"| {'held' if outcome.held else 'did NOT hold'} |"
-        )
-
+"""A server with more memory is replaced, so that the next attack starts from little."""
 
 HEADER = (
     "| attack | times | outcome | another session waited | peak memory | took | verdict |\n"
@@ -79,117 +38,84 @@ HEADER = (
 )
 
 
-class House:
+class Target:
     """A server and a session on it, replaced once an attack has harmed them."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._stack = ExitStack()
-        self._served: Served | None = None
-        self.server: Server
-        self.other: Bystander
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
+        self.server: Server | None = None
 
-    def prepare(self, served: Served) -> None:
-        """Have a healthy server of this kind."""
-        if self._served == served:
-            is_well = self.server.is_alive and not self.other.is_lost
-            if is_well and self.server.memory.now() < SETTLED_BYTES:
-                return
-        self.leave()
-        self.server = self._stack.enter_context(running(served, self._folder))
-        if served.has_token:
-            self.server.headers = cookie(self.server)
-        self.other = Bystander(self.server)
-        self._served = served
+    def healthy(self) -> tuple[Server, Bystander]:
+        """Return a server and a session that are well."""
+        server = self.server
+        if server is None or not self._is_well(server):
+            self._stack.close()
+            self.server = server = self._stack.enter_context(running())
+            self.other = Bystander(server.address)
+            self._stack.callback(self.other.leave)
+        server.memory.restart()
+        self.other.restart()
+        return server, self.other
 
-    def leave(self) -> None:
-        """End the server."""
-        if self._served is not None:
-            self.other.leave()
-        self._stack.close()
-        self._served = None
+    def _is_well(self, server: Server) -> bool:
+        return server.is_alive and not self.other.is_lost and server.memory.now() < SETTLED_BYTES
 
 
-def cookie(server: Server) -> dict[str, str]:
-    """Let a client in by the token."""
-
-    class Stay(HTTPRedirectHandler):
-        def redirect_request(self, *_: object) -> None:
-            """Go nowhere: the redirection itself brings the cookie."""
-
-    try:
-        build_opener(Stay).open(f"{server.address}?{urlencode({'token': TOKEN})}")
-    except HTTPError as redirection:
-        return {"Cookie": redirection.headers["Set-Cookie"].partition(";")[0]}
-    raise ConnectionError("the server sent no cookie for its token")
-
-
-def tried(attack: Attack, house: House, folder: Path) -> Row:
-    """Try one attack."""
-    begun = time.monotonic()
-    if attack.served is None:
-        return Row(attack.title, _outcome(attack, folder), time.monotonic() - begun)
-    house.prepare(attack.served)
-    server, other = house.server, house.other
-    server.memory.restart()
-    other.restart()
-    begun = time.monotonic()
-    outcome = _outcome(attack, server)
-    time.sleep(1)  # the other session asks for something in the meantime
-    waited_s, said = other.longest_s, outcome.said
-    if not server.is_alive:
-        how = "killed at its bound" if server.memory.is_killed else last_line(server.logged(), 60)
-        said += f"; the server ENDED ({how})"
-    elif other.is_lost:
-        said += "; another session was LOST"
-    held = outcome.held and server.is_alive and not other.is_lost and waited_s < PATIENCE_S
-    peak = server.memory.peak_bytes
-    outcome = replace(outcome, said=said, held=held, peak_bytes=peak)
-    return Row(attack.title, outcome, time.monotonic() - begun, waited_s)
+def row_of(attack: Attack, target: Target, folder: Path) -> tuple[str, bool]:
+    """Try an attack; return its row of the table, and whether it held."""
+    if attack.needs_server:
+        server, other = target.healthy()
+        begun = time.monotonic()
+        outcome = _outcome(attack, server)
+        time.sleep(1)  # the other session moves in the meantime
+        waited_s, text = other.longest_s, outcome.text
+        if not server.is_alive:
+            how = "killed at its limit" if server.memory.is_killed else server.logged()
+            text += f"; the server ENDED ({last_line(how, 60)})"
+        elif other.is_lost:
+            text += "; another session was LOST"
+        held = outcome.held and server.is_alive and not other.is_lost and waited_s < LONGEST_WAIT_S
+        outcome = replace(outcome, text=text, held=held, peak_bytes=server.memory.peak_bytes)
+        waited = f"{waited_s:.1f} s"
+    else:
+        begun, waited = time.monotonic(), ""
+        outcome = _outcome(attack, folder)
+    row = (
+        f"| {attack.title} | {outcome.times} | {outcome.text.replace('|', '/')} | {waited} "
+        f"| {outcome.peak_bytes / MIB:.0f} MiB | {time.monotonic() - begun:.0f} s "
+        f"| {'held' if outcome.held else 'did NOT hold'} |"
+    )
+    return row, outcome.held
 
 
 def _outcome(attack: Attack, target: Server | Path) -> Outcome:
+    async def awaited(found: object) -> Outcome:
+        assert inspect.isawaitable(found)
+        outcome: Outcome = await found
+        return outcome
+
     try:
         found = attack.run(target)
-        if isinstance(found, Outcome):
-            return found
-        return asyncio.run(_awaited(found))
-    except Exception as error:  # such as a server that has ended in the middle
+        return found if isinstance(found, Outcome) else asyncio.run(awaited(found))
+    except Exception as error:  # such as a server that has ended
         return Outcome(1, f"{type(error).__name__}: {last_line(str(error), 100)}", False)
 
 
-async def _awaited(found: object) -> Outcome:
-    assert inspect.isawaitable(found)
-    outcome: Outcome = await found
-    return outcome
-
-
-def rows(attacks: list[Attack]) -> Iterator[Row]:
-    """Try attacks, one after the other."""
-    with TemporaryDirectory(prefix="firstphoton-attack-") as name:
-        folder = Path(name)
-        house = House(folder)
-        try:
-            for attack in attacks:
-                yield tried(attack, house, folder)
-        finally:
-            house.leave()
-
-
 def main(arguments: list[str] | None = None) -> int:
-    """Try the attacks and print a row for each; returns 1 if one did not hold."""
+    """Try the attacks and print a row for each; return 1 if one did not hold."""
     parser = argparse.ArgumentParser(prog="python -m tests.attack", description=__doc__)
-    parser.add_argument(
-        "--only", metavar="WORD", default="", help="attacks that have it in a title"
-    )
+    parser.add_argument("--only", metavar="TEXT", default="", help="attacks with it in their title")
     chosen = parser.parse_args(arguments)
-    logging.getLogger("asyncio").setLevel(logging.ERROR)  # sockets that a server cuts off are meant
+    logging.getLogger("asyncio").setLevel(logging.ERROR)  # the server cuts off sockets on purpose
     attacks = [each for each in ATTACKS if chosen.only.lower() in each.title.lower()]
     print(HEADER, flush=True)
     begun, held = time.monotonic(), []
-    for row in rows(attacks):
-        print(row.line, flush=True)
-        held.append(row.outcome.held)
+    with TemporaryDirectory(prefix="firstphoton-attack-") as folder, ExitStack() as stack:
+        target = Target(stack)
+        for attack in attacks:
+            row, has_held = row_of(attack, target, Path(folder))
+            print(row, flush=True)
+            held.append(has_held)
     minutes = (time.monotonic() - begun) / 60
     print(f"\n{sum(held)} of {len(held)} attacks held, in {minutes:.1f} minutes.")
     return 0 if held and all(held) else 1

@@ -1,6 +1,6 @@
-"""The app with parts that break, for `tests.test_failures`: ``python -m tests.broken``.
+"""The app with parts that fail, for `tests.test_failures`: ``python -m tests.broken``.
 
-What breaks is asked for by the seed of the simulation, so that another seed mends it.
+The seed of the simulation selects what fails, so that another seed works.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def recursing() -> None:
     recursing()
 
 
-def failing(error: BaseException):
+def raising(error: BaseException):
     def fail() -> None:
         raise error
 
@@ -36,51 +36,45 @@ def failing(error: BaseException):
 
 
 AT_SEED = {
-    1: failing(MemoryError()),
+    1: raising(MemoryError()),
     2: recursing,
-    3: failing(BrokenExecutor("a worker has died")),
-    4: failing(SystemExit(1)),
-    5: failing(OSError(28, "No space left on device", str(FOLDER / "x"))),
+    3: raising(BrokenExecutor("a worker has died")),
+    4: raising(SystemExit(1)),
+    5: raising(OSError(28, "No space left on device", str(FOLDER / "x"))),
     6: refused,
 }
 WHEN_DRAWN = 7
 WHEN_INSPECTED = (3, 4)
 WHEN_TAPPED = (5, 6)
 
-simulate, enter, inspect, choose = (
-    app.model.store.simulate,
-    app.pages.explore.text.figure_strip,
-    app.pages.explore.page.inspect,
-    app.pages.session.Session.choose_pixel,
-)
+
+def failing_where(works, is_failing):
+    """Return a function that raises where its arguments say so."""
+
+    def work(*arguments, **options):
+        if is_failing(*arguments, **options):
+            raise KeyError(str(FOLDER))
+        return works(*arguments, **options)
+
+    return work
 
 
-def breaking_simulate(*arguments, seed, **options):
+simulate = app.model.store.simulate
+
+
+def failing_simulate(*arguments, seed, **options):
     AT_SEED.get(seed, lambda: None)()
     return simulate(*arguments, seed=seed, **options)
 
 
-def breaking_figures(answer):
-    if answer.request.light.seed == WHEN_DRAWN:
-        raise KeyError(str(FOLDER))
-    return enter(answer)
-
-
-def breaking_inspect(answer, row, col):
-    if (row, col) == WHEN_INSPECTED:
-        raise KeyError(str(FOLDER))
-    return inspect(answer, row, col)
-
-
-def breaking_choose(session, row, col):
-    if (row, col) == WHEN_TAPPED:
-        raise KeyError(str(FOLDER))
-    choose(session, row, col)
-
-
 if __name__ == "__main__":
-    app.model.store.simulate = breaking_simulate
-    app.pages.explore.text.figure_strip = breaking_figures
-    app.pages.explore.page.inspect = breaking_inspect
-    app.pages.session.Session.choose_pixel = breaking_choose
+    page, session = app.pages.explore.page, app.pages.session.Session
+    app.model.store.simulate = failing_simulate
+    page.text.figure_strip = failing_where(
+        page.text.figure_strip, lambda answer: answer.request.light.seed == WHEN_DRAWN
+    )
+    page.inspect = failing_where(page.inspect, lambda _, *pixel: pixel == WHEN_INSPECTED)
+    session.choose_pixel = failing_where(
+        session.choose_pixel, lambda _, *pixel: pixel == WHEN_TAPPED
+    )
     sys.exit(started.main())

@@ -1,4 +1,4 @@
-"""The served app and a real browser, for tests and benchmarks."""
+"""The served app in a real browser, for tests and benchmarks: start, actions and observations."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
@@ -17,8 +18,10 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
 
+import numpy as np
 import psutil
-from playwright.sync_api import Browser, BrowserType, Locator, Page, sync_playwright
+from PIL import Image
+from playwright.sync_api import Browser, BrowserType, Locator, Page, expect, sync_playwright
 
 from app.server.ports import free_port
 
@@ -27,7 +30,7 @@ const views = [];
 const walk = (view) => { views.push(view); (view.child_views ?? []).forEach(walk); };
 [...Bokeh.index.roots].forEach(walk);
 """
-"""JavaScript that sets ``views``: all that Bokeh has drawn, or keeps ready, on the page."""
+"""JavaScript that sets ``views`` to all views of Bokeh on the page."""
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -44,14 +47,18 @@ ARGUMENTS = [
 
 
 def browser_path() -> str | None:
-    """The machine's own browser; None leaves it to the one that Playwright has installed."""
+    """Return the path of the machine's browser; None stands for Playwright's own."""
     named = os.environ.get("BROWSER_PATH")
     return named or next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
+READY = ".stage[data-camera], [aria-label='Pinned pixels']"
+"""Part of a page that is drawn late: Explore's cloud, or the pins of Inspect."""
+
+
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A running browser without a window; fails, and says so, where there is none."""
+    """Start a browser without a window; raise where there is none."""
     with sync_playwright() as playwright:
         browser = launch(playwright.chromium)
         yield browser
@@ -59,7 +66,7 @@ def chromium() -> Iterator[Browser]:
 
 
 def launch(kind: BrowserType) -> Browser:
-    """A browser whose first context is that of `open_page`."""
+    """Start a browser whose first context is that of `open_page`."""
     browser = kind.launch(executable_path=browser_path(), args=ARGUMENTS)
     browser.new_context()
     return browser
@@ -69,13 +76,10 @@ def launch(kind: BrowserType) -> Browser:
 def serving(
     *arguments: str | Path, module: str = "app", log_path: Path | None = None, **environment: str
 ) -> Iterator[str]:
-    """The app in a process of its own, at the address that is yielded.
-
-    What it prints goes to `log_path`, where one is given.
-    """
+    """Serve the app in a process of its own and yield its address; print to `log_path`, if any."""
     port = free_port()
     command = [sys.executable, "-m", module, "--port", str(port), *map(str, arguments)]
-    # Into a file: a pipe that nobody reads would stop the server once it is full.
+    # A pipe that nobody reads would block the server when it is full.
     with (
         TemporaryFile("w+") if log_path is None else log_path.open("w+") as log,
         subprocess.Popen(
@@ -100,28 +104,26 @@ def open_page(
     height: int = 900,
     prepare: str = "",
     watch: Callable[[Page], None] = lambda page: None,
+    ready: str = READY,
 ) -> Page:
-    """A page of its own session, drawn and ready for input: a tab beside the other ones.
+    """Open a tab with a session of its own, and wait until it is drawn and ready for input.
 
-    `prepare` is a script to run first, `watch` is shown the page before it loads anything.
+    `prepare` is a script to run first; `watch` is called with the page before it loads anything.
     """
-    page = browser.contexts[0].new_page()  # which knows the scripts from other pages
+    page = browser.contexts[0].new_page()  # of one context: scripts are cached
     page.set_viewport_size({"width": width, "height": height})
     watch(page)
     page.add_init_script(prepare)
     page.goto(address)
-    # Explore's cloud or, where a capture is opened, the pins of Inspect.
-    page.locator(".stage[data-camera], [aria-label='Pinned pixels']").first.wait_for(
-        state="attached"
-    )
+    page.locator(ready).first.wait_for(state="attached")
     page.wait_for_function("Bokeh.documents[0].is_idle")
     return page
 
 
 def eventually(holds: Callable[[], object], limit_s: float = 60.0) -> None:
-    """Wait until something is so; for what the page's elements cannot tell.
+    """Wait until a condition holds that no `expect` can express.
 
-    Looking takes no more of the machine than waiting does: what is waited for needs it, too.
+    Pauses last as long as checks: the app needs the machine, too.
     """
     until = time.monotonic() + limit_s
     while True:
@@ -133,13 +135,88 @@ def eventually(holds: Callable[[], object], limit_s: float = 60.0) -> None:
 
 
 def fact(page: Page, name: str) -> Locator:
-    """The value of a figure or of a pixel's number on the page that is shown."""
+    """Return the value of a named fact on the visible page."""
     term = page.locator("dt").filter(has_text=re.compile(f"^{re.escape(name)}$"))
     return page.locator("dl div", has=term).locator("dd").filter(visible=True)
 
 
+def slider(page: Page, name: str) -> Locator:
+    return page.get_by_role("slider", name=name, exact=True)
+
+
+def field(page: Page, name: str) -> Locator:
+    return page.get_by_role("textbox", name=name, exact=True)
+
+
+def chosen(page: Page, name: str) -> Locator:
+    """Return the box of a list that shows the selected option."""
+    return page.get_by_role("combobox", name=re.compile(f"^{name}"))
+
+
+def warning(page: Page) -> Locator:
+    """Return the sentence about a failed request."""
+    return page.get_by_role("alert").filter(has_text="The page still shows")
+
+
+def image(page: Page) -> Locator:
+    return page.locator("[data-part=image]").filter(visible=True)
+
+
+def stage(page: Page) -> Locator:
+    """Return the place where the 3D cloud is drawn."""
+    return page.locator(".stage")
+
+
+def parts(page: Page) -> dict[str, Locator]:
+    """Return all pictures of Explore."""
+    plots = page.locator(".bk-Figure").filter(has_text="answer").filter(visible=True).all()
+    names = ("image", "cloud", "histogram", "residual", "enhanced")
+    return dict(zip(names, [image(page), stage(page), *plots], strict=True))
+
+
+def choose(page: Page, name: str, option: str) -> None:
+    chosen(page, name).click()
+    page.get_by_role("menuitem", name=option, exact=True).click()
+    expect(chosen(page, name)).to_have_text(option)
+
+
+def enter(page: Page, name: str, text: str) -> None:
+    field(page, name).fill(text)
+    field(page, name).press("Enter")
+
+
+def upload(page: Page, name: str, content: bytes) -> None:
+    file = {"name": name, "mimeType": "application/octet-stream", "buffer": content}
+    page.locator("input[type=file]").set_input_files(file)
+    # The button is replaced when it first shows a name: a file set on the old one would be lost.
+    expect(page.get_by_role("button", name=name, exact=True)).to_be_visible()
+
+
+def pixels(png: bytes) -> np.ndarray:
+    """Decode a picture to uint8 (row, col, rgb)."""
+    return np.asarray(Image.open(BytesIO(png)).convert("RGB"))
+
+
+def look(page: Page) -> dict[str, np.ndarray]:
+    """Return a screenshot of each picture of Explore, uint8 (row, col, rgb)."""
+    whole = pixels(page.screenshot())
+    shown = {}
+    for name, part in parts(page).items():
+        box = part.bounding_box()
+        assert box is not None
+        left, top = round(box["x"]), round(box["y"])
+        right, bottom = round(box["x"] + box["width"]), round(box["y"] + box["height"])
+        shown[name] = whole[top:bottom, left:right]
+    return shown
+
+
+def pixel_on_show(page: Page) -> tuple[int, int]:
+    row, col = re.findall(r"\d+", fact(page, "Pixel").inner_text())
+    return int(row), int(col)
+
+
 def server_process(address: str) -> psutil.Process:
-    """Process of a server that this one has started, by its address."""
+    """Return the process of a server that this process has started."""
     port = str(urlsplit(address).port)
     alive = (
         each
@@ -150,19 +227,19 @@ def server_process(address: str) -> psutil.Process:
 
 
 def _gone(server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 60.0) -> None:
-    """Wait until it has ended; where it does not, it is ended, and that is an error."""
+    """Wait for the end of a server; kill it and raise where it does not end."""
     try:
         server.wait(limit_s)
     except subprocess.TimeoutExpired as late:
         server.kill()
         log.seek(0)
-        raise RuntimeError(f"the app was asked to stop, and went on:\n{log.read()}") from late
+        raise RuntimeError(f"the app did not stop when terminated:\n{log.read()}") from late
 
 
 def when_up(
     address: str, server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 120.0
 ) -> str:
-    """The address, once it answers; a first start compiles the kernels."""
+    """Return the address when it responds; a first start compiles the kernels."""
     until = time.monotonic() + limit_s
     while time.monotonic() < until:
         if server.poll() is not None:
@@ -170,7 +247,7 @@ def when_up(
             raise RuntimeError(f"the app stopped at once:\n{log.read()}")
         try:
             urlopen(f"{address}favicon.ico", timeout=5).close()
-        except HTTPError as refusal:  # it answers, if only to ask for a token
+        except HTTPError as refusal:  # it requires a token
             refusal.close()
             return address
         except OSError:

@@ -1,4 +1,4 @@
-"""What the tests of the app share: the served app, a browser, watched pages, real captures."""
+"""Fixtures of the app's tests: the served app, a browser, watched pages, real captures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 from core.tests.captures import real_capture_path
 from tests.browser import chromium, open_page, serving
 
-# Pages are drawn in software, five clouds side by side among them, on as few cores as there are.
+# Pages are drawn in software, some with five clouds, on few cores.
 expect.set_options(timeout=60_000)
 
 
@@ -22,21 +22,21 @@ OWN_SCHEMES = ("data", "blob")
 
 @pytest.fixture(scope="session")
 def address() -> Iterator[str]:
-    """Where the app is served for all tests."""
+    """Address of an app that serves all tests."""
     with serving() as running_at:
         yield running_at
 
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    """One browser for all tests. Where there is none the tests fail: they are never skipped."""
+    """One browser for all tests; without one the tests fail, they are never skipped."""
     with chromium() as running:
         yield running
 
 
 @pytest.fixture(scope="session")
 def troubles() -> list[str]:
-    """What the pages complained of that the present test opened or uses."""
+    """Errors of the pages of the present test."""
     return []
 
 
@@ -44,7 +44,7 @@ def troubles() -> list[str]:
 def open_watched(
     browser: Browser, troubles: list[str], request: pytest.FixtureRequest
 ) -> Callable[..., Page]:
-    """Opens a page of the app and notes its errors and whatever it asks of other machines."""
+    """Open a page of the app; note its errors and its requests to other machines."""
 
     def note_console(message: ConsoleMessage) -> None:
         if message.type == "error":
@@ -58,7 +58,7 @@ def open_watched(
     def watch(page: Page) -> None:
         page.on("console", note_console)
         page.on("pageerror", lambda error: troubles.append(f"page error: {error}"))
-        page.on("request", lambda asked: note_url(asked.url))
+        page.on("request", lambda request: note_url(request.url))
         page.on("websocket", lambda socket: note_url(socket.url))
 
     def open_(address: str | None = None, **options: Any) -> Page:
@@ -70,7 +70,7 @@ def open_watched(
 
 @pytest.fixture
 def page(open_watched: Callable[..., Page], troubles: list[str]) -> Iterator[Callable[..., Page]]:
-    """Open pages with sessions of their own; a page that reports an error fails the test."""
+    """Open pages with sessions of their own; any error on a page fails the test."""
     opened: list[Page] = []
 
     def open_(*arguments: Any, **options: Any) -> Page:

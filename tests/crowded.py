@@ -1,4 +1,4 @@
-"""The app with room for a few sessions only, and little patience: ``python -m tests.crowded``."""
+"""The app with small limits on sessions: ``python -m tests.crowded``."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""From a user's hand to changed pixels, through a real browser: ``python -m tests.latency``.
+"""Time from a key press to changed pixels in a real browser: ``python -m tests.latency``.
 
 Each move presses an arrow key on a slider of the served app, at 64 × 64 pixels and 100 bins. The
-page itself keeps the time: of the key, of messages to and from the server, and of every stroke on a
-canvas. "Plots" are the pixel's three plots, "everything" includes the image and the 3D cloud, which
+page records the times of the key, of messages to and from the server, and of every stroke on a
+canvas. "Plots" are the pixel's three plots; "everything" includes the image and the 3D cloud, which
 are drawn after them on purpose.
 
-On the 21 km capture, 256 × 256 pixels and 200 bins, arrow keys move the pixel of the Inspect page;
-and its page is opened by browsers that have never been there, and by each of them again, from the
-address to the last stroke. The server has shown the page once before that.
+On the 21 km capture, 256 × 256 pixels and 200 bins, arrow keys move the pixel of the Inspect page.
+Opening times run from the address to the last stroke, for new browsers and for a second visit; the
+server has shown the page before.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ const part = (canvas) => {
     if (node.dataset?.part) return node.dataset.part;
     if (node === document) return "plots";
   }
-  return "none"; // drawn beside the page, as a step towards a picture on it
+  return "none"; // an off-screen canvas
 };
 const observe = (prototype, names) => {
   for (const name of names) {
@@ -85,17 +85,17 @@ class Move:
 
 
 def moves(page: Page, label: str, count: int) -> list[Move]:
-    """Press the arrow keys on a slider, to and fro, and wait each time until all is drawn."""
+    """Press the arrow keys on a slider, back and forth, and wait each time until all is drawn."""
     return _moves(page, page.get_by_role("slider", name=label, exact=True), count)
 
 
 def pixel_moves(page: Page, count: int) -> list[Move]:
-    """The same on the picture that one navigates by."""
+    """Press the arrow keys on the range image."""
     return _moves(page, page.locator("[data-part=image]"), count)
 
 
 def openings_ms(browser: Browser, address: str) -> tuple[float, float]:
-    """Milliseconds from the address of a page to its last stroke, the first time and the second."""
+    """Milliseconds from the address of a page to its last stroke, at the first and second visit."""
     context = browser.new_context(viewport={"width": 1440, "height": 900})
     page = context.new_page()
     page.add_init_script(STOPWATCH)
@@ -133,13 +133,13 @@ def _moves(page: Page, control: Locator, count: int) -> list[Move]:
     return taken
 
 
-def as_markdown(taken: dict[str, list[Move]]) -> str:
+def as_markdown(measured: dict[str, list[Move]]) -> str:
     """Median and 95th percentile of each part, a row a slider."""
     lines = [
         "| move | answer in the browser, ms (95 %) | plots painted | image and cloud painted |",
         "|---|---|---|---|",
     ]
-    for label, each in taken.items():
+    for label, each in measured.items():
         cells = []
         for part in fields(Move):
             times = [getattr(move, part.name) for move in each]
@@ -173,10 +173,10 @@ def main(arguments: list[str] | None = None) -> int:
         opened = (
             f"Open the 21 km capture, ranged and drawn: {np.median(agains):.0f} ms "
             f"(longest of {OPENINGS}: {max(agains):.0f}); "
-            f"by a browser that was never there: {np.median(firsts):.0f} ms ({max(firsts):.0f})"
+            f"by a new browser: {np.median(firsts):.0f} ms ({max(firsts):.0f})"
         )
     print(as_markdown(taken))
-    print(f"\n{opened or f'{capture} is absent: nothing was measured on it.'}")
+    print(f"\n{opened or f'{capture} is missing: it was not measured.'}")
     return 0
 
 

@@ -1,11 +1,11 @@
-"""Many sessions at once, and very many interactions in one: ``python -m tests.load``.
+"""Many sessions at once, and many interactions in one: ``python -m tests.load``.
 
-Sessions are clients of Bokeh's protocol (`tests.wire`), on the same cores as the server: as many
-real browsers would measure browsers. Each drags one control after the other, 20 values a second as
-a hand does, whether or not the last one is answered. As in a browser a value that is overtaken may
-not even be sent (`app/pages/bokeh.js`), and has no answer of its own; each counts as answered when
-the first data arrive that show it or a later one of the same drag. The data themselves tell which:
-T_n is where the weight in its plot begins, SBR follows from the first of the expected counts.
+Sessions are clients of Bokeh's protocol (`tests.wire`), on the same cores as the server; as many
+real browsers would measure browsers. Each drags one control after the other, 20 values a second,
+whether or not the last one was answered. As in a browser, a value that is replaced before it is
+sent (``latest_value.js``) has no response of its own: each value counts as answered when the first
+data arrive that show it or a later one of the same drag. The value follows from the data: T_n is
+where the weight begins, SBR follows from the first of the expected counts.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from tests.wire import Wire
 MOVES_A_SECOND = 20
 MOVES_A_DRAG = 40
 PAUSE_S = 0.3
-"""What a hand needs from one control to the next."""
+"""Pause of a user between two controls."""
 
 LATEST_S = 30.0
-"""An answer that takes longer is missing."""
+"""A response that takes longer is missing."""
 
 TITLES = {"Estimate": "Estimated", "Truth": "True", "Error": "Error:", "Counts": "Detections"}
-"""How the title of each kind of image begins."""
+"""First word of the title of each kind of image."""
 
 SCENES = ("Car at 50 m", "Staircase through the gate", "Car at 50 m", "Random depths")
-"""Of one session after the other: half of them stay on the scene that the app opens on."""
+"""Scenes of the sessions; half of them stay on the first scene."""
 
 FORGOTTEN_S = 40.0
-"""By then the server has let go of sessions that are closed."""
+"""Time after which the server has dropped closed sessions."""
 
 WARM = 200
-"""Interactions before the growth by the others is counted."""
+"""Interactions before growth is measured."""
 
 MEGA = 1e6
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What is asked of the server."""
+    """Requirements on the server."""
 
     latency_s: float = 1.0
     session_mb: float = 60.0
@@ -64,7 +64,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Control:
-    """Something to drag, and the value of it that the data on the page show."""
+    """A control to drag, and the value of it that the data on the page show."""
 
     model: str
     attribute: str
@@ -73,7 +73,7 @@ class Control:
 
 
 class Hand:
-    """What moves the controls of one session, and waits for the answers."""
+    """Moves the controls of one session, and waits for the responses."""
 
     def __init__(self, wire: Wire, random: Random) -> None:
         self._wire = wire
@@ -107,7 +107,7 @@ class Hand:
         self.troubles: list[str] = []
 
     async def go_to(self, scene: str) -> None:
-        """Look at another scene."""
+        """Choose another scene."""
         if scene != SCENES[0]:
             chosen = self._wire.find("Select", label="Scene or capture")
             cloud = self._wire.find("PointCloud")
@@ -116,7 +116,7 @@ class Hand:
             await self._until(lambda: self._wire.values[cloud, "scene_id"] != before)
 
     async def drag(self) -> None:
-        """Drag some control through some of its values, at the pace of a hand."""
+        """Drag a random control through some of its values."""
         control = self._random.choice((*self._controls, self._image))
         values = self._some(control)
         sent_s: list[float] = []
@@ -130,7 +130,7 @@ class Hand:
         await asyncio.sleep(PAUSE_S)
 
     async def step(self) -> None:
-        """Set some control to another value, and wait for the answer."""
+        """Set a random control to another value, and wait for the response."""
         control = self._random.choice(self._controls)
         value = self._random.choice([v for v in control.values if v != control.shown()])
         sent_s = [time.perf_counter()]
@@ -138,7 +138,7 @@ class Hand:
         await self._follow(control, [value], sent_s)
 
     def _some(self, control: Control) -> list[Any]:
-        """Values one after the other, to and fro, of which none is the one on show."""
+        """Return consecutive values without the one on show."""
         values = list(control.values)
         if control is self._image:
             return [kind for kind in values if kind != control.shown()]
@@ -150,7 +150,7 @@ class Hand:
     async def _follow(
         self, control: Control, values: Sequence[Any], sent_s: Sequence[float]
     ) -> None:
-        """Note the time to the answer of each value, until the last one has come."""
+        """Record the response time of each value until the last one has come."""
         answered = 0
 
         def is_over() -> bool:
@@ -214,22 +214,22 @@ def _nearest(value: float, among: Sequence[float]) -> float:
     return min(among, key=lambda each: abs(math.log(each / value)))
 
 
-# What is measured
+# Measurements
 
 
 @dataclass(frozen=True)
 class Load:
-    """What became of some sessions at once."""
+    """Result of several sessions at once."""
 
     sessions: int
     latencies_s: np.ndarray[Any, Any]
     troubles: list[str]
     before_mb: float
-    """Resident memory of the server, one session having come and gone."""
+    """Resident memory of the server after one session."""
     with_mb: float
-    """The same at its highest, with all sessions."""
+    """Highest resident memory with all sessions."""
     after_mb: float
-    """The same once they have been closed and forgotten."""
+    """Resident memory after all sessions have ended."""
 
     @property
     def session_mb(self) -> float:
@@ -239,7 +239,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Growth:
-    """What became of one session of many interactions."""
+    """Result of one session with many interactions."""
 
     interactions: int
     troubles: list[str]
@@ -254,7 +254,7 @@ async def load(
     seconds: float,
     forgotten_s: float = FORGOTTEN_S,
 ) -> Load:
-    """Open sessions, have each drag its controls for so long, and close them."""
+    """Open sessions, drag the controls of each for some seconds, and close them."""
     warm, _ = await opened(address, seed=0)
     warm.close()
     await asyncio.sleep(forgotten_s)
@@ -294,7 +294,7 @@ async def load(
 async def growth(
     address: str, resident_mb: Callable[[], float], interactions: int, warm: int = WARM
 ) -> Growth:
-    """Set controls of one session one after the other, each after the last one's answer."""
+    """Set controls of one session one after the other."""
     wire, hand = await opened(address, seed=0)
     for _ in range(warm):
         await hand.step()
@@ -307,14 +307,14 @@ async def growth(
 
 
 async def opened(address: str, seed: int) -> tuple[Wire, Hand]:
-    """A session, and a hand on its controls."""
+    """Open a session; return it with a hand on its controls."""
     wire = Wire()
     await wire.open(address)
     return wire, Hand(wire, Random(seed))
 
 
 def verdicts(used: Load, grown: Growth, bounds: Bounds) -> list[tuple[str, str, str, bool]]:
-    """What was asked, the bound, what was measured, and whether it was reached."""
+    """Return quantity, requirement, measurement, and whether it is met."""
     troubles = [*used.troubles, *grown.troubles]
     median, p95, p99 = np.percentile(used.latencies_s, [50, 95, 99])
     resident = ", ".join(f"{mb:.0f}" for mb in (used.before_mb, used.with_mb, used.after_mb))
@@ -323,14 +323,14 @@ def verdicts(used: Load, grown: Growth, bounds: Bounds) -> list[tuple[str, str, 
         ("sessions at once", "", f"{used.sessions}", True),
         ("interactions", "", f"{used.latencies_s.size:,}", True),
         ("errors", "none", f"{len(troubles)}", not troubles),
-        ("answer, median", "", f"{1e3 * median:.0f} ms", True),
+        ("response, median", "", f"{1e3 * median:.0f} ms", True),
         (
-            "answer, 95 %",
+            "response, 95 %",
             f"< {1e3 * bounds.latency_s:.0f} ms",
             f"{1e3 * p95:.0f} ms",
             bool(p95 < bounds.latency_s),
         ),
-        ("answer, 99 %", "", f"{1e3 * p99:.0f} ms", True),
+        ("response, 99 %", "", f"{1e3 * p99:.0f} ms", True),
         ("resident memory before, with, after", "", f"{resident} MB", True),
         (
             "memory of a session",
@@ -348,8 +348,8 @@ def verdicts(used: Load, grown: Growth, bounds: Bounds) -> list[tuple[str, str, 
 
 
 def as_markdown(found: Sequence[tuple[str, str, str, bool]]) -> str:
-    """A table, a row a verdict."""
-    lines = ["| what | asked | measured |  |", "|---|---|---|---|"]
+    """Return a table with a row for each verdict."""
+    lines = ["| quantity | required | measured |  |", "|---|---|---|---|"]
     for what, asked, measured, is_reached in found:
         verdict = ("reached" if is_reached else "missed") if asked else ""
         lines.append(f"| {what} | {asked} | {measured} | {verdict} |")
@@ -363,7 +363,7 @@ def server_mb(address: str) -> Callable[[], float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure and print; returns 1 where something that was asked is missed."""
+    """Measure and print; return 1 if a requirement is missed."""
     parser = argparse.ArgumentParser(prog="python -m tests.load", description=__doc__)
     parser.add_argument("--sessions", type=int, default=20, help="at once; default: 20")
     parser.add_argument("--seconds", type=float, default=60.0, help="of dragging; default: 60")
@@ -374,7 +374,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     with serving() as address:
         used = asyncio.run(load(address, server_mb(address), chosen.sessions, chosen.seconds))
-    with serving() as address:  # another: what many sessions left would hide what one adds
+    with serving() as address:  # another process, without the memory of many sessions
         grown = asyncio.run(growth(address, server_mb(address), chosen.interactions))
     found = verdicts(used, grown, Bounds())
     print(as_markdown(found))

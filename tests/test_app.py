@@ -1,4 +1,4 @@
-"""The app without a browser: what was chosen, what was computed, and what the page says of it."""
+"""The app without a browser: state, estimates, colours, texts, plots, controls and the page."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from bokeh.document import Document
 
 import core
 from app.model import colors as looks
-from app.model import text as words
-from app.model.address import Wanted, query_of
+from app.model import text as model_text
+from app.model.address import Link, query_of
 from app.model.script import script_of
-from app.model.state import Illumination, Less, Viewing
+from app.model.state import Illumination, ReductionSettings, Viewing
 from app.model.store import (
     Request,
     built_in_sources,
@@ -29,7 +29,7 @@ from app.pages.layout import CUSTOM, Layout
 from app.pages.shared.estimate import lane_of
 from app.plots import elements as plots
 from app.tasks.scheduler import GENERAL, PAGE, SHORT
-from app.theme import DARK, LIGHT, OUTSIDE_COLOR
+from app.theme import LIGHT, OUTSIDE_COLOR
 from app.widgets.controls import Knob, SettingsPanel
 from app.widgets.figures import Plot
 from app.widgets.image_view import ImageView
@@ -49,7 +49,7 @@ def ask(source="car", **chosen):
         "light": Illumination(),
         "reading": ReadOptions(),
         "tracking": TrackingParameters(),
-        "less": Less(),
+        "less": ReductionSettings(),
     } | chosen
     known = built_in_sources()
     return Request(known[source] if isinstance(source, str) else source, **choices)
@@ -57,19 +57,19 @@ def ask(source="car", **chosen):
 
 @pytest.fixture(scope="module")
 def car():
-    """The car, with a truth and with pixels that see no target."""
+    """The estimate of the car, with truth and with pixels without a target."""
     return compute(ask("car"), None)
 
 
 @pytest.fixture(scope="module")
 def sample():
-    """A file, without truth."""
+    """The estimate of a file, without truth."""
     return compute(ask("sample"), None)
 
 
 @pytest.fixture
 def small_capture(rng):
-    """Other sizes than the built-in scenes, and nothing known but the counts."""
+    """Other sizes than the built-in scenes, and only the counts are known."""
     cube = rng.poisson(5, (4, 6, 37)).astype(np.uint16)
     cube[:, :, 20] += 60
     return Capture(cube, Acquisition(37, 2e-9, 1e-6, None, 1e-3), source="made here")
@@ -87,7 +87,7 @@ def rng():
     return np.random.default_rng(7)
 
 
-# -- what was chosen -------------------------------------------------------------------------------
+# -- state ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -108,29 +108,7 @@ def test_impossible_settings_are_refused_by_name(settings, changes):
         replace(settings, **changes)
 
 
-def test_light_is_the_flux_and_the_pulses_of_an_acquisition():
-    light = Illumination(sbr=0.5, ppp=0.2, n_pulses=77)
-    assert (light.flux.sbr, light.flux.signal) == (0.5, 0.2)
-    gate = Acquisition(n_bins=40, gate_delay_s=1e-6)
-    assert light.acquisition(gate) == replace(gate, n_pulses=77)
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "remedy"),
-    [
-        ("n_bins", "2.5", "a whole number"),
-        ("n_pulses", "many", "a whole number"),
-        ("bin_width_s", "1 xs", "a time such as 64ps"),
-        ("shape", "64", "rows and columns such as 64 x 64"),
-        ("detection", "some", "'first' or 'all'"),
-    ],
-)
-def test_text_that_is_no_number_is_refused_with_a_remedy(name, text, remedy):
-    with pytest.raises(ValueError, match=rf"{name}.*{text}.*{remedy}"):
-        ReadOptions.from_text({name: text})
-
-
-# -- what was computed -----------------------------------------------------------------------------
+# -- estimates ------------------------------------------------------------------------------------
 
 
 def test_only_what_changed_is_computed_again(car):
@@ -145,10 +123,10 @@ def test_only_what_changed_is_computed_again(car):
         assert compute(replace(car.request, **change), car).capture is not car.capture
 
 
-def test_the_page_computes_what_takes_less_than_to_draw_it(car):
+def test_the_page_computes_what_is_faster_than_drawing(car):
     other = {"tracking": PRESETS["as printed"]}
     assert lane_of(replace(car.request, **other), car) is PAGE
-    for again in ({"light": Illumination(seed=1)}, {"less": Less(skip=2)}):
+    for again in ({"light": Illumination(seed=1)}, {"less": ReductionSettings(skip=2)}):
         assert lane_of(replace(car.request, **again, **other), car) is SHORT
     for new in ({"source": built_in_sources()["staircase"]}, {"absent": frozenset(["jitter"])}):
         assert lane_of(replace(car.request, **new, **other), car) is GENERAL
@@ -157,11 +135,11 @@ def test_the_page_computes_what_takes_less_than_to_draw_it(car):
         assert lane_of(replace(large.request, **change), large) is GENERAL
     file = compute(ask("sample"), None)
     assert lane_of(replace(file.request, **other), file) is PAGE
-    assert lane_of(replace(file.request, less=Less(skip=2)), file) is GENERAL
+    assert lane_of(replace(file.request, less=ReductionSettings(skip=2)), file) is GENERAL
 
 
-def test_less_of_a_capture_is_taken_from_the_whole_of_it(car):
-    less = Less(merge=2, gate_from=0.2, gate_to=0.9, pool=2, pulses=0.5)
+def test_a_reduction_is_applied_to_the_whole_capture(car):
+    less = ReductionSettings(merge=2, gate_from=0.2, gate_to=0.9, pool=2, pulses=0.5)
     reduced = compute(replace(car.request, less=less), car)
     assert reduced.whole is car.whole is car.capture
     assert reduced.capture.cube.shape == (32, 32, 35)
@@ -176,16 +154,16 @@ def test_less_of_a_capture_is_taken_from_the_whole_of_it(car):
     "reduction",
     [Reduction(), Reduction(4, (7, 33), skip=2), Reduction(gate=(0, 99), pool=3, pulses=0.1)],
 )
-def test_a_reduction_is_what_its_settings_say(reduction):
+def test_settings_and_reduction_describe_each_other(reduction):
     for n_bins in (100, 334, 876):
-        assert Less.of(reduction, n_bins).reduction(n_bins) == reduction
+        assert ReductionSettings.of(reduction, n_bins).reduction(n_bins) == reduction
 
 
 def test_a_gate_is_never_empty():
-    assert Less(gate_from=1.0, gate_to=0.0).reduction(10) == Reduction(gate=(9, 10))
+    assert ReductionSettings(gate_from=1.0, gate_to=0.0).reduction(10) == Reduction(gate=(9, 10))
 
 
-def test_an_answer_is_what_core_computes(car):
+def test_an_estimate_is_what_core_computes(car):
     scene, light = core.scenes["car"](), Illumination()
     capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
     run = core.run(capture, "tracking", TrackingParameters())
@@ -212,22 +190,14 @@ def test_a_pixel_shows_the_stages_of_its_own_estimate(car, preset):
     assert pixel.counts == histogram.sum()
 
 
-def test_the_expected_counts_are_those_of_many_throws(car):
+def test_expected_counts_are_the_mean_of_many_pulses(car):
     many = compute(ask("car", light=Illumination(n_pulses=100_000)), None)
     pixel = inspect(many, 32, 30)
     np.testing.assert_allclose(pixel.signals.raw, pixel.expected, atol=5 * np.sqrt(4000))
     assert pixel.expected.sum() == pytest.approx(pixel.counts, rel=0.01)
 
 
-def test_without_truth_nothing_is_expected_of_a_pixel(sample):
-    pixel = inspect(sample, 32, 32)
-    assert pixel.expected is None
-    assert np.isnan(pixel.truth_m)
-    assert np.isnan(pixel.truth_bin)
-    assert is_wrong(sample) is None
-
-
-def test_wrong_is_an_answer_far_off_or_without_a_target(car):
+def test_an_estimate_is_wrong_far_off_or_without_a_target(car):
     wrong = is_wrong(car)
     truth_m, image = car.capture.truth_range_m, car.run.image
     np.testing.assert_array_equal(wrong[np.isnan(truth_m)], image.valid[np.isnan(truth_m)])
@@ -236,27 +206,12 @@ def test_wrong_is_an_answer_far_off_or_without_a_target(car):
     assert is_wrong(car, 0.1).sum() > wrong.sum()
 
 
-def test_a_file_is_a_source(small_file, small_capture):
-    source = file_source(small_file)
-    assert source.title == "small.npz"
-    assert not source.is_scene
-    read = source.load(Illumination(), ReadOptions(), ())
-    np.testing.assert_array_equal(read.cube, small_capture.cube)
-    again = source.load(Illumination(), ReadOptions(bin_width_s=3e-9), ())
-    assert again.acquisition.bin_width_s == 3e-9
-
-
 @pytest.mark.parametrize("key", built_in_sources())
-def test_every_built_in_source_gives_an_answer(key):
+def test_every_built_in_source_can_be_estimated(key):
     answer = compute(ask(key), None)
     assert answer.run.image.valid.any()
     assert bool(answer.run.figures) == answer.request.source.is_scene
     assert answer.capture.source
-
-
-def test_sources_have_names_of_their_own():
-    titles = [source.title for source in built_in_sources().values()]
-    assert len(set(titles)) == len(titles)
 
 
 # -- colours ---------------------------------------------------------------------------------------
@@ -274,7 +229,7 @@ def test_truth_and_estimate_share_one_scale(car):
 
 
 @pytest.mark.parametrize("kind", ["Estimate", "Error"])
-def test_answers_below_the_confidence_are_left_blank(car, kind):
+def test_estimates_below_the_confidence_are_blank(car, kind):
     confidence = car.run.image.confidence
     for least in (0.0, 0.5, 0.99):
         image, _ = looks.image_of(car, kind, least)
@@ -298,7 +253,7 @@ def test_counts_are_those_of_the_capture(car):
     assert (look.low, look.high, look.unit) == (counts.min(), counts.max(), "counts")
 
 
-def test_without_truth_the_scale_fits_confident_answers(sample):
+def test_without_truth_the_scale_fits_confident_estimates(sample):
     image, look = looks.image_of(sample, "Truth", 0.9)
     assert look.title == "Estimated range"
     inside = (image > look.low) & (image < look.high)
@@ -306,7 +261,7 @@ def test_without_truth_the_scale_fits_confident_answers(sample):
 
 
 def test_a_colour_for_every_value():
-    look = looks.Look("", "", 0.0, 1.0, ["#000000", "#808080", "#ffffff"], OUTSIDE_COLOR)
+    look = looks.ColorScale("", "", 0.0, 1.0, ["#000000", "#808080", "#ffffff"], OUTSIDE_COLOR)
     grey = [int(OUTSIDE_COLOR[at : at + 2], 16) for at in (1, 3, 5)]
     rgb = look.rgb(np.array([-0.01, 0.0, 0.5, 1.0, 1.01]))
     np.testing.assert_array_equal(rgb, [grey, [0] * 3, [128] * 3, [255] * 3, grey])
@@ -315,7 +270,7 @@ def test_a_colour_for_every_value():
     np.testing.assert_array_equal(without, [[0] * 3, [255] * 3])
 
 
-# -- words -----------------------------------------------------------------------------------------
+# -- texts ----------------------------------------------------------------------------------------
 
 
 def names(facts):
@@ -336,93 +291,42 @@ def test_figures_and_numbers_are_cores(car):
     assert numbers["r small"] == f"{settings.l * sigma:.4g}"
     assert numbers["r large"] == f"{settings.n * settings.l * sigma:.4g}"
     assert numbers["Pulses that fired"] == f"{car.capture.counts[32, 30] / 10:.1f} %"
+    empty = np.argwhere(np.isnan(car.capture.truth_range_m))[0]
+    numbers = {
+        name: value for name, value, _ in explore_text.pixel_numbers(car, inspect(car, *empty))
+    }
+    assert (numbers["Truth"], numbers["Error"]) == ("no target", "–")
 
 
 def test_what_needs_a_truth_is_left_out_without_one(car, sample):
-    def said(answer):
+    def names_of(answer):
         pixel = inspect(answer, 32, 32)
         numbers = explore_text.pixel_numbers(answer, pixel)
         return names(explore_text.figure_strip(answer)) | names(numbers)
 
-    assert said(car) >= NEED_TRUTH
-    assert said(car) - said(sample) == NEED_TRUTH | {"Simulated in"}
+    assert names_of(car) >= NEED_TRUTH
+    assert names_of(car) - names_of(sample) == NEED_TRUTH | {"Simulated in"}
     assert "wrong" in explore_text.cloud_caption(car, 10, 3)
     assert "wrong" not in explore_text.cloud_caption(sample, 10, None)
 
 
-def test_a_pixel_without_a_target_says_so(car):
-    row, col = np.argwhere(np.isnan(car.capture.truth_range_m))[0]
-    pixel = explore_text.pixel_numbers(car, inspect(car, row, col))
-    numbers = {name: value for name, value, _ in pixel}
-    assert numbers["Truth"] == "no target"
-    assert numbers["Error"] == "–"
-
-
-def test_pulses_that_are_not_known_are_not_counted(small_file):
-    answer = compute(ask(file_source(small_file)), None)
-    said = names(explore_text.pixel_numbers(answer, inspect(answer, 0, 0)))
-    assert "Pulses that fired" not in said
-
-
-def test_the_page_is_told_plain_text_only(car, sample):
+def test_texts_have_no_markup(car, sample):
     for answer in (car, sample):
         pixel = inspect(answer, 32, 32)
         facts = explore_text.figure_strip(answer) + explore_text.pixel_numbers(answer, pixel)
         texts = [text for fact in facts for text in fact]
-        texts += [words.provenance(answer), explore_text.cloud_caption(answer, 1, 1)]
+        texts += [model_text.provenance(answer), explore_text.cloud_caption(answer, 1, 1)]
         assert all(texts)
         assert not [text for text in texts if "<" in text or "&" in text]
 
 
-def test_provenance_tells_size_and_gate(car):
-    sentence = words.provenance(car)
+def test_provenance_states_size_and_gate(car):
+    sentence = model_text.provenance(car)
     for part in ("64 × 64 pixels", "100 bins of 1 ns", "280 to 380 ns", "41.9709 to 56.9606 m"):
         assert part in sentence
 
 
-def test_a_failure_is_a_sentence_with_a_remedy():
-    assert words.failure(ValueError("l is bad: give more.")).startswith("l is bad: give more. The")
-    unforeseen = words.failure(KeyError("secret"))
-    assert "KeyError" in unforeseen
-    assert "secret" not in unforeseen
-    assert "change them back" in unforeseen
-
-
 # -- plots -----------------------------------------------------------------------------------------
-
-
-def test_the_histogram_plot_carries_what_it_was_given(rng):
-    counts, expected, small, large = rng.random((4, 12))
-    overlay = plots.histogram(counts, expected, small, large, LIGHT)
-    layers = {element.label: element for element in overlay}
-    np.testing.assert_array_equal(layers["raw histogram"].dimension_values("counts"), counts)
-    np.testing.assert_array_equal(layers["raw histogram"].edges, np.arange(13))
-    curves = {"expected": expected, "small scale": small, "large scale": large}
-    for label, values in curves.items():
-        np.testing.assert_array_equal(layers[label].dimension_values("counts"), values)
-        np.testing.assert_array_equal(layers[label].dimension_values("bin"), np.arange(12) + 0.5)
-    assert list(layers) == ["raw histogram", *curves, "truth", "answer"]
-
-
-def test_residual_and_enhanced_plots_carry_what_they_were_given(rng):
-    one, other = rng.random((2, 12))
-    residual = {each.label: each for each in plots.residual(one, other, LIGHT)}
-    np.testing.assert_array_equal(residual["residual"].dimension_values("residual"), one)
-    difference = residual["first difference of the raw histogram"]
-    np.testing.assert_array_equal(difference.dimension_values("residual"), other)
-    enhanced = {each.label: each for each in plots.enhanced(one, other, LIGHT)}
-    np.testing.assert_array_equal(enhanced["enhanced"].dimension_values("enhanced"), one)
-    weight = enhanced["weight (scaled to fit)"]
-    np.testing.assert_array_equal(weight.dimension_values("enhanced"), other)
-
-
-def test_the_image_plot_has_row_0_at_the_top(rng):
-    image = rng.random((3, 5))
-    picture, *frames = plots.range_image(image, 0.0, 1.0)
-    values = picture.dimension_values("value", flat=False)
-    np.testing.assert_array_equal(picture.interface.coords(picture, "row"), np.arange(3))
-    np.testing.assert_array_equal(values, image)
-    assert len(frames) == 2
 
 
 def test_every_plot_has_a_title_a_legend_and_labels_with_units():
@@ -442,7 +346,7 @@ def test_every_plot_has_a_title_a_legend_and_labels_with_units():
     assert image.figure.y_range.flipped
 
 
-# -- views -----------------------------------------------------------------------------------------
+# -- widgets --------------------------------------------------------------------------------------
 
 
 def test_only_changed_columns_travel_and_as_float32():
@@ -486,7 +390,7 @@ def test_a_pixels_stages_stand_in_its_plots(car):
         assert plot is not views.histogram or plot.figure.y_range.end >= max(shown)
 
 
-def test_another_gate_lays_the_axes_anew(car, small_file):
+def test_axes_follow_another_gate(car, small_file):
     views = SignalPlots()
     views.update(inspect(car, 32, 30), car.capture.acquisition, with_difference=False)
     answer = compute(ask(file_source(small_file)), None)
@@ -506,7 +410,7 @@ def legend(plot):
     return {item.label.value: item.visible for item in plot.figure.legend.items}
 
 
-def test_lines_that_have_no_place_are_not_drawn(car, sample):
+def test_lines_without_a_position_are_not_drawn(car, sample):
     views = SignalPlots()
     for answer, has_truth in ((car, True), (sample, False), (car, True)):
         pixel = inspect(answer, 32, 30)
@@ -538,19 +442,12 @@ def test_an_image_is_shown_with_its_scale_and_its_frame(car):
         assert middle == (5, 3)
 
 
-def test_plots_follow_the_page_into_the_dark():
-    views = SignalPlots()
-    for palette in (DARK, LIGHT):
-        views.paint(palette)
-        for plot in (views.histogram, views.residual, views.enhanced):
-            assert plot.figure.title.text_color == palette.text
-            assert plot.layers["answer"]["glyph"].line_color == palette.answer
-
-
 # -- controls --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("settings", [TrackingParameters(), Illumination(), Less(), Viewing()])
+@pytest.mark.parametrize(
+    "settings", [TrackingParameters(), Illumination(), ReductionSettings(), Viewing()]
+)
 def test_every_field_has_a_control_made_from_its_metadata(settings):
     controls = SettingsPanel(settings, lambda new: None).controls
     assert list(controls) == [each.name for each in fields(settings)]
@@ -568,25 +465,18 @@ def test_every_field_has_a_control_made_from_its_metadata(settings):
             assert control.description == each.metadata["help"]
 
 
-def test_a_change_is_reported_as_new_settings():
+def test_a_change_by_the_user_is_reported_as_new_settings_and_one_by_the_page_is_not():
     reported = []
     panel = SettingsPanel(Illumination(), reported.append)
     panel.controls["n_pulses"].value = 500.0
-    assert reported == [replace(Illumination(), n_pulses=500)]
+    assert reported == [Illumination(n_pulses=500)]
     assert isinstance(reported[0].n_pulses, int)
-    panel.controls["sbr"].value = 1.0
-    assert reported[1:] == [replace(Illumination(), n_pulses=500, sbr=1.0)]
-
-
-def test_showing_settings_reports_nothing():
-    reported = []
-    panel = SettingsPanel(TrackingParameters(), reported.append)
-    panel.show(PRESETS["as printed"])
-    shown = {name: control.value for name, control in panel.controls.items()}
-    assert shown == asdict(PRESETS["as printed"])
-    assert reported == []
-    panel.controls["l"].value = 0.5
-    assert reported == [replace(PRESETS["as printed"], l=0.5)]
+    panel.show(Illumination(sbr=2.0))
+    assert {name: control.value for name, control in panel.controls.items()} == asdict(
+        Illumination(sbr=2.0)
+    )
+    panel.controls["seed"].value = 7
+    assert reported[1:] == [Illumination(sbr=2.0, seed=7)]
 
 
 # -- the whole page --------------------------------------------------------------------------------
@@ -602,29 +492,25 @@ def explore(layout):
     return layout.contents["Explore"]
 
 
-def complaint(layout):
-    """The sentence that the page shows on failures, empty for none."""
+def alert_of(layout):
+    """Return the sentence that the page shows on failures."""
     return layout.heard[-1]
 
 
-def next_answer(layout):
-    return layout.next_answer()
-
-
 def open_file(layout, path):
-    """Go to a file; what an upload does once its content is stored."""
+    """Open a file, as an upload does once it is stored."""
     layout.session.sources[path.name] = file_source(path)
     layout.session.state.param.update(source=path.name, reading=ReadOptions())
 
 
-def told(facts):
+def values_of(facts):
     return {name: value for name, value, _ in facts.facts}
 
 
-def test_a_page_is_complete_and_answered(layout, explore):
+def test_a_page_is_complete(layout, explore):
     session = layout.session
-    assert told(explore.figures)["RMSE"] == f"{session.answer.run.figures['rmse_m']:.4g} m"
-    assert told(explore.numbers)["Pixel"] == "row {}, col {}".format(*session.state.pixel)
+    assert values_of(explore.figures)["RMSE"] == f"{session.answer.run.figures['rmse_m']:.4g} m"
+    assert values_of(explore.numbers)["Pixel"] == "row {}, col {}".format(*session.state.pixel)
     assert np.isfinite(session.answer.capture.truth_range_m[session.state.pixel])
     shown = looks.shown(session.answer, 0.9).sum()
     assert len(explore.cloud.positions) == 12 * shown
@@ -640,8 +526,8 @@ def test_every_source_can_be_drawn_in_every_way(layout, explore, key):
     session = layout.session
     if key != session.state.source:
         control(layout, "Scene or capture").value = key
-        assert next_answer(layout).request.source is session.sources[key]
-    assert complaint(layout) == ""
+        assert layout.next_answer().request.source is session.sources[key]
+    assert alert_of(layout) == ""
     for kind in session.state.param.image.objects:
         session.state.image = kind
         layout.settle()
@@ -652,80 +538,70 @@ def test_every_source_can_be_drawn_in_every_way(layout, explore, key):
         assert len(explore.cloud.colors) == len(explore.cloud.positions) / 4
 
 
-def test_a_tracking_parameter_changes_the_answer(layout, explore):
-    before, figures = layout.session.answer, told(explore.figures)
-    control(layout, "l").value = 0.05
-    answer = next_answer(layout)
-    assert answer.request.tracking == TrackingParameters(l=0.05)
-    assert answer.capture is before.capture
-    assert told(explore.figures)["RMSE"] == f"{answer.run.figures['rmse_m']:.4g} m"
-    assert told(explore.figures)["RMSE"] != figures["RMSE"]
-
-
 def test_presets_set_all_controls_and_a_change_makes_them_custom(layout):
     preset = control(layout, "Preset")
     preset.value = "as printed"
-    assert next_answer(layout).request.tracking == PRESETS["as printed"]
+    assert layout.next_answer().request.tracking == PRESETS["as printed"]
     assert (control(layout, "m").value, control(layout, "Weight").value) == (1.5, "cubic")
     control(layout, "m").value = 2.0
     assert preset.value == CUSTOM
-    assert next_answer(layout).request.tracking == replace(PRESETS["as printed"], m=2.0)
+    assert layout.next_answer().request.tracking == replace(PRESETS["as printed"], m=2.0)
     control(layout, "m").value = 1.5
     assert preset.value == "as printed"
 
 
-def test_a_file_that_cannot_be_read_leaves_the_picture_and_says_why(layout, tmp_path):
+def test_a_file_that_cannot_be_read_is_reported_and_leaves_the_page(layout, tmp_path):
     path = tmp_path / "noise.npz"
     path.write_bytes(b"nothing of the kind")
     before = layout.session.answer
     open_file(layout, path)
-    assert next_answer(layout) is before
-    assert "noise.npz" in complaint(layout)
-    assert "still shows the last settings" in complaint(layout)
+    assert layout.next_answer() is before
+    assert "noise.npz" in alert_of(layout)
+    assert "still shows the last settings" in alert_of(layout)
     assert control(layout, "Scene or capture").value == layout.session.state.source == "car"
     control(layout, "SBR").value = 1.0
-    assert next_answer(layout).request.light.sbr == 1.0
-    assert complaint(layout) == ""
+    assert layout.next_answer().request.light.sbr == 1.0
+    assert alert_of(layout) == ""
 
 
-def test_a_failure_keeps_how_the_present_file_is_read(layout, small_file, tmp_path):
+def test_a_failure_keeps_the_reading_options_of_the_present_file(layout, small_file, tmp_path):
     open_file(layout, small_file)
-    next_answer(layout)
+    layout.next_answer()
     layout.session.state.reading = ReadOptions(bin_width_s=3e-9)
-    assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9
+    assert layout.next_answer().capture.acquisition.bin_width_s == 3e-9
     open_file(layout, tmp_path / "absent.npz")
-    next_answer(layout)
-    assert "absent.npz" in complaint(layout)
+    layout.next_answer()
+    assert "absent.npz" in alert_of(layout)
     control(layout, "l").value = 0.01
-    assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9
+    assert layout.next_answer().capture.acquisition.bin_width_s == 3e-9
 
 
-def test_a_weight_that_needs_pulses_is_refused_where_they_are_not_known(layout, small_file):
+def test_a_weight_that_needs_pulses_is_refused_without_them(layout, small_file):
     open_file(layout, small_file)
-    before = next_answer(layout)
+    before = layout.next_answer()
     control(layout, "Weight").value = "survival"
-    assert next_answer(layout) is before
-    assert "weight = 'survival' needs the number of pulses" in complaint(layout)
+    assert layout.next_answer() is before
+    assert "weight = 'survival' needs the number of pulses" in alert_of(layout)
     control(layout, "Weight").value = "none"
-    assert next_answer(layout) is not before
-    assert complaint(layout) == ""
+    assert layout.next_answer() is not before
+    assert alert_of(layout) == ""
 
 
 def opened(layout, title):
-    """A part of the sidebar, unfolded."""
+    """Unfold a part of the sidebar."""
     (part,) = layout.page.select(lambda each: getattr(each, "title", "") == title)
     part.collapsed = False
     return part
 
 
-def test_what_is_folded_away_is_built_when_it_is_first_opened(layout):
-    names = [spec_of(each).symbol for each in fields(Less)]
+def test_a_folded_part_is_built_when_it_is_first_opened(layout):
+    names = [spec_of(each).symbol for each in fields(ReductionSettings)]
 
     def on_page():
         return [each.label for each in layout.page.select(Knob) if each.label in names]
 
     assert on_page() == []
-    part = opened(layout, "Less data, faster")
+    part = opened(layout, "Data reduction")
     for collapsed in (False, True, False):
         part.collapsed = collapsed
         assert on_page() == names
@@ -733,90 +609,77 @@ def test_what_is_folded_away_is_built_when_it_is_first_opened(layout):
 
 def test_form_link_and_script_have_each_option_for_reading_a_file(layout, small_file):
     given = ReadOptions(**EXAMPLES)
-    opened(layout, "How to read the file")
+    opened(layout, "Reading options")
     open_file(layout, small_file)
-    answer = next_answer(layout)
+    answer = layout.next_answer()
     for name, option in reading_options().items():
         control(layout, option.label).value = given.as_text(name)
     control(layout, "Read again").clicks += 1
     state = layout.session.state
     assert state.reading == given
-    linked = Wanted(dict(parse_qsl(query_of(state, {})))).of({"reading": ReadOptions()})
+    linked = Link(dict(parse_qsl(query_of(state, {})))).of({"reading": ReadOptions()})
     assert linked == {"reading": given}
     script = script_of(replace(answer, request=replace(answer.request, reading=given)), state)
     assert [name for name in EXAMPLES if f" {name}=" not in script] == []
 
 
-def test_typed_text_changes_how_a_file_is_read(layout, small_file):
-    opened(layout, "How to read the file")
-    open_file(layout, small_file)
-    before = next_answer(layout)
-    control(layout, "Bin width (s)").value = "wide"
-    control(layout, "Read again").clicks += 1
-    assert layout.session.answer is before
-    assert layout.session.state.reading == ReadOptions()
-    control(layout, "Bin width (s)").value = "3e-9"
-    control(layout, "Read again").clicks += 1
-    assert next_answer(layout).capture.acquisition.bin_width_s == 3e-9
-
-
-def test_less_of_a_capture_is_another_view_of_it(layout):
-    opened(layout, "Less data, faster")
-    control(layout, "Pixels added").value = 4
-    assert next_answer(layout).capture.shape == (16, 16)
+def test_a_reduced_capture_is_shown(layout):
+    opened(layout, "Data reduction")
+    control(layout, "Pixels summed").value = 4
+    assert layout.next_answer().capture.shape == (16, 16)
     assert max(layout.session.state.pixel) < 16
     control(layout, "Bins merged").value = 2
-    assert next_answer(layout).capture.cube.shape == (16, 16, 50)
+    assert layout.next_answer().capture.cube.shape == (16, 16, 50)
     control(layout, "Gate from").value = 1.0  # leaves one bin, where two are to be merged
-    next_answer(layout)
-    assert "factor = 2 is not accepted" in complaint(layout)
+    layout.next_answer()
+    assert "factor = 2 is not accepted" in alert_of(layout)
     assert (control(layout, "Bins merged").value, control(layout, "Gate from").value) == (2, 0.0)
     control(layout, "Scene or capture").value = "staircase"
-    assert next_answer(layout).capture.shape == (64, 64)
-    assert control(layout, "Pixels added").value == 1
+    assert layout.next_answer().capture.shape == (64, 64)
+    assert control(layout, "Pixels summed").value == 1
 
 
 def test_a_capture_without_truth_hides_what_needs_one(layout, explore, real_capture):
     session = layout.session
     session.state.param.update(image="Error", cloud_color="Error")
     open_file(layout, real_capture("21km_K11_night.mat"))
-    assert next_answer(layout).capture.shape == (256, 256)
+    assert layout.next_answer().capture.shape == (256, 256)
     assert session.state.param.image.objects == ["Estimate", "Counts"]
     assert session.state.param.cloud_color.objects == ["Range", "Counts"]
     assert (session.state.image, session.state.cloud_color) == ("Estimate", "Range")
-    assert not NEED_TRUTH & (set(told(explore.figures)) | set(told(explore.numbers)))
+    assert not NEED_TRUTH & (set(values_of(explore.figures)) | set(values_of(explore.numbers)))
     assert not any(explore.cloud.wrong)
     control(layout, "Scene or capture").value = "car"
-    assert next_answer(layout).request.source.is_scene
+    assert layout.next_answer().request.source.is_scene
     assert session.state.param.image.objects == ["Estimate", "Truth", "Error", "Counts"]
 
 
 @pytest.mark.parametrize("counts", [0, 1])
-def test_a_capture_without_any_answer_is_shown_as_such(layout, explore, tmp_path, counts):
+def test_a_capture_without_estimates_is_reported(layout, explore, tmp_path, counts):
     path = tmp_path / "silence.npz"
     save_capture(Capture(np.full((3, 5, 40), counts, np.uint16), Acquisition(40)), path)
     open_file(layout, path)
-    answer = next_answer(layout)
+    answer = layout.next_answer()
     assert answer.request.source.title == "silence.npz"
     assert not answer.run.image.valid.any()
-    assert "No pixel has an answer" in complaint(layout)
-    assert told(explore.numbers)["Estimate"] == "–"
+    assert "No pixel has an estimate" in alert_of(layout)
+    assert values_of(explore.numbers)["Estimate"] == "–"
     assert explore.cloud.positions == b""
-    assert explore.cloud.caption.startswith("0 of 15 answers")
+    assert explore.cloud.caption.startswith("0 of 15 estimates")
 
 
-def test_a_gate_that_ends_before_t_n_is_told(layout, tmp_path):
+def test_a_gate_that_ends_before_t_n_is_reported(layout, tmp_path):
     path = tmp_path / "short.npz"
     cube = np.ones((3, 5, 9), np.uint16)
     cube[:, :, 5] = 9
     save_capture(Capture(cube, Acquisition(9)), path)
     open_file(layout, path)
-    next_answer(layout)
-    assert "T_n = 20 leaves no bin of 9" in complaint(layout)
+    layout.next_answer()
+    assert "T_n = 20 excludes all 9 bins" in alert_of(layout)
     assert control(layout, "T_n").high == 8
     control(layout, "T_n").value = 3
-    next_answer(layout)
-    assert complaint(layout) == ""
+    layout.next_answer()
+    assert alert_of(layout) == ""
 
 
 def test_a_pixel_can_be_chosen_by_point_and_by_key(layout, explore):
@@ -827,7 +690,7 @@ def test_a_pixel_can_be_chosen_by_point_and_by_key(layout, explore):
     explore.image_keys.pixel = [11, 20]  # a list, as the browser sends it
     layout.settle()
     assert explore.cloud.selected == 11 * 64 + 20
-    assert told(explore.numbers)["Pixel"] == "row 11, col 20"
+    assert values_of(explore.numbers)["Pixel"] == "row 11, col 20"
 
 
 def test_a_page_off_screen_is_not_drawn_and_catches_up(layout, explore):
@@ -837,22 +700,22 @@ def test_a_page_off_screen_is_not_drawn_and_catches_up(layout, explore):
     layout.settle()
     assert explore.numbers.facts is before
     layout.pages.choice.value = "Explore"
-    assert told(explore.numbers)["Pixel"] == "row 3, col 4"
+    assert values_of(explore.numbers)["Pixel"] == "row 3, col 4"
 
 
-def test_hidden_answers_leave_the_cloud_but_not_the_figures(layout, explore):
-    session, figures = layout.session, told(explore.figures)
+def test_hidden_estimates_leave_the_cloud_but_not_the_figures(layout, explore):
+    session, figures = layout.session, values_of(explore.figures)
     confidence = session.answer.run.image.confidence
     for least in (0.0, 0.5, 1.0):
         control(layout, "Show from confidence").value = least
         layout.settle()
         assert len(explore.cloud.positions) / 12 == (confidence >= least).sum()
-        assert told(explore.figures) == figures
+        assert values_of(explore.figures) == figures
 
 
 def test_controls_fit_the_capture_they_are_for(layout, small_file):
     open_file(layout, small_file)
-    answer = next_answer(layout)
+    answer = layout.next_answer()
     assert control(layout, "T_n").high == 36
     field_of_view = control(layout, "Field of view")
     width_deg = np.degrees(answer.capture.shape[1] * answer.capture.acquisition.pixel_angle_rad)
@@ -861,7 +724,7 @@ def test_controls_fit_the_capture_they_are_for(layout, small_file):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_page_can_be_the_first_one(page):
-    layout = Layout(built_in_sources(), Wanted({"page": page.name}))
+    layout = Layout(built_in_sources(), Link({"page": page.name}))
     assert (layout.pages.choice.value, [*layout.contents]) == (page.name, [page.name])
     assert layout.page.sidebar_open != page.is_standalone
     assert layout.page.get_root().references()
@@ -873,7 +736,7 @@ def test_every_page_can_be_the_first_one(page):
 
 
 def test_a_page_that_does_not_exist_is_refused_by_name():
-    layout = Layout(built_in_sources(), Wanted({"page": "Nowhere"}))
+    layout = Layout(built_in_sources(), Link({"page": "Nowhere"}))
     assert layout.pages.choice.value == "Explore"
     assert "page = 'Nowhere' is not accepted: give Explore, Inspect" in layout.alert.text
 

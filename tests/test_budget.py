@@ -11,13 +11,13 @@ import psutil
 import pytest
 
 from app.model import budget
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from app.model.store import Request, compute, file_source
 from app.pages.compare.ranking import Task, run_task
-from app.pages.inspect.results import capture_known, pixel_lit
+from app.pages.inspect.results import inspect_capture, inspect_pixel_with_flux
 from app.pages.session import Session
 from app.pages.shared.estimate import FEW_COUNTS, lane_of
-from app.pages.tradeoff.page import affordable
+from app.pages.tradeoff.speed import affordable
 from app.tasks.scheduler import GENERAL
 from core import ESTIMATORS, Acquisition, Capture, TrackingParameters, save_capture
 from core.cost import Cost
@@ -36,7 +36,9 @@ def source(tmp_path):
 
 
 def ask(source, less=None):
-    return Request(source, Illumination(), ReadOptions(), TrackingParameters(), less or Less())
+    return Request(
+        source, Illumination(), ReadOptions(), TrackingParameters(), less or ReductionSettings()
+    )
 
 
 @pytest.fixture
@@ -46,13 +48,13 @@ def tight(monkeypatch):
     monkeypatch.setattr(budget, "REQUEST_BYTES", 16 * MB)
 
 
-def test_a_capture_too_costly_opens_reduced_and_says_so(source, tight):
+def test_a_costly_capture_opens_reduced_and_says_so(source, tight):
     answer = compute(ask(source), None)
     less = answer.request.less
     assert less.merge * less.skip > 1
-    assert answer.asked == Less()
+    assert answer.requested == ReductionSettings()
     assert answer.capture.cube.size < answer.whole.cube.size
-    assert "no more than this server allows" in answer.capture.source
+    assert "limits of this server" in answer.capture.source
     # As few as will do: one step less is refused.
     for name in ("merge", "skip"):
         if getattr(less, name) > 1:
@@ -61,45 +63,45 @@ def test_a_capture_too_costly_opens_reduced_and_says_so(source, tight):
                 compute(ask(source, more), answer)
 
 
-def test_a_capture_that_fits_is_left_as_it_is(source):
+def test_a_capture_that_fits_is_not_reduced(source):
     answer = compute(ask(source), None)
-    assert answer.request.less == answer.asked == Less()
+    assert answer.request.less == answer.requested == ReductionSettings()
     assert answer.capture.cube.shape == (120, 120, 100)
 
 
-def test_the_controls_show_what_was_left_out(source, tight):
+def test_the_controls_show_the_reduction(source, tight):
     session = Session({"wide": source})
-    assert session.state.less == session.answer.request.less != Less()
+    assert session.state.less == session.answer.request.less != ReductionSettings()
     assert session.answer.request == session.estimate.request  # the next request asks for the same
 
 
-def test_more_of_it_is_refused_with_a_remedy(source, tight):
+def test_a_weaker_reduction_is_refused_with_a_remedy(source, tight):
     answer = compute(ask(source), None)
-    with pytest.raises(ValueError, match="Less data, faster") as refused:
+    with pytest.raises(ValueError, match="Data reduction") as refused:
         compute(ask(source), answer)
     assert "120 x 120 pixels of 100 bins" in str(refused.value)
 
 
-def test_time_is_bounded_as_memory_is(source, monkeypatch):
+def test_time_is_limited_like_memory(source, monkeypatch):
     monkeypatch.setattr(budget, "REQUEST_S", 0.04)
     answer = compute(ask(source), None)
-    assert answer.request.less != Less()
+    assert answer.request.less != ReductionSettings()
     with pytest.raises(ValueError, match="estimated time of 'tracking'"):
         compute(ask(source), answer)
 
 
-def test_what_other_pages_compute_is_refused_too(source, monkeypatch):
+def test_computations_of_other_pages_are_limited(source, monkeypatch):
     answer = compute(ask(source), None)
     monkeypatch.setattr(budget, "REQUEST_S", 1e-4)
     for method in ("unmixing", "likelihood"):
         with pytest.raises(ValueError, match=f"estimated time of '{method}'"):
             run_task(Task(method, ESTIMATORS[method].parameters()), answer)
-    for work in (capture_known, lambda each: pixel_lit(each, 0, 0)):
-        with pytest.raises(ValueError, match="estimated time of 'light'"):
+    for work in (inspect_capture, lambda each: inspect_pixel_with_flux(each, 0, 0)):
+        with pytest.raises(ValueError, match="estimated time of 'flux'"):
             work(answer)
 
 
-def test_the_trade_off_leaves_out_what_takes_too_long(source, monkeypatch):
+def test_the_trade_off_leaves_out_slow_configurations(source, monkeypatch):
     capture = compute(ask(source), None).whole
     ways = candidates()
     assert affordable(capture, ways) == ways
@@ -111,8 +113,8 @@ def test_the_trade_off_leaves_out_what_takes_too_long(source, monkeypatch):
         affordable(capture, ways)
 
 
-def test_a_long_gate_is_not_ranged_on_the_page(tmp_path):
-    """Though its counts are few, its delays are many."""
+def test_a_long_gate_is_not_processed_on_the_page(tmp_path):
+    """It has few counts, but many delays."""
     cube = np.ones((1, 1, 300_000), np.uint8)
     capture = Capture(cube, Acquisition(300_000, 1e-9, n_pulses=10**6))
     save_capture(capture, tmp_path / "long.npz")
@@ -147,14 +149,14 @@ def test_requests_wait_until_there_is_memory_for_them(monkeypatch):
         thread.join()
 
 
-def test_what_fails_gives_its_memory_back():
+def test_a_failed_request_returns_its_memory():
     shared = budget.Budget()
     for _ in range(2):
         with pytest.raises(KeyError), shared.spending(10**15):
             raise KeyError
 
 
-def test_more_than_a_request_may_take_is_never_begun():
+def test_a_request_beyond_the_limit_is_never_started():
     cost = Cost(10**15, 0.0)
     with pytest.raises(ValueError, match="on this server"), budget.spending((1, 1, 9), "x", cost):
         raise AssertionError

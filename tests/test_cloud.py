@@ -1,3 +1,5 @@
+"""Point clouds: their geometry, and the buffers for the browser."""
+
 import numpy as np
 import pytest
 
@@ -26,23 +28,18 @@ def cloud(range_m):
     return point_cloud(range_m, ANGLE, error_m=range_m - 50, counts=counts, rgb=rgb)
 
 
-def test_each_point_lies_at_its_range_on_its_line_of_sight(cloud, range_m):
-    points = np.asarray(cloud.points)
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+def test_each_finite_pixel_is_a_point_at_its_range_on_its_line_of_sight(cloud, range_m):
+    points, row, col = np.asarray(cloud.points), cloud["row"], cloud["col"]
+    assert cloud.n_points == cloud.n_verts == np.isfinite(range_m).sum()
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), cloud["range_m"], rtol=1e-12)
-    lines = sight_lines(range_m.shape, ANGLE)[cloud["row"], cloud["col"]]
-    np.testing.assert_allclose(points, cloud["range_m"][:, np.newaxis] * lines, rtol=1e-12)
-
-
-def test_only_finite_pixels_become_points(cloud, range_m):
-    assert cloud.n_points == cloud.n_verts == np.isfinite(range_m).sum() == range_m.size - 2
-    pixels = set(zip(cloud["row"], cloud["col"], strict=True))
-    assert (3, 5) not in pixels
-    assert (20, 32) not in pixels
-
-
-def test_a_point_leads_back_to_its_pixel(cloud, range_m):
-    np.testing.assert_array_equal(range_m[cloud["row"], cloud["col"]], cloud["range_m"])
-    np.testing.assert_array_equal(range_m.ravel()[pixel_index(cloud)], cloud["range_m"])
+    lines = sight_lines(range_m.shape, ANGLE)[row, col]
+    np.testing.assert_allclose(points, range_m[row, col][:, np.newaxis] * lines, rtol=1e-12)
+    np.testing.assert_array_equal(pixel_index(cloud), 33 * row + col)
     np.testing.assert_array_equal(pixel_index(cloud), cloud["counts"])
     np.testing.assert_allclose(cloud["error_m"], cloud["range_m"] - 50)
 
@@ -60,61 +57,48 @@ def test_spacing_is_the_distance_between_neighbours():
     assert spacing_m(wall) == pytest.approx(np.linalg.norm(points[4, 4] - points[4, 5]), rel=1e-4)
 
 
-def test_bounds_hold_the_target_and_not_the_scattered_points(rng):
+def test_bounds_contain_the_target_without_scattered_points(rng):
     row, col = np.mgrid[0:64, 0:64]
     truth = np.where(col < 32, 50 + 0.02 * row, 55.0)
     range_m = np.where(rng.random(truth.shape) < 0.5, rng.uniform(30, 300, truth.shape), truth)
-    target, mixed = point_cloud(truth, ANGLE), point_cloud(range_m, ANGLE)
-    bounds = np.array(view_bounds(mixed))
-    exact = np.array(target.bounds)
+    bounds = np.array(view_bounds(point_cloud(range_m, ANGLE)))
+    exact = np.array(point_cloud(truth, ANGLE).bounds)
     assert np.all(bounds[::2] <= exact[::2] + 0.2)
     assert np.all(bounds[1::2] >= exact[1::2] - 0.2)
     assert bounds[3] - bounds[2] < 2 * (exact[3] - exact[2])
 
 
-def test_bounds_of_a_target_that_fills_the_gate_hold_nearly_all(rng):
-    cloud = point_cloud(rng.uniform(100, 200, (64, 64)), ANGLE)
-    _, _, near, far, _, _ = view_bounds(cloud)
-    assert near == pytest.approx(100, abs=1.5)
-    assert far == pytest.approx(200, abs=1.5)
+def test_bounds_of_a_target_that_fills_the_gate_contain_nearly_all(rng):
+    _, _, near, far, _, _ = view_bounds(point_cloud(rng.uniform(100, 200, (64, 64)), ANGLE))
+    assert (near, far) == (pytest.approx(100, abs=1.5), pytest.approx(200, abs=1.5))
 
 
-def test_bounds_look_only_at_the_points_to_keep(cloud):
-    left = view_bounds(cloud, cloud["col"] < 10)
-    assert left[1] < view_bounds(cloud)[1]
+def test_bounds_are_those_of_the_points_to_keep_and_have_a_volume(cloud):
+    assert view_bounds(cloud, cloud["col"] < 10)[1] < view_bounds(cloud)[1]
     assert view_bounds(cloud, np.zeros(cloud.n_points, bool)) == view_bounds(cloud)
-
-
-def test_a_flat_wall_has_bounds_with_a_volume():
-    bounds = np.array(view_bounds(point_cloud(np.full((1, 1), 21e3), ANGLE)))
-    assert np.all(bounds[1::2] > bounds[::2])
+    flat = np.array(view_bounds(point_cloud(np.full((1, 1), 21e3), ANGLE)))
+    assert np.all(flat[1::2] > flat[::2])
 
 
 def test_a_cloud_without_points():
     cloud = point_cloud(np.full((4, 4), np.nan), ANGLE, counts=np.zeros((4, 4)))
-    assert cloud.n_points == 0
-    assert view_bounds(cloud) == []
-    assert spacing_m(cloud) == 0
+    assert (cloud.n_points, view_bounds(cloud), spacing_m(cloud)) == (0, [], 0)
     pane = PointCloud()
     pane.draw(cloud, np.zeros((0, 3), np.uint8), scene_id="empty")
     assert pane.positions == pane.pixels == pane.wrong == b""
     assert pane.bounds == []
-    seen = point_cloud(np.full((4, 4), 50.0), ANGLE)
-    pane.draw(seen, np.zeros((16, 3), np.uint8), scene_id="empty")
-    assert pane.bounds == view_bounds(seen)
+    wall = point_cloud(np.full((4, 4), 50.0), ANGLE)
+    pane.draw(wall, np.zeros((16, 3), np.uint8), scene_id="empty")
+    assert pane.bounds == view_bounds(wall)
 
 
-def test_drawing_fills_the_buffers_in_one_update(cloud):
-    pane = PointCloud()
+def test_a_cloud_is_drawn_in_one_update(cloud):
+    pane, updates = PointCloud(), []
     wrong = cloud["row"] == 4
-    updates = []
-    pane.param.watch(
-        lambda *events: updates.append({event.name for event in events}),
-        ["positions", "colors", "pixels", "wrong", "spacing_m", "bounds", "scene_id"],
-    )
+    names = ["positions", "colors", "pixels", "wrong", "spacing_m", "bounds", "scene_id"]
+    pane.param.watch(lambda *events: updates.append({event.name for event in events}), names)
     pane.draw(cloud, cloud["rgb"], wrong, scene_id="slope")
     assert len(updates) == 1
-    assert {"positions", "colors", "pixels", "wrong", "scene_id"} <= updates[0]
     positions = np.frombuffer(pane.positions, "<f4").reshape(-1, 3)
     np.testing.assert_allclose(positions, cloud.points, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(np.frombuffer(pane.colors, "u1").reshape(-1, 3), cloud["rgb"])
@@ -135,21 +119,15 @@ def test_bounds_change_with_the_scene_or_when_given(cloud, range_m):
     assert pane.bounds == [0, 1, 2, 3, 4, 5]
 
 
-def test_colours_and_marks_must_fit_the_points(cloud):
-    pane = PointCloud()
+def test_colours_and_marks_must_match_the_points(cloud):
     with pytest.raises(ValueError, match="rgb has shape"):
-        pane.draw(cloud, np.zeros((2, 3), np.uint8))
+        PointCloud().draw(cloud, np.zeros((2, 3), np.uint8))
     with pytest.raises(ValueError, match="wrong has shape"):
-        pane.draw(cloud, cloud["rgb"], np.zeros(2, bool))
+        PointCloud().draw(cloud, cloud["rgb"], np.zeros(2, bool))
 
 
-def test_colours_follow_the_page():
+def test_colours_follow_the_theme():
     pane = PointCloud(dark=True)
-    assert (pane.ink, pane.paper) == (palette(True).text, palette(True).paper)
-    pane.dark = False
-    assert (pane.ink, pane.paper) == (palette(False).text, palette(False).paper)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(7)
+    for dark in (True, False):
+        pane.dark = dark
+        assert (pane.ink, pane.paper) == (palette(dark).text, palette(dark).paper)

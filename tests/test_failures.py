@@ -1,4 +1,4 @@
-"""What goes wrong is told by the page in words, and the next move works."""
+"""Failures are shown as sentences, and the next action works."""
 
 from __future__ import annotations
 
@@ -15,27 +15,29 @@ import panel as pn
 import pytest
 
 from app import __main__ as started
-from app.model import download_text as download_words
-from app.model import text as words
-from app.model.address import Wanted
+from app.model import download_text
+from app.model import text as model_text
+from app.model.address import Link
 from app.model.state import Illumination
 from app.model.store import built_in_sources, scene_source
 from app.model.uploads import Uploads
-from app.pages.compare import text as ranking_words
+from app.pages.compare import text as compare_text
 from app.pages.compare.page import Compare
-from app.pages.inspect.capture import Whole
-from app.pages.inspect.page import Inspector
-from app.pages.inspect.pins import Pins
-from app.pages.inspect.pixel import Sight
+from app.pages.inspect.capture import CaptureSection
+from app.pages.inspect.page import Inspect
+from app.pages.inspect.pins import PinsSection
+from app.pages.inspect.pixel import PixelSection
 from app.pages.inspect.views import rectangle
 from app.pages.layout import Layout, Template
 from app.pages.navigation import Pages, View
-from app.pages.paper.page import Jump, RangeImages, Repeated, Sliders, Trials, jump
+from app.pages.paper.page import Jump, LiveFigures, RangeImages, RepeatedTable, jump
 from app.pages.session import Session
 from app.pages.shared.failures import FailureLog
-from app.pages.tradeoff.ablation import Judged, Requires
-from app.pages.tradeoff.page import Acquisition, Effort, Ways
-from app.pages.tradeoff.sensitivity import Trust
+from app.pages.shared.section import Repetitions
+from app.pages.tradeoff.ablation import AblationSection
+from app.pages.tradeoff.acquisition import AcquisitionSection
+from app.pages.tradeoff.sensitivity import SensitivitySection, Swept
+from app.pages.tradeoff.speed import Effort, SpeedSection
 from core import ESTIMATORS, CaptureError
 from core.studies.paper import figures as paper
 from core.studies.trials import Condition
@@ -48,13 +50,13 @@ from tests.threads import control
 
 @pytest.fixture(scope="module")
 def broken():
-    """Where the app is served whose parts break."""
+    """Address of an app whose parts break."""
     with serving(module="tests.broken") as running_at:
         yield running_at
 
 
 def provoke(address, break_it, mend_it):
-    """What the page says when something is broken, and when it has been mended."""
+    """Return the sentences that the page shows after each action."""
 
     async def session():
         wire, _ = await opened_wire(address, seed=0)
@@ -84,18 +86,18 @@ def moving(kind, attribute, value, **attributes):
 
 
 @pytest.mark.parametrize("seed", [*AT_SEED, WHEN_DRAWN])
-def test_an_answer_that_fails_is_told_and_the_next_move_works(broken, seed):
+def test_an_estimate_that_fails_is_reported_and_the_next_move_works(broken, seed):
     said, mended = provoke(
         broken,
         moving("Knob", "value", seed, label="Seed"),
         moving("Knob", "value", 99, label="Seed"),
     )
-    assert "The picture still shows" in said
+    assert "The page still shows" in said
     assert str(ROOT) not in said and "Traceback" not in said
     assert mended == ""
 
 
-def test_a_callback_that_fails_is_told_and_the_next_works(broken):
+def test_a_callback_that_fails_is_reported_and_the_next_works(broken):
     for row, col in (WHEN_INSPECTED, WHEN_TAPPED):
         said, _ = provoke(
             broken,
@@ -106,11 +108,11 @@ def test_a_callback_that_fails_is_told_and_the_next_works(broken):
         assert str(ROOT) not in said
 
 
-# -- parts of the pages, without a browser ---------------------------------------------------------
+# -- sections of the pages, without a browser ------------------------------------------------------
 
 FOLDER = "/srv/data/secret"
 
-RAISED = (
+ERRORS = (
     CaptureError(f"face.mat: cannot be read (OSError: [Errno 5] '{FOLDER}/face.mat'): copy it."),
     OSError(28, "No space left on device", f"{FOLDER}/x"),
     MemoryError(),
@@ -119,7 +121,7 @@ RAISED = (
 
 
 def breaking(monkeypatch, where):
-    """What a function raises from now on, where there is something; else it works."""
+    """Replace a function by one that raises what is in the returned list, if anything."""
     works, raised = resolve_name(where), []
 
     def work(*arguments, **options):
@@ -131,96 +133,97 @@ def breaking(monkeypatch, where):
     return raised
 
 
-def check_told(sentence, error):
+def check_sentence(sentence, error):
     assert FOLDER not in sentence and "Traceback" not in sentence
-    told = "cannot be read (OSError: [Errno 5] 'face.mat')", type(error).__name__
-    assert any(each in sentence for each in told)
+    expected = "cannot be read (OSError: [Errno 5] 'face.mat')", type(error).__name__
+    assert any(each in sentence for each in expected)
 
 
-def started_by_compute(make):
-    def build(session):
-        study = make(session)._study
-        is_under_way = re.compile(r"Done|[1-9]\d* of")
-        return study.start, lambda: is_under_way.match(study.controls[-1].text)
-
-    return build
+# Each returns what starts the work, and whether it has succeeded.
 
 
-def moved(session):
-    part, places = Sliders(session, Jump(), "", jump, count=2), iter(range(20, 99))
-    return lambda: part._ask(Jump(onset_bin=next(places))), lambda: part._cards[1].figure
+def by_compute(section, settings=None):
+    """Work that the button Compute starts."""
+    if settings is not None:
+        section.change(settings)
+    is_running = re.compile(r"Done|[1-9]\d* of")
+    return section.study.start, lambda: is_running.match(section.study.controls[-1].text)
+
+
+def live(session):
+    section = LiveFigures(session, Jump(), "", jump, count=2)
+    places = iter(range(20, 99))
+    return lambda: section.change(Jump(onset_bin=next(places))), lambda: section.shown
 
 
 def repeated(session):
     plan, table = {Condition("car", 0.06): paper.COMPARED[:1]}, paper.arithmetic()
-    return Trials(session, Repeated(repetitions=2), "", lambda _: plan, lambda *_: table)
-
-
-def ways(session):
-    part = Ways(session, lambda *_: None)
-    part._effort = Effort(repetitions=2, repeats=6, merges="none")
-    return part
-
-
-def trust(session):
-    part = Trust(session)
-    part._swept = type(part._swept)(ESTIMATORS["kde"].title)
-    return part
-
-
-def requires(session):
-    part = Requires(session)
-    part._judged = Judged(repetitions=2)
-    return part
-
-
-def navigated(session):
-    page, maps = Inspector(session), cycle(["Peak", "Counts"])
-    nothing = page._navigator.figure.title.text
-    page.view.show(True)
-    return (
-        lambda: session.state.param.update(map=next(maps)),
-        lambda: page._navigator.figure.title.text != nothing,
+    settings = Repetitions()
+    return by_compute(
+        RepeatedTable(session, settings, "", lambda _: plan, lambda *_: table), settings
     )
 
 
-def pinned(session):
-    part, places = Pins(session), cycle([(0, 0), (1, 1)])
-    part.view.show(True)
-    return lambda: session.state.param.update(pins=(next(places),)), lambda: part._table.rows
+def ablation(session):
+    return by_compute(AblationSection(session), Repetitions())
 
 
-def added(session):
-    part, rows = Sight(session, "region"), cycle([1, 2])
-    part.view.show(True)
-    region = (rectangle((0, row), (0, 1)) for row in rows)
-    return lambda: session.state.param.update(region=next(region)), lambda: part._facts.facts
+def speed(session):
+    return by_compute(SpeedSection(session), Effort(repetitions=2, repeats=6, merges="none"))
 
 
-def reported(session):
-    part = Whole(session)
-    part.view.show(True)
-    return part._follow, lambda: part._facts.facts
+def sensitivity(session):
+    return by_compute(SensitivitySection(session), Swept(ESTIMATORS["kde"].title))
 
 
-PARTS = {
-    "app.pages.inspect.page.map_of": navigated,
-    "app.pages.inspect.pins.pixel_lit": pinned,
-    "core.inspection.region_report": added,
-    "core.inspection.capture_report": reported,
-    "core.inspection.accuracy_over_pulses": started_by_compute(Whole),
-    "core.studies.paper.figures.figure_1": moved,
-    "app.pages.paper.page.trials": started_by_compute(repeated),
-    "core.studies.paper.figures.figure_8": started_by_compute(RangeImages),
-    "app.pages.tradeoff.page.study": started_by_compute(ways),
-    "app.pages.tradeoff.page.acquired": started_by_compute(Acquisition),
-    "app.pages.tradeoff.ablation.requirements": started_by_compute(requires),
-    "app.pages.tradeoff.sensitivity.setting_sweep": started_by_compute(trust),
+def maps(session):
+    page, kinds = Inspect(session), cycle(["Peak", "Counts"])
+    blank = page.navigator.figure.title.text
+    page.show(True)
+    return (
+        lambda: session.state.param.update(map=next(kinds)),
+        lambda: page.navigator.figure.title.text != blank,
+    )
+
+
+def pins(session):
+    section, places = PinsSection(session), cycle([(0, 0), (1, 1)])
+    section.show(True)
+    return lambda: session.state.param.update(pins=(next(places),)), lambda: section.found
+
+
+def region(session):
+    section, rows = PixelSection(session, "region"), cycle([1, 2])
+    section.show(True)
+    regions = (rectangle((0, row), (0, 1)) for row in rows)
+    return lambda: session.state.param.update(region=next(regions)), lambda: section.found
+
+
+def report(session):
+    section = CaptureSection(session)
+    section.show(True)
+    return section.refresh, lambda: section.report
+
+
+SECTIONS = {
+    "app.pages.inspect.page.map_of": maps,
+    "app.pages.inspect.pins.inspect_pixel_with_flux": pins,
+    "core.inspection.region_report": region,
+    "core.inspection.capture_report": report,
+    "core.inspection.accuracy_over_pulses": lambda session: by_compute(CaptureSection(session)),
+    "core.studies.paper.figures.figure_1": live,
+    "app.pages.paper.page.trials": repeated,
+    "core.studies.paper.figures.figure_8": lambda session: by_compute(RangeImages(session)),
+    "app.pages.tradeoff.speed.study": speed,
+    "app.pages.tradeoff.acquisition.acquisition_sweeps": lambda session: by_compute(
+        AcquisitionSection(session)
+    ),
+    "app.pages.tradeoff.ablation.requirements": ablation,
+    "app.pages.tradeoff.sensitivity.setting_sweep": sensitivity,
 }
 
-
-REFUSE = ("core.inspection.region_report",)
-"""Parts that may refuse their input: their ``ValueError`` stands where the picture would be."""
+REFUSING = ("core.inspection.region_report",)
+"""Functions that may refuse their input: the sentence of a ``ValueError`` replaces the plots."""
 
 
 def few_pixels():
@@ -232,24 +235,33 @@ def session():
     return Session(few_pixels())
 
 
-@pytest.mark.parametrize("where", PARTS)
-def test_work_of_a_page_that_fails_is_told_and_the_next_works(where, monkeypatch, session):
-    raised, told = breaking(monkeypatch, where), []
-    session.failures.shown.subscribe(told.append)
-    errors = RAISED[1:] if where in REFUSE else RAISED
+@pytest.fixture
+def shown(session):
+    """The sentences on failures that the page has shown."""
+    sentences = []
+    session.failures.shown.subscribe(sentences.append)
+    return sentences
+
+
+@pytest.mark.parametrize("where", SECTIONS)
+def test_work_of_a_section_that_fails_is_reported_and_the_next_works(
+    where, monkeypatch, session, shown
+):
+    raised = breaking(monkeypatch, where)
+    errors = ERRORS[1:] if where in REFUSING else ERRORS
     raised[:] = errors[:1]
-    act, goes_on = PARTS[where](session)
+    act, has_succeeded = SECTIONS[where](session)
     for error in errors:
-        raised[:], before = [error], len(told)
+        raised[:], before = [error], len(shown)
         act()
-        eventually(lambda before=before: len(told) > before and told[-1])
-        check_told(told[-1], error)
-        assert "Compute" in told[-1] or "The picture still shows" in told[-1]
-        assert not goes_on()
+        eventually(lambda before=before: len(shown) > before and shown[-1])
+        check_sentence(shown[-1], error)
+        assert "Compute" in shown[-1] or "still shows" in shown[-1]
+        assert not has_succeeded()
     raised.clear()
     act()
-    eventually(goes_on)
-    eventually(lambda: told[-1] == "")
+    eventually(has_succeeded)
+    eventually(lambda: shown[-1] == "")
 
 
 def test_a_failure_is_shown_until_its_own_part_works_again():
@@ -269,140 +281,144 @@ def test_a_failure_is_shown_until_its_own_part_works_again():
     assert shown[-1] == ""
 
 
-def test_another_pixel_does_not_silence_a_map_that_failed(monkeypatch, session):
-    raised, told = breaking(monkeypatch, "app.pages.inspect.page.map_of"), []
-    session.failures.shown.subscribe(told.append)
+def test_another_pixel_does_not_hide_that_a_map_failed(monkeypatch, session, shown):
+    raised = breaking(monkeypatch, "app.pages.inspect.page.map_of")
     raised.append(MemoryError())
-    change_map, _ = navigated(session)
-    sight = Sight(session, "pixel")
-    sight.view.show(True)
+    section = PixelSection(session, "pixel")
+    section.show(True)
+    change_map, _ = maps(session)
     change_map()
-    eventually(lambda: told)
+    eventually(lambda: shown)
     session.choose_pixel(1, 1)
-    eventually(lambda: sight._facts.facts[0][1] == "1, 1")
-    assert told[-1]
+    eventually(lambda: section.facts.facts[0][1] == "1, 1")
+    assert shown[-1]
+
+
+@pytest.fixture
+def compare(session):
+    """The Compare page with one method, not yet on screen."""
+    session.state.comparison = replace(session.state.comparison, methods=("peak",))
+    page = Compare(session)
+    session.estimate.changed.subscribe(page.follow)
+    return page
 
 
 def messages(page):
-    return {row["name"]: row.get("message", "") for row in page._table.rows}
+    return {row["name"]: row.get("message", "") for row in page.table.rows}
 
 
-@pytest.mark.parametrize("error", RAISED, ids=lambda error: type(error).__name__)
-def test_a_method_that_fails_is_told_and_works_once_it_is_picked_anew(error, monkeypatch, session):
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_a_method_that_fails_is_reported_and_runs_when_selected_again(error, monkeypatch, compare):
     raised, name = (
         breaking(monkeypatch, "app.pages.compare.page.run_task"),
         ESTIMATORS["peak"].title,
     )
     raised[:] = [error]
-    session.state.comparison = replace(session.state.comparison, methods=("peak",))
-    page = Compare(session)
-    page.view.show(True)
-    eventually(lambda: page._measure is not None)
-    check_told(messages(page)[name], error)
+    compare.show(True)
+    eventually(lambda: messages(compare)[name] != model_text.NOT_COMPUTED)
+    check_sentence(messages(compare)[name], error)
     raised.clear()
-    page._picks.value = []
-    page._picks.value = ["peak"]
-    eventually(lambda: len(page._answers()) == 1)
-    eventually(lambda: messages(page)[name] == "")
+    compare.picks.value = []
+    compare.picks.value = ["peak"]
+    eventually(lambda: messages(compare)[name] == "")
 
 
-def test_a_limit_that_fails_is_told_and_is_not_called_unknown(monkeypatch, session):
-    raised = breaking(monkeypatch, "app.pages.compare.page.yardstick")
-    raised[:] = RAISED[2:]
-    session.state.comparison = replace(session.state.comparison, methods=("peak",))
-    page = Compare(session)
-    session.estimate.changed.subscribe(page.view.follow)
-    page.view.show(True)
-    eventually(lambda: messages(page)["Physics’ limit"] not in ("", words.NOT_COMPUTED))
-    check_told(messages(page)["Physics’ limit"], raised[0])
+def test_a_limit_that_fails_is_reported_and_not_called_unknown(monkeypatch, session, compare):
+    raised = breaking(monkeypatch, "app.pages.compare.page.reference_of")
+    raised[:] = ERRORS[2:]
+    compare.show(True)
+    limit = "Physical limit"
+    eventually(lambda: messages(compare)[limit] not in ("", model_text.NOT_COMPUTED))
+    check_sentence(messages(compare)[limit], raised[0])
     raised.clear()
     session.state.light = Illumination(seed=1)
-    eventually(lambda: page._measure is not None and page._measure.limit is not None)
-    eventually(lambda: messages(page)["Physics’ limit"] == "")
+    eventually(lambda: messages(compare)[limit] == "")
 
 
-def test_curves_that_fail_are_told_and_those_of_the_next_pixel_are_drawn(monkeypatch, session):
-    raised, told = breaking(monkeypatch, "app.pages.compare.page.score_curves"), []
-    session.failures.shown.subscribe(told.append)
-    session.state.comparison = replace(session.state.comparison, methods=("peak",))
-    page = Compare(session)
-    page.view.show(True)
-    eventually(lambda: page._measure is not None)
-    for error in RAISED:
-        raised[:], before = [error], len(told)
-        page._ask_curves()
-        eventually(lambda before=before: len(told) > before and told[-1])
-        check_told(told[-1], error)
+def test_scores_that_fail_are_reported_and_those_of_the_next_pixel_are_drawn(
+    monkeypatch, session, compare, shown
+):
+    raised = breaking(monkeypatch, "app.pages.compare.page.score_curves")
+    compare.show(True)
+    eventually(lambda: compare.is_complete)
+    for error in ERRORS:
+        raised[:], before = [error], len(shown)
+        compare.request_curves()
+        eventually(lambda before=before: len(shown) > before and shown[-1])
+        check_sentence(shown[-1], error)
     raised.clear()
     session.choose_pixel(1, 2)
-    eventually(lambda: told[-1] == "")
+    eventually(lambda: shown[-1] == "")
 
 
-def test_what_is_typed_in_vain_is_told_and_the_next_reading_works():
+def test_a_refused_reading_option_is_reported_and_the_next_reading_works():
     layout = Layout({"sample": built_in_sources()["sample"]})
-    opened(layout, "How to read the file")
+    opened(layout, "Reading options")
     width, alert, again = (
         control(layout, "Bin width (s)"),
         layout.alert,
         control(layout, "Read again"),
     )
-    width.value = "<b>wide</b>"
-    again.clicks += 1
-    assert "bin_width_s = '<b>wide</b>' is not accepted: give" in alert.text
-    width.value = "-2e-9"
-    again.clicks += 1
-    eventually(lambda: "bin_width_s = -2e-09" in alert.text)
+    for typed, sentence in (
+        ("<b>wide</b>", "bin_width_s = '<b>wide</b>' is not accepted: give"),
+        ("-2e-9", "bin_width_s = -2e-09"),
+    ):
+        width.value = typed
+        again.clicks += 1
+        eventually(lambda sentence=sentence: sentence in alert.text)
     width.value = "2e-9"
     again.clicks += 1
     eventually(lambda: alert.text == "")
     assert layout.session.answer.capture.acquisition.bin_width_s == 2e-9
 
 
-def test_an_address_that_asks_for_an_unreadable_file_names_no_folder(monkeypatch):
-    raised, wanted = breaking(monkeypatch, "app.model.restore.compute"), Wanted({"seed": "3"})
-    for error in RAISED:
+def test_a_link_to_an_unreadable_file_shows_no_folder(monkeypatch):
+    raised, link = breaking(monkeypatch, "app.model.restore.compute"), Link({"seed": "3"})
+    for error in ERRORS:
         raised[:] = [error]
         with pytest.raises(type(error)):
-            Session(few_pixels(), wanted)
-        check_told(wanted.refused.pop(), error)
+            Session(few_pixels(), link)
+        check_sentence(link.refused.pop(), error)
 
 
 # -- a page that cannot be built -------------------------------------------------------------------
 
 
-def test_a_page_that_cannot_be_built_says_so_and_the_log_says_why(monkeypatch, caplog):
+def test_a_page_that_cannot_be_built_shows_that_and_the_log_says_why(monkeypatch, caplog):
     raised = breaking(monkeypatch, "app.__main__.build_page")
-    for error in RAISED:
+    for error in ERRORS:
         raised[:] = [error]
         page = started.page_for(few_pixels(), Uploads())
-        assert (page.text, page.warning) == (words.NO_PAGE, True)
+        assert (page.text, page.warning) == (model_text.NO_PAGE, True)
         assert caplog.records[-1].exc_info[1] is error
     raised.clear()
     assert isinstance(started.page_for(few_pixels(), Uploads()), Template)
 
 
-def test_files_have_names_and_no_folders():
-    for path, name in (
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
         ("/srv/data/secret/face.mat", "face.mat"),
         ("'/srv/my data/fa ce.mat'", "'fa ce.mat'"),
         ('"/srv/a/b.npz"', '"b.npz"'),
+    ],
+)
+def test_messages_name_files_without_folders(path, name):
+    message = f"it.mat: cannot be read ({path}: 3.5 counts/s, 1/2/3, m/s): give another"
+    assert model_text.without_folders(message) == message.replace(path, name)
+    for describe in (
+        model_text.failure,
+        model_text.reason,
+        model_text.unfinished,
+        compare_text.failure,
+        compare_text.no_reference,
+        download_text.not_saved,
     ):
-        told = f"it.mat: cannot be read ({path}: 3.5 counts/s, 1/2/3, m/s): give another"
-        kept = f"it.mat: cannot be read ({name}: 3.5 counts/s, 1/2/3, m/s): give another"
-        assert words.without_folders(told) == kept
-        for say in (
-            words.failure,
-            words.reason,
-            words.unfinished,
-            ranking_words.problem,
-            ranking_words.no_yardstick,
-            download_words.not_saved,
-        ):
-            assert "/srv" not in say(CaptureError(told))
-            assert "/srv" not in say(OSError(told))
+        assert "/srv" not in describe(CaptureError(message))
+        assert "/srv" not in describe(OSError(message))
 
 
-def test_a_page_that_cannot_be_built_leaves_the_one_that_is_open():
+def test_a_page_that_cannot_be_built_leaves_the_open_one():
     broken = True
 
     def build():
@@ -411,13 +427,15 @@ def test_a_page_that_cannot_be_built_leaves_the_one_that_is_open():
         return View(pn.pane.Str("there"), [])
 
     pages = Pages({"first": lambda: View([], []), "second": build})
-    with pytest.raises(OSError, match="No space"):
-        pages.choice.value = "second"
-    assert pages.choice.value == "first"
-    assert [pages.mains[name].visible for name in ("first", "second")] == [True, False]
-    broken = False
-    pages.choice.value = "second"
-    assert [pages.mains[name].visible for name in ("first", "second")] == [False, True]
+    for is_open in (False, True):
+        broken = not is_open
+        if broken:
+            with pytest.raises(OSError, match="No space"):
+                pages.choice.value = "second"
+        else:
+            pages.choice.value = "second"
+        assert pages.choice.value == ("second" if is_open else "first")
+        assert [pages.mains[name].visible for name in ("first", "second")] == [not is_open, is_open]
     assert len(pages.mains["second"]) == 1
 
 
@@ -425,15 +443,13 @@ def killed(_):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_a_process_that_is_killed_is_told_and_the_next_works(monkeypatch, session):
-    told = []
-    session.failures.shown.subscribe(told.append)
-    start, goes_on = started_by_compute(ways)(session)
+def test_a_killed_process_is_reported_and_the_next_works(monkeypatch, session, shown):
+    start, has_succeeded = speed(session)
     with monkeypatch.context() as patched:
         patched.setattr("core.studies.tradeoff.measure.held_bytes", killed)
         start()
-        eventually(lambda: told and "BrokenProcessPool" in told[-1])
-    assert "Compute begins anew" in told[-1]
+        eventually(lambda: shown and "BrokenProcessPool" in shown[-1])
+    assert "Press Compute" in shown[-1]
     start()
-    eventually(lambda: goes_on() and goes_on()[0] == "Done")
-    assert told[-1] == ""
+    eventually(lambda: has_succeeded() and has_succeeded()[0] == "Done")
+    assert shown[-1] == ""

@@ -1,4 +1,4 @@
-"""A file arrives in parts: they are checked by the server, whatever the browser checks."""
+"""The server checks the parts in which a file arrives, whatever the browser checks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def complaints():
 
 @pytest.fixture
 def given(complaints):
-    """A file input, whose messages come as from a browser."""
+    """A file input that receives messages as from a browser."""
     return FileInput(complaints.append, max_file_size=MAX_UPLOAD_BYTES)
 
 
@@ -43,7 +43,7 @@ def test_a_file_in_parts_arrives_whole(given, complaints):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "text"),
     [
         ({"total_chunks": MAX_UPLOAD_BYTES // PART_BYTES + 1}, "parts of the file = 26"),
         ({"total_chunks": "2"}, "parts of the file"),
@@ -59,13 +59,11 @@ def test_a_file_in_parts_arrives_whole(given, complaints):
         ({"status": "error", "error": "too large"}, "too large"),
     ],
 )
-def test_what_no_browser_of_ours_sends_is_refused_and_the_next_file_arrives(
-    given, complaints, changes, said
-):
+def test_a_malformed_message_is_refused_and_the_next_file_arrives(given, complaints, changes, text):
     send(given)
     send(given, **changes)
     assert len(complaints) == 1
-    assert said in complaints[0]
+    assert text in complaints[0]
     assert not given.value
     given._handle_msg({"status": "initializing"})
     send(given, total_chunks=1, data=b"x")
@@ -73,11 +71,11 @@ def test_what_no_browser_of_ours_sends_is_refused_and_the_next_file_arrives(
     assert given.value == b"x"
 
 
-def test_files_that_are_begun_and_never_end_are_not_kept_side_by_side(given, complaints):
+def test_unfinished_files_are_not_kept(given, complaints):
     for n in range(50):
         send(given, name=f"{n}.npz")
     assert "one file at a time" in complaints[0]
-    assert len(complaints) == 25  # every second one is refused, and the one before it forgotten
+    assert len(complaints) == 25  # every second one is refused, with the one before it
 
 
 @pytest.mark.browser
@@ -87,8 +85,8 @@ def test_a_file_that_is_too_large_is_refused_by_its_limit(page, tmp_path, troubl
         file.truncate(MAX_UPLOAD_BYTES + 1)
     opened = page()
     opened.locator("input[type=file]").set_input_files(large)
-    said = opened.get_by_role("alert").filter(has_text="large.npz")
-    expect(said).to_contain_text("Files of up to 100 MiB can be uploaded")
+    alert = opened.get_by_role("alert").filter(has_text="large.npz")
+    expect(alert).to_contain_text("The limit is 100 MiB")
     (trouble,) = troubles
     assert "exceeds maximum file size" in trouble  # the widget's own line in the console
     troubles.clear()

@@ -1,4 +1,4 @@
-"""What the app imports: public names of core, and of its own rooms only lower ones."""
+"""The app imports public names of core, and its rooms import lower rooms only."""
 
 from __future__ import annotations
 

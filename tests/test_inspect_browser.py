@@ -1,13 +1,15 @@
-"""The Inspect page in a real browser: what its user does, on the 21 km capture and on the façade.
+"""The Inspect page in a browser, on the 21 km capture and on the simulated building.
 
-The numbers to be seen then are computed here by `core`.
+Expected numbers are computed by `core`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from csv import DictReader
 from dataclasses import dataclass
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -16,13 +18,12 @@ from playwright.sync_api import Locator, Page, expect
 
 import core
 from app.model.state import Illumination
-from app.pages.inspect import text as inspector_words
+from app.pages.inspect import text
 from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
 from core.tests.captures import real_capture_path
-from tests.browser import VIEWS, eventually, fact, serving
-from tests.test_browser import chosen, enter, slider
-from tests.test_browser import image as picture
+from tests.browser import VIEWS, chosen, enter, eventually, fact, serving, slider
+from tests.browser import image as picture
 from tests.test_downloads import columns_of, download
 from tests.test_lasting import here as address_of
 from tests.test_lasting import rests
@@ -34,15 +35,15 @@ CAPTURE = "21km_K11_night.mat"
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A capture, and where the app shows it."""
+    """A capture, and the address at which the app shows it."""
 
     address: str
     capture: Capture
     image: RangeImage
     name: str
-    """Of the capture in files' names."""
+    """The capture's name in files' names."""
     pixel: tuple[int, int]
-    """One with a surface, and others to its right."""
+    """A pixel with a surface, which continues to its right."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,7 @@ def ranged(capture: Capture) -> RangeImage:
 
 
 BOTH = pytest.mark.parametrize("here", ["at_21_km", "facade"], indirect=True)
-"""Run on a real capture, too; the other tests use the simulated building."""
+"""Run on the real capture as well; other tests use the building only."""
 
 
 @pytest.fixture
@@ -95,20 +96,20 @@ def button(page: Page, name: str) -> Locator:
     return page.get_by_role("button", name=name, exact=True).filter(visible=True)
 
 
-def told_button(page: Page, name: str) -> Locator:
-    """One whose accessible name is a sentence that begins with what stands on it."""
+def described_button(page: Page, name: str) -> Locator:
+    """Return a button whose accessible name begins with its label."""
     named = re.compile(f"^{re.escape(name)}:")
     return page.get_by_role("button", name=named).filter(visible=True)
 
 
 def within(page: Page, across: float, down: float, figure: int = 0) -> tuple[float, float]:
-    """Where on the page a place in one of its figures is, in shares of its width and height."""
+    """Return the page position of a place in a figure, given in shares of its width and height."""
     box = page.locator(".bk-Figure").filter(visible=True).nth(figure).bounding_box()
     return box["x"] + across * box["width"], box["y"] + down * box["height"]
 
 
 def in_figure(page: Page, title: str, values: str) -> Any:
-    """What the browser knows of the ``figure`` on show whose title begins so."""
+    """Evaluate JavaScript with ``figure``, the visible figure whose title begins so."""
     found = page.wait_for_function(
         f"""(title) => {{
           {VIEWS}
@@ -126,12 +127,12 @@ def in_figure(page: Page, title: str, values: str) -> Any:
 
 
 def drawn(page: Page, title: str, layer: str, column: str) -> np.ndarray:
-    """Values of a layer of the figure on show whose title begins so."""
+    """Return values of a layer of the visible figure whose title begins so."""
     return np.array(in_figure(page, title, f"layer('{layer}').get_array('{column}')"), float)
 
 
 def of_picture(page: Page, values: str) -> Any:
-    """What the browser knows of the picture to navigate by, its model being ``found``."""
+    """Evaluate JavaScript with ``found``, the map's model."""
     return page.evaluate(f"""() => {{
       {VIEWS}
       const {{el, frame, model: found}} = views.find(({{model, el}}) =>
@@ -141,7 +142,7 @@ def of_picture(page: Page, values: str) -> Any:
 
 
 def place_at(page: Page, across: float, down: float) -> tuple[float, float]:
-    """Row and column at a place of the picture, in shares of its width and height."""
+    """Return row and column at a place of the map, given in shares of its width and height."""
     row, col = (
         f"frame.{axis}_scale.invert({share} * el.getBoundingClientRect().{side})"
         for axis, share, side in (("y", down, "height"), ("x", across, "width"))
@@ -152,11 +153,11 @@ def place_at(page: Page, across: float, down: float) -> tuple[float, float]:
 COUNTS, RATE, STAGES = "Counts, and the two scales", "Rate", "Residual, and enhanced"
 
 
-# -- what a user does ------------------------------------------------------------------------------
+# -- actions of a user -----------------------------------------------------------------------------
 
 
 def go_to(page: Page, row: int, col: int) -> None:
-    """Choose a pixel, the keyboard being at the picture then."""
+    """Choose a pixel, and focus the map."""
     enter(page, "Row", str(row))
     enter(page, "Column", str(col))
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
@@ -170,7 +171,7 @@ def choose_map(page: Page, name: str) -> None:
 
 
 def drag(page: Page, mode: str, *places: tuple[float, float]) -> None:
-    """Drag on the picture from one place to the others, in shares of its width and height."""
+    """Drag on the map from one place to the others, in shares of its width and height."""
     button(page, mode).click()
     first, *others = (within(page, *each) for each in places)
     page.mouse.move(*first)
@@ -182,13 +183,13 @@ def drag(page: Page, mode: str, *places: tuple[float, float]) -> None:
 
 
 def clear_region(page: Page) -> None:
-    told_button(page, "Clear region").click()
+    described_button(page, "Clear region").click()
     expect(button(page, "Pixel")).to_have_attribute("aria-pressed", "true")
     eventually(lambda: not region_in(page))
 
 
 def region_in(page: Page) -> tuple[tuple[float, float], ...]:
-    """Corners of the region that the address tells, none where it tells none."""
+    """Return the corners of the region in the address."""
     found = re.search(r"region=(\[\[.*?\]\])", address_of(page))
     numbers = re.findall(r"[-\d.]+", found[1]) if found else []
     return tuple(zip(map(float, numbers[::2]), map(float, numbers[1::2]), strict=True))
@@ -198,20 +199,22 @@ def region_in(page: Page) -> tuple[tuple[float, float], ...]:
 
 
 @BOTH
-def test_a_pixel_is_shown_with_all_that_is_known_of_it(here):
+def test_everything_about_a_pixel_is_shown(here):
     page, (row, col) = here.page, here.pixel
     expect(button(page, "Inspect")).to_have_attribute("aria-pressed", "true")
     go_to(page, row, col)
     tracking = core.TrackingParameters()
     report = inspection.pixel_report(here.capture, here.image, row, col, "tracking", tracking)
     for name, found in zip(("Signal S", "Background B", "SBR"), report.flux, strict=True):
-        expect(fact(page, name)).to_have_text(inspector_words.interval(found))
+        expect(fact(page, name)).to_have_text(text.interval(found))
     name, table = download(page, "numbers", "csv")
     assert name == f"{here.name}_tracking_numbers-row{row}-col{col}.csv"
+    saved = {row["quantity"]: row for row in DictReader(StringIO(table.decode()))}["SBR"]
     sbr = report.flux.sbr
-    assert f"\nSBR,{sbr.value:.3g},{sbr.low:.3g},{sbr.high:.3g},".encode() in table
-    told = fact(page, "Detections")
-    expect(told).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
+    ends = [float(saved[end]) for end in ("value", "low", "high")]
+    assert ends == pytest.approx([sbr.value, sbr.low, sbr.high])
+    shown = fact(page, "Detections")
+    expect(shown).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
     verdict = f"Verdict: {report.verdict.health}. {report.verdict.why}"
     expect(page.get_by_text(verdict)).to_be_visible()
     for title in ("Rank", "Bin", "Score", "Probability"):
@@ -252,7 +255,7 @@ def test_keys_taps_and_fields_move_the_pixel(here):
     expect(refused).to_be_hidden()
 
 
-def test_a_move_paints_each_plot_once_and_then_tells_the_numbers(here):
+def test_a_move_paints_each_plot_once_and_then_writes_the_numbers(here):
     page, (row, col) = here.page, here.pixel
     go_to(page, row, col)
     page.evaluate("""() => {
@@ -265,20 +268,20 @@ def test_a_move_paints_each_plot_once_and_then_tells_the_numbers(here):
       };
     }""")
     fact(page, "Pixel").locator("xpath=ancestor::dl").evaluate(
-        "list => new MutationObserver(() => seen.push('told')).observe(list, { childList: true })"
+        "l => new MutationObserver(() => seen.push('numbers')).observe(l, { childList: true })"
     )
     page.keyboard.press("ArrowRight")
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 1}")
-    *painted, told = page.evaluate("seen")
-    assert told == "told"
+    *painted, last = page.evaluate("seen")
+    assert last == "numbers"
     assert len(painted) == len(set(painted)) == 4  # the picture, and three plots
 
 
-# -- the picture to navigate by --------------------------------------------------------------------
+# -- the map ---------------------------------------------------------------------------------------
 
 
 EACH = 17
-"""Every so many-th pixel of a map is read back: all of them take a browser a second."""
+"""Only every so many-th pixel of a map is compared, since all take the browser a second."""
 
 
 @BOTH
@@ -335,7 +338,7 @@ def test_zoom_stays_when_map_and_pixel_change(here):
     eventually(shows_all)
 
 
-def test_what_a_drag_does_is_chosen_before_the_server_hears_of_it(here):
+def test_what_a_drag_does_is_chosen_in_the_browser(here):
     page = here.page
     page.evaluate("""() => {
       WebSocket.prototype.send = () => {};
@@ -412,7 +415,7 @@ def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
         page.keyboard.press("ArrowRight")
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 4}")
     page.keyboard.press("p")
-    expect(page.get_by_text(inspector_words.TOO_MANY_PINS)).to_be_visible()
+    expect(page.get_by_text(text.TOO_MANY_PINS)).to_be_visible()
     button(page, "Pins").click()
     headers = page.get_by_role("rowheader").filter(visible=True)
     expect(headers).to_have_text(names)
@@ -422,13 +425,10 @@ def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
     while names:
         button(page, f"Remove {names.pop()}").press("Enter")
         expect(headers).to_have_text(names)
-    expect(page.get_by_text(inspector_words.NO_PINS)).to_be_visible()
+    expect(page.get_by_text(text.NO_PINS)).to_be_visible()
 
 
-# -- units -----------------------------------------------------------------------------------------
-
-
-def test_units_change_axes_and_tables_and_the_pointer_reads_all(here):
+def test_units_change_axes_and_table_and_the_pointer_reads_out_all(here):
     page = here.page
     for unit, title, other in (
         ("ns", "Time (ns)", "Range (m)"),
@@ -449,18 +449,15 @@ def test_units_change_axes_and_tables_and_the_pointer_reads_all(here):
     expect(tip).to_contain_text(re.compile(r"\d m"))
 
 
-# -- a phone ---------------------------------------------------------------------------------------
-
-
 def test_a_phone_shows_all_parts_below_each_other(page, facade):
     page = page(facade.address, width=390, height=844)
-    told = page.get_by_text("64 × 64 pixels, 334 bins")
+    shown = page.get_by_text("64 × 64 pixels, 334 bins")
     for subject, n_plots in (("Capture", 3), ("Region", 1), ("Pins", 3), ("Pixel", 4)):
         button(page, subject).click()
         plots = page.locator(".bk-Figure").filter(visible=True)
         expect(plots).to_have_count(n_plots)
         bottom = 0.0
-        for box in [*(plot.bounding_box() for plot in plots.all()), told.bounding_box()]:
+        for box in [*(plot.bounding_box() for plot in plots.all()), shown.bounding_box()]:
             assert 0 <= box["x"] < box["x"] + box["width"] <= 390
             assert box["y"] >= bottom
             bottom = box["y"] + box["height"]
@@ -471,47 +468,39 @@ def test_a_phone_shows_all_parts_below_each_other(page, facade):
 
 @pytest.fixture
 def whole(here) -> Inspected:
-    """The page on its capture as a whole."""
+    """The page with its section on the capture."""
     button(here.page, "Capture").click()
     return here
-
-
-def bins_told(here: Inspected, n_bins: int | None = None) -> Locator:
-    """The sentence on what is looked at, where it tells so many bins; all if not given."""
-    rows, cols = here.capture.shape
-    bins = n_bins or here.capture.acquisition.n_bins
-    return here.page.get_by_text(f"{rows} × {cols} pixels, {bins} bins")
 
 
 @BOTH
 def test_the_capture_is_reported(whole):
     report = inspection.capture_report(whole.capture)
     for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.flux, strict=True):
-        expect(fact(whole.page, name)).to_have_text(inspector_words.interval(found))
-    told = whole.page.get_by_text(f"Signal, background and SBR: {report.flux_method}")
-    expect(told).to_be_visible()
+        expect(fact(whole.page, name)).to_have_text(text.interval(found))
+    shown = whole.page.get_by_text(f"Signal, background and SBR: {report.flux_method}")
+    expect(shown).to_be_visible()
     counts = drawn(whole.page, "Counts of all pixels", "raw", "raw")
     np.testing.assert_array_equal(counts, report.histogram)
 
 
-@BOTH
-def test_accuracy_is_studied_and_a_bar_tells_how_far(whole):
-    page, has_truth = whole.page, whole.capture.truth_range_m is not None
+def test_accuracy_is_studied_and_a_bar_shows_the_progress(whole):
+    page = whole.page
     done = page.get_by_text(re.compile("^Done: 8"))
     expect(done).to_be_visible()
     *_, bar = page.get_by_role("progressbar").filter(visible=True).all()
     bar.evaluate("""(bar) => {
-      window.told = [];
-      new MutationObserver(() => told.push(Number(bar.ariaValueNow)))
+      window.seen = [];
+      new MutationObserver(() => seen.push(Number(bar.ariaValueNow)))
         .observe(bar, { attributeFilter: ["aria-valuenow"] });
     }""")
-    told_button(page, "Compute").click()
-    eventually(lambda: page.evaluate("told.at(-1)") == 100)
-    told = page.evaluate("told")
-    assert told == sorted(told)
-    assert any(0 < each < 100 for each in told)
+    described_button(page, "Compute").click()
+    eventually(lambda: page.evaluate("seen.at(-1)") == 100)
+    shares = page.evaluate("seen")
+    assert shares == sorted(shares)
+    assert any(0 < each < 100 for each in shares)
     expect(done).to_be_visible()
-    title = "Accuracy against pulses" if has_truth else "Agreement with all pulses"
+    title = "Accuracy against number"
     near, taken = (drawn(page, title, "points", column) for column in ("value", "pulses"))
     expected = inspection.accuracy_over_pulses(
         whole.capture, (SHARES[4], 1.0), "tracking", core.TrackingParameters()
@@ -522,7 +511,7 @@ def test_accuracy_is_studied_and_a_bar_tells_how_far(whole):
 
 @BOTH
 def test_fewer_pulses_are_taken_live(whole):
-    page, slide = whole.page, slider(whole.page, "Pulses accumulated (of all)").filter(visible=True)
+    page, slide = whole.page, slider(whole.page, "Pulses used (of all)").filter(visible=True)
     for _ in range(3):
         slide.press("PageDown")
     share = float(slide.get_attribute("aria-valuetext").split()[0])
@@ -533,16 +522,17 @@ def test_fewer_pulses_are_taken_live(whole):
     eventually(lambda: np.array_equal(drawn(page, "Counts of all pixels", "raw", "raw"), counts))
 
 
-@BOTH
-def test_what_is_suggested_is_told_with_its_reason_and_taken(whole):
+def test_suggestions_are_shown_with_reasons_and_applied(whole):
     page, suggested = whole.page, inspection.capture_report(whole.capture).suggestion
     first, end = suggested.gate
-    for told in (
+    for shown in (
         f"Suggested gate, in bins: {first} to {end}. {suggested.why_gate}",
         f"Suggested T_n: {suggested.t_n}. {suggested.why_t_n}",
     ):
-        expect(page.get_by_text(told)).to_be_visible()
-    apply_t_n, apply_gate = (told_button(page, f"Apply {name}") for name in ("T_n", "the gate"))
+        expect(page.get_by_text(shown)).to_be_visible()
+    apply_t_n, apply_gate = (
+        described_button(page, f"Apply {name}") for name in ("T_n", "the gate")
+    )
     t_n = slider(page, "T_n (bins)")
     for _ in range(2):  # one of them is not the one that is suggested
         t_n.press("PageUp")
@@ -550,6 +540,7 @@ def test_what_is_suggested_is_told_with_its_reason_and_taken(whole):
     expect(t_n).to_have_attribute("aria-valuetext", f"{suggested.t_n} bins")
     expect(apply_t_n).to_be_disabled()
     apply_gate.click()
-    expect(bins_told(whole, end - first)).to_be_visible()
+    rows, cols = whole.capture.shape
+    expect(page.get_by_text(f"{rows} × {cols} pixels, {end - first} bins")).to_be_visible()
     within_gate = core.reductions.cut_gate(whole.capture, first, end)
     expect(fact(page, "Detections")).to_have_text(f"{within_gate.counts.mean():.4g}")

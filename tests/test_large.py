@@ -1,4 +1,4 @@
-"""Captures larger than memory: a preview, then only what is looked at."""
+"""Captures larger than memory: a preview, and windows that are read in full."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from playwright.sync_api import Page, expect
 import core
 from app.__main__ import main
 from app.model import large
-from app.model.address import Wanted
+from app.model.address import Link
 from app.model.colors import image_of
 from app.model.large import LIMIT, Grid, most_whole_bytes
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from app.model.store import built_in_sources, compute, file_source
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
@@ -30,9 +30,9 @@ from core.io import ReadOptions
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT, fact, serving
-from tests.test_app import ask, complaint, control, told
+from tests.test_app import alert_of, ask, values_of
 from tests.test_downloads import columns_of, written
-from tests.threads import HeldLayout
+from tests.threads import HeldLayout, control
 
 ROWS, COLS, CHUNK = 96, 128, 16
 PIECES = ROWS * COLS // CHUNK**2
@@ -41,7 +41,7 @@ BINS = core.scenes["building"]().acquisition.n_bins
 
 @pytest.fixture(scope="module")
 def building():
-    """Of the size that a small test affords."""
+    """A building small enough for a test."""
     scene = core.scenes["building"](COLS)
     scene = core.Scene(scene.range_m[:ROWS])
     acquisition = core.scenes["building"](COLS).acquisition
@@ -71,8 +71,8 @@ def path(building, small, tmp_path):
 
 @pytest.fixture
 def slow(monkeypatch):
-    """Nothing more than the first few pieces is read before a preview is shown."""
-    monkeypatch.setattr(large, "AT_ONCE_S", 0.0)
+    """Read only the first few pieces before a preview is shown; return the windows read."""
+    monkeypatch.setattr(large, "FIRST_READ_S", 0.0)
     read_some = core.out_of_core.windows.WindowReader.read_some
     steps = []
 
@@ -88,10 +88,10 @@ def never():
     return False
 
 
-# -- what is held as a whole -----------------------------------------------------------------------
+# -- limits ----------------------------------------------------------------------------------------
 
 
-def test_size_decides_what_is_held_as_a_whole(path, building, monkeypatch):
+def test_captures_up_to_the_limit_are_held_in_memory(path, building, monkeypatch):
     reading = ReadOptions()
     assert file_source(path).large(reading) is not None
     monkeypatch.setenv(LIMIT, str(building.cube.nbytes))
@@ -114,7 +114,7 @@ def test_a_format_without_windows_is_refused_with_a_remedy_that_works(building, 
 # -- the preview -----------------------------------------------------------------------------------
 
 
-def test_a_preview_fills_up_and_then_rests(path, building, slow):
+def test_a_preview_is_read_once_in_growing_parts(path, building, slow):
     source = file_source(path)
     answers = [compute(ask(source), None)]
     file = answers[0].cutout.file
@@ -136,7 +136,7 @@ def large_share(pieces):
     return pieces / PIECES
 
 
-def test_what_is_not_read_yet_is_blank(path, slow):
+def test_unread_pixels_are_blank(path, slow):
     answer = compute(ask(file_source(path)), None)
     for kind in ("Counts", "Estimate", "Confidence"):
         image, _ = image_of(answer, kind, 0.0)
@@ -156,7 +156,7 @@ def test_reading_ends_when_it_is_cancelled(path, slow):
 # -- windows ---------------------------------------------------------------------------------------
 
 
-def test_a_window_is_read_once_and_says_what_the_whole_says(path, building, slow):
+def test_a_window_is_read_once_and_has_the_flux_of_the_whole(path, building, slow):
     source, window = file_source(path), Window((40, 70), (30, 62))
     answer = compute(ask(source, window=window), None)
     assert set(slow) == {window}
@@ -184,7 +184,15 @@ def test_only_one_window_is_kept(path):
     assert file.cutout(one.window) is not one
 
 
-@pytest.mark.parametrize("less", [Less(), Less(skip=2), Less(pool=3), Less(skip=3, pool=2)])
+@pytest.mark.parametrize(
+    "less",
+    [
+        ReductionSettings(),
+        ReductionSettings(skip=2),
+        ReductionSettings(pool=3),
+        ReductionSettings(skip=3, pool=2),
+    ],
+)
 def test_pixels_know_their_places_in_the_file(path, less):
     window = Window((8, 90), (5, 120), 3)
     answer = compute(ask(file_source(path), window=window, less=less), None)
@@ -198,13 +206,11 @@ def test_pixels_know_their_places_in_the_file(path, less):
         assert answer.grid.pixel(*place) == (row, col)
 
 
-def test_what_is_in_memory_as_a_whole_has_its_own_places():
+def test_a_capture_in_memory_has_its_own_rows_and_columns():
     assert compute(ask("sample"), None).grid == Grid()
 
 
-def test_a_file_that_cannot_be_held_is_refused_in_words_before_anything_is_served(
-    monkeypatch, capsys
-):
+def test_a_file_that_is_too_large_is_refused_before_the_server_starts(monkeypatch, capsys):
     monkeypatch.setenv(LIMIT, "1000")
     with pytest.raises(SystemExit):
         main([str(ROOT / "assets" / "sample_capture.npz")])
@@ -231,117 +237,106 @@ def test_other_bounds_are_refused(text):
 
 
 @pytest.fixture
-def looking(path):
-    """A page on a large file, its thread in the hands of the test."""
-    return HeldLayout({"file": file_source(path)} | built_in_sources(), Wanted({"page": "Explore"}))
+def app(path):
+    """The app on a large file, its page's thread in the hands of the test."""
+    return HeldLayout({"file": file_source(path)} | built_in_sources(), Link({"page": "Explore"}))
 
 
-def settle(page, holds):
-    while not holds():
-        page.tasks.run_one()
-
-
-def taken_away(page):
-    """First and last row and column of the image's table, and how many pixels it holds."""
-    table = page.contents["Explore"].image_shown().files["csv"]
+def saved_window(app):
+    """Return first and last row and column of the image's table, and its number of pixels."""
+    table = app.contents["Explore"].image_shown().files["csv"]
     rows, cols, shown = columns_of(written(table)).values()
-    session = page.session
+    session = app.session
     values, _ = image_of(session.answer, "Estimate", session.state.viewing.least_confidence)
     at = [session.answer.grid.pixel(*each) for each in zip(rows, cols, strict=True)]
     np.testing.assert_array_equal(shown, [values[each] for each in at])
     return (rows.min(), rows.max()), (cols.min(), cols.max()), rows.size
 
 
-def test_the_table_of_a_preview_holds_the_pixels_in_view(looking):
-    session, explore = looking.session, looking.contents["Explore"]
-    settle(looking, lambda: session.answer.cutout.is_final)
+def test_the_table_of_a_preview_holds_the_pixels_in_view(app):
+    session, explore = app.session, app.contents["Explore"]
+    app.tasks.run_until(lambda: session.answer.cutout.is_final)
     step = session.answer.grid.step
     assert step > 1
     explore.image.figure.x_range.update(start=60.2, end=90.1)
-    _, (first, last), _ = taken_away(looking)
+    _, (first, last), _ = saved_window(app)
     assert 60.2 - step / 2 < first <= 60.2 + step / 2
     assert 90.1 - step / 2 <= last < 90.1 + step / 2
 
 
-def fields(page):
-    return [control(page, name).value for name in ("Rows shown", "Columns shown")]
+def read_window(app, rows, cols):
+    control(app, "Rows shown").value, control(app, "Columns shown").value = rows, cols
+    control(app, "Read window").clicks += 1
 
 
-def test_a_page_reads_on_until_the_preview_is_whole(looking):
-    settle(looking, lambda: looking.session.answer.cutout.is_final)
-    assert looking.session.answer.cutout.read == 1.0
-    assert fields(looking) == [f"0 to {ROWS - 1}", f"0 to {COLS - 1}"]
-    settle(looking, lambda: control(looking, "Cancel").disabled)
+def test_a_page_reads_on_until_the_preview_is_whole(app):
+    app.tasks.run_until(lambda: app.session.answer.cutout.is_final)
+    assert app.session.answer.cutout.read == 1.0
+    assert control(app, "Rows shown").value == f"0 to {ROWS - 1}"
+    assert control(app, "Columns shown").value == f"0 to {COLS - 1}"
+    app.tasks.run_until(lambda: control(app, "Cancel").disabled)
 
 
-def test_looking_closer_keeps_the_pixel_and_tells_its_place(looking):
-    session, explore = looking.session, looking.contents["Explore"]
-    settle(looking, lambda: session.answer.cutout.is_final and control(looking, "Cancel").disabled)
+def test_a_window_keeps_the_pixel_and_shows_its_place_in_the_file(app):
+    session, explore = app.session, app.contents["Explore"]
+    app.tasks.run_until(lambda: session.answer.cutout.is_final and control(app, "Cancel").disabled)
     session.choose_pixel(10, 12)
-    looking.settle()
+    app.settle()
     place = session.answer.grid.place(10, 12)
     histogram = session.answer.capture.cube[10, 12]
-    control(looking, "Rows shown").value, control(looking, "Columns shown").value = (
-        "30 to 69",
-        "20 to 79",
-    )
-    control(looking, "Look closer").clicks += 1
-    assert not control(looking, "Cancel").disabled
-    settle(looking, lambda: not session.answer.cutout.is_preview)
+    read_window(app, "30 to 69", "20 to 79")
+    assert not control(app, "Cancel").disabled
+    app.tasks.run_until(lambda: not session.answer.cutout.is_preview)
     assert session.state.window == session.answer.cutout.window == Window((30, 70), (20, 80))
     assert session.answer.grid.place(*session.state.pixel) == place
     np.testing.assert_array_equal(session.answer.capture.cube[session.state.pixel], histogram)
-    assert told(explore.numbers)["Pixel"] == "row {}, col {}".format(*place)
-    picture = explore.image._plot.source("picture").data
-    assert (picture["x"][0], picture["dw"][0]) == (19.5, 60)
-    assert taken_away(looking) == ((30, 69), (20, 79), 40 * 60)
+    assert values_of(explore.numbers)["Pixel"] == "row {}, col {}".format(*place)
+    (picture,) = (r for r in explore.image.figure.renderers if "image" in r.data_source.data)
+    assert [picture.data_source.data[name][0] for name in ("x", "dw")] == [19.5, 60]
+    assert saved_window(app) == ((30, 69), (20, 79), 40 * 60)
     name = downloads.explored(session).file_name("range image", "csv")
     assert "_rows30-69_cols20-79_" in name
     at = "row{} col{}".format(*place)
     assert downloads.pixel_plot(session, explore.signals.histogram.figure, "h").what == f"h {at}"
-    control(looking, "The whole").clicks += 1
-    settle(looking, lambda: session.answer.cutout.is_preview)
+    control(app, "Show all").clicks += 1
+    app.tasks.run_until(lambda: session.answer.cutout.is_preview)
     assert session.state.window is None
 
 
-def test_reading_ends_when_something_else_is_looked_at(looking):
-    session = looking.session
-    control(looking, "Look closer").clicks += 1
+def test_reading_ends_when_another_source_is_chosen(app):
+    session = app.session
+    control(app, "Read window").clicks += 1
     session.state.param.update(source="car")
-    settle(looking, lambda: session.answer.request.source.is_scene)
-    settle(looking, lambda: control(looking, "Cancel").disabled)
-    looking.settle()
+    app.tasks.run_until(lambda: session.answer.request.source.is_scene)
+    app.tasks.run_until(lambda: control(app, "Cancel").disabled)
+    app.settle()
     assert session.state.source == "car" and session.state.window is None
 
 
-def test_wrong_bounds_are_told_and_nothing_is_read(looking):
-    settle(looking, lambda: control(looking, "Cancel").disabled)
-    control(looking, "Rows shown").value = "90 to 200"
+def test_wrong_bounds_are_refused_and_nothing_is_read(app):
+    app.tasks.run_until(lambda: control(app, "Cancel").disabled)
+    control(app, "Rows shown").value = "90 to 200"
     with pytest.raises(ValueError, match=r"rows = '90 to 200'"):  # Panel hands it to the page
-        control(looking, "Look closer").clicks += 1
-    assert looking.session.state.window is None
+        control(app, "Read window").clicks += 1
+    assert app.session.state.window is None
 
 
-def test_a_damaged_part_is_told_and_the_page_goes_on(looking, path):
-    session = looking.session
-    settle(looking, lambda: session.answer.cutout.is_final and control(looking, "Cancel").disabled)
+def test_a_damaged_part_is_reported_and_the_page_continues(app, path):
+    session = app.session
+    app.tasks.run_until(lambda: session.answer.cutout.is_final and control(app, "Cancel").disabled)
     before = session.answer
     chunk = path / "counts" / "c" / "0" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:-9])
-    control(looking, "Rows shown").value, control(looking, "Columns shown").value = (
-        "0 to 9",
-        "0 to 9",
-    )
-    control(looking, "Look closer").clicks += 1
-    settle(looking, lambda: complaint(looking))
-    assert "counts cannot be read" in complaint(looking)
-    assert str(path.parent) not in complaint(looking)
+    read_window(app, "0 to 9", "0 to 9")
+    app.tasks.run_until(lambda: alert_of(app))
+    assert "counts cannot be read" in alert_of(app)
+    assert str(path.parent) not in alert_of(app)
     assert session.answer is before and session.state.window is None
     shutil.rmtree(path)
-    control(looking, "Look closer").clicks += 1
-    settle(looking, lambda: "has not gone" in complaint(looking))
-    control(looking, "l").value = 0.01
-    settle(looking, lambda: session.answer is not before)
+    control(app, "Read window").clicks += 1
+    app.tasks.run_until(lambda: "has not gone" in alert_of(app))
+    control(app, "l").value = 0.01
+    app.tasks.run_until(lambda: session.answer is not before)
     assert session.answer.request.tracking.l == 0.01
 
 
@@ -353,7 +348,7 @@ SIDE = 512
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
-    """Path of a large capture, and where the app shows it."""
+    """Path of a large capture, address of the app, and the capture."""
     scene = core.scenes["car"]()
     car = core.simulate(scene, scene.acquisition, core.Flux(sbr=1.0), seed=1)
     times = SIDE // car.shape[0]
@@ -377,7 +372,7 @@ def shows(page: Page, rows: str, cols: str) -> None:
 
 
 def zoom(page: Page) -> None:
-    """Drag a box on the picture."""
+    """Drag a box on the image."""
     box = page.locator("[data-part=image]").bounding_box()
     left, top = box["x"] + 0.4 * box["width"], box["y"] + 0.4 * box["height"]
     page.mouse.move(left, top)
@@ -390,14 +385,14 @@ def zoom(page: Page) -> None:
 
 @contextmanager
 def endless(chunk: Path) -> Iterator[None]:
-    """A chunk that takes for ever to be read, until this is over."""
+    """Replace a chunk by one that takes for ever to be read."""
     kept = chunk.read_bytes()
     chunk.unlink()
     os.mkfifo(chunk)
     try:
         yield
     finally:
-        chunk.open("wb").close()  # who waits for it reads its end
+        chunk.open("wb").close()  # readers see the end of the file
         chunk.unlink()
         chunk.write_bytes(kept)
 
@@ -406,7 +401,7 @@ def endless(chunk: Path) -> Iterator[None]:
 def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     path, address, capture = served
     opened = page(address)
-    closer = opened.get_by_role("button", name="Look closer")
+    closer = opened.get_by_role("button", name="Read window")
     cancel = opened.get_by_role("button", name="Cancel").filter(visible=True)
     preview = opened.get_by_text(f"Preview of {SIDE} × {SIDE} pixels, 1 of each 2 × 2")
     expect(preview).to_be_visible()
@@ -414,9 +409,9 @@ def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
     shows(opened, "0 to 511", "0 to 511")
     zoom(opened)
     closer.click()
-    told = opened.get_by_text(re.compile("^Seen: rows"))
-    expect(told).to_be_visible()
-    seen = re.fullmatch(r"Seen: rows (.*), columns (.*), of 512 × 512 pixels\.", told.inner_text())
+    line = opened.get_by_text(re.compile("^Shown: rows"))
+    expect(line).to_be_visible()
+    seen = re.fullmatch(r"Shown: rows (.*), columns (.*), of 512 × 512 pixels\.", line.inner_text())
     shows(opened, *seen.groups())
     first, last = map(int, seen[1].split(" to "))
     assert 0 < first < last < SIDE - 1
@@ -436,15 +431,15 @@ def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
         )
         cancel.click()
         expect(cancel).to_be_disabled()
-        expect(told).to_have_text(seen[0])
+        expect(line).to_have_text(seen[0])
     kept = chunk.read_bytes()
     chunk.write_bytes(kept[:-9])
     closer.click()
     expect(opened.get_by_role("alert").filter(has_text="is damaged")).to_be_visible()
-    expect(told).to_have_text(seen[0])
+    expect(line).to_have_text(seen[0])
     chunk.write_bytes(kept)
     closer.click()
-    expect(told).to_have_text("Seen: rows 0 to 63, columns 0 to 63, of 512 × 512 pixels.")
-    opened.get_by_role("button", name="The whole").click()
+    expect(line).to_have_text("Shown: rows 0 to 63, columns 0 to 63, of 512 × 512 pixels.")
+    opened.get_by_role("button", name="Show all").click()
     expect(preview).to_be_visible()
     shows(opened, "0 to 511", "0 to 511")

@@ -1,4 +1,4 @@
-"""The stopwatch of ``python -m tests.latency``: that it measures, not how fast the app is."""
+"""The stopwatch of ``python -m tests.latency`` measures; how fast the app is, is not tested."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits on a client before the server knows who it is."""
+"""Limits on clients that the server does not know yet."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEAD = f"POST / HTTP/1.1\r\nHost: {NAME}\r\nContent-Type: application/x-www-form
 
 @pytest.fixture
 def away():
-    """A server that asks for a token."""
+    """A server that requires a token."""
     options = ("--address", "0.0.0.0", "--origin", NAME)
     with serving(*options, **{TOKEN_VARIABLE: TOKEN}) as running_at:
         yield Site(running_at)
@@ -28,7 +28,7 @@ def away():
 
 @pytest.fixture
 def resident_bytes(away):
-    """How much memory the server has."""
+    """Resident memory of the server."""
     server = server_process(away.address)
     return lambda: server.memory_info().rss
 
@@ -68,8 +68,8 @@ def test_a_large_body_is_refused_before_it_is_read(away, resident_bytes):
     assert away.ask("/", Host=NAME)[0] == 403
 
 
-def test_half_requests_end_and_keep_nobody_out(away):
-    """More connections than are kept: some without a header, some without the body announced."""
+def test_incomplete_requests_end_and_block_no_client(away):
+    """More connections than accepted, with half a header or half a body."""
     halves = [
         sending(away, "GET / HTTP/1.1\r\nHo" if n % 2 else f"{HEAD}Content-Length: 9\r\n\r\ntok")
         for n in range(MOST_CONNECTIONS + 50)
@@ -82,7 +82,7 @@ def test_half_requests_end_and_keep_nobody_out(away):
         half.close()
 
 
-def test_a_connection_that_goes_on_slowly_ends_too(away):
+def test_a_slow_connection_ends(away):
     slow, gone = sending(away, f"{HEAD}Content-Length: 50000\r\n\r\n"), []
 
     def drip():
@@ -97,11 +97,11 @@ def test_a_connection_that_goes_on_slowly_ends_too(away):
     slow.close()
 
 
-def test_after_some_wrong_tokens_none_is_looked_at_for_a_while(away):
+def test_after_some_wrong_tokens_none_is_checked_for_a_while(away):
     statuses = [try_token(away, f"wrong {n}")[0] for n in range(WrongTokens.FREE + 5)]
     assert statuses[: WrongTokens.FREE + 1] == [403] * (WrongTokens.FREE + 1)
     assert 429 in statuses
-    status, headers, text = try_token(away, TOKEN)  # else many at once would find it
+    status, headers, text = try_token(away, TOKEN)  # else parallel attempts would succeed
     assert status == 429
     assert f"Try again in {headers['Retry-After']} s" in text
     assert "Set-Cookie" not in headers
@@ -135,7 +135,7 @@ def test_delays_double_up_to_a_bound_and_end_with_the_right_token():
     assert wrong.delay_s("192.0.2.1") == 0
 
 
-def test_who_owns_a_network_of_addresses_has_one_count():
+def test_an_ipv6_network_has_one_count():
     wrong = WrongTokens(Clock())
     for n in range(WrongTokens.FREE + 1):
         wrong.add(f"2001:db8::{n:x}")
@@ -143,7 +143,7 @@ def test_who_owns_a_network_of_addresses_has_one_count():
     assert wrong.delay_s("2001:db8:0:1::1") == 0
 
 
-def test_of_many_addresses_the_oldest_are_forgotten(monkeypatch):
+def test_the_oldest_of_many_addresses_are_forgotten(monkeypatch):
     monkeypatch.setattr(WrongTokens, "MOST_ADDRESSES", 3)
     wrong = WrongTokens(Clock())
     for _ in range(WrongTokens.FREE + 1):
@@ -154,8 +154,8 @@ def test_of_many_addresses_the_oldest_are_forgotten(monkeypatch):
 
 
 @pytest.mark.parametrize("port", ["70000", "-1", "x", "65536"])
-def test_a_port_that_is_none_is_refused_in_one_sentence(port, capsys):
+def test_an_invalid_port_is_refused(port, capsys):
     with pytest.raises(SystemExit):
         main(["--port", port])
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert f"{port!r} is not a port: give 0 to 65535." in said
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert f"{port!r} is not a port: give 0 to 65535." in printed

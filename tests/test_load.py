@@ -1,4 +1,4 @@
-"""``python -m tests.load`` in short: answers arrive, memory stays, verdicts are as measured."""
+"""``python -m tests.load`` in short: responses arrive, memory does not grow, verdicts are right."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from tests.load import Bounds, Growth, Load, as_markdown, growth, load, server_m
 
 @pytest.fixture
 def address():
-    """A server of its own: what it holds is measured."""
+    """A server of its own, since its memory is measured."""
     with serving() as running_at:
         yield running_at
 
 
-def test_sessions_at_once_are_all_answered_and_none_wrongly(address):
+def test_all_sessions_are_answered(address):
     used = asyncio.run(load(address, server_mb(address), sessions=3, seconds=2.0, forgotten_s=0.0))
     assert used.troubles == []
     assert used.latencies_s.size > 40
     assert used.session_mb <= Bounds().session_mb
 
 
-def test_interactions_do_not_pile_up(address):
+def test_interactions_leave_no_memory(address):
     grown = asyncio.run(growth(address, server_mb(address), interactions=150, warm=40))
     assert grown.troubles == []
     assert grown.after_mb - grown.before_mb < 15
 
 
-def test_a_bound_that_is_missed_is_told():
+def test_a_missed_requirement_is_reported():
     used = Load(2, np.array([0.1, 0.2]), [], 500.0, 540.0, 510.0)
     grown = Growth(100, [], 510.0, 515.0)
     bounds = Bounds()

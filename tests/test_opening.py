@@ -1,4 +1,4 @@
-"""A page's head comes before the page is built, and head and page are one whole page."""
+"""The head of a page is sent before the page is built, and both make one complete page."""
 
 from __future__ import annotations
 
@@ -9,30 +9,29 @@ import panel_material_ui as pmui
 import pytest
 from tornado.httpclient import AsyncHTTPClient
 
-from app.model import text as words
+from app.model import text
 from app.server import opening
 from app.server.access import Access
-from app.server.opening import Answers, PageHandler
+from app.server.opening import MOST_WAITS, PageHandler, ResponseCount, when_quiet
 from app.server.ports import free_port
 from app.server.serve import server_of
 from app.widgets.controls import Sentence
 
 
 @pytest.fixture(autouse=True)
-def as_before(monkeypatch):
-    """No head is known yet."""
+def no_known_head(monkeypatch):
     monkeypatch.setattr(PageHandler, "known_head", "")
 
 
-def asked(build, *queries):
-    """Each page that a server of its own answers with, and what there was before it was built."""
+def fetched(build, *queries):
+    """Pages of a server: the part that was sent before the page was built, and the whole."""
     built = []
 
     def page():
         built.append(True)
         return build(len(built))
 
-    async def ask():
+    async def fetch():
         port = free_port("127.0.0.1")
         server = server_of(page, Access.of("127.0.0.1", port, [], None), "127.0.0.1", port)
         server.start()
@@ -49,67 +48,66 @@ def asked(build, *queries):
         server.stop()
         return pages
 
-    return asyncio.run(ask())
+    return asyncio.run(fetch())
 
 
-def alike(page):
-    """A page without what is its own: names of models, and its session's token."""
+def common(page):
+    """A page without names of models and its session's token."""
     return re.sub(r'"token":"[^"]*"|p\d{4,}|[0-9a-f]{8}(-[0-9a-f]{4,12}){4}', "", page)
 
 
-def of_material(_number):
-    return pmui.Page(main=["what it shows"])
+def material_page(_number):
+    return pmui.Page(main=["content"])
 
 
-def test_a_head_comes_before_its_page_is_built():
-    (nothing, first), (head, second), (again, third) = asked(of_material, "", "", "?l=0.1")
-    assert nothing == ""
+def test_the_head_is_sent_before_the_page_is_built():
+    (early, first), (head, second), (again, third) = fetched(material_page, "", "", "?l=0.1")
+    assert early == ""
     assert "<title>firstphoton</title>" in head
-    assert "<script" in head
-    assert "<body" not in head
+    assert "<script" in head and "<body" not in head
     assert head == again
-    assert alike(first) == alike(second) == alike(third)
+    assert common(first) == common(second) == common(third)
     assert first.count("</head>") == 1
 
 
-def test_what_an_address_asks_for_is_in_no_other_pages_head():
-    (_, dark), (nothing, light), (head, _) = asked(of_material, "?theme=dark", "", "?theme=dark")
-    assert alike(dark) != alike(light)
-    assert nothing == ""
+def test_a_query_changes_no_other_head():
+    (_, dark), (early, light), (head, _) = fetched(material_page, "?theme=dark", "", "?theme=dark")
+    assert common(dark) != common(light)
+    assert early == ""
     assert head == light.partition("</head>")[0]
 
 
-def test_a_page_that_cannot_be_built_lends_its_head_to_none_and_stands_below_any():
+def test_a_page_that_could_not_be_built_leaves_its_head_to_none():
     def build(number):
-        return Sentence(text=words.NO_PAGE) if number in (1, 3) else of_material(number)
+        return Sentence(text=text.NO_PAGE) if number in (1, 3) else material_page(number)
 
-    (_, failed), (nothing, good), (head, told), (_, last) = asked(build, "", "", "", "")
-    assert nothing == ""
-    assert alike(good) == alike(last)
+    (_, failed), (early, good), (head, mixed), (_, last) = fetched(build, "", "", "", "")
+    assert early == ""
+    assert common(good) == common(last)
     assert head == good.partition("</head>")[0]
-    assert alike(told).endswith(alike(failed).partition("</head>")[2])
+    assert common(mixed).endswith(common(failed).partition("</head>")[2])
 
 
-def test_a_busy_server_is_not_waited_for_in_vain(monkeypatch):
-    looks = []
+def test_a_busy_server_does_not_delay_a_page_for_ever(monkeypatch):
+    waits = []
 
-    async def busily(_seconds):
-        looks.append(True)
-        Answers.count += 1
+    async def busy(_seconds):
+        waits.append(True)
+        ResponseCount.count += 1
 
-    monkeypatch.setattr(opening.asyncio, "sleep", busily)
-    asyncio.run(opening._quiet())
-    assert len(looks) == opening.LOOKS
+    monkeypatch.setattr(opening.asyncio, "sleep", busy)
+    asyncio.run(when_quiet())
+    assert len(waits) == MOST_WAITS
 
 
 @pytest.mark.browser
-def test_the_widgets_module_is_fetched_once_before_the_page_is_there(page):
+def test_the_widgets_module_is_fetched_once_and_early(page):
     new = page()
     started_ms = new.evaluate("""performance.getEntriesByType("resource")
       .filter(({ name }) => name.includes("panel-material-ui.bundle.js"))
       .map(({ startTime }) => startTime)""")
-    there_ms = new.evaluate(
+    loaded_ms = new.evaluate(
         "performance.timing.domContentLoadedEventStart - performance.timeOrigin"
     )
     assert len(started_ms) == 1
-    assert started_ms[0] < there_ms
+    assert started_ms[0] < loaded_ms

@@ -1,9 +1,11 @@
-"""Patches of Panel and Bokeh: they can be left out, and give what the libraries give."""
+"""Patches of Panel and Bokeh can be left out, and return what the libraries return."""
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import json
+import re
 import weakref
 from pathlib import Path
 
@@ -17,24 +19,27 @@ from bokeh.plotting import figure
 from playwright.sync_api import expect
 
 import app.server.patches
-from app.server.garbage import collect_all, spare
+from app.server.garbage import collect_all, freeze_all
 from app.server.patches import OFF_VARIABLE, PATCHES, Patch, in_use
 from app.server.patches.default_values import cached
-from app.server.patches.incoming_messages import QuickDeserializer
 from app.server.patches.outgoing_messages import INLINE_BYTES, QuickSerializer
-from tests.browser import fact, open_page, serving
-from tests.test_browser import slider
+from app.server.patches.removed_models import PartialDeserializer
+from tests.broken import WHEN_TAPPED
+from tests.browser import ROOT, fact, open_page, serving, slider
+from tests.load import opened
 
 FOLDER = Path(app.server.patches.__file__).parent
 
 # -- switches --------------------------------------------------------------------------------------
 
 
-def test_each_patch_is_a_file_that_states_its_upstream_issue():
+def test_each_file_states_the_upstream_issue_and_a_gain_or_a_fix():
     files = [*FOLDER.glob("*.js"), *(f for f in FOLDER.glob("*.py") if f.stem != "__init__")]
     assert sorted(f.stem for f in files) == sorted(patch.name for patch in PATCHES)
     for file in files:
-        assert "Upstream:" in file.read_text(encoding="utf-8"), file.name
+        text = file.read_text(encoding="utf-8")
+        assert re.search(r"Upstream:", text), file.name
+        assert re.search(r"Gain:|Fixes", text), file.name
 
 
 def test_patches_are_left_out_by_name(monkeypatch):
@@ -80,14 +85,14 @@ def document():
     return made
 
 
-def test_a_message_names_known_models_and_spells_out_new_ones(document):
+def test_a_message_refers_to_known_models_and_contains_new_ones(document):
     (plot,) = document.roots
     known, new = plot.x_range, Range1d(0, 5)
-    told = [known, new, [known, {"a": plot.y_range}], np.zeros(INLINE_BYTES)]
+    sent = [known, new, [known, {"a": plot.y_range}], np.zeros(INLINE_BYTES)]
     written = []
     for serializer in (Serializer, QuickSerializer):
         made = serializer(references=set(document.models))
-        written.append(made.encode(told))
+        written.append(made.encode(sent))
         assert made.has_ref(known)
         assert made.has_ref(new)
         assert not made.has_ref(Range1d())
@@ -97,7 +102,7 @@ def test_a_message_names_known_models_and_spells_out_new_ones(document):
     assert written[1][0] == known.ref
 
 
-def test_few_numbers_travel_within_the_message():
+def test_short_arrays_are_part_of_the_message():
     few, many = np.arange(5, dtype=np.float32), np.zeros(INLINE_BYTES + 1, np.uint8)
     serializer = QuickSerializer()
     message = json.loads(json.dumps(serializer.encode(few)))
@@ -107,7 +112,7 @@ def test_few_numbers_travel_within_the_message():
     assert [each.data.nbytes for each in serializer.buffers] == [many.nbytes]
 
 
-def test_defaults_are_found_once_for_all_models_of_a_kind(document):
+def test_a_default_is_computed_once_for_a_class(document):
     found, get = [], PropertyDescriptor._get_default
 
     def counting(descriptor, model):
@@ -125,37 +130,15 @@ def test_defaults_are_found_once_for_all_models_of_a_kind(document):
     assert found.count((Line, "tags")) > found.count((Line, "line_width")) == 1
 
 
-def test_defaults_that_may_be_changed_in_place_are_each_models_own():
+def test_mutable_defaults_are_not_shared():
     kept = cached(PropertyDescriptor._get_default)
     one, other = (kept(each.lookup("tags"), each) for each in (Range1d(), Range1d()))
     one.append("x")
     assert other == []
 
 
-def test_a_message_finds_known_models_and_makes_new_ones(document):
-    (plot,) = document.roots
-    new = Range1d(0, 5)
-    told = json.loads(json.dumps(Serializer(references={plot}).encode([plot, new, new])))
-    for deserializer in (Deserializer, QuickDeserializer):
-        made = deserializer(list(document.models), setter=None)
-        found, range_, again = made.decode(told)
-        assert found is plot
-        assert range_ is again
-        assert (range_.start, range_.end) == (0, 5)
-        assert made.has_ref(plot)
-        assert made.has_ref(range_)
-        assert not made.has_ref(Range1d())
-
-
-def test_a_model_that_comes_to_the_document_later_was_not_known(document):
-    made = QuickDeserializer(list(document.models))
-    later = Range1d()
-    document.add_root(later)
-    assert not made.has_ref(later)
-
-
 def patch(**changed):
-    """What a page would say of a model's attribute, by the model's id."""
+    """A message that sets attributes, by the id of the model."""
     events = [
         {"kind": "ModelChanged", "model": {"id": model}, "attr": "start", "new": value}
         for model, value in changed.items()
@@ -163,38 +146,62 @@ def patch(**changed):
     return {"events": events}
 
 
-def test_what_is_said_of_others_than_of_a_model_that_is_gone_is_heard(document, monkeypatch):
-    monkeypatch.setattr("bokeh.document.document.Deserializer", QuickDeserializer)
-    there, gone = Range1d(), Range1d()
-    document.add_root(there)
-    document.add_root(gone)
-    document.remove_root(gone)
-    heard = []
-    there.on_change("start", lambda attr, old, new: heard.append(new))
-    document.apply_json_patch(patch(**{gone.id: 1}))
-    document.apply_json_patch(patch(**{gone.id: 2, there.id: 3}))
-    document.apply_json_patch(patch(**{there.id: 4, gone.id: 5}))
-    assert heard == [3, 4]
+def test_only_events_of_removed_models_are_dropped(document, monkeypatch):
+    monkeypatch.setattr("bokeh.document.document.Deserializer", PartialDeserializer)
+    present, removed = Range1d(), Range1d()
+    document.add_root(present)
+    document.add_root(removed)
+    document.remove_root(removed)
+    values = []
+    present.on_change("start", lambda attr, old, new: values.append(new))
+    document.apply_json_patch(patch(**{removed.id: 1}))
+    document.apply_json_patch(patch(**{removed.id: 2, present.id: 3}))
+    document.apply_json_patch(patch(**{present.id: 4, removed.id: 5}))
+    assert values == [3, 4]
     with pytest.raises(UnknownReferenceError, match="never-there"):
-        document.apply_json_patch(patch(**{there.id: 6, "never-there": 7}))
-    assert there.start == 4
+        document.apply_json_patch(patch(**{present.id: 6, "never-there": 7}))
+    assert present.start == 4
 
 
-def test_all_in_use_is_passed_over_and_all_is_looked_through():
+def test_an_error_in_a_callback_of_bokeh_is_shown_without_a_traceback():
+    async def tap(address):
+        wire, _ = await opened(address, seed=0)
+        image = next(
+            key
+            for key, model in wire.models.items()
+            if model["name"] == "Figure"
+            and model["attributes"]["title"]["attributes"]["text"].startswith("Estimated")
+        )
+        row, col = WHEN_TAPPED
+        alert = wire.find("Sentence", warning=True), "text"
+        await wire.emit("tap", image, {"x": col, "y": row, "sx": 1, "sy": 1})
+        async with asyncio.timeout(60), wire.news:
+            await wire.news.wait_for(lambda: wire.values.get(alert) and wire.troubles)
+        wire.close()
+        return wire.values[alert], *wire.troubles
+
+    with serving(module="tests.broken") as address:
+        sentence, error = asyncio.run(tap(address))
+    assert "KeyError" in sentence
+    assert "The error is shown in the app." in error
+    assert str(ROOT) not in error
+
+
+def test_frozen_objects_are_collected_with_all_others():
     class Loop:
         def __init__(self):
             self.itself = self
 
-    left = Loop()
-    gone = weakref.ref(left)
-    spare()
+    loop = Loop()
+    alive = weakref.ref(loop)
+    freeze_all()
     try:
         assert gc.get_freeze_count() > 0
-        del left
+        del loop
         gc.collect()
-        assert gone() is not None
+        assert alive() is not None
         collect_all()
-        assert gone() is None
+        assert alive() is None
         assert gc.get_freeze_count() > 0
     finally:
         gc.unfreeze()

@@ -1,7 +1,8 @@
-"""No request runs code, ends the server or leaves a traceback."""
+"""No request runs code, ends the server or causes a traceback."""
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
@@ -18,7 +19,7 @@ from tests.wire import token_in
 
 REMOVED = {
     ("/metadata$", "MetadataHandler"),
-    ("/autoload.js$", "AutoloadJsHandler"),  # lends a session to any page
+    ("/autoload.js$", "AutoloadJsHandler"),  # gives a session to any page
     ("/?$", "RootHandler"),
     ("/static/(.*)$", "StaticHandler"),
 }
@@ -28,10 +29,7 @@ MARKER = "from pathlib import Path\nPath({!r}).touch()\n"
 
 @pytest.fixture(scope="module")
 def marked(tmp_path_factory):
-    """A server on whose path lies a module that leaves a file when it is run.
-
-    Also that file, and the one into which the server prints.
-    """
+    """A server that finds a module which writes a file when it is run; that file, and the log."""
     folder = tmp_path_factory.mktemp("modules")
     mark, log = folder / "mark", folder / "log"
     (folder / "leaves_a_mark.py").write_text(MARKER.format(str(mark)))
@@ -46,7 +44,6 @@ def routes(server) -> Iterator[tuple[str, type]]:
 
 
 def test_every_route_of_the_libraries_is_known():
-    """A route that a later version adds is not served; here it is seen, and can be judged."""
     options = {"port": 0, "show": False, "start": False, "verbose": False}
     server = pn.serve({"/": pn.Column}, **options)
     found = {(path, handler.__name__) for path, handler in routes(server)}
@@ -56,7 +53,7 @@ def test_every_route_of_the_libraries_is_known():
 
 @pytest.mark.parametrize("module", ["unittest.__main__", "this", "leaves_a_mark", "..", "", "core"])
 @pytest.mark.parametrize("site", [None, "cross-site"])
-def test_no_module_is_run_that_an_address_names(marked, module, site):
+def test_an_address_runs_no_module(marked, module, site):
     server, mark, _ = marked
     said = {} if site is None else {"Sec_Fetch_Site": site, "Sec_Fetch_Mode": "no-cors"}
     status, _, text = server.ask(RUN.format(module), **said)
@@ -77,12 +74,10 @@ def test_no_module_is_run_that_an_address_names(marked, module, site):
         "/components/app.widgets.connection/Nothing/_stylesheets/connection.css",
     ],
 )
-def test_of_a_component_nothing_is_served_but_its_files(address, path):
+def test_only_files_of_components_are_served(address, path):
     site = Site(address)
-    assert (
-        site.ask("/components/app.widgets.connection/Connection/_stylesheets/connection.css")[0]
-        == 200
-    )
+    file = "/components/app.widgets.connection/Connection/_stylesheets/connection.css"
+    assert site.ask(file)[0] == 200
     status, _, text = site.ask(path)
     assert 400 <= status < 500
     assert "Traceback" not in text
@@ -94,6 +89,13 @@ def test_of_a_component_nothing_is_served_but_its_files(address, path):
         ("HEAD", "/"),
         ("PUT", "/"),
         ("POST", "/"),
+        ("TRACE", "/"),
+        ("NONSENSE", "/"),
+        ("GET", "/%"),
+        ("GET", "/%00"),
+        ("GET", "/no/such/page"),
+        ("GET", "/" + "%41" * 10_000),
+        ("GET", "/static/..%2f..%2f..%2fetc/passwd"),
         ("GET", "/static/%00"),
         ("GET", "/static/js/bokeh.min.js%00"),
         ("GET", "/static/extensions/panel/%0a"),
@@ -104,7 +106,7 @@ def test_of_a_component_nothing_is_served_but_its_files(address, path):
         ("GET", "/ws"),
     ],
 )
-def test_what_is_not_served_is_refused_and_leaves_no_traceback(marked, method, path):
+def test_other_requests_are_refused_without_a_traceback(marked, method, path):
     server, _, log = marked
     status = server.ask(path, method)[0]
     assert 400 <= status < 500
@@ -114,16 +116,43 @@ def test_what_is_not_served_is_refused_and_leaves_no_traceback(marked, method, p
     assert "Traceback" not in printed
 
 
-@pytest.mark.parametrize("asked", ["bokeh-session-id=", "bokeh-session-id=a%20b", "bokeh-token=a"])
-def test_a_session_that_an_address_makes_up_is_ignored(marked, asked):
+MALFORMED = {
+    "two hosts": b"GET / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nHost: evil.example\r\n\r\n",
+    "a name with a space": b"GET / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nA b: c\r\n\r\n",
+    "negative length": b"POST / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nContent-Length: -1\r\n\r\n",
+    "a chunk of 2**63 bytes": b"POST / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n"
+    b"Transfer-Encoding: chunked\r\n\r\n8000000000000000\r\n",
+    "headers of 100 kB": b"GET / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nX: "
+    + b"x" * 100_000
+    + b"\r\n\r\n",
+    "TLS": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(200),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_malformed_requests_are_refused_without_a_traceback(marked, name):
     server, _, log = marked
-    status, _, text = server.ask(f"/?{asked}")
+    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as link:
+        link.sendall(MALFORMED[name].replace(b"%d", str(server.port).encode()))
+        try:
+            first = link.makefile("rb").readline()
+        except ConnectionError:
+            first = b""
+    assert first == b"" or 400 <= int(first.split()[1]) < 500
+    assert server.ask("/favicon.ico")[0] == 200
+    assert "Traceback" not in log.read_text()
+
+
+@pytest.mark.parametrize("query", ["bokeh-session-id=", "bokeh-session-id=a%20b", "bokeh-token=a"])
+def test_a_session_invented_by_an_address_is_ignored(marked, query):
+    server, _, log = marked
+    status, _, text = server.ask(f"/?{query}")
     assert status == 200
     assert get_session_id(token_in(text)) != "a b"
     assert "Traceback" not in log.read_text()
 
 
-def test_a_session_is_returned_to_from_its_own_page_alone(marked):
+def test_only_its_own_page_returns_to_a_session(marked):
     server, *_ = marked
     named = get_session_id(token_in(server.ask()[2]))
 

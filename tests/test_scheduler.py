@@ -1,4 +1,4 @@
-"""Order of work: the latest request wins, lanes are fair, pages take turns."""
+"""Order of background work: the latest request wins, lanes are fair, pages take turns."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import pytest
 
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane, Latest, LongWork, Step
-from app.tasks.turns import MESSAGES_FIRST, Turns
+from app.tasks.turns import ROUNDS_BETWEEN, Turns
 from tests.browser import eventually
 from tests.threads import HeldTasks
 
 # -- the latest request wins -----------------------------------------------------------------------
 
 
-class Desk:
-    """Requests that wait for a signal, and their outcomes."""
+class Client:
+    """Submits requests, which wait for a signal unless `is_free`, and keeps their results."""
 
     def __init__(self, page=None, lane=GENERAL, is_free=False):
         self.channel = Latest(page or PageTasks(), lane)
@@ -41,125 +41,115 @@ class Desk:
         self.channel.submit(lambda: 1 / 0, self.done.append, self.failed.append, lane)
 
 
-def test_the_latest_request_wins_and_the_overtaken_never_run():
-    desk = Desk()
-    desk.submit(0)
-    eventually(lambda: desk.ran)
+def test_only_the_first_and_the_latest_request_run():
+    client = Client()
+    client.submit(0)
+    eventually(lambda: client.ran)
     for name in range(1, 5):
-        desk.submit(name)
-    desk.go.set()
-    eventually(lambda: 4 in desk.done)
-    assert desk.ran == desk.done == [0, 4]
+        client.submit(name)
+    client.go.set()
+    eventually(lambda: 4 in client.done)
+    assert client.ran == client.done == [0, 4]
 
 
-def test_nothing_is_computed_ahead_of_a_page_that_is_still_drawing():
+def test_the_next_request_starts_after_the_page_has_drawn_the_last():
     page = HeldTasks()
-    desk = Desk(page, is_free=True)
-    desk.submit("first")
+    client = Client(page, is_free=True)
+    client.submit("first")
     eventually(lambda: not page.waiting.empty())
     for name in ("second", "third"):
-        desk.submit(name)
-    assert desk.ran == ["first"]
+        client.submit(name)
+    assert client.ran == ["first"]
     page.run_one()
     page.run_one()
-    assert desk.ran == desk.done == ["first", "third"]
+    assert client.ran == client.done == ["first", "third"]
 
 
 def test_a_failure_is_reported_and_the_next_request_runs():
     page = HeldTasks()
-    desk = Desk(page, is_free=True)
-    desk.fail()
+    client = Client(page, is_free=True)
+    client.fail()
     page.run_one()
-    desk.channel.submit(lambda: 0, lambda _: 1 / 0, desk.failed.append)  # cannot be drawn
+    client.channel.submit(lambda: 0, lambda _: 1 / 0, client.failed.append)  # cannot be drawn
     page.run_one()
-    assert [type(each) for each in desk.failed] == [ZeroDivisionError] * 2
-    desk.submit("next")
+    assert [type(each) for each in client.failed] == [ZeroDivisionError] * 2
+    client.submit("next")
     page.run_one()
-    assert desk.done == ["next"]
+    assert client.done == ["next"]
 
 
-def test_a_failure_to_start_a_thread_is_reported_for_each_request(monkeypatch):
+def test_a_thread_that_cannot_start_is_reported_for_each_request(monkeypatch):
     def refuse(*_):
-        raise BrokenExecutor("no thread can be had")
+        raise BrokenExecutor("no thread available")
 
     monkeypatch.setattr(ThreadPoolExecutor, "submit", refuse)
-    desk = Desk(lane=Lane(1, "dead"))
+    client = Client(lane=Lane(1, "dead"))
     for name in range(3):
-        desk.submit(name)
-    assert [type(each) for each in desk.failed] == [BrokenExecutor] * 3
+        client.submit(name)
+    assert [type(each) for each in client.failed] == [BrokenExecutor] * 3
 
 
 # -- lanes -----------------------------------------------------------------------------------------
 
 
-def test_a_slow_request_of_one_session_delays_no_other():
-    slow, quick = Desk(), Desk(is_free=True)
-    slow.submit("slow")
-    quick.submit("quick")
-    eventually(lambda: quick.done)
-    assert not slow.done
-    slow.go.set()
-    eventually(lambda: slow.done)
-
-
-def test_quick_work_runs_on_the_page_in_its_turn_and_only_the_newest():
+def test_page_work_runs_on_the_page_in_its_turn():
     page = HeldTasks()
-    desk = Desk(page, is_free=True)
+    client = Client(page, is_free=True)
     for name in ("first", "second", "third"):
-        desk.submit(name, PAGE)
-    assert desk.ran == []
+        client.submit(name, PAGE)
+    assert client.ran == []
     page.run_one()
     assert page.waiting.empty()
-    assert desk.ran == desk.done == ["third"]
-    assert desk.threads == [threading.current_thread()]
-    desk.fail(PAGE)
+    assert client.ran == client.done == ["third"]
+    assert client.threads == [threading.current_thread()]
+    client.fail(PAGE)
     page.run_one()
-    assert isinstance(desk.failed[0], ZeroDivisionError)
-    assert not desk.channel.has_more
+    assert isinstance(client.failed[0], ZeroDivisionError)
+    assert not client.channel.has_more
 
 
-def test_quick_work_runs_at_once_on_a_page_that_is_at_hand():
+def test_page_work_runs_at_once_on_a_page_that_is_at_hand():
     class AtHand(HeldTasks):
         is_at_hand = True
 
     page = AtHand()
-    desk = Desk(page, is_free=True)
-    desk.submit("first", PAGE)
-    assert desk.done == ["first"]
+    client = Client(page, is_free=True)
+    client.submit("first", PAGE)
+    assert client.done == ["first"]
     assert page.waiting.empty()
 
 
 @pytest.mark.parametrize("lane", [SHORT, GENERAL])
-def test_longer_work_that_overtakes_quick_work_leaves_the_page(lane):
+def test_longer_work_that_replaces_page_work_runs_on_a_thread(lane):
     page = HeldTasks()
-    desk = Desk(page, is_free=True)
-    desk.submit("quick", PAGE)
-    desk.submit("longer", lane)
+    client = Client(page, is_free=True)
+    client.submit("quick", PAGE)
+    client.submit("longer", lane)
     page.run_one()
     page.run_one()
-    assert desk.done == ["longer"]
-    assert desk.threads != [threading.current_thread()]
+    assert client.done == ["longer"]
+    assert client.threads != [threading.current_thread()]
 
 
-def test_short_work_runs_one_request_at_a_time_beside_other_work():
-    first, second, third, other = (Desk() for _ in range(4))
+def test_short_work_runs_one_request_at_a_time_and_in_parallel_with_other_work():
+    first, second, third, other = (Client() for _ in range(4))
     other.submit("long")
-    for desk in (first, second, third):
-        desk.submit("short", SHORT)
-    eventually(lambda: first.ran)
+    for client in (first, second, third):
+        client.submit("short", SHORT)
+    eventually(lambda: first.ran and other.ran)
     assert second.ran == []
     second.submit("long", GENERAL)  # must not run on the thread for short work
     first.go.set()
     eventually(lambda: third.ran and second.ran)
-    for desk in (second, third, other):
-        desk.go.set()
+    for client in (second, third, other):
+        client.go.set()
     eventually(lambda: second.done == ["long"] and third.done == ["short"])
     eventually(lambda: other.done)
 
 
-def test_a_session_that_waited_starts_with_its_newest_request():
+def test_a_client_that_waited_starts_with_its_newest_request():
     lane = Lane(1, "one")
-    first, second = Desk(lane=lane), Desk(lane=lane, is_free=True)
+    first, second = Client(lane=lane), Client(lane=lane, is_free=True)
     first.submit("first")
     eventually(lambda: first.ran)
     for name in ("old", "older", "newest"):
@@ -169,13 +159,13 @@ def test_a_session_that_waited_starts_with_its_newest_request():
     assert second.ran == second.done == ["newest"]
 
 
-def test_a_thread_is_held_until_its_result_is_about_to_be_drawn():
-    class Gone(HeldTasks):
+def test_a_thread_is_taken_until_its_result_is_about_to_be_drawn():
+    class Closed(HeldTasks):
         def queue(self, act, due=None):
-            self.waiting.put(due)  # the page is gone: nothing is drawn
+            self.waiting.put(due)  # nothing is drawn
 
-    lane, page = Lane(1, "one"), Gone()
-    first, second = Desk(page, lane, is_free=True), Desk(lane=lane, is_free=True)
+    lane, page = Lane(1, "one"), Closed()
+    first, second = Client(page, lane, is_free=True), Client(lane=lane, is_free=True)
     first.submit("first")
     eventually(lambda: not page.waiting.empty())
     second.submit("second")
@@ -184,9 +174,9 @@ def test_a_thread_is_held_until_its_result_is_about_to_be_drawn():
     eventually(lambda: second.done)
 
 
-@pytest.mark.parametrize("number", [1, 3])
-def test_threads_are_had_in_the_order_of_the_requests(number):
-    lane, ran, go = Lane(number, "few"), [], threading.Semaphore(0)
+@pytest.mark.parametrize("n_threads", [1, 3])
+def test_threads_are_given_in_the_order_of_the_requests(n_threads):
+    lane, ran, go = Lane(n_threads, "few"), [], threading.Semaphore(0)
 
     def begin(name):
         ran.append(name)
@@ -196,34 +186,29 @@ def test_threads_are_had_in_the_order_of_the_requests(number):
     for name in range(6):
         lane.acquire(lambda name=name: begin(name), ran.append)
     for done in range(6):
-        there = min(done + number, 6)
-        eventually(lambda there=there: len(ran) == there)
-        assert sorted(ran) == [*range(there)]
+        n_started = min(done + n_threads, 6)
+        eventually(lambda n_started=n_started: len(ran) == n_started)
+        assert sorted(ran) == [*range(n_started)]
         go.release()
 
 
 # -- long work -------------------------------------------------------------------------------------
 
 
-class Long:
-    """Long work in steps that wait for a signal, and their outcomes."""
+class Study:
+    """Long work in three steps that wait for a signal, and its results."""
 
-    def __init__(self, count=3, fails_at=None):
+    def __init__(self, fails_at=None):
         self.gate, self.drawn, self.failures = threading.Semaphore(0), [], []
-        self.begun = self.changes = 0
+        self.n_begun, self.fails_at = 0, fails_at
         self.page = HeldTasks()
-        self.work = LongWork(self.page, self.changed, self.failures.append)
-        self.steps = [
-            Step(lambda k=k: self.do(k, fails_at), self.drawn.append) for k in range(count)
-        ]
+        self.work = LongWork(self.page, lambda: None, self.failures.append)
+        self.steps = [Step(lambda k=k: self.run(k), self.drawn.append) for k in range(3)]
 
-    def changed(self):
-        self.changes += 1
-
-    def do(self, k, fails_at):
-        self.begun += 1
+    def run(self, k):
+        self.n_begun += 1
         assert self.gate.acquire(timeout=20)
-        if k == fails_at:
+        if k == self.fails_at:
             raise ValueError("no")
         return k
 
@@ -232,97 +217,97 @@ class Long:
             self.page.run_one()
 
 
-def test_steps_run_one_after_the_other():
-    long = Long()
-    long.gate.release(3)
-    long.work.start(long.steps)
-    long.finish()
-    assert long.drawn == [0, 1, 2]
-    assert (long.work.done, long.work.of) == (3, 3)
-
-
-def test_cancelled_work_draws_nothing_more_and_starts_no_step():
-    long = Long()
-    long.gate.release(1)
-    long.work.start(long.steps)
-    long.page.run_one()
-    eventually(lambda: long.begun == 2)
-    long.work.cancel()
-    long.gate.release(2)
-    long.page.run_one()
-    assert (long.drawn, long.begun, long.work.is_running) == ([0], 2, False)
-
-
 def test_paused_work_continues_with_the_next_step():
-    long = Long()
-    long.work.start(long.steps)
-    long.work.pause(True)
-    long.gate.release(3)
-    long.page.run_one()
-    assert (long.drawn, long.begun) == ([0], 1)
-    long.work.pause(False)
-    long.finish()
-    assert long.drawn == [0, 1, 2]
-    assert long.begun == 3
+    study = Study()
+    study.work.start(study.steps)
+    study.work.pause(True)
+    study.gate.release(3)
+    study.page.run_one()
+    assert (study.drawn, study.n_begun) == ([0], 1)
+    study.work.pause(False)
+    study.finish()
+    assert study.drawn == [0, 1, 2]
+    assert (study.n_begun, study.work.done, study.work.of) == (3, 3, 3)
 
 
-def test_another_start_replaces_the_first():
-    long = Long()
-    long.work.start(long.steps)
-    eventually(lambda: long.begun == 1)
-    long.work.start(long.steps[1:])
-    long.gate.release(3)
-    long.finish()
-    assert long.drawn == [1, 2]
+def test_cancelled_work_draws_nothing_and_starts_no_step():
+    study = Study()
+    study.gate.release(1)
+    study.work.start(study.steps)
+    study.page.run_one()
+    eventually(lambda: study.n_begun == 2)
+    study.work.cancel()
+    study.gate.release(2)
+    study.page.run_one()
+    assert (study.drawn, study.n_begun, study.work.is_running) == ([0], 2, False)
+
+
+def test_a_second_start_replaces_the_first():
+    study = Study()
+    study.work.start(study.steps)
+    eventually(lambda: study.n_begun == 1)
+    study.work.start(study.steps[1:])
+    study.gate.release(3)
+    study.finish()
+    assert study.drawn == [1, 2]
 
 
 def test_a_failure_ends_the_work_and_is_reported():
-    long = Long(fails_at=1)
-    long.gate.release(3)
-    long.work.start(long.steps)
-    long.finish()
-    assert (long.drawn, long.begun, len(long.failures)) == ([0], 2, 1)
+    study = Study(fails_at=1)
+    study.gate.release(3)
+    study.work.start(study.steps)
+    study.finish()
+    assert (study.drawn, study.n_begun, len(study.failures)) == ([0], 2, 1)
 
 
-def test_one_piece_reports_its_progress_and_sees_that_it_is_cancelled():
-    long, cancelled_seen = Long(), []
+def test_one_piece_reports_its_progress_and_can_be_cancelled():
+    study, cancelled_seen = Study(), []
 
     def piece(progress, cancelled):
         progress(1, 4)
-        assert long.gate.acquire(timeout=20)
+        assert study.gate.acquire(timeout=20)
         cancelled_seen.append(cancelled())
         progress(2, 4)
         return "result"
 
     for is_cancelled in (False, True):
-        long.work.start_piece(piece, long.drawn.append)
-        long.page.run_one()
-        assert (long.work.done, long.work.of, long.work.is_running) == (1, 4, True)
+        study.work.start_piece(piece, study.drawn.append)
+        study.page.run_one()
+        assert (study.work.done, study.work.of, study.work.is_running) == (1, 4, True)
         if is_cancelled:
-            long.work.cancel()
-        long.gate.release()
-        long.page.run_one()
-        long.page.run_one()
-        assert not long.work.is_running
+            study.work.cancel()
+        study.gate.release()
+        study.page.run_one()
+        study.page.run_one()
+        assert not study.work.is_running
     assert cancelled_seen == [False, True]
-    assert long.drawn == ["result"]
+    assert study.drawn == ["result"]
 
 
-# -- turns of pages -------------------------------------------------------------------------------
+# -- turns of pages --------------------------------------------------------------------------------
 
 
-async def when_all_had_their_turn(turns):
-    while turns.is_crowded:
+def after_turns(ask):
+    """Results of callbacks once all have had their turn, and errors that were logged."""
+
+    async def run():
+        turns, done, errors = Turns(), [], []
+        asyncio.get_running_loop().set_exception_handler(lambda _, error: errors.append(error))
+        ask(turns, done)
+        while turns.is_crowded:
+            await asyncio.sleep(0)
         await asyncio.sleep(0)
-    await asyncio.sleep(0)
+        return done, errors
+
+    return asyncio.run(run())
 
 
-def test_turns_are_taken_in_order_and_messages_come_in_between():
+def test_messages_are_handled_between_turns():
     async def queue():
         turns, done = Turns(), []
 
         async def message():
-            while len(done) < 4 * MESSAGES_FIRST:
+            while len(done) < 4 * ROUNDS_BETWEEN:
                 done.append(" ")
                 await asyncio.sleep(0)
 
@@ -336,44 +321,31 @@ def test_turns_are_taken_in_order_and_messages_come_in_between():
     assert asyncio.run(queue()).split() == ["a", "b", "c"]
 
 
-def test_each_turn_begins_in_the_context_of_who_asked():
-    who = ContextVar("who")
+def test_each_turn_has_the_context_of_its_caller():
+    caller = ContextVar("caller")
 
-    async def queue():
-        turns, done = Turns(), []
+    def ask(turns, done):
         for name in "abc":
-            who.set(name)
-            turns.ask(lambda: done.append(who.get()))
-        await when_all_had_their_turn(turns)
-        return done
+            caller.set(name)
+            turns.ask(lambda: done.append(caller.get()))
 
-    assert asyncio.run(queue()) == ["a", "b", "c"]
+    assert after_turns(ask) == (["a", "b", "c"], [])
 
 
-def test_a_turn_that_fails_does_not_hold_up_the_next():
-    async def queue():
-        turns, done = Turns(), []
-        asyncio.get_running_loop().set_exception_handler(lambda _, told: done.append(told))
+def test_a_turn_that_fails_does_not_stop_the_next():
+    def ask(turns, done):
         turns.ask(lambda: 1 / 0)
         turns.ask(lambda: done.append("second"))
-        await when_all_had_their_turn(turns)
-        turns.ask(lambda: done.append("third"))
-        await when_all_had_their_turn(turns)
-        return done
 
-    told, *done = asyncio.run(queue())
-    assert isinstance(told["exception"], ZeroDivisionError)
-    assert done == ["second", "third"]
+    done, (error,) = after_turns(ask)
+    assert done == ["second"]
+    assert isinstance(error["exception"], ZeroDivisionError)
 
 
-def test_what_was_computed_and_the_rest_take_turns():
-    async def queue():
-        turns, done = Turns(), []
-        for name in "abc":
-            turns.ask(lambda name=name: done.append(name))
-        for name in "xyz":
-            turns.ask(lambda name=name: done.append(name), is_computed=True)
-        await when_all_had_their_turn(turns)
-        return "".join(done)
+def test_results_and_other_callbacks_alternate():
+    def ask(turns, done):
+        for name in "abcxyz":
+            turns.ask(lambda name=name: done.append(name), is_computed=name in "xyz")
 
-    assert asyncio.run(queue()) == "xaybzc"
+    done, _ = after_turns(ask)
+    assert "".join(done) == "xaybzc"

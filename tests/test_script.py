@@ -1,4 +1,4 @@
-"""The state as code: run in a fresh process it gives what the session shows, bit for bit."""
+"""Generated scripts: run in a fresh process, they reproduce the view bit for bit."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 import core
-from app.model.address import Wanted, defaults, query_of
+from app.model.address import Link, defaults, query_of
 from app.model.colors import image_of
 from app.model.large import LIMIT
-from app.model.script import ELSEWHERE, script_of
+from app.model.script import COMMANDS, script_of
 from app.model.state import State
 from app.model.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
 from app.pages.catalog import PAGES
@@ -31,7 +31,7 @@ from tests.states import another, random_state
 PAGE_NAMES = [page.name for page in PAGES]
 
 NOT_CODE = {"cloud_color", "unit"}
-"""Of the state, what changes nothing that `core` could find: colours, and units on axes."""
+"""Parameters without an effect on arrays: colours, and units on axes."""
 
 RUN_EACH = """
 import os, runpy, sys
@@ -56,13 +56,13 @@ for folder in sys.argv[1:]:
 
 def opened(query: str, **files: Path) -> Session:
     sources = built_in_sources() | {name: file_source(path) for name, path in files.items()}
-    session = Session(sources, Wanted(dict(parse_qsl(query))))
+    session = Session(sources, Link(dict(parse_qsl(query))))
     assert session.refused == []
     return session
 
 
 def run(folder: Path, sessions: dict[str, Session], *files: Path) -> dict[str, dict]:
-    """What each session's script finds, all run in one fresh process, by the names it has there."""
+    """Arrays that each session's script computes, all in one fresh process."""
     for name, session in sessions.items():
         (folder / name).mkdir()
         (folder / name / "script.py").write_text(script_of(session.answer, session.state), "utf-8")
@@ -78,7 +78,7 @@ def run(folder: Path, sessions: dict[str, Session], *files: Path) -> dict[str, d
 
 
 def check_style(folder: Path) -> None:
-    """By the project's own rules, and as any formatter has it."""
+    """Check linter and formatter, with the project's rules and with defaults."""
     for arguments in (
         ("check", "--config", str(ROOT / "pyproject.toml")),
         ("check", "--isolated"),
@@ -90,13 +90,13 @@ def check_style(folder: Path) -> None:
 
 
 def same(found: dict, name: str, expected) -> None:
-    """All arrays of a range image, or of signals, bit for bit."""
+    """Compare all arrays of a range image, or of signals, bit for bit."""
     whole = expected._asdict() if hasattr(expected, "_asdict") else vars(expected)
     for each, value in whole.items():
         assert np.array_equal(found[f"{name} {each}"], np.asarray(value), equal_nan=True), each
 
 
-# -- what it finds ---------------------------------------------------------------------------------
+# -- results ---------------------------------------------------------------------------------------
 
 STATES = {
     "first": "",
@@ -111,7 +111,7 @@ STATES = {
 }
 
 
-def test_scripts_find_what_is_on_the_screen(tmp_path):
+def test_scripts_reproduce_the_screen(tmp_path):
     sessions = {name: opened(query) for name, query in STATES.items()}
     found = run(tmp_path, sessions, ASSETS / "sample_capture.npz")
     for name, session in sessions.items():
@@ -132,21 +132,21 @@ def test_scripts_find_what_is_on_the_screen(tmp_path):
     assert np.array_equal(more["picture"], sbr, equal_nan=True)
 
 
-def test_random_states_are_found_again(tmp_path):
-    """Whatever is chosen: bad settings leave an image without answers, and a script that runs."""
+def test_scripts_of_random_states_run(tmp_path):
+    """Bad settings give an image without ranges, and a script that runs."""
     sessions = {}
     for seed in range(4):
         state = random_state(np.random.default_rng(seed))
         state.param.update(source="car", page="Explore", pixel=(5, 6), region=(), pins=())
         state.param.update(window=None, image="Counts", comparison=State().comparison)
-        session = Session(built_in_sources(), Wanted(dict(parse_qsl(query_of(state, {})))))
+        session = Session(built_in_sources(), Link(dict(parse_qsl(query_of(state, {})))))
         sessions[str(seed)] = session
     for name, found in run(tmp_path, sessions).items():
         same(found, "image", sessions[name].answer.run.image)
         same(found, "signals", inspect(sessions[name].answer, 5, 6).signals)
 
 
-def test_a_real_capture_is_found_again(tmp_path, real_capture):
+def test_a_script_reproduces_a_real_capture(tmp_path, real_capture):
     path = real_capture("21km_K11_night.mat")
     query = "source=it&less.pool=2&reading.n_pulses=20000&tracking.l=0.01&pixel=[60,70]"
     session = opened(query, it=path)
@@ -156,8 +156,8 @@ def test_a_real_capture_is_found_again(tmp_path, real_capture):
     assert str(path.parent) not in script_of(session.answer, session.state)
 
 
-def test_a_part_of_a_large_capture_is_found_again(tmp_path, monkeypatch):
-    """In the light of the whole, which tells another confidence than the part's own would."""
+def test_a_script_reproduces_a_window_of_a_large_capture(tmp_path, monkeypatch):
+    """Its confidence follows from the flux prior of the whole capture."""
     scene = core.scenes["building"]()
     whole = core.simulate(scene, scene.acquisition, core.Flux(sbr=0.5))
     path = tmp_path / "large.zarr"
@@ -173,7 +173,7 @@ def test_a_part_of_a_large_capture_is_found_again(tmp_path, monkeypatch):
     assert not np.array_equal(alone.confidence, found["image confidence"])
 
 
-def test_methods_are_compared_by_a_script_alike(tmp_path):
+def test_a_script_reproduces_the_comparison(tmp_path):
     query = (
         "page=Compare&comparison.methods=[%22peak%22,%22kde%22,%22tracking%22,%22oracle%22]"
         "&comparison.false_alarm=0.1&comparison.settings.kde.bandwidth_bins=0.7&tracking.l=0.01"
@@ -196,7 +196,7 @@ def test_methods_are_compared_by_a_script_alike(tmp_path):
             assert np.array_equal(found[name][f"{method} picture"], picture, equal_nan=True)
 
 
-# -- what it says ----------------------------------------------------------------------------------
+# -- text ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -204,27 +204,28 @@ def car() -> Answer:
     return opened("").answer
 
 
-@pytest.mark.parametrize(("page", "command"), ELSEWHERE.items())
-def test_pages_of_commands_name_them(page, command, car):
+@pytest.mark.parametrize(("page", "command"), COMMANDS.items())
+def test_the_title_names_the_command_of_a_page(page, command, car):
     script, usual = (script_of(car, State(page=each)) for each in (page, "Explore"))
     first, *rest = script.splitlines()
-    assert first == f'"""What firstphoton shows on Explore ({page}: {command}), found again."""'
+    assert first == f'"""Explore view of firstphoton ({page}: {command})."""'
     assert rest == usual.splitlines()[1:]
 
 
 @pytest.mark.parametrize("name", sorted(defaults().keys() - NOT_CODE))
 def test_every_parameter_is_in_the_script_of_some_page(name, car):
-    """Fails for a new parameter, or a new field of one, of which a script knows nothing."""
+    """Fails for a new parameter or field that scripts ignore."""
     first = {"source": "sample" if name in ("reading", "window") else "worn"}
     for value in ["building"] if name == "source" else another(name):
         seen = [{"page": page, **first} for page in PAGE_NAMES]
         assert any(
-            told_by(car, State(**one)) != told_by(car, State(**one | {name: value})) for one in seen
+            script_with(car, State(**one)) != script_with(car, State(**one | {name: value}))
+            for one in seen
         )
 
 
-def told_by(answer: Answer, state: State, **of_source: str) -> str:
-    """The script of a state, as if it had been computed."""
+def script_with(answer: Answer, state: State, **of_source: str) -> str:
+    """Return the script of a state, without computing it."""
     chosen = {each.name: getattr(state, each.name) for each in fields(Request)}
     source = replace(built_in_sources()[state.source], **of_source)
     request = Request(**chosen | {"source": source})
@@ -233,11 +234,11 @@ def told_by(answer: Answer, state: State, **of_source: str) -> str:
 
 def test_a_name_from_outside_is_never_code(car):
     name = 'a"b\'c\n\\"""; import os #{x}\u2028%s.npz'
-    text = told_by(car, State(source="sample"), name=name)
-    (told,) = (
+    text = script_with(car, State(source="sample"), name=name)
+    (path,) = (
         node.value.value
         for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "path"
     )
-    assert told == name
+    assert path == name
     assert text.replace("\n", "").isprintable()

@@ -1,4 +1,4 @@
-"""Who is served and who is not, by plain HTTP and websocket clients."""
+"""Access control, by plain HTTP and websocket clients."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ PARTS = ("/", "/favicon.ico", STATIC, "/ws", "/metadata", "/no/such/page")
 
 
 class Site:
-    """A server as plain clients see it, which may say any host."""
+    """A client of a server, which may send any header."""
 
     def __init__(self, address):
         self.address = address
         self.port = int(address.rstrip("/").rpartition(":")[2])
 
     def ask(self, path="/", method="GET", body=None, **headers):
-        """Status, headers and text of an answer."""
+        """Return status, headers and text of a response."""
         headers = {name.replace("_", "-"): value for name, value in headers.items()}
         link = HTTPConnection("127.0.0.1", self.port, timeout=120)
         try:
@@ -50,19 +50,19 @@ class Site:
             link.close()
 
     def socket(self, token, **headers):
-        """What comes of asking for a session's socket: 101, or the status of the refusal."""
+        """Return the status of a request for a session's socket: 101 if it is accepted."""
         return self.ask("/ws", **UPGRADE, Sec_WebSocket_Protocol=f"bokeh, {token}", **headers)[0]
 
 
 @pytest.fixture(scope="module")
 def here(address):
-    """The app as it is served unless told otherwise."""
+    """The app with default options."""
     return Site(address)
 
 
 @pytest.fixture(scope="module")
 def away():
-    """The app as it is served to others."""
+    """The app on a network."""
     options = ("--address", "0.0.0.0", "--origin", NAME)
     with serving(*options, **{TOKEN_VARIABLE: TOKEN}) as running_at:
         yield Site(running_at)
@@ -70,7 +70,7 @@ def away():
 
 @pytest.fixture(scope="module")
 def cookie(away):
-    """What a browser keeps that has come by the link."""
+    """The cookie of a browser that opened the link."""
     status, headers, _ = away.ask(f"/?{urlencode({'token': TOKEN})}", Host=NAME)
     assert status == 303
     return headers["Set-Cookie"].partition(";")[0]
@@ -89,7 +89,7 @@ def test_this_machine_needs_no_token(here, host):
 
 @pytest.mark.parametrize("path", PARTS)
 @pytest.mark.parametrize(
-    "said",
+    "headers",
     [
         {"Host": "rebound.example.com"},
         {"Host": "127.0.0.1:1"},
@@ -98,20 +98,20 @@ def test_this_machine_needs_no_token(here, host):
         {"Origin": "http://localhost:1"},
     ],
 )
-def test_a_foreign_page_and_a_name_led_here_are_refused(here, path, said):
-    status, _, text = here.ask(path, **said)
+def test_requests_of_foreign_pages_and_hosts_are_refused(here, path, headers):
+    status, _, text = here.ask(path, **headers)
     assert status == 403
     assert "--origin" in text
     assert "Traceback" not in text
 
 
-def test_a_foreign_page_gets_no_socket_whatever_token_it_has(here):
+def test_a_foreign_page_gets_no_socket(here):
     token = token_in(here.ask()[2])
     assert here.socket(token, Origin="http://evil.example.com") == 403
     assert here.socket(token, Host="rebound.example.com") == 403
 
 
-def test_browsers_are_told_to_lend_answers_to_nobody(here):
+def test_responses_have_security_headers(here):
     for path in PARTS:
         headers = here.ask(path)[1]
         assert headers["X-Content-Type-Options"] == "nosniff"
@@ -119,7 +119,7 @@ def test_browsers_are_told_to_lend_answers_to_nobody(here):
         assert headers["Referrer-Policy"] == "same-origin"
 
 
-# -- others ----------------------------------------------------------------------------------------
+# -- other machines --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", PARTS)
@@ -139,7 +139,7 @@ def test_without_the_token_there_is_no_socket(away, here, cookie):
     assert away.socket(token, Host=NAME, Cookie=forged) == 403
 
 
-def test_the_link_lets_a_browser_in_and_leaves_the_address(away):
+def test_the_link_sets_a_cookie_and_drops_the_token(away):
     query = urlencode({"token": TOKEN, "sbr": "0.05", "scene": "a b"})
     status, headers, _ = away.ask(f"/?{query}", Host=NAME)
     assert status == 303
@@ -147,7 +147,7 @@ def test_the_link_lets_a_browser_in_and_leaves_the_address(away):
     assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Lax" in headers["Set-Cookie"]
 
 
-def test_who_is_in_gets_all_there_is(away, cookie):
+def test_a_browser_with_the_cookie_is_served(away, cookie):
     known = {"Host": NAME, "Cookie": cookie, "Origin": f"http://{NAME}"}
     status, _, page = away.ask(**known)
     assert status == 200
@@ -170,7 +170,7 @@ def test_a_wrong_token_is_refused(away, wrong):
         assert "Wrong token" in text
 
 
-def test_a_typed_token_lets_in_and_leads_nowhere_else(away):
+def test_the_form_accepts_the_token_and_redirects_to_this_server(away):
     form = {"Content-Type": "application/x-www-form-urlencoded", "Host": NAME}
     status, headers, _ = away.ask(
         "//evil.example.com/", "POST", urlencode({"token": TOKEN}), **form
@@ -185,7 +185,7 @@ def test_a_typed_token_lets_in_and_leads_nowhere_else(away):
 # -- how it is started -----------------------------------------------------------------------------
 
 
-def test_names_and_tokens_are_asked_for_where_others_reach_the_server():
+def test_origins_and_tokens_are_required_on_a_network():
     assert Access.of("127.0.0.1", 5006, [], None).token is None
     made = Access.of("0.0.0.0", 5006, ["lab:80", "lab.example.org"], None)
     assert len(made.token) >= 32
@@ -193,7 +193,7 @@ def test_names_and_tokens_are_asked_for_where_others_reach_the_server():
     assert made.hosts == {"lab:80", "lab.example.org", "lab.example.org:5006"}
     assert Access.of("::1", 5006, [], None).hosts == {"[::1]:5006", "localhost:5006"}
     assert Access.of("127.0.0.1", 5006, [], "long enough").token == "long enough"
-    for address, origins, token, told in (
+    for address, origins, token, named in (
         ("0.0.0.0", [], None, "--origin"),
         ("192.0.2.1", [], "long enough", "--origin"),
         ("0.0.0.0", ["*"], None, "--origin"),
@@ -201,7 +201,7 @@ def test_names_and_tokens_are_asked_for_where_others_reach_the_server():
         ("127.0.0.1", ["lab/x"], None, "--origin"),
         ("127.0.0.1", [], "short", TOKEN_VARIABLE),
     ):
-        with pytest.raises(ValueError, match=told) as refusal:
+        with pytest.raises(ValueError, match=named) as refusal:
             Access.of(address, 5006, origins, token)
         assert "short" not in str(refusal.value)
 
@@ -218,35 +218,35 @@ def run(*arguments):
         try:
             yield started
         finally:
-            started.kill()  # whatever failed
+            started.kill()
 
 
 def start(*options):
     return run("-m", "app", *options)
 
 
-def test_a_port_in_use_is_a_sentence(here):
+def test_a_port_in_use_is_reported(here):
     with start("--port", str(here.port)) as second:
-        told = second.communicate(timeout=120)[0]
+        printed = second.communicate(timeout=120)[0]
     assert second.returncode == 1
-    assert "in use" in told and "--port" in told
-    assert "Traceback" not in told
+    assert "in use" in printed and "--port" in printed
+    assert "Traceback" not in printed
 
 
 @pytest.mark.parametrize("seconds", [-1.0, 0.0, 1.0, np.nan, np.inf])
-def test_a_session_is_kept_for_as_long_as_a_page_takes_to_connect(seconds):
+def test_a_session_is_kept_until_a_page_can_connect(seconds):
     with pytest.raises(ValueError, match="--linger"):
         serving_options(seconds)
 
 
-def test_others_are_not_served_before_the_origin_is_named():
+def test_a_network_address_requires_an_origin():
     with start("--address", "0.0.0.0", "--port", "0") as refused:
-        told = refused.communicate(timeout=120)[0]
+        printed = refused.communicate(timeout=120)[0]
     assert refused.returncode == 2
-    assert "--origin" in told and "Traceback" not in told
+    assert "--origin" in printed and "Traceback" not in printed
 
 
-def test_the_link_is_printed_with_a_token_of_its_own_and_ctrl_c_stops():
+def test_the_printed_link_has_a_token_and_ctrl_c_stops():
     with start("--address", "0.0.0.0", "--origin", "127.0.0.1", "--port", "0") as server:
         line = next(line for line in server.stdout if line.startswith("Open"))
         link = re.search(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{20,})", line)
@@ -275,7 +275,7 @@ def long_work(progress, cancelled):
     print("ended", flush=True)
 
 class Last:
-    def __del__(self):  # Python loses whatever is raised in here
+    def __del__(self):  # Python ignores exceptions raised here
         print("now", flush=True)
         os.kill(os.getpid(), signal.SIGTERM)
 
@@ -289,7 +289,7 @@ sys.exit(started.main(["--port", "0"]))
 """
 
 
-def test_a_stop_is_heard_at_any_moment_and_waits_for_no_long_work():
+def test_sigterm_stops_at_any_time_and_cancels_long_work():
     with run("-c", STOPPED_AT_A_BAD_MOMENT) as server:
         line = next(line for line in server.stdout if line.startswith("Open"))
         Site(line.split()[1]).ask()
@@ -302,7 +302,7 @@ def test_a_stop_is_heard_at_any_moment_and_waits_for_no_long_work():
 
 
 @pytest.mark.browser
-def test_the_door_opens_to_the_token_alone(browser):
+def test_the_token_form_in_a_browser(browser):
     with serving("--origin", "localhost", **{TOKEN_VARIABLE: TOKEN}) as running_at:
         context = browser.new_context()
         page = context.new_page()

@@ -1,4 +1,4 @@
-"""Sessions are bounded in number, memory and the time that they wait for their browser."""
+"""Limits on sessions: number, memory, and time without a browser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bokeh.util.token import generate_jwt_token, generate_session_id
 from playwright.sync_api import expect
 from tornado.httpclient import HTTPClientError
 
-from app.server.sessions import LOOK_S, RETRY_S, Bounds, Sessions
+from app.server.sessions import CHECK_S, RETRY_S, Bounds, Sessions
 from tests.browser import eventually, server_process, serving
 from tests.crowded import BOUNDS
 from tests.test_serving import Site
@@ -20,7 +20,7 @@ from tests.wire import Wire, connected
 
 
 class Kept:
-    """A session as Bokeh's contexts keep it."""
+    """A session of Bokeh."""
 
     def __init__(self, name, connections=0, idle_s=0.0):
         self.id, self.connection_count = name, connections
@@ -44,28 +44,28 @@ def kept_by(*kept, memory=lambda: 0, clock=None, **bounds):
     return Sessions(context, bounds, memory, clock or Clock())
 
 
-def test_a_session_without_a_browser_ends_and_one_with_a_browser_stays():
+def test_only_a_session_without_a_browser_ends():
     late, early, served = Kept("a", idle_s=21), Kept("b", idle_s=19), Kept("c", idle_s=99)
     clock = Clock()
     sessions = kept_by(late, early, served, clock=clock)
     sessions.connected(served)
-    clock.s += LOOK_S
-    sessions.look()
+    clock.s += CHECK_S
+    sessions.check()
     assert (late.is_ended, early.is_ended, served.is_ended) == (True, False, False)
 
 
-def test_a_server_that_was_busy_listens_before_it_ends_a_session():
+def test_a_busy_server_accepts_connections_before_it_ends_a_session():
     late, clock = Kept("a", idle_s=60), Clock()
     sessions = kept_by(late, clock=clock)
     clock.s += 30
-    sessions.look()
+    sessions.check()
     assert not late.is_ended
-    clock.s += LOOK_S
-    sessions.look()
+    clock.s += CHECK_S
+    sessions.check()
     assert late.is_ended
 
 
-def test_closed_pages_make_room_the_longest_closed_first():
+def test_closed_pages_make_room_the_oldest_first():
     kept = [Kept("a", idle_s=5), Kept("b", idle_s=50), Kept("c", connections=1)]
     sessions = kept_by(*kept, queued=9)
     for each in kept:
@@ -77,7 +77,7 @@ def test_closed_pages_make_room_the_longest_closed_first():
             assert (has_more, has_most) == (True, False)
 
 
-def test_pages_being_built_count_and_a_page_that_comes_back_needs_no_room():
+def test_pages_being_built_count_and_a_returning_page_needs_no_room():
     sessions = kept_by(Kept("a"))
     with sessions.opening(None) as first, sessions.opening(None) as second:
         assert (first, second) == (True, False)
@@ -87,7 +87,7 @@ def test_pages_being_built_count_and_a_page_that_comes_back_needs_no_room():
         assert has_room
 
 
-def test_beyond_its_memory_a_server_opens_nothing_and_lets_go_of_closed_pages():
+def test_a_server_out_of_memory_opens_nothing_and_ends_closed_pages():
     closed = Kept("a", idle_s=1)
     sessions = kept_by(closed, memory=lambda: 11)
     sessions.connected(closed)
@@ -101,7 +101,7 @@ def test_beyond_its_memory_a_server_opens_nothing_and_lets_go_of_closed_pages():
 
 @pytest.fixture(scope="module")
 def crowded():
-    """A server with room for a few sessions, which wait for their browsers a few seconds only."""
+    """A server with small limits."""
     with serving(module="tests.crowded") as address:
         yield Site(address)
 
@@ -114,35 +114,31 @@ def has_room(site):
     return status == 200
 
 
-def asked_at_once(site, times):
-    """Statuses of requests of pages that nobody looks at."""
+def statuses_of(site, times):
+    """Statuses of simultaneous requests of pages to which no browser connects."""
     with ThreadPoolExecutor(times) as threads:
         return [answer[0] for answer in threads.map(lambda _: site.ask(), range(times))]
 
 
-def test_requests_of_pages_that_nobody_looks_at_wait_or_are_refused(crowded):
+def test_pages_without_a_browser_wait_or_are_refused_and_do_not_fill_the_memory(crowded):
+    server = server_process(crowded.address)
     eventually(lambda: has_room(crowded))
-    statuses = asked_at_once(crowded, 12)
+    statuses = statuses_of(crowded, 12)
     assert {*statuses} == {200, 503}
     assert statuses.count(200) <= BOUNDS.sessions + BOUNDS.queued
-    eventually(lambda: has_room(crowded))
-
-
-def test_requests_of_pages_that_nobody_looks_at_do_not_fill_the_memory(crowded):
-    server = server_process(crowded.address)
     eventually(lambda: has_room(crowded))
     before = server.memory_info().rss
     built = 0
     for _ in range(20):
-        built += asked_at_once(crowded, 8).count(200)
+        built += statuses_of(crowded, 8).count(200)
         if built >= 8:
             break
     assert built >= 8
-    grown = server.memory_info().rss - before
-    assert grown < 50e6  # as many sessions that are kept take 80 MB
+    # Eight live sessions take 80 MB.
+    eventually(lambda: server.memory_info().rss - before < 50e6)
 
 
-def test_beyond_the_bound_a_page_is_refused_and_those_that_are_open_go_on(crowded):
+def test_a_full_server_refuses_a_page_and_open_pages_go_on(crowded):
     async def entered():
         while True:
             wire = Wire()
@@ -165,7 +161,7 @@ def test_beyond_the_bound_a_page_is_refused_and_those_that_are_open_go_on(crowde
         async with first.news:
             await first.news.wait_for(lambda: first.values[facts] != before or first.is_closed)
         assert first.troubles == []
-        second.close()  # and makes room
+        second.close()
         for wire in [*wires, await entered()]:
             wire.close()
 
@@ -173,13 +169,11 @@ def test_beyond_the_bound_a_page_is_refused_and_those_that_are_open_go_on(crowde
 
 
 def test_a_socket_opens_no_session(crowded):
-    """One whose page was never asked for, and one whose session has ended."""
-
     async def answer(token):
         socket = await connected(crowded.address, token)
-        said = await socket.read_message()
+        message = await socket.read_message()
         socket.close()
-        return said
+        return message
 
     def closes(token):
         return asyncio.run(asyncio.wait_for(answer(token), 60)) is None
@@ -190,9 +184,9 @@ def test_a_socket_opens_no_session(crowded):
 
 
 @pytest.mark.browser
-def test_a_page_that_connects_too_late_is_loaded_again(browser, crowded):
+def test_a_page_that_connects_too_late_is_reloaded(browser, crowded):
     page = browser.contexts[0].new_page()
-    delays_s = iter([BOUNDS.unconnected_s + 3 * LOOK_S])
+    delays_s = iter([BOUNDS.unconnected_s + 3 * CHECK_S])
 
     def late(route):
         time.sleep(next(delays_s, 0.0))
@@ -207,7 +201,7 @@ def test_a_page_that_connects_too_late_is_loaded_again(browser, crowded):
 
 
 @pytest.mark.browser
-def test_a_browser_that_finds_no_room_is_told_and_comes_in_later(browser, crowded):
+def test_a_browser_that_finds_the_server_full_gets_in_later(browser, crowded):
 
     def opened():
         page = browser.contexts[0].new_page()

@@ -1,12 +1,12 @@
-"""A page's thread in the hands of a test."""
+"""A page's thread under control of a test."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from queue import SimpleQueue
 from typing import Any
 
-from app.model.address import Wanted
+from app.model.address import Link
 from app.model.store import Answer, Source
 from app.pages.layout import Layout
 from app.tasks.page import PageTasks
@@ -14,7 +14,7 @@ from app.tasks.scheduler import Act
 
 
 class HeldTasks(PageTasks):
-    """Callbacks of a page wait until the test runs them, as if it were the page's thread.
+    """Holds callbacks of a page until the test runs them.
 
     Attributes
     ----------
@@ -36,9 +36,14 @@ class HeldTasks(PageTasks):
         """Run the next callback; wait for it if necessary."""
         self.waiting.get(timeout=60)()
 
+    def run_until(self, holds: Callable[[], object]) -> None:
+        """Run callbacks until something is so."""
+        while not holds():
+            self.run_one()
+
 
 class HeldLayout(Layout):
-    """The app without a browser, its page's thread in the hands of the test.
+    """The app without a browser, its page's thread under control of the test.
 
     Attributes
     ----------
@@ -46,7 +51,7 @@ class HeldLayout(Layout):
         Every sentence on failures, the latest last; empty ones where all works.
     """
 
-    def __init__(self, sources: Mapping[str, Source], wanted: Wanted | None = None) -> None:
+    def __init__(self, sources: Mapping[str, Source], wanted: Link | None = None) -> None:
         self.tasks = HeldTasks()
         super().__init__(sources, wanted, tasks=self.tasks)
         self.heard = [""]

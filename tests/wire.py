@@ -1,7 +1,7 @@
-"""One session of the served app without a browser: what a page would send, and what it receives.
+"""A session of the served app without a browser.
 
-It speaks Bokeh's protocol and keeps the few models that it follows as plain values: a document of
-real models, as `bokeh.client` has it, would cost more than the server's answer.
+A client of Bokeh's protocol that keeps attributes of models as plain values: a document of models,
+as in `bokeh.client`, would cost more than the server's response.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ READY = {
         "values": {"type": "map", "entries": []},
     },
 }
-"""What a page says once it is drawn; until then the server keeps what it has to tell."""
+"""Sent by a page once it is drawn; the server holds back changes until then."""
 
 RULES = (ROOT / "app" / "server" / "patches" / "latest_value.js").read_text("utf-8")
 LONGEST_PAUSE_S = int(re.findall(r"const LONGEST_PAUSE_MS = (\d+);", RULES)[0]) / 1000
-"""The browser's own."""
+"""Longest time for which the browser waits for a response."""
 
 Model = dict[str, Any]
 
@@ -54,9 +54,11 @@ class Wire:
     news : asyncio.Condition
         Notified when a message has come, or the connection has ended.
     troubles : list of str
-        What the server complained of.
+        Errors of the server and the connection.
     is_closed : bool
         Whether the server has ended the connection.
+    n_messages, n_bytes : int
+        Parts of messages received so far, and their size.
     """
 
     def __init__(self) -> None:
@@ -65,6 +67,7 @@ class Wire:
         self.news = asyncio.Condition()
         self.troubles: list[str] = []
         self.is_closed = False
+        self.n_messages = self.n_bytes = 0
         self._numbers: defaultdict[str, int] = defaultdict(int)
         self._waiting: dict[tuple[str, str], Any] = {}
         self._pause: asyncio.Future[None] | None = None
@@ -81,7 +84,7 @@ class Wire:
             self.models[model["id"]] = model
             for name, value in model["attributes"].items():
                 self._keep(model["id"], name, value, buffers)
-        # Two ways there and back: what the server does at the first it has done by the second.
+        # The second round trip ensures that the server has handled the first.
         await self._send("PATCH-DOC", {"events": [READY]})
         await self._send("SERVER-INFO-REQ", {})
         while await self._take() != "SERVER-INFO-REPLY":
@@ -89,7 +92,7 @@ class Wire:
         self._reading = asyncio.ensure_future(self._read())
 
     def close(self) -> None:
-        """Go away as a closed tab does."""
+        """Disconnect like a closed tab."""
         self._reading.cancel()
         self._socket.close()
 
@@ -103,7 +106,7 @@ class Wire:
         )
 
     async def set(self, model: str, attribute: str, value: Any) -> None:
-        """Change a model as the page does: what is overtaken before it could be sent never is."""
+        """Change a model; a value that is replaced before it can be sent is dropped."""
         self._waiting.pop((model, attribute), None)
         self._waiting[model, attribute] = value
         if self._pause is None:
@@ -120,10 +123,20 @@ class Wire:
             return {"type": "bytes", "data": {"id": f"b{len(buffers) - 1}"}}
 
         data = {"type": "map", "entries": [[name, put(each)] for name, each in message.items()]}
-        values = {"type": "map", "entries": [["model", {"id": model}], ["data", data]]}
-        event = {"type": "event", "name": "data_event", "values": values}
-        said = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": event}
-        await self._send("PATCH-DOC", {"events": [said]}, buffers)
+        await self.emit("data_event", model, {"data": data}, buffers)
+
+    async def emit(
+        self,
+        event: str,
+        model: str,
+        values: Mapping[str, Any],
+        buffers: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:
+        """Send an event of a model, such as a tap on a plot."""
+        entries = [["model", {"id": model}], *map(list, values.items())]
+        data = {"type": "event", "name": event, "values": {"type": "map", "entries": entries}}
+        sent = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": data}
+        await self._send("PATCH-DOC", {"events": [sent]}, buffers)
 
     async def _send_waiting(self) -> None:
         events = [
@@ -136,7 +149,7 @@ class Wire:
         await self._send("PATCH-DOC", {"events": events})
 
     def _go_on(self, _pause: Any) -> None:
-        """What waits may be sent: the server has answered, or takes long."""
+        """Send waiting values: the server has responded, or takes long."""
         self._pause = None
         if self._waiting and not self.is_closed:
             self._sending = asyncio.ensure_future(self._send_waiting())
@@ -148,7 +161,11 @@ class Wire:
         header = {"msgid": f"{kind}-{self._numbers[kind]}", "msgtype": kind}
         if buffers:
             header["num_buffers"] = len(buffers)
-        for part in (header, {}, content):  # without a pause: nothing can come between
+        for part in (
+            header,
+            {},
+            content,
+        ):  # without a pause, so that no other message comes between
             sent = self._socket.write_message(json.dumps(part))
         for name, buffer in buffers.items():
             self._socket.write_message(json.dumps({"id": name}))
@@ -169,6 +186,8 @@ class Wire:
         part = await self._socket.read_message()
         if part is None:
             raise ConnectionError("the server has closed the connection")
+        self.n_messages += 1
+        self.n_bytes += len(part)
         return part
 
     async def _read(self) -> None:
@@ -177,14 +196,14 @@ class Wire:
                 await self._take()
                 async with self.news:
                     self.news.notify_all()
-        except Exception as error:  # whatever it is: nothing is read any more
+        except Exception as error:  # in any case, nothing more is read
             self.troubles.append(f"{type(error).__name__}: {error}")
             self.is_closed = True
             async with self.news:
                 self.news.notify_all()
 
     async def _take(self) -> str:
-        """Take in the next message, and tell its kind."""
+        """Handle the next message, and return its kind."""
         kind, content, buffers = await self._receive()
         if kind == "ERROR":
             self.troubles.append(json.dumps(content))
@@ -215,7 +234,7 @@ class Wire:
 
 
 def token_in(page: str) -> str:
-    """The token that a page's session is connected by."""
+    """Return the token of a page's session."""
     found = re.search(r'"token":"([^"]+)"', page)
     if found is None:
         raise ValueError(f"no page of the app: {page[:200]!r}")
@@ -223,7 +242,7 @@ def token_in(page: str) -> str:
 
 
 async def connected(address: str, token: str, **headers: str) -> WebSocketClientConnection:
-    """The websocket of a session; raises `HTTPClientError` where it is refused."""
+    """Return the websocket of a session; raise `HTTPClientError` if it is refused."""
     place = address.partition("?")[0].replace("http", "ws", 1)
     return await websocket_connect(
         HTTPRequest(f"{place}ws", headers=headers),
@@ -233,7 +252,7 @@ async def connected(address: str, token: str, **headers: str) -> WebSocketClient
 
 
 def _objects(content: Any) -> Iterator[Model]:
-    """Every model in a document, where it is defined."""
+    """Yield every model that is defined in a document."""
     parts = content.values() if isinstance(content, dict) else content
     if isinstance(content, dict) and content.get("type") == "object" and "id" in content:
         yield {"attributes": {}, **content}

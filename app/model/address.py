@@ -1,17 +1,20 @@
-"""The state of a page as the query of its address, and back: only what differs from the default.
+"""Links: the state of a page as the query of its address, without values at their default.
 
-A parameter of the `State` is written under its name, a field of one under both names, such as
-``light.sbr``: a string verbatim, anything else as JSON. An address comes from outside: a value that
-the parameter or the dataclass does not accept is refused with a sentence, and the rest is used.
+A parameter of `State` is written under its name, a field of one under both names, such as
+``light.sbr``: a string as it is, any other value as JSON. A link comes from outside: a value that
+the parameter or the dataclass rejects is described in a sentence, and the rest is used.
+
+``pn.state.location.sync`` (Panel 1.9.4) cannot do this: it raises TypeError for 7 of 19 parameters,
+writes every default, and drops values that are rejected without a message.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import urlencode
 
 import param
@@ -20,57 +23,53 @@ from app.model.state import State
 from core.checks import require
 from core.io import ReadOptions
 
-Entries = Mapping[str, str]
-"""Of an address, the text by its name."""
+Result = TypeVar("Result")
 
-MOST_LETTERS = 20_000
-"""Of one entry: a region's many corners."""
+MOST_CHARACTERS = 20_000
+"""Longest value accepted; a region may have many corners."""
 
-NOT_OURS = ("bokeh-session-id", "bokeh-token", "theme", "token")
+SERVER_ENTRIES = ("bokeh-session-id", "bokeh-token", "theme", "token")
 """Entries of an address that the server reads."""
 
 
 def defaults() -> dict[str, Any]:
-    """Of each parameter of the state."""
+    """Return the default of each parameter of the state."""
     return {name: State.param[name].default for name in State.param if name != "name"}
 
 
 def query_of(state: State, own: Mapping[str, Any]) -> str:
-    """The query that gives this state again.
+    """Return the query that restores a state.
 
     Parameters
     ----------
     state : State
     own : mapping
-        Values that need not be told, since the capture brings them: they go before the defaults.
+        Defaults of the session or its capture, which replace those of `State`.
     """
     entries: dict[str, str] = {}
     for name, default in (defaults() | dict(own)).items():
-        entries |= _written(name, getattr(state, name), default)
+        entries |= _entries(name, getattr(state, name), default)
     return urlencode(entries, safe="[],:")
 
 
-def _written(name: str, value: Any, default: Any) -> dict[str, str]:
-    """A value as entries; none where it is the default."""
+def _entries(name: str, value: Any, default: Any) -> dict[str, str]:
+    """Write a value as entries; none where it is the default."""
     if value == default:
         return {}
-    inner = _inner(value)
-    if inner is None:
-        text = (
-            value
-            if isinstance(default, str)
-            else json.dumps(value, separators=(",", ":"), default=sorted)
-        )
-        return {name: text}
-    known = _inner(default) or {}
+    parts = _parts(value)
+    if parts is None:
+        if isinstance(default, str):
+            return {name: value}
+        return {name: json.dumps(value, separators=(",", ":"), default=sorted)}
+    known = _parts(default) or {}
     entries: dict[str, str] = {}
-    for each, part in inner.items():
-        entries |= _written(f"{name}.{each}", part, known.get(each))
+    for each, part in parts.items():
+        entries |= _entries(f"{name}.{each}", part, known.get(each))
     return entries
 
 
-def _inner(value: Any) -> dict[str, Any] | None:
-    """What a value consists of, by name; None where it is one piece."""
+def _parts(value: Any) -> dict[str, Any] | None:
+    """Return the fields or items of a value by name; None where it has none."""
     if isinstance(value, ReadOptions):
         return {each.name: value.as_text(each.name) for each in fields(value)}
     if is_dataclass(value):
@@ -78,13 +77,13 @@ def _inner(value: Any) -> dict[str, Any] | None:
     return dict(value) if isinstance(value, Mapping) else None
 
 
-class Wanted:
-    """What an address asks for.
+class Link:
+    """The entries of a link, checked as they are read.
 
     Parameters
     ----------
     entries : mapping of str to str
-        From outside.
+        Text of each entry by its name, from outside.
 
     Attributes
     ----------
@@ -92,117 +91,111 @@ class Wanted:
         A sentence on each entry that could not be used.
     """
 
-    def __init__(self, entries: Entries) -> None:
+    def __init__(self, entries: Mapping[str, str]) -> None:
         self._entries = entries
         self._known: set[str] = set()
         self.refused: list[str] = []
 
     @property
     def source(self) -> str:
-        """Key of the scene or capture for which it asks, or empty."""
+        """Key of the scene or capture that the link names, or an empty string."""
         return self._entries.get("source", "")
 
     def of(self, bases: Mapping[str, Any]) -> dict[str, Any]:
-        """Those of some parameters for which it asks, by name.
+        """Return the parameters that the link changes, by name.
 
         Parameters
         ----------
         bases : mapping
-            Their values so far: an entry may change a part of one.
+            Present values of the parameters to read: an entry may change a part of one.
         """
-        found = {}
+        found: dict[str, Any] = {}
         for name, base in bases.items():
             kind = getattr(State.param[name], "class_", None)
-            optional = base is None and is_dataclass(kind)
-            value = self._made(name, kind) if optional else self._changed(name, base)
+            is_absent = base is None and is_dataclass(kind)
+            value = self._created(name, kind) if is_absent else self._changed(name, base)
             if value is not base:
-                try:
-                    _check(name, value)
-                except ValueError as error:
-                    self.refused.append(str(error))
-                else:
-                    found[name] = value
+                found |= self._attempt(_checked, name, value) or {}
         return found
 
     def refuse_others(self) -> None:
-        """Refuse the entries that nothing has been asked for."""
-        others = [n for n in self._entries if n not in self._known and n not in NOT_OURS]
+        """Refuse the entries that are not parameters."""
+        others = [n for n in self._entries if n not in self._known and n not in SERVER_ENTRIES]
         if others:
-            self.refused.append(f"There is nothing called {', '.join(others[:5])}.")
+            self.refused.append(f"Unknown parameter: {', '.join(others[:5])}.")
 
-    def _changed(self, name: str, base: Any) -> Any:
-        """A value with the parts that its entries tell."""
-        if isinstance(base, ReadOptions):
-            return self._reading(name, base)
-        inner = _inner(base)
-        if inner is None:
-            return self._told(name, base)
-        changes = {}
-        for each, part in inner.items():
-            changed = self._changed(f"{name}.{each}", part)
-            if changed is not part:
-                changes[each] = changed
-        if isinstance(base, Mapping):
-            return {**base, **changes} if changes else base
-        for each, part in changes.items():  # one by one: the others are good without a bad one
-            try:
-                base = replace(base, **{each: part})
-            except (ValueError, TypeError) as error:
-                self.refused.append(str(error))
-        return base
-
-    def _made(self, name: str, kind: Any) -> Any:
-        """An object that there is not unless its entries make it."""
-        told = {each.name: self._told(f"{name}.{each.name}", None) for each in fields(kind)}
-        told = {each: value for each, value in told.items() if value is not None}
+    def _attempt(self, call: Callable[..., Result], *values: Any, **named: Any) -> Result | None:
+        """Return the result of a call; None, and a sentence in `refused`, where it fails."""
         try:
-            return kind(**told) if told else None
-        except (ValueError, TypeError):
-            self.refused.append(f"{name} = {told} is not accepted.")
+            return call(*values, **named)
+        except (ValueError, TypeError) as error:
+            self.refused.append(str(error))
             return None
 
-    def _reading(self, name: str, base: ReadOptions) -> ReadOptions:
-        typed = {each.name: base.as_text(each.name) for each in fields(base)}
-        for each in typed:
-            text = self._text(f"{name}.{each}")
-            if text is not None:
-                try:
-                    base = ReadOptions.from_text(typed | {each: text})
-                except ValueError as error:
-                    self.refused.append(str(error))
-                else:
-                    typed[each] = text
+    def _changed(self, name: str, base: Any) -> Any:
+        """Return a value with the parts that its entries change, or the value itself."""
+        if isinstance(base, ReadOptions):
+            return self._read_options(name, base)
+        parts = _parts(base)
+        if parts is None:
+            return self._parsed(name, base)
+        changed = {each: self._changed(f"{name}.{each}", part) for each, part in parts.items()}
+        changed = {each: part for each, part in changed.items() if part is not parts[each]}
+        if isinstance(base, Mapping):
+            return {**base, **changed} if changed else base
+        for each, part in changed.items():  # one by one, so that a bad one leaves the others
+            base = self._attempt(replace, base, **{each: part}) or base
         return base
 
-    def _told(self, name: str, base: Any) -> Any:
+    def _created(self, name: str, kind: Any) -> Any:
+        """Return an object made from its entries; None where there are none."""
+        given = {each.name: self._parsed(f"{name}.{each.name}", None) for each in fields(kind)}
+        given = {each: value for each, value in given.items() if value is not None}
+        try:
+            return kind(**given) if given else None
+        except (ValueError, TypeError):
+            self.refused.append(f"{name} = {given} is not accepted.")
+            return None
+
+    def _read_options(self, name: str, base: ReadOptions) -> ReadOptions:
+        for each in fields(base):
+            text = self._text(f"{name}.{each.name}")
+            if text is not None:
+                texts = {other.name: base.as_text(other.name) for other in fields(base)}
+                texts[each.name] = text
+                base = self._attempt(ReadOptions.from_text, texts) or base
+        return base
+
+    def _parsed(self, name: str, base: Any) -> Any:
         text = self._text(name)
         if text is None or isinstance(base, str):
             return base if text is None else text
         try:
             return _like(base, json.loads(text))
         except (ValueError, TypeError, RecursionError):
-            what = "a finite number" if isinstance(base, float) else f"something like {base}"
-            self.refused.append(f"{name} = {text[:80]!r} is not accepted: give {what}.")
+            expected = "a finite number" if isinstance(base, float) else f"a value such as {base}"
+            self.refused.append(f"{name} = {text[:80]!r} is not accepted: give {expected}.")
             return base
 
     def _text(self, name: str) -> str | None:
         self._known.add(name)
         text = self._entries.get(name)
-        if text is not None and len(text) > MOST_LETTERS:
-            self.refused.append(f"{name} is not accepted: it has over {MOST_LETTERS} letters.")
+        if text is not None and len(text) > MOST_CHARACTERS:
+            self.refused.append(f"{name} is not accepted: it has over {MOST_CHARACTERS} letters.")
             return None
         return text
 
 
-def _check(name: str, value: Any) -> None:
-    if isinstance(State.param[name], param.Selector):  # more readable than in param's own words
+def _checked(name: str, value: Any) -> dict[str, Any]:
+    if isinstance(State.param[name], param.Selector):  # param's message is less readable
         options = State.param[name].objects
         require(name, value, value in options, " or ".join(map(repr, options)))
     State(**{name: value})
+    return {name: value}
 
 
 def _like(base: Any, value: Any) -> Any:
-    """A value read from JSON, of the type of another."""
+    """Convert a value read from JSON to the type of another."""
     if isinstance(base, float) and type(value) is int:
         return float(value)
     if isinstance(value, float) and not math.isfinite(value):

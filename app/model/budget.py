@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import psutil
@@ -16,26 +17,26 @@ from core.cost import Cost, cost_of, needs, predicted
 from core.reductions import Reduction
 
 REQUEST_BYTES = 2**30
-"""Working memory of one request at most, if `REQUEST_SHARE` of what is free is no less."""
+"""Most working memory of one request, unless `REQUEST_SHARE` of the free memory is less."""
 
 REQUEST_SHARE = 1 / 8
 REQUEST_S = 25.0
-"""Estimated time of one request at most, on one thread."""
+"""Longest estimated time of one request on one thread."""
 
 SERVER_REQUESTS = 4
 """Requests of the largest size that may be computed at once."""
 
 FREE_BYTES = 2**26
-"""A request that needs less is not counted: it never waits for others."""
+"""Requests below this size are not counted and never wait."""
 
 REMEDY = (
-    "Crop the gate, merge bins or keep fewer pixels under Less data, faster; or range all of it "
+    "Crop the gate, merge bins or keep fewer pixels under Data reduction; or range all of it "
     "without this page: python -m core estimate"
 )
 
 
 def most_bytes() -> int:
-    """Working memory that one request may take now."""
+    """Return the working memory that one request may take now."""
     free = psutil.virtual_memory().available
     return max(FREE_BYTES, min(REQUEST_BYTES, int(REQUEST_SHARE * free)))
 
@@ -46,24 +47,24 @@ def fits(cost: Cost) -> bool:
 
 
 def require_fitting(shape: tuple[int, ...], what: str, cost: Cost) -> None:
-    """Refuse a computation on a capture that takes more memory or time than one request may.
+    """Refuse a computation on a capture that exceeds the limits of a request.
 
     Raises
     ------
     ValueError
-        If it does: says how much it would take, how much it may, and what to do.
+        With the cost, the limit and a remedy.
     """
-    most = most_bytes()
-    name, needed = needs(shape, what), cost.working_bytes
-    accepted = f"at most {most / 1e6:,.0f} MB on this server. {REMEDY}"
-    require(name, f"{needed / 1e6:,.0f} MB", needed <= most, accepted)
-    name = name.replace("working memory", "estimated time")
-    accepted = f"at most {REQUEST_S:.0f} s on this server. {REMEDY}"
-    require(name, f"{cost.seconds:,.0f} s", cost.seconds <= REQUEST_S, accepted)
+    memory = needs(shape, what)
+    for name, cost_, limit, unit in (
+        (memory, cost.working_bytes / 1e6, most_bytes() / 1e6, "MB"),
+        (memory.replace("working memory", "estimated time"), cost.seconds, REQUEST_S, "s"),
+    ):
+        accepted = f"at most {limit:,.0f} {unit} on this server. {REMEDY}"
+        require(name, f"{cost_:,.0f} {unit}", cost_ <= limit, accepted)
 
 
 class Budget:
-    """Working memory that all requests together may take at once; others wait for their turn."""
+    """Working memory that all requests share; a request waits until there is enough."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -71,12 +72,12 @@ class Budget:
 
     @contextmanager
     def spending(self, n_bytes: int) -> Iterator[None]:
-        """Compute something, once there is memory for it; on a worker, for this may wait."""
+        """Take memory for a block; blocks the thread until there is enough."""
         if n_bytes < FREE_BYTES:
             yield
             return
         with self._changed:
-            # Alone, any request may run: it was checked before.
+            # A single request always runs: its size was checked before.
             self._changed.wait_for(lambda: self._has_room_for(n_bytes))
             self._taken_bytes += n_bytes
         try:
@@ -96,7 +97,7 @@ BUDGET = Budget()
 
 @contextmanager
 def spending(shape: tuple[int, ...], what: str, cost: Cost) -> Iterator[None]:
-    """Compute something within the limits of a request, and within what all may take at once.
+    """Compute something within the limits of a request and of all requests together.
 
     Raises
     ------
@@ -111,7 +112,7 @@ def spending(shape: tuple[int, ...], what: str, cost: Cost) -> Iterator[None]:
 def ranging(
     capture: Capture, method: str, settings: Any = None, false_alarm: float | None = None
 ) -> AbstractContextManager[None]:
-    """`spending` of an estimate."""
+    """Compute an estimate within the limits; see `spending`."""
     cost = cost_of(capture, method, settings, false_alarm)
     return spending(capture.cube.shape, method, cost)
 
@@ -119,7 +120,7 @@ def ranging(
 def fitting(
     shape: tuple[int, int, int], method: str, least: Reduction, most: int = 8
 ) -> tuple[int, int] | None:
-    """Bins to merge and pixels to skip, so that a capture fits; as few as will do.
+    """Find the weakest merging of bins and skipping of pixels with which a capture fits.
 
     Parameters
     ----------
@@ -127,22 +128,17 @@ def fitting(
         Rows, columns and bins of the capture.
     method : str
     least : Reduction
-        What is left out of it in any case.
+        Reduction that is applied in any case.
     most : int
         Largest factor of either.
 
     Returns
     -------
     tuple of int
-        ``merge`` and ``skip``; None where no such reduction is enough.
+        ``merge`` and ``skip``; None where no reduction is strong enough.
     """
-    tried = sorted(
-        ((merge, skip) for merge in range(1, most + 1) for skip in range(1, most + 1)),
-        key=lambda each: (each[0] * each[1] ** 2, each[1]),
-    )
-    for merge, skip in tried:
-        if merge < least.merge or skip < least.skip:
-            continue
+    factors = product(range(least.merge, most + 1), range(least.skip, most + 1))
+    for merge, skip in sorted(factors, key=lambda each: (each[0] * each[1] ** 2, each[1])):
         reduction = replace(least, merge=merge, skip=skip)
         if reduction.fits(shape) and fits(predicted(reduction.shape(shape), method)):
             return merge, skip

@@ -1,4 +1,4 @@
-"""Values of the state that follow from a capture unless the user chooses others."""
+"""Defaults of the state that depend on the capture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What downloads say: their formats, and why one failed."""
+"""Texts of downloads: their formats, and reasons for failures."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ FORMATS = {
     "png": "picture, as on screen",
     "svg": "picture, as on screen, to enlarge and edit",
     "csv": "the numbers on screen, as text",
-    "npz": "what is shown, and the answer's arrays, for NumPy",
-    "tif": "what is shown, then range, confidence and counts, for GIS",
+    "npz": "image and arrays of the estimate, for NumPy",
+    "tif": "image, range, confidence and counts, for GIS",
     "ply": "the points on screen, with colours",
     "las": "the points on screen, for survey software",
 }
 
-NOTHING_DRAWN = "There is nothing to save: nothing is drawn here yet. Wait for it, then try again."
+NOTHING_DRAWN = "There is nothing to save: nothing is drawn here yet. Try again later."
 
 NO_POINTS = (
-    "There is nothing to save: no answer is confident enough to be shown. Lower “Show from "
+    "There is nothing to save: no estimate is confident enough to be shown. Lower “Show from "
     "confidence”, then try again."
 )
 
-_GOES_ON = "The page goes on as before."
+_GOES_ON = "The page works as before."
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def not_saved(error: Exception) -> str:
-    """Why a file could not be written, and what to do."""
+    """Return why a file could not be written, and what to do."""
     if isinstance(error, OSError) and error.errno in _FULL:
         return (
             "Nothing was saved: the server's disk for temporary files is full. Make room there, or "
@@ -37,8 +37,8 @@ def not_saved(error: Exception) -> str:
         )
     if isinstance(error, MemoryError):
         return (
-            "Nothing was saved: the server's memory does not suffice for this file. Show less, or "
-            f"choose another format, then try again. {_GOES_ON}"
+            "Nothing was saved: not enough memory on the server for this file. Show fewer pixels, "
+            f"or choose another format, then try again. {_GOES_ON}"
         )
     if isinstance(error, ValueError):
         return cause(error)
@@ -49,5 +49,5 @@ def not_saved(error: Exception) -> str:
 
 
 def no_picture(reason: str) -> str:
-    """Why the browser could not make a picture."""
+    """Return why the browser could not make a picture."""
     return f"Nothing was saved: the picture could not be made ({reason}). {_GOES_ON}"

@@ -1,6 +1,7 @@
-"""What the files hold that are downloaded: of plots, images, clouds and tables, as shown.
+"""Files for download: plots, images, point clouds and tables as they are on screen.
 
-Each function takes what is shown now and returns what writes it later, on a worker.
+Each function takes what is shown now, and returns a function that writes the file on a thread.
+Numbers come from arrays and from `app.units.Quantity`, never from text.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ import numpy as np
 from bokeh.models import Axis, GlyphRenderer
 from numpy.typing import NDArray
 
-from app.model.colors import Look, cloud_of, map_of, shown
+from app.model.colors import ColorScale, cloud_of, map_of, shown
 from app.model.download_text import NO_POINTS, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.state import UNITS, Viewing
 from app.model.store import Answer
 from app.model.text import Fact
 from app.theme import WRONG_COLOR
-from app.units import AXIS_TITLES, scale
+from app.units import AXIS_TITLES, Quantity, scale
 from core import Acquisition
 from core.io import WRITERS, Plane, Product, write_columns
 from core.studies import Table, as_csv
@@ -31,29 +32,29 @@ from core.studies import Table, as_csv
 Array = NDArray[Any]
 
 Write = Callable[[BinaryIO], None]
-"""Writes a file, on a worker."""
+"""Writes a file; runs on a thread."""
 
 
 # Plots
 
 
 def plot_file(figure: Any, acquisition: Acquisition | None = None) -> Write:
-    """The curves of a Bokeh figure, as CSV; see `drawn`."""
+    """Return the curves of a Bokeh figure as CSV; see `drawn`."""
     return partial(write_columns, drawn(figure, acquisition))
 
 
 def drawn(figure: Any, acquisition: Acquisition | None = None) -> dict[str, Array]:
-    """The curves of a Bokeh figure as columns, as far as they are in view.
+    """Return the curves of a Bokeh figure as columns, as far as they are in view.
 
-    The first column is the horizontal axis. Curves over the same places share their lines; those
-    over other places follow in lines of their own, NaN in all other columns. A mark, such as an
-    upright line, is a 1 at its place. What the legend has hidden is left out.
+    The first column is the horizontal axis. Curves over the same positions share rows; others have
+    rows of their own, NaN in all other columns. A mark, such as a vertical line, is a 1 at its
+    position. Curves that are hidden by the legend are left out.
 
     Parameters
     ----------
     figure : bokeh.plotting.figure
     acquisition : Acquisition, optional
-        Of a figure over bins: its first columns are bins, nanoseconds and metres.
+        For a figure over bins, whose first columns are then bins, nanoseconds and metres.
 
     Raises
     ------
@@ -86,7 +87,7 @@ def drawn(figure: Any, acquisition: Acquisition | None = None) -> dict[str, Arra
 
 
 def _curves(figure: Any) -> Iterator[tuple[str, Array, Array]]:
-    """Name with unit, x and y of all that a figure draws and names."""
+    """Yield name with unit, x and y of each curve that a figure draws and names."""
     labels = {
         renderer.id: item.label
         for legend in figure.legend
@@ -105,13 +106,13 @@ def _curves(figure: Any) -> Iterator[tuple[str, Array, Array]]:
             lines = zip(names, columns["xs"], columns["ys"], strict=True)
             found = [(name, np.asarray(x), np.asarray(y)) for name, x, y in lines]
         else:
-            # Beside the legend stand bands and points; other lines only join what has a name.
+            # Bands and points need no legend; lines without one only connect points.
             name = renderer.name if kind in ("VArea", "Scatter") else ""
             data = {name: np.asarray(x) for name, x in columns.items()}
             found = _shape(kind, getattr(label, "value", name), glyph, data)
         for name, x, y in found:
             is_upright = kind == "Line" and x.size == 2 and x[0] == x[1]
-            if name and (is_upright or not unit):  # its height says nothing
+            if name and (is_upright or not unit):  # its height has no meaning
                 yield name, np.unique(x), np.ones(np.unique(x).size, np.float32)
             elif name:
                 yield name if name == unit else f"{name} ({unit})", x, y
@@ -120,7 +121,7 @@ def _curves(figure: Any) -> Iterator[tuple[str, Array, Array]]:
 def _shape(
     kind: str, name: str, glyph: Any, data: Mapping[str, Array]
 ) -> list[tuple[str, Array, Array]]:
-    """Name, x and y of what a glyph draws."""
+    """Return name, x and y of the curves of a glyph."""
     if kind == "Quad" and glyph.top in data:
         return [(name, (data["left"] + data["right"]) / 2, data[glyph.top])]
     if kind == "Quad":
@@ -136,20 +137,20 @@ def _shape(
 
 
 def _label(axes: Sequence[Any], range_name: str = "default") -> str:
-    """Label of the first axis of a vertical range; empty where there is none."""
+    """Return the label of the first axis of a vertical range, or an empty string."""
     own = (each for each in axes if isinstance(each, Axis) and each.y_range_name == range_name)
     return next((each.axis_label or "" for each in own), "")
 
 
 def _unit(label: str) -> str:
-    """What an axis counts: what its label has in brackets, or else the label."""
+    """Return the unit of an axis: the part of its label in brackets, or the whole label."""
     in_brackets = re.search(r"\((.*)\)$", label)
     return in_brackets[1] if in_brackets else label[:1].lower() + label[1:]
 
 
-def _view(of: Any) -> tuple[float, float]:
-    """Ends of an axis as it is zoomed; everything where the browser has not told yet."""
-    ends = [of.start, of.end]
+def _view(axis_range: Any) -> tuple[float, float]:
+    """Return the visible ends of an axis; infinite until the browser has reported them."""
+    ends = [axis_range.start, axis_range.end]
     if any(map(math.isnan, ends)):
         return -math.inf, math.inf
     return min(ends), max(ends)
@@ -161,17 +162,17 @@ def _view(of: Any) -> tuple[float, float]:
 def image_files(
     answer: Answer, kind: str, least_confidence: float, figure: Any
 ) -> dict[str, Write]:
-    """An image (row, col) as shown, and the answer behind it.
+    """Return an image (row, col) as shown, with the estimate that it belongs to.
 
     Parameters
     ----------
     answer : Answer
     kind : str
-        What is shown of it, as `app.model.colors.map_of` takes it.
+        As for `app.model.colors.map_of`.
     least_confidence : float
-        Answers below are left out.
+        Estimates below it are left out.
     figure : bokeh.plotting.figure
-        Where it is drawn; a CSV file holds the pixels in view.
+        Plot of the image; a CSV file holds the pixels in view.
     """
     values, look = map_of(answer, kind, least_confidence)
     name = "range_m" if kind == "Estimate" else kind.lower()
@@ -181,10 +182,10 @@ def image_files(
     return {"csv": image_file(values, look, figure, answer.grid), **files}
 
 
-def image_file(values: Array, look: Look, figure: Any, grid: Grid) -> Write:
-    """The pixels in view of an image (row, col), one line each, as CSV.
+def image_file(values: Array, look: ColorScale, figure: Any, grid: Grid) -> Write:
+    """Return the pixels in view of an image (row, col), one line each, as CSV.
 
-    Rows and columns are those of the file, as on the axes; `grid` tells them.
+    Rows and columns are those of the file, as on the axes.
     """
     places = grid.place(*map(np.arange, values.shape))
     in_view = [
@@ -200,14 +201,14 @@ def image_file(values: Array, look: Look, figure: Any, grid: Grid) -> Write:
     return write
 
 
-def _in_view(of: Any, place: Array, half: float) -> NDArray[np.bool_]:
-    """Which of an image's rows or columns are at least partly in view."""
-    low, high = _view(of)
+def _in_view(axis_range: Any, place: Array, half: float) -> NDArray[np.bool_]:
+    """Return which rows or columns are at least partly in view."""
+    low, high = _view(axis_range)
     return np.asarray((place + half > low) & (place - half < high))
 
 
 def _product(answer: Answer, least_confidence: float, **more: Any) -> Product:
-    """What is shown of an answer, as `core.io.writers` takes it."""
+    """Return the pixels on show of an estimate, for `core.io.writers`."""
     visible, image = shown(answer, least_confidence), answer.run.image
     range_m = np.where(visible, image.range_m, np.nan)
     more.setdefault("pixel_angle_rad", answer.capture.acquisition.pixel_angle_rad)
@@ -218,12 +219,12 @@ def _product(answer: Answer, least_confidence: float, **more: Any) -> Product:
 
 
 def cloud_files(answer: Answer, kind: str, viewing: Viewing) -> dict[str, Write]:
-    """The points of `app.model.colors.cloud_of`, with the colours that they have on screen.
+    """Return the points of `app.model.colors.cloud_of` in their colours on screen.
 
     Raises
     ------
     ValueError
-        If there are none.
+        If there are no points.
     """
     if not shown(answer, viewing.least_confidence).any():
         raise ValueError(NO_POINTS)
@@ -243,7 +244,7 @@ def cloud_files(answer: Answer, kind: str, viewing: Viewing) -> dict[str, Write]
 
 
 def _cloud(answer: Answer, kind: str, viewing: Viewing) -> Product:
-    """The answers on show, and in the image of their colours those of the points on screen."""
+    """Return the pixels on show with an image of their colours."""
     cloud, rgb, wrong = cloud_of(answer, kind, viewing)
     rgb = rgb.copy()
     if wrong is not None:
@@ -258,55 +259,58 @@ def _cloud(answer: Answer, kind: str, viewing: Viewing) -> Product:
 
 
 def table_file(item: Table) -> Write:
-    """A table with every digit of its numbers, as CSV."""
-    return _text(item.columns, item.rows)
+    """Return a table with every digit of its numbers, as CSV."""
+    return _csv(item.columns, item.rows)
 
 
 def shown_table_file(columns: Sequence[Sequence[Any]], rows: Sequence[Mapping[str, Any]]) -> Write:
-    """Columns and rows of an `app.widgets.controls.Table` as they stand there, as CSV.
+    """Return the columns and rows of an `app.widgets.controls.Table` as CSV.
 
-    A cell's smaller line and a row's note get columns of their own; a percent sign that a whole
-    column carries moves into its name.
+    A cell's smaller line and a row's note get columns of their own; the unit that the numbers of a
+    column share moves into its name.
     """
     (first, *_), *others = columns
     heads, body = [first], [[row["name"]] for row in rows]
-    for place, (title, *_) in enumerate(others):
-        cells = [row["cells"][place] if row.get("cells") else ("", None, "") for row in rows]
-        texts = ["" if cell[0] == "–" else cell[0].replace(",", "") for cell in cells]
-        in_percent = all(text.endswith(" %") for text in texts if text) and any(texts)
-        heads.append(f"{title} (%)" if in_percent else title)
-        for line, text in zip(body, texts, strict=True):
-            line.append(text.removesuffix(" %"))
-        if any(cell[2] for cell in cells):
+    for n, (title, *_) in enumerate(others):
+        cells = [row["cells"][n] if row.get("cells") else ("", None, "") for row in rows]
+        texts, values, below = zip(*cells, strict=True)
+        unit = next((each.unit for each in texts if isinstance(each, Quantity)), "")
+        heads.append(f"{title} ({unit})" if unit and unit not in title else title)
+        for line, text, value in zip(body, texts, values, strict=True):
+            is_number = isinstance(value, int | float) and not isinstance(text, Quantity)
+            line.append(value if is_number else _value(text))
+        if any(below):
             heads.append(f"{title}, more")
-            for line, cell in zip(body, cells, strict=True):
-                line.append(cell[2])
+            for line, more in zip(body, below, strict=True):
+                line.append(more)
     notes = [row.get("message") or row.get("note") or "" for row in rows]
-    return _text([*heads, "note"], [[*line, note] for line, note in zip(body, notes, strict=True)])
-
-
-_A_NUMBER = r"([+-]?[\d,.]+(?:e[+-]\d+)?|∞)"
-_A_FACT = re.compile(
-    rf"{_A_NUMBER}(?: \[{_A_NUMBER}, {_A_NUMBER}\])?(?: (%|[^\W\d]+))?(?: \((.+)\))?"
-)
+    return _csv([*heads, "note"], [[*line, note] for line, note in zip(body, notes, strict=True)])
 
 
 def facts_file(facts: Sequence[Fact]) -> Write:
-    """Named values as CSV; what else stands beside a number has columns of its own."""
+    """Return named values as CSV; interval, unit and note of a number have columns of their own."""
     rows = []
     for name, text, help in facts:
-        parts = _A_FACT.fullmatch(text)
-        told = parts.groups("") if parts else ("" if text == "–" else text, *[""] * 4)
-        plain = [each.replace("∞", "inf").replace(",", "") for each in told] if parts else told
-        rows.append([name, *plain, help])
-    return _text(("quantity", "value", "low", "high", "unit", "more", "meaning"), rows)
+        more: Sequence[Any] = [""] * 4
+        if isinstance(text, Quantity):
+            more = [text.low, text.high, text.unit, text.note]
+        rows.append([name, _value(text), *more, help])
+    return _csv(("quantity", "value", "low", "high", "unit", "more", "meaning"), rows)
 
 
-def _text(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Write:
+def _value(text: str) -> Any:
+    """Return the number of a text that keeps one; a dash is an empty cell."""
+    return text.value if isinstance(text, Quantity) else "" if text == "–" else text
+
+
+def _csv(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Write:
     if not rows:
         raise ValueError(NOTHING_DRAWN)
     plain = [
-        ["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row]
+        [
+            "" if cell is None or (isinstance(cell, float) and math.isnan(cell)) else cell
+            for cell in row
+        ]
         for row in rows
     ]
 

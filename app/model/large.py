@@ -1,4 +1,4 @@
-"""Files larger than memory: a preview of all of it, then windows, in memory one at a time."""
+"""Files larger than memory: a preview of the whole file, then windows, one at a time in memory."""
 
 from __future__ import annotations
 
@@ -27,40 +27,42 @@ if TYPE_CHECKING:
     import xarray as xr
 
 PREVIEW_COUNTS = 2**23
-"""Of the preview's pixels and bins: ranged in some tenths of a second, each time more is read."""
+"""Most pixels times bins of a preview, whose estimate is computed again as more is read."""
 
 WINDOW_COUNTS = 2**24
-"""Of a window's: a slider still answers at once."""
+"""Most pixels times bins of a window: sliders still respond at once."""
 
 PREVIEW_PIXELS, WINDOW_PIXELS = 2**20, 2**21
-"""Pixels of either: with few bins, the images of a pixel take more memory than its counts."""
+"""Most pixels: with few bins, the images take more memory than the counts."""
 
-AT_ONCE_S = 1.0
-"""Spent reading before a preview is first shown, whatever it holds by then."""
+FIRST_READ_S = 1.0
+"""Reading time before a preview is first shown."""
 
-WHOLE_BYTES = 2**28  # of counts: ranged in some seconds
-WHOLE_SHARE = (
-    1 / 8
-)  # of the memory that is free; a capture and its posterior take five times as much
+WHOLE_BYTES = 2**28
+"""Most bytes of counts that are held as a whole: some seconds per estimate."""
+
+WHOLE_SHARE = 1 / 8
+"""The same as a share of free memory; a capture with its posterior takes five times its counts."""
+
 LIMIT = "FIRSTPHOTON_WHOLE_BYTES"
-"""Variable of the environment that overrides both."""
+"""Environment variable that overrides both."""
 
 Progress = Callable[[int, int], None]
 At = TypeVar("At", int, float, NDArray[np.int_])
 
 
 def most_whole_bytes() -> int:
-    """Counts of a file that are held as a whole, in bytes; of a larger one, windows are."""
-    told = os.environ.get(LIMIT)
+    """Return the most bytes of counts that are held as a whole."""
+    override = os.environ.get(LIMIT)
     free = psutil.virtual_memory().available
-    return min(WHOLE_BYTES, int(WHOLE_SHARE * free)) if told is None else int(told)
+    return min(WHOLE_BYTES, int(WHOLE_SHARE * free)) if override is None else int(override)
 
 
 def require_small(path: Path, n_bytes: int) -> None:
-    """Refuse counts that are too many to be held as a whole, of a format that knows no windows."""
+    """Refuse a capture too large for memory, of a format that cannot be read in windows."""
     most = most_whole_bytes()
     remedy = (
-        f"at most {most:,} to this page. A .zarr may be of any size, for it is read in parts: "
+        f"at most {most:,}. A .zarr may have any size, since it is read in parts: "
         f"python -m core export {path.name} {path.stem}.zarr"
     )
     require(f"bytes of counts of {path.name}", n_bytes, n_bytes <= most, remedy)
@@ -68,29 +70,29 @@ def require_small(path: Path, n_bytes: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Cutout:
-    """What is in memory of a file."""
+    """The part of a file that is in memory."""
 
     file: LargeFile
     window: Window
     capture: Capture
     read: float
-    """Share of the window's pixels that have been read; others have no counts."""
+    """Share of the window's pixels that have been read; the others have no counts."""
     is_final: bool
-    """Whether all of them have been, and are seen in the light of the whole file."""
+    """Whether all pixels have been read and the flux prior of the whole file is known."""
 
     @property
     def is_preview(self) -> bool:
-        """Whether it is all of the file."""
+        """Whether the window is the whole file."""
         return self.window == self.file.whole
 
 
 class LargeFile:
-    """A file of which windows are read; any number of sessions may look at it.
+    """A file that is read in windows, for any number of sessions.
 
     Parameters
     ----------
     counts : DataArray, shape (row, col, bin)
-        As `core.open_capture` gives them.
+        As `core.open_capture` returns it.
     """
 
     def __init__(self, counts: xr.DataArray) -> None:
@@ -103,12 +105,12 @@ class LargeFile:
         self._reading, self._preparing_prior = Lock(), Lock()
 
     def fitting(self, rows: tuple[int, int], cols: tuple[int, int]) -> Window:
-        """The window of the finest step that may be read."""
+        """Return the window of the finest step that may be read."""
         return Window.fitting(rows, cols, self._most_pixels)
 
     @property
     def _most_pixels(self) -> int:
-        """Largest number of pixels in a window."""
+        """Most pixels of a window."""
         return min(WINDOW_COUNTS // self._n_bins, WINDOW_PIXELS)
 
     @cached_property
@@ -117,39 +119,39 @@ class LargeFile:
 
     @property
     def preview(self) -> Cutout:
-        """All of the file, as far as it has been read; a little of it is read the first time."""
+        """The whole file as far as it has been read, at first for `FIRST_READ_S`."""
         with self._reading:
             if self._preview is None:
                 started = perf_counter()
                 self._reader.read_some()
-                while not self._reader.is_complete and perf_counter() - started < AT_ONCE_S:
+                while not self._reader.is_complete and perf_counter() - started < FIRST_READ_S:
                     self._reader.read_some()
-                self._preview = self._look()
+                self._preview = self._whole_cutout()
             return self._preview
 
     def read_on(self, progress: Progress, cancelled: Callable[[], bool]) -> bool:
-        """Read more of the preview, about as much again as there is; whether it is final then.
+        """Double what the preview has read; return whether it is final.
 
         Raises
         ------
         Cancelled
-            If `cancelled` said so.
+            If `cancelled` returned True.
         CaptureError
             If a part of the file cannot be read.
         """
         reader = self._reader
         enough = 2 * reader.done
         while not reader.is_complete and reader.done < enough:
-            _go_on(cancelled)
+            _raise_if(cancelled)
             with self._reading:
                 reader.read_some()
             progress(reader.done, reader.of + 1)
         flux_prior = self._flux_prior if reader.is_complete else None
         with self._reading:
-            self._preview = self._look(flux_prior)
+            self._preview = self._whole_cutout(flux_prior)
             return self._preview.is_final
 
-    def _look(self, flux_prior: FluxPrior | None = None) -> Cutout:
+    def _whole_cutout(self, flux_prior: FluxPrior | None = None) -> Cutout:
         read, capture = float(self._reader.seen.mean()), self._reader.capture(flux_prior)
         return Cutout(self, self.whole, capture, read, is_final=flux_prior is not None)
 
@@ -159,16 +161,16 @@ class LargeFile:
         progress: Progress = lambda done, of: None,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Cutout:
-        """The preview, or a window; the latest one is kept.
+        """Return the preview, or a window; the latest window is kept.
 
         Raises
         ------
         Cancelled
-            If `cancelled` said so.
+            If `cancelled` returned True.
         CaptureError
             If a part of the file cannot be read.
         ValueError
-            If the window does not lie in the image, or holds too much.
+            If the window is outside the image or too large.
         """
         if window is None:
             return self.preview
@@ -180,17 +182,17 @@ class LargeFile:
         require("pixels of a window", n_pixels, n_pixels <= max(most, 1), f"at most {most:,}")
         reader = WindowReader(self._counts, window)
         while not reader.is_complete:
-            _go_on(cancelled)
+            _raise_if(cancelled)
             reader.read_some()
             progress(reader.done, reader.of + 1)
-        _go_on(cancelled)
+        _raise_if(cancelled)
         capture = reader.capture(self._flux_prior)
         self._latest = Cutout(self, window, capture, read=1.0, is_final=True)
         return self._latest
 
     @property
     def _flux_prior(self) -> FluxPrior:
-        """Learned when it is first needed, while others wait."""
+        """The flux prior of the whole file; computed once, while other sessions wait."""
         with self._preparing_prior:
             return self._sampled_flux_prior
 
@@ -199,13 +201,13 @@ class LargeFile:
         return sampled_flux_prior(self._counts)
 
 
-def _go_on(cancelled: Callable[[], bool]) -> None:
+def _raise_if(cancelled: Callable[[], bool]) -> None:
     if cancelled():
         raise Cancelled
 
 
 def open_large(path: Path, options: dict[str, Any]) -> LargeFile | None:
-    """A file too large to be held as a whole; None if it is not, or knows no windows."""
+    """Open a file too large for memory; None for others, and for formats without windows."""
     n_bytes = bytes_of(path, **options)
     if n_bytes is None or n_bytes <= most_whole_bytes():
         return None
@@ -214,25 +216,25 @@ def open_large(path: Path, options: dict[str, Any]) -> LargeFile | None:
 
 @dataclass(frozen=True)
 class Grid:
-    """Which rows and columns of a file the pixels of an image are."""
+    """Rows and columns in a file of the pixels of an image."""
 
     first: tuple[int, int] = (0, 0)
     step: int = 1
 
     def place(self, row: At, col: At) -> tuple[At, At]:
-        """Row and column in the file of a pixel of the image, or of a place between pixels."""
+        """Convert a row and a column of the image, whole or not, to those of the file."""
         return self.first[0] + self.step * row, self.first[1] + self.step * col
 
     def index(self, row: float, col: float) -> tuple[float, float]:
-        """Where in the image a row and a column of the file are, inside of it or not."""
+        """Convert a row and a column of the file to those of the image, inside it or not."""
         return (row - self.first[0]) / self.step, (col - self.first[1]) / self.step
 
     def pixel(self, row: float, col: float) -> tuple[int, int]:
-        """The nearest pixel to that."""
+        """Return the pixel nearest to a row and a column of the file."""
         down, across = self.index(row, col)
         return round(down), round(across)
 
     def thinned(self, skip: int, pool: int) -> Grid:
-        """The same once pixels are left out and added (`core.reductions.Reduction`)."""
+        """Return the grid after pixels are skipped and pooled (`core.reductions.Reduction`)."""
         shift = (skip - 1) // 2 + skip * (pool - 1) // 2
         return Grid(self.place(shift, shift), self.step * skip * pool)

@@ -32,8 +32,8 @@ def point_cloud(range_m: ArrayLike, pixel_angle_rad: float, **images: ArrayLike)
     Raises
     ------
     ValueError
-        If ``range_m`` is no image, an image has another size than ``range_m``, or the angle is not
-        between 0 and π/2.
+        If ``range_m`` is not an image, another image differs in size, or the angle is not between
+        0 and π/2.
     """
     ranges = np.asarray(range_m, float)
     xyz_m, row, col = points_m(ranges, pixel_angle_rad)
@@ -54,31 +54,31 @@ def point_cloud(range_m: ArrayLike, pixel_angle_rad: float, **images: ArrayLike)
 
 
 def pixel_index(cloud: pv.PolyData) -> NDArray[np.int32]:
-    """Index of each point's pixel in the flattened image, ``row * n_cols + col``."""
+    """Return the index of each point's pixel in the flattened image, ``row * n_cols + col``."""
     n_cols = cloud.field_data["image_shape"][1]
     return np.asarray(cloud["row"] * n_cols + cloud["col"], np.int32)
 
 
 def spacing_m(cloud: pv.PolyData) -> float:
-    """Distance between neighbouring points of a surface at the middle range; 0 without points."""
+    """Return the distance of neighbouring points at the median range; 0 without points."""
     if cloud.n_points == 0:
         return 0.0
     return float(np.median(cloud["range_m"]) * cloud.field_data["pixel_angle_rad"][0])
 
 
 def view_bounds(cloud: pv.PolyData, keep: ArrayLike | None = None) -> list[float]:
-    """Box around the target, not around points scattered through the gate.
+    """Return a box around the target that leaves out points scattered through the gate.
 
-    False detections lie evenly over the ranges of the gate, so a slice of range belongs to the
-    target where it holds clearly more points than the middle slice. Where most points lie in no
-    such slice the target itself fills the gate, and nearly all ranges count.
+    False detections are spread evenly over the gate. A slice of range therefore belongs to the
+    target where it holds clearly more points than the median slice. If most points lie outside such
+    slices, the target fills the gate, and nearly all ranges are included.
 
     Parameters
     ----------
     cloud : pyvista.PolyData
         From `point_cloud`.
     keep : array_like of bool, shape (point,), optional
-        Points to look at, such as those known to be right; all points if it names none.
+        Points to use, such as those known to be right; all points if none is set.
 
     Returns
     -------
@@ -99,7 +99,7 @@ def view_bounds(cloud: pv.PolyData, keep: ArrayLike | None = None) -> list[float
 
 
 def _target_ranges(ranges: Floats) -> tuple[float, float]:
-    """Lowest and highest range of the target; looks closer while that halves the span."""
+    """Return the lowest and highest range of the target; repeats while that halves the span."""
     low, high = _dense_ranges(ranges)
     if high - low > 0.5 * np.ptp(ranges):
         return low, high
@@ -107,7 +107,7 @@ def _target_ranges(ranges: Floats) -> tuple[float, float]:
 
 
 def _dense_ranges(ranges: Floats) -> tuple[float, float]:
-    """Ends of the slices that hold clearly more points than the middle one, see `view_bounds`."""
+    """Return the ends of the slices with clearly more points than the median slice."""
     counts, edges = np.histogram(ranges, bins=100)
     dense = np.flatnonzero(counts > 3 * np.median(counts) + 0.002 * ranges.size)
     if counts[dense].sum() < 0.5 * ranges.size:

@@ -1,4 +1,4 @@
-"""Titles of the estimators, as shown on screen."""
+"""Titles of the estimators on screen."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ METHOD_TITLES = {name: estimator.title for name, estimator in ESTIMATORS.items()
 
 
 def method_title(name: str) -> str:
-    """Title of an estimator; a reconstruction is marked as such."""
+    """Return the title of an estimator; a reconstruction is marked as such."""
     return METHOD_TITLES[name] + (" (reconstruction)" if ESTIMATORS[name].reconstructed else "")

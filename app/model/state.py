@@ -1,4 +1,4 @@
-"""What a session's user has chosen: parameters only, each already a frozen object of `core`."""
+"""Everything that a user can choose in a session, as frozen objects."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from core.studies.ablation import TITLES
 
 @dataclass(frozen=True)
 class Illumination:
-    """How a built-in scene is lit and recorded."""
+    """Illumination and recording of a built-in scene."""
 
     sbr: float = parameter(
         0.06,
         Number("SBR", 0.01, 10.0, log=True, least=0.0, open_below=True),
-        "Signal over background, both in photons per pulse over the whole gate. Daylight: < 0.1.",
+        "Signal flux divided by background flux over the whole gate. Daylight: below 0.1.",
     )
     ppp: float = parameter(
         0.1041,
         Number("PPP", 0.001, 10.0, log=True, least=0.0, unit="photons per pulse"),
-        "Signal photons detected per pulse, were the detector always armed.",
+        "Signal flux: detections per pulse if the detector were always armed.",
     )
     n_pulses: int = parameter(
         1000,
         Number("Pulses", 10, 50_000, log=True, whole=True, least=1),
-        "Pulses sent for each pixel: more make the histogram smoother, and take longer to record.",
+        "Pulses per pixel. More make the histogram smoother, and take longer to record.",
     )
     seed: int = parameter(
         0,
         Number("Seed", 0, 999, whole=True, least=0),
-        "Which throw of the dice: the same seed gives the same capture again.",
+        "Random seed: the same seed gives the same capture.",
     )
 
     def __post_init__(self) -> None:
@@ -52,24 +52,24 @@ class Illumination:
         return Flux(self.ppp, self.sbr)
 
     def acquisition(self, of_scene: Acquisition) -> Acquisition:
-        """The scene's instrument setting, with this number of pulses."""
+        """Return a scene's acquisition with this number of pulses."""
         return replace(of_scene, n_pulses=self.n_pulses)
 
 
 @dataclass(frozen=True)
 class Viewing:
-    """How the answer is shown; changes no figure."""
+    """Display of the estimate; does not affect it."""
 
     least_confidence: float = parameter(
         0.9,
         Number("Show from confidence", 0.0, 1.0, least=0.0),
-        "Answers below are hidden in image and cloud, not in the figures. 0 shows what the "
-        "estimator makes of pure noise, too.",
+        "Estimates with less confidence are hidden in image and cloud, but count in the figures. "
+        "0 also shows estimates from noise alone.",
     )
     field_of_view_deg: float = parameter(
         5.0,
         Number("Field of view", 0.001, 120.0, log=True, unit="degrees", least=0.0, open_below=True),
-        "Width of the image as seen from the sensor: sets how wide the cloud is, in metres.",
+        "Horizontal field of view of the sensor; determines the width of the cloud in metres.",
     )
 
     def __post_init__(self) -> None:
@@ -77,40 +77,39 @@ class Viewing:
 
 
 @dataclass(frozen=True)
-class Less:
-    """Less of a capture than there is: quicker to range, or clearer, and never as fine."""
+class ReductionSettings:
+    """Reduction of a capture: faster to process, or with more photons per pixel, but coarser."""
 
     merge: int = parameter(
         1,
         Number("Bins merged", 1, 8, whole=True, least=1, unit="bins"),
-        "Neighbouring bins added to one: less to range, and a coarser answer. T_n counts the "
-        "merged ones.",
+        "Neighbouring bins summed to one: faster and coarser. T_n counts merged bins.",
     )
     gate_from: float = parameter(
         0.0,
         Number("Gate from", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
-        "Bins before are left out, and the pulses that fired in them.",
+        "Earlier bins are cut, with the pulses that fired in them.",
     )
     gate_to: float = parameter(
         1.0,
         Number("Gate to", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
-        "Bins behind are left out: an echo there is lost.",
+        "Later bins are cut, with the echoes in them.",
     )
     pool: int = parameter(
         1,
-        Number("Pixels added", 1, 8, whole=True, least=1, unit="rows and columns"),
-        "Histograms of so many rows and columns of neighbours added to one: more photons in each, "
-        "and a blurred image.",
+        Number("Pixels summed", 1, 8, whole=True, least=1, unit="rows and columns"),
+        "Histograms of this many rows and columns summed to one: more photons per pixel, and a "
+        "blurred image.",
     )
     skip: int = parameter(
         1,
-        Number("Pixels skipped to", 1, 8, whole=True, least=1, unit="rows and columns"),
-        "One pixel is kept of so many rows and columns.",
+        Number("Pixel step", 1, 8, whole=True, least=1, unit="rows and columns"),
+        "Keep one pixel of this many rows and columns.",
     )
     pulses: float = parameter(
         1.0,
         Number(
-            "Pulses accumulated",
+            "Pulses used",
             1e-3,
             1.0,
             log=True,
@@ -119,16 +118,16 @@ class Less:
             most=1.0,
             open_below=True,
         ),
-        "Share of the pulses whose detections are kept, as if recording had ended sooner: fewer "
-        "are a part of more.",
+        "Share of the pulses to use, as if the recording had ended earlier. A smaller share is a "
+        "subset of a larger one.",
     )
 
     def __post_init__(self) -> None:
         check_fields(self)
 
     @classmethod
-    def of(cls, reduction: Reduction, n_bins: int) -> Less:
-        """The settings that reduce a capture of so many bins like this."""
+    def of(cls, reduction: Reduction, n_bins: int) -> ReductionSettings:
+        """Return the settings that make this reduction of a capture with `n_bins` bins."""
         first, end = reduction.gate or (0, n_bins)
         return cls(
             reduction.merge,
@@ -140,7 +139,7 @@ class Less:
         )
 
     def reduction(self, n_bins: int) -> Reduction:
-        """What is to be done to a capture of so many bins."""
+        """Return the reduction for a capture with `n_bins` bins."""
         first = min(round(self.gate_from * n_bins), n_bins - 1)
         end = max(round(self.gate_to * n_bins), first + 1)
         gate = None if (first, end) == (0, n_bins) else (first, end)
@@ -154,14 +153,14 @@ FIRST_METHODS = ("peak", "coates", "likelihood", "tracking", "oracle")
 CLOUDS = "3D clouds"
 
 KINDS = ("Range", "Error", "Confidence", CLOUDS)
-"""What the pictures of methods may show."""
+"""Kinds of pictures of methods."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Which methods are compared, how they are set, and what their pictures show.
+    """The methods that are compared, their settings, and the kind of their pictures.
 
-    The tracking differentiator has the settings that it has on every page.
+    The tracking differentiator has the same settings as on other pages.
     """
 
     methods: tuple[str, ...] = tuple(each for each in ESTIMATORS if each in FIRST_METHODS)
@@ -201,9 +200,9 @@ MOST_CORNERS = 1000
 
 
 class Checked(param.Parameter):
-    """A parameter of which a function knows what is acceptable, and raises ``ValueError`` if not.
+    """A parameter whose values are checked by a function of its name and a value.
 
-    It is called with the parameter's name and a value.
+    The function raises ``ValueError``.
     """
 
     __slots__ = ("check",)
@@ -248,36 +247,40 @@ def _check_absent(name: str, value: Any) -> None:
 
 
 class State(param.Parameterized):
-    """Everything a user can choose.
+    """Everything that a user can choose.
 
-    `app.model.address` writes all of it into the address of the page, and `app.model.script` what
-    concerns `core` into a script: both know a new parameter, or a new field of one, by its default.
+    `app.model.address` and `app.model.script` follow from the parameters and from the fields of
+    their values. Those of `app.model.store.Request` are what an estimate is computed from.
     """
 
-    source = param.String(default="car", doc="Key of the catalogue.")
+    source = param.String(default="car", doc="Key of a scene or capture.")
     light = param.ClassSelector(class_=Illumination, default=Illumination())
     reading = param.ClassSelector(class_=ReadOptions, default=ReadOptions())
     window = param.ClassSelector(
-        class_=Window, default=None, doc="Of a capture larger than memory; None for all of it."
+        class_=Window,
+        default=None,
+        doc="Part of a capture larger than memory; None for its preview.",
     )
-    less = param.ClassSelector(class_=Less, default=Less())
+    less = param.ClassSelector(class_=ReductionSettings, default=ReductionSettings())
     absent: Any = Checked(
         frozenset(), _check_absent, doc="Parts and corrections that are switched off."
     )
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
-    pixel: Any = Checked((31, 24), _check_pixel, doc="Row and column on show.")
+    pixel: Any = Checked((31, 24), _check_pixel, doc="Selected row and column.")
     image = param.Selector(default="Estimate", objects=list(IMAGES))
     cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
     viewing = param.ClassSelector(class_=Viewing, default=Viewing())
     difference = param.Boolean(default=False, doc="Whether the first difference is drawn.")
     page: Any = Checked("Explore", _check_page, doc="Name of a page of `app.pages.catalog`.")
-    unit = param.Selector(default="bins", objects=list(UNITS), doc="Of each axis along the gate.")
-    map = param.Selector(default="Estimate", objects=list(MAPS), doc="What one navigates by.")
-    subject = param.Selector(default="Pixel", objects=list(SUBJECTS), doc="What is inspected.")
+    unit = param.Selector(default="bins", objects=list(UNITS), doc="Unit of axes along the gate.")
+    map = param.Selector(default="Estimate", objects=list(MAPS), doc="Image of the Inspect page.")
+    subject = param.Selector(
+        default="Pixel", objects=list(SUBJECTS), doc="Subject of the Inspect page."
+    )
     pins: Any = Checked((), _check_pins, doc="Up to four pixels (row, col) to compare.")
     region: Any = Checked(
         (),
         _check_region,
-        doc="Corners (row, col) of a polygon of pixels that are looked at as one; none if empty.",
+        doc="Corners (row, col) of a polygon of pixels whose counts are added.",
     )
     comparison = param.ClassSelector(class_=Comparison, default=Comparison())

@@ -1,4 +1,4 @@
-"""A session's capture and answer: runs `core`, holds read-only results, knows no widget."""
+"""Requests and estimates: runs `core`, holds read-only results, imports no widgets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
-from app.model.state import Illumination, Less
+from app.model.state import Illumination, ReductionSettings
 from core import (
     CORRECTIONS,
     PARTS,
@@ -44,28 +44,28 @@ ASSETS = Path(str(resources.files("assets")))
 
 @dataclass(frozen=True)
 class Source:
-    """Something to look at: a built-in scene to simulate, or a file to read."""
+    """A built-in scene to simulate, or a file to read."""
 
     title: str
     load: Callable[[Illumination, ReadOptions, Collection[str]], Capture]
-    """Makes the capture, parts of some names left out of a scene."""
+    """Makes the capture, without the parts of the scene that are named."""
     scene: Callable[[], Scene] | None = None
     """None for a file."""
     large: Callable[[ReadOptions], LargeFile | None] = lambda _reading: None
-    """Opens a file of which only windows are read; None where all of it is."""
+    """Opens a file that is read in windows; None for one that is read as a whole."""
     name: str = ""
-    """Of the scene in `core.scenes`, or of the file."""
+    """Name of the scene in `core.scenes`, or of the file."""
     arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    """With which the scene is built."""
+    """Arguments of the scene."""
 
     @property
     def is_scene(self) -> bool:
-        """Whether it is simulated."""
+        """Whether captures are simulated."""
         return self.scene is not None
 
 
 def bare(scene: Scene, absent: Collection[str]) -> Scene:
-    """A scene without those of its parts that are switched off."""
+    """Return a scene without the parts that are switched off."""
     for part in PARTS:
         if part in absent:
             scene = without(scene, part)
@@ -73,8 +73,7 @@ def bare(scene: Scene, absent: Collection[str]) -> Scene:
 
 
 def scene_source(title: str, name: str, **arguments: Any) -> Source:
-    """A built-in scene of `core.scenes`."""
-
+    """Return a source of captures of a scene of `core.scenes`."""
     build = cache(partial(scenes[name], **arguments))
 
     def load(light: Illumination, _reading: ReadOptions, absent: Collection[str]) -> Capture:
@@ -85,7 +84,7 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
 
 
 def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
-    """A capture file; one that all sessions share is kept once it is read."""
+    """Return a capture file as a source; with `shared`, its capture is kept for all sessions."""
 
     def read(reading: ReadOptions) -> Capture:
         capture = read_capture(path, **vars(reading))
@@ -105,7 +104,7 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
 
 
 def built_in_sources() -> dict[str, Source]:
-    """What every session starts with."""
+    """Return the scenes and the sample that every session offers."""
     return {
         "car": scene_source("Car at 50 m", "car"),
         "car_256": scene_source("Car at 50 m, 256 × 256", "car", size=256),
@@ -122,47 +121,47 @@ def built_in_sources() -> dict[str, Source]:
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be computed."""
+    """Everything that an estimate is computed from."""
 
     source: Source
     light: Illumination
     reading: ReadOptions
     tracking: TrackingParameters
-    less: Less
+    less: ReductionSettings
     absent: frozenset[str] = frozenset()
     """Parts of the scene and corrections of the estimators that are switched off."""
     window: Window | None = None
-    """Of a capture larger than memory; None for all of it."""
+    """Part of a capture larger than memory; None for its preview."""
 
 
 COMPUTED_FROM = tuple(each.name for each in fields(Request))
-"""Parameters of the state that an answer is computed from."""
+"""Parameters of the state that a request is made of."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What was computed, and from what."""
+    """The estimate that was computed for a request."""
 
     request: Request
     run: Run
     capture_s: float
     """Seconds spent simulating or reading."""
     whole: Capture
-    """What the capture that was ranged is a part of, or that capture itself."""
+    """The capture before its reduction."""
     cutout: Cutout | None = None
-    """Of a file larger than memory, what is in memory."""
-    asked: Less = field(default_factory=Less)
-    """The reduction that was asked for; that of `request` leaves out more where this would take
-    more than the server gives to a request."""
+    """The part in memory of a file larger than memory."""
+    requested: ReductionSettings = field(default_factory=ReductionSettings)
+    """The reduction that was requested; `request` has a stronger one where the server requires
+    it."""
 
     @property
     def capture(self) -> Capture:
-        """The capture that was ranged."""
+        """The capture after its reduction."""
         return self.run.capture
 
     @property
     def grid(self) -> Grid:
-        """Which rows and columns of its file the pixels of the capture are."""
+        """Rows and columns in the file of the capture's pixels."""
         if self.cutout is None:
             return Grid()
         rows, cols = self.cutout.window.picked
@@ -171,62 +170,63 @@ class Answer:
 
 
 def compute(request: Request, previous: Answer | None) -> Answer:
-    """Answer a request; what the previous answer already holds is not computed again.
+    """Compute an estimate, as far as possible from what the previous one holds.
 
-    A capture that is opened, and takes more memory or time than one request may, is reduced until
-    it fits (`app.model.budget`).
+    A capture that has just been opened is reduced until it fits the limits of a request
+    (`app.model.budget`).
 
     Raises
     ------
     ValueError
-        If it takes more than one request may, and is not opened just now; as `Source.load`.
+        If the request exceeds these limits otherwise; as `Source.load`.
     """
     started = perf_counter()
-    cutout = _cutout(request, previous)
+    is_new = previous is None or not same_capture(request, previous.request)
+    cutout = _cutout(request, None if is_new else previous)
     if cutout is not None:
         whole = cutout.capture
-    elif previous is None or not same_capture(request, previous.request):
+    elif previous is None or is_new:
         whole = request.source.load(request.light, request.reading, request.absent)
     else:
         whole = previous.whole
-    asked = request.less
-    if previous is None or not same_capture(request, previous.request):
+    requested = request.less
+    if is_new:
         request = replace(request, less=_fitting(whole, request))
     if (
         previous is not None
         and whole is previous.whole
-        and _same(request, previous.request, "less", "absent")
+        and _agree(request, previous.request, "less", "absent")
     ):
         capture, capture_s = previous.capture, previous.capture_s
     else:
         require_fitting(_reduced_shape(whole, request), "tracking", _cost(whole, request))
         capture = reduced(whole, request)
-        if request.less != asked:
-            fewer = f"{capture.source}; so reduced that it takes no more than this server allows"
-            capture = replace(capture, source=fewer)
+        if request.less != requested:
+            source = f"{capture.source}; reduced to fit the limits of this server"
+            capture = replace(capture, source=source)
         capture_s = perf_counter() - started
     with ranging(capture, "tracking", request.tracking):
         started = perf_counter()
         if not has_posterior(capture):
-            posterior_of(capture)  # what every answer's confidence rests on, whatever the method
+            posterior_of(capture)  # every confidence is computed from it, whatever the method
             capture_s += perf_counter() - started
-        ranged = run(capture, "tracking", request.tracking)
-    return Answer(request, ranged, capture_s, whole, cutout, asked)
+        estimated = run(capture, "tracking", request.tracking)
+    return Answer(request, estimated, capture_s, whole, cutout, requested)
 
 
 def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:
     rows, cols, n_bins = whole.cube.shape
     reduction = request.less.reduction(n_bins)
-    fits = reduction.fits((rows, cols, n_bins))
-    return reduction.shape((rows, cols, n_bins)) if fits else (rows, cols, n_bins)
+    shape = rows, cols, n_bins
+    return reduction.shape(shape) if reduction.fits(shape) else shape
 
 
 def _cost(whole: Capture, request: Request) -> Cost:
     return predicted(_reduced_shape(whole, request), "tracking", request.tracking)
 
 
-def _fitting(whole: Capture, request: Request) -> Less:
-    """The reduction asked for, or the least that is more of it and that one request may take."""
+def _fitting(whole: Capture, request: Request) -> ReductionSettings:
+    """Return the requested reduction, or the weakest stronger one that fits."""
     if fits(_cost(whole, request)):
         return request.less
     rows, cols, n_bins = whole.cube.shape
@@ -235,8 +235,8 @@ def _fitting(whole: Capture, request: Request) -> Less:
 
 
 def _cutout(request: Request, previous: Answer | None) -> Cutout | None:
-    """What is looked at of a file larger than memory; of its preview, as much as has been read."""
-    if previous is None or not same_capture(request, previous.request):
+    """Return the part in memory of a large file; its preview grows as more is read."""
+    if previous is None:
         large = request.source.large(request.reading)
         return None if large is None else large.cutout(request.window)
     if previous.cutout is None or request.window is not None:
@@ -245,7 +245,7 @@ def _cutout(request: Request, previous: Answer | None) -> Cutout | None:
 
 
 def reduced(whole: Capture, request: Request) -> Capture:
-    """As much of a capture as is asked for, some corrections switched off."""
+    """Return a capture with the reduction and without the corrections that are switched off."""
     capture = request.less.reduction(whole.acquisition.n_bins).of(whole)
     for name in CORRECTIONS:
         if name in request.absent:
@@ -254,40 +254,40 @@ def reduced(whole: Capture, request: Request) -> Capture:
 
 
 def same_subject(one: Request, other: Request) -> bool:
-    """Whether both look at the same scene in the same light, or the same file, part or no part."""
-    return _same(one, other, "source", "light", "reading", "window")
+    """Whether two requests are for the same scene and illumination, or the same file."""
+    return _agree(one, other, "source", "light", "reading", "window")
 
 
 def same_capture(one: Request, other: Request) -> bool:
-    """Whether both look at the same capture, however much of it."""
+    """Whether two requests are for the same capture, reductions aside."""
     return same_subject(one, other) and one.absent & {*PARTS} == other.absent & {*PARTS}
 
 
 def same_view(one: Request, other: Request) -> bool:
-    """Whether the answers to both show the same pixels and bins, in whatever light."""
-    seen = (replace(each.less, pulses=1.0) for each in (one, other))
-    return _same(one, other, "source", "reading", "window") and len({*seen}) == 1
+    """Whether the estimates of two requests have the same pixels and bins."""
+    kept = {replace(each.less, pulses=1.0) for each in (one, other)}
+    return _agree(one, other, "source", "reading", "window") and len(kept) == 1
 
 
 def same_pixels(one: Answer, other: Answer) -> bool:
-    """Whether a row and a column mean the same in both."""
+    """Whether a row and a column mean the same in two estimates."""
     same = one.capture.shape == other.capture.shape and one.grid == other.grid
     return same and one.request.source is other.request.source
 
 
-def _same(one: Request, other: Request, *names: str) -> bool:
+def _agree(one: Request, other: Request, *names: str) -> bool:
     return all(getattr(one, name) == getattr(other, name) for name in names)
 
 
 @dataclass(frozen=True)
 class Pixel:
-    """Everything about one pixel; bins are fractional, NaN where there is nothing."""
+    """One pixel of an estimate; bins are fractional, NaN where there is no range."""
 
     row: int
     col: int
     signals: Signals
     expected: np.ndarray[Any, Any] | None
-    """The model's expected counts, where the truth is known."""
+    """Expected counts of the model; None where the truth is unknown."""
     difference: np.ndarray[Any, Any]
     truth_bin: float
     answer_bin: float
@@ -298,16 +298,15 @@ class Pixel:
 
 
 def inspect(answer: Answer, row: int, col: int) -> Pixel:
-    """Every stage of the estimator for one pixel of an answer."""
+    """Return every stage of the tracking differentiator for one pixel."""
     capture, image = answer.capture, answer.run.image
     acquisition, histogram = capture.acquisition, capture.cube[row, col]
     truth_m = np.nan if capture.truth_range_m is None else float(capture.truth_range_m[row, col])
-    expected = _expected_counts(capture, row, col)
     return Pixel(
         row,
         col,
         tracking_signals(histogram, answer.request.tracking, capture.gated_pulses),
-        expected,
+        _expected_counts(capture, row, col),
         first_difference(histogram),
         float(acquisition.range_m_to_bin(truth_m)),
         float(image.bin[row, col]),
@@ -319,23 +318,17 @@ def inspect(answer: Answer, row: int, col: int) -> Pixel:
 
 
 def _expected_counts(capture: Capture, row: int, col: int) -> np.ndarray[Any, Any] | None:
-    acquisition = capture.acquisition
-    if (
-        capture.truth_range_m is None
-        or capture.signal is None
-        or capture.background is None
-        or acquisition.n_pulses is None
-    ):
+    acquisition, truth_m = capture.acquisition, capture.truth_range_m
+    signal, background = capture.signal, capture.background
+    if truth_m is None or signal is None or background is None or acquisition.n_pulses is None:
         return None
-    onset_bin = acquisition.range_m_to_bin(capture.truth_range_m[row, col])
-    rate = rate_per_bin(
-        onset_bin, capture.signal[row, col], capture.background, capture.pulse, acquisition
-    )
+    onset_bin = acquisition.range_m_to_bin(truth_m[row, col])
+    rate = rate_per_bin(onset_bin, signal[row, col], background, capture.pulse, acquisition)
     return trigger_probability(rate) * acquisition.n_pulses
 
 
 def is_wrong(answer: Answer, tolerance_bins: float = 3.0) -> np.ndarray[Any, Any] | None:
-    """Answers off by more than `tolerance_bins`, or without a target; None without truth."""
+    """Return the pixels whose estimate is outside the tolerance; None without a truth."""
     truth_m, image = answer.capture.truth_range_m, answer.run.image
     if truth_m is None:
         return None

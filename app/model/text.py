@@ -1,4 +1,4 @@
-"""What the page says: figures, numbers and sentences, as plain text."""
+"""Sentences and formatted numbers that several pages show, without markup."""
 
 from __future__ import annotations
 
@@ -7,119 +7,154 @@ import re
 from collections.abc import Iterable
 from concurrent.futures import BrokenExecutor
 
-import numpy as np
-
-from app.model.store import Answer
+from app.model.store import Answer, Pixel
+from app.units import Scale
+from app.units import milliseconds as milliseconds  # noqa: PLC0414
+from app.units import number as number  # noqa: PLC0414
+from app.units import share as share  # noqa: PLC0414
+from core.metrics import Interval
 from core.studies.ablation import TITLES
 
 Fact = tuple[str, str, str]
-"""Name, value, and a line of help."""
+"""Name, value and help; a value that is a number is an `app.units.Quantity`."""
+
+Cell = tuple[str, float | None, str]
+"""Text of a table's cell, the value to sort by, and a smaller second line."""
 
 FIELD_OF_VIEW_UNKNOWN = (
-    " The file does not tell the field of view: widths and heights of the cloud are a guess (View)."
+    " The file does not state the field of view: the width of the cloud is a guess (see View)."
 )
 
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
+
+CONFIDENCE_HELP = "Probability of a surface within 3 bins of the estimate."
+
+TRUTH_HELP = "True range of the surface."
 
 COMPUTING = "Computing …"
 
 NOT_COMPUTED = "Not computed yet."
 
-UNIT_HELP = "What axes and read-outs along the gate count in: bins, nanoseconds or metres."
+UNIT_HELP = "Unit of axes and positions along the gate: bins, nanoseconds or metres."
 
 NO_PAGE = (
-    "This page could not be built. Reload it; if it happens again, what the server has printed "
-    "tells whoever started it why."
+    "This page could not be built. Reload it. If that does not help, the server's log states the "
+    "cause."
 )
 
 
 def provenance(answer: Answer) -> str:
-    """Where the capture came from and what was guessed, as a sentence."""
-    acquisition, rows_cols = answer.capture.acquisition, answer.capture.shape
+    """Return the source of the capture, its size and its gate."""
+    acquisition, (rows, cols) = answer.capture.acquisition, answer.capture.shape
     opens_ns = acquisition.gate_delay_s * 1e9
     closes_ns = opens_ns + acquisition.n_bins * acquisition.bin_width_s * 1e9
+    opens_m, closes_m = (float(acquisition.bin_to_range_m(at)) for at in (0, acquisition.n_bins))
     absent = ", ".join(TITLES[name] for name in TITLES if name in answer.request.absent)
     switched_off = f" Switched off: {absent}." if absent else ""
     return (
-        f"{answer.capture.source}.{switched_off} {rows_cols[0]} × {rows_cols[1]} pixels, "
+        f"{answer.capture.source}.{switched_off} {rows} × {cols} pixels, "
         f"{acquisition.n_bins} bins of {acquisition.bin_width_s * 1e9:.4g} ns, "
-        f"gate {opens_ns:.6g} to {closes_ns:.6g} ns "
-        f"({float(acquisition.bin_to_range_m(0)):.6g} to "
-        f"{float(acquisition.bin_to_range_m(acquisition.n_bins)):.6g} m)."
+        f"gate {opens_ns:.6g} to {closes_ns:.6g} ns ({opens_m:.6g} to {closes_m:.6g} m)."
         + (FIELD_OF_VIEW_UNKNOWN if acquisition.pixel_angle_rad is None else "")
     )
 
 
-def lack(answer: Answer) -> str:
-    """Why there is nothing to see, and what to do; empty where there is something."""
+def no_estimates(answer: Answer) -> str:
+    """Return why no pixel has an estimate, and what to do; empty if any has one."""
     if answer.run.image.valid.any():
         return ""
     n_bins, t_n = answer.capture.acquisition.n_bins, answer.request.tracking.t_n
     if t_n >= n_bins:
-        return f"T_n = {t_n} leaves no bin of {n_bins} in which an echo may lie: lower it."
+        return f"T_n = {t_n} excludes all {n_bins} bins: reduce it."
     return (
-        "No pixel has an answer: both scales move alike, or no photon was detected. "
-        "Take back the last change, or choose a preset."
+        "No pixel has an estimate: both scales are equal everywhere, or no photon was detected. "
+        "Undo the last change, or choose a preset."
     )
 
 
 def failure(error: Exception) -> str:
-    """What happened and what to do, without a traceback."""
-    shown = f"{reason(error)} The picture still shows the last settings that worked"
+    """Return what failed and what to do, without a traceback."""
+    shown = f"{reason(error)} The page still shows the last settings that worked"
     if isinstance(error, ValueError):
         return f"{shown}."
-    return f"{shown}: change them back, or choose another scene."
+    return f"{shown}: undo the change, or choose another scene."
 
 
 def unfinished(error: Exception) -> str:
-    """Why long work has ended, and what to do."""
+    """Return why long work ended, and what to do."""
     return (
-        f"{reason(error)} What this part shows was computed before that. Compute begins anew; if "
-        "it fails again, ask for less, or choose another scene."
+        f"{reason(error)} Results computed before that are kept. Press Compute to run it again; if "
+        "it fails again, reduce the settings, or choose another scene."
     )
 
 
 def cause(error: Exception) -> str:
-    """What has gone wrong: what an error says that is meant to be read, or which kind it is."""
+    """Return the message of a ``ValueError``, which is written for users, or the type of others."""
     if isinstance(error, ValueError):
         return without_folders(str(error))
     kind = type(error).__name__
     if isinstance(error, MemoryError):
-        return f"the server's memory does not suffice ({kind})"
+        return f"not enough memory on the server ({kind})"
     if isinstance(error, BrokenExecutor):
-        return f"a worker of the server has ended ({kind})"
+        return f"a worker process of the server has ended ({kind})"
     return kind
 
 
-def without_folders(text: str) -> str:
-    """A text in which files have their names only: where they lie on the server is its own affair.
+def reason(error: Exception) -> str:
+    """Return why something could not be computed, as a sentence."""
+    is_message = isinstance(error, ValueError)
+    return cause(error) if is_message else f"The computation failed: {cause(error)}."
 
-    Names in quotes may hold spaces; others end at one.
+
+def without_folders(text: str) -> str:
+    """Remove the folders of paths, which only the server's owner may see.
+
+    Paths in quotes may contain spaces; others end at one.
     """
     text = re.sub(r"(['\"])/[^'\"\n]*/([^'\"/\n]*)\1", r"\1\2\1", text)
     return re.sub(r"(?<![\w.:/])/(?:[^\s/'\"]+/)+", "", text)
 
 
-def number(value: float, unit: str, sign: bool = False) -> str:
-    """A number with its unit; a dash where there is none."""
-    if not np.isfinite(value):
-        return "–"
-    text = f"{value:+.4g}" if sign else f"{value:.4g}" if abs(value) < 1000 else f"{value:,.2f}"
-    return f"{text} {unit}".strip()
+def cell(value: float, form: str = "{:.4g}", below: str = "") -> Cell:
+    """Return a table's cell; a dash if the value is not finite."""
+    return (form.format(value), value, below) if math.isfinite(value) else ("–", None, below)
 
 
-def share(value: float) -> str:
-    """A share in percent; a dash where there is none."""
-    return "–" if math.isnan(value) else f"{100 * value:.1f} %"
+def percent_cell(value: float, below: str = "") -> Cell:
+    """Return a share as a table's cell, sorted by the share."""
+    return share(value), value if math.isfinite(value) else None, below
 
 
-def milliseconds(seconds: float) -> str:
-    """A duration as one reads it."""
-    return f"{1000 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
+def interval_cell(found: Interval, form: str) -> Cell:
+    """Return an estimate as a table's cell, with its interval below."""
+    if math.isnan(found.value):
+        return "–", None, ""
+    low, high = (form.removesuffix(" %").format(end) for end in (found.low, found.high))
+    return cell(found.value, form, f"{low} to {high}")
+
+
+def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
+    """Return name, value and help of a pixel's estimate, compared with the truth if it is known."""
+    help = "Range of the surface, lag removed."
+    facts: list[Fact] = [("Estimate", number(pixel.range_m, "m"), help)]
+    if along.name != "m":
+        facts.append(("Position", along.place(pixel.answer_bin), "The estimate along the gate."))
+    if has_truth:
+        error = number(pixel.range_m - pixel.truth_m, "m", sign=True)
+        facts += [
+            ("Truth", target(pixel.truth_m), TRUTH_HELP),
+            ("Error", error, "Estimate minus truth."),
+        ]
+    return [*facts, ("Confidence", share(pixel.confidence), CONFIDENCE_HELP)]
+
+
+def target(truth_m: float) -> str:
+    """Format the true range of a pixel, which may have no target."""
+    return "no target" if math.isnan(truth_m) else number(truth_m, "m")
 
 
 def progress(done: int, of: int, noun: str, is_running: bool) -> str:
-    """How far a study has come."""
+    """Return the progress of a study; empty before its start."""
     if of == 0:
         return ""
     if is_running:
@@ -129,50 +164,44 @@ def progress(done: int, of: int, noun: str, is_running: bool) -> str:
     return f"Done: {of} {noun if of != 1 else noun.removesuffix('s')}."
 
 
-def reason(error: Exception) -> str:
-    """Why something could not be computed, without a traceback."""
-    named = isinstance(error, ValueError)
-    return cause(error) if named else f"This could not be computed: {cause(error)}."
-
-
 def source_is_gone(key: str) -> str:
-    """Of a scene or capture that an address names in vain."""
+    """Return the message about a missing scene or capture of a link."""
     return (
-        f"There is no scene or capture {key[:40]!r} here; an uploaded file is kept only while a "
-        "page has it open: open it again."
+        f"There is no scene or capture {key[:40]!r}. Uploaded files are removed when no page uses "
+        "them: upload the file again."
     )
 
 
 def no_page(name: str, known: Iterable[str]) -> str:
-    """Message about a page that a link names and the app lacks."""
+    """Return the message about a page of a link that does not exist."""
     return f"page = {name[:40]!r} is not accepted: give {', '.join(known)}."
 
 
 def pins_outside(rows: int, cols: int) -> str:
-    """Of pinned pixels that an address names in vain."""
-    return f"pins outside of {rows} × {cols} pixels are left out."
+    """Return the message about pins of a link that lie outside the image."""
+    return f"Pins outside the {rows} × {cols} pixels were removed."
 
 
 def not_restored(refused: list[str]) -> str:
-    """What a page could not restore of its address; empty where it could restore all."""
+    """Return the message about settings of a link that were refused; empty if there are none."""
     if not refused:
         return ""
-    return f"The address asks for what cannot be had: {' '.join(refused)} The rest is as it says."
+    return f"Some settings in this link could not be restored. {' '.join(refused)}"
 
 
 def not_uploaded(reason: str, most_bytes: int) -> str:
-    """Why a file did not arrive, and what to do."""
+    """Return why the upload of a file failed, and what to do."""
     return (
-        f"Could not upload the file: {reason.rstrip('.')}. Files of up to {most_bytes >> 20} MiB "
-        "can be uploaded; a larger one opens by its path, when the server is started with it."
+        f"Could not upload the file: {reason.rstrip('.')}. The limit is {most_bytes >> 20} MiB. To "
+        "open a larger file, start the server with its path."
     )
 
 
 def not_kept(error: ValueError | OSError) -> str:
-    """Why a file could not be opened here, and what to do."""
+    """Return why an uploaded file was not opened, and what to do."""
     if isinstance(error, ValueError):
-        return f"The file is not opened: {error}"
+        return f"Could not open the file: {error}"
     return (
-        f"The file is not opened: it cannot be kept here ({error.strerror}). Free room in the "
-        "system's temporary folder, or give the file's path on the command line."
+        f"Could not store the uploaded file ({error.strerror}). Free space in the system's "
+        "temporary folder, or start the server with the file's path."
     )

@@ -1,7 +1,7 @@
-"""Files that users open from the page: where they lie, who uses them, and when they go.
+"""Uploaded files: where they are stored, which sessions use them, and when they are deleted.
 
-Each has a key that nobody can guess and whoever has it can use: it stands in the address of the
-page, so that a page that is loaded anew, or a link in another tab, finds the file again.
+Each file has an unguessable key, which is part of the page's link: a page that is reloaded, or a
+link in another tab, finds the file again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_UPLOAD_BYTES = 100 * MEBIBYTE
 
 @dataclass(frozen=True)
 class Bounds:
-    """How much is accepted."""
+    """Limits on uploaded files."""
 
     file_bytes: int = MAX_UPLOAD_BYTES
     session_files: int = 10
@@ -38,33 +38,34 @@ class Bounds:
 
 
 class _Upload:
-    """A file in a folder of its own, which goes with this object, at the latest with the process.
+    """A file in a folder of its own, which is deleted with this object or with the process.
 
     Raises
     ------
     OSError
-        If it cannot be written; nothing of it is left then.
+        If it cannot be written; the folder is deleted then.
     """
 
     def __init__(self, name: str, content: bytes, user: object) -> None:
         folder = mkdtemp(prefix="firstphoton-")
         self.remove = finalize(self, rmtree, folder, ignore_errors=True)
         self.n_bytes, self.users = len(content), WeakSet([user])
-        path = Path(folder) / harmless(name)
+        path = Path(folder) / safe_name(name)
         try:
             path.write_bytes(content)
         except OSError:
             self.remove()
             raise
         source = file_source(path)
-        self.source = replace(source, load=kept_while_used(source.load))
+        self.source = replace(source, load=cached_while_used(source.load))
 
 
 class Uploads:
-    """All sessions' files, each in a folder of its own among the system's temporary ones.
+    """Uploaded files of all sessions, in temporary folders.
 
-    A user is any object that stands for a session. Each file that it uses counts to its bounds,
-    whoever brought it. A file goes with its last user, and all go when the process ends.
+    A user is any object that stands for a session. A file counts towards the limits of each user,
+    whoever uploaded it. It is deleted with its last user, and all files are deleted when the
+    process ends.
 
     Parameters
     ----------
@@ -73,87 +74,87 @@ class Uploads:
 
     def __init__(self, bounds: Bounds | None = None) -> None:
         self.bounds = bounds or Bounds()
-        self._kept: dict[str, _Upload] = {}
+        self._uploads: dict[str, _Upload] = {}
         self._lock = Lock()
 
     def add(self, name: str, content: bytes, user: object) -> str:
-        """Keep a file for a user, and return its key.
+        """Store a file for a user, and return its key.
 
         Raises
         ------
         ValueError
-            If it is too large, or there are too many: says which bound it exceeds.
+            If a limit is exceeded.
         OSError
-            If it cannot be written.
+            If the file cannot be written.
         """
         with self._lock:
-            self._sweep()
+            self._delete_unused()
             self._require_room(len(content), user)
             key = secrets.token_urlsafe(16)
-            self._kept[key] = _Upload(name, content, user)
+            self._uploads[key] = _Upload(name, content, user)
             return key
 
     def use(self, key: str, user: object) -> Source | None:
-        """The file of a key, which is kept for this user now, too; None if there is none."""
+        """Return the file of a key and keep it for another user; None if there is none."""
         with self._lock:
-            upload = self._kept.get(key)
+            upload = self._uploads.get(key)
             if upload is None:
                 return None
             upload.users.add(user)
             return upload.source
 
     def leave(self, user: object) -> None:
-        """A user is gone for good, and with it the files that it was the last to use."""
+        """Remove a user, and the files that no other user has."""
         with self._lock:
-            for upload in self._kept.values():
+            for upload in self._uploads.values():
                 upload.users.discard(user)
-            self._sweep()
+            self._delete_unused()
 
-    def _sweep(self) -> None:
-        """Remove the files that nobody uses."""
-        unused = [key for key, upload in self._kept.items() if not upload.users]
-        for key in unused:
-            self._kept.pop(key).remove()
+    def _delete_unused(self) -> None:
+        for key in [key for key, upload in self._uploads.items() if not upload.users]:
+            self._uploads.pop(key).remove()
 
     def _require_room(self, n_bytes: int, user: object) -> None:
-        bounds, everything = self.bounds, list(self._kept.values())
-        own = [each for each in everything if user in each.users]
-        _require_below("the file", n_bytes, bounds.file_bytes)
-        for whose, kept, most_files, most_bytes in (
+        bounds, uploads = self.bounds, list(self._uploads.values())
+        own = [each for each in uploads if user in each.users]
+        _require_size("the file", n_bytes, bounds.file_bytes)
+        for whose, stored, most_files, most_bytes in (
             ("this page", own, bounds.session_files, bounds.session_bytes),
-            ("all pages", everything, bounds.all_files, bounds.all_bytes),
+            ("all pages", uploads, bounds.all_files, bounds.all_bytes),
         ):
-            files = len(kept) + 1
-            more = f"at most {most_files}: close a page that has files open, or give their paths "
-            require(f"files of {whose}", files, files <= most_files, more + "on the command line")
-            _require_below(
-                f"the files of {whose}", n_bytes + sum(each.n_bytes for each in kept), most_bytes
-            )
+            files = len(stored) + 1
+            accepted = f"at most {most_files}: close a page that has files open, or give their "
+            require(f"files of {whose}", files, files <= most_files, f"{accepted}paths{_OPTION}")
+            total = n_bytes + sum(each.n_bytes for each in stored)
+            _require_size(f"the files of {whose}", total, most_bytes)
 
 
-def kept_while_used(load: Callable[..., Capture]) -> Callable[..., Capture]:
-    """The same, but what somebody still holds is not loaded again.
+_OPTION = " on the command line"
 
-    The session of a page that is loaded anew takes the capture from the one before.
+
+def _require_size(what: str, n_bytes: int, most_bytes: int) -> None:
+    size = f"{n_bytes / MEBIBYTE:.1f} MiB"
+    accepted = f"at most {most_bytes / MEBIBYTE:.0f} MiB, or the path of the file{_OPTION}"
+    require(f"size of {what}", size, n_bytes <= most_bytes, accepted)
+
+
+def cached_while_used(load: Callable[..., Capture]) -> Callable[..., Capture]:
+    """Return a loader that shares captures which a session still holds.
+
+    The session of a reloaded page thus takes the capture of the session before.
     """
-    kept: WeakValueDictionary[tuple[Any, ...], Capture] = WeakValueDictionary()
+    captures: WeakValueDictionary[tuple[Any, ...], Capture] = WeakValueDictionary()
 
-    def load_or_take(*how: Any) -> Capture:
-        capture = kept.get(how)
+    def load_or_share(*arguments: Any) -> Capture:
+        capture = captures.get(arguments)
         if capture is None:
-            capture = kept[how] = load(*how)
+            capture = captures[arguments] = load(*arguments)
         return capture
 
-    return load_or_take
+    return load_or_share
 
 
-def _require_below(what: str, n_bytes: int, most_bytes: int) -> None:
-    size = f"{n_bytes / MEBIBYTE:.1f} MiB"
-    most = f"at most {most_bytes / MEBIBYTE:.0f} MiB, or the path of the file on the command line"
-    require(f"size of {what}", size, n_bytes <= most_bytes, most)
-
-
-def harmless(name: str) -> str:
-    """A file's name from outside: only its last part, and only harmless letters of that."""
+def safe_name(name: str) -> str:
+    """Return the last part of a file name from outside, with harmless characters only."""
     last = name.replace("\\", "/").rsplit("/", 1)[-1]
     return re.sub(r"[^\w.-]+", "_", last)[-80:].lstrip(".") or "upload"

@@ -1,4 +1,4 @@
-"""The template, the sidebar and the wiring of a page. The only module that knows the template."""
+"""The template, the sidebar and the wiring of a page; the only module that uses the template."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import param
 from panel.util import edit_readonly
 from panel_material_ui.template.base import Meta
 
-from app.model import text as words
-from app.model.address import Wanted
+from app.model import text
+from app.model.address import Link
 from app.model.restore import parameters_of
 from app.model.script import script_of
-from app.model.state import Illumination, Less
+from app.model.state import ReductionSettings
 from app.model.store import Answer, Request, Source
 from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
 from app.pages.catalog import PAGES
@@ -29,7 +29,7 @@ from app.widgets.cards import choice, part, select
 from app.widgets.connection import Connection
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import FileInput
-from app.widgets.share import TakeAway
+from app.widgets.share import Share
 from core import PRESETS, TrackingParameters
 from core.io import SUFFIXES, ReadOptions, reading_options
 
@@ -45,7 +45,7 @@ THEME = {
                 "styleOverrides": {
                     "root": {
                         "minHeight": "48px !important",
-                        # On a phone the buttons need the room.
+                        # A phone has room only for the buttons.
                         "@media (max-width: 500px)": {"& .title": {"display": "none"}},
                     }
                 }
@@ -57,8 +57,8 @@ THEME = {
         ("dark", "#4fb3cb", "#0c3a48", "#0f141a", DARK.paper),
     )
 }
-AS_WRITTEN = {"& .MuiToggleButton-root": {"textTransform": "none", "padding": "3px 8px"}}
-IN_THE_BAR = {
+UNIT_BUTTONS = {"& .MuiToggleButton-root": {"textTransform": "none", "padding": "3px 8px"}}
+PAGE_BUTTONS = {
     "& .MuiToggleButton-root": {
         "color": "#ffffff",
         "borderColor": "#ffffff80",
@@ -78,7 +78,7 @@ IN_THE_BAR = {
 
 TEMPLATE = (
     '{% extends "base.html" %}{% block postamble %}{{ super() }}<script>{{ scripts | safe }}'
-    # The widgets' module, which would otherwise be requested when the page has loaded.
+    # Load the widgets' module now, not only when the page has loaded.
     + f'importShim("{pmui.Button._render_esm(server=True)}");'
     + "</script>{% endblock %}"
 )
@@ -86,10 +86,10 @@ TEMPLATE = (
 
 
 class Template(pmui.Page):
-    """Panel's template with two features switched off.
+    """Panel's template without its theme for plots and its busy indicator.
 
-    It would restyle the plots, whose sizes and colours are those of `app.theme`, and redraw itself
-    twice for every message to show for a moment that the server is busy.
+    The theme would override the sizes and colours of `app.theme`; the indicator redraws the page
+    twice for every message.
     """
 
     is_narrow = param.Boolean(
@@ -99,7 +99,7 @@ class Template(pmui.Page):
 
     def __init__(self, **params: Any) -> None:
         super().__init__(**params)
-        # Params keep this watcher of the whole server's state, and with it the page, for ever.
+        # This watcher of the server's state would keep the page in memory for ever.
         for _, watcher in self._param__private.ref_watchers:
             pn.state.param.unwatch(watcher)
         self._param__private.ref_watchers = []
@@ -107,36 +107,36 @@ class Template(pmui.Page):
             self.busy = False
 
     def get_root(self, doc: Any = None, comm: Any = None, preprocess: bool = True) -> Any:
-        """The page's model, told which parts of Bokeh's plots not to restyle."""
+        """Return the page's model, with the parts of Bokeh's plots that keep their style."""
         root = super().get_root(doc, comm, preprocess)
         root.data._custom_theme = list(STYLES)
         return root
 
 
 def build_page(sources: Mapping[str, Source], uploads: Uploads) -> pmui.Page:
-    """A new page with a session of its own, as its address asks for."""
-    asked = {
+    """Return a new page with a session of its own, restored from its address."""
+    query = {
         name: texts[-1].decode(errors="replace") for name, texts in pn.state.session_args.items()
     }
-    return Layout(sources, Wanted(asked), uploads).page
+    return Layout(sources, Link(query), uploads).page
 
 
 class Layout:
     """The template, the sidebar and the pages around one session.
 
-    The session comes first, then the controls, then the pages, which know the session alone, then
-    the template around all of them; listeners are connected last.
+    The session is built first, then the controls, then the pages, which depend on the session only,
+    then the template; listeners are connected last.
 
     Parameters
     ----------
     sources : mapping of str to Source
         Scenes and captures to choose from.
-    wanted : Wanted, optional
-        What the link of the page asks for.
+    link : Link, optional
+        Settings from the link of the page.
     uploads : Uploads, optional
         Where uploaded files are stored.
     tasks : PageTasks, optional
-        The page's thread, where it is not that of the page being built.
+        The page's thread; by default that of the page being built.
 
     Attributes
     ----------
@@ -144,23 +144,23 @@ class Layout:
     pages : Pages
         The navigation.
     contents : dict of str to object
-        Of the pages that have been visited, by name.
+        Contents of the pages that have been visited, by name.
     page : Template
     """
 
     def __init__(
         self,
         sources: Mapping[str, Source],
-        wanted: Wanted | None = None,
+        link: Link | None = None,
         uploads: Uploads | None = None,
         tasks: PageTasks | None = None,
     ) -> None:
-        wanted, self._uploads = wanted or Wanted({}), uploads or Uploads()
-        session = self.session = Session(self._with_upload(sources, wanted.source), wanted, tasks)
+        link, self._uploads = link or Link({}), uploads or Uploads()
+        session = self.session = Session(self._with_upload(sources, link.source), link, tasks)
         state = session.state
         self._pages = {each.name: each for each in PAGES}
         if state.page not in self._pages:
-            session.refused.append(words.no_page(state.page, self._pages))
+            session.refused.append(text.no_page(state.page, self._pages))
             state.page = "Explore" if session.answer.request.source.is_scene else "Inspect"
         self._make_controls()
         self.contents: dict[str, Content] = {}
@@ -170,12 +170,12 @@ class Layout:
             help=", ".join(f"{each.name} {each.help}" for each in PAGES) + ".",
             first=state.page,
         )
-        self.pages.choice.param.update(sx=IN_THE_BAR, margin=(0, 0, 0, 8))
+        self.pages.choice.param.update(sx=PAGE_BUTTONS, margin=(0, 0, 0, 8))
         self.page = self._template()
         self._show_answer(session.answer)
         self._listen()
         if session.refused:
-            session.failures.show(words.not_restored(session.refused))
+            session.failures.show(text.not_restored(session.refused))
 
     def _view_of(self, page: Page) -> View:
         content = self.contents[page.name] = page.build(self.session)
@@ -197,7 +197,7 @@ class Layout:
             "A built-in scene to simulate, or a capture from a file.",
         )
         self._file = FileInput(
-            lambda reason: session.failures.show(words.not_uploaded(reason, MAX_UPLOAD_BYTES)),
+            lambda reason: session.failures.show(text.not_uploaded(reason, MAX_UPLOAD_BYTES)),
             label="Open a capture file",
             accept=",".join(SUFFIXES),
             max_file_size=MAX_UPLOAD_BYTES,
@@ -206,19 +206,20 @@ class Layout:
             sizing_mode="stretch_width",
             margin=(4, 8),
         )
-        self._light = SettingsPanel(Illumination(), partial(setattr, state, "light"))
-        self._tracking = SettingsPanel(TrackingParameters(), partial(setattr, state, "tracking"))
-        self._less = SettingsPanel(Less(), partial(setattr, state, "less"))
+        self._panels: dict[str, SettingsPanel[Any]] = {
+            name: SettingsPanel(type(getattr(state, name))(), partial(setattr, state, name))
+            for name in ("light", "tracking", "less")
+        }
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
             _preset_of(state.tracking),
-            "recommended: the best on random depths. as printed: the paper's text, literally.",
+            "recommended: best on random depths. as printed: the paper's settings, literally.",
         )
         self._reading = {
             name: pmui.TextInput(
                 label=option.label,
-                description=f"{option.label}: {option.help}",
+                description=option.help,
                 placeholder="guess",
                 size="small",
                 sizing_mode="stretch_width",
@@ -226,9 +227,9 @@ class Layout:
             )
             for name, option in reading_options().items()
         }
-        unit = choice(words.UNIT_HELP, state.param.unit)
+        unit = choice(text.UNIT_HELP, state.param.unit)
         unit.param.update(
-            label="Gate axes in", sx=AS_WRITTEN, sizing_mode="stretch_width", margin=(4, 8)
+            label="Gate axes in", sx=UNIT_BUTTONS, sizing_mode="stretch_width", margin=(4, 8)
         )
         self._make_parts(unit)
         self._shown_source: Source | None = None
@@ -238,22 +239,22 @@ class Layout:
         self._connection = Connection(session_id)
 
     def _make_parts(self, unit: Any) -> None:
-        """Make the parts of the sidebar that pages share."""
+        """Make the parts of the sidebar that pages share; `_show_answer` shows one of the first."""
         read_again = pmui.Button(label="Read again", size="small", margin=(6, 8))
         read_again.on_click(lambda _: self._read_again())
-        # `_show_answer` shows the one that suits the source.
-        self._light_part = part("Light and recording", self._light.layout, is_shown=False)
+        self._light_part = part("Simulation", self._panels["light"].layout, is_shown=False)
         self._reading_part = part(
-            "How to read the file",
+            "Reading options",
             *self._reading.values(),
             read_again,
             is_open=self.session.answer.request.reading != ReadOptions(),
             is_shown=False,
         )
+        tracking = self._panels["tracking"]
         self._shared = {
             Shared.UNIT: unit,
-            Shared.TRACKING: part("Tracking differentiator", self._preset, self._tracking.layout),
-            Shared.REDUCTION: part("Less data, faster", self._less.layout, is_open=False),
+            Shared.TRACKING: part("Tracking differentiator", self._preset, tracking.layout),
+            Shared.REDUCTION: part("Data reduction", self._panels["less"].layout, is_open=False),
         }
 
     def _template(self) -> Template:
@@ -269,21 +270,16 @@ class Layout:
             title="firstphoton",
             template=TEMPLATE,
             sidebar=self._sidebar(),
-            # In the bar, where it costs the plots no height.
-            header=[self.pages.choice],
+            header=[self.pages.choice],  # not in `main`: plots keep the height
             main=[head, *self.pages.mains.values(), self._provenance],
             sidebar_width=330,
             theme_config=THEME,
-            meta=Meta(title="firstphoton", description=words.ONE_LINE),
+            meta=Meta(title="firstphoton", description=text.ONE_LINE),
         )
 
     def _sidebar(self) -> list[Any]:
         session, asides = self.session, self.pages.asides
-        script = TakeAway(
-            lambda: script_of(session.answer, session.state),
-            sizing_mode="stretch_width",
-            margin=8,
-        )
+        share = Share(lambda: script_of(session.answer, session.state))
         return [
             self._source,
             self._file,
@@ -293,7 +289,7 @@ class Layout:
             self._reading_part,
             self._shared[Shared.TRACKING],
             self._shared[Shared.REDUCTION],
-            part("Take it away", script),
+            part("Share", share.layout),
             *(aside for name, aside in asides.items() if self._pages[name].sidebar_last),
         ]
 
@@ -308,17 +304,19 @@ class Layout:
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._file.param.watch(lambda event: self._upload(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
-        state.param.watch(lambda *_: self._show_settings(), ["light", "tracking"])
+        state.param.watch(
+            lambda *_: self._show_settings("light", "tracking"), ["light", "tracking"]
+        )
         self.pages.choice.link(state, value="page", bidirectional=True)
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
         self._fit_sidebar()
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if tasks.is_served:
             pn.state.on_session_destroyed(lambda _: self._close())
-            pn.config.exception_handler = session.failures.report  # of this session alone
+            pn.config.exception_handler = session.failures.report  # for this session only
 
     def _fit_sidebar(self) -> None:
-        """Show what has an effect on the open page."""
+        """Show the controls that affect the open page."""
         page = self._pages[self.pages.choice.value]
         for each, content in self._shared.items():
             content.visible = each in page.shared
@@ -331,7 +329,7 @@ class Layout:
 
     def _show_answer(self, answer: Answer) -> None:
         is_scene = answer.request.source.is_scene
-        if self.session.state.source == self._uploaded:  # it could be read: look into it
+        if self.session.state.source == self._uploaded:  # it could be read
             self._uploaded, self.session.state.page = "", "Inspect"
         self._source.value = self.session.state.source
         if answer.request.source is not self._shown_source:
@@ -339,17 +337,18 @@ class Layout:
             for name, field in self._reading.items():
                 field.value = answer.request.reading.as_text(name)
         self._light_part.visible, self._reading_part.visible = is_scene, not is_scene
-        self._provenance.text = words.provenance(answer)[:2000]
-        self._less.show(self.session.state.less)
+        self._provenance.text = text.provenance(answer)[:2000]
         self._show_settings()
-        self._tracking.controls["t_n"].high = max(answer.capture.acquisition.n_bins - 1, 1)
+        self._panels["tracking"].controls["t_n"].high = max(
+            answer.capture.acquisition.n_bins - 1, 1
+        )
         self.pages.follow(answer)
 
-    def _show_settings(self) -> None:
-        """Show settings that a page or a link has changed."""
+    def _show_settings(self, *names: str) -> None:
+        """Show settings that were changed by a page, a preset or an estimate; all by default."""
         state = self.session.state
-        self._light.show(state.light)
-        self._tracking.show(state.tracking)
+        for name in names or self._panels:
+            self._panels[name].show(getattr(state, name))
         self._preset.value = _preset_of(state.tracking)
 
     # Actions of the user
@@ -358,7 +357,11 @@ class Layout:
         session, state = self.session, self.session.state
         if key != state.source:
             request = Request(
-                session.sources[key], state.light, ReadOptions(), state.tracking, Less()
+                session.sources[key],
+                state.light,
+                ReadOptions(),
+                state.tracking,
+                ReductionSettings(),
             )
             state.param.update(parameters_of(request, session.sources))
 
@@ -373,7 +376,7 @@ class Layout:
         try:
             key = self._uploads.add(name, content, self)
         except (ValueError, OSError) as error:
-            self.session.failures.show(words.not_kept(error))
+            self.session.failures.show(text.not_kept(error))
             return
         self.session.sources.update(self._with_upload({}, key))
         self._source.options = self._titles()
@@ -388,20 +391,19 @@ class Layout:
             self.session.failures.show(str(error))
 
     def _close(self) -> None:
-        """Release what a closed page would leave behind."""
+        """Release what would outlive a closed page."""
         pn.config._session_config.pop(self.session.page, None)
         self._uploads.leave(self)
 
     # Sources
 
     def _titles(self) -> dict[str, str]:
-        """Key of each source by its title; further files of the same name are numbered."""
+        """Return the key of each source by its title; files of the same name are numbered."""
         titles: dict[str, str] = {}
         for key, source in self.session.sources.items():
-            again = sum(title.startswith(source.title) for title in titles)
-            titles[f"{source.title} ({again + 1})" if source.title in titles else source.title] = (
-                key
-            )
+            number = 1 + sum(title.startswith(source.title) for title in titles)
+            is_new = source.title not in titles
+            titles[source.title if is_new else f"{source.title} ({number})"] = key
         return titles
 
     def _with_upload(self, sources: Mapping[str, Source], key: str) -> dict[str, Source]:
@@ -411,5 +413,5 @@ class Layout:
 
 
 def _preset_of(settings: TrackingParameters) -> str:
-    """Name of the preset with these settings."""
+    """Return the name of the preset with these settings."""
     return next((name for name, preset in PRESETS.items() if preset == settings), CUSTOM)

@@ -16,7 +16,7 @@ from app.widgets.cards import CHOICE_PX
 if TYPE_CHECKING:
     from app.pages.session import Session
 
-# As high as its parts, and not as wide as all of them side by side, which exceeds a phone.
+# As high as its content, and no wider than a phone.
 HOLDER = """
 :host { flex: none !important; height: auto !important; max-height: none !important;
   min-width: 0 !important; }
@@ -24,14 +24,14 @@ HOLDER = """
 
 
 class Shared(Enum):
-    """Parts of the sidebar that pages share, all about the session's capture."""
+    """Parts of the sidebar that pages share."""
 
     UNIT = auto()
     """Unit of the axes along the gate."""
     TRACKING = auto()
     """Settings of the tracking differentiator."""
     REDUCTION = auto()
-    """Which part of the capture is used."""
+    """Reduction of the capture."""
 
 
 def _ignore(_value: Any) -> None:
@@ -40,22 +40,22 @@ def _ignore(_value: Any) -> None:
 
 @dataclass(frozen=True)
 class View:
-    """The content of a page, and its reactions."""
+    """The content of a page and its reactions to events."""
 
     main: Any
-    """An object, or several, one below the other."""
+    """One object, or a list of several."""
     aside: Any
-    """Its own part of the sidebar, or several."""
+    """Its own part of the sidebar, or a list of several."""
     show: Callable[[bool], None] = _ignore
     """Called with True when it comes on screen, and with False when it leaves."""
     follow: Callable[[Answer], None] = _ignore
-    """Called with each new answer, on screen or not."""
+    """Called with each new estimate, on screen or not."""
     paint: Callable[[bool], None] = _ignore
-    """Called with True when the page becomes dark, with False when light; once when built."""
+    """Called when the theme changes, and once when built; True stands for dark."""
 
 
 class Content(Protocol):
-    """What builds the content of a page."""
+    """Object that holds the content of a page."""
 
     @property
     def view(self) -> View:
@@ -67,35 +67,35 @@ class Page:
     """A page of the app, listed in `app.pages.catalog`."""
 
     name: str
-    """On its button, and in links."""
+    """Label of its button, and its name in links."""
     build: Callable[[Session], Content]
     """Called when the page is first visited."""
     help: str
-    """What the page does: the rest of a sentence that begins with its name."""
+    """Purpose of the page: the rest of a sentence that begins with its name."""
     shared: frozenset[Shared] = frozenset(Shared)
-    """Parts of the sidebar that have an effect on this page."""
+    """Shared parts of the sidebar that affect this page."""
     is_standalone: bool = False
-    """Whether the session's capture has no part in the page: the sidebar is closed."""
+    """Whether the page ignores the session's capture: the sidebar is closed."""
     sidebar_last: bool = False
-    """Whether its own part of the sidebar stands below the shared ones."""
+    """Whether its own part of the sidebar comes below the shared ones."""
 
 
 class Pages:
     """Navigation between pages.
 
-    Bokeh lays out a plot inside of an ESM component only if no more than one column of plots lies
-    between that component and the template: `mains` belong directly into the template.
+    Place `mains` directly into the template: Bokeh lays out a plot inside an ESM component only if
+    at most one column lies between that component and the template.
 
     Parameters
     ----------
     builders : mapping of str to callable
         The builder of each page, by the name on its button.
     label, help : str
-        Name of the row of buttons, and a sentence about it.
+        Label and description of the row of buttons.
     orientation : {"horizontal", "vertical"}
         Orientation of the buttons.
     first : str, optional
-        The page that is opened at once; by default the first one.
+        The page to open first; by default the first builder.
     """
 
     def __init__(
@@ -125,18 +125,18 @@ class Pages:
         self._open(self.choice.value)
 
     def follow(self, answer: Answer) -> None:
-        """Pass on a new answer."""
+        """Pass on a new estimate."""
         for view in self._built.values():
             view.follow(answer)
 
     def paint(self, dark: bool) -> None:
-        """Pass on the change from light to dark or back."""
+        """Pass on a change of the theme."""
         self._dark = dark
         for view in self._built.values():
             view.paint(dark)
 
     def show(self, is_on_screen: bool) -> None:
-        """Pass on that the open page comes on screen together with its parent, or leaves."""
+        """Pass on that the parent, and with it the open page, comes on screen or leaves."""
         self._built[self.choice.value].show(is_on_screen)
 
     def _go(self, old: str, new: str) -> None:
@@ -156,7 +156,7 @@ class Pages:
         else:
             view = self._builders[name]()
             view.paint(self._dark)
-            # Drawn before it is placed, the page reaches the browser in one piece.
+            # Drawn before it is placed, the page reaches the browser in one message.
             view.show(True)
             self.mains[name].extend(_several(view.main))
             self.asides[name].extend(_several(view.aside))

@@ -1,4 +1,4 @@
-"""One user's session: the state, its estimate, and the services that all pages share."""
+"""One user's session: the state, its estimate, and the services shared by all pages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from app.model.address import Wanted, query_of
+from app.model.address import Link, query_of
 from app.model.capture_defaults import defaults_of
 from app.model.restore import restore
 from app.model.state import State
@@ -17,27 +17,27 @@ from app.tasks.page import PageTasks
 
 
 class Session:
-    """What the pages of one user share.
+    """State and services shared by the pages of one user.
 
     Parameters
     ----------
     sources : mapping of str to Source
-        Scenes and captures to choose from; copied, so that an upload belongs to this session alone.
-    wanted : Wanted, optional
-        What the link of the page asks for.
+        Scenes and captures to choose from; copied, so that an upload belongs to this session only.
+    link : Link, optional
+        Settings from the link of the page.
     tasks : PageTasks, optional
-        The page's thread, where it is not that of the page being built.
+        The page's thread; by default that of the page being built.
 
     Attributes
     ----------
     state : State
-        All that the user has chosen.
+        Everything that the user has chosen.
     estimate : CurrentEstimate
-        The answer to the state's request.
+        The estimate for that state.
     tasks : PageTasks
         The page's thread.
     failures : FailureLog
-        What the page says about failures.
+        The error that the page shows.
     refused : list of str
         A sentence on each setting of the link that could not be restored.
     """
@@ -45,27 +45,27 @@ class Session:
     def __init__(
         self,
         sources: Mapping[str, Source],
-        wanted: Wanted | None = None,
+        link: Link | None = None,
         tasks: PageTasks | None = None,
     ) -> None:
-        wanted = wanted or Wanted({})
+        link = link or Link({})
         self.sources = dict(sources)
         key, first = next(iter(self.sources.items()))
-        # A session that is started with a file opens on Inspect.
+        # A session started with a file opens on Inspect.
         self._own = {"source": key, "page": "Explore" if first.is_scene else "Inspect"}
         self.state = State(**self._own)
         self.tasks = tasks or PageTasks()
         self.failures = FailureLog()
         self.tasks.failed.subscribe(self.failures.report)
-        first_answer = restore(self.state, self.sources, wanted, self._own)
-        self.refused = wanted.refused
+        first_answer = restore(self.state, self.sources, link, self._own)
+        self.refused = link.refused
         self.estimate = CurrentEstimate(
             self.state, self.sources, self.tasks, self.failures, first_answer
         )
 
     @property
     def answer(self) -> Answer:
-        """The latest answer that could be computed."""
+        """The latest estimate that could be computed."""
         return self.estimate.answer
 
     @property
@@ -89,11 +89,11 @@ class Session:
     def choose_pixel(self, row: int, col: int) -> None:
         """Show another pixel, or the nearest one inside the image."""
         rows, cols = self.answer.capture.shape
-        with self.tasks.hold():  # all that follows reaches the browser at once
+        with self.tasks.hold():  # one message for all consequences
             self.state.pixel = (min(max(row, 0), rows - 1), min(max(col, 0), cols - 1))
 
     def pick(self, index: int) -> None:
-        """Show the pixel at this place in the flattened image; -1 is none."""
+        """Show the pixel with this index in the flattened image; -1 is none."""
         if index >= 0:
             self.choose_pixel(*divmod(index, self.answer.capture.shape[1]))
 

@@ -1,7 +1,7 @@
 """Plots as pure functions: arrays in, HoloViews elements or Bokeh figures out.
 
-They are declared once. When values change, `app.widgets.figures` writes the changed columns to the
-rendered plots: building a plot again would take ten times as long as drawing it.
+Each plot is built once. When values change, `app.widgets.figures` writes the changed columns to it:
+building a plot again would take ten times as long as drawing it.
 """
 
 from __future__ import annotations
@@ -29,95 +29,98 @@ from core.studies.paper import figures as paper
 Array = NDArray[Any]
 
 hv.extension("bokeh")
-# Copying each plot out of a WebGL canvas takes longer than drawing its few lines on a plain one.
+# Copying each plot from a WebGL canvas takes longer than drawing its few lines on a plain one.
 hv.renderer("bokeh").webgl = False
 
 BIN = hv.Dimension("bin", label="Bin")
 
-# The layers of each plot, by the palette's names for them, in the order in which they are drawn.
+# Layers of each plot, by their colours' names in the palette, in drawing order.
 HISTOGRAM_LAYERS = ("raw", "expected", "small", "large", "truth", "answer")
 RESIDUAL_LAYERS = ("raw", "residual", "truth", "answer")
 ENHANCED_LAYERS = ("weight", "enhanced", "truth", "answer")
 
 
 def marker_line(position_bin: float, top: float, bottom: float = 0.0) -> tuple[Array, Array]:
-    """Coordinates of an upright line; of nothing at NaN."""
+    """Return the coordinates of a vertical line; it is not drawn at NaN."""
     return np.full(2, position_bin), np.array([bottom, top])
 
 
 def edges(n_bins: int) -> Array:
-    """Edges of the bins as a histogram draws them: bin k is centred on k + 1/2."""
+    """Return the edges of the bins: bin k is centred on k + 1/2."""
     return np.arange(n_bins + 1, dtype=float)
 
 
 def centres(n_bins: int) -> Array:
-    """Centres of the bins."""
+    """Return the centres of the bins."""
     return np.arange(n_bins) + 0.5
 
 
 def histogram(
     counts: Array, expected: Array, small: Array, large: Array, colors: Palette
 ) -> hv.Overlay:
-    """Raw counts with the model's expectation and both scales over them.
+    """Plot raw counts with the expected counts of the model and both scales.
 
     Parameters
     ----------
     counts, expected, small, large : ndarray, shape (bin,)
-        In counts; NaN where there is nothing to draw.
+        In counts; NaN is not drawn.
     """
-    n_bins = counts.size
     unit = hv.Dimension("counts", label="Counts")
-    bars = hv.Histogram((edges(n_bins), counts), kdims=BIN, vdims=unit, label="raw histogram")
+    data = edges(counts.size), counts
+    bars = hv.Histogram(data, kdims=BIN, vdims=unit, label="raw histogram")
     layers = [
         bars.opts(color=colors.raw, line_width=0),
-        _curve(centres(n_bins), expected, unit, "expected").opts(
-            color=colors.expected, line_dash="dotted", line_width=1.5
-        ),
-        _curve(centres(n_bins), small, unit, "small scale").opts(color=colors.small, line_width=2),
-        _curve(centres(n_bins), large, unit, "large scale").opts(color=colors.large, line_width=2),
+        _signal(expected, unit, "expected", colors.expected, 1.5, "dotted"),
+        _signal(small, unit, "small scale", colors.small),
+        _signal(large, unit, "large scale", colors.large),
         *_markers(unit, colors),
     ]
     return _panel(layers, "Histogram of the pixel, and the two scales that follow it")
 
 
 def residual(values: Array, difference: Array, colors: Palette) -> hv.Overlay:
-    """Positive difference of the scales; the raw first difference on demand, shape (bin,) each."""
-    n_bins = values.size
+    """Plot the positive difference of the scales, and the first difference of the histogram."""
     unit = hv.Dimension("residual", label="Counts")
     layers = [
-        _curve(centres(n_bins), difference, unit, "first difference of the raw histogram").opts(
-            color=colors.raw, line_width=1.2
-        ),
-        _curve(centres(n_bins), values, unit, "residual").opts(color=colors.residual, line_width=2),
+        _signal(difference, unit, "first difference of the raw histogram", colors.raw, 1.2),
+        _signal(values, unit, "residual", colors.residual),
         *_markers(unit, colors),
     ]
     return _panel(layers, "Residual: large scale minus small scale, where positive")
 
 
 def enhanced(values: Array, weight: Array, colors: Palette) -> hv.Overlay:
-    """Residual times weight, with the weight scaled to the plot, shape (bin,) each."""
-    n_bins = values.size
+    """Plot the residual times its weight, and the weight scaled to the plot."""
     unit = hv.Dimension("enhanced", label="Counts × weight")
     layers = [
-        _curve(centres(n_bins), weight, unit, "weight (scaled to fit)").opts(
-            color=colors.weight, line_dash="dashed", line_width=1.2
-        ),
-        _curve(centres(n_bins), values, unit, "enhanced").opts(color=colors.enhanced, line_width=2),
+        _signal(weight, unit, "weight (scaled to fit)", colors.weight, 1.2, "dashed"),
+        _signal(values, unit, "enhanced", colors.enhanced),
         *_markers(unit, colors),
     ]
     return _panel(layers, "Enhanced: residual × weight; its largest value is the echo")
 
 
-def _curve(x: Array, y: Array, unit: hv.Dimension, label: str) -> hv.Curve:
-    return hv.Curve((x, y), kdims=BIN, vdims=unit, label=label)
+def _signal(
+    y: Array, unit: hv.Dimension, label: str, color: str, width: float = 2, dash: str = "solid"
+) -> hv.Curve:
+    """Draw values of the bins (bin,)."""
+    return _curve(centres(y.size), y, unit, label, color, width, dash)
+
+
+def _curve(
+    x: Array, y: Array, unit: hv.Dimension, label: str, color: str, width: float, dash: str
+) -> hv.Curve:
+    curve = hv.Curve((x, y), kdims=BIN, vdims=unit, label=label)
+    return curve.opts(color=color, line_width=width, line_dash=dash)
+
+
+def _truth(unit: hv.Dimension, colors: Palette) -> hv.Curve:
+    return _curve(*marker_line(np.nan, 1.0), unit, "truth", colors.truth, 2.5, "4 2")
 
 
 def _markers(unit: hv.Dimension, colors: Palette) -> list[hv.Curve]:
-    nowhere = marker_line(np.nan, 1.0)
-    return [
-        _curve(*nowhere, unit, "truth").opts(color=colors.truth, line_width=2.5, line_dash="4 2"),
-        _curve(*nowhere, unit, "answer").opts(color=colors.answer, line_width=1.5),
-    ]
+    line = marker_line(np.nan, 1.0)
+    return [_truth(unit, colors), _curve(*line, unit, "answer", colors.answer, 1.5, "solid")]
 
 
 def _panel(layers: list[Any], title: str) -> hv.Overlay:
@@ -137,12 +140,12 @@ def _panel(layers: list[Any], title: str) -> hv.Overlay:
 
 
 def range_image(image: Array, low: float, high: float) -> hv.Overlay:
-    """An image (row, col) with row 0 at the top, and a frame for the pixel on show.
+    """Plot an image (row, col) with row 0 at the top, and a frame around the selected pixel.
 
     Parameters
     ----------
     image : ndarray, shape (row, col)
-        NaN is left blank.
+        NaN is transparent.
     low, high : float
         Values at the ends of the colour scale.
     """
@@ -177,20 +180,18 @@ def range_image(image: Array, low: float, high: float) -> hv.Overlay:
 
 
 def pixel_frame(row: float, col: float, half: float = 1.5) -> tuple[float, float, float, float]:
-    """Left, bottom, right and top of a frame around a pixel that leaves the pixel itself free."""
+    """Return left, bottom, right and top of a frame that does not cover its pixel."""
     return col - half, row - half, col + half, row + half
 
 
 def score_curves(colors: Palette) -> hv.Overlay:
-    """Scores of each bin, a line for each method, with the truth and the methods' answers."""
+    """Plot the scores of each bin, a line for each method, with the truth and the estimates."""
     unit = hv.Dimension("score", label="Score, scaled")
     nothing = np.full(1, np.nan)
     layers = [
         hv.Path([np.full((1, 2), np.nan)], [BIN, unit]).opts(line_width=1.8),
-        _curve(*marker_line(np.nan, 1.0), unit, "truth").opts(
-            color=colors.truth, line_width=2.5, line_dash="4 2"
-        ),
-        hv.Scatter((nothing, nothing), BIN, unit, label="answer, own lag removed").opts(
+        _truth(unit, colors),
+        hv.Scatter((nothing, nothing), BIN, unit, label="estimate, own lag removed").opts(
             marker="inverted_triangle", size=9, line_width=0
         ),
     ]
@@ -200,23 +201,23 @@ def score_curves(colors: Palette) -> hv.Overlay:
 
 
 def reliability(colors: Palette) -> hv.Overlay:
-    """Share right against confidence told, a line for each method, and the diagonal."""
-    told = hv.Dimension("told", label="Confidence told")
+    """Plot the share of right pixels against the confidence, a line for each method."""
+    stated = hv.Dimension("confidence", label="Confidence")
     right = hv.Dimension("right", label="Share right within 3 bins")
     ends, nothing = np.array([0.0, 1.0]), np.full(1, np.nan)
     layers = [
-        hv.Curve((ends, ends), told, right, label="honest").opts(
+        hv.Curve((ends, ends), stated, right, label="calibrated").opts(
             color=colors.muted, line_width=1, line_dash="dashed"
         ),
-        hv.Path([np.full((1, 2), np.nan)], [told, right]).opts(line_width=1.8),
-        hv.Scatter((nothing, nothing), told, right).opts(size=6, line_width=0),
+        hv.Path([np.full((1, 2), np.nan)], [stated, right]).opts(line_width=1.8),
+        hv.Scatter((nothing, nothing), stated, right).opts(size=6, line_width=0),
     ]
-    return _panel(layers, "Reliability: on the dashed line confidence is honest").opts(
+    return _panel(layers, "Reliability diagram (dashed: perfectly calibrated)").opts(
         hv.opts.Overlay(show_legend=False)
     )
 
 
-# Curves of the studies that have a colour of their own, by the palette's names, and their dashes.
+# Curves of the studies with a colour of their own, by its name in the palette, and their dashes.
 STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "histogram": ("raw", []),
     "small scale": ("small", []),
@@ -228,19 +229,19 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "limit: probability of the right bin": ("text", [2, 4]),
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
-    "answer, lag included": ("answer", []),
+    "estimate, lag included": ("answer", []),
     "the echo above": ("answer", []),
 }
-METHOD_PLACES = {method.name: place for place, method in enumerate(paper.COMPARED)}
+METHOD_PLACES = {method.name: n for n, method in enumerate(paper.COMPARED)}
 BARS = "histogram"
 """The curve that is drawn as bars."""
 
 
 def curves(item: items.Plot, colors: Palette) -> Any:
-    """A Bokeh figure of a study's curves, and upright lines at its marks, as named renderers.
+    """Plot a study's curves, and vertical lines at its marks, as named renderers.
 
-    The band of a curve has the curve's name and "band". Without HoloViews, which would take five
-    times as long: these are built while someone waits.
+    The band of a curve has the curve's name and "band". Built without HoloViews, which takes five
+    times as long, since these plots are built while the page is shown.
     """
     drawing = figure(
         title=item.title,
@@ -268,7 +269,7 @@ def curves(item: items.Plot, colors: Palette) -> Any:
             renderer = drawing.line(x, y, color=color, line_dash=dash, line_width=2, name=name)
         entries.append(LegendItem(label=name.replace("_", " "), renderers=[renderer]))
     many = len(entries) > 6
-    # Room for the legend, the same for all: plots above each other stay aligned.
+    # The same room for all legends keeps plots below each other aligned.
     drawing.min_border_right = 196 if many else 14
     legend = Legend(
         items=entries,
@@ -282,21 +283,21 @@ def curves(item: items.Plot, colors: Palette) -> Any:
 
 
 def curve_styles(item: items.Plot, colors: Palette) -> dict[str, tuple[str, list[int]]]:
-    """Colour and dashes of each curve and mark; of a method by its place among all methods."""
+    """Return colour and dashes of each curve and mark; a method has the same ones everywhere."""
     styles = {}
-    for place, name in enumerate((*item.curves, *item.marks)):
+    for n, name in enumerate((*item.curves, *item.marks)):
         if name in STUDY_COLORS:
-            of_palette, dash = STUDY_COLORS[name]
-            styles[name] = (getattr(colors, of_palette), dash)
+            color, dash = STUDY_COLORS[name]
+            styles[name] = (getattr(colors, color), dash)
         else:
-            styles[name] = method_style(METHOD_PLACES.get(name, place), colors)
+            styles[name] = method_style(METHOD_PLACES.get(name, n), colors)
     return styles
 
 
 def pictures(item: items.Pictures) -> list[Any]:
-    """A Bokeh figure for each image (row, col), row 0 at the top; they share colours and view.
+    """Plot images (row, col), a figure each, row 0 at the top, with common colours and view.
 
-    Each has the renderers "picture", and "shadow" and "frame" around a pixel.
+    Each figure has the renderers "picture", and "shadow" and "frame" around a pixel.
     """
     mapper = LinearColorMapper(
         palette=RANGE_COLORS,
@@ -318,8 +319,8 @@ def pictures(item: items.Pictures) -> list[Any]:
             tools="box_zoom,tap",
             toolbar_location=None,
         )
-        place = {"x": -0.5, "y": -0.5, "dw": cols, "dh": rows}
-        shown.append(drawing.image([image], **place, color_mapper=mapper, name="picture"))
+        box = {"x": -0.5, "y": -0.5, "dw": cols, "dh": rows}
+        shown.append(drawing.image([image], **box, color_mapper=mapper, name="picture"))
         left, bottom, right, top = ([side] for side in pixel_frame(0, 0))
         for layer, color, width in (("shadow", "#000000", 4), ("frame", "#ffffff", 1.6)):
             drawing.quad(
@@ -330,33 +331,33 @@ def pictures(item: items.Pictures) -> list[Any]:
                 name=layer,
             )
         drawings.append(drawing)
-    for ranges in (across, down):  # frames do not widen the view
+    for ranges in (across, down):  # frames must not widen the view
         ranges.renderers = shown
     return drawings
 
 
 MARKERS = ("circle", "square", "triangle")
-"""Of methods that share a colour."""
+"""Markers of methods that share a colour."""
 
 
 def tradeoff(colors: Palette) -> Any:
-    """A Bokeh figure of missed targets against time, as named renderers.
+    """Plot missed targets against time, as named renderers.
 
-    ``points`` are measured ways to range, ``times`` and ``degrees`` their whiskers, ``front`` the
-    line of those that none beats, ``chosen`` a ring around what is recommended.
+    ``points`` are measured configurations, ``times`` and ``degrees`` their error bars, ``front``
+    the Pareto front, ``chosen`` a ring around the recommended configuration.
     """
     drawing = figure(
         x_axis_type="log",
         y_axis_type="log",
         x_axis_label="Time for an image (ms)",
         y_axis_label="Not within 3 bins (share of the target pixels)",
-        title="Further left is faster, further down is right more often",
+        title="Error rate against time per image",
         sizing_mode="stretch_both",
         min_height=240,
         tools="box_zoom,tap",
         toolbar_location=None,
     )
-    for name, dimension in _ASKED.items():
+    for name, dimension in _GOALS.items():
         drawing.add_layout(Span(name=name, dimension=dimension, line_dash=[6, 3]))
     drawing.step("x", "y", source=_empty("x", "y"), mode="after", line_width=2, name="front")
     for name in ("times", "degrees"):
@@ -369,7 +370,7 @@ def tradeoff(colors: Palette) -> Any:
     points = drawing.scatter(
         "x",
         "y",
-        source=_empty("x", "y", "color", "marker", "method", "way", "told"),
+        source=_empty("x", "y", "color", "marker", "method", "way", "tip"),
         size=9,
         color="color",
         marker="marker",
@@ -379,32 +380,31 @@ def tradeoff(colors: Palette) -> Any:
     points.nonselection_glyph = points.selection_glyph = None
     drawing.add_tools(
         HoverTool(
-            renderers=[points], tooltips=[("", "@way"), ("", "@told")], point_policy="snap_to_data"
+            renderers=[points], tooltips=[("", "@way"), ("", "@tip")], point_policy="snap_to_data"
         )
     )
     legend = drawing.legend[0]
     legend.update(background_fill_alpha=0.0, orientation="horizontal", ncols=3)
-    drawing.add_layout(legend, "below")  # beside the plot it would leave a phone none
+    drawing.add_layout(legend, "below")  # on a phone there is no room at its side
     paint_tradeoff(drawing, colors)
     return drawing
 
 
-_ASKED = {"asked time": "height", "asked degree": "width"}
-"""Lines at what was asked for, and along what they run."""
+_GOALS = {"goal time": "height", "goal degree": "width"}
+"""Lines at the required time and restoration degree, and their direction."""
 
 
-def show_asked(drawing: Any, milliseconds: float, degree: float) -> None:
-    """Draw what was asked of the ways to range; a degree of 1 lies below any axis."""
-    missed = 1 - degree or None
-    for name, place in zip(_ASKED, (milliseconds, missed), strict=True):
-        drawing.select_one({"name": name}).location = place
+def show_goals(drawing: Any, milliseconds: float, degree: float) -> None:
+    """Draw the required time and restoration degree; a degree of 1 is off the log axis."""
+    for name, location in zip(_GOALS, (milliseconds, 1 - degree or None), strict=True):
+        drawing.select_one({"name": name}).location = location
 
 
 def paint_tradeoff(drawing: Any, colors: Palette) -> None:
-    """Colours of the lines between the points, which have their own."""
+    """Set the colours of lines; the points have their own."""
     for name, color in (("front", colors.text), ("chosen", colors.answer)):
         drawing.select_one({"name": name}).glyph.line_color = color
-    for name in _ASKED:
+    for name in _GOALS:
         drawing.select_one({"name": name}).line_color = colors.muted
 
 

@@ -1,7 +1,7 @@
 """Figures of the Inspect page as pure functions: Bokeh figures with named renderers.
 
-Figures over the gate have an extra vertical range ``marks`` from 0 to 1, in which upright lines
-reach from bottom to top whatever the data do.
+Figures over the gate have an extra vertical range ``marks`` from 0 to 1, in which vertical lines
+extend from bottom to top whatever the data.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from bokeh.plotting import figure
 
 MARKS = "marks"
 RATE_TITLES = {
-    "photons per pulse": "Rate, pile-up undone (Coates)",
-    "photons": "Rate, as counted: no pile-up to undo",
+    "photons per pulse": "Rate, pile-up corrected (Coates)",
+    "photons": "Rate as counted (no pile-up to correct)",
 }
 CANDIDATE_HEIGHT = 0.05
-"""Of the candidates' marks within a plot: near the bottom, where no legend hides them."""
+"""Height of the candidates' marks: near the bottom, where no legend hides them."""
 
 
 def empty(*columns: str) -> ColumnDataSource:
-    """A source of nothing yet."""
+    """Return an empty source."""
     return ColumnDataSource({name: [] for name in columns})
 
 
 def counts(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
-    """Counts of each bin as bars, both scales and the model's expectation over them."""
+    """Plot the counts of each bin as bars, with both scales and the expected counts."""
     drawing = _over_the_gate("Counts, and the two scales that follow them", "Counts", bins)
     source = empty("bin", "raw", "expected", "small", "large")
     _bars(drawing, source, "raw", "counts")
@@ -45,7 +45,7 @@ def counts(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
 
 
 def rate(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
-    """Detection rate of each bin, what earlier bins hid being undone."""
+    """Plot the detection rate of each bin, corrected for pile-up."""
     drawing = _over_the_gate("", "", bins)
     source = empty("bin", "rate")
     _bars(drawing, source, "rate", "rate")
@@ -53,7 +53,7 @@ def rate(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
 
 
 def stages(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
-    """Residual of the two scales, and on an axis of its own what the weight makes of it."""
+    """Plot the residual of the two scales, and the weighted residual on an axis of its own."""
     drawing = _over_the_gate("Residual, and enhanced by the weight", "Residual (counts)", bins)
     source = empty("bin", "residual", "enhanced")
     drawing.extra_y_ranges["enhanced"] = Range1d(0, 1)
@@ -65,7 +65,7 @@ def stages(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
 
 
 def overlay(bins: Range1d, title: str, unit: str) -> Any:
-    """A line for each pin."""
+    """Plot a line for each pin."""
     drawing = _over_the_gate(title, unit, bins)
     drawing.multi_line(
         "xs",
@@ -80,9 +80,9 @@ def overlay(bins: Range1d, title: str, unit: str) -> Any:
 
 
 def aggregate(bins: Range1d) -> Any:
-    """Counts of all pixels together, the gate that is suggested, and T_n."""
+    """Plot the summed counts of all pixels, the suggested gate, and T_n."""
     drawing = _over_the_gate("Counts of all pixels along the gate", "Counts", bins)
-    drawing.yaxis.formatter = NumeralTickFormatter(format="0,0")  # of millions, too
+    drawing.yaxis.formatter = NumeralTickFormatter(format="0,0")  # also for millions
     _bars(drawing, empty("bin", "raw"), "raw", "counts")
     drawing.quad(
         "left",
@@ -97,12 +97,12 @@ def aggregate(bins: Range1d) -> Any:
         legend_label="suggested gate",
     )
     for name, label, dash in (("t_n", "T_n", "solid"), ("suggested", "suggested T_n", "dashed")):
-        _upright(drawing, empty("x", "y"), name, label, line_dash=dash)
+        _vertical(drawing, empty("x", "y"), name, label, line_dash=dash)
     return _with_legend(drawing)
 
 
 def accuracy() -> Any:
-    """Share of pixels that are right against the pulses that are taken, with 95 % intervals."""
+    """Plot the share of right pixels against the number of pulses, with 95 % intervals."""
     drawing = _with_marks(
         x_axis_type="log",
         x_axis_label="Pulses",
@@ -138,7 +138,7 @@ def accuracy() -> Any:
         )
     )
     drawing.xaxis.formatter = PrintfTickFormatter(format="%.3g")
-    _upright(drawing, empty("x", "y"), "answer", "taken at present")
+    _vertical(drawing, empty("x", "y"), "answer", "present number")
     return _with_legend(drawing, "bottom_right")
 
 
@@ -156,7 +156,7 @@ def _over_the_gate(title: str, unit: str, bins: Range1d) -> Any:
 
 
 def _with_marks(**options: Any) -> Any:
-    """A figure as wide and high as there is room, with the range ``marks``."""
+    """Return a responsive figure with the range ``marks``."""
     drawing = figure(
         sizing_mode="stretch_both",
         min_height=110,
@@ -182,7 +182,7 @@ def _line(
     )
 
 
-def _upright(
+def _vertical(
     drawing: Any,
     source: ColumnDataSource,
     name: str,
@@ -203,13 +203,13 @@ def _upright(
 
 
 def _marked(drawing: Any, marks: Mapping[str, ColumnDataSource], with_ranks: bool = False) -> Any:
-    """Truth, answer and candidates, from sources that figures share."""
-    _upright(drawing, marks["truth"], "truth", "truth", 2.5, line_dash="4 2")
-    _upright(drawing, marks["answer"], "answer", "answer", 1.5)
+    """Add truth, estimate and candidates, from sources that figures share."""
+    _vertical(drawing, marks["truth"], "truth", "truth", 2.5, line_dash="4 2")
+    _vertical(drawing, marks["answer"], "answer", "answer", 1.5)
     places = {"source": marks["candidates"], "y_range_name": MARKS}
     drawing.scatter("x", "y", marker="triangle", size=8, **places, name="candidates")
     if with_ranks:
-        # Above their marks: beside them they would meet the next one, or the end of the gate.
+        # Above their marks; at their side they would overlap the next one.
         above = {"y_offset": -4, "text_align": "center", "text_baseline": "bottom"}
         drawing.text("x", "y", "rank", **places, **above, text_font_size="11px", name="ranks")
     return _with_legend(drawing)

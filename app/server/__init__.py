@@ -1,1 +1,1 @@
-"""The server: who is served, what, and how much of it."""
+"""The server: access, routes, sessions and limits."""

@@ -1,7 +1,7 @@
-"""Who is served: only hosts that are named, and where others reach them, only who knows a token.
+"""Access control: accepted hosts, and a token where other machines reach the server.
 
-One rule stands before all others, so that it guards pages, sockets, scripts and whatever a library
-serves beside them. Bokeh and Panel know of users too, but their static files are open to everyone.
+One routing rule precedes all others, so that it guards pages, sockets, scripts and whatever else a
+library serves. The user accounts of Bokeh and Panel leave static files open to everyone.
 """
 
 from __future__ import annotations
@@ -25,18 +25,26 @@ from tornado.web import (
 )
 
 from app.server.limits import Connections, WrongTokens
-from app.server.messages import ASK, FOREIGN, MALFORMED, WRONG, refusal, token_form, too_many_tokens
+from app.server.messages import (
+    FOREIGN,
+    MALFORMED,
+    TOKEN_REQUIRED,
+    WRONG_TOKEN,
+    refusal,
+    token_form,
+    too_many_tokens,
+)
 from core.checks import require
 
 TOKEN_VARIABLE = "FIRSTPHOTON_TOKEN"
-LEAST_CHARACTERS = 8
+SHORTEST_TOKEN = 8
 COOKIE_DAYS = 30.0
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "same-origin",
-    # Bokeh and vtk.js make functions out of text, Panel's components are modules of their own.
+    # Bokeh and vtk.js compile text to functions; Panel's components are modules.
     "Content-Security-Policy": "; ".join(
         (
             "default-src 'self'",
@@ -56,7 +64,7 @@ HEADERS = {
 
 
 def is_loopback(address: str) -> bool:
-    """Whether only this machine reaches an address."""
+    """Whether only this machine can reach an address."""
     try:
         return address == "localhost" or ip_address(address).is_loopback
     except ValueError:
@@ -64,33 +72,32 @@ def is_loopback(address: str) -> bool:
 
 
 def is_cross_site(request: HTTPServerRequest) -> bool:
-    """Whether a page of another site sends a request, other than by a link that opens this one.
+    """Whether a page of another site sent a request, other than by a link to this server.
 
-    An image or a script of a foreign page brings no Origin; browsers say so in other headers (W3C,
-    Fetch Metadata Request Headers), which a page cannot change.
+    An image or a script of a foreign page has no Origin header. Browsers describe it in other
+    headers, which a page cannot change (W3C, Fetch Metadata Request Headers).
     """
-    said = request.headers.get
-    is_link = said("Sec-Fetch-Mode") == "navigate" and said("Sec-Fetch-Dest") == "document"
-    return said("Sec-Fetch-Site", "none") not in ("same-origin", "none") and not is_link
+    header = request.headers.get
+    is_link = header("Sec-Fetch-Mode") == "navigate" and header("Sec-Fetch-Dest") == "document"
+    return header("Sec-Fetch-Site", "none") not in ("same-origin", "none") and not is_link
 
 
 def is_well_formed(request: HTTPServerRequest) -> bool:
-    """Whether a path has printable characters only, as the name of each file here has."""
+    """Whether a path has printable characters only, like all paths of this server."""
     return unquote(request.path, errors="replace").isprintable()
 
 
 @dataclass(frozen=True)
 class Access:
-    """What a request must show to be served.
+    """Conditions under which a request is served.
 
     Parameters
     ----------
     hosts : frozenset of str
-        What the address bar of a browser may say: host and port, or a host alone where no port is
-        shown. A page of another site has another origin, and a foreign name that has been led to
-        this machine is another host.
+        Accepted hosts with their ports, as in the address bar of a browser. A page of another site
+        has another origin; a foreign name that resolves to this machine is another host.
     token : str, optional
-        What must be known; None where only this machine reaches the server.
+        Required token; None where only this machine reaches the server.
     """
 
     hosts: frozenset[str]
@@ -98,21 +105,21 @@ class Access:
 
     @classmethod
     def of(cls, address: str, port: int, origins: list[str], token: str | None) -> Access:
-        """For a server at this address.
+        """Return the conditions for a server at an address.
 
         Parameters
         ----------
         origins : list of str
             Host, or host and port, as browsers see them.
         token : str, optional
-            One that the user has chosen; where others reach the server and there is none, one is
-            made.
+            The user's own token. Without one, a token is generated where other machines reach the
+            server.
 
         Raises
         ------
         ValueError
-            If others reach the server and no origin is named, an origin is no host, or the token
-            is too short to be one.
+            If other machines reach the server and no origin is given, an origin is not a host, or
+            the token is too short.
         """
         for origin in origins:
             parts = urlsplit(f"//{origin}")
@@ -125,70 +132,68 @@ class Access:
             f"the host under which browsers reach {address}, such as lab.example.org",
         )
         if token is not None:
-            is_long = len(token) >= LEAST_CHARACTERS
-            require(TOKEN_VARIABLE, "…", is_long, f"at least {LEAST_CHARACTERS} characters")
+            is_long = len(token) >= SHORTEST_TOKEN
+            require(TOKEN_VARIABLE, "…", is_long, f"at least {SHORTEST_TOKEN} characters")
         elif not is_loopback(address):
             token = secrets.token_urlsafe(24)
-        named = [*origins, *(["localhost", address] if is_loopback(address) else [])]
-        places = {_place(host, port) for host in named}
-        # A proxy in front of it may show no port.
-        return cls(frozenset(each.lower() for each in {*origins, *places}), token)
+        hosts = [*origins, *(["localhost", address] if is_loopback(address) else [])]
+        # Behind a proxy the origins may have no port.
+        accepted = {*origins, *(_with_port(host, port) for host in hosts)}
+        return cls(frozenset(each.lower() for each in accepted), token)
 
     def link(self, origin: str, port: int) -> str:
-        """Where a browser finds the server under one of its names."""
+        """Return the link that opens the server under one of its hosts."""
         query = f"?{urlencode({'token': self.token})}" if self.token else ""
-        return f"http://{_place(origin, port)}/{query}"
+        return f"http://{_with_port(origin, port)}/{query}"
 
-    def is_from_here(self, request: HTTPServerRequest) -> bool:
-        """Whether a request is for this server, and comes from its own pages or from no page."""
+    def is_own(self, request: HTTPServerRequest) -> bool:
+        """Whether a request names this server and comes from its own pages or from no page."""
         origin = request.headers.get("Origin")
         is_ours = origin is None or urlsplit(origin).netloc.lower() in self.hosts
         return request.host.lower() in self.hosts and is_ours and not is_cross_site(request)
 
     def accepts(self, token: str) -> bool:
-        """Whether this is the token."""
+        """Whether a token is the right one."""
         return self.token is not None and hmac.compare_digest(token.encode(), self.token.encode())
 
 
-def _place(host: str, port: int) -> str:
-    """Host and port as an address has them."""
+def _with_port(host: str, port: int) -> str:
     host = f"[{host}]" if host.count(":") > 1 and "]" not in host else host
     return host if urlsplit(f"//{host}").port else f"{host}:{port}"
 
 
 class Guard(Matcher):
-    """Matches the requests that `Gate` is to answer, instead of whatever they ask for."""
+    """Matches the requests that `Gate` answers in place of the route that they name."""
 
     def __init__(self, access: Access, connections: Connections) -> None:
         self._access, self._connections = access, connections
         self.wrong_tokens = WrongTokens()
-        # A cookie is valid for one run of the server. Browsers share cookies between ports.
+        # Cookies are valid for one run of the server; browsers share them between ports.
         self._secret = secrets.token_bytes(32)
         self._cookie = f"firstphoton-{secrets.token_hex(4)}"
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
-        """None for a request that is welcome."""
+        """Return None for a request that is served."""
         self._connections.completed(request)
-        is_welcome = self.refusal(request) is None and (
-            self._access.token is None
-            or (self._is_known(request) and "token" not in request.query_arguments)
+        is_admitted = self._access.token is None or (
+            self._has_cookie(request) and "token" not in request.query_arguments
         )
-        return None if is_welcome else {}
+        return None if is_admitted and self.refusal(request) is None else {}
 
     def refusal(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        """Status and sentence for a request that no token helps; None for others."""
-        if not self._access.is_from_here(request):
+        """Return status and sentence for a request that is refused whatever its token."""
+        if not self._access.is_own(request):
             return 403, FOREIGN
         return None if is_well_formed(request) else (400, MALFORMED)
 
-    def _is_known(self, request: HTTPServerRequest) -> bool:
-        kept = request.cookies.get(self._cookie)
-        return kept is not None and bool(
-            decode_signed_value(self._secret, self._cookie, kept.value, max_age_days=COOKIE_DAYS)
+    def _has_cookie(self, request: HTTPServerRequest) -> bool:
+        cookie = request.cookies.get(self._cookie)
+        return cookie is not None and bool(
+            decode_signed_value(self._secret, self._cookie, cookie.value, max_age_days=COOKIE_DAYS)
         )
 
     def admit(self, handler: RequestHandler) -> None:
-        """Let a browser in from now on."""
+        """Give a browser the cookie with which it is served."""
         handler.set_cookie(
             self._cookie,
             create_signed_value(self._secret, self._cookie, "1"),
@@ -203,29 +208,28 @@ class Gate(RequestHandler):
     """Asks for the token, or refuses."""
 
     def initialize(self, access: Access, guard: Guard) -> None:
-        """Take over what the rule was made with."""
+        """Store the arguments of the rule."""
         self._access, self._guard = access, guard
 
     def prepare(self) -> None:
-        """Refuse what no token helps."""
-        refused = self._guard.refusal(self.request)
-        if refused is not None:
+        """Refuse requests of other sites."""
+        if refused := self._guard.refusal(self.request):
             status, sentence = refused
             self._answer(refusal(sentence), status)
 
     def get(self) -> None:
-        """Take the token out of the address, or ask for it."""
+        """Check the token in the address, or ask for one."""
         token = self.get_query_argument("token", None)
         if token is None:
-            self._answer(token_form(ASK))
+            self._answer(token_form(TOKEN_REQUIRED))
         else:
-            self._try(token)
+            self._check(token)
 
     def post(self) -> None:
-        """Take the token that was typed."""
-        self._try(self.get_body_argument("token", ""))
+        """Check the token of the form."""
+        self._check(self.get_body_argument("token", ""))
 
-    def _try(self, token: str) -> None:
+    def _check(self, token: str) -> None:
         address, wrong = str(self.request.remote_ip), self._guard.wrong_tokens
         delay_s = wrong.delay_s(address)
         if delay_s > 0:
@@ -234,7 +238,7 @@ class Gate(RequestHandler):
             return
         if not self._access.accepts(token):
             wrong.add(address)
-            self._answer(token_form(WRONG))
+            self._answer(token_form(WRONG_TOKEN))
             return
         wrong.forgive(address)
         self._guard.admit(self)
@@ -243,7 +247,7 @@ class Gate(RequestHandler):
             for pair in parse_qsl(self.request.query, keep_blank_values=True)
             if pair[0] != "token"
         ]
-        # One slash: two of them, of whatever kind, would lead to another host.
+        # Two slashes of any kind would redirect to another host.
         path = "/" + self.request.path.lstrip("/\\")
         self.redirect(path + (f"?{urlencode(others)}" if others else ""), status=303)
 
@@ -254,19 +258,18 @@ class Gate(RequestHandler):
 
 
 def guard(application: Application, access: Access, connections: Connections) -> None:
-    """Put the rule before all others of an application."""
+    """Insert the rule before all others of an application."""
     rule = Guard(access, connections)
-    known = {"access": access, "guard": rule}
-    application.default_router.rules.insert(0, Rule(rule, Gate, known))
+    arguments = {"access": access, "guard": rule}
+    application.default_router.rules.insert(0, Rule(rule, Gate, arguments))
 
 
 class Headers(OutputTransform):
-    """Adds to every answer what keeps browsers from lending it to others."""
+    """Adds security headers to every response."""
 
     def transform_first_chunk(
         self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
     ) -> tuple[int, HTTPHeaders, bytes]:
-        """As tornado calls it before anything is sent."""
-        for name, value in HEADERS.items():
-            headers[name] = value
+        """Add the headers before anything is sent; called by Tornado."""
+        headers.update(HEADERS)
         return status_code, headers, chunk

@@ -1,7 +1,7 @@
-"""Python's collector of garbage, kept from walking through every open page time and again.
+"""Freeze long-lived objects so that full garbage collections stay cheap.
 
-A page is some ten thousands of objects. With twenty of them a full collection takes more than half
-a second, in which nobody is answered; sliders that are dragged and pages that open bring it about.
+A page has some ten thousand objects. With twenty pages a full collection takes more than half a
+second, during which the server does not respond. Dragging sliders and opening pages trigger it.
 """
 
 from __future__ import annotations
@@ -11,24 +11,21 @@ import gc
 import os
 
 
-def spare() -> None:
-    """Have later collections pass over all that is in use now, until `collect_all`."""
+def freeze_all() -> None:
+    """Exclude all present objects from collections until `collect_all`."""
     gc.collect()
     gc.freeze()
 
 
 def collect_all() -> None:
-    """Look through everything: a page is gone, and has left something behind."""
+    """Collect all garbage, that of closed pages included, and return the memory."""
     gc.unfreeze()
-    spare()
+    freeze_all()
     _return_freed_memory()
 
 
 def _return_freed_memory() -> None:
-    """Give the system back what has been freed; glibc keeps most of it otherwise.
-
-    After 20 closed sessions of 256 × 256 pixels, 1.4 GiB stayed resident, of which 0.5 were in use.
-    """
+    """Return freed memory to the system, most of which glibc would keep."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
         trim(0)

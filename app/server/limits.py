@@ -1,4 +1,4 @@
-"""Limits on what a request may take before anything is known of who sent it."""
+"""Limits on requests and connections before the client is known."""
 
 from __future__ import annotations
 
@@ -13,27 +13,26 @@ from tornado.httputil import HTTPServerRequest
 from tornado.iostream import IOStream
 
 HTTP_LIMITS: dict[str, Any] = {
-    "max_body_size": 2**16,  # the form that asks for the token is the only body
+    "max_body_size": 2**16,  # the token form is the only body
     "body_timeout": 10.0,
-    # Also the time within which the header of a request must arrive.
+    # Also limits the time until the header of a request has arrived.
     "idle_connection_timeout": 15.0,
 }
 """Options of the HTTP server, sizes in bytes and times in seconds. Websockets have their own."""
 
 MOST_CONNECTIONS = 500
-"""Connections at once. A browser opens up to seven for a page, and keeps one."""
+"""Most connections at once. A browser opens up to seven for a page, and keeps one."""
 
 
 class Connections:
-    """The open connections of a server, of which there are never more than a given number.
+    """The open connections of a server, limited in number.
 
-    A new connection beyond the bound takes the place of the one that has waited longest without
-    completing a request; where all have completed one, the new connection is closed.
+    A new connection beyond the limit replaces the oldest one that has not completed a request. If
+    all have completed one, the new connection is closed.
 
     Parameters
     ----------
     most : int
-        Connections at once.
     """
 
     def __init__(self, most: int = MOST_CONNECTIONS) -> None:
@@ -41,7 +40,7 @@ class Connections:
         self._has_completed: dict[IOStream, bool] = {}  # oldest first
 
     def bound(self, server: HTTPServer) -> None:
-        """Apply the bound to a server that has not been started."""
+        """Apply the limit to a server that has not been started."""
         serve = server.handle_stream
 
         def handle_stream(stream: IOStream, address: Any) -> None:
@@ -54,11 +53,11 @@ class Connections:
         server.handle_stream = handle_stream  # type: ignore[method-assign]
 
     def completed(self, request: HTTPServerRequest) -> None:
-        """Note that the header of a request has arrived."""
+        """Record that the header of a request has arrived."""
         self._has_completed[request.connection.stream] = True  # type: ignore[union-attr]
 
     def _has_room(self) -> bool:
-        # Looked through here: HTTP connections replace each other's close callbacks.
+        # Checked here, since HTTP connections replace each other's close callbacks.
         still_open = {s: done for s, done in self._has_completed.items() if not s.closed()}
         self._has_completed = still_open
         if len(still_open) < self._most:
@@ -72,15 +71,15 @@ class Connections:
 
 
 class WrongTokens:
-    """How long an address has to wait after wrong tokens.
+    """Delays of clients that have sent wrong tokens.
 
-    The first few cost nothing; each one after them doubles the delay. An attempt during the delay
-    is refused unread, so the delay cannot be avoided by many attempts at once.
+    The first few are free; each further one doubles the delay. An attempt during the delay is
+    refused unread, so that parallel attempts gain nothing.
 
     Parameters
     ----------
     clock : callable
-        Time in seconds.
+        Returns the time in seconds.
     """
 
     FREE = 10
@@ -93,12 +92,12 @@ class WrongTokens:
         self._known: OrderedDict[str, tuple[int, float]] = OrderedDict()
 
     def delay_s(self, address: str) -> float:
-        """Seconds until an address may try again; 0 where it may at once."""
+        """Return the seconds until an address may try again."""
         _, until_s = self._known.get(_network_of(address), (0, 0.0))
         return max(0.0, until_s - self._clock())
 
     def add(self, address: str) -> None:
-        """Note a wrong token."""
+        """Count a wrong token."""
         network = _network_of(address)
         n_wrong = self._known.pop(network, (0, 0.0))[0] + 1
         doublings = min(n_wrong - self.FREE, 32)
@@ -108,14 +107,14 @@ class WrongTokens:
             self._known.popitem(last=False)
 
     def forgive(self, address: str) -> None:
-        """Note the right token."""
+        """Reset the count after the right token."""
         self._known.pop(_network_of(address), None)
 
 
 def _network_of(address: str) -> str:
-    """The address, or the /64 network of an IPv6 address, all of which belongs to one user."""
+    """Return the address, or the /64 network of an IPv6 address, which belongs to one user."""
     try:
-        is_long = ip_address(address).version == 6
+        is_ipv6 = ip_address(address).version == 6
     except ValueError:  # a Unix socket has no address
         return address
-    return str(ip_network(f"{address}/64", strict=False)) if is_long else address
+    return str(ip_network(f"{address}/64", strict=False)) if is_ipv6 else address

@@ -1,4 +1,4 @@
-"""Pages of one sentence, for requests that are not served."""
+"""Pages with a single sentence, for requests that are not served."""
 
 from __future__ import annotations
 
@@ -22,36 +22,38 @@ _FORM = """
 </label> <button>Enter</button>
 </form>"""
 
-ASK = "This server asks for a token. The link that was printed when it was started contains it."
-WRONG = "Wrong token. The token was printed when the server was started."
-FOREIGN = (
-    "This request names an address, or comes from another site's page, that this server does not "
-    "accept. To add an address, start the server with --origin."
+TOKEN_REQUIRED = (
+    "This server requires a token. It is part of the link that was printed when the server started."
 )
-MALFORMED = "This address contains characters that no address of this server has."
+WRONG_TOKEN = "Wrong token. The token was printed when the server was started."
+FOREIGN = (
+    "This server does not accept requests for this address, or from pages of another site. To add "
+    "an address, start the server with --origin."
+)
+MALFORMED = "This address contains characters that are not accepted."
 
 
 def refusal(sentence: str) -> str:
-    """A page that says why nothing is served."""
+    """Return a page with the reason why nothing is served."""
     return _PAGE.format(sentence=escape(sentence), form="", role="alert", meta="")
 
 
 def token_form(sentence: str) -> str:
-    """A page that asks for the token."""
-    role = "note" if sentence == ASK else "alert"
+    """Return a page with a form for the token."""
+    role = "note" if sentence == TOKEN_REQUIRED else "alert"
     return _PAGE.format(sentence=escape(sentence), form=_FORM, role=role, meta="")
 
 
 def too_many_tokens(delay_s: float) -> str:
-    """Sentence for an address that has sent too many wrong tokens."""
+    """Return the sentence for a client that has sent too many wrong tokens."""
     return f"Too many wrong tokens from your address. Try again in {delay_s:.0f} s."
 
 
 def full_page(retry_s: int) -> str:
-    """A page that says that the server has no room, and tries again by itself."""
+    """Return a page for a full server, which reloads itself."""
     sentence = (
-        "This server has no room for another session at the moment. The page tries again by "
-        f"itself every {retry_s} s; room is made when someone closes a page."
+        "This server has no room for another session at the moment. This page tries again every "
+        f"{retry_s} s; closing another page makes room."
     )
     meta = f'<meta http-equiv="refresh" content="{retry_s}">'
     return _PAGE.format(sentence=sentence, form="", role="status", meta=meta)

@@ -1,4 +1,4 @@
-"""Serve the head of a page at once, and the page itself when it is built."""
+"""Serve the head of a page at once, and its body when it has been built."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from app.server.messages import full_page
 from app.server.sessions import RETRY_S, Sessions
 
 QUIET_S = 0.1
-"""Time after which a browser that has not asked for a head's files has them already. They come from
-the thread that builds the page, and would wait for it."""
+"""Time without requests after which a browser has the files of the head. They come from the thread
+that builds the page, and would wait for it."""
 
-LOOKS = 5
-"""Times that is waited for at most, however many others ask for something."""
+MOST_WAITS = 5
+"""Most times that this is waited for, however many other requests come."""
 
 
-class Answers(OutputTransform):
-    """Counts what is answered."""
+class ResponseCount(OutputTransform):
+    """Counts responses."""
 
     count = 0
 
-    def transform_first_chunk(self, *answer: Any) -> Any:
-        """As tornado calls it before anything is sent."""
+    def transform_first_chunk(self, *response: Any) -> Any:
+        """Count a response before anything is sent; called by Tornado."""
         type(self).count += 1
-        return super().transform_first_chunk(*answer)
+        return super().transform_first_chunk(*response)
 
 
 class PageHandler(DocHandler):
-    """Sends the head of a page first: the browser loads its scripts while the page is built.
+    """Sends the head first, so that the browser loads its scripts while the page is built.
 
-    Heads differ only by what an address asks for, so that each page keeps its head for the next.
-    Where there is no room for a session, none is built, and the page says so.
+    Heads differ only by the query of the address; the head of a page without one is used for the
+    next pages. Without room for a session, none is built, and the page says so.
     """
 
     known_head = ""
-    _is_alike = _is_left = False
+    _has_common_head = _is_left = False
 
     def initialize(self, sessions: Sessions, **options: Any) -> None:
-        """Take over what the route was made with."""
+        """Store the arguments of the route."""
         super().initialize(**options)
         self._sessions = sessions
 
     async def get(self, *arguments: Any, **options: Any) -> None:
-        """Build the page, or say that there is no room for it."""
+        """Build the page, or report that the server is full."""
         with self._sessions.opening(self._returning()) as has_room:
             if has_room:
                 await super().get(*arguments, **options)
@@ -58,14 +58,14 @@ class PageHandler(DocHandler):
         self.finish(full_page(RETRY_S))
 
     def on_connection_close(self) -> None:
-        """Nobody waits for the page any more."""
+        """Record that the browser has left."""
         self._is_left = True
 
     def _returning(self) -> str | None:
-        """The session that one of its own pages returns to, where that is still there.
+        """Return the existing session to which one of its own pages returns.
 
-        A name that comes by a link, or a token, is ignored: whoever made the link would know the
-        session of whoever follows it.
+        A session or a token in a link of another origin is ignored: its author would know the
+        session of everyone who follows the link.
         """
         arguments, headers = self.request.arguments, self.request.headers
         named = self.get_query_argument("bokeh-session-id", None)
@@ -78,31 +78,33 @@ class PageHandler(DocHandler):
         return None
 
     async def get_session(self) -> Any:
-        """The page, which is built in here."""
+        """Send the known head, and build the page."""
         if self.known_head:
             super().write(self.known_head)
             await self.flush()
-            await _quiet()
+            await when_quiet()
         async with self._sessions.building():
             if self._is_left:
                 raise HTTPError(400, "the browser has left")
             session = await super().get_session()
-        self._is_alike = "is_page" in session.document.template_variables and not self.request.query
+        is_page = "is_page" in session.document.template_variables
+        self._has_common_head = is_page and not self.request.query
         return session
 
     def write(self, chunk: str) -> None:
-        """Send the page, as Panel calls it, without what was sent before."""
+        """Send the page without what was sent before; called by Panel."""
         head, *rest = chunk.partition("</head>")
         if self._headers_written:
             chunk = "".join(rest)
-        elif self._is_alike:
+        elif self._has_common_head:
             type(self).known_head = head
         super().write(chunk)
 
 
-async def _quiet() -> None:
-    for _ in range(LOOKS):
-        before = Answers.count
+async def when_quiet() -> None:
+    """Wait until there are no requests for a moment, but not for long."""
+    for _ in range(MOST_WAITS):
+        before = ResponseCount.count
         await asyncio.sleep(QUIET_S)
-        if Answers.count == before:
+        if ResponseCount.count == before:
             return

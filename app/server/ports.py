@@ -1,4 +1,4 @@
-"""TCP ports: command-line values and free ports."""
+"""TCP ports."""
 
 from __future__ import annotations
 

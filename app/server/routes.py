@@ -1,13 +1,12 @@
-"""Routes: a page, its socket and its files, and nothing else that the libraries offer.
+"""Routes: the page, its socket and its files.
 
-Of Panel's and Bokeh's routes those in `SERVED` are kept, some with a handler of our own; all others
-are removed, those that a later version adds included.
+Routes of Panel and Bokeh that are not in `SERVED` are removed, those of later versions included.
 
-Panel's own handler of ``/components/<module>/<class>/<attribute>/<path>`` calls
-``importlib.import_module`` with whatever the address names before it checks anything
-(``panel.io.server.ComponentResourceHandler.parse_url_path``, read in Panel 1.9.4). Importing runs
-code: ``/components/unittest.__main__/x/_css/y`` ends the process, and any module on the path can be
-run, those in the current folder included. `ComponentFiles` looks only at modules that are loaded.
+Panel's handler of ``/components/<module>/<class>/<attribute>/<path>`` calls
+``importlib.import_module`` with the module of the address before any check
+(``panel.io.server.ComponentResourceHandler.parse_url_path`` in Panel 1.9.4). Importing runs code:
+``/components/unittest.__main__/x/_css/y`` ends the process, and any module on the path can be run,
+those in the current folder included. `ComponentFiles` uses only modules that are loaded.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from app.server.opening import PageHandler
 from app.server.sessions import Sessions
 
 MOST_MESSAGE_BYTES = 16 * 2**20
-"""Largest message from a browser; a part of a file (`app.widgets.file_input`) is smaller."""
+"""Largest message from a browser; parts of a file (`app.widgets.file_input`) are smaller."""
 
 _COMPONENT_PACKAGE = "app."
 
@@ -37,10 +36,10 @@ _POLICY_VIOLATION, _TOO_BIG = 1008, 1009  # status codes of RFC 6455
 
 
 class ComponentFiles(ComponentResourceHandler):
-    """Files of components that are loaded; imports nothing."""
+    """Serves files of components that are loaded; imports nothing."""
 
     def parse_url_path(self, path: str) -> str:
-        """Path of the file that an address names."""
+        """Return the path of the file that an address names."""
         module, _, rest = path.partition("/")
         name = rest.partition("/")[0]
         is_ours = module.startswith(_COMPONENT_PACKAGE) and module in sys.modules
@@ -56,16 +55,16 @@ class ComponentFiles(ComponentResourceHandler):
 
 
 class SocketHandler(WSHandler):
-    """Connects a browser to the session of its page, and opens no session of its own."""
+    """Connects a browser to the session of its page; never creates a session."""
 
     def initialize(self, sessions: Sessions, **options: Any) -> None:
-        """Take over what the route was made with."""
+        """Store the arguments of the route."""
         super().initialize(**options)
         self._sessions = sessions
         self._n_pending_bytes = 0
 
     def open(self, *arguments: Any, **options: Any) -> None:
-        """Refuse a token that is malformed, expired, or of no session."""
+        """Refuse a token that is malformed or expired, or has no session."""
         try:
             if not self._sessions.has(get_session_id(self._token)):
                 raise ProtocolError("no such session")
@@ -97,11 +96,11 @@ SERVED: dict[tuple[str, type[RequestHandler]], type[RequestHandler]] = {
     ("/static/extensions/(.*)$", MultiRootStaticHandler): MultiRootStaticHandler,
     ("/components/(.*)$", ComponentResourceHandler): ComponentFiles,
 }
-"""Handler of each route that is kept, by its pattern and the handler that the libraries have."""
+"""Handler of each route, by its pattern and the handler of the libraries."""
 
 
 def restrict(application: Application, sessions: Sessions) -> None:
-    """Keep only what is in `SERVED`."""
+    """Remove all routes of an application that are not in `SERVED`."""
     router = application.wildcard_router
     kept = []
     for rule in router.rules:

@@ -1,4 +1,4 @@
-"""A server of one page, with everything in place that bounds and guards it."""
+"""The server with access control, limits and routes in place."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bokeh.server.server import Server
 
 from app.server.access import Access, Headers, guard
 from app.server.limits import HTTP_LIMITS, Connections
-from app.server.opening import Answers
+from app.server.opening import ResponseCount
 from app.server.routes import MOST_MESSAGE_BYTES, restrict
 from app.server.sessions import Bounds, Sessions
 from app.widgets.connection import LINGER_S, serving_options
@@ -24,7 +24,7 @@ def server_of(
     linger_s: float = LINGER_S,
     bounds: Bounds | None = None,
 ) -> Server:
-    """A server that is not started yet.
+    """Return a server that has not been started.
 
     Parameters
     ----------
@@ -32,19 +32,19 @@ def server_of(
         Called once for each session.
     access : Access
     address : str
-        Where to listen.
+        Address to listen on.
     port : int
     linger_s : float
-        Seconds for which a session is kept after its page was closed or cut off.
+        Seconds for which a session is kept after its page was closed or disconnected.
     bounds : Bounds, optional
-        On all sessions together.
+        Limits on all sessions together.
 
     Raises
     ------
     ValueError
         If `linger_s` is out of bounds.
     OSError
-        If the port cannot be had.
+        If the port is not available.
     """
     server = pn.serve(
         {"/": build_page},
@@ -53,7 +53,7 @@ def server_of(
         websocket_origin=sorted(access.hosts),
         websocket_max_message_size=MOST_MESSAGE_BYTES,
         http_server_kwargs=dict(HTTP_LIMITS),
-        transforms=[Headers, Answers],
+        transforms=[Headers, ResponseCount],
         title="firstphoton",
         verbose=False,
         show=False,

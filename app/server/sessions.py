@@ -1,9 +1,8 @@
-"""Bounds on the sessions of a server: how many, how much memory, and for how long unconnected.
+"""Limits on the sessions of a server: number, memory, and time without a browser.
 
-Panel builds a session for each request of a page, whether or not a browser connects to it
-afterwards. A connected session lasts as long as its connection, and for
-`app.widgets.connection.LINGER_S` longer, so that a page can be reloaded; one that no browser ever
-connected to ends much sooner.
+Panel builds a session for each request of a page, whether or not a browser connects to it. A
+connected session lasts as long as its connection and `app.widgets.connection.LINGER_S` longer, so
+that a page can be reloaded; one to which no browser connects ends much sooner.
 """
 
 from __future__ import annotations
@@ -20,18 +19,17 @@ from bokeh.server.contexts import ApplicationContext
 from bokeh.server.session import ServerSession
 from tornado.ioloop import PeriodicCallback
 
-LOOK_S = 2.0
-"""Time between two looks at the sessions."""
+CHECK_S = 2.0
+"""Interval at which unconnected sessions are checked."""
 
 POLL_S = 0.1
-"""Time between two looks whether the next page can be built."""
+"""Interval at which a waiting page checks whether it can be built."""
 
 PAUSE = 0.5
-"""Time between two pages that are built, as a share of what the first one took: open pages, which
-the same thread serves, have their turn."""
+"""Pause after a page was built, as a share of the time that took; open pages respond in it."""
 
 RETRY_S = 10
-"""Time after which a browser that found no room asks again."""
+"""Time after which a browser that found the server full asks again."""
 
 
 @dataclass(frozen=True)
@@ -41,17 +39,16 @@ class Bounds:
     Parameters
     ----------
     sessions : int
-        Sessions at once.
+        Most sessions.
     unconnected : int
-        Of them, those that no browser has connected to yet. The next page is built when one of
-        these is connected, or has ended.
+        Most sessions without a browser; the next page waits until one is connected or has ended.
     unconnected_s : float
-        Seconds for which a session waits for its browser.
+        Seconds after which a session without a browser ends.
     queued : int
-        Pages that wait to be built.
+        Most pages that wait to be built.
     memory_bytes : int
-        Resident memory of the server beyond which it opens no further session. By default half of
-        the machine's.
+        Resident memory of the server beyond which it opens no further session; half of the
+        machine's by default.
     """
 
     sessions: int = 100
@@ -62,22 +59,22 @@ class Bounds:
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process."""
+    """Return the resident memory of this process."""
     return int(psutil.Process().memory_info().rss)
 
 
 class Sessions:
-    """The sessions of one application, within bounds.
+    """The sessions of an application within limits.
 
     Parameters
     ----------
     context : ApplicationContext
-        Where Bokeh keeps them.
+        Holds Bokeh's sessions.
     bounds : Bounds, optional
     memory : callable
-        Bytes in use.
+        Returns the bytes in use.
     clock : callable
-        Time in seconds.
+        Returns the time in seconds.
     """
 
     def __init__(
@@ -92,27 +89,27 @@ class Sessions:
         self._memory, self._clock = memory, clock
         self._connected: WeakSet[ServerSession] = WeakSet()
         self._n_opening = 0
-        self._building, self._free_s = asyncio.Lock(), clock()
-        self._looked_s = clock()
-        self._looks = PeriodicCallback(self.look, 1000 * LOOK_S)
+        self._building, self._next_build_s = asyncio.Lock(), clock()
+        self._checked_s = clock()
+        self._checks = PeriodicCallback(self.check, 1000 * CHECK_S)
 
     def start(self) -> None:
-        """Begin to end sessions that no browser connects to."""
-        self._looks.start()
+        """Start to end sessions without a browser."""
+        self._checks.start()
 
     def has(self, session_id: str) -> bool:
         """Whether there is a session of this name."""
         return any(session.id == session_id for session in self._context.sessions)
 
     def connected(self, session: ServerSession) -> None:
-        """Note that a browser has connected."""
+        """Record that a browser has connected."""
         self._connected.add(session)
 
     @contextmanager
     def opening(self, session_id: str | None) -> Iterator[bool]:
-        """Reserve room for a session while its page is built; yields whether there is any.
+        """Reserve room for a session while its page is built; yield whether there is room.
 
-        A session that exists already takes no further room.
+        An existing session needs no further room.
         """
         if session_id is not None and self.has(session_id):
             yield True
@@ -126,9 +123,9 @@ class Sessions:
 
     @asynccontextmanager
     async def building(self) -> AsyncIterator[None]:
-        """Build a page once it is its turn: one at a time, with pauses in between."""
+        """Build pages one at a time, with pauses in between."""
         async with self._building:
-            await asyncio.sleep(max(0.0, self._free_s - self._clock()))
+            await asyncio.sleep(max(0.0, self._next_build_s - self._clock()))
             while len(self._unconnected()) >= self._bounds.unconnected:
                 await asyncio.sleep(POLL_S)
             begun_s = self._clock()
@@ -136,14 +133,14 @@ class Sessions:
                 yield
             finally:
                 now_s = self._clock()
-                self._free_s = now_s + PAUSE * (now_s - begun_s)
+                self._next_build_s = now_s + PAUSE * (now_s - begun_s)
 
-    def look(self) -> None:
+    def check(self) -> None:
         """End the sessions that have waited too long for their browser."""
         now_s = self._clock()
-        is_late = now_s - self._looked_s > 2 * LOOK_S
-        self._looked_s = now_s
-        if is_late:  # the server was busy: connections may wait that it has not accepted yet
+        is_late = now_s - self._checked_s > 2 * CHECK_S
+        self._checked_s = now_s
+        if is_late:  # the server was busy, and connections may not be accepted yet
             return
         for session in self._unconnected():
             if session.milliseconds_since_last_unsubscribe > 1000 * self._bounds.unconnected_s:
@@ -153,7 +150,7 @@ class Sessions:
         return [each for each in self._context.sessions if each not in self._connected]
 
     def _has_room(self) -> bool:
-        """Whether one more session fits; sessions whose page was closed make room for it."""
+        """Whether one more session fits, after ending sessions whose page was closed."""
         bounds = self._bounds
         closed = [
             each
@@ -165,5 +162,4 @@ class Sessions:
         is_out_of_memory = self._memory() > bounds.memory_bytes
         for each in closed[: None if is_out_of_memory else max(surplus, 0)]:
             each.request_expiration()
-        has_place = surplus <= len(closed) and self._n_opening < bounds.queued
-        return has_place and not is_out_of_memory
+        return surplus <= len(closed) and self._n_opening < bounds.queued and not is_out_of_memory

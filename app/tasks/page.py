@@ -1,4 +1,4 @@
-"""The thread of a page: callbacks in fair turns, at once, or after a while."""
+"""Callbacks on the thread of a page: in fair turns, at once, or after a delay."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from app.tasks.turns import TURNS
 
 
 class PageTasks:
-    """Runs callbacks on the thread of the page that is being built, and work for it elsewhere.
+    """Runs callbacks on the thread of the page that is being built, and its work elsewhere.
 
-    Without a browser, as in tests, callbacks run at once and delayed ones never.
+    Without a browser, as in tests, callbacks run at once, and delayed ones never.
 
     Attributes
     ----------
     document : bokeh.document.Document or None
         The page's document.
     failed : Signal of Exception
-        Emitted where a callback raises.
+        Emitted when a callback raises.
     """
 
     def __init__(self) -> None:
@@ -77,15 +77,15 @@ class PageTasks:
             self.document.add_next_tick_callback(self._once(act))
 
     def call_later(self, wait_ms: int, act: Act) -> None:
-        """Call a function after a while, on the page's thread but without its document.
+        """Call a function after a delay, on the page's thread but without its document.
 
-        To enter the document costs more than most timers do: those that need it use `run_next`.
+        Entering the document costs more than most timers; a callback that needs it uses `run_next`.
         """
         if self._loop is not None:
             self._loop.call_later(1e-3 * wait_ms, act)
 
     def soon(self, act: Act) -> Callable[..., None]:
-        """Return a trigger that queues a callback once, however often it is pulled until then."""
+        """Return a trigger that queues a callback; further calls before it runs have no effect."""
         is_due = False
 
         def run() -> None:

@@ -1,7 +1,7 @@
-"""Background work of all sessions: the latest request of a channel wins, lanes bound the threads.
+"""Background work of all sessions: the latest request of a channel wins, lanes limit the threads.
 
 A session submits work to a channel (`Latest`). The work runs in a lane, either on the page's thread
-or on one of a few threads that all sessions share, and its result is drawn when the page gets its
+or on one of a few threads that all sessions share, and its result is drawn when it is the page's
 turn (`app.tasks.turns`). Long work (`LongWork`) reports its progress and can be cancelled.
 """
 
@@ -26,7 +26,7 @@ class PageThread(Protocol):
     """The part of `app.tasks.page.PageTasks` that schedules work."""
 
     def queue(self, act: Act, due: Act | None = None) -> None:
-        """Run `due` when the page's turn comes, then `act` unless the page is gone."""
+        """Run `due` when the page's turn comes, then `act` unless the page is closed."""
 
     @property
     def is_at_hand(self) -> bool:
@@ -34,14 +34,14 @@ class PageThread(Protocol):
 
     @property
     def is_gone(self) -> bool:
-        """Whether the browser has left."""
+        """Whether the page's session has ended."""
 
 
 class Lane:
-    """Threads, each held from the start of a request until its result is about to be drawn.
+    """Threads, each taken from the start of a request until its result is about to be drawn.
 
-    A thread that were free while its result waits for the page's thread would compute results that
-    are outdated by the time they are drawn.
+    A thread that took the next request while its result waits for the page's thread would compute
+    results that are outdated when they are drawn.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Lane:
         self.is_closed = False
 
     def acquire(self, begin: Act, failed: Failed) -> None:
-        """Run `begin` on a thread once one is free; call `failed` where that is impossible."""
+        """Run `begin` on a thread once one is free; call `failed` if that is impossible."""
         with self._lock:
             if self._free == 0:
                 self._waiting.append((begin, failed))
@@ -73,7 +73,7 @@ class Lane:
         self._begin(begin, failed)
 
     def release(self) -> None:
-        """Free a thread, or hand it to the request that has waited longest."""
+        """Free a thread, or give it to the request that has waited longest."""
         with self._lock:
             if not self._waiting:
                 self._free += 1
@@ -89,15 +89,14 @@ class Lane:
 
 
 PAGE = Lane(0, "page")
-"""Work shorter than drawing its result. On a thread of its own it would compete with the page's
-thread for the interpreter, which costs both a multiple of that."""
+"""Work shorter than drawing its result. On another thread it would compete with the page's thread
+for the interpreter, which takes several times as long."""
 
 SHORT = Lane(1, "firstphoton-short")
-"""Some tens of milliseconds, one request at a time: several at once only slow each other down."""
+"""Some tens of milliseconds, one request at a time: parallel ones would slow each other down."""
 
 GENERAL = Lane(4, "firstphoton")
-"""Work of unknown cost, such as reading a file. Kernels that use all cores take turns by a lock of
-their own."""
+"""Unknown cost, such as reading a file. Kernels that use all cores have a lock of their own."""
 
 STUDIES = Lane(2, "firstphoton-study")
 """Long work, which must never delay a slider."""
@@ -112,16 +111,25 @@ class _Request(NamedTuple):
     failed: Failed
     lane: Lane
 
+    def run(self) -> Act:
+        """Run the work; return a function that draws its result or reports its failure."""
+        try:
+            return partial(self.done, self.work())
+        except Exception as error:  # the page reports any failure
+            return partial(self.failed, error)
+        except BaseException as error:  # a library may raise SystemExit
+            return partial(self.failed, RuntimeError(f"{type(error).__name__}: {error}"))
+
 
 class Latest:
-    """A channel that runs the newest of its requests and drops those it has overtaken.
+    """A channel that runs the newest of its requests and drops the ones before it.
 
     Parameters
     ----------
     page : PageTasks
-        Where results are drawn.
+        Draws the results.
     lane : Lane
-        Where requests run that name no other lane.
+        Default lane of the requests.
     """
 
     def __init__(self, page: PageThread, lane: Lane = GENERAL) -> None:
@@ -173,13 +181,13 @@ class Latest:
 
     def _attempt(self, lane: Lane) -> None:
         assert self._newest is not None
-        if self._newest.lane is not lane:  # a request for another lane has overtaken this one
+        if self._newest.lane is not lane:  # replaced by a request for another lane
             if lane is not PAGE:
                 lane.release()
             self._start()
             return
         request = self._take()
-        draw = partial(self._finish, _outcome(request), request.failed)
+        draw = partial(self._finish, request.run(), request.failed)
         if lane is PAGE:
             draw()
         else:
@@ -199,16 +207,6 @@ class Latest:
                 self._is_busy = self._newest is not None
             if self._is_busy:
                 self._start()
-
-
-def _outcome(request: _Request) -> Act:
-    """Run a request; return what draws its result or reports its failure."""
-    try:
-        return partial(request.done, request.work())
-    except Exception as error:  # the page reports any failure
-        return partial(request.failed, error)
-    except BaseException as error:  # a library may raise SystemExit
-        return partial(request.failed, RuntimeError(f"{type(error).__name__}: {error}"))
 
 
 @dataclass(frozen=True)
@@ -235,7 +233,7 @@ class _Run:
 
 
 class LongWork:
-    """Work in steps that can be paused between them, or of one piece that reports its progress.
+    """Work in steps that can be paused in between, or in one piece that reports its progress.
 
     Parameters
     ----------
@@ -266,7 +264,7 @@ class LongWork:
 
     @property
     def is_running(self) -> bool:
-        """Whether there is work left that nobody has cancelled."""
+        """Whether the work has neither ended nor been cancelled."""
         return self._run.is_running
 
     def start(self, steps: Sequence[Step[Any]]) -> None:
@@ -274,7 +272,7 @@ class LongWork:
         self._begin(_Run(list(steps), of=len(steps), is_running=bool(steps)))
 
     def start_piece(self, work: Work[Result], draw: Callable[[Result], None]) -> None:
-        """Run work of one piece in place of the present work, and draw its result."""
+        """Run work in one piece, in place of the present work, and draw its result."""
         run = _Run(is_running=True)
         progress = partial(self._report, run)
         run.steps = [Step(partial(work, progress, lambda: self._is_cancelled(run)), draw)]
@@ -286,12 +284,12 @@ class LongWork:
         self._changed()
 
     def pause(self, is_paused: bool) -> None:
-        """Start no step for a while, or continue."""
+        """Start no further step, or continue."""
         self._is_paused = is_paused
         self._continue(self._run)
 
     def _begin(self, run: _Run) -> None:
-        self._run.is_running = False  # its work sees that it is cancelled
+        self._run.is_running = False  # cancels the present work
         self._run = run
         self._changed()
         self._continue(run)
@@ -301,10 +299,10 @@ class LongWork:
             run.is_working = True
             step = run.steps[run.next_step]
             self._channel.submit(
-                step.work, partial(self._arrived, run, step), partial(self._ended, run)
+                step.work, partial(self._draw, run, step), partial(self._fail, run)
             )
 
-    def _arrived(self, run: _Run, step: Step[Any], result: Any) -> None:
+    def _draw(self, run: _Run, step: Step[Any], result: Any) -> None:
         if not run.is_running:
             return
         step.draw(result)
@@ -315,8 +313,8 @@ class LongWork:
         self._changed()
         self._continue(run)
 
-    def _ended(self, run: _Run, error: Exception) -> None:
-        if run.is_running:  # else the work ended because it was cancelled
+    def _fail(self, run: _Run, error: Exception) -> None:
+        if run.is_running:  # else it was cancelled
             self.cancel()
             self._failed(error)
 

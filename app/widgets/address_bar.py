@@ -13,7 +13,7 @@ from app.model.state import State
 from app.widgets.component import Component
 
 REST_MS = 250
-"""Time without a change after which the address is updated: moving sliders are not delayed."""
+"""Time without a change after which the address is updated: slider moves are not delayed."""
 
 
 class AddressBar(Component):
@@ -44,7 +44,7 @@ class AddressBar(Component):
         wait: Callable[[int, Callable[[], None]], None],
         run_on_page: Callable[[Callable[[], None]], None],
     ) -> None:
-        """Update the address whenever the state has come to rest.
+        """Update the address whenever the state has not changed for `REST_MS`.
 
         Parameters
         ----------
@@ -52,10 +52,9 @@ class AddressBar(Component):
         query : callable
             Returns the query of the present state.
         wait, run_on_page : callable
-            Of the `app.pages.session.Session`.
+            ``call_later`` and ``run_next`` of `app.tasks.page.PageTasks`.
         """
         changes = 0
-        is_waiting = False
 
         def write() -> None:
             self.query = query()
@@ -63,20 +62,10 @@ class AddressBar(Component):
         def changed(*_events: Any) -> None:
             nonlocal changes
             changes += 1
-            if not is_waiting:
-                check_later()
-
-        def check_later() -> None:
-            nonlocal is_waiting
-            is_waiting = True
             wait(REST_MS, partial(check, changes))
 
         def check(seen: int) -> None:
-            nonlocal is_waiting
-            if seen != changes:
-                check_later()
-            else:
-                is_waiting = False
+            if seen == changes:
                 run_on_page(write)
 
         write()

@@ -1,4 +1,4 @@
-"""Pieces that pages are put together from: cards, folding parts, lists and rows of choices."""
+"""Building blocks of pages: cards, folding parts of the sidebar, lists and buttons."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import panel_material_ui as pmui
 import param
 
 BREAK_PX = 900
-"""Of a page: less, and its parts follow each other. A page of more parts has another."""
+"""Width of a page below which its parts are stacked."""
 
 
 def unrolled(break_px: int, height: str = "auto") -> str:
-    """Style of a part that keeps a height of its own where parts follow each other."""
+    """Return the style of a part that keeps its own height where parts are stacked."""
     kept = f"height: {height} !important; max-height: none !important; flex: none !important;"
     return f"@media (max-width: {break_px}px) {{ :host {{ {kept} }} }}"
 
 
 def board(least_px: int, rest_px: int, break_px: int) -> str:
-    """Style of two columns that fill a laptop's screen, but for what stands around them."""
+    """Return the style of two columns that fill the screen except for the last `rest_px`."""
     return f"""
 :host {{ display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
   gap: 10px; flex: none !important; height: max({least_px}px, calc(100vh - {rest_px}px)) !important;
@@ -33,7 +33,7 @@ def board(least_px: int, rest_px: int, break_px: int) -> str:
 
 
 def column(gap_px: int, break_px: int) -> str:
-    """Style of one of these columns."""
+    """Return the style of one of these columns."""
     return f"""
 :host {{ display: flex !important; flex-direction: column; gap: {gap_px}px; height: 100%;
   min-height: 0; min-width: 0; }}
@@ -41,8 +41,8 @@ def column(gap_px: int, break_px: int) -> str:
 """
 
 
-# Heights of small widgets, kept free from the start: the browser draws them one by one after the
-# plots, which would make room, and be painted anew, for each.
+# Heights of small widgets, reserved from the start: the browser draws them one by one after the
+# plots, which would be resized and painted again for each.
 FIELD_PX, SELECT_PX, BUTTON_PX, CHOICE_PX = 37, 32, 34, 36
 
 CARD = """
@@ -53,7 +53,7 @@ CARD = """
 
 
 def select(label: str, options: Any, value: str, help: str) -> pmui.Select:
-    """A list to choose one of."""
+    """Return a list from which to choose one option."""
     return pmui.Select(
         label=label,
         options=options,
@@ -67,7 +67,7 @@ def select(label: str, options: Any, value: str, help: str) -> pmui.Select:
 
 
 def choice(help: str, parameter: Any) -> pmui.RadioButtonGroup:
-    """A row of buttons of which one is pressed."""
+    """Return a row of buttons of which one is pressed."""
     return pmui.RadioButtonGroup.from_param(
         parameter,
         label="",
@@ -81,7 +81,7 @@ def choice(help: str, parameter: Any) -> pmui.RadioButtonGroup:
 def button(
     label: str, help: str, act: Callable[[], None], margin: int | tuple[int, ...] = 0
 ) -> pmui.Button:
-    """A small button."""
+    """Return a small button."""
     made = pmui.Button(
         label=label,
         description=help,
@@ -97,13 +97,12 @@ def button(
 class Part(pmui.Card):
     """A part of the sidebar that folds."""
 
-    # Headers of what is in it: there are none, but of each Panel would ask all kinds of panes
-    # whether they can show it. To answer, one loads the whole of VTK.
+    # There are no headers. Panel would ask all panes whether they can show one, which loads VTK.
     _headers = param.List(default=[], item_type=object)
 
 
 def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True) -> Part:
-    """A part of the sidebar that folds; the browser gets its content once it is to be seen."""
+    """Return a part of the sidebar that folds; its content is sent when it is first visible."""
     made = Part(
         title=title,
         title_variant="subtitle2",
@@ -124,5 +123,5 @@ def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True)
 
 
 def card(*content: Any) -> pn.Column:
-    """A framed picture."""
+    """Return a framed picture."""
     return pn.Column(*content, stylesheets=[CARD], sizing_mode="stretch_both", margin=0)

@@ -1,4 +1,4 @@
-// Labels of what is kept, each to go to and to remove; what has the keyboard keeps it.
+// Coloured labels, each with a button that selects it and one that removes it.
 
 const element = (tag, text, attributes) => {
   const node = document.createElement(tag);
@@ -12,12 +12,12 @@ export function render({ model }) {
 
   const chip = ([key, text, color]) => {
     const item = element("span", "", { role: "listitem", class: "chip" });
-    const go = element("button", text, { type: "button", title: `Show ${text}` });
+    const select = element("button", text, { type: "button", title: `Show ${text}` });
     const remove = element("button", "×", { type: "button", "aria-label": `Remove ${text}` });
     item.style.setProperty("--mark", color);
-    go.addEventListener("click", () => (model.chosen = [key, Date.now()]));
+    select.addEventListener("click", () => (model.chosen = [key, Date.now()]));
     remove.addEventListener("click", () => (model.removed = [key, Date.now()]));
-    item.append(go, remove);
+    item.append(select, remove);
     return item;
   };
   const show = () => {

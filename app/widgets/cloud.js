@@ -1,24 +1,24 @@
 /* The 3D point cloud: draws what app/widgets/cloud.py sends, with the vtk.js that Panel bundles.
  *
- * Coordinates are the server's: metres, x right, y away from the sensor, z up. Every change only
- * marks what is out of date; one animation frame later all of it is applied and drawn at once, so
- * the buffers of two updates can never be seen together.
+ * Coordinates are the server's: metres, x right, y away from the sensor, z up. A change only marks
+ * what is out of date; the next animation frame applies all changes and draws once, so that the
+ * buffers of two updates never mix.
  */
 
 const VIEW_ANGLE_DEG = 20
 const HALF_VIEW = Math.tan((VIEW_ANGLE_DEG * Math.PI) / 360)
-const LABEL_ROOM_PX = [75, 50] // beside and above the box in the home view, for its tick labels
+const LABEL_ROOM_PX = [75, 50] // beside and above the box in the home view, for tick labels
 const LABEL_LETTER_PX = 6 // width of an average letter of a label
-const BOX_INK = 0.25 // share of the text's colour in the lines of the box
+const BOX_INK = 0.25 // share of the text colour in the lines of the box
 const CLICK_MOVE_PX = 4 // a press that moves less than this is a click, not a drag
 const PICK_PX = 12
 const KEY_TURN = Math.PI / 36
 const KEY_ZOOM = 1.15
 const CAMERA_EVENT = "firstphoton:camera" // a linked camera has moved
-const MAX_PIXEL_RATIO = 2 // more costs frames and shows nothing
+const MAX_PIXEL_RATIO = 2 // more costs frame rate and shows no more detail
 
-/* How one point is painted; p runs over the point's square from -1 to 1. A disc with a darker rim,
- * or a plain square where there are too few pixels for a rim. */
+/* Fragment shaders of one point; p runs over the point's square from -1 to 1. A disc with a darker
+ * rim, or a plain square where there are too few pixels for a rim. */
 const DISC = `
   float r = length(p);
   float step = fwidth(p.x);
@@ -116,7 +116,7 @@ class Orbit {
   homeDistance = 1
   focal = [0, 0, 0]
 
-  /* Look from where another camera does. */
+  /* Copy the view of another camera. */
   follow({azimuth, elevation, distance, homeDistance, focal}) {
     Object.assign(this, {azimuth, elevation, distance, homeDistance, focal: [...focal]})
   }
@@ -148,8 +148,8 @@ class Orbit {
     this.focal = this.focal.map((v, axis) => v + metres * (dy * up[axis] - dx * right[axis]))
   }
 
-  /* From the sensor's side, raised and to the right; less so for a scene that is much deeper than
-   * wide, of which a steep view would show only a thin streak. */
+  /* View from the sensor's side, raised and to the right; less so for a scene much deeper than
+   * wide, which a steep view would show as a thin streak. */
   home(bounds, width, height) {
     const [x0, x1, y0, y1, z0, z1] = bounds
     const size = Math.max(x1 - x0, z1 - z0)
@@ -165,8 +165,8 @@ class Orbit {
     this.distance = this.homeDistance = Math.max(across.distance, upward.distance, 1e-3)
   }
 
-  /* The smallest distance, and the shift sideways, at which the box spans no more than `slope` to
-   * either side: a corner at (s, b) along (side, back) asks that
+  /* The smallest distance, with its sideways shift, at which the box spans at most `slope` to
+   * either side: a corner at (s, b) along (side, back) requires
    * |s - shift| <= slope (distance - b). */
   fit(bounds, side, slope) {
     const basis = this.basis()
@@ -180,7 +180,7 @@ class Orbit {
     return {distance: (plus + minus) / (2 * slope), shift: (plus - minus) / 2}
   }
 
-  /* A function that writes [x, y, depth] of the point (px, py, pz) on a picture of this size. */
+  /* Return a function that projects (px, py, pz) to [x, y, depth] on a picture of this size. */
   projector(width, height) {
     const eye = this.eye()
     const {right, up, back} = this.basis()
@@ -291,7 +291,7 @@ class Box {
     this.show([])
   }
 
-  /* Labels stand outside the box: across along the near bottom edge, distance along the bottom
+  /* Place the labels outside the box: across along the near bottom edge, distance along the bottom
    * edge on the viewer's side, height along the upright edge farthest left. */
   place(eye, project, width, height) {
     const [x0, x1, y0, y1, z0, z1] = this.bounds
@@ -300,7 +300,7 @@ class Box {
     const at = (x, y, z) => project(x, y, z, [0, 0, 0])
     const uprights = [[x0, y0], [x1, y0], [x0, y1], [x1, y1]]
     const [ux, uy] = uprights.sort((a, b) => at(...a, z0)[0] - at(...b, z0)[0])[0]
-    const wanted = [
+    const labels = [
       ...this.edge(0, (v) => [v, near, z0], "across (m)", at),
       ...this.edge(1, (v) => [side, v, z0], "distance (m)", at),
       ...this.edge(2, (v) => [ux, uy, v], "height (m)", at),
@@ -308,26 +308,26 @@ class Box {
       const left = x + anchor * text.length * LABEL_LETTER_PX
       return left > 0 && left + text.length * LABEL_LETTER_PX < width && y > 6 && y < height - 6
     })
-    this.show(wanted)
+    this.show(labels)
   }
 
-  show(wanted) {
-    while (this.labels.length < wanted.length) {
+  show(shown) {
+    while (this.labels.length < shown.length) {
       const label = element("span", {class: "tick", "aria-hidden": "true"})
       this.labels.push(this.holder.appendChild(label))
     }
     this.labels.forEach((label, i) => {
-      label.hidden = i >= wanted.length
+      label.hidden = i >= shown.length
       if (label.hidden) return
-      const {x, y, anchor, text} = wanted[i]
+      const {x, y, anchor, text} = shown[i]
       if (label.textContent !== text) label.textContent = text
       label.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)
         translate(${(100 * anchor).toFixed(1)}%, -50%)`
     })
-    this.shown = wanted
+    this.shown = shown
   }
 
-  /* Labels of one edge, pushed away from the middle of the box, and farther out its name. */
+  /* Labels of one edge, away from the middle of the box, and farther out the edge's name. */
   edge(axis, point, name, at) {
     const [x0, x1, y0, y1, z0, z1] = this.bounds
     const middle = at((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2)
@@ -380,20 +380,20 @@ class CloudView {
     })
   }
 
-  /* Everything of vtk.js, built at the first frame that has a size to draw on. */
+  /* Create all vtk.js objects, at the first frame that has a size. */
   build(vtk) {
     const {vtkRenderWindow, vtkRenderer} = vtk.Rendering.Core
     this.ratio = Math.min(window.devicePixelRatio || 1, MAX_PIXEL_RATIO)
     this.surface = vtk.Rendering.OpenGL.vtkRenderWindow.newInstance()
     const canvas = this.surface.getCanvas()
-    // vtk.js asks this canvas for its context later and is given the one made here. The points
-    // smooth their own edges; multisampling costs a quarter of the frames where no GPU helps.
+    // vtk.js uses this context. The shaders smooth edges; multisampling would cost a quarter of the
+    // frame rate without a GPU.
     const context = canvas.getContext("webgl2", {antialias: false})
     if (!context) throw new Error("this browser offers no WebGL 2")
     canvas.addEventListener("webglcontextlost", () => this.rebuild(canvas))
     this.window = vtkRenderWindow.newInstance()
     this.renderer = vtkRenderer.newInstance()
-    this.renderer.setBackground(0, 0, 0, 0) // the page's own colour shows through
+    this.renderer.setBackground(0, 0, 0, 0) // transparent: the page's colour
     this.window.addRenderer(this.renderer)
     this.window.addView(this.surface)
     this.surface.setContainer(this.stage)
@@ -407,19 +407,19 @@ class CloudView {
     if (this.window) return true
     const {vtk} = window
     try {
-      if (!vtk) throw new Error("vtk.js is not on this page: the app must call pn.extension('vtk')")
+      if (!vtk) throw new Error("vtk.js is missing: the app must call pn.extension('vtk')")
       this.build(vtk)
       this.say("")
       return true
     } catch (error) {
-      // A browser that has just lost its graphics offers none for a while.
-      this.say(`The 3D cloud cannot be drawn: ${error.message}. Its next change tries again.`)
+      // After the loss of its graphics a browser offers none for a while.
+      this.say(`The 3D cloud cannot be drawn: ${error.message}. It is tried again at the next change.`)
       return false
     }
   }
 
   say(text) {
-    // Written anew, the same text would be read out again.
+    // Setting an equal text would make screen readers repeat it.
     if (this.problem.textContent !== text) this.problem.textContent = text
   }
 
@@ -427,7 +427,7 @@ class CloudView {
     const {clientWidth: width, clientHeight: height} = this.stage
     if (width === 0 || height === 0 || this.dead || !this.ready()) return
     const {stale} = this
-    if (this.atHome === undefined) stale.add("home") // nothing framed yet
+    if (this.atHome === undefined) stale.add("home") // not framed yet
     if (stale.has("data") && !this.readData()) return
     if (stale.has("box") || stale.has("home")) this.readBox()
     if (stale.has("look")) this.readLook()
@@ -444,7 +444,7 @@ class CloudView {
     this.stage.dataset.camera = [...eye, ...this.orbit.focal].map((v) => v.toFixed(3)).join(" ")
   }
 
-  /* Split the points into right and wrong ones. Buffers whose lengths disagree are left alone. */
+  /* Split the points into right and wrong ones; skip buffers whose lengths disagree. */
   readData() {
     const {positions, colors, pixels, wrong} = this.model
     const xyz = new Float32Array(positions ?? 0)
@@ -454,30 +454,16 @@ class CloudView {
     const count = xyz.length / 3
     if (rgb.length !== 3 * count || index.length !== count) return false
     if (mask.length !== 0 && mask.length !== count) return false
-    const bad = mask.reduce((sum, flag) => sum + flag, 0)
     Object.assign(this, {xyz, count, pixels: index})
-    if (bad === 0) {
-      this.good.set(xyz, rgb)
-      this.bad.set(new Float32Array(0))
-      return true
-    }
-    const goodXyz = new Float32Array(3 * (count - bad))
-    const goodRgb = new Uint8Array(3 * (count - bad))
-    const badXyz = new Float32Array(3 * bad)
-    for (let i = 0, g = 0, b = 0; i < 3 * count; i++) {
-      if (mask[(i / 3) | 0]) {
-        badXyz[b++] = xyz[i]
-      } else {
-        goodRgb[g] = rgb[i]
-        goodXyz[g++] = xyz[i]
-      }
-    }
-    this.good.set(goodXyz, goodRgb)
-    this.bad.set(badXyz)
+    const isWrong = (_, i) => mask[(i / 3) | 0] === 1
+    const isRight = (_, i) => !isWrong(_, i)
+    const hasWrong = mask.includes(1)
+    this.good.set(hasWrong ? xyz.filter(isRight) : xyz, hasWrong ? rgb.filter(isRight) : rgb)
+    this.bad.set(hasWrong ? xyz.filter(isWrong) : new Float32Array(0))
     return true
   }
 
-  /* The bounds to frame; those of the points themselves until the server has given some. */
+  /* Set the box to the server's bounds, or to those of the points as long as there are none. */
   readBox() {
     let {bounds} = this.model
     if (bounds.length !== 6 && this.count > 0) {
@@ -514,7 +500,7 @@ class CloudView {
     this.atHome = true
   }
 
-  /* Tell the other clouds of the page where the camera is; each view has a module of its own. */
+  /* Send the camera to the linked clouds of the page; each component has its own module. */
   share() {
     const {link} = this.model
     if (!link) return
@@ -529,7 +515,7 @@ class CloudView {
     this.schedule()
   }
 
-  /* Back to the home view, by hand: linked clouds come along. */
+  /* Return to the home view, with all linked clouds. */
   homeByHand() {
     this.goHome(this.stage.clientWidth, this.stage.clientHeight)
     this.share()
@@ -558,8 +544,8 @@ class CloudView {
     this.ring.actor.getProperty().setPointSize(2.2 * scale)
   }
 
-  /* Index of the point under (x, y): the front one of those whose disc covers it, because that is
-   * the one to be seen there; else the nearest within reach; else -1. */
+  /* Index of the point under (x, y): the front one of those whose disc covers it, which is the
+   * visible one; else the nearest within PICK_PX; else -1. */
   pick(x, y) {
     const {clientWidth: width, clientHeight: height} = this.stage
     const project = this.orbit.projector(width, height)
@@ -602,8 +588,8 @@ class CloudView {
     this.moved()
   }
 
-  /* The picture with its tick labels and its caption, as a canvas, and its size on the page. The
-   * view's canvas is copied in the task that drew it, before the browser may clear it. */
+  /* Return the picture with tick labels and caption as a canvas, and its size. The WebGL
+   * canvas is copied in the task that drew it, before the browser may clear it. */
   picture() {
     this.draw()
     if (!this.window) throw new Error(this.problem.textContent || "the cloud is not drawn yet")
@@ -626,7 +612,7 @@ class CloudView {
     return {canvas, width, height}
   }
 
-  /* vtk.js does not survive the loss of its context, as when a laptop changes its GPU. */
+  /* vtk.js does not survive the loss of its context, for example when a laptop switches GPUs. */
   rebuild(canvas) {
     if (this.surface?.getCanvas() !== canvas) return
     this.release()
@@ -649,14 +635,14 @@ class CloudView {
     surface.setContainer(null)
     for (const part of [this.renderer, this.window, surface]) part.delete()
     this.surface = this.window = null
-    // Browsers keep only a few contexts alive; waiting for the garbage collector is too late.
+    // Browsers allow few contexts; garbage collection comes too late.
     context.getExtension("WEBGL_lose_context")?.loseContext()
   }
 }
 
-// ---------------------------------------------------------------------------- hand and keyboard
+// ---------------------------------------------------------------------------- pointer and keyboard
 
-/* One pointer turns (with shift, or another button: moves); two pinch and move. */
+/* One pointer rotates (with Shift or another button: pans); two zoom and pan. */
 function listenToPointers(stage, view) {
   const held = new Map()
   let travelled = 0
@@ -728,7 +714,7 @@ function listenToKeys(stage, view) {
 
 // ---------------------------------------------------------------------------- Panel
 
-// Panel may render a component again without announcing the end of its first view.
+// Panel may render a component again without announcing the removal of its first view.
 const views = new WeakMap()
 
 export function render({model}) {
@@ -741,7 +727,7 @@ export function render({model}) {
     button("Home view (0)", HOME_ICON, () => view.homeByHand()))
   const root = element("div", {class: "cloud"}, element("style", {}, STYLE),
     stage, caption, tools, problem)
-  root.picture = () => view.picture() // for whoever saves it
+  root.picture = () => view.picture() // for downloads.js
   views.set(model, view)
   listenToPointers(stage, view)
   listenToKeys(stage, view)

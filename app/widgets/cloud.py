@@ -1,9 +1,7 @@
-"""The 3D cloud: a range image as a PyVista mesh, and as points in the browser.
+"""The 3D cloud: a PyVista mesh whose points and colours the browser draws.
 
-Its coordinates are those of `core.geometry`.
-
-The mesh never becomes a picture on the server, where OpenGL may be missing: its points and colours
-go to the browser, which draws them with the vtk.js that Panel bundles.
+Coordinates are those of `core.geometry`. The server, where OpenGL may be missing, never renders the
+mesh; the browser does, with the vtk.js that Panel bundles.
 """
 
 from __future__ import annotations
@@ -25,59 +23,43 @@ from app.widgets.component import Component
 class PointCloud(Component):
     """Draw a point cloud in the browser.
 
-    Call `draw` to show a cloud; all of it travels in one message and is painted in one frame. The
-    camera stays where the user left it until ``scene_id`` changes or ``home`` is triggered. The
-    page must have been set up with ``pn.extension("vtk")``.
+    `draw` sends a cloud in one message, which is painted in one frame. The camera stays where the
+    user left it until ``scene_id`` changes or ``home`` is triggered. The page requires
+    ``pn.extension("vtk")``.
     """
 
     positions = param.Bytes(default=b"", doc="float32 x, y, z of each point in metres.")
-
     colors = param.Bytes(default=b"", doc="uint8 red, green, blue of each point.")
-
     pixels = param.Bytes(default=b"", doc="int32 index of each point's pixel.")
-
     wrong = param.Bytes(default=b"", doc="uint8, 1 for points drawn as crosses; empty for none.")
-
     selected = param.Integer(
         default=-1,
-        doc="Index of the pixel that carries a ring, -1 for none; a click on a point sets it.",
+        doc="Index of the pixel marked by a ring, -1 for none; a click on a point sets it.",
     )
-
     point_size = param.Number(
         default=1.4,
         bounds=(0.2, 5.0),
         doc="Diameter of a point as a multiple of the distance between neighbouring points.",
     )
-
     spacing_m = param.Number(default=0.0, doc="Distance between neighbouring points in metres.")
-
     bounds = param.List(
         default=[],
         item_type=float,
         doc="Box that the home view frames: xmin, xmax, ymin, ymax, zmin, zmax in metres.",
     )
-
     scene_id = param.String(default="", doc="Name of the scene; a new one resets the camera.")
-
     home = param.Event(doc="Reset the camera.")
-
     link = param.String(
-        default="", doc="Clouds of a page that share this name share their camera; empty for none."
+        default="", doc="Clouds of a page with the same name share their camera; empty for none."
     )
-
-    dark = param.Boolean(default=False, doc="Take ink and paper from the dark palette.")
-
+    dark = param.Boolean(default=False, doc="Whether ink and paper come from the dark palette.")
     ink = param.Color(default=palette(dark=False).text, doc="Colour of text, as #rrggbb.")
-
     paper = param.Color(default=palette(dark=False).paper, doc="Background, as #rrggbb.")
-
     wrong_color = param.Color(default=WRONG_COLOR, doc="Colour of the crosses, as #rrggbb.")
-
     label = param.String(
-        default="Point cloud. Arrow keys turn it, plus and minus zoom, 0 resets the view.",
-        doc="What a screen reader says of the picture.",
+        default="Point cloud. Arrow keys rotate it, plus and minus zoom, 0 resets the view.",
+        doc="Name of the picture for screen readers.",
     )
-
     caption = param.String(default="", doc="A line of text in the lower left corner.")
 
     _esm = Path(__file__).with_name("cloud.js")
@@ -96,7 +78,7 @@ class PointCloud(Component):
         scene_id: str | None = None,
         bounds: Sequence[float] | None = None,
     ) -> None:
-        """Show a cloud in place of the present one.
+        """Show a cloud in place of the last one.
 
         Parameters
         ----------
@@ -107,15 +89,14 @@ class PointCloud(Component):
         wrong : array_like of bool, shape (point,), optional
             Points to draw as crosses.
         scene_id : str, optional
-            Name of the scene; if it differs from the present one the camera is reset.
+            Name of the scene; a new name resets the camera.
         bounds : sequence of float, optional
-            Box for the home view; for a new scene `view_bounds` of the points not wrong is taken
-            where none is given.
+            Box for the home view; for a new scene by default `view_bounds` of the right points.
 
         Raises
         ------
         ValueError
-            If ``rgb`` or ``wrong`` does not fit the number of points.
+            If the length of ``rgb`` or ``wrong`` is not the number of points.
         """
         colors = np.ascontiguousarray(rgb, np.uint8)
         if colors.shape != (cloud.n_points, 3):

@@ -1,4 +1,4 @@
-"""What our components of the page are made from."""
+"""Base class of the app's own components."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from panel.io import hold
 
 
 class Component(JSComponent):
-    """An ESM component whose own values take a short way to the page and back.
+    """An ESM component that sends and receives its plain values without Panel's general machinery.
 
-    Panel's way is made for style sheets, children and values that are models: with each value it
-    looks up the design, walks through every model below the component and searches for names like
-    those that a model has not. That is most of what a plain value costs, and a stroke changes many.
+    For each value Panel looks up the design, walks through all models below the component and
+    searches for references, in case it is a style sheet, a child or a model. That is most of the
+    cost of a plain value, and a slider move changes many.
     """
 
     def _update_properties(self, *events: Any, doc: Any) -> dict[str, Any]:
@@ -27,9 +27,9 @@ class Component(JSComponent):
         self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any
     ) -> None:
         if self._are_plain(msg):
-            # Whoever holds the document sends it all; each hold looks through what is held so far.
+            # An outer hold sends everything; each further hold would scan what is held so far.
             with nullcontext() if doc and doc.callbacks.hold_value else hold(doc):
-                model.data.update(**msg)  # what comes from there is no news to it
+                model.data.update(**msg)  # a value that came from the browser is equal: not sent
         else:
             super()._update_model(events, msg, root, model, doc, comm)
 
@@ -48,6 +48,6 @@ class Component(JSComponent):
 
 @cache
 def _plain(kind: Any) -> frozenset[str]:
-    """Names of a component's own values that are no children and are not taken back."""
+    """Return the names of a component's own values, without children and events."""
     own = set(kind.param) - set(JSComponent.param)
     return frozenset(n for n in own if not isinstance(kind.param[n], Child | param.Event))

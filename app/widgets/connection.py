@@ -1,4 +1,4 @@
-"""A page that loses its server says so, waits, and comes back to the session that it had."""
+"""Return of a page to its session after the connection to the server was lost."""
 
 from __future__ import annotations
 
@@ -12,21 +12,19 @@ from app.widgets.component import Component
 from core.checks import require
 
 LINGER_S = 180
-"""A session is kept for so long when no page is connected to it: while a page is loaded anew, or a
-connection is lost for a minute."""
-
+"""Time for which a session without a page is kept: during a reload or a lost connection."""
 
 LEAST_LINGER_S, MOST_LINGER_S = 5.0, 86_400.0
 """Bounds of the option: a reloaded page needs some seconds to return to its session."""
 
 
 def serving_options(linger_s: float = LINGER_S) -> dict[str, Any]:
-    """What ``panel.serve`` must be told for that.
+    """Return the options of ``panel.serve`` that keep sessions for so long.
 
     Raises
     ------
     ValueError
-        If that is too short for a page to connect, or longer than a day.
+        If the time is too short for a page to connect, or longer than a day.
     """
     accepted = LEAST_LINGER_S <= linger_s <= MOST_LINGER_S
     require("--linger", linger_s, accepted, f"{LEAST_LINGER_S:g} to {MOST_LINGER_S:g} seconds")
@@ -37,18 +35,18 @@ def serving_options(linger_s: float = LINGER_S) -> dict[str, Any]:
 
 
 class Connection(Component):
-    """Watches the connection of a page.
+    """Watch the connection of a page.
 
-    While it is lost a dialog covers the page, for what would be chosen meanwhile would be lost.
-    When the server answers again the page is loaded anew, from the same session if that is still
-    kept, and else from the address.
+    While it is lost, a dialog covers the page, since changes would be lost. When the server
+    responds again the page is reloaded, with the same session if it is still kept, else from the
+    address.
 
-    Bokeh's own reconnection is not used: until 3.9 at least it leaves a page as it was when it was
-    cut off (bokeh/bokeh#15347), and it gives up after half a minute.
+    Panel's ``reconnect`` is not used: it leaves the page as it was when the connection was lost
+    (bokeh/bokeh#15347, Bokeh 3.9), and gives up after half a minute.
     """
 
-    session = param.String(default="", doc="By which the server knows the session.")
-    made = param.String(default="", doc="Tells this session from another of the same name.")
+    session = param.String(default="", doc="The server's name of the session.")
+    made = param.String(default="", doc="Distinguishes this session from others of that name.")
 
     _esm = Path(__file__).with_name("connection.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("connection.css")]

@@ -1,17 +1,26 @@
-"""Controls made from the metadata of frozen dataclasses: one knob or select for each field."""
+"""Controls made from the metadata of frozen dataclasses, and small components of text and values.
+
+Our own components where panel-material-ui 0.16 and Panel 1.9 are worse for a person:
+
+- `Knob`: their sliders have no logarithmic track and no marked zones; a move was painted after 90
+  to 140 ms, with a native input after 76 to 81.
+- `Facts`: only the browser knows when it has painted.
+- `Table`: Tabulator's headers cannot be sorted by keyboard, and it loads 443 kB of script.
+- `Chips`: their Chip has no button that removes it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import Field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import panel as pn
-import panel_material_ui as pmui
 import param
 from panel.custom import Child
 
+from app.widgets.cards import select
 from app.widgets.component import Component
 from core.parameters import Number, joint_doubts, spec_of
 
@@ -19,15 +28,14 @@ Settings = TypeVar("Settings")
 
 
 class Knob(Component):
-    """A number with a slider, a field to type in, its unit, a line of help and a reset.
+    """A number with a slider, a text field, its unit, help and a reset.
 
-    Values with which answers are in doubt are marked on the slider; while one of them is set, a
-    sentence below says why. Only values between `low` and `high` can be set; the field says so when
-    something else is typed.
+    Unreliable values are marked on the slider; while one of them is set, a sentence says why. Only
+    values between `low` and `high` can be set; the field refuses others with a sentence.
     """
 
     value = param.Number(default=0.0)
-    initial = param.Number(default=0.0, doc="What the reset button returns to.")
+    initial = param.Number(default=0.0, doc="Value set by the reset button.")
     low = param.Number(default=0.0)
     high = param.Number(default=1.0)
     log = param.Boolean(default=False)
@@ -35,9 +43,9 @@ class Knob(Component):
     label = param.String(default="")
     unit = param.String(default="")
     help = param.String(default="")
-    doubtful = param.List(default=[], doc="Zones of values in doubt: low, high, and why.")
+    doubtful = param.List(default=[], doc="Zones of unreliable values: low, high, and why.")
 
-    # That someone drags is no news to the server's other pages, whom Panel would tell each time.
+    # Panel would mark all pages of the server as busy with each move.
     _busy__ignore: ClassVar = ["value"]
 
     _esm = Path(__file__).with_name("knob.js")
@@ -45,7 +53,7 @@ class Knob(Component):
 
     @classmethod
     def of(cls, spec: Number, value: float, help: str) -> Knob:
-        """The knob of a field."""
+        """Return the knob of a field."""
         return cls(
             value=value,
             initial=value,
@@ -62,7 +70,7 @@ class Knob(Component):
         )
 
 
-# As a knob tells of its own doubts.
+# As in knob.css.
 DOUBT = """
 .note { padding: 2px 0 4px 8px; border-left: 3px solid var(--mui-palette-warning-dark, #e65100); }
 """
@@ -83,33 +91,21 @@ class SettingsPanel(Generic[Settings]):
         self._settings = settings
         self._changed = changed
         self._silent = False
-        self.controls: dict[str, Any] = {}
-        # Of settings that are sound one by one; each knob tells of its own.
+        # About combinations of settings; each knob reports its own unreliable values.
         self.doubts = Sentence(
             live=True, stylesheets=[DOUBT], sizing_mode="stretch_width", margin=(0, 8, 4, 8)
         )
         self.doubts.text = " ".join(joint_doubts(settings))
-        for each in fields(settings):  # type: ignore[arg-type]
-            spec, value, help = spec_of(each), getattr(settings, each.name), each.metadata["help"]
-            control = (
-                Knob.of(spec, value, help)
-                if isinstance(spec, Number)
-                else pmui.Select(
-                    label=spec.symbol,
-                    value=value,
-                    options=list(spec.options),
-                    description=help,
-                    size="small",
-                    sizing_mode="stretch_width",
-                    margin=(8, 8, 4, 8),
-                )
-            )
+        self.controls: dict[str, Any] = {
+            field.name: _control(field, getattr(settings, field.name))
+            for field in fields(settings)  # type: ignore[arg-type]
+        }
+        for control in self.controls.values():
             control.param.watch(self._collect, "value")
-            self.controls[each.name] = control
 
     @property
     def layout(self) -> pn.Column:
-        """All controls, in the order of the fields, and what is to be doubted of them together."""
+        """All controls in the order of the fields, and a sentence on unreliable combinations."""
         content = (*self.controls.values(), self.doubts)
         return pn.Column(*content, sizing_mode="stretch_width", margin=0)
 
@@ -119,35 +115,43 @@ class SettingsPanel(Generic[Settings]):
         try:
             for name, control in self.controls.items():
                 value = getattr(settings, name)
-                if control.value != value:  # which costs less than to set it in vain
+                if control.value != value:  # setting an equal value costs more than comparing
                     control.value = value
         finally:
             self._silent = False
-        self._settle(settings)
+        self._accept(settings)
 
     def _collect(self, _event: param.parameterized.Event) -> None:
         if self._silent:
             return
-        values = {name: control.value for name, control in self.controls.items()}
-        whole = {n for n, c in self.controls.items() if isinstance(c, Knob) and c.whole}
-        values = {n: round(v) if n in whole else v for n, v in values.items()}
-        self._settle(replace(self._settings, **values))  # type: ignore[type-var]
+        values = {
+            name: round(control.value) if getattr(control, "whole", False) else control.value
+            for name, control in self.controls.items()
+        }
+        self._accept(replace(self._settings, **values))  # type: ignore[type-var]
         self._changed(self._settings)
 
-    def _settle(self, settings: Settings) -> None:
+    def _accept(self, settings: Settings) -> None:
         self._settings = settings
         self.doubts.text = " ".join(joint_doubts(settings))
 
 
+def _control(field: Field[Any], value: Any) -> Any:
+    spec, help = spec_of(field), field.metadata["help"]
+    if isinstance(spec, Number):
+        return Knob.of(spec, value, help)
+    return select(spec.symbol, list(spec.options), value, help)
+
+
 HEADLINE_PX, FACTS_PX, LINE_PX = 37, 32, 17
-"""Heights of timed facts, of a row of others, and of a sentence; kept free from the start."""
+"""Heights of timed facts, of a row of others, and of a sentence; reserved from the start."""
 
 
 class Facts(Component):
-    """A list of named values; updating it costs the page no new layout."""
+    """A list of named values; an update does not make the browser lay out the page again."""
 
     facts = param.List(default=[], doc="Name, value and one line of help, each a string.")
-    timed = param.Boolean(default=False, doc="Whether the page adds how long its drawing took.")
+    timed = param.Boolean(default=False, doc="Whether to add the times that drawing took.")
 
     _esm = Path(__file__).with_name("facts.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("facts.css")]
@@ -156,14 +160,14 @@ class Facts(Component):
 class Table(Component):
     """A table of numbers; its column headers are buttons that sort the rows."""
 
-    title = param.String(default="", doc="What a screen reader says of the table.")
-    columns = param.List(default=[], doc="Title, line of help, and 1 or -1: which end comes first.")
+    title = param.String(default="", doc="Name of the table for screen readers.")
+    columns = param.List(default=[], doc="Title, line of help, and 1 or -1: the first direction.")
     rows = param.List(
         default=[],
-        doc="""Of each row a dict of ``name``, ``note`` on it, ``color`` and ``dash`` of its line,
+        doc="""A dict for each row: ``name``, ``note`` below it, ``color`` and ``dash`` of its line,
         ``cells`` of text, value to sort by and a smaller second line, a ``message`` in place of
-        cells, and ``last``: whether it stays below the others. One with an ``action`` has a button
-        of that name, which reports the row's ``key``.""",
+        cells, and ``last``: whether it stays below the others. A row with an ``action`` has a
+        button of that name, which reports the row's ``key``.""",
     )
     acted = param.List(default=[], doc="Key of the row whose button was pressed, and when.")
 
@@ -172,11 +176,11 @@ class Table(Component):
 
 
 class Sentence(Component):
-    """Text, shown letter by letter: nothing of it, a file's name say, becomes part of the page."""
+    """Plain text: a file's name, say, is never interpreted as HTML."""
 
     text = param.String(default="")
-    warning = param.Boolean(default=False, doc="Whether it tells of something that went wrong.")
-    live = param.Boolean(default=False, doc="Whether a screen reader reads out each new text.")
+    warning = param.Boolean(default=False, doc="Whether it reports an error.")
+    live = param.Boolean(default=False, doc="Whether screen readers read out each new text.")
 
     _esm = """
     export function render({ model }) {
@@ -207,10 +211,10 @@ class Sentence(Component):
 
 
 class Chips(Component):
-    """Small labels, each with a colour, a button of its text, and one that removes it."""
+    """Coloured labels, each with a button that selects it and one that removes it."""
 
-    label = param.String(default="", doc="What a screen reader says of them.")
-    chips = param.List(default=[], doc="Of each chip its key, text and colour.")
+    label = param.String(default="", doc="Name of the list for screen readers.")
+    chips = param.List(default=[], doc="Key, text and colour of each chip.")
     chosen = param.List(default=[], doc="Key of the chip that was pressed, and when.")
     removed = param.List(default=[], doc="Key of the chip that was removed, and when.")
 
@@ -219,24 +223,24 @@ class Chips(Component):
 
 
 class PixelKeys(Component):
-    """Holds a picture that takes the keyboard: arrow keys move the pixel, with Shift by eight.
+    """Make a picture focusable: arrow keys move the pixel, with Shift by eight.
 
-    Without a picture it gives the keyboard to the column in which it stands. Plots that come to a
-    page already drawn must stand in columns alone: Bokeh would lay out those within an ESM
-    component before they are there.
+    Without a child, the column in which this component stands becomes focusable. Plots that are
+    already rendered when they reach a page need such a column: Bokeh would lay out those inside an
+    ESM component before they are attached.
     """
 
     child = Child()
     pixel = param.List(default=[0, 0], item_type=int, doc="Row and column.")
     shape = param.List(default=[1, 1], item_type=int, doc="Rows and columns of the image.")
     label = param.String(
-        default="Range image. Arrow keys move the pixel on show, with Shift by eight.",
-        doc="What a screen reader says of the picture.",
+        default="Range image. Arrow keys move the selected pixel, with Shift by eight.",
+        doc="Name of the picture for screen readers.",
     )
-    letters = param.String(default="", doc="Further keys that are reported.")
+    letters = param.String(default="", doc="Further keys to report.")
     pressed = param.List(default=[], doc="The letter that was pressed, and when.")
 
-    _busy__ignore: ClassVar = ["pixel"]  # as of a knob
+    _busy__ignore: ClassVar = ["pixel"]  # as for a knob
 
     _esm = """
     export function render({ model, el }) {
@@ -246,9 +250,9 @@ class PixelKeys(Component):
         frame.append(model.get_child("child"));
         listen(model, frame);
       } else {
-        const outside = (node) => node.getRootNode().host;
+        const host = (node) => node.getRootNode().host;
         const find = () => {
-          const column = outside(el) && outside(outside(el));
+          const column = host(el) && host(host(el));
           column ? listen(model, column) : requestAnimationFrame(find);
         };
         find();

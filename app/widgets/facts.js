@@ -1,4 +1,4 @@
-// Named values. Where asked to, it adds two times of its own: only the browser knows when it painted.
+// A list of named values. A timed list adds two times that only the browser knows: it paints.
 
 export function render({ model }) {
   const root = document.createElement("dl");
@@ -6,19 +6,19 @@ export function render({ model }) {
 
   const entry = ([name, value, help]) => {
     const item = document.createElement("div");
-    const [term, number] = [document.createElement("dt"), document.createElement("dd")];
+    const [term, number] = ["dt", "dd"].map((tag) => document.createElement(tag));
     [item.title, term.textContent, number.textContent] = [help, name, value];
     item.append(term, number);
     return item;
   };
-  const drawn = entry(["Drawn in", "–", "From the answer's arrival in the browser to painted plots."]);
-  const hand = entry(["Hand to screen", "–", "From your last move of a control to painted plots."]);
+  const drawing = entry(["Drawing time", "–", "From the estimate's arrival to painted plots."]);
+  const response = entry(["Response time", "–", "From your last slider move to painted plots."]);
   const write = (item, since) => {
     item.lastChild.textContent = `${(performance.now() - since).toFixed(0)} ms`;
   };
 
   const show = () => {
-    root.replaceChildren(...model.facts.map(entry), ...(model.timed ? [drawn, hand] : []));
+    root.replaceChildren(...model.facts.map(entry), ...(model.timed ? [drawing, response] : []));
     if (model.timed) time();
   };
   const time = () => {
@@ -27,8 +27,8 @@ export function render({ model }) {
     window.firstphotonInput = undefined;
     const painted = new MessageChannel();
     painted.port1.onmessage = () => {
-      write(drawn, arrival);
-      if (arrival - input < 5000) write(hand, input); // else that move changed no figure
+      write(drawing, arrival);
+      if (arrival - input < 5000) write(response, input); // else that move changed no value
     };
     // A message sent in an animation frame is delivered after that frame has been painted.
     requestAnimationFrame(() => painted.port2.postMessage(null));

@@ -1,4 +1,4 @@
-"""Rendered figures whose data are updated in place, and their colours, panes and axes."""
+"""Rendered figures with data that are updated in place; their colours, panes and axes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from app.theme import STYLES, Palette
 
 
 class Layers:
-    """A figure that stays; new values go into the sources of its layers.
+    """A figure whose layers receive new values.
 
     Parameters
     ----------
     figure : bokeh.plotting.figure
     layers : mapping
-        Of each layer the "source", the "glyph" and the "glyph_renderer".
+        "source", "glyph" and "glyph_renderer" of each layer.
     """
 
     def __init__(self, figure: Any, layers: Mapping[str, Mapping[str, Any]]) -> None:
@@ -34,11 +34,11 @@ class Layers:
         self.figure.js_on_event(DoubleTap, reset)
 
     def source(self, layer: str) -> Any:
-        """The data source of a layer."""
+        """Return the data source of a layer."""
         return self.layers[layer]["source"]
 
     def write(self, layer: str, **columns: ArrayLike) -> None:
-        """Replace columns of a layer; only what changed travels, as float32."""
+        """Replace columns of a layer; only changed ones are sent, as float32."""
         data = self.source(layer).data
         new = {name: np.asarray(values, np.float32) for name, values in columns.items()}
         new = {n: v for n, v in new.items() if not np.array_equal(data[n], v, equal_nan=True)}
@@ -46,7 +46,7 @@ class Layers:
             data.update(new)
 
     def show(self, layer: str, visible: bool) -> None:
-        """Draw a layer, and its line in the legend, or leave them out."""
+        """Show or hide a layer and its line in the legend."""
         renderer = self.layers[layer]["glyph_renderer"]
         if renderer.visible == visible:
             return
@@ -64,7 +64,7 @@ class Plot(Layers):
     ----------
     overlay : hv.Overlay
     layers : sequence of str
-        A palette's name for each element of the overlay, in their order.
+        Name of each element of the overlay, which is also that of its colour in `Palette`.
     """
 
     def __init__(self, overlay: hv.Overlay, layers: Sequence[str]) -> None:
@@ -73,7 +73,7 @@ class Plot(Layers):
         super().__init__(rendered.state, dict(zip(layers, handles, strict=True)))
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Apply the colours of a theme."""
         paint_frame(self.figure, colors)
         for layer, handles in self.layers.items():
             glyph, color = handles["glyph"], getattr(colors, layer)
@@ -83,7 +83,7 @@ class Plot(Layers):
 
 
 def paint_frame(figure: Any, colors: Palette) -> None:
-    """Colours of all that surrounds the data."""
+    """Apply colours to everything around the data."""
     figure.title.text_color = colors.text
     for axis in figure.axis:
         axis.axis_label_text_color = axis.major_label_text_color = colors.muted
@@ -97,14 +97,14 @@ def paint_frame(figure: Any, colors: Palette) -> None:
 
 
 def color_bars(figure: Any) -> list[ColorBar]:
-    """Of a figure, below it or at its right side."""
+    """Return the colour bars below a figure or at its right side."""
     return [each for each in (*figure.below, *figure.right) if isinstance(each, ColorBar)]
 
 
 def pane_of(figure: Any) -> pn.pane.Bokeh:
-    """A place that the figure fills."""
+    """Return a pane that the figure fills."""
     for renderer in figure.renderers:
-        # How a line would look if it were chosen, or others were: nothing is chosen in a plot.
+        # Nothing can be selected in a plot: these glyphs would only be sent and built.
         renderer.update(selection_glyph=None, nonselection_glyph=None, muted_glyph=None)
     for model in (figure, figure.title, *figure.axis, *figure.legend, *color_bars(figure)):
         for kind, sizes in STYLES.items():
@@ -114,7 +114,7 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
 
 
 def cover(bins: Range1d, n_bins: int) -> bool:
-    """Let an axis show a whole gate, whatever it was zoomed to; whether that was another gate."""
+    """Fit an axis to a gate of another length; return whether it was another."""
     if n_bins == bins.reset_end:
         return False
     bins.update(start=0, end=n_bins, reset_start=0, reset_end=n_bins)
@@ -122,7 +122,7 @@ def cover(bins: Range1d, n_bins: int) -> bool:
 
 
 def round_up(value: float) -> float:
-    """The next of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten: an axis that rests."""
+    """Round up to a few steps per decade, so that an axis seldom changes."""
     if value <= 0.0:
         return 0.0
     power = 10.0 ** math.floor(math.log10(value))

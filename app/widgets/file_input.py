@@ -1,4 +1,4 @@
-"""A file input whose uploads are bounded on the server, too."""
+"""A file input whose uploads are checked on the server, too."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import panel_material_ui as pmui
 from core.checks import require
 
 PART_BYTES = 4 * 2**20
-"""A file arrives in parts of this size, each in a message of its own."""
+"""Size of the parts in which a file arrives, each in its own message."""
 
 _LONGEST_NAME = 1024
 
 
 class FileInput(pmui.FileInput):
-    """Takes one file at a time, of at most `max_file_size` bytes.
+    """Accept one file at a time, of at most `max_file_size` bytes.
 
-    The browser checks the size first, but what arrives is whatever a client sends.
+    The browser checks the size first, but a client may send anything.
 
     Parameters
     ----------
     complain : callable
-        Called with the reason where a file cannot be taken.
+        Called with the reason where a file is refused.
     """
 
     def __init__(self, complain: Callable[[str], None], **params: Any) -> None:
@@ -34,14 +34,14 @@ class FileInput(pmui.FileInput):
     def _handle_msg(self, msg: Mapping[str, Any]) -> None:
         try:
             status = msg.get("status")
-            if status == "error":  # the browser has refused the file, or cannot read it
+            if status == "error":  # the browser refused the file, or could not read it
                 raise ValueError(str(msg.get("error"))[:_LONGEST_NAME])
             if status == "initializing":
                 self._discard()
             elif status == "upload_event":
                 self._require_part(msg)
             super()._handle_msg(msg)
-        except Exception as error:  # a part may be malformed in many ways
+        except Exception as error:  # a message may be malformed in many ways
             self._discard()
             self._send_msg({"status": "error", "error": str(error)})
             self._complain(str(error))

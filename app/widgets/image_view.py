@@ -10,7 +10,7 @@ from bokeh.events import Tap
 from bokeh.models import BoxZoomTool, CustomJS, DataRange1d
 from numpy.typing import NDArray
 
-from app.model.colors import Look
+from app.model.colors import ColorScale
 from app.model.large import Grid
 from app.plots import elements as plots
 from app.theme import Palette
@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 
 class ImageView:
-    """The image to navigate by; a tap chooses a pixel.
+    """An image in which a tap selects a pixel.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class ImageView:
             plots.range_image(np.zeros((2, 2)), 0.0, 1.0), ("picture", "shadow", "frame")
         )
         self._shape, self._grid = (0, 0), Grid()
-        self._look: Look | None = None
+        self._look: ColorScale | None = None
         self.figure = self._plot.figure
         self.pane = pane_of(self.figure)
         self.figure.match_aspect = True
@@ -42,13 +42,13 @@ class ImageView:
         picture = self._plot.layers["picture"]
         for ranges in (self.figure.x_range, self.figure.y_range):
             ranges.renderers = [picture["glyph_renderer"]]
-        for layer in ("shadow", "frame"):  # which move more often than the picture below changes
+        for layer in ("shadow", "frame"):  # moving them does not redraw the image
             self._plot.layers[layer]["glyph_renderer"].level = "overlay"
         self._mapper = picture["color_mapper"]
         (self._bar,) = color_bars(self.figure)
         (zoom,) = self.figure.select(BoxZoomTool)
         zoom.match_aspect = True
-        # HoloViews adds others, of which Bokeh takes the first.
+        # Else Bokeh activates the first of the tools that HoloViews adds.
         self.figure.toolbar.active_drag = zoom
 
         def tap(event: Tap) -> None:
@@ -61,7 +61,7 @@ class ImageView:
         self.figure.js_on_change("tags", reset)
 
     def join(self, first: ImageView) -> None:
-        """Become one of several side by side, with one view, and one scale that stands by them."""
+        """Share zoom with the first of several images, and their colour scale."""
         self._bar.visible = False
         self.figure.xaxis.axis_label = self.figure.yaxis.axis_label = None
         if first is self:
@@ -72,28 +72,28 @@ class ImageView:
             setattr(self.figure, name, shared)
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Apply the colours of a theme."""
         paint_frame(self.figure, colors)
 
     def fit(self, rows: int, cols: int, grid: Grid) -> None:
-        """Make room for an image of other pixels; for one of the same, the zoom stays."""
+        """Prepare for an image; the zoom is kept if its pixels are the same as before."""
         if ((rows, cols), grid) != (self._shape, self._grid):
             self.enter(rows, cols, grid)
 
     def enter(self, rows: int, cols: int, grid: Grid) -> None:
-        """Make room for another image, blank so far."""
+        """Prepare for another image, which stays blank until `update`."""
         self._shape, self._grid = (rows, cols), grid
         blank = [np.full((rows, cols), np.nan, np.float32)]
         left, above, *_ = plots.pixel_frame(*grid.place(0, 0), grid.step / 2)
         size = {"dw": [cols * grid.step], "dh": [rows * grid.step]}
         self._plot.source("picture").data = {"image": blank, "x": [left], "y": [above], **size}
-        self.figure.tags = [*grid.first, grid.step, rows, cols]  # which ends a zoom
+        self.figure.tags = [*grid.first, grid.step, rows, cols]  # resets the zoom, see above
 
-    def update(self, image: Array, look: Look) -> None:
-        """Show an image (row, col); NaN is left blank."""
+    def update(self, image: Array, look: ColorScale) -> None:
+        """Show an image (row, col); NaN is blank."""
         self._plot.source("picture").data["image"] = [np.asarray(image, np.float32)]
         if look == self._look:
-            return  # Bokeh would look at every single colour again
+            return  # Bokeh would compare every colour
         self._look = look
         self._mapper.update(
             low=look.low,
@@ -107,7 +107,7 @@ class ImageView:
 
     @property
     def half_frame(self) -> float:
-        """Half the side of a frame, in pixels of the file: it is seen in a large image, too."""
+        """Half the side of a frame in pixels of the file, large enough to be visible."""
         return max(1.5, 0.014 * max(self._shape)) * self._grid.step
 
     def mark(self, row: int, col: int) -> None:

@@ -1,4 +1,4 @@
-// A labelled number: typed, dragged or stepped by keys; on a linear or a logarithmic track.
+// A labelled number: typed, dragged or stepped by keys, on a linear or logarithmic track.
 
 const STEPS = 400; // positions of the track
 
@@ -17,9 +17,9 @@ export function render({ model }) {
     <div class="error" role="alert"></div>
     <div class="doubt" id="doubt" role="status"></div>
     <div class="help" id="help" hidden></div>`;
-  const part = (name) => root.querySelector("." + name);
-  const [field, track, error, help, ask, zones, doubt] =
-    ["field", "track", "error", "help", "ask", "zones", "doubt"].map(part);
+  const [label, unit, field, reset, ask, zones, track, error, doubt, help] = [
+    "label", "unit", "field", "reset", "ask", "zones", "track", "error", "doubt", "help",
+  ].map((name) => root.querySelector("." + name));
 
   // Position on the track <-> value.
   const toValue = (position) => {
@@ -38,89 +38,79 @@ export function render({ model }) {
     return size !== 0 && (size < 1e-3 || size >= 1e6) ? value.toExponential() : String(value);
   };
 
-  // Values in doubt, as far as the track reaches.
-  const reached = () =>
-    model.doubtful
-      .map(([from, to, why]) => [Math.max(from, model.low), Math.min(to, model.high), why])
-      .filter(([from, to]) => from <= to);
-  const mark = () => {
-    zones.replaceChildren(
-      ...reached().map(([from, to, why]) => {
-        const [left, right] = [from, to].map((at) => (100 * toPosition(at)) / track.max);
-        const zone = document.createElement("div");
-        zone.className = "zone";
-        zone.style.cssText = `left: ${left}%; width: ${right - left}%`;
-        zone.title = why;
-        return zone;
-      }),
-    );
+  const zone = ([from, to, why]) => {
+    const [left, right] = [from, to].map((value) => (100 * toPosition(value)) / track.max);
+    const node = document.createElement("div");
+    node.className = "zone";
+    node.style.cssText = `left: ${left}%; width: ${right - left}%`;
+    node.title = why;
+    return node;
   };
-  const doubts = (value) =>
-    model.doubtful.filter(([from, to]) => from <= value && value <= to).map(([, , why]) => why);
 
-  const show = () => {
-    const { value, low, high, label, unit, whole, log } = model;
-    track.min = 0;
-    track.max = whole && !log ? high - low : STEPS;
-    track.step = 1;
-    track.value = toPosition(value);
-    field.value = text(value);
-    part("label").textContent = label;
-    part("unit").textContent = unit ? `(${unit})` : "";
-    const inDoubt = reached().map(
-      ([from, to, why]) => ` In doubt from ${text(from)} to ${text(to)}: ${why}`,
-    );
-    help.textContent =
-      `${model.help} ${text(low)} to ${text(high)}${unit ? " " + unit : ""}.` + inDoubt.join("");
-    mark();
-    doubt.textContent = doubts(value).join(" ");
-    track.setAttribute("aria-label", unit ? `${label} (${unit})` : label);
-    track.setAttribute("aria-valuetext", `${text(value)} ${unit}`);
-    track.setAttribute("aria-describedby", "help doubt");
-    track.title = model.help;
-    track.style.setProperty("--filled", `${(100 * track.value) / track.max}%`);
-    part("reset").setAttribute("aria-label", `Reset ${label} to ${text(model.initial)}`);
-    part("reset").title = `Reset to ${text(model.initial)}`;
-    part("reset").style.visibility = value === model.initial ? "hidden" : "visible";
-    ask.setAttribute("aria-label", `What is ${label}?`);
-    ask.title = help.textContent;
-    complain("");
-  };
   const complain = (message) => {
     error.textContent = message;
     field.setAttribute("aria-invalid", message !== "");
   };
+  const show = () => {
+    const { value, low, high, initial, whole, log, doubtful } = model;
+    track.max = whole && !log ? high - low : STEPS;
+    track.value = toPosition(value);
+    track.style.setProperty("--filled", `${(100 * track.value) / track.max}%`);
+    track.setAttribute("aria-valuetext", `${text(value)} ${model.unit}`);
+    field.value = text(value);
+    label.textContent = model.label;
+    unit.textContent = model.unit && `(${model.unit})`;
+    track.setAttribute("aria-label", `${model.label} ${unit.textContent}`.trim());
+    const visible = doubtful
+      .map(([from, to, why]) => [Math.max(from, low), Math.min(to, high), why])
+      .filter(([from, to]) => from <= to);
+    zones.replaceChildren(...visible.map(zone));
+    doubt.textContent = doubtful
+      .filter(([from, to]) => from <= value && value <= to)
+      .map(([, , why]) => why)
+      .join(" ");
+    help.textContent = [
+      `${model.help} ${text(low)} to ${text(high)} ${model.unit}`.trim() + ".",
+      ...visible.map(([from, to, why]) => `Unreliable from ${text(from)} to ${text(to)}: ${why}`),
+    ].join(" ");
+    ask.title = help.textContent;
+    ask.setAttribute("aria-label", `Help on ${model.label}`);
+    track.title = model.help;
+    reset.title = `Reset to ${text(initial)}`;
+    reset.setAttribute("aria-label", `Reset ${model.label} to ${text(initial)}`);
+    reset.style.visibility = value === initial ? "hidden" : "visible";
+    complain("");
+  };
   const set = (value) => {
-    window.firstphotonInput = performance.now(); // where the page's own stopwatch starts
+    window.firstphotonInput = performance.now(); // start of the response time, see facts.js
     model.value = value;
     show();
   };
 
+  track.setAttribute("aria-describedby", "help doubt");
   track.addEventListener("input", () => {
     const value = toValue(track.value);
     if (value !== model.value) set(value);
   });
-  const typed = () => {
-    const value = Number(field.value.trim().replace(",", "."));
+  field.addEventListener("change", () => {
     const { low, high, whole } = model;
-    const allowed = `${whole ? "a whole number " : ""}from ${text(low)} to ${text(high)}`;
-    if (field.value.trim() === "" || !(value >= low && value <= high) || (whole && value % 1)) {
-      complain(`${field.value || "Nothing"} is not possible here: give ${allowed}.`);
-    } else {
+    const typed = field.value.trim();
+    const value = Number(typed.replace(",", "."));
+    if (typed !== "" && value >= low && value <= high && !(whole && value % 1)) {
       set(value);
+    } else {
+      const kind = whole ? "a whole number" : "a number";
+      complain(`“${typed}” is not accepted: enter ${kind} from ${text(low)} to ${text(high)}.`);
     }
-  };
-  field.addEventListener("change", typed);
-  field.addEventListener("keydown", (event) => {
-    if (event.key === "Escape") show();
   });
-  part("reset").addEventListener("click", () => set(model.initial));
+  field.addEventListener("keydown", ({ key }) => key === "Escape" && show());
+  reset.addEventListener("click", () => set(model.initial));
   ask.addEventListener("click", () => {
     help.hidden = !help.hidden;
     ask.setAttribute("aria-expanded", String(!help.hidden));
   });
 
-  for (const name of ["value", "low", "high", "initial", "label", "doubtful"]) model.on(name, show);
+  model.on(["value", "low", "high", "initial", "label", "doubtful"], show);
   show();
   return root;
 }

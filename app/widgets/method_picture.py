@@ -1,4 +1,4 @@
-"""Image or point cloud of one method, and the colour scale that several methods share."""
+"""Image or point cloud of one method, and the colour scale of several methods."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bokeh.models import ColorBar, LinearColorMapper, Range1d
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from app.model.colors import Look
+from app.model.colors import ColorScale
 from app.theme import WRONG_COLOR, Palette
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import Sentence
@@ -28,13 +28,13 @@ PICTURE = """
   background: var(--mui-palette-background-paper, #fff); transition: opacity 0.2s 0.25s; }
 """
 
-# Titles of one line and of three: the pictures below them stand at one height.
+# Titles of one to three lines: the pictures below them are aligned.
 TITLE = ":host { flex: 1 !important } .note { font-weight: 600 }"
 CAPTION = ".note { white-space: nowrap; overflow: hidden; text-overflow: ellipsis }"
 
 
 class Picture:
-    """One method's image, or its cloud, with a line on the pixel below it.
+    """One method's image or cloud, with a line about the pixel below it.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Picture:
     ) -> None:
         self.image = ImageView(tapped)
         self.cloud: PointCloud | None = None
-        # On the right there is room for a download button.
+        # The margin leaves room for a download button.
         self.title = Sentence(
             stylesheets=[TITLE], sizing_mode="stretch_width", margin=(4, 30, 0, 8)
         )
@@ -68,23 +68,23 @@ class Picture:
         )
         self.resize(height)
 
-    def draw_image(self, values: Array, look: Look) -> None:
-        """Show an image (row, col) on the common scale, in place of the cloud."""
+    def draw_image(self, values: Array, look: ColorScale) -> None:
+        """Show an image (row, col) in place of the cloud."""
         self.image.pane.visible = True
         if self.cloud is not None:
             self.cloud.visible = False
         self.image.update(values, replace(look, title=""))
 
     def resize(self, height: int) -> None:
-        """Make picture and cloud this high."""
+        """Set the height of image and cloud."""
         self._stage.height = height
 
     def dim(self, is_outdated: bool) -> None:
-        """Draw what is still to be replaced faintly."""
+        """Draw an outdated picture faintly."""
         self.card.styles = {"opacity": "0.35" if is_outdated else "1"}
 
     def show_cloud(self, dark: bool) -> PointCloud:
-        """Put the cloud in place of the image; it is made when it is first asked for."""
+        """Show the cloud in place of the image; it is made on demand."""
         if self.cloud is None:
             self.cloud = PointCloud(
                 wrong_color=WRONG_COLOR, link="methods", dark=dark, sizing_mode="stretch_both"
@@ -96,10 +96,10 @@ class Picture:
 
 
 class ScaleBar:
-    """The one colour scale of several pictures."""
+    """The common colour scale of several pictures."""
 
     def __init__(self) -> None:
-        # A colour bar needs a figure to stand in; nothing is drawn in this one.
+        # A colour bar needs a figure; this one is empty.
         self.figure = figure(
             height=52,
             sizing_mode="stretch_width",
@@ -118,11 +118,11 @@ class ScaleBar:
         self.pane = pane_of(self.figure)
         self.pane.sizing_mode = "stretch_width"
 
-    def update(self, look: Look) -> None:
+    def update(self, look: ColorScale) -> None:
         """Show another scale."""
         self._mapper.update(low=look.low, high=look.high, palette=look.colors)
         self._bar.title = look.legend
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Apply the colours of a theme."""
         paint_frame(self.figure, colors)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.model.methods import METHOD_TITLES
 from app.plots import elements as plots
-from app.plots.gate import GateAxes
+from app.plots.gate_axes import GateAxes
 from app.theme import LIGHT, Palette
 from app.widgets.figures import Plot, paint_frame, pane_of
 from core import Acquisition
@@ -23,11 +23,11 @@ Style = tuple[str, list[int]]
 """Colour and dashes of a method's line."""
 
 LOWEST_SCORE = -1.0
-"""Of the scale that runs from a curve's median, 0, to its maximum, 1: what lies lower is cut."""
+"""Lower scores are cut; the scale runs from a curve's median, 0, to its maximum, 1."""
 
 
 class Lines:
-    """The lines of a plot, one for each method, in one layer: a layer each would take longer."""
+    """The lines of a plot, one for each method, in one layer, which is faster than a layer each."""
 
     def __init__(self, plot: Plot) -> None:
         self.source = plot.source("lines")
@@ -36,7 +36,7 @@ class Lines:
         plot.layers["lines"]["glyph"].update(line_color=color, line_dash=dash)
 
     def update(self, lines: Mapping[str, tuple[Array, Array]], styles: Mapping[str, Style]) -> None:
-        """Draw other lines, by method."""
+        """Replace the lines, by method."""
         self.source.data = {
             "xs": [x.astype(np.float32) for x, _ in lines.values()],
             "ys": [y.astype(np.float32) for _, y in lines.values()],
@@ -47,7 +47,7 @@ class Lines:
 
 
 class CurvePlot:
-    """Each picked method's score of each bin of one pixel."""
+    """Score of each bin of one pixel, by method."""
 
     def __init__(self) -> None:
         self._plot = Plot(plots.score_curves(LIGHT), ("lines", "truth", "answers"))
@@ -64,7 +64,7 @@ class CurvePlot:
             0, LegendItem(label={"field": "title"}, renderers=[renderer])
         )
         self.pane = pane_of(drawing)
-        drawing.legend.spacing = 1  # room for all methods there are
+        drawing.legend.spacing = 1  # leaves room for all methods
 
     def update(
         self,
@@ -75,7 +75,7 @@ class CurvePlot:
         styles: Mapping[str, Style],
         unit: str,
     ) -> None:
-        """Show a pixel: curves (bin,), answers in bins and lines' styles, by method."""
+        """Show a pixel: curves (bin,), estimates in bins and styles of lines, by method."""
         plot, bins = self._plot, self._plot.figure.x_range
         if bins.end != acquisition.n_bins:
             bins.update(end=acquisition.n_bins, reset_end=acquisition.n_bins)
@@ -84,7 +84,7 @@ class CurvePlot:
         self._lines.update({method: (centres, curve) for method, curve in curves.items()}, styles)
         lowest = min((float(curve.min()) for curve in curves.values()), default=0.0)
         low = 1.05 * max(lowest, LOWEST_SCORE) - 0.02
-        # One above the other, so that equal answers can be told apart.
+        # One above the other, so that equal estimates remain visible.
         height = {method: 1.06 + 0.07 * place for place, method in enumerate(answers)}
         top = 1.1 + 0.07 * len(answers)
         vertical = plot.figure.y_range
@@ -101,19 +101,19 @@ class CurvePlot:
         plot.show("truth", bool(np.isfinite(truth_bin)))
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode; those of the lines come with `update`."""
+        """Apply the colours of a theme; those of the lines come with `update`."""
         paint_frame(self._plot.figure, colors)
         self._plot.layers["truth"]["glyph"].line_color = colors.truth
 
 
 class ReliabilityPlot:
-    """How often each picked method is right, against how sure it is."""
+    """Share of right estimates against their confidence, by method."""
 
     def __init__(self) -> None:
         self._plot = Plot(plots.reliability(LIGHT), ("honest", "lines", "dots"))
         self._lines = Lines(self._plot)
         self._dots = self._plot.source("dots")
-        self._dots.data = {"told": [], "right": [], "color": []}
+        self._dots.data = {"confidence": [], "right": [], "color": []}
         self._plot.layers["dots"]["glyph"].fill_color = {"field": "color"}
         drawing = self._plot.figure
         drawing.x_range, drawing.y_range = Range1d(0, 1.02), Range1d(0, 1.04)
@@ -121,17 +121,17 @@ class ReliabilityPlot:
         self.pane = pane_of(drawing)
 
     def update(self, lines: Mapping[str, tuple[Array, Array]], styles: Mapping[str, Style]) -> None:
-        """Show confidence told and share right, by method."""
+        """Show confidence and share of right estimates, by method."""
         self._lines.update(lines, styles)
-        told, right = ([each[axis] for each in lines.values()] for axis in (0, 1))
+        confidence, right = ([each[axis] for each in lines.values()] for axis in (0, 1))
         colors = [[styles[method][0]] * each[0].size for method, each in lines.items()]
         self._dots.data = {
-            "told": np.concatenate([*told, np.empty(0)]),
+            "confidence": np.concatenate([*confidence, np.empty(0)]),
             "right": np.concatenate([*right, np.empty(0)]),
             "color": [color for several in colors for color in several],
         }
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode; those of the lines come with `update`."""
+        """Apply the colours of a theme; those of the lines come with `update`."""
         paint_frame(self._plot.figure, colors)
         self._plot.layers["honest"]["glyph"].line_color = colors.muted

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.model.store import Pixel
 from app.plots import elements as plots
-from app.plots.gate import GateAxes, GateReadOut
+from app.plots.gate_axes import GateAxes, GateReadOut
 from app.theme import LIGHT, Palette
 from app.widgets.figures import Plot, cover, pane_of, round_up
 from core import Acquisition
@@ -34,7 +34,7 @@ class SignalPlots:
             figure.min_border_left, figure.min_border_right = 46, 14
             figure.min_border_top = figure.min_border_bottom = 4
             figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
-        # The second axis once: the plots stand above each other.
+        # The second axis appears once: the plots are stacked.
         self._axes = [GateAxes(plot.figure, plot is self.histogram) for plot in self._plots]
         raw = ("Counts", self.histogram.source("raw"), "top")
         small, large = (
@@ -64,14 +64,14 @@ class SignalPlots:
         return self.histogram, self.residual, self.enhanced
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Apply the colours of a theme."""
         for plot in self._plots:
             plot.paint(colors)
 
     def update(
         self, pixel: Pixel, acquisition: Acquisition, with_difference: bool, unit: str = "bins"
     ) -> None:
-        """Show a pixel, positions in a unit."""
+        """Show a pixel, with axes in a unit."""
         for axes in self._axes:
             axes.follow(unit, acquisition)
         for read_out in self._read_outs:
@@ -101,7 +101,7 @@ class SignalPlots:
         self._frame(self.enhanced, pixel, 0.0, signals.enhanced, weight)
 
     def _lay_out(self, n_bins: int) -> None:
-        """Lay out the plots for another number of bins."""
+        """Prepare the plots for another number of bins."""
         edges, centres = plots.edges(n_bins), plots.centres(n_bins)
         empty = np.zeros(n_bins)
         bars = {"left": edges[:-1], "right": edges[1:], "top": empty, "bottom": empty}
@@ -116,7 +116,7 @@ class SignalPlots:
 
     @staticmethod
     def _frame(plot: Plot, pixel: Pixel, low: float, *curves: Array) -> None:
-        """Fit the vertical axis, and draw truth and answer from bottom to top."""
+        """Fit the vertical axis, and draw the lines of truth and estimate."""
         highest = max(float(np.nanmax(curve, initial=0.0)) for curve in curves)
         vertical = plot.figure.y_range
         end, start = round_up(highest * 1.15), -round_up(-low * 1.05)

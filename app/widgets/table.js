@@ -1,7 +1,4 @@
-// A table whose headers sort its rows: by click, or by Enter and Space as on any button. A row may
-// have a button of its own, which reports the row's key.
-
-const ORDER = { 1: "ascending", "-1": "descending" };
+// A table with sortable columns and, where a row has an action, a button in that row.
 
 const element = (tag, text = "", attributes = {}) => {
   const node = document.createElement(tag);
@@ -10,82 +7,83 @@ const element = (tag, text = "", attributes = {}) => {
   return node;
 };
 
-// A piece of the row's line, as the plots draw it.
-const line = ({ color, dash }) => {
-  const picture = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-  const stroke = document.createElementNS("http://www.w3.org/2000/svg", "path");
-  picture.setAttribute("aria-hidden", "true");
-  picture.setAttribute("viewBox", "0 0 20 8");
-  stroke.setAttribute("d", "M0 4H20");
-  stroke.setAttribute("stroke", color);
-  stroke.setAttribute("stroke-width", "3");
-  stroke.setAttribute("stroke-dasharray", dash.join(" "));
-  picture.append(stroke);
-  return picture;
-};
+// A sample of the row's line, as the plots draw it.
+function sample({ color, dash }) {
+  const picture = element("span");
+  picture.innerHTML = `<svg aria-hidden="true" viewBox="0 0 20 8"><path d="M0 4H20"/></svg>`;
+  const stroke = { stroke: color, "stroke-width": "3", "stroke-dasharray": dash.join(" ") };
+  for (const [name, value] of Object.entries(stroke)) {
+    picture.querySelector("path").setAttribute(name, value);
+  }
+  return picture.firstChild;
+}
 
 export function render({ model }) {
   const root = element("div", "", { class: "scroll", tabindex: "0", role: "region" });
-  let sorted = { column: -1, direction: 1 }; // -1: as the server sends them
+  let sorted = { column: -1, direction: 1 }; // -1: the server's order
 
-  const value = (row) => (sorted.column === 0 ? row.name : row.cells[sorted.column - 1]?.[1] ?? null);
+  const key = (row) => (sorted.column === 0 ? row.name : row.cells[sorted.column - 1]?.[1] ?? null);
   const compare = (one, other) => {
-    const [a, b] = [value(one), value(other)];
-    if (a === null || b === null) return (a === null) - (b === null); // nothing comes last
+    const [a, b] = [key(one), key(other)];
+    if (a === null || b === null) return (a === null) - (b === null); // missing values come last
     return sorted.direction * (typeof a === "string" ? a.localeCompare(b) : a - b);
   };
 
   const header = ([title, help, first], column) => {
     const cell = element("th", "", { scope: "col" });
     const button = element("button", title, { type: "button", title: help });
-    if (column === sorted.column) cell.setAttribute("aria-sort", ORDER[sorted.direction]);
+    const isSorted = column === sorted.column;
+    if (isSorted) cell.ariaSort = sorted.direction > 0 ? "ascending" : "descending";
     button.addEventListener("click", () => {
-      const direction = column === sorted.column ? -sorted.direction : first;
-      sorted = { column, direction };
+      sorted = { column, direction: isSorted ? -sorted.direction : first };
       show();
     });
     cell.append(button);
     return cell;
   };
 
-  const body = (row) => {
-    const line_ = element("tr");
+  const line = (row) => {
     const name = element("th", row.name, { scope: "row" });
-    if (row.color) name.prepend(line(row));
+    if (row.color) name.prepend(sample(row));
     if (row.note) name.append(element("small", row.note));
     if (row.action) {
-      const button = element("button", row.action, { type: "button", class: "action" });
-      button.setAttribute("aria-label", `${row.action}: ${row.name}`);
+      const label = `${row.action}: ${row.name}`;
+      const button = element("button", row.action, { class: "action", "aria-label": label });
       button.addEventListener("click", () => (model.acted = [row.key, Date.now()]));
       name.append(button);
     }
-    line_.append(name);
-    if (row.message) {
-      const span = String(model.columns.length - 1);
-      line_.append(element("td", row.message, { class: "message", colspan: span }));
-    }
-    for (const [text, , below] of row.message ? [] : row.cells) {
-      const cell = element("td", text);
-      if (below) cell.append(element("small", below));
-      line_.append(cell);
-    }
-    return line_;
+    const cells = row.message
+      ? [element("td", row.message, { class: "message", colspan: model.columns.length - 1 })]
+      : row.cells.map(([text, , below]) => {
+          const cell = element("td", text);
+          if (below) cell.append(element("small", below));
+          return cell;
+        });
+    const node = element("tr");
+    node.append(name, ...cells);
+    return node;
   };
 
+  const group = (tag, rows) => {
+    const node = element(tag);
+    node.append(...rows);
+    return node;
+  };
   const show = () => {
     root.setAttribute("aria-label", model.title);
-    const [table, head] = [element("table"), element("thead")];
-    const [top, rows, last] = [element("tr"), element("tbody"), element("tbody")];
     if (sorted.column >= model.columns.length) sorted = { column: -1, direction: 1 };
-    top.append(...model.columns.map(header));
-    head.append(top);
-    const free = model.rows.filter((row) => !row.last);
-    rows.append(...(sorted.column < 0 ? free : free.sort(compare)).map(body));
-    last.append(...model.rows.filter((row) => row.last).map(body));
-    table.append(head, rows, last);
+    const rows = model.rows.filter((row) => !row.last);
+    if (sorted.column >= 0) rows.sort(compare);
+    const last = model.rows.filter((row) => row.last);
     const buttons = () => [...root.querySelectorAll("thead button")];
     const focused = buttons().indexOf(root.getRootNode().activeElement);
-    root.replaceChildren(table);
+    root.replaceChildren(
+      group("table", [
+        group("thead", [group("tr", model.columns.map(header))]),
+        group("tbody", rows.map(line)),
+        group("tbody", last.map(line)),
+      ]),
+    );
     buttons()[focused]?.focus();
   };
   model.on(["columns", "rows"], show);

@@ -1,84 +1,81 @@
-"""The command that says how much model a scene or a capture requires."""
+"""The command that judges which parts of the model a scene or a capture needs."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from core.acquisition import Pulse
 from core.cli.options import (
-    LIGHT_NAMES,
-    add_light,
+    FLUX_OPTIONS,
+    add_flux,
     add_reading,
-    flux,
+    flux_of,
     reading,
     require_none,
     show,
     show_progress,
     whole_from_to,
 )
-from core.cli.results import add_results, show_tables
+from core.cli.results import add_results, publish
 from core.estimators import ESTIMATORS
 from core.io.readers import read_capture
 from core.scene import scenes
 from core.studies.ablation import plain
-from core.studies.ablation import study as requires
 from core.studies.ablation.criterion import Requirement
-from core.studies.outputs import Table
+from core.studies.ablation.study import RULE, requirements, requirements_table
+from core.studies.outputs import Item
 from core.studies.timing import machine
 
 _SEEDS = 16
 
 
 def add(commands: Any) -> None:
-    """Add this command to a parser's."""
+    """Add this command to a parser."""
     command = commands.add_parser(
-        "requires", help="which parts and corrections a scene or a capture needs, and which not"
+        "requires", help="judge which parts and corrections a scene or a capture needs"
     )
-    seen = command.add_mutually_exclusive_group()
-    seen.add_argument("--capture", type=Path, help="a file that `info` can read")
-    seen.add_argument("--scene", choices=scenes, default="car", help="built in (car)")
-    add_light(command)
+    subject = command.add_mutually_exclusive_group()
+    subject.add_argument("--capture", type=Path, help="a file that `info` can read")
+    subject.add_argument("--scene", choices=scenes, default="car", help="built in (car)")
+    add_flux(command)
     command.add_argument("--method", choices=ESTIMATORS, default="likelihood", help="(likelihood)")
     command.add_argument(
-        "--seeds", type=whole_from_to(2, 1000), help=f"captures of a scene ({_SEEDS})"
+        "--seeds", type=whole_from_to(2, 1000), help=f"simulated captures of a scene ({_SEEDS})"
     )
-    command.add_argument("--folder", type=Path, help="for a page and its tables")
     command.add_argument("--json", action="store_true", help="one JSON object instead of tables")
-    add_results(command)
+    add_results(command, folder="")
     add_reading(command)
     command.set_defaults(work=_requires)
 
 
 def _requires(chosen: argparse.Namespace) -> None:
-    title, rows, others = _of_scene(chosen) if chosen.capture is None else _of_capture(chosen)
+    judge = _judge_scene if chosen.capture is None else _judge_capture
+    title, rows, tables = judge(chosen)
     print(file=sys.stderr)
-    tables = [requires.table(rows, title), *others]
     if chosen.json:
         show({row.part: asdict(row) for row in rows}, as_json=True)
-    else:
-        show_tables(tables, chosen)
-    if chosen.folder is not None:
-        from core.studies.report import write  # noqa: PLC0415 - draws, as nothing else here
-
-        page = write([*tables, machine()], chosen.folder, title, (requires.RULE,))
-        print(page, file=sys.stderr)
+    items: list[Item] = [requirements_table(rows, title), *tables, machine()]
+    printed = ("requirements", *(each.key for each in tables))
+    publish(items, chosen, title, (RULE,), printed, quiet=chosen.json)
 
 
-def _of_scene(chosen: argparse.Namespace) -> tuple[str, Sequence[Requirement], list[Table]]:
-    told = reading(chosen)
-    n_pulses = told.pop("n_pulses")
-    require_none(told, sorted(told), "a scene is not read from a file")
-    scene, light, pulse = scenes[chosen.scene](), flux(chosen), Pulse()
+_Judged = tuple[str, tuple[Requirement, ...], list[Item]]
+
+
+def _judge_scene(chosen: argparse.Namespace) -> _Judged:
+    options = reading(chosen)
+    n_pulses = options.pop("n_pulses")
+    require_none(options, sorted(options), "a scene is not read from a file")
+    scene, flux, pulse = scenes[chosen.scene](), flux_of(chosen), Pulse()
     acquisition = replace(scene.acquisition, n_pulses=n_pulses or scene.acquisition.n_pulses)
     first, count = chosen.seed or 0, chosen.seeds or _SEEDS
-    rows = requires.requirements(
+    rows = requirements(
         scene,
-        light,
+        flux,
         acquisition=acquisition,
         pulse=pulse,
         method=chosen.method,
@@ -86,15 +83,15 @@ def _of_scene(chosen: argparse.Namespace) -> tuple[str, Sequence[Requirement], l
         progress=show_progress,
     )
     title = (
-        f"What {chosen.scene} requires at SBR {light.sbr:g}, {light.signal:g} signal photons and "
+        f"Requirements of {chosen.scene} at SBR {flux.sbr:g}, {flux.signal:g} signal photons and "
         f"{acquisition.n_pulses} pulses, ranged by {chosen.method}"
     )
-    return title, rows, [plain.table(scene, acquisition, light, pulse)]
+    return title, rows, [plain.table(scene, acquisition, flux, pulse)]
 
 
-def _of_capture(chosen: argparse.Namespace) -> tuple[str, Sequence[Requirement], list[Table]]:
-    require_none(vars(chosen), (*LIGHT_NAMES, "seeds"), "a capture is lit and drawn already")
+def _judge_capture(chosen: argparse.Namespace) -> _Judged:
+    require_none(vars(chosen), (*FLUX_OPTIONS, "seeds"), "a capture has its own flux")
     capture = read_capture(chosen.capture, **reading(chosen))
-    print(capture.source, file=sys.stderr)  # with the guesses, before anything rests on them
-    rows = requires.requirements(capture, method=chosen.method, progress=show_progress)
-    return f"What {chosen.capture.name} requires, ranged by {chosen.method}", rows, []
+    print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
+    rows = requirements(capture, method=chosen.method, progress=show_progress)
+    return f"Requirements of {chosen.capture.name}, ranged by {chosen.method}", rows, []

@@ -1,10 +1,10 @@
-"""Commands for captures: look at one, range it, simulate one, write it in another layout."""
+"""Commands for captures: inspect, range, simulate and convert them."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from time import perf_counter
@@ -13,20 +13,20 @@ from typing import Any
 import numpy as np
 
 from core.acquisition import Acquisition
-from core.capture import Capture, Seen
+from core.capture import Capture, CaptureInfo
 from core.checks import printable, require, shown
 from core.cli.options import (
-    LIGHT_NAMES,
-    add_light,
+    FLUX_OPTIONS,
+    add_flux,
     add_reading,
-    flux,
+    flux_of,
     reading,
     require_none,
     show,
     whole_from_to,
 )
 from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage, estimate
-from core.inspection import FluxEstimate, capture_report, pixel_report
+from core.inspection import capture_report, pixel_report
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
@@ -49,14 +49,14 @@ from core.simulation import simulate
 from core.tracking import PRESETS
 
 _CONFIDENT = 0.9
-_MOST_REPORTED = 2**27  # counts: of more, what their pixels tell takes minutes
+_MAX_REPORTED = 2**27  # counts; a report on more takes minutes
 _VIEW = ("unit_m", "distance_m", "pixel_angle_rad")
 
 
 def add(commands: Any) -> None:
-    """Add these commands to a parser's."""
-    for each in (_add_info, _add_estimate, _add_simulate, _add_export):
-        each(commands)
+    """Add these commands to a parser."""
+    for add_one in (_add_info, _add_estimate, _add_simulate, _add_export):
+        add_one(commands)
 
 
 # -- info ------------------------------------------------------------------------------------------
@@ -64,16 +64,10 @@ def add(commands: Any) -> None:
 
 def _add_info(commands: Any) -> None:
     command = commands.add_parser(
-        "info", help="what a capture file holds, and what would be guessed of it"
+        "info", help="show what a capture file contains and what is assumed about it"
     )
     command.add_argument("capture", type=Path, help=f"a file: {', '.join(SUFFIXES)}")
-    command.add_argument(
-        "--pixel",
-        type=int,
-        nargs=2,
-        metavar=("ROW", "COL"),
-        help="what is known of one pixel, by the tracking differentiator's defaults",
-    )
+    _add_pixel(command, "report on one pixel, ranged by tracking with default settings")
     _add_json(command)
     add_reading(command)
     command.set_defaults(work=_info)
@@ -82,7 +76,7 @@ def _add_info(commands: Any) -> None:
 def _info(chosen: argparse.Namespace) -> None:
     if chosen.pixel is not None:
         capture = read_capture(chosen.capture, **reading(chosen))
-        show(_of_pixel(capture, *chosen.pixel), chosen.json)
+        show(_pixel_facts(capture, *chosen.pixel), chosen.json)
         return
     counts = open_capture(chosen.capture, **reading(chosen))
     acquisition, pulse, detection, source = describe(counts, ReadOptions())
@@ -112,18 +106,16 @@ def _info(chosen: argparse.Namespace) -> None:
             "photons_in_one_pixel_at_most": int(photons.max()),
             "share_of_pixels_empty": float((photons == 0).mean()),
         }
-    if counts.size <= _MOST_REPORTED:
-        facts |= _of_capture(read_capture(chosen.capture, **reading(chosen)))
+    if counts.size <= _MAX_REPORTED:
+        facts |= _capture_facts(read_capture(chosen.capture, **reading(chosen)))
     show(facts, chosen.json)
 
 
-def _of_capture(capture: Capture) -> dict[str, Any]:
-    """What its pixels together tell."""
+def _capture_facts(capture: Capture) -> dict[str, Any]:
     report = capture_report(capture)
     suggestion = report.suggestion
     return {
-        **_light(report.flux, report.flux_unit),
-        "light_method": report.flux_method,
+        **_flux_facts(report),
         "hot_pixels": report.n_hot,
         "dead_pixels": report.n_dead,
         "suggested_gate_first_bin": suggestion.gate[0],
@@ -134,7 +126,7 @@ def _of_capture(capture: Capture) -> dict[str, Any]:
     }
 
 
-def _of_pixel(capture: Capture, row: int, col: int) -> dict[str, Any]:
+def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
     report = pixel_report(capture, estimate(capture, "tracking"), row, col)
     facts: dict[str, Any] = {
         "source": capture.source,
@@ -143,8 +135,7 @@ def _of_pixel(capture: Capture, row: int, col: int) -> dict[str, Any]:
         "photons": int(report.counts.sum()),
         "range_m": report.answer_m,
         "confidence": report.confidence,
-        **_light(report.flux, report.flux_unit),
-        "light_method": report.flux_method,
+        **_flux_facts(report),
         "verdict": report.verdict.health,
         "why_verdict": report.verdict.why,
     }
@@ -153,42 +144,44 @@ def _of_pixel(capture: Capture, row: int, col: int) -> dict[str, Any]:
     return facts
 
 
-def _light(light: FluxEstimate, unit: str) -> dict[str, Any]:
-    facts: dict[str, Any] = {"light_unit": unit}
-    for name, interval in light._asdict().items():
+def _flux_facts(report: Any) -> dict[str, Any]:
+    facts: dict[str, Any] = {"flux_unit": report.flux_unit}
+    for name, interval in report.flux._asdict().items():
         facts |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
-    return facts
+    return facts | {"flux_method": report.flux_method}
 
 
 # -- estimate --------------------------------------------------------------------------------------
 
 
 def _add_estimate(commands: Any) -> None:
-    command = commands.add_parser("estimate", help="range a scene or a capture by one method")
+    command = commands.add_parser("estimate", help="range a capture or a scene by one method")
     methods = command.add_subparsers(dest="method", required=True)
     for name, estimator in ESTIMATORS.items():
         method = methods.add_parser(name, help=estimator.title, description=estimator.title)
-        seen = method.add_mutually_exclusive_group()
-        seen.add_argument("--capture", type=Path, help="a file that `info` can read")
-        seen.add_argument("--scene", choices=scenes, default="car", help="to simulate (car)")
-        add_light(method)
+        subject = method.add_mutually_exclusive_group()
+        subject.add_argument("--capture", type=Path, help="a file that `info` can read")
+        subject.add_argument("--scene", choices=scenes, default="car", help="to simulate (car)")
+        add_flux(method)
         method.add_argument(
             "--false-alarm",
             type=float,
-            help=f"share of pixels without an echo that may be answered, "
-            f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; all are where not given",
+            help="accepted share of echo-free pixels with an estimate, "
+            f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one",
         )
-        _add_out(method, "the answer", (*WRITERS, *FOLDER_WRITERS))
+        _add_out(method, "the range image", (*WRITERS, *FOLDER_WRITERS))
         method.add_argument(
-            "--scheduler", help="address of a Dask cluster to range on, such as tcp://host:8786"
+            "--scheduler", help="address of a Dask cluster to use, such as tcp://host:8786"
         )
         _add_json(method)
+        group = method.add_argument_group("settings of the method")
         for each in fields(estimator.parameters):
             spec = spec_of(each)
-            method.add_argument(
+            kind = (int if spec.whole else float) if isinstance(spec, Number) else str
+            group.add_argument(
                 f"--{each.name.replace('_', '-')}",
                 dest=f"setting_{each.name}",
-                type=_kind(spec),
+                type=kind,
                 default=each.default,
                 metavar=each.name.upper(),
                 help=f"{each.metadata['help']} ({each.default})".replace("%", "%%"),
@@ -197,38 +190,25 @@ def _add_estimate(commands: Any) -> None:
         method.set_defaults(work=_estimate)
 
 
-def _kind(spec: Any) -> Callable[[str], Any]:
-    if not isinstance(spec, Number):
-        return str
-    return int if spec.whole else float
-
-
-def _settings(chosen: argparse.Namespace) -> Any:
-    prefix = "setting_"
-    told = {k.removeprefix(prefix): v for k, v in vars(chosen).items() if k.startswith(prefix)}
-    return ESTIMATORS[chosen.method].parameters(**told)
-
-
 def _estimate(chosen: argparse.Namespace) -> None:
-    _require_free(chosen)
-    settings = _settings(chosen)
-    if chosen.scheduler or _exceeds_memory(chosen):
-        seen, image, facts = _ranged_in_parts(chosen, settings)
-    else:
-        seen, image, facts = _ranged_at_once(chosen, settings)
+    _require_writable(chosen)
+    kind = ESTIMATORS[chosen.method].parameters
+    settings = kind(**{f.name: getattr(chosen, f"setting_{f.name}") for f in fields(kind)})
+    in_tiles = chosen.scheduler or _exceeds_memory(chosen)
+    described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
     for path in chosen.out:
-        save_image(seen, image, path, overwrite=chosen.overwrite)
+        save_image(described, image, path, overwrite=chosen.overwrite)
     known = {
-        "source": seen.source,
+        "source": described.source,
         "remark": facts.pop("remark"),
         "settings": str(settings),
         "in_doubt": " ".join(doubts(settings)),
         "pixels": image.valid.size,
-        "pixels_answered": int(image.valid.sum()),
-        f"of_them_at_confidence_{_CONFIDENT}": int((image.confidence >= _CONFIDENT).sum()),
+        "pixels_estimated": int(image.valid.sum()),
+        f"pixels_at_confidence_{_CONFIDENT}": int((image.confidence >= _CONFIDENT).sum()),
         "median_range_m": float(np.median(image.range_m[image.valid])) if image.valid.any() else "",
         **facts,
-        "written": ", ".join(map(str, chosen.out)),
+        "written": _names(chosen.out),
     }
     show({name: value for name, value in known.items() if value != ""}, chosen.json)
 
@@ -238,16 +218,16 @@ def _exceeds_memory(chosen: argparse.Namespace) -> bool:
     return n_bytes is not None and n_bytes > MAX_CUBE_BYTES
 
 
-def _ranged_at_once(
+def _range_at_once(
     chosen: argparse.Namespace, settings: Any
-) -> tuple[Seen, RangeImage, dict[str, Any]]:
+) -> tuple[CaptureInfo, RangeImage, dict[str, Any]]:
     capture = _capture(chosen)
-    print(capture.source, file=sys.stderr)  # with the guesses, before anything rests on them
+    print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
     _require_angle(chosen, capture.acquisition)
     found = run(capture, chosen.method, settings, chosen.false_alarm)
     facts: dict[str, Any] = found.figures | {
         "remark": ESTIMATORS[chosen.method].remark(capture),
-        "light_s": found.flux_time_s,
+        "flux_s": found.flux_time_s,
         "estimate_s": found.estimate_s,
     }
     if capture.truth_range_m is not None:
@@ -255,65 +235,59 @@ def _ranged_at_once(
     return capture, found.image, facts
 
 
-def _ranged_in_parts(
+def _range_in_tiles(
     chosen: argparse.Namespace, settings: Any
-) -> tuple[Seen, RangeImage, dict[str, Any]]:
-    from core.out_of_core import tiles as large  # noqa: PLC0415 - brings Dask, for which small captures need not wait
+) -> tuple[CaptureInfo, RangeImage, dict[str, Any]]:
+    from core.out_of_core import tiles  # noqa: PLC0415 - loads Dask, which small captures do not need
 
     if chosen.capture is None:
-        raise ValueError("scheduler takes a --capture: a scene is simulated and ranged here.")
+        raise ValueError("scheduler needs a --capture: a scene is simulated and ranged here.")
     counts = open_capture(chosen.capture, **reading(chosen))
     print(counts.attrs.get("source", ""), file=sys.stderr)
     _require_angle(chosen, describe(counts, ReadOptions()).acquisition)
     started = perf_counter()
-    parts = large.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)
-    seen, image = large.as_image(large.computed(parts, chosen.scheduler))
+    parts = tiles.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)
+    described, image = tiles.as_image(tiles.computed(parts, chosen.scheduler))
     facts = {"remark": parts.attrs["remark"], "seconds": perf_counter() - started}
-    return seen, image, facts
+    return described, image, facts
 
 
 # -- simulate and export ---------------------------------------------------------------------------
 
 
 def _add_simulate(commands: Any) -> None:
-    command = commands.add_parser("simulate", help="a capture of a scene, built-in or from a file")
+    command = commands.add_parser("simulate", help="simulate a capture of a scene")
+    names = ", ".join(scenes)
     command.add_argument(
-        "--scene",
-        default="car",
-        help=f"{', '.join(scenes)}, or a file: a mesh or a depth map (car)",
+        "--scene", default="car", help=f"{names}, or a file: a mesh or a depth map (car)"
     )
     command.add_argument("--size", type=whole_from_to(8, 4096), help="rows and columns")
-    command.add_argument("--pulses", type=whole_from_to(1, 2**32 - 1), help="the scene's own")
-    group = command.add_argument_group("how a file's scene is seen; what is not told is guessed")
-    group.add_argument("--unit", dest="unit_m", type=float, help="of the file, in metres")
-    group.add_argument(
-        "--distance",
-        dest="distance_m",
-        type=float,
-        help="to the nearest point of a mesh, in metres",
+    command.add_argument(
+        "--pulses", type=whole_from_to(1, 2**32 - 1), help="by default the scene's own"
     )
-    group.add_argument(
-        "--pixel-angle",
-        dest="pixel_angle_rad",
-        type=float,
-        help="between neighbouring pixels, in radians",
-    )
-    add_light(command)
+    group = command.add_argument_group("view of a scene file; what is not given is assumed")
+    for flag, name, help in (
+        ("--unit", "unit_m", "of the file, in metres"),
+        ("--distance", "distance_m", "to the nearest point of a mesh, in metres"),
+        ("--pixel-angle", "pixel_angle_rad", "between neighbouring pixels, in radians"),
+    ):
+        group.add_argument(flag, dest=name, type=float, help=help)
+    add_flux(command)
     _add_out(command, "the capture", CAPTURE_SUFFIXES, required=True)
     _add_json(command)
     command.set_defaults(work=_simulate)
 
 
 def _simulate(chosen: argparse.Namespace) -> None:
-    _require_free(chosen)
+    _require_writable(chosen)
     scene = _scene(chosen)
     acquisition = scene.acquisition
     if chosen.pulses is not None:
         acquisition = replace(acquisition, n_pulses=chosen.pulses)
-    capture = _simulated(scene, acquisition, chosen)
-    told = {"unit": chosen.unit_m, "distance": chosen.distance_m, "SBR": chosen.sbr}
-    seen = [f"{name} {value:g}" for name, value in told.items() if value is not None]
-    source = ", ".join((printable(chosen.scene), capture.source, *seen))
+    capture = simulate(scene, acquisition, flux_of(chosen), seed=chosen.seed or 0)
+    given = {"unit": chosen.unit_m, "distance": chosen.distance_m, "SBR": chosen.sbr}
+    options = [f"{name} {value:g}" for name, value in given.items() if value is not None]
+    source = ", ".join((printable(chosen.scene), capture.source, *options))
     _save_captures(replace(capture, source=source), chosen)
 
 
@@ -322,22 +296,20 @@ def _scene(chosen: argparse.Namespace) -> Scene:
     if chosen.scene not in scenes:
         known = " or ".join(scenes)
         require("scene", chosen.scene, Path(chosen.scene).suffix != "", f"{known}, or a file")
-        seen = {name: getattr(chosen, name) for name in _VIEW}
-        return read_scene(chosen.scene, size=None if size is None else (size, size), **seen)
+        view = {name: getattr(chosen, name) for name in _VIEW}
+        return read_scene(chosen.scene, size=None if size is None else (size, size), **view)
     require_none(vars(chosen), _VIEW, "a built-in scene has a view of its own")
     return scenes[chosen.scene](**({} if size is None else {"size": size}))
 
 
 def _add_export(commands: Any) -> None:
     command = commands.add_parser(
-        "export", help="write a capture in another layout, or a pixel's signals as CSV"
+        "export", help="convert a capture, or write a pixel's signals as CSV"
     )
     command.add_argument("capture", type=Path, help="a file that `info` can read")
     suffixes = ", ".join(CAPTURE_SUFFIXES)
     command.add_argument("out", type=Path, nargs="+", help=f"{suffixes}; .csv with --pixel")
-    command.add_argument(
-        "--pixel", type=int, nargs=2, metavar=("ROW", "COL"), help="whose signals are written"
-    )
+    _add_pixel(command, "write the signals of this pixel")
     command.add_argument(
         "--preset", choices=PRESETS, default="recommended", help="of these signals (recommended)"
     )
@@ -348,7 +320,7 @@ def _add_export(commands: Any) -> None:
 
 
 def _export(chosen: argparse.Namespace) -> None:
-    _require_free(chosen)
+    _require_writable(chosen)
     capture = read_capture(chosen.capture, **reading(chosen))
     if chosen.pixel is None:
         _save_captures(capture, chosen)
@@ -357,18 +329,26 @@ def _export(chosen: argparse.Namespace) -> None:
     for path in chosen.out:
         settings = PRESETS[chosen.preset]
         save_pixel(capture, row, col, settings, path, overwrite=chosen.overwrite)
-    show({"source": capture.source, "written": ", ".join(map(str, chosen.out))}, chosen.json)
+    show({"source": capture.source, "written": _names(chosen.out)}, chosen.json)
 
 
 def _save_captures(capture: Capture, chosen: argparse.Namespace) -> None:
     for path in chosen.out:
         save_capture(capture, path, overwrite=chosen.overwrite)
     photons = int(capture.counts.sum())
-    written = ", ".join(map(str, chosen.out))
-    show({"source": capture.source, "photons": photons, "written": written}, chosen.json)
+    facts = {"source": capture.source, "photons": photons, "written": _names(chosen.out)}
+    show(facts, chosen.json)
 
 
-# -- what they share -------------------------------------------------------------------------------
+# -- Shared ----------------------------------------------------------------------------------------
+
+
+def _names(paths: Sequence[Path]) -> str:
+    return ", ".join(map(str, paths))
+
+
+def _add_pixel(command: Any, help: str) -> None:
+    command.add_argument("--pixel", type=int, nargs=2, metavar=("ROW", "COL"), help=help)
 
 
 def _add_out(command: Any, what: str, suffixes: Sequence[str], required: bool = False) -> None:
@@ -378,7 +358,7 @@ def _add_out(command: Any, what: str, suffixes: Sequence[str], required: bool = 
         action="append",
         default=[],
         required=required,
-        help=f"a file for {what}, its suffix tells the format: {', '.join(suffixes)}; repeatable",
+        help=f"a file for {what} in the format of its suffix: {', '.join(suffixes)}; repeatable",
     )
     command.add_argument("--overwrite", action="store_true", help="replace files")
     command.set_defaults(suffixes=suffixes)
@@ -389,13 +369,13 @@ def _add_json(command: Any) -> None:
 
 
 def _require_angle(chosen: argparse.Namespace, acquisition: Acquisition) -> None:
-    """Refuse a cloud of pixels that look nobody knows where before they are ranged."""
+    """Refuse a point cloud with unknown directions before anything is ranged."""
     clouds = [str(path) for path in chosen.out if path.suffix.lower() in CLOUD_SUFFIXES]
     known = acquisition.pixel_angle_rad is not None
     require("pixel_angle_rad", None, known or not clouds, f"it, which {', '.join(clouds)} needs")
 
 
-def _require_free(chosen: argparse.Namespace) -> None:
+def _require_writable(chosen: argparse.Namespace) -> None:
     """Refuse what cannot be written before anything is computed."""
     for path in chosen.out:
         known = path.suffix.lower() in chosen.suffixes
@@ -404,18 +384,14 @@ def _require_free(chosen: argparse.Namespace) -> None:
             if path.exists() and not chosen.overwrite:
                 raise FileExistsError(f"{path} exists: give another name, or --overwrite.")
         if not path.absolute().parent.is_dir():
-            raise FileNotFoundError(f"{shown(path.parent)} is no folder: make it first.")
+            raise FileNotFoundError(f"{shown(path.parent)} is not a folder: create it first.")
 
 
 def _capture(chosen: argparse.Namespace) -> Capture:
     if chosen.capture:
-        require_none(vars(chosen), LIGHT_NAMES, "a capture is lit already")
+        require_none(vars(chosen), FLUX_OPTIONS, "a capture has its own flux")
         return read_capture(chosen.capture, **reading(chosen))
-    told = reading(chosen)
-    require_none(told, list(told), "a scene is not read from a file")
+    options = reading(chosen)
+    require_none(options, list(options), "a scene is not read from a file")
     scene = scenes[chosen.scene]()
-    return _simulated(scene, scene.acquisition, chosen)
-
-
-def _simulated(scene: Scene, acquisition: Acquisition, chosen: argparse.Namespace) -> Capture:
-    return simulate(scene, acquisition, flux(chosen), seed=chosen.seed or 0)
+    return simulate(scene, scene.acquisition, flux_of(chosen), seed=chosen.seed or 0)

@@ -1,4 +1,4 @@
-"""Options and output that commands share."""
+"""Options and output shared by commands."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from core.io import ReadOptions, reading_options
 
 
 def whole_from_to(least: int, most: int) -> Callable[[str], int]:
-    """A whole number within bounds."""
+    """Return a parser of whole numbers within bounds."""
 
     def whole(text: str) -> int:
         if not (text.isdigit() and least <= int(text) <= most):
@@ -31,20 +31,19 @@ def whole_from_to(least: int, most: int) -> Callable[[str], int]:
 
 def add_reading(command: Any) -> None:
     """Add the options for reading a file, one for each field of `core.io.ReadOptions`."""
-    group = command.add_argument_group("how to read the file; what is not specified is guessed")
+    group = command.add_argument_group("reading the file; what is not given is guessed")
     for name, option in reading_options().items():
-        parts = option.kind.words
+        parts = option.kind.metavars
         # One string for each option: `reading` parses them as the app's form does.
         several = {"nargs": len(parts), "metavar": parts} if parts else {}
         group.add_argument(f"--{option.flag}", dest=name, help=option.help, **several)
 
 
 def add_processes(command: Any) -> None:
-    """Add the option that tells how many processes share the work."""
+    """Add the option for the number of processes, by default one per core."""
     cores = os.cpu_count() or 1
-    command.add_argument(
-        "--processes", type=whole_from_to(1, 256), default=cores, help=f"({cores})"
-    )
+    help = f"that share the work ({cores})"
+    command.add_argument("--processes", type=whole_from_to(1, 256), default=cores, help=help)
 
 
 def reading(chosen: argparse.Namespace) -> dict[str, Any]:
@@ -56,31 +55,28 @@ def reading(chosen: argparse.Namespace) -> dict[str, Any]:
     return vars(ReadOptions.from_text(joined))
 
 
-LIGHT_NAMES = ("sbr", "ppp", "seed")
+FLUX_OPTIONS = ("sbr", "ppp", "seed")
 
 
-def add_light(command: Any) -> None:
-    """Add the options that tell how a scene is lit."""
-    group = command.add_argument_group("how a scene is lit")
-    usual = Flux()
-    group.add_argument("--sbr", type=float, help=f"signal over background ({usual.sbr})")
-    group.add_argument("--ppp", type=float, help=f"signal photons per pulse ({usual.signal})")
-    group.add_argument("--seed", type=int, help="of the simulation (0)")
+def add_flux(command: Any) -> None:
+    """Add the options for the flux of a simulated scene."""
+    group = command.add_argument_group("simulation of a scene")
+    default = Flux()
+    group.add_argument("--sbr", type=float, help=f"signal over background ({default.sbr})")
+    group.add_argument("--ppp", type=float, help=f"signal photons per pulse ({default.signal})")
+    group.add_argument("--seed", type=int, help="of the random numbers (0)")
 
 
-def flux(chosen: argparse.Namespace) -> Flux:
-    """The light that these options tell."""
-    usual = Flux()
-    return Flux(
-        usual.signal if chosen.ppp is None else chosen.ppp,
-        usual.sbr if chosen.sbr is None else chosen.sbr,
-    )
+def flux_of(chosen: argparse.Namespace) -> Flux:
+    """Return the flux that these options give."""
+    given = {"signal": chosen.ppp, "sbr": chosen.sbr}
+    return Flux(**{name: value for name, value in given.items() if value is not None})
 
 
-def require_none(told: Mapping[str, Any], names: Sequence[str], why: str) -> None:
-    """Refuse what makes no sense beside other options."""
+def require_none(options: Mapping[str, Any], names: Sequence[str], reason: str) -> None:
+    """Refuse options that contradict others."""
     for name in names:
-        require(name, told[name], told[name] is None, f"None: {why}")
+        require(name, options[name], options[name] is None, f"None: {reason}")
 
 
 def as_options(message: str) -> str:
@@ -92,13 +88,13 @@ def as_options(message: str) -> str:
 
 
 def show_progress(done: int, of: int, what: str = "pieces") -> None:
-    """A bar on standard error."""
+    """Draw a progress bar on standard error."""
     bar = "#" * (40 * done // max(of, 1))
     print(f"\r[{bar:<40}] {done} of {of} {what}", end="", file=sys.stderr, flush=True)
 
 
 def show(facts: Mapping[str, Any], as_json: bool) -> None:
-    """Print facts, one a line or as one JSON object; what is no number there is null."""
+    """Print facts, one per line or as one JSON object, where NaN and infinity are null."""
     if as_json:
         print(json.dumps(_plain(facts)))
         return

@@ -1,39 +1,78 @@
-"""Tables of a study: printed, and written as Markdown where asked."""
+"""Output of a study: tables on standard output, a Markdown file and a folder with a page."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Iterable
+import sys
+from collections.abc import Collection, Iterable, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any
 
-from core.studies.outputs import Table, as_markdown
+from core.studies.outputs import Item, Table, as_markdown
 from core.studies.timing import machine
 
 
-def add_results(command: Any) -> None:
-    """Add the option that writes the printed tables to a Markdown file."""
+class CheckFailed(Exception):
+    """A measurement contradicts what it is checked against."""
+
+
+def add_results(command: Any, folder: str | None = None) -> None:
+    """Add ``--results`` and, where `folder` is given, ``--folder`` with that default ("": none)."""
     command.add_argument(
-        "--results", type=Path, metavar="FILE", help="write the tables to this Markdown file, too"
+        "--results", type=Path, metavar="FILE", help="also write the tables to this Markdown file"
     )
+    if folder is not None:
+        command.add_argument(
+            "--folder",
+            type=Path,
+            default=Path(folder) if folder else None,
+            help="folder for a page with plots and CSV files"
+            + (f" ({folder})" if folder else "; none by default"),
+        )
 
 
-def show_tables(tables: Iterable[Table], chosen: argparse.Namespace) -> None:
-    """Print tables as they come; with ``--results``, write all of them to one file at the end."""
-    parts = []
-    for table in tables:
-        text = f"{as_markdown(table.columns, table.rows)}\n"
-        print(f"{table.title}\n\n{text}", flush=True)
-        parts.append(f"## {table.title}\n\n{text}" + (f"\n{table.note}\n" if table.note else ""))
+def publish(
+    items: Iterable[Item],
+    chosen: argparse.Namespace,
+    title: str = "",
+    introduction: Sequence[str] = (),
+    only: Collection[str] = (),
+    quiet: bool = False,
+) -> None:
+    """Print tables as they arrive, then write what ``--results`` and ``--folder`` ask for.
+
+    Parameters
+    ----------
+    items : iterable
+    chosen : argparse.Namespace
+    title, introduction
+        Heading and first paragraphs of the page.
+    only : collection of str
+        Keys of the tables that are printed and written as Markdown; all of them where empty.
+    quiet : bool
+        Print nothing.
+    """
+    kept, parts = [], []
+    for item in items:
+        kept.append(item)
+        if isinstance(item, Table) and (not only or item.key in only):
+            text = f"{as_markdown(item.columns, item.rows, item.formats)}\n"
+            if not quiet:
+                print(f"{item.title}\n\n{text}", flush=True)
+            parts.append(f"## {item.title}\n\n{text}" + (f"\n{item.note}\n" if item.note else ""))
     if chosen.results is not None:
         chosen.results.parent.mkdir(parents=True, exist_ok=True)
         chosen.results.write_text("\n".join([_head(chosen), *parts]), encoding="utf-8")
+    if getattr(chosen, "folder", None) is not None:
+        from core.studies.report import write  # noqa: PLC0415 - loads matplotlib
+
+        print(write(kept, chosen.folder, title, introduction), file=sys.stderr)
 
 
 def _head(chosen: argparse.Namespace) -> str:
-    """Return what made the tables: command, date, machine and versions."""
+    """Return what produced the tables: command, date, machine and versions."""
     arguments = list(chosen.arguments)
     if "--results" in arguments:
         at = arguments.index("--results")

@@ -1,4 +1,4 @@
-"""The registry of estimators, and the one way to call them."""
+"""Registry of estimators, and the function that calls them."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def estimate(
     false_alarm: float | None = None,
     **parameters: Any,
 ) -> RangeImage:
-    """Range every pixel of a capture.
+    """Estimate the range of every pixel of a capture.
 
     Parameters
     ----------
@@ -57,12 +57,12 @@ def estimate(
     method : str
         A key of `ESTIMATORS`.
     settings : object, optional
-        The method's settings as its own dataclass, ``ESTIMATORS[method].parameters``.
+        Settings of the method, of type ``ESTIMATORS[method].parameters``.
     false_alarm : float, optional
-        Answer only where the score exceeds what this share of pixels without an echo would show;
-        every pixel that saw a photon is answered where None.
+        Give a range only where the score exceeds the threshold that this share of echo-free pixels
+        exceeds. If None, every pixel with a detection gets one.
     **parameters
-        The same, field by field, where `settings` is not given.
+        Settings as single fields, instead of `settings`.
 
     Returns
     -------
@@ -71,8 +71,8 @@ def estimate(
     Raises
     ------
     ValueError
-        If the method is unknown, a parameter is unknown or out of its bounds, the method needs
-        what the capture does not know, or more working memory than is free (`core.cost`).
+        If the method or a parameter is unknown, a parameter is out of its bounds, the capture lacks
+        data that the method needs, or memory is not sufficient (`core.cost`).
     """
     settings = settings_of(method, settings, **parameters)
     require_memory(capture, method, settings, false_alarm)
@@ -80,12 +80,12 @@ def estimate(
 
 
 def settings_of(method: str, settings: Any = None, **parameters: Any) -> Any:
-    """A method's settings, from its own dataclass or from single fields, as `estimate` takes them.
+    """Return a method's settings from the `settings` or the single fields of `estimate`.
 
     Raises
     ------
     ValueError
-        If the method or a parameter is unknown, or one is out of its bounds.
+        If the method or a parameter is unknown, or a parameter is out of its bounds.
     """
     require("method", method, method in ESTIMATORS, " or ".join(map(repr, ESTIMATORS)))
     kind = ESTIMATORS[method].parameters

@@ -1,4 +1,4 @@
-"""What all estimators share: signature, calibration of the lag, confidence, "no target"."""
+"""Common parts of estimators: interface, lag calibration, confidence, detection threshold."""
 
 from __future__ import annotations
 
@@ -19,28 +19,34 @@ from core.inference.likelihood import Conditions
 from core.inference.neighbours import patches, pooled_at, pooled_in
 from core.inference.posterior import tolerance_probability
 from core.parameters import Number
-from core.trigger import drawn, rate_per_bin, trigger_probability
+from core.trigger import draw_counts, rate_per_bin, trigger_probability
+
+
+@dataclass(frozen=True)
+class NoParameters:
+    """Settings of a method that has none."""
 
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """An estimator's answer; every field has shape (row, col).
+    """Estimate of a capture; every field has shape (row, col).
 
     Parameters
     ----------
     range_m : ndarray of float
         Range of the surface in metres; NaN where `valid` is False.
     bin : ndarray of float
-        The echo's delay in fractional bins, the estimator's own lag removed; NaN likewise.
-    score : ndarray of float
-        The estimator's score at its answer; its unit is the estimator's own.
-    confidence : ndarray of float
-        Probability that there is a surface within 3 bins of the answer, by the exact first-photon
-        likelihood and the light that the capture itself tells of (`core.inference.posterior`):
-        among pixels told 0.9, nine in ten are right, whichever estimator answers. 0 where `valid`
+        Delay of the echo in fractional bins, corrected for the estimator's lag; NaN where `valid`
         is False.
+    score : ndarray of float
+        Score of the estimator at its estimate, in a unit of its own.
+    confidence : ndarray of float
+        Posterior probability of a surface within 3 bins of the estimate, from the exact
+        first-photon likelihood and the fluxes estimated from the capture
+        (`core.inference.posterior`). It is calibrated for every estimator: of pixels with
+        confidence 0.9, nine in ten are right. 0 where `valid` is False.
     valid : ndarray of bool
-        Whether there is an answer.
+        Whether the pixel has an estimate.
     """
 
     range_m: Floats
@@ -51,19 +57,19 @@ class RangeImage:
 
 
 FALSE_ALARM = Number("False alarms", 1e-3, 1.0, log=True, least=1e-3, most=1.0)
-"""Share of the pixels without an echo that may be answered; 1 answers all of them."""
+"""Share of echo-free pixels that may get an estimate; with 1 all of them do."""
 
 NULL_SIDE = 256
-"""Rows and columns of the echo-free image on which a detection threshold is found."""
+"""Rows and columns of the echo-free image from which a detection threshold is found."""
 
 
 class Calibration(NamedTuple):
-    """What an estimator knows of all pixels of an image before it ranges one of them."""
+    """Quantities of an estimator that all pixels of an image share."""
 
     lag_bins: float
     """`Estimator.lag_bins`."""
     least_score: float | None
-    """`Estimator.threshold`; None where every pixel is answered."""
+    """`Estimator.threshold`; None for no threshold."""
 
 
 @dataclass(frozen=True)
@@ -73,60 +79,60 @@ class Estimator:
     Parameters
     ----------
     title : str
-        As shown to people.
+        Name on screen.
     parameters : type
         Frozen dataclass of its settings.
     curve : callable
         ``(histogram, conditions, parameters) -> score``, both of shape (..., bin): the score of
         each bin, larger where an echo is more plausible.
     locate : callable, optional
-        ``(capture, light, parameters) -> (position_bin, score)``, each of shape (row, col), NaN
-        where there is none: a quicker way to the largest of the curve, or a finer one.
-    reach : callable, optional
+        ``(capture, flux_model, parameters) -> (position_bin, score)``, each of shape (row, col),
+        NaN where there is none: a faster or finer search for the maximum of the curve.
+    window_size : callable, optional
         ``parameters -> pixels``, odd: rows and columns of the neighbourhood whose counts are added
-        before `curve` sees them.
+        before `curve` is applied.
     first_bin : callable, optional
-        ``parameters -> bin`` before which the estimator gives no answer.
+        ``parameters -> bin`` of the first possible estimate.
     finds_delay : bool
-        Whether positions are delays of the surface already, with no lag to be calibrated.
+        Whether positions are delays of the surface, without a lag to calibrate.
     flux_model : callable
-        ``capture -> FluxModel`` that the estimator is told; raises ``ValueError`` where it is not
-        known.
+        ``capture -> FluxModel`` for the estimator; raises ``ValueError`` if it is unknown.
     reconstructed : str
-        Where the original was not available: from what the method was reconstructed.
+        If the original was not available: the source of the reconstruction.
     null_side : int
-        Rows and columns of the echo-free image on which a detection threshold is found.
+        Rows and columns of the echo-free image from which a detection threshold is found.
     undoes_pile_up : bool
-        Whether the estimator takes counts for first photons and undoes that early ones hide later
-        ones, where the number of pulses is known.
-    spares : callable
-        ``capture -> sentence``: what it leaves out of its model since the capture's pulses do not
-        tell it, at less cost; empty where nothing.
+        Whether the estimator corrects pile-up of first photons if the number of pulses is known.
+    omits : callable
+        ``capture -> clause`` that describes which part of its model the estimator leaves out
+        because the pulses of the capture do not resolve it; empty if none.
     whole_image : bool
-        Whether a pixel's answer depends on pixels beyond its `reach`, so that no part of an image
-        can be ranged without the rest.
+        Whether the estimate of a pixel depends on pixels outside its window, so that no part of an
+        image can be estimated alone.
     """
 
     title: str
     parameters: type[Any]
     curve: Callable[[Floats, Conditions, Any], Floats]
     locate: Callable[[Capture, FluxModel, Any], tuple[Floats, Floats]] | None = None
-    reach: Callable[[Any], int] = lambda _: 1
+    window_size: Callable[[Any], int] = lambda _: 1
     first_bin: Callable[[Any], int] = lambda _: 0
     finds_delay: bool = False
     flux_model: Callable[[Capture], FluxModel] = flux_model_of
     reconstructed: str = ""
     null_side: int = NULL_SIDE
     undoes_pile_up: bool = False
-    spares: Callable[[Capture], str] = lambda _: ""
+    omits: Callable[[Capture], str] = lambda _: ""
     whole_image: bool = False
 
     light = renamed("flux_model")
+    reach = renamed("window_size")
+    spares = renamed("omits")
 
     def __call__(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
     ) -> RangeImage:
-        """Range every pixel of a capture.
+        """Estimate the range of every pixel of a capture; see `core.estimate`.
 
         Parameters
         ----------
@@ -134,8 +140,7 @@ class Estimator:
         parameters : object
             Of type `Estimator.parameters`.
         false_alarm : float, optional
-            Answer only where the score exceeds what this share of pixels without an echo shows;
-            every pixel is answered where None or 1.
+            As for `core.estimate`; 1 is the same as None.
 
         Raises
         ------
@@ -145,28 +150,28 @@ class Estimator:
         return self.ranged(capture, parameters, self.calibration(capture, parameters, false_alarm))
 
     def remark(self, capture: Capture) -> str:
-        """What the estimator leaves out for a capture; empty where nothing."""
-        said = [self.spares(capture)]
+        """Return which corrections the estimator leaves out for a capture; empty if none."""
+        clauses = [self.omits(capture)]
         if self.undoes_pile_up and capture.gated_pulses is None:
-            every = "the capture holds all photons, none hides another"
-            why = every if capture.detection == "all" else "the number of pulses is not known"
-            said.append(f"no pile-up is undone: {why}")
-        return "; ".join(filter(None, said))
+            known = capture.detection == "all"
+            why = "the capture holds all photons" if known else "the number of pulses is not known"
+            clauses.append(f"no pile-up is undone: {why}")
+        return "; ".join(filter(None, clauses))
 
     def calibration(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
     ) -> Calibration:
-        """What is to be known of a capture, or of a sample of it, before it is ranged."""
+        """Compute lag and threshold from a capture or a sample of it; arguments as for a call."""
+        least = None
         if false_alarm is not None:
             FALSE_ALARM.check("false_alarm", false_alarm)
-        least = None
-        if false_alarm is not None and false_alarm < 1:
-            least = self.threshold(capture, parameters, false_alarm)
+            if false_alarm < 1:
+                least = self.threshold(capture, parameters, false_alarm)
         lag = 0.0 if self.finds_delay else self.lag_bins(capture, parameters)
         return Calibration(lag, least)
 
     def ranged(self, capture: Capture, parameters: Any, calibration: Calibration) -> RangeImage:
-        """Range every pixel of a capture, or of a part of one."""
+        """Estimate the range of every pixel of a capture, or of a part of the calibrated one."""
         bins, score = self._delays(capture, parameters, calibration)
         return RangeImage(
             range_m=capture.acquisition.bin_to_range_m(bins),
@@ -179,67 +184,67 @@ class Estimator:
     def delays(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
     ) -> tuple[Floats, Floats]:
-        """`RangeImage.bin` and `RangeImage.score` alone: the estimator without what it is worth."""
+        """Return only `RangeImage.bin` and `RangeImage.score`, without computing confidence."""
         return self._delays(capture, parameters, self.calibration(capture, parameters, false_alarm))
 
     def _delays(
         self, capture: Capture, parameters: Any, calibration: Calibration
     ) -> tuple[Floats, Floats]:
-        position, score = self._best(capture, self.flux_model(capture), parameters)
+        position, score = self.positions(capture, self.flux_model(capture), parameters)
         if calibration.least_score is not None:
             position = np.where(score > calibration.least_score, position, np.nan)
         delay = np.clip(position - calibration.lag_bins, 0.0, capture.acquisition.n_bins)
         return delay, score
 
     def curves(self, capture: Capture, row: int, col: int, parameters: Any) -> Floats:
-        """The score of each bin for one pixel, shape (bin,)."""
-        flux, reach = self.flux_model(capture), self.reach(parameters)
-        around = pooled_at(capture.cube, row, col, reach)
-        given = conditions_of(capture, flux, reach)
+        """Score of each bin for one pixel, shape (bin,)."""
+        flux, size = self.flux_model(capture), self.window_size(parameters)
+        around = pooled_at(capture.cube, row, col, size)
+        given = conditions_of(capture, flux, size)
         here = np.s_[row : row + 1, col : col + 1]
         conditions = given._replace(signal=given.signal[here], background=given.background[here])
         one = around[np.newaxis, np.newaxis].astype(float)
         return np.asarray(self.curve(one, conditions, parameters)[0, 0])
 
     def threshold(self, capture: Capture, parameters: Any, false_alarm: float) -> float:
-        """The score that a share `false_alarm` of pixels without an echo exceeds.
+        """Score that a share `false_alarm` of echo-free pixels exceeds.
 
-        Found on an image that sees the capture's own background and nothing else.
+        The scores are those of an image drawn from the background of the capture alone.
         """
-        whole = tuple(_whole(self.null_side, size) for size in capture.shape)
+        whole = tuple(whole_patches(self.null_side, size) for size in capture.shape)
         some = np.s_[: whole[0], : whole[1]]
         cube = _null_cube(capture)[some].copy()
         null = Capture(cube, capture.acquisition, capture.pulse, detection=capture.detection)
-        flux = self.flux_model(capture).of_pixels(_null_pixels(capture)[some])
-        _, score = self._best(null, flux, parameters)
+        flux = self.flux_model(capture).of_pixels(null_pixels(capture)[some])
+        _, score = self.positions(null, flux, parameters)
         return float(np.quantile(score, 1 - false_alarm))
 
     def lag_bins(self, capture: Capture, parameters: Any) -> float:
-        """How far behind the surface's delay a noise-free echo adds most to the score.
+        """Distance in bins from the surface's delay to the maximum of a noise-free echo's score.
 
-        Echoes as strong as the capture's own, over its own background, are put at all fractions of
-        a bin at some places of the gate; their median lag is the calibration. It moves a little
-        with the strength of echo and background, which is why it is not a constant.
+        Expected echoes with the capture's mean signal and background are placed at all fractions of
+        a bin at several delays of the gate; the calibration is their median lag. It depends a
+        little on the fluxes and is therefore not a constant.
 
         Returns
         -------
         float
-            Lag in bins; 0 where no echo can be found at all (every bin excluded, say).
+            0 if no echo is found at all (if every bin is excluded, for example).
         """
         n_bins = capture.acquisition.n_bins
-        given = conditions_of(capture, self.flux_model(capture), self.reach(parameters))
+        given = conditions_of(capture, self.flux_model(capture), self.window_size(parameters))
         given = given._replace(
             signal=np.asarray(given.signal.mean()), background=np.asarray(given.background.mean())
         )
         first = max(self.first_bin(parameters), 0.1 * n_bins)
         places = np.round(np.linspace(first, 0.9 * n_bins, 8))
         onset = (places[:, np.newaxis] + np.arange(8) / 8).ravel()
-        # Not the largest score but the largest that the echo adds: noise-free, a falling background
-        # is still there, and where an echo is weak it would take the scores near it for the echo's.
+        # The maximum of the score that the echo adds: the score of the falling background itself
+        # may be larger than that of a weak echo.
         no_echo = _expected(onset[:1], given._replace(signal=np.zeros(())))
         without = self.curve(no_echo, given, parameters)
         most, at = np.empty(onset.size), np.empty(onset.size, np.intp)
-        at_once = max(1, _AT_ONCE // n_bins)
+        at_once = max(1, NUMBERS_AT_ONCE // n_bins)
         for first in range(0, onset.size, at_once):
             some = slice(first, first + at_once)
             added = self.curve(_expected(onset[some], given), given, parameters) - without
@@ -249,20 +254,25 @@ class Estimator:
             return 0.0
         return float(np.median(at[found] - onset[found]))
 
-    def _best(self, capture: Capture, flux: FluxModel, parameters: Any) -> tuple[Floats, Floats]:
-        """Bin and value of the largest score, each of shape (row, col)."""
+    def positions(
+        self, capture: Capture, flux: FluxModel, parameters: Any
+    ) -> tuple[Floats, Floats]:
+        """Bin and value of the largest score, each of shape (row, col), the lag not corrected.
+
+        NaN and 0 where a pixel has no detection.
+        """
         locate = self.locate or self._largest
         position, score = locate(capture, flux, parameters)
         seen = capture.counts > 0
         return np.where(seen, position, np.nan), np.where(seen, score, 0.0)
 
     def _largest(self, capture: Capture, flux: FluxModel, parameters: Any) -> tuple[Floats, Floats]:
-        reach = self.reach(parameters)
-        given = conditions_of(capture, flux, reach)
+        size = self.window_size(parameters)
+        given = conditions_of(capture, flux, size)
         position, score = np.empty((2, *capture.shape))
-        for patch in patches(capture.cube.shape, _AT_ONCE):
-            cube = pooled_in(capture.cube, patch, reach)
-            # A few rows at a time: temporaries beyond the cache cost more than their arithmetic.
+        for patch in patches(capture.cube.shape, NUMBERS_AT_ONCE):
+            cube = pooled_in(capture.cube, patch, size)
+            # A few rows at a time, so that temporaries stay in the cache.
             rows_at_once = max(1, _IN_CACHE // cube[0].size)
             for first in range(0, len(cube), rows_at_once):
                 rows = slice(first, first + rows_at_once)
@@ -274,15 +284,15 @@ class Estimator:
         return position, score
 
 
-def conditions_of(capture: Capture, flux: FluxModel, reach: int = 1) -> Conditions:
-    """What an estimator knows of a capture's histograms, `reach` x `reach` of them added."""
-    n_pulses = capture.gated_pulses
-    more = 1 if n_pulses else reach * reach  # photons are counted per pixel where pulses are not
+def conditions_of(capture: Capture, flux: FluxModel, window_size: int = 1) -> Conditions:
+    """Conditions of a capture's histograms, summed over windows of `window_size` squared pixels."""
+    n_pulses, n_pixels = capture.gated_pulses, window_size * window_size
+    more = 1 if n_pulses else n_pixels  # without pulses, fluxes are per histogram
     signal, background = flux.typical_signal, flux.typical_background
     return Conditions(
         capture.acquisition,
         capture.pulse,
-        n_pulses * reach * reach if n_pulses else None,
+        n_pulses * n_pixels if n_pulses else None,
         signal * more,
         background * more,
         flux.contrast,
@@ -291,34 +301,31 @@ def conditions_of(capture: Capture, flux: FluxModel, reach: int = 1) -> Conditio
 
 
 def _expected(onset_bin: Floats, given: Conditions) -> Floats:
-    """Expected counts of echoes at some delays, shape (delay, bin)."""
+    """Expected counts of echoes at given delays, shape (delay, bin)."""
     signal = np.full(onset_bin.size, given.signal)
     rate = rate_per_bin(onset_bin, signal, float(given.background), given.pulse, given.acquisition)
     return rate if given.n_pulses is None else trigger_probability(rate) * given.n_pulses
 
 
-_AT_ONCE = 2**20  # float64 numbers of a temporary: 8 MiB
+NUMBERS_AT_ONCE = 2**20  # float64 numbers of a temporary: 8 MiB
 _IN_CACHE = 2**16
-_PATCH = 64  # rows and columns that stay together, for what looks at neighbours
+_PATCH = 64  # rows and columns that stay together, for methods that use neighbours
 
 
-def _whole(side: int, size: int) -> int:
-    """About `side` rows or columns: as many as whole patches of an image of `size` have."""
+def whole_patches(side: int, size: int) -> int:
+    """Round `side` rows or columns to whole patches of an image of `size`."""
     patch = min(_PATCH, size)
     return max(1, round(side / patch)) * patch
 
 
 @cached_per_capture
-def _null_pixels(capture: Capture) -> NDArray[np.intp]:
-    """Pixels of the capture, in patches drawn at random, whose background an echo-free image sees.
-
-    Flat indices, shape (row, col).
-    """
+def null_pixels(capture: Capture) -> NDArray[np.intp]:
+    """Flat indices (row, col) of random patches whose background the echo-free image has."""
     rows, cols = capture.shape
-    # A large gate's image would not fit: fewer pixels then, and a coarser threshold.
+    # Fewer pixels, and a less precise threshold, for a long gate.
     side = min(NULL_SIDE, math.isqrt(2**23 // capture.acquisition.n_bins))
     high, wide = min(_PATCH, rows), min(_PATCH, cols)
-    down, across = _whole(side, rows) // high, _whole(side, cols) // wide
+    down, across = whole_patches(side, rows) // high, whole_patches(side, cols) // wide
     rng = np.random.default_rng(0)
     top = rng.integers(rows - high + 1, size=(down, 1, across, 1))
     left = rng.integers(cols - wide + 1, size=(down, 1, across, 1))
@@ -329,14 +336,14 @@ def _null_pixels(capture: Capture) -> NDArray[np.intp]:
 
 @cached_per_capture
 def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
-    """Counts of pixels that see the capture's background alone, shape (row, col, bin)."""
+    """Draw counts of pixels that see only the background of the capture, (row, col, bin)."""
     rng = np.random.default_rng(1)
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
-    pixels = _null_pixels(capture)
+    pixels = null_pixels(capture)
     background = flux_model_of(capture).of_pixels(pixels).typical_background
     cubes = []
-    rows_at_once = max(1, _AT_ONCE // (pixels.shape[1] * n_bins))
+    rows_at_once = max(1, NUMBERS_AT_ONCE // (pixels.shape[1] * n_bins))
     for first in range(0, len(pixels), rows_at_once):
         rate = background[first : first + rows_at_once, :, np.newaxis] / n_bins
-        cubes.append(drawn(np.repeat(rate, n_bins, axis=2), n_pulses, rng))
+        cubes.append(draw_counts(np.repeat(rate, n_bins, axis=2), n_pulses, rng))
     return np.concatenate(cubes)

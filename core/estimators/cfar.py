@@ -1,15 +1,14 @@
-"""Cell-averaging CFAR: each bin over the noise that its surroundings show (Finn & Johnson 1968).
+"""Cell-averaging CFAR: ratio of each bin to the noise around it (Finn & Johnson 1968).
 
-With the histogram smoothed by a Gaussian, ``x_k``, and the training cells ``T_k``, so many bins on
+With the histogram smoothed by a Gaussian, ``x_k``, and the training cells ``T_k``, which lie on
 either side of a guard around bin k, the score is ::
 
     x_k / (1 + mean of x over T_k)
 
-so that the decay of first-photon histograms, which is slow over the training cells, cancels. Near
-the gate's ends only the training cells within the gate are averaged. The count added to the noise
-is not part of the original, which knows no counts: without it a single photon where hardly any is
-left, late in the gate, outdoes an echo of dozens, which at an SBR of 0.03 costs a quarter of the
-right answers. The filters take 20 ns a pixel and bin.
+so that the slow decay of first-photon histograms cancels. Near the ends of the gate only training
+cells within the gate are averaged. The count added to the noise is not part of the original method:
+without it a single photon late in the gate, where few are left, exceeds an echo of dozens, which
+costs a quarter of the right estimates at an SBR of 0.03. The filters take 20 ns per pixel and bin.
 """
 
 from __future__ import annotations
@@ -23,28 +22,22 @@ from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
 from core.inference.likelihood import Conditions
-from core.parameters import Number, check_fields, parameter
+from core.parameters import Number, Settings, parameter
 
 
 @dataclass(frozen=True)
-class CfarParameters:
-    """Settings of the CFAR.
-
-    Raises
-    ------
-    ValueError
-        If a value lies outside its bounds.
-    """
+class CfarParameters(Settings):
+    """Settings of the CFAR."""
 
     smoothing_bins: float = parameter(
         1.0,
         Number("Smoothing", 0.0, 3.0, unit="bins", least=0.0, most=100.0),
-        "Standard deviation of the Gaussian that smooths the histogram first; 0 smooths nothing.",
+        "Standard deviation of the Gaussian that smooths the histogram; 0 for no smoothing.",
     )
     guard_bins: int = parameter(
         3,
         Number("Guard", 0, 10, whole=True, unit="bins", least=0, most=1000),
-        "Bins on either side that the echo itself may fill, and which tell nothing of the noise.",
+        "Bins on either side that the echo may fill and that are excluded from the noise.",
     )
     training_bins: int = parameter(
         8,
@@ -52,33 +45,28 @@ class CfarParameters:
         "Bins beyond the guard, on either side, whose mean is the noise.",
     )
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
 
 def _curve(histogram: Floats, conditions: Conditions, parameters: CfarParameters) -> Floats:
     """``x_k / (1 + mean of x over T_k)``; see the module's docstring."""
-    taps = gaussian_taps(parameters.smoothing_bins)
-    smooth = correlate(histogram, taps, -(taps.size // 2))
+    smooth = correlate(histogram, gaussian_taps(parameters.smoothing_bins))
     around = training_taps(parameters.guard_bins, parameters.training_bins)
-    begin = -(around.size // 2)
-    total = correlate(smooth, around, begin)
-    cells = correlate(np.ones(histogram.shape[-1]), around, begin)
+    total = correlate(smooth, around)
+    cells = correlate(np.ones(histogram.shape[-1]), around)
     return np.asarray(smooth / (1.0 + total / np.maximum(cells, 1.0)))
 
 
 def gaussian_taps(sigma_bins: float) -> Floats:
-    """A Gaussian at whole bins out to 4 standard deviations, of sum 1; shape (odd,)."""
+    """Gaussian at whole bins up to 4 standard deviations, of sum 1; shape (odd,)."""
     half = math.ceil(4 * sigma_bins)
     if half == 0:
         return np.ones(1)
-    with np.errstate(over="ignore"):  # one so narrow that no neighbour is reached
+    with np.errstate(over="ignore"):  # a Gaussian narrower than a bin
         taps = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma_bins) ** 2)
     return np.asarray(taps / taps.sum())
 
 
 def training_taps(guard_bins: int, training_bins: int) -> Floats:
-    """1 for a training cell, 0 for the guard and the cell under test; shape (odd,)."""
+    """1 for training cells, 0 for the guard and the cell under test; shape (odd,)."""
     side, guard = np.ones(training_bins), np.zeros(2 * guard_bins + 1)
     return np.concatenate([side, guard, side])
 

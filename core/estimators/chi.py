@@ -1,24 +1,23 @@
 """Adaptive kernel density and gradient repair, after Chi et al. 2025.
 
-The abstract alone was available. It names an adaptive-bandwidth kernel density estimate of the
-triggers of a neighbourhood, and a correction of the range image by its gradient. Everything else
-here is a reconstruction.
+Only the abstract was available. It names an adaptive-bandwidth kernel density estimate of the
+triggers of a neighbourhood, and a correction of the range image by its gradient. Everything else is
+a reconstruction.
 
-**Density.** The triggers of 3 x 3 pixels are taken together; of 5 x 5 where those are fewer than
-the gate has bins. With ``f_i`` their density at bandwidth ``h0`` (`core.estimators.kde`) and ``g``
-the geometric mean of f over the triggers, each trigger gets a bandwidth of its own (Abramson
-1982)::
+**Density.** The triggers of 3 x 3 pixels are pooled, or of 5 x 5 if those are fewer than the bins
+of the gate. With ``f_i`` their density at bandwidth ``h0`` (`core.estimators.kde`) and ``g`` the
+geometric mean of f over the triggers, the bandwidth of each trigger is (Abramson 1982)::
 
     h_i = h0 (f_i / g)^(-1/2)      but within [h0 / 2, 3 h0]
     F_k = Σ_i n_i [ Φ((k - i + 1/2) / h_i) - Φ((k - i - 1/2) / h_i) ]
 
-so that peaks stay sharp and the thinly populated rest is smoothed. The arg max is the answer z.
+so that peaks stay sharp and sparse parts are smoothed. The estimate z is the arg max.
 
-**Repair.** With ``|∇z|`` made of the larger of the two differences along rows and along columns, a
-pixel is replaced where ``|∇z| > median + 3 MAD`` over the image and more than two thirds of its up
-to 8 neighbours lie more than 3 bins away. It takes the median of their answers, each weighted with
-its density there: a pixel on an edge, or in a corner, of a surface has enough neighbours on that
-surface to stay what it is. All of it takes 35 ns a pixel and bin.
+**Repair.** ``|∇z|`` is made of the larger of the two differences along rows and along columns. A
+pixel is replaced if ``|∇z| > median + 3 MAD`` over the image and more than two thirds of its up to
+8 neighbours lie more than 3 bins away. Its new value is the median of their estimates, weighted
+with their densities. A pixel on an edge or in a corner of a surface has enough neighbours on that
+surface to be kept. Everything together takes 35 ns per pixel and bin.
 """
 
 from __future__ import annotations
@@ -34,50 +33,30 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators.base import Estimator
 from core.estimators.filters import correlate
-from core.estimators.kde import kernel_taps
+from core.estimators.kde import bandwidth_spec, kernel_taps
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
 from core.inference.neighbours import neighbours, patches, pooled_in, weighted_median
 from core.inference.posterior import TOLERANCE_BINS
 from core.kernels.parallel import COMPILED
-from core.parameters import Number, Zone, check_fields, parameter
+from core.parameters import Settings, parameter
 
 NARROWEST, WIDEST = 0.5, 3.0
-"""Bounds of a trigger's bandwidth, in those of the first density."""
+"""Bounds of a trigger's bandwidth, relative to that of the first density."""
 
-_AT_ONCE = 2**20  # counts treated together
-_LEVELS = 64  # of bandwidth in the table of kernels, interpolated between
+NUMBERS_AT_ONCE = 2**20  # counts processed together
+_LEVELS = 64  # bandwidths in the table of kernels, with interpolation between
 
 
 @dataclass(frozen=True)
-class ChiParameters:
-    """Settings of the adaptive density.
-
-    Raises
-    ------
-    ValueError
-        If a value lies outside its bounds.
-    """
+class ChiParameters(Settings):
+    """Settings of the adaptive density."""
 
     bandwidth_bins: float = parameter(
         0.4,
-        Number(
-            "h₀",
-            0.1,
-            3.0,
-            log=True,
-            unit="bins",
-            least=0.01,
-            most=100.0,
-            doubtful=(
-                Zone(2.4, 100.0, "So wide a kernel drowns the echo in the background before it."),
-            ),
-        ),
-        "Bandwidth of the first density; each trigger's own lies between half and thrice of it.",
+        bandwidth_spec("h₀", 2.4),
+        "Bandwidth of the first density; that of each trigger is half to three times as large.",
     )
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 def adaptive_density(counts: Floats, bandwidth_bins: float) -> Floats:
@@ -92,23 +71,17 @@ def adaptive_density(counts: Floats, bandwidth_bins: float) -> Floats:
     -------
     ndarray, shape (..., bin)
     """
-    taps = kernel_taps(bandwidth_bins)
-    first = correlate(counts, taps, -(taps.size // 2))
-    flat = (-1, counts.shape[-1])
-    density = np.zeros((first.size // counts.shape[-1], counts.shape[-1]))
-    kernels, halves = _kernels(bandwidth_bins)
-    _fill_density(
-        np.ascontiguousarray(counts).reshape(flat),
-        np.ascontiguousarray(first).reshape(flat),
-        kernels,
-        halves,
-        density,
+    first = correlate(counts, kernel_taps(bandwidth_bins))
+    rows, first_rows = (
+        np.ascontiguousarray(each).reshape(-1, counts.shape[-1]) for each in (counts, first)
     )
+    density = np.zeros(rows.shape)
+    _fill_density(rows, first_rows, *_kernels(bandwidth_bins), density)
     return density.reshape(counts.shape)
 
 
 def _kernels(bandwidth_bins: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Kernels of `_LEVELS` bandwidths in geometric steps, and bins on either side of each."""
+    """Kernels of `_LEVELS` bandwidths in geometric steps, and their half-widths in bins."""
     widths = bandwidth_bins * np.geomspace(NARROWEST, WIDEST, _LEVELS)
     taps = [kernel_taps(width) for width in widths]
     kernels = np.zeros((_LEVELS, taps[-1].size))
@@ -120,7 +93,7 @@ def _kernels(bandwidth_bins: float) -> tuple[Floats, NDArray[np.int64]]:
 
 @njit(**COMPILED)
 def _fill_density(counts, first, kernels, halves, density):  # type: ignore[no-untyped-def]
-    """Put each bin's triggers into `density` with the kernel of their own bandwidth."""
+    """Add the triggers of each bin to `density` with the kernel of their bandwidth."""
     n_bins = counts.shape[1]
     last, middle = kernels.shape[0] - 1, kernels.shape[1] // 2
     per_log = last / math.log(WIDEST / NARROWEST)
@@ -146,14 +119,14 @@ def _fill_density(counts, first, kernels, halves, density):  # type: ignore[no-u
 
 
 def repaired(position: Floats, intensity: Floats) -> Floats:
-    """Replace what disagrees with its surroundings; see the module's docstring.
+    """Replace estimates that disagree with their neighbours; see the module's docstring.
 
     Parameters
     ----------
     position : ndarray, shape (row, col)
-        In bins; NaN where there is none, which stays so.
+        In bins; NaN stays NaN.
     intensity : ndarray, shape (row, col)
-        Weight of each pixel in its neighbours' medians, positive.
+        Weight of each pixel in the medians of its neighbours, positive.
 
     Returns
     -------
@@ -161,13 +134,13 @@ def repaired(position: Floats, intensity: Floats) -> Floats:
     """
     around = neighbours(position, np.nan)
     away = np.nan_to_num(np.abs(around - position))  # 0 where either has none
-    # Of the 8 neighbours those above and below are number 1 and 6, those beside it 3 and 4.
+    # Of the 8 neighbours, 1 and 6 are above and below, 3 and 4 to the left and right.
     steep = np.hypot(np.maximum(away[1], away[6]), np.maximum(away[3], away[4]))
-    answered = steep[np.isfinite(position)]
-    if answered.size == 0:
+    gradient = steep[np.isfinite(position)]
+    if gradient.size == 0:
         return position
-    median = np.median(answered)
-    limit = median + 3 * np.median(np.abs(answered - median))
+    median = np.median(gradient)
+    limit = median + 3 * np.median(np.abs(gradient - median))
     known = np.isfinite(around)
     alone = (away > TOLERANCE_BINS).sum(axis=0) > 2 / 3 * known.sum(axis=0)
     wrong = alone & (steep > limit)
@@ -178,9 +151,9 @@ def repaired(position: Floats, intensity: Floats) -> Floats:
 
 
 def _locate(capture: Capture, flux: FluxModel, parameters: ChiParameters) -> tuple[Floats, Floats]:
-    """Repaired positions, and the density of each at its own first answer."""
+    """Return repaired positions and the density at the unrepaired ones."""
     position, height = np.empty((2, *capture.shape))
-    for here in patches(capture.cube.shape, _AT_ONCE):
+    for here in patches(capture.cube.shape, NUMBERS_AT_ONCE):
         counts = pooled_in(capture.cube, here, 3)
         starved = counts.sum(axis=2) < capture.acquisition.n_bins
         if starved.any():
@@ -201,7 +174,7 @@ ESTIMATOR = Estimator(
     ChiParameters,
     _curve,
     _locate,
-    reach=lambda _: 3,
+    window_size=lambda _: 3,
     reconstructed="the abstract of Chi et al. (2025)",
     whole_image=True,
 )

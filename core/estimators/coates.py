@@ -1,31 +1,24 @@
-"""Matched filter on counts whose pile-up is undone (Coates 1968).
+"""Matched filter on rates with pile-up corrected (Coates 1968).
 
-The corrected rate of bin k is known to ``sqrt(λ / A_k)`` only, A_k pulses being armed, so that bins
-count in proportion to A_k: the score is the weighted least-squares amplitude of an echo over its
-standard deviation. Where the pulses hide pile-up (`core.inference.resolution`), counts are rates
-and all bins count alike, which costs half.
+The corrected rate of bin k has a standard deviation of ``sqrt(λ / A_k)`` with A_k armed pulses, so
+that bins are weighted with A_k: the score is the weighted least-squares amplitude of an echo over
+its standard deviation. If the pulses do not resolve pile-up (`core.inference.resolution`), counts
+are used as rates and bins have equal weights, which takes half the time.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from core.acquisition import Floats
 from core.capture import Capture
-from core.estimators.base import Estimator
+from core.estimators.base import Estimator, NoParameters
 from core.estimators.filters import correlate, echo_shape
 from core.inference.flux import flux_prior_of
 from core.inference.likelihood import Conditions, rate_and_n_armed
 
 
-@dataclass(frozen=True)
-class CoatesParameters:
-    """The Coates matched filter has no settings: pulse and pulses sent are the capture's."""
-
-
-def _curve(histogram: Floats, conditions: Conditions, parameters: CoatesParameters) -> Floats:
+def _curve(histogram: Floats, conditions: Conditions, parameters: NoParameters) -> Floats:
     """``Σ_k A_k (λ_k - λ) p(k - d) / sqrt(λ Σ_k A_k p(k - d)²)`` at each bin's beginning d."""
     echo, first = echo_shape(conditions)
     n_pulses = conditions.n_pulses
@@ -35,12 +28,12 @@ def _curve(histogram: Floats, conditions: Conditions, parameters: CoatesParamete
         rate, armed = histogram / n_pulses, np.full(histogram.shape[-1], float(n_pulses))
     mean = np.maximum(rate.mean(axis=-1, keepdims=True), np.finfo(float).tiny)
     amplitude = correlate(armed * (rate - mean), echo, first)
-    # Where next to no pulse is armed an echo cannot show: one pulse keeps the ratio finite.
+    # At least one armed pulse keeps the ratio finite.
     spread = np.sqrt(mean * np.maximum(correlate(armed, echo**2, first), 1.0))
     return np.asarray(amplitude / spread)
 
 
-def _spares(capture: Capture) -> str:
+def _omits(capture: Capture) -> str:
     if flux_prior_of(capture).pile_up or capture.gated_pulses is None:
         return ""
     return "Coates undoes no pile-up: too few pulses fire for one photon to hide another"
@@ -48,8 +41,8 @@ def _spares(capture: Capture) -> str:
 
 ESTIMATOR = Estimator(
     "Coates correction, matched filter",
-    CoatesParameters,
+    NoParameters,
     _curve,
     undoes_pile_up=True,
-    spares=_spares,
+    omits=_omits,
 )

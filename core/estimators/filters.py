@@ -1,4 +1,4 @@
-"""Correlation along the bins, as the filters among the estimators share it."""
+"""Correlation along the bins, shared by estimators that filter the histogram."""
 
 from __future__ import annotations
 
@@ -10,26 +10,28 @@ from core.inference.likelihood import Conditions
 
 
 def echo_shape(conditions: Conditions) -> tuple[Floats, int]:
-    """`Pulse.taps` of an echo that begins with a bin."""
+    """Return `Pulse.taps` of an echo that begins at the start of a bin."""
     acquisition = conditions.acquisition
     return conditions.pulse.taps(acquisition.n_bins, acquisition.bin_width_s)
 
 
-def correlate(values: Floats, taps: Floats, first: int) -> Floats:
-    """``Σ_j values[k + first + j] taps[j]`` for each bin k, nothing lying beyond the gate.
+def correlate(values: Floats, taps: Floats, first: int | None = None) -> Floats:
+    """Compute ``Σ_j values[k + first + j] taps[j]`` for each bin k, with zeros beyond the gate.
 
     Parameters
     ----------
     values : ndarray, shape (..., bin)
     taps : ndarray, shape (tap,)
-    first : int
-        Bins from k to the first tap.
+    first : int, optional
+        Bins from k to the first tap; if None, the middle tap is at k.
 
     Returns
     -------
     ndarray, shape (..., bin)
     """
-    # The library wants a filter around its centre, which lies within it.
+    if first is None:
+        first = -(len(taps) // 2)
+    # SciPy needs a filter that is centred on its middle tap.
     last = first + len(taps) - 1
     half = max(-first, last, 0)
     centred = np.zeros(2 * half + 1)

@@ -1,4 +1,4 @@
-"""The exact first-photon likelihood, told the true light: what physics allows a single pixel."""
+"""The exact first-photon likelihood with true fluxes: the physical limit of a single pixel."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from core.inference.flux_model import FluxModel
 
 @cached_per_capture
 def true_flux_model(capture: Capture) -> FluxModel:
-    """The light of a simulated capture.
+    """Return the true fluxes of a simulated capture.
 
     Raises
     ------
     ValueError
-        If the capture does not know its light.
+        If they are unknown.
     """
     if capture.signal is None or capture.background is None:
         raise ValueError(
@@ -25,7 +25,7 @@ def true_flux_model(capture: Capture) -> FluxModel:
             "capture knows: take 'likelihood', which estimates them."
         )
     target = capture.signal[capture.signal > 0]
-    # A pixel without a target is asked where the echo would be, were there a typical one.
+    # For a pixel without a target, a typical echo is assumed.
     typical = float(target.mean()) if target.size else 1.0
     signal = np.where(capture.signal > 0, capture.signal, typical)
     background = np.full(capture.shape, max(capture.background, 1e-12))
@@ -38,7 +38,7 @@ def true_flux_model(capture: Capture) -> FluxModel:
 
 
 ESTIMATOR = Estimator(
-    "Oracle: likelihood told the true light",
+    "Oracle: likelihood with true fluxes",
     LikelihoodParameters,
     curve,
     locate,

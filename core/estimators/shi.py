@@ -1,17 +1,17 @@
 """Sample function and peak prominence, after Shi et al. 2025.
 
 Shi et al., "GM-APD lidar reconstruction algorithm with few frames based on sample function", Optics
-& Laser Technology 192, 113866. The abstract alone was available. It names the steps: recovery of
-the waveform by the sample function, removal of small spikes, local peaks, and their prominence, of
-which the largest is the echo. Everything else here is a reconstruction::
+& Laser Technology 192, 113866. Only the abstract was available. It names the steps: recovery of the
+waveform with the sample function, removal of small spikes, local peaks and their prominences, the
+largest of which is the echo. Everything else is a reconstruction::
 
     y_k = Σ_j n_{k+j} sinc(j / w) cos²(π j / 26) / Σ_j …     j from -12 to 12, w = 2 bins
     x_k = median(y_{k-1}, y_k, y_{k+1})
     score_k = x_k - max(lowest on the left, lowest on the right)     where x_k is a local peak
 
-"On the left" reaches to the nearest higher sample, or to the gate's beginning, and "on the right"
-likewise: by so much one has to descend before one can climb higher. Beyond its ends the gate goes
-on as it ends, or else its opening would look like an echo. All of it takes 40 ns a pixel and bin.
+"On the left" extends to the nearest higher sample or the beginning of the gate, and "on the right"
+likewise. Beyond its ends the histogram is continued with its end values, since otherwise the
+opening of the gate would look like an echo. All steps together take 40 ns per pixel and bin.
 """
 
 from __future__ import annotations
@@ -26,41 +26,32 @@ from core.acquisition import Floats
 from core.estimators.base import Estimator
 from core.inference.likelihood import Conditions
 from core.kernels.parallel import COMPILED
-from core.parameters import Number, check_fields, parameter
+from core.parameters import Number, Settings, parameter
 
 HALF_TAPS = 12
-"""Bins on either side that the sample function looks at."""
+"""Bins on either side in the sample function."""
 
 
 @dataclass(frozen=True)
-class ShiParameters:
-    """Settings of the sample function.
-
-    Raises
-    ------
-    ValueError
-        If a value lies outside its bounds.
-    """
+class ShiParameters(Settings):
+    """Settings of the sample function."""
 
     width_bins: float = parameter(
         2.0,
-        Number("w", 1.0, 4.0, unit="bins", least=0.5, most=12.0),
-        "From the sample function's middle to its first zero; wider smooths more.",
+        Number("w", 1.0, 4.0, unit="bins", merge_power=0, least=0.5, most=12.0),
+        "Distance from the centre of the sample function to its first zero; wider smooths more.",
     )
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 def sample_function(width_bins: float) -> Floats:
-    """A sinc under a Hann window, of sum 1; shape (2 * HALF_TAPS + 1,)."""
+    """Sinc with a Hann window, of sum 1; shape (2 * HALF_TAPS + 1,)."""
     j = np.arange(-HALF_TAPS, HALF_TAPS + 1)
     taps = np.sinc(j / width_bins) * np.cos(np.pi * j / (2 * HALF_TAPS + 2)) ** 2
     return np.asarray(taps / taps.sum())
 
 
 def median_of_three(values: Floats) -> Floats:
-    """Each bin's median with its two neighbours, the end bins standing beside themselves."""
+    """Median of each bin and its two neighbours; end bins are repeated."""
     left = np.concatenate([values[..., :1], values[..., :-1]], axis=-1)
     right = np.concatenate([values[..., 1:], values[..., -1:]], axis=-1)
     low, high = np.minimum(left, right), np.maximum(left, right)
@@ -68,10 +59,10 @@ def median_of_three(values: Floats) -> Floats:
 
 
 def prominences(values: Floats) -> Floats:
-    """Prominence of every local peak, at its middle bin; 0 everywhere else.
+    """Prominence of every local peak, at its middle bin, and 0 elsewhere.
 
-    Local peaks are what `scipy.signal.find_peaks` takes for them: a bin, or several of the same
-    value, between two lower ones.
+    Local peaks are those of `scipy.signal.find_peaks`: a bin, or several of the same value, between
+    two lower ones.
 
     Parameters
     ----------
@@ -89,10 +80,10 @@ def prominences(values: Floats) -> Floats:
 
 @njit(**COMPILED)
 def _fill_lowest(row, step, stack, lowest):  # type: ignore[no-untyped-def]
-    """Lowest value from each bin back to the nearest higher one, walking up (1) or down (-1).
+    """Fill the lowest value from each bin back to the nearest higher one; `step` is 1 or -1.
 
-    The stack holds the bins that are still higher than all bins since, each with the lowest value
-    between it and the one below it: every bin is put there and taken away once.
+    The stack holds bins that are higher than all later ones, each with the lowest value between it
+    and the one below it on the stack, so that every bin is pushed and popped once.
     """
     n_bins = row.size
     height = 0
@@ -127,7 +118,7 @@ def _fill_prominences(rows, found):  # type: ignore[no-untyped-def]
 
 
 def _curve(histogram: Floats, conditions: Conditions, parameters: ShiParameters) -> Floats:
-    """Prominence of the recovered waveform's local peaks; see the module's docstring."""
+    """Prominence of the local peaks of the waveform; see the module's docstring."""
     taps = sample_function(parameters.width_bins)
     waveform = scipy.ndimage.correlate1d(histogram, taps, axis=-1, mode="nearest")
     return prominences(median_of_three(waveform))

@@ -1,4 +1,4 @@
-"""The paper's estimator: the dual-scale tracking differentiator of `core.tracking`."""
+"""The paper's estimator, the dual-scale tracking differentiator of `core.tracking`."""
 
 from __future__ import annotations
 

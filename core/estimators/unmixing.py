@@ -1,41 +1,40 @@
 """Unmixing of signal and noise with superpixels, after Rapp & Goyal 2017.
 
 Rapp & Goyal, "A few photons among many: unmixing signal and noise for photon-efficient active
-imaging", IEEE Transactions on Computational Imaging 3, 445. Rebuilt from public descriptions, for
-binned first photons, in five steps.
+imaging", IEEE Transactions on Computational Imaging 3, 445. Reconstructed from public descriptions,
+for binned first photons, in five steps.
 
-**Time.** The rule for clusters wants noise that is uniform in time, and that of a first-photon
-detector is not. Time is therefore counted as noise sees it: bin i lasts ``e_i = b A_i``, background
-times pulses still armed, and noise is uniform in ``u_k = Σ_{i<k} e_i / Σ_i e_i``. Where there is
-noise alone this is the map ``(1 - exp(-b t)) / (1 - exp(-b T))``; behind an echo, where fewer
-pulses are armed than that says, it stays right.
+**Time.** The cluster rule assumes noise that is uniform in time, which that of a first-photon
+detector is not. Bin i is therefore given the length ``e_i = b A_i``, background times armed pulses,
+so that noise is uniform in ``u_k = Σ_{i<k} e_i / Σ_i e_i``. For noise alone this is the map
+``(1 - exp(-b t)) / (1 - exp(-b T))``; it also holds after an echo, where fewer pulses are armed.
 
-**Clusters.** A window of ``2 T_pulse`` is moved along the gate, T_pulse being half the time in
-which the middle 68 % of an echo arrive (the standard deviation of a Gaussian one). With c of the n
-triggers in a window that is p long in u, and ``q = c / n``, its score is the signed root ::
+**Clusters.** A window of ``2 T_pulse`` is moved along the gate. T_pulse is half the time in which
+the middle 68 % of an echo arrive (the standard deviation of a Gaussian pulse). With c of the n
+triggers in a window of length p in u, and ``q = c / n``, its score is the signed root ::
 
     ± sqrt( 2 n [ q ln(q / p) + (1 - q) ln((1 - q) / (1 - p)) ] )
 
-of the likelihood ratio to noise, close to a standard normal number where there is noise alone. The
-window with the largest is the cluster. It is kept if it is so large that noise would make one like
-it, in any of the N windows, with probability below τ_FA: ``N P(Binomial(n, p) >= c) < τ_FA``.
+of the likelihood ratio to noise, nearly standard normal for noise alone. The window with the
+largest score is the cluster. It is kept if the probability that noise forms one like it in any of
+the N windows is below τ_FA: ``N P(Binomial(n, p) >= c) < τ_FA``.
 
-**Superpixels.** A pixel without a cluster takes in its neighbours, 3 x 3, 5 x 5 and so on, until
-there is one. A pixel that finds none in the largest superpixel has no target.
+**Superpixels.** A pixel without a cluster is pooled with its neighbours, 3 x 3, 5 x 5 and so on,
+until there is one. A pixel without a cluster in the largest superpixel has no target.
 
-**Range.** Within the window's surroundings the echo's delay is that of the best matched filter, the
-noise taken away.
+**Range.** The delay is that of the best matched filter around the window, after subtraction of the
+noise.
 
-**Censoring and smoothing.** The rank-ordered mean of the 8 neighbours is the median of their
-clusters' times. An answer further from it than two windows is dropped, unless its cluster is one
-that noise would not make anywhere in the whole image. What remains, y, is smoothed to the z that
-minimises ``Σ w (z - y)² / 2 + β TV(z)`` (Rudin, Osher & Fatemi 1992), w being what each answer is
-known to, ``s² / (c T_pulse²)`` for s of c photons being signal, and 0 where dropped.
+**Censoring and smoothing.** The rank-ordered mean of the 8 neighbours is the median of the times of
+their clusters. An estimate more than two windows away from it is dropped, unless noise would not
+form its cluster anywhere in the image. The remaining estimates y are smoothed to the z that
+minimises ``Σ w (z - y)² / 2 + β TV(z)`` (Rudin, Osher & Fatemi 1992), with the precision w of each,
+``s² / (c T_pulse²)`` for s signal photons of c, and 0 where dropped.
 
-Not taken over: the original forms superpixels of neighbours of similar reflectivity only, whose
-estimate needs another regularised image. Surfaces before an empty sky gain a rim of up to a
-superpixel's reach here; its confidence is low. All of it takes about 200 ns a pixel and bin at an
-SBR of 0.05, where three pixels in four want superpixels.
+Not included: the original forms superpixels only of neighbours of similar reflectivity, whose
+estimate needs another regularised image. Here, surfaces in front of an empty sky gain a rim of up
+to half a superpixel, with low confidence. Everything together takes about 200 ns per pixel and bin
+at an SBR of 0.05, where three of four pixels need superpixels.
 """
 
 from __future__ import annotations
@@ -55,55 +54,46 @@ from core.estimators.filters import echo_shape
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions, rate_and_n_armed
 from core.inference.neighbours import box_sum, neighbours, patches, weighted_median, widened
-from core.parameters import Number, check_fields, parameter
+from core.parameters import Number, Settings, parameter
 
 _LAGS = 65  # delays tried around a window
 _STEPS = 100  # of the smoothing
-_AT_ONCE = 2**20  # counts treated together: temporaries of a whole cube may not fit
+NUMBERS_AT_ONCE = 2**20  # counts processed together, which bounds temporaries
 
 
 @dataclass(frozen=True)
-class UnmixingParameters:
-    """Settings of the unmixing.
-
-    Raises
-    ------
-    ValueError
-        If a value lies outside its bounds.
-    """
+class UnmixingParameters(Settings):
+    """Settings of the unmixing."""
 
     false_acceptance: float = parameter(
         0.01,
         Number("τ_FA", 1e-4, 0.5, log=True, least=1e-12, most=1.0),
-        "Probability that noise alone makes a cluster which is kept.",
+        "Probability that noise alone forms a cluster that is kept.",
     )
     growth: int = parameter(
         2,
         Number("Growth", 0, 5, whole=True, unit="pixels", least=0, most=16),
-        "How far a superpixel may reach from its middle; 2 means 5 × 5 pixels.",
+        "Largest half-width of a superpixel; 2 means 5 × 5 pixels.",
     )
     smoothness: float = parameter(
         1.0,
         Number("β", 0.01, 10.0, log=True, unit="1/bin", least=0.0, most=1e6),
-        "Weight of the total variation: large values smooth, 0 leaves answers as they are.",
+        "Weight of the total variation: large values smooth, 0 does not.",
     )
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 def spread_bins(pulse: Pulse, acquisition: Acquisition) -> float:
-    """``T_pulse`` in bins: half the time in which the middle 68 % of an echo arrive."""
+    """Return ``T_pulse`` in bins: half the time in which the middle 68 % of an echo arrive."""
     return 0.5 * (pulse.quantile_s(0.84) - pulse.quantile_s(0.16)) / acquisition.bin_width_s
 
 
 def window_bins(pulse: Pulse, acquisition: Acquisition) -> int:
-    """``2 T_pulse`` in whole bins, at least one and at most the gate."""
+    """Return ``2 T_pulse`` in whole bins, at least one and at most the gate."""
     return min(max(1, math.ceil(2 * spread_bins(pulse, acquisition))), acquisition.n_bins)
 
 
 def window_sums(values: Floats, window: int) -> Floats:
-    """Sum over the window that begins at each bin, cut off at the gate's end; shape (..., bin)."""
+    """Sum over the window that begins at each bin, clipped to the gate; shape (..., bin)."""
     until = np.cumsum(values, axis=-1)
     before = until - values
     full = max(values.shape[-1] - window + 1, 0)
@@ -113,24 +103,24 @@ def window_sums(values: Floats, window: int) -> Floats:
 
 
 def exposures(histogram: Floats, background: Floats, n_pulses: int | None) -> Floats:
-    """How long each bin lasts as noise sees it, ``e_i = b A_i``; shape (..., bin)."""
+    """Length of each bin in which noise is uniform, ``e_i = b A_i``; shape (..., bin)."""
     _, armed = rate_and_n_armed(histogram, n_pulses)
     return np.asarray(np.asarray(background)[..., np.newaxis] * armed)
 
 
 class _Windows(NamedTuple):
-    """What the window that begins at each bin holds, each of shape (..., bin)."""
+    """Content of the window that begins at each bin, each of shape (..., bin)."""
 
     inside: Floats
     """Triggers, c."""
     length: Floats
-    """Length in the time that noise sees, p."""
+    """Length in which noise is uniform, p."""
     score: Floats
     """Signed root of the likelihood ratio to noise."""
 
 
 def scan(counts: Floats, exposure: Floats, window: int) -> _Windows:
-    """Compare every window with what lies outside of it.
+    """Compare every window with the rest of the gate.
 
     Parameters
     ----------
@@ -140,64 +130,66 @@ def scan(counts: Floats, exposure: Floats, window: int) -> _Windows:
     """
     inside, total = window_sums(counts, window), counts.sum(axis=-1, keepdims=True)
     lasts = window_sums(exposure, window) / exposure.sum(axis=-1, keepdims=True)
-    length = np.clip(lasts, 0.0, 1.0)  # sums round
-    share = np.where(total > 0, inside / np.maximum(total, 1.0), length)  # none: as noise has it
+    length = np.clip(lasts, 0.0, 1.0)  # rounding
+    share = np.where(total > 0, inside / np.maximum(total, 1.0), length)  # empty: as noise
     rel_entr = scipy.special.rel_entr
     ratio = total * (rel_entr(share, length) + rel_entr(1 - share, 1 - length))
     score = np.copysign(np.sqrt(2 * np.maximum(ratio, 0.0)), share - length)
     return _Windows(inside, length, score)
 
 
-class _Ruler(NamedTuple):
-    """An echo as the windows meet it."""
+class _Templates(NamedTuple):
+    """Echoes at several delays relative to a window."""
 
     window: int
     """Bins."""
     spread: float
     """``T_pulse`` in bins."""
     lags: Floats
-    """Delays tried, in bins from that at which the echo fills the window best."""
+    """Tried delays, in bins from the one at which the window holds most of the echo."""
     offset: int
-    """Bins from that delay to the window's first bin."""
+    """Bins from that delay to the first bin of the window."""
     first: int
-    """Bins from the window's first bin to the first one of its surroundings."""
-    templates: Floats
-    """The echo at each lag in the surroundings, each of norm 1; shape (lag, bin)."""
+    """Bins from the first bin of the window to that of the templates."""
+    shapes: Floats
+    """Echo at each lag, of norm 1; shape (lag, bin)."""
 
 
-def _ruler(capture: Capture, flux: FluxModel) -> _Ruler:
+def _echo_templates(capture: Capture, flux: FluxModel) -> _Templates:
     pulse, acquisition = capture.pulse, capture.acquisition
     echo, begin = echo_shape(conditions_of(capture, flux))
     window = window_bins(pulse, acquisition)
     fullest = int(np.argmax(window_sums(echo, window)))
     lags = np.linspace(-window, window, _LAGS)
-    # From where the earliest echo begins to where the latest one ends.
+    # From the beginning of the earliest echo to the end of the latest.
     first, n_bins = -fullest - window, echo.size + 2 * window + 1
-    templates = pulse.bin_probability(lags - begin + window, n_bins, acquisition.bin_width_s)
-    norm = np.linalg.norm(templates, axis=1, keepdims=True)
-    templates /= np.maximum(norm, np.finfo(float).tiny)  # 0 where an echo begins after the gate
+    shapes = pulse.bin_probability(lags - begin + window, n_bins, acquisition.bin_width_s)
+    norm = np.linalg.norm(shapes, axis=1, keepdims=True)
+    shapes /= np.maximum(norm, np.finfo(float).tiny)  # 0 if an echo begins after the gate
     spread = spread_bins(pulse, acquisition)
-    return _Ruler(window, spread, lags, begin + fullest, first, templates)
+    return _Templates(window, spread, lags, begin + fullest, first, shapes)
 
 
 class Clusters(NamedTuple):
-    """The cluster of each pixel, each of shape (row, col)."""
+    """Cluster of each pixel, each of shape (row, col)."""
 
     delay: Floats
-    """Of the surface, in bins; NaN where there is no cluster."""
+    """Delay of the surface in bins; NaN without a cluster."""
     score: Floats
-    """That of the window; 0 where there is none."""
+    """Score of the window; 0 without a cluster."""
     chance: Floats
-    """Bound on the probability that noise makes one like it."""
+    """Bound on the probability that noise forms one like it."""
     size: Floats
     """Triggers in it, per pixel."""
     precision: Floats
-    """One over the delay's variance in bins², per pixel; 0 where there is none."""
+    """Reciprocal variance of the delay in 1/bin², per pixel; 0 without a cluster."""
 
 
-def _clusters(counts: Floats, exposure: Floats, ruler: _Ruler, false_acceptance: float) -> Clusters:
-    """The clusters of histograms (pixel, bin), each of shape (pixel,)."""
-    windows = scan(counts, exposure, ruler.window)
+def _clusters(
+    counts: Floats, exposure: Floats, templates: _Templates, false_acceptance: float
+) -> Clusters:
+    """Find the clusters of histograms (pixel, bin), each of shape (pixel,)."""
+    windows = scan(counts, exposure, templates.window)
     start = windows.score.argmax(axis=1)[:, np.newaxis]
     size, length, score = (np.take_along_axis(x, start, axis=1)[:, 0] for x in windows)
     total, whole = counts.sum(axis=1), exposure.sum(axis=1)
@@ -205,95 +197,100 @@ def _clusters(counts: Floats, exposure: Floats, ruler: _Ruler, false_acceptance:
     kept = chance < false_acceptance
 
     noise = _ratio(total - size, (1 - length) * whole)
-    delay = start[:, 0] + _delays(counts, exposure, start, noise, ruler)
+    delay = start[:, 0] + _delays(counts, exposure, start, noise, templates)
     signal = np.maximum(size - noise * length * whole, 0.0)
     return Clusters(
         np.where(kept, delay, np.nan),
         np.where(kept, score, 0.0),
         chance,
         size,
-        np.where(kept, _ratio(signal**2, size) / ruler.spread**2, 0.0),
+        np.where(kept, _ratio(signal**2, size) / templates.spread**2, 0.0),
     )
 
 
 def binomial_from(least: Floats, trials: Floats, chance: Floats) -> Floats:
-    """Probability of `least` or more successes, all of them whole numbers."""
+    """Probability of `least` or more successes; all arguments are whole numbers."""
     betainc = scipy.special.betainc
     tail = betainc(np.maximum(least, 1.0), trials - least + 1, np.clip(chance, 0.0, 1.0))
     return np.where(least > 0, tail, 1.0)
 
 
 def _delays(
-    counts: Floats, exposure: Floats, start: NDArray[np.intp], noise: Floats, ruler: _Ruler
+    counts: Floats,
+    exposure: Floats,
+    start: NDArray[np.intp],
+    noise: Floats,
+    templates: _Templates,
 ) -> Floats:
-    """Delay of the best matched filter, in bins from the window's start; shape (pixel,)."""
+    """Delay of the best matched filter, in bins from the window, shape (pixel,)."""
     n_bins = counts.shape[1]
-    around = start + ruler.first + np.arange(ruler.templates.shape[1])
+    around = start + templates.first + np.arange(templates.shapes.shape[1])
     within, around = (around >= 0) & (around < n_bins), np.clip(around, 0, n_bins - 1)
     expected = noise[:, np.newaxis] * np.take_along_axis(exposure, around, axis=1)
     excess = np.where(within, np.take_along_axis(counts, around, axis=1) - expected, 0.0)
-    # Not a BLAS product, whose order of summation depends on the processor.
-    match = np.einsum("pk,lk->pl", excess, ruler.templates)
-    return np.asarray(ruler.lags[match.argmax(axis=1)] - ruler.offset)
+    # A BLAS product would round differently on other processors.
+    match = np.einsum("pk,lk->pl", excess, templates.shapes)
+    return np.asarray(templates.lags[match.argmax(axis=1)] - templates.offset)
 
 
 def _ratio(numerator: Floats, denominator: Floats) -> Floats:
-    """0 where there is nothing to divide by."""
+    """Divide; 0 where the denominator is not positive."""
     nothing = np.zeros_like(numerator)
     return np.divide(numerator, denominator, out=nothing, where=denominator > 0)
 
 
 def find_clusters(capture: Capture, flux: FluxModel, parameters: UnmixingParameters) -> Clusters:
-    """The cluster of each pixel's smallest superpixel that has one."""
+    """Find the cluster of the smallest superpixel of each pixel that has one."""
     found = np.zeros((len(Clusters._fields), *capture.shape))
     found[0] = np.nan
-    ruler, background, growth = _ruler(capture, flux), flux.typical_background, parameters.growth
+    templates, growth = _echo_templates(capture, flux), parameters.growth
+    background = flux.typical_background
     rows, cols, n_bins = capture.cube.shape
-    for here in patches((rows, cols, n_bins + _LAGS), _AT_ONCE):
-        around, inner = widened(here, growth)  # with the pixels that superpixels reach
+    for here in patches((rows, cols, n_bins + _LAGS), NUMBERS_AT_ONCE):
+        around, inner = widened(here, growth)  # with a margin for superpixels
         counts = capture.cube[around].astype(float)
         exposure = exposures(counts, background[around], capture.gated_pulses)
-        for reach in range(1, 2 * growth + 2, 2):
-            waiting = np.isnan(found[0][here]) & (capture.counts[here] > 0)
-            if waiting.any():
-                seen, lasts = (
-                    box_sum(x, reach, "constant")[inner][waiting] for x in (counts, exposure)
+        for size in range(1, 2 * growth + 2, 2):
+            open_pixels = np.isnan(found[0][here]) & (capture.counts[here] > 0)
+            if open_pixels.any():
+                pooled, lasts = (
+                    box_sum(x, size, "constant")[inner][open_pixels] for x in (counts, exposure)
                 )
-                of = _clusters(seen, lasts, ruler, parameters.false_acceptance)
-                # A superpixel's answer weighs no more for being shared.
-                of = of._replace(size=of.size / reach**2, precision=of.precision / reach**2)
-                found[:, *here][:, waiting] = of
+                of = _clusters(pooled, lasts, templates, parameters.false_acceptance)
+                # Per pixel: the estimate of a superpixel is repeated in each of its pixels.
+                of = of._replace(size=of.size / size**2, precision=of.precision / size**2)
+                found[:, *here][:, open_pixels] = of
     return Clusters(*found)
 
 
 def censored(clusters: Clusters, window: int, false_acceptance: float) -> NDArray[np.bool_]:
-    """Where a cluster is far from the neighbours' and not beyond doubt; shape (row, col)."""
+    """Find clusters far from those of the neighbours and not significant; shape (row, col)."""
     around, weight = neighbours(clusters.delay, np.nan), neighbours(clusters.size, 0.0)
     rank_ordered = weighted_median(around, np.where(np.isfinite(around), weight, 0.0))
     doubtful = clusters.chance * clusters.chance.size >= false_acceptance
-    # A NaN, that of a pixel without neighbours, censors nothing.
+    # The comparison is False for NaN, a pixel without neighbours.
     return (np.abs(clusters.delay - rank_ordered) > 2 * window) & doubtful
 
 
 def smoothed(values: Floats, precision: Floats, smoothness: float) -> Floats:
-    """The z that minimises ``Σ w (z - y)² / 2 + β TV(z)``, by Chambolle & Pock's 2011 iteration.
+    """Minimise ``Σ w (z - y)² / 2 + β TV(z)`` over z (iteration of Chambolle & Pock 2011).
 
     The total variation is isotropic, ``Σ |∇z|`` with differences to the next row and column.
 
     Parameters
     ----------
     values : ndarray, shape (row, col)
-        y, in bins; finite, also where not known.
+        y in bins, finite everywhere.
     precision : ndarray, shape (row, col)
-        w, in 1/bin²; 0 where y is not known.
+        w in 1/bin²; 0 where y is unknown.
     smoothness : float
-        β, in 1/bin.
+        β in 1/bin.
     """
     if smoothness == 0:
         return values
     z, ahead = values.copy(), values.copy()
     flow = np.zeros((2, *values.shape))
-    step = 1 / math.sqrt(8)  # the gradient's norm is below sqrt(8)
+    step = 1 / math.sqrt(8)  # the norm of the gradient is below sqrt(8)
     for _ in range(_STEPS):
         flow[0, :-1] += step * np.diff(ahead, axis=0)
         flow[1, :, :-1] += step * np.diff(ahead, axis=1)
@@ -310,7 +307,7 @@ def smoothed(values: Floats, precision: Floats, smoothness: float) -> Floats:
 def _locate(
     capture: Capture, flux: FluxModel, parameters: UnmixingParameters
 ) -> tuple[Floats, Floats]:
-    """Smoothed delays, and the score of each pixel's cluster."""
+    """Return smoothed delays and the score of each pixel's cluster."""
     clusters = find_clusters(capture, flux, parameters)
     window = window_bins(capture.pulse, capture.acquisition)
     dropped = censored(clusters, window, parameters.false_acceptance)
@@ -325,7 +322,7 @@ def _locate(
 
 
 def _curve(histogram: Floats, conditions: Conditions, parameters: UnmixingParameters) -> Floats:
-    """Score of the window that begins at each bin, for the pixel alone."""
+    """Return the score of the window that begins at each bin, for a single pixel."""
     exposure = exposures(histogram, conditions.background, conditions.n_pulses)
     window = window_bins(conditions.pulse, conditions.acquisition)
     return scan(histogram, exposure, window).score

@@ -1,4 +1,4 @@
-"""Inference from photon counts: signal and background flux, posterior, and physical limits."""
+"""Inference from photon counts: signal and background fluxes, posterior, physical limits."""
 
 from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_prior_of
 from core.inference.flux_model import FluxModel, FluxPrior

@@ -1,9 +1,8 @@
 """Estimation of signal levels and background from the pixels of a capture.
 
-The distribution of signal levels is estimated from a sample of the pixels (nonparametric maximum
-likelihood of a mixing distribution, Kiefer & Wolfowitz 1956, on a grid of levels that includes "no
-echo"), and so is the distribution of delays. The background of a pixel is what a signal level
-leaves of its total rate.
+The distributions of signal levels and of delays are estimated from a sample of the pixels
+(nonparametric maximum likelihood of a mixing distribution, Kiefer & Wolfowitz 1956, on a grid of
+levels that includes "no echo"). The background of a pixel is its total rate minus the signal level.
 """
 
 from __future__ import annotations
@@ -30,30 +29,28 @@ from core.inference.resolution import FEW, Difference, difference, pile_up
 from core.kernels.posterior import learn_shares, learn_shares_and_depths
 from core.trigger import rate_per_bin, trigger_probability
 
-_AT_ONCE = 2**19  # numbers: what is made of them should find them in the cache
-LEVELS = 12  # of signal, besides none
-SAMPLE = 512  # pixels from which the light is estimated
-_SPREAD = 200.0  # the strongest level over the faintest
-_MISSED = 2.0  # log likelihood that faint levels must be worth to be kept
-_TOO_FEW = 3  # unfired pulses, of which the logarithm is chance
+_AT_ONCE = 2**19  # numbers that fit in the cache
+LEVELS = 12  # of signal, without "no echo"
+SAMPLE = 512  # pixels from which the fluxes are estimated
+LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
+_LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
+_TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _RARE = 1e-3  # levels with a smaller share are left out
 
 
 @cached_per_capture
 def flux_model_of(capture: Capture) -> FluxModel:
-    """Signal levels, their shares, and each pixel's background, as the capture itself tells."""
+    """Estimate signal levels, their shares, and the background of each pixel of a capture."""
     return flux_prior_of(capture).model(_totals(capture)[0], _least_background(capture))
 
 
 @cached_per_capture
 def flux_prior_of(capture: Capture) -> FluxPrior:
-    """What a capture tells of the light that its pixels see, in the cheapest model that will do.
+    """Estimate the flux parameters that the pixels share, in the simplest sufficient model.
 
-    Pile-up that the pulses hide is taken for none (`core.inference.resolution`). The mean of all
-    levels of signal is taken for each of them, where a pixel's pulses do not tell them from it: a
-    pixel that cannot tell its level orders delays by any of them much alike.
-
-    That of `Capture.flux_prior` where it is given.
+    Pile-up that the pulses do not resolve is neglected (`core.inference.resolution`). If the pulses
+    of a pixel do not resolve the signal levels, their mean is used for all: the levels then order
+    delays nearly alike. Returns `Capture.flux_prior` if it is given.
     """
     if capture.flux_prior is not None:
         return capture.flux_prior
@@ -61,26 +58,26 @@ def flux_prior_of(capture: Capture) -> FluxPrior:
     if n_pulses is not None:
         is_hidden = pile_up(capture.counts / n_pulses, n_pulses).is_hidden
         found = found._replace(pile_up=not is_hidden)
-    told = level_differences(found, capture).told
-    return found.with_one_level() if found.share[1:] @ told <= FEW else found
+    is_resolved = level_differences(found, capture).is_resolved
+    return found.with_one_level() if found.share[1:] @ is_resolved <= FEW else found
 
 
 @cached_per_capture
 def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
-    """`flux_prior_of` with every level of signal that the pixels together tell.
+    """Estimate `flux_prior_of` with all signal levels that the pixels together resolve.
 
-    The total of a pixel's rates (Coates 1968) is signal and background together. What a level of
-    signal leaves of it is background, drawn towards the image's mean background as far as its
-    scatter is what chance alone makes (James & Stein 1961, the chance being Greenwood's 1926
-    variance): where all pixels see the same background, all are given the same.
+    The total rate of a pixel (Coates 1968) is signal plus background. The total minus a signal
+    level is shrunk towards the mean background of the image as far as its scatter is explained by
+    chance (James & Stein 1961, with the variance of Greenwood 1926). If all pixels see the same
+    background, all get the same value.
     """
     total, chance = _totals(capture)
     flat = capture.cube.reshape(total.size, -1)
-    # At random: a regular step could miss what stands in columns.
+    # At random, since a regular step could miss columns.
     drawn = np.random.default_rng(0).permutation(total.size)[:SAMPLE]
     pixels, least = np.sort(drawn)[np.newaxis], _least_background(capture)
     levels = _levels(flat[pixels[0]], capture)
-    # While nothing is known, each level is everyone's signal.
+    # Initially each level is the signal of all pixels.
     guess = FluxPrior(
         levels,
         share=np.full(levels.size, 1 / levels.size),
@@ -88,13 +85,13 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
         background=total.mean() - levels[:, np.newaxis, np.newaxis],
         own_weight=_own_weight(total, chance),
     )
-    lit = guess.model(total.ravel()[pixels], least)
-    share = _shares(level_evidence(prepare(capture, flat[pixels], lit, 1)))
+    flux = guess.model(total.ravel()[pixels], least)
+    share = _shares(level_evidence(prepare(capture, flat[pixels], flux, 1)))
     mean = np.asarray(share @ levels)
     variance = float(share @ (levels - mean) ** 2)
     kept = share > _RARE
     kept[0] = True
-    if not kept[1:].any():  # an echo so rare that the sample missed it
+    if not kept[1:].any():  # echoes so rare that the sample has none
         kept[-1], share[-1] = True, _RARE
     found = guess._replace(
         levels=levels[kept],
@@ -102,26 +99,26 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
         background=total.mean() - mean,
         own_weight=_own_weight(total, chance + variance),
     )
-    # Delays take a table of all levels of the sample: in a long gate, of fewer pixels.
+    # Delays need a table of all levels of the sample: fewer pixels in a long gate.
     each = found.share.size * flat.shape[1]
     most = sampled_numbers(found.share.size, flat.shape[1]) // each
     pixels = np.sort(drawn[:most])[np.newaxis]
-    lit = found.model(total.ravel()[pixels], least)
-    prepared = prepare(capture, flat[pixels], lit, 1)
-    share, depth = _shares_and_depths(level_densities(prepared), found.share)
+    flux = found.model(total.ravel()[pixels], least)
+    prepared = prepare(capture, flat[pixels], flux, 1)
+    share, depth = shares_and_depths(level_densities(prepared), found.share)
     found = found._replace(share=share, depth=depth)
     return found._replace(contrast=found.model(total, least).contrast)
 
 
 def total_rates(capture: Capture) -> Floats:
-    """Signal and background of each pixel together, shape (row, col)."""
+    """Estimate the sum of signal and background of each pixel, shape (row, col)."""
     return _totals(capture)[0]
 
 
 def level_likelihoods(
     capture: Capture, pixels: NDArray[np.intp], flux_prior: FluxPrior, steps_per_bin: int
 ) -> Floats:
-    """Log likelihood of each level of signal, delays being as likely as `FluxPrior.depth` says.
+    """Log likelihood of each signal level, with `FluxPrior.depth` as the prior of the delay.
 
     Parameters
     ----------
@@ -130,12 +127,12 @@ def level_likelihoods(
         Flat indices.
     flux_prior : FluxPrior
     steps_per_bin : int
-        Delays tried within each bin.
+        Delays per bin.
 
     Returns
     -------
     ndarray, shape (pixel, level)
-        But for what depends on the counts alone.
+        Without terms that depend only on the counts.
     """
     some, n_bins, n_pulses = pixels[np.newaxis], capture.cube.shape[2], capture.gated_pulses
     flux = flux_prior.model(_totals(capture)[0].ravel()[some], _least_background(capture))
@@ -153,7 +150,7 @@ def level_likelihoods(
 
 
 def level_differences(flux_prior: FluxPrior, capture: Capture) -> Difference:
-    """How far each level of signal lies from their mean, shape (level - 1,).
+    """Compare each signal level with their mean, shape (level - 1,).
 
     For an echo at the beginning of the gate, where most pulses are armed.
     """
@@ -171,16 +168,16 @@ def level_differences(flux_prior: FluxPrior, capture: Capture) -> Difference:
 
 
 def _least_background(capture: Capture) -> float:
-    """Half a count more than nothing: what was never seen may still be there."""
+    """Rate of half a count, the lower bound of a background without detections."""
     return 0.5 / (capture.gated_pulses or 1)
 
 
 def _totals(capture: Capture) -> tuple[Floats, float]:
-    """Each pixel's total rate (row, col), and its variance by chance alone.
+    """Total rate of each pixel (row, col), and the mean variance due to chance.
 
-    Coates' rates add up to ``ln(M / (M - Σ n))`` over the gate, M being the pulses sent, and
-    Greenwood's variances to ``1 / (M - Σ n) - 1 / M``. A logarithm of few is too small on average,
-    by half its variance: over an image that would be taken for background.
+    With M pulses sent, Coates' rates add up to ``ln(M / (M - Σ n))`` over the gate, and Greenwood's
+    variances to ``1 / (M - Σ n) - 1 / M``. The mean of the logarithm is biased by half its
+    variance, which is subtracted.
     """
     n_pulses = capture.gated_pulses
     if n_pulses is None:
@@ -195,12 +192,11 @@ def _totals(capture: Capture) -> tuple[Floats, float]:
 
 
 def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats:
-    """Total rate of the background of pixels (pixel, bin) whose pulses fired, all or nearly all.
+    """Total background rate of pixels (pixel, bin) in which (nearly) all pulses fired.
 
-    The bins behind the last pulse tell nothing; their rate is taken for the median of the others,
-    each counting as often as it has pulses armed: that is the background where it fired the pulses,
-    and next to nothing where an echo did. Without them, light that fires every pulse early in the
-    gate would be an echo there, beyond all doubt.
+    Bins without armed pulses have no rate; theirs is taken as the median of the others, weighted
+    with their armed pulses. That is the background if it fired the pulses, and nearly 0 if an echo
+    did. Without this, flux that fires every pulse early in the gate would be mistaken for an echo.
     """
     median = np.empty(len(pixels))
     for some in _some_rows(pixels):
@@ -210,14 +206,14 @@ def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats
 
 
 def _some_rows(pixels: NDArray[Any]) -> Iterator[slice]:
-    """Pixels (pixel, bin) a few at a time, so that temporaries stay small."""
+    """Yield slices of pixels (pixel, bin), so that temporaries stay small."""
     at_once = max(1, _AT_ONCE // pixels.shape[1])
     for first in range(0, len(pixels), at_once):
         yield slice(first, first + at_once)
 
 
 def _own_weight(total: Floats, unrelated: float) -> float:
-    """Share of the totals' variance that is no chance, `unrelated` being the variance by chance."""
+    """Share of the variance of the totals that exceeds the variance `unrelated` to background."""
     scatter = float(total.var())
     own_weight = max(0.0, 1 - unrelated / scatter) if scatter > 0 else 0.0
     return (
@@ -226,13 +222,13 @@ def _own_weight(total: Floats, unrelated: float) -> float:
 
 
 def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture) -> Floats:
-    """None, and signals up to that of the strongest echoes among pixels (pixel, bin)."""
+    """Signal levels: 0, and a geometric grid up to the strongest echoes of (pixel, bin)."""
     top = _strongest(pixels, capture)
-    return np.concatenate([[0.0], np.geomspace(top / _SPREAD, top, LEVELS)])
+    return np.concatenate([[0.0], np.geomspace(top / LEVEL_SPAN, top, LEVELS)])
 
 
 def _strongest(pixels: NDArray[np.unsignedinteger], capture: Capture) -> float:
-    """Signal of the strongest echoes among pixels (pixel, bin), at least one detection."""
+    """Signal of the strongest echoes of pixels (pixel, bin), at least one detection."""
     n_bins = pixels.shape[1]
     excess, width = np.empty(len(pixels)), min(capture.echo_bins, n_bins)
     for some in _some_rows(pixels):
@@ -244,17 +240,17 @@ def _strongest(pixels: NDArray[np.unsignedinteger], capture: Capture) -> float:
 
 
 def _shares(evidence: Floats) -> Floats:
-    """Shares of the levels that make the evidence (pixel, level; logarithms) most likely.
+    """Estimate the shares of levels from the evidence (pixel, level), in logarithms.
 
-    One pixel more is counted as having no echo: that none was seen is no proof that none occurs.
-    The faintest levels cannot be told from no echo, and sharing pixels out among them is arbitrary:
-    these are counted as having no echo, as long as the likelihood does not miss the others.
+    One additional pixel counts as having no echo, so that its share is never 0. The faintest levels
+    cannot be distinguished from no echo; they are merged with it as long as the likelihood
+    decreases little.
     """
     n_levels = evidence.shape[1]
     likelihood = np.exp(evidence - evidence.max(axis=1, keepdims=True))
     share = np.full(n_levels, 1 / n_levels)
     learn_shares(likelihood, share)
-    least = np.log(likelihood @ share).sum() - _MISSED
+    least = np.log(likelihood @ share).sum() - _LEAST_GAIN
     for faintest in range(1, n_levels - 1):
         simpler = share.copy()
         simpler[0], simpler[faintest] = share[0] + share[faintest], 0.0
@@ -265,12 +261,12 @@ def _shares(evidence: Floats) -> Floats:
     return share
 
 
-def _shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Floats, Floats]:
-    """Shares of the levels and of the delays that make densities (pixel, level, bin) most likely.
+def shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Floats, Floats]:
+    """Estimate shares of levels, and of delays in each bin, from densities (pixel, level, bin).
 
-    The first level, no echo, has the same density at all delays. Few steps, from delays that are
-    all alike and smoothed each time, and a part of the pixels that stays so: pixels are too few to
-    tell a share for each bin.
+    The first level, no echo, has the same density at all delays. There are too few pixels for an
+    independent share of each bin: delays start uniform, take few steps, are smoothed in each, and
+    keep a uniform part.
     """
     n_bins = density.shape[2]
     share, depth = share.copy(), np.full(n_bins, 1 / n_bins)

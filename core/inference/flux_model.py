@@ -1,4 +1,4 @@
-"""Flux of an image: what its pixels share, and the levels that each of them may have seen."""
+"""Fluxes of an image: parameters that its pixels share, and the levels of each pixel."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from core.acquisition import Floats
 
 @dataclass(frozen=True, eq=False)
 class FluxModel:
-    """Flux that each pixel may have seen: levels of signal, and how often each occurs.
+    """Possible fluxes of each pixel: signal levels, and how often each occurs.
 
     Parameters
     ----------
     signal : ndarray, shape (level, row, col)
         Signal photons per pulse; the first level is 0, "no echo".
     background : ndarray, shape (level, row, col)
-        Background photons per pulse over the gate, if the signal is of that level.
+        Background photons per pulse over the gate if the signal has that level.
     share : ndarray, shape (level,)
         Share of the pixels at each level; sums to 1.
     depth : ndarray, shape (bin,)
-        How much more often than in others a surface's delay falls in each bin; 1 on average.
+        Prior density of the delay in each bin, relative to uniform; 1 on average.
     image_contrast : float, optional
-        `contrast` of the image that these pixels are a part of; None where they are all of it.
+        `contrast` of the image that these pixels belong to; None if they are all of it.
     pile_up : bool
-        Whether the pulses show that early photons hide later ones.
+        Whether the pulses resolve that early photons hide later ones.
     """
 
     signal: Floats
@@ -41,7 +41,7 @@ class FluxModel:
 
     @cached_property
     def typical_signal(self) -> Floats:
-        """Mean signal of the pixels that see an echo, shape (row, col)."""
+        """Mean signal of pixels with an echo, shape (row, col)."""
         share = self.share[1:]
         share = share / share.sum() if share.sum() > 0 else np.full(share.size, 1 / share.size)
         return _weighted_sum(share, self.signal[1:])
@@ -53,13 +53,13 @@ class FluxModel:
 
     @property
     def contrast(self) -> float:
-        """Signal over background, both on average over the image."""
+        """Mean signal over mean background of the image."""
         if self.image_contrast is not None:
             return self.image_contrast
         return float(self.typical_signal.mean() / self.typical_background.mean())
 
     def of_pixels(self, pixels: NDArray[np.intp]) -> FluxModel:
-        """The light of some pixels, given as flat indices of shape (row, col)."""
+        """Return the fluxes of some pixels, given as flat indices of shape (row, col)."""
         flat = (len(self.share), -1)
         return FluxModel(
             self.signal.reshape(flat)[:, pixels],
@@ -81,25 +81,25 @@ class FluxPrior(NamedTuple):
     depth: Floats
     """`FluxModel.depth`."""
     background: Floats
-    """Mean background over the image, per level where the signals are not known yet."""
+    """Mean background over the image; per level while the signals are unknown."""
     own_weight: float
-    """Share of a background's deviation from the mean that is no chance."""
+    """Share of a pixel's deviation from the mean background that is not chance."""
     contrast: float | None = None
     """`FluxModel.contrast` of the image."""
     pile_up: bool = True
     """`FluxModel.pile_up`."""
 
     def with_one_level(self) -> FluxPrior:
-        """The same with the mean of all signals for each of them."""
+        """Return the prior with all signal levels replaced by their mean."""
         some = self.share[1:].sum()
         mean = float(self.share[1:] @ self.levels[1:] / some)
         return self._replace(levels=np.array([0.0, mean]), share=np.array([self.share[0], some]))
 
     def model(self, total: Floats, least_background: float) -> FluxModel:
-        """The light of pixels of which the total rates are known, shape (row, col)."""
+        """Return the fluxes of pixels with known total rates, shape (row, col)."""
         shape, levels = (self.levels.size, *total.shape), self.levels[:, np.newaxis, np.newaxis]
         mean = np.broadcast_to(self.background, levels.shape)
-        if self.own_weight == 0:  # the same in all pixels: one number a level
+        if self.own_weight == 0:  # one number per level
             background = np.broadcast_to(np.maximum(mean, least_background), shape)
         else:
             background = np.empty(shape)
@@ -117,7 +117,7 @@ class FluxPrior(NamedTuple):
 
 
 def _weighted_sum(weights: Floats, images: Floats) -> Floats:
-    """``Σ_i weights_i images_i``, added in this order: a BLAS product depends on the processor."""
+    """Compute ``Σ_i weights_i images_i`` in order; a BLAS product depends on the processor."""
     total = np.zeros(images.shape[1:])
     for weight, image in zip(weights, images, strict=True):
         total += weight * image

@@ -1,4 +1,4 @@
-"""Exact first-photon likelihood of an echo's delay and signal level.
+"""Exact first-photon likelihood of the delay and signal level of an echo.
 
 With background ``b`` and signal ``s_k(d) = S p_k(d)`` photons per pulse in bin ``k``, ``n_k``
 detections and ``A_k`` armed pulses, the log likelihood ratio of an echo at delay ``d`` to no echo
@@ -6,12 +6,12 @@ is ::
 
     T(d) = Σ_k [ n_k ln((1 - exp(-b - s_k)) / (1 - exp(-b))) - (A_k - n_k) s_k ]
 
-which is exact for the trigger probabilities of Eq. 1. Where the number of pulses is unknown, or
-where a pulse may fire more than once, counts are Poisson: ``ln(1 + s_k / b)`` and ``-s_k``, with
-photons per pixel instead of per pulse.
+which is exact for the trigger probabilities of Eq. 1. If the number of pulses is unknown, or a
+pulse may fire more than once, counts are Poisson: the terms are ``n_k ln(1 + s_k / b)`` and
+``-s_k``, with photons per pixel instead of per pulse.
 
-`log_likelihood_ratio` is the equation as written. The tables of all pixels, levels and delays are
-computed in float32 by `core.kernels.posterior`, a few blocks of pixels at a time.
+`log_likelihood_ratio` is the equation as written. `core.kernels.posterior` computes the tables of
+all pixels, levels and delays in float32, a few blocks of pixels at a time.
 """
 
 from __future__ import annotations
@@ -29,49 +29,49 @@ from core.kernels.blocks import LANES, lane_counts
 from core.kernels.parallel import entering
 from core.kernels.posterior import fill_blocks
 
-_AT_ONCE = 2**19  # numbers: what is made of them should find them in the cache
-_SAMPLE_NUMBERS = 2**25  # likelihoods of the sample's levels and delays that are held: 128 MiB
-_TABLE_NUMBERS = 2**22  # likelihoods of a block's levels and delays: 16 MiB
-_FEWEST_LANES = 2  # a single lane would be summed pairwise by numpy, which rounds differently
-_FLUX_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
-_DARKEST = 1e-100  # photons: with none at all one count would outweigh every other, without end
+NUMBERS_AT_ONCE = 2**19  # numbers that fit in the cache
+_SAMPLE_NUMBERS = 2**25  # likelihoods of the levels and delays of the sample: 128 MiB
+TABLE_NUMBERS = 2**22  # likelihoods of the levels and delays of a block: 16 MiB
+_FEWEST_LANES = 2  # numpy sums a single lane pairwise, which rounds differently
+FLUX_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
+_LEAST_BACKGROUND = 1e-100  # photons; without any, the likelihood ratio of one count is infinite
 
 
 class Conditions(NamedTuple):
-    """What is known of histograms (..., bin) besides their counts."""
+    """Acquisition and fluxes of histograms (..., bin)."""
 
     acquisition: Acquisition
     pulse: Pulse
     n_pulses: int | None
-    """Pulses sent, where counts are first photons; None where that is not known."""
+    """Pulses sent for first photons; None for all photons and if unknown."""
     signal: Floats
-    """Signal photons per pulse, (...) or scalar; per histogram where `n_pulses` is None."""
+    """Signal photons per pulse, (...) or scalar; per histogram if `n_pulses` is None."""
     background: Floats
     """Background photons per pulse over the gate, likewise."""
     contrast: float
-    """Signal over background, both as they are on average over the image."""
+    """Mean signal over mean background of the image."""
     pile_up: bool = True
     """`FluxModel.pile_up`."""
 
 
 def rate_and_n_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Floats]:
-    """Rate of each bin with the pile-up undone (Coates 1968), and the pulses that tell of it.
+    """Rate of each bin with pile-up corrected (Coates 1968), and its number of armed pulses.
 
     Parameters
     ----------
     histogram : ndarray, shape (..., bin)
         Counts, or expected counts.
     n_pulses : int or None
-        Pulses sent; None where that is not known, or where a pulse fires more than once.
+        Pulses sent; None if unknown, or if a pulse may fire more than once.
 
     Returns
     -------
     rate : ndarray, shape (..., bin)
-        Detections per pulse were the detector always armed. A bin in which every armed pulse fired
-        counts half a pulse less, so that its rate is finite; those behind it count 0. The counts
-        themselves where `n_pulses` is None.
+        Detections per pulse of a detector that is always armed. If all armed pulses fire in a bin,
+        half a pulse less is counted, so that the rate is finite; later bins are 0. The counts
+        themselves if `n_pulses` is None.
     armed : ndarray, shape (..., bin)
-        Pulses armed before each bin; 1 everywhere where `n_pulses` is None.
+        Pulses armed before each bin; 1 everywhere if `n_pulses` is None.
     """
     if n_pulses is None:
         return histogram, np.ones_like(histogram)
@@ -82,7 +82,7 @@ def rate_and_n_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, F
 
 
 def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
-    """``T(d)`` of the module's docstring at each bin's beginning, as written.
+    """Compute ``T(d)`` of the module's docstring at the beginning of each bin, as written.
 
     Parameters
     ----------
@@ -95,9 +95,9 @@ def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
     """
     acquisition, n_pulses = conditions.acquisition, conditions.n_pulses
     n_bins = acquisition.n_bins
-    # An echo at whole bins is one filter: its share in the bin that lies `step` behind the delay.
+    # At whole bins an echo is one filter, of its share in the bin `step` bins after the delay.
     echo = conditions.pulse.bin_probability(n_bins - 1.0, 2 * n_bins - 1, acquisition.bin_width_s)
-    b = np.maximum(conditions.background, _DARKEST)[..., np.newaxis] / n_bins
+    b = np.maximum(conditions.background, _LEAST_BACKGROUND)[..., np.newaxis] / n_bins
     unfired = np.ones_like(histogram)
     if n_pulses is not None:
         unfired = n_pulses - np.cumsum(histogram, axis=-1)
@@ -112,10 +112,10 @@ def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
 
 
 class LikelihoodInput(NamedTuple):
-    """A cube and its light, as the kernels take them."""
+    """A cube and its fluxes, in the layout of the kernels."""
 
     counts: NDArray[np.unsignedinteger]
-    """Shape (block, bin, lane): `LANES` lanes, fewer where a table of all delays would be large."""
+    """Shape (block, bin, lane); fewer than `LANES` lanes if the table of delays is large."""
     signal: Floats
     """Shape (level, block, lane)."""
     background: Floats
@@ -123,20 +123,20 @@ class LikelihoodInput(NamedTuple):
     depth: NDArray[np.float32]
     """`FluxModel.depth`, shape (delay,)."""
     echo: NDArray[np.float32]
-    """Share of an echo's photons per bin, shape (step, tap)."""
+    """Share of the photons of an echo per bin, shape (step, tap)."""
     first_tap: int
-    """Bins from a delay to its echo's first tap."""
+    """Bins from a delay to the first tap of its echo."""
     n_pulses: int
-    """0 where not known."""
+    """0 if unknown."""
     n_pixels: int
     n_counts: int
-    """Number of counts in the whole cube that these pixels are a part of."""
+    """Counts in the cube of the whole image."""
 
 
 def prepare(
     capture: Capture, cube: NDArray[np.unsignedinteger], flux: FluxModel, steps_per_bin: int
 ) -> LikelihoodInput:
-    """Pixels (row, col, bin) and their light, all at once."""
+    """Lay out pixels (row, col, bin) and their fluxes, all at once."""
     lanes = lanes_of(flux.share.size, cube.shape[2] * steps_per_bin)
     flat = cube.reshape(-1, cube.shape[2])
     everyone = _Part(lane_counts(flat, lanes), slice(0, len(flat)), cube.size)
@@ -146,7 +146,7 @@ def prepare(
 def prepared_groups(
     capture: Capture, flux: FluxModel, steps_per_bin: int
 ) -> Iterator[tuple[slice, LikelihoodInput]]:
-    """All pixels of a capture and their light, so many at a time as keep what is laid out small.
+    """Lay out all pixels of a capture and their fluxes in groups that bound the memory.
 
     Yields
     ------
@@ -156,9 +156,9 @@ def prepared_groups(
     """
     n_levels, n_pixels, n_bins = flux.share.size, capture.counts.size, capture.cube.shape[2]
     lanes = lanes_of(n_levels, n_bins * steps_per_bin)
-    at_once = lanes * max(1, _FLUX_NUMBERS // (n_levels * lanes))
+    at_once = lanes * max(1, FLUX_NUMBERS // (n_levels * lanes))
     if lanes < LANES:
-        at_once = lanes * max(1, _TABLE_NUMBERS // (n_bins * lanes))
+        at_once = lanes * max(1, TABLE_NUMBERS // (n_bins * lanes))
     flat = capture.cube.reshape(-1, n_bins)
     for first in range(0, n_pixels, at_once):
         some = slice(first, min(first + at_once, n_pixels))
@@ -171,41 +171,41 @@ def prepared_groups(
 
 
 def sampled_numbers(n_levels: int, n_bins: int) -> int:
-    """Largest table of levels and delays that is held of a sample of the pixels, in numbers."""
+    """Largest table of levels and delays of a sample of the pixels, in numbers."""
     return max(_SAMPLE_NUMBERS, n_levels * n_bins)
 
 
 def lanes_of(n_levels: int, n_delays: int) -> int:
-    """Pixels treated together, so that a table of their levels and delays stays small."""
+    """Pixels processed together, so that a table of their levels and delays stays small."""
     lanes = LANES
-    while lanes > _FEWEST_LANES and n_levels * n_delays * lanes > _TABLE_NUMBERS:
+    while lanes > _FEWEST_LANES and n_levels * n_delays * lanes > TABLE_NUMBERS:
         lanes //= 2
     return lanes
 
 
 def pixels_of(blocks: slice, prepared: LikelihoodInput, pixels: slice) -> slice:
-    """Which of the image's pixels some blocks of a group hold."""
+    """Pixels of the image in some blocks of a group."""
     lanes, first = prepared.counts.shape[2], pixels.start
     return slice(first + blocks.start * lanes, min(first + blocks.stop * lanes, pixels.stop))
 
 
 class _Part(NamedTuple):
-    """Some pixels of an image, laid out."""
+    """Some pixels of an image in the layout of the kernels."""
 
     counts: NDArray[np.unsignedinteger]
-    """As `LikelihoodInput.counts`."""
+    """`LikelihoodInput.counts`."""
     pixels: slice
     """Their flat indices in the image."""
-    of_counts: int
-    """Counts of the whole image."""
+    n_counts: int
+    """Counts in the cube of the whole image."""
 
 
 def _with_echo(
     capture: Capture, part: _Part, flux: FluxModel, steps_per_bin: int
 ) -> LikelihoodInput:
-    """A part of an image with its light, that of the image being given."""
+    """Combine a part of an image with the fluxes of the image."""
     acquisition, lanes = capture.acquisition, part.counts.shape[2]
-    # Delays stand for the step around them, so that whole steps fill the gate and any whole bins.
+    # Delays are the centres of steps, so that steps fill the gate and every bin.
     delay = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
     echo, first = capture.pulse.taps(acquisition.n_bins, acquisition.bin_width_s, delay)
     log_share = np.log(np.maximum(flux.share, np.finfo(float).tiny))
@@ -219,27 +219,27 @@ def _with_echo(
         first,
         capture.gated_pulses or 0,
         part.pixels.stop - part.pixels.start,
-        part.of_counts,
+        part.n_counts,
     )
 
 
 def _in_lanes(image: Floats, pixels: slice, lanes: int) -> Floats:
-    """Some of (level, row, col) as (level, block, lane); the last block repeats its last pixel."""
+    """Lay out (level, row, col) as (level, block, lane), padded with the last pixel."""
     flat = image.reshape(len(image), -1)[:, pixels]
     filled = np.pad(flat, ((0, 0), (0, -flat.shape[1] % lanes)), mode="edge")
     return np.ascontiguousarray(filled.reshape(len(image), -1, lanes))
 
 
 def level_evidence(prepared: LikelihoodInput, depth: NDArray[np.float32] | float = 1.0) -> Floats:
-    """Log likelihood of each level over that of no echo, (pixel, level).
+    """Log likelihood ratio of each level to no echo, (pixel, level).
 
-    How much more often a delay occurs than others is `depth`, of shape (delay, 1).
+    `depth` is the prior density of the delay relative to uniform, of shape (delay, 1).
     """
     n_levels, n_blocks, lanes = prepared.signal.shape
     evidence = np.empty((n_blocks, lanes, n_levels))
-    # Some levels at a time, each with the first one, which the others are compared with.
+    # Some levels at a time, together with the first, to which the others are compared.
     table = prepared.depth.size * lanes
-    at_once = max(1, _TABLE_NUMBERS // table - 1)
+    at_once = max(1, TABLE_NUMBERS // table - 1)
     evidence[..., 0] = 0.0
     for first in range(1, n_levels, at_once):
         levels = [0, *range(first, min(first + at_once, n_levels))]
@@ -259,7 +259,7 @@ def level_evidence(prepared: LikelihoodInput, depth: NDArray[np.float32] | float
 
 
 def level_densities(prepared: LikelihoodInput) -> NDArray[np.float32]:
-    """Likelihood of each level and delay over the pixel's largest; (pixel, level, delay)."""
+    """Likelihood of each level and delay relative to the pixel's maximum (pixel, level, delay)."""
     n_levels, n_blocks, lanes = prepared.signal.shape
     n_copied = n_blocks if n_blocks > 1 else 0
     densities = np.empty((n_copied, lanes, n_levels, prepared.depth.size), np.float32)
@@ -267,7 +267,7 @@ def level_densities(prepared: LikelihoodInput) -> NDArray[np.float32]:
         np.subtract(log, log.max(axis=(1, 2), keepdims=True), out=log)
         density = np.exp(log, out=log).transpose(0, 3, 1, 2)
         if n_blocks == 1:
-            densities = density  # as it lies: a copy would take as much again
+            densities = density  # a view: a copy would double the memory
         else:
             densities[some] = density
     return densities.reshape(-1, *densities.shape[2:])[: prepared.n_pixels]
@@ -276,7 +276,7 @@ def level_densities(prepared: LikelihoodInput) -> NDArray[np.float32]:
 def delay_densities(
     prepared: LikelihoodInput,
 ) -> Iterator[tuple[slice, NDArray[np.float32], Floats, NDArray[np.float32]]]:
-    """Likelihood of each delay over that of no echo, all levels of signal weighted.
+    """Likelihood ratio of each delay to no echo, averaged over the signal levels.
 
     Yields
     ------
@@ -285,7 +285,7 @@ def delay_densities(
         In units of ``exp(top)``.
     top : ndarray, shape (block, lane)
     weighted : ndarray, shape (block, level, delay, lane)
-        Logarithms that the density is made of, level by level, `FluxModel.depth` left out.
+        Logarithm of the contribution of each level, without `FluxModel.depth`.
     """
     weight = prepared.log_share[1:, np.newaxis, np.newaxis].astype(np.float32)
     for some, log in _log_likelihoods(prepared):
@@ -300,9 +300,9 @@ def delay_densities(
 def delay_curves(
     prepared: LikelihoodInput,
 ) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.float32]]]:
-    """A curve that is highest where the density of `delay_densities` is, and what that is made of.
+    """Yield a curve with the maximum of the density of `delay_densities`, and its contributions.
 
-    Of one level there is nothing to average: its logarithms do, and exponentials are what costs.
+    With one level of signal, the curve is the logarithm, which saves the exponentials.
     """
     if len(prepared.signal) > 2:
         for some, density, _, weighted in delay_densities(prepared):
@@ -315,7 +315,7 @@ def delay_curves(
 
 
 def _log_likelihoods(prepared: LikelihoodInput) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-    """Log likelihood of each level and delay over that of no echo, some blocks at a time.
+    """Log likelihood ratio of each level and delay to no echo, some blocks at a time.
 
     Yields
     ------
@@ -324,7 +324,7 @@ def _log_likelihoods(prepared: LikelihoodInput) -> Iterator[tuple[slice, NDArray
     """
     n_levels, n_blocks, lanes = prepared.signal.shape
     n_delays = prepared.counts.shape[1] * prepared.echo.shape[0]
-    at_once = max(1, _AT_ONCE // (n_levels * n_delays * lanes))
+    at_once = max(1, NUMBERS_AT_ONCE // (n_levels * n_delays * lanes))
     for first in range(0, n_blocks, at_once):
         some = slice(first, min(first + at_once, n_blocks))
         log = np.empty((some.stop - first, n_levels, n_delays, lanes), np.float32)

@@ -1,4 +1,4 @@
-"""What looks at a pixel's neighbours."""
+"""Sums, values and medians of the neighbours of each pixel."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ from core.acquisition import Floats
 
 
 def pooled_at(
-    cube: NDArray[np.unsignedinteger], row: int, col: int, reach: int
+    cube: NDArray[np.unsignedinteger], row: int, col: int, window_size: int
 ) -> NDArray[np.uint64]:
-    """What `pooled` gives one pixel, shape (bin,)."""
-    steps = np.arange(reach) - reach // 2
+    """Return `pooled` for one pixel, shape (bin,)."""
+    steps = np.arange(window_size) - window_size // 2
     rows = np.clip(row + steps, 0, cube.shape[0] - 1)
     cols = np.clip(col + steps, 0, cube.shape[1] - 1)
     return np.asarray(cube[np.ix_(rows, cols)].sum(axis=(0, 1), dtype=np.uint64))
 
 
-def pooled(cube: NDArray[np.unsignedinteger], reach: int) -> NDArray[np.unsignedinteger]:
-    """Each pixel's counts added to those of its neighbours.
+def pooled(cube: NDArray[np.unsignedinteger], window_size: int) -> NDArray[np.unsignedinteger]:
+    """Add the counts of the neighbours to those of each pixel.
 
     Parameters
     ----------
     cube : ndarray, shape (row, col, bin)
-    reach : int
+    window_size : int
         Rows and columns of the neighbourhood, odd.
 
     Returns
     -------
     ndarray, shape (row, col, bin)
-        At the image's edge the outermost pixels stand in for the missing ones, so that every
-        pixel's counts are those of the same number of pulses. As uint32, or as uint64 where that
-        may not hold them.
+        Pixels at the edge of the image are repeated beyond it, so that all sums are of the same
+        number of pulses. As uint32, or uint64 for a uint32 cube.
     """
-    return box_sum(cube.astype(np.uint64 if cube.dtype == np.uint32 else np.uint32), reach, "edge")
+    wide = np.uint64 if cube.dtype == np.uint32 else np.uint32
+    return box_sum(cube.astype(wide), window_size, "edge")
 
 
 def pooled_in(
-    cube: NDArray[np.unsignedinteger], here: tuple[slice, slice], reach: int
+    cube: NDArray[np.unsignedinteger], here: tuple[slice, slice], window_size: int
 ) -> NDArray[np.unsignedinteger]:
-    """Return `pooled` for some rows and columns; the cube itself where `reach` is 1."""
-    if reach == 1:
+    """Return `pooled` for some rows and columns; a view of the cube if `window_size` is 1."""
+    if window_size == 1:
         return cube[here]
-    wide, inner = widened(here, reach // 2)
-    return pooled(cube[wide], reach)[inner]
+    wide, inner = widened(here, window_size // 2)
+    return pooled(cube[wide], window_size)[inner]
 
 
 Patch = tuple[slice, slice]
@@ -56,7 +56,7 @@ Patch = tuple[slice, slice]
 
 
 def widened(here: Patch, margin: int) -> tuple[Patch, Patch]:
-    """Rows and columns with a margin, as far as there is one, and where in them the former lie."""
+    """Return a patch with a margin, clipped to the image, and the position of `here` in it."""
     first = [max(part.start - margin, 0) for part in here]
     wide = [slice(at, part.stop + margin) for at, part in zip(first, here, strict=True)]
     inner = [slice(part.start - at, part.stop - at) for at, part in zip(first, here, strict=True)]
@@ -64,7 +64,7 @@ def widened(here: Patch, margin: int) -> tuple[Patch, Patch]:
 
 
 def patches(shape: tuple[int, ...], most: int) -> Iterator[Patch]:
-    """Cut a cube into parts that hold about `most` counts each, about as high as wide.
+    """Split a cube into nearly square patches of about `most` counts each.
 
     Parameters
     ----------
@@ -80,43 +80,45 @@ def patches(shape: tuple[int, ...], most: int) -> Iterator[Patch]:
             yield slice(row, min(row + high, rows)), slice(col, min(col + wide, cols))
 
 
-def box_sum(image: NDArray[Any], reach: int, beyond: Literal["edge", "constant"]) -> NDArray[Any]:
+def box_sum(
+    image: NDArray[Any], window_size: int, beyond: Literal["edge", "constant"]
+) -> NDArray[Any]:
     """Sum over the neighbourhood of each pixel.
 
     Parameters
     ----------
     image : ndarray, shape (row, col, ...)
-    reach : int
+    window_size : int
         Rows and columns of the neighbourhood, odd.
     beyond : str
-        Beyond the image's edge: its outermost pixels ("edge"), or zeros ("constant").
+        Values beyond the edge of the image: its outermost pixels ("edge") or zeros ("constant").
 
     Returns
     -------
     ndarray, shape (row, col, ...)
         Of the image's type.
     """
-    half = reach // 2
+    half = window_size // 2
     around = [(half, half), (half, half)] + [(0, 0)] * (image.ndim - 2)
     wide = np.pad(image, around, mode=beyond)
     rows, cols = image.shape[:2]
     over_rows = wide[:rows].copy()
-    for i in range(1, reach):
+    for i in range(1, window_size):
         over_rows += wide[i : i + rows]
     over_both = over_rows[:, :cols].copy()
-    for i in range(1, reach):
+    for i in range(1, window_size):
         over_both += over_rows[:, i : i + cols]
     return over_both
 
 
 def neighbours(image: Floats, missing: float) -> Floats:
-    """The values of each pixel's 8 neighbours, shape (8, row, col).
+    """Values of the 8 neighbours of each pixel, shape (8, row, col).
 
     Parameters
     ----------
     image : ndarray, shape (row, col)
     missing : float
-        Stands for a neighbour beyond the image's edge.
+        Value beyond the edge of the image.
     """
     wide = np.pad(image, 1, constant_values=missing)
     rows, cols = image.shape
@@ -130,12 +132,12 @@ def weighted_median(values: Floats, weights: Floats) -> Floats:
     Parameters
     ----------
     values, weights : ndarray, shape (n, ...)
-        Weights are non-negative; that of a NaN must be 0.
+        Weights are non-negative, and 0 for NaN.
 
     Returns
     -------
     ndarray, shape (...)
-        NaN where all values are.
+        NaN where all values are NaN.
     """
     order = np.argsort(values, axis=0)  # NaN last
     until = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)

@@ -1,8 +1,8 @@
-"""Empirical Bayes posterior of each pixel's delay.
+"""Empirical Bayes posterior of the delay of each pixel.
 
 The likelihood (`core.inference.likelihood`) is averaged over the signal levels of
-`core.inference.flux`, and delays are weighted as often as they occur in the capture. The mass
-around an estimate is the probability that it is right, whichever estimator made it.
+`core.inference.flux`, and multiplied by the distribution of delays in the capture. The probability
+mass around an estimate is its confidence, for any estimator.
 """
 
 from __future__ import annotations
@@ -18,35 +18,35 @@ from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import delay_curves, delay_densities, pixels_of, prepared_groups
 
-_AT_ONCE = 2**19  # numbers: what is made of them should find them in the cache
+_AT_ONCE = 2**19  # numbers that fit in the cache
 TOLERANCE_BINS = 3
-"""An answer is right within this many bins: the tolerance that reproduces the paper's tables."""
+"""Tolerance within which an estimate is right; it reproduces the paper's tables."""
 
 
 class Posterior(NamedTuple):
-    """What is known of each pixel's delay once its counts are known."""
+    """Posterior of the delay of each pixel."""
 
     tolerance_probability: NDArray[np.float32]
-    """Probability that there is a surface, and within `TOLERANCE_BINS` of each bin's beginning;
-    shape (row, col, bin)."""
+    """Probability of a surface within `TOLERANCE_BINS` of the beginning of each bin, shape
+    (row, col, bin)."""
     surface: Floats
-    """Probability that there is a surface at all, shape (row, col)."""
+    """Probability of a surface anywhere in the gate, shape (row, col)."""
 
 
 @cached_per_capture
 def posterior_of(capture: Capture) -> Posterior:
-    """Where each pixel's surface may be, in the light of `flux_model_of`."""
+    """Compute the posterior of a capture with the fluxes of `flux_model_of`."""
     n_pixels, n_bins = capture.counts.size, capture.cube.shape[2]
-    near, surface = np.empty((n_pixels, n_bins), np.float32), np.empty(n_pixels)
+    within, surface = np.empty((n_pixels, n_bins), np.float32), np.empty(n_pixels)
     for pixels, prepared in prepared_groups(capture, flux_model_of(capture), 1):
         for some, density, top, _ in delay_densities(prepared):
-            # What lies before each delay, from so many bins before the gate to so many behind it.
+            # Cumulative density, extended by the tolerance on both sides of the gate.
             before = np.zeros((len(top), n_bins + 2 * TOLERANCE_BINS + 1, top.shape[1]), np.float32)
             behind = TOLERANCE_BINS + n_bins
             np.cumsum(density, axis=1, out=before[:, TOLERANCE_BINS + 1 : behind + 1])
             everything = before[:, behind]
             before[:, behind + 1 :] = everything[:, np.newaxis]
-            # In units of the larger of the two, so that neither overflows.
+            # Relative to the larger of the two, so that neither overflows.
             unit = np.maximum(top, prepared.log_share[0])
             seen = np.exp(top - unit) * everything / n_bins
             present = seen / (seen + np.exp(prepared.log_share[0] - unit))
@@ -54,9 +54,9 @@ def posterior_of(capture: Capture) -> Posterior:
             mass *= (present / everything)[:, np.newaxis].astype(np.float32)
             here = pixels_of(some, prepared, pixels)
             size = here.stop - here.start
-            near[here] = mass.transpose(0, 2, 1).reshape(-1, n_bins)[:size]
+            within[here] = mass.transpose(0, 2, 1).reshape(-1, n_bins)[:size]
             surface[here] = present.ravel()[:size]
-    return Posterior(near.reshape(capture.cube.shape), surface.reshape(capture.shape))
+    return Posterior(within.reshape(capture.cube.shape), surface.reshape(capture.shape))
 
 
 def has_posterior(capture: Capture) -> bool:
@@ -65,13 +65,13 @@ def has_posterior(capture: Capture) -> bool:
 
 
 def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
-    """Probability that the surface lies within `TOLERANCE_BINS` of a delay, shape (row, col).
+    """Probability of a surface within `TOLERANCE_BINS` of a delay, shape (row, col).
 
     Parameters
     ----------
     capture : Capture
     bins : ndarray, shape (row, col)
-        Delays in fractional bins, from 0 to n_bins; the probability is 0 where NaN.
+        Delays in fractional bins, from 0 to n_bins; NaN gives 0.
     """
     table, found = posterior_of(capture).tolerance_probability, np.empty(bins.size)
     last = table.shape[2] - 1
@@ -81,7 +81,7 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
         at = np.clip(np.nan_to_num(delay), 0, last)
         below = np.minimum(at.astype(np.intp), max(last - 1, 0))
         above = np.minimum(below + 1, last)
-        # By flat indices: those of `numpy.take_along_axis` cost more than all the rest.
+        # Flat indices: `numpy.take_along_axis` takes longer than everything else.
         first = np.arange(begin, begin + at.size) * table.shape[2]
         low, high = table.take(first + below), table.take(first + above)
         between = low + (at - below) * (high - low)
@@ -90,14 +90,21 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
 
 
 def most_likely(capture: Capture, flux: FluxModel, steps_per_bin: int) -> tuple[Floats, Floats]:
-    """The delay of the largest posterior density.
+    """Find the delay of the largest posterior density.
+
+    Parameters
+    ----------
+    capture : Capture
+    flux : FluxModel
+    steps_per_bin : int
+        Delays tried within each bin.
 
     Returns
     -------
     delay_bin : ndarray, shape (row, col)
-        In fractional bins, refined between the steps by a parabola through the density's logarithm.
+        In fractional bins, refined by a parabola through the logarithm of the density.
     score : ndarray, shape (row, col)
-        Logarithm of its likelihood over that of no echo.
+        Log likelihood ratio to no echo at that delay.
     """
     delay, score = np.empty((2, capture.counts.size))
     for pixels, prepared in prepared_groups(capture, flux, steps_per_bin):
@@ -105,7 +112,7 @@ def most_likely(capture: Capture, flux: FluxModel, steps_per_bin: int) -> tuple[
             at = curve.argmax(axis=1)[:, np.newaxis]
             last = curve.shape[1] - 1
             around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
-            # Not of the density: beside an echo of many photons that is 0, and has no logarithm.
+            # From logarithms, since the density next to a strong echo underflows to 0.
             log = np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float)
             log = np.logaddexp.reduce(log, axis=1) + np.log(prepared.depth[around])
             left, middle, right = log.transpose(1, 0, 2)

@@ -1,20 +1,19 @@
-"""What so many pulses can tell: whether a histogram shows which of two models drew it.
+"""Resolution of models: whether a histogram shows which of two models it was drawn from.
 
-Two distributions of one pulse's outcome, ``P`` and ``Q``, overlap by ``ρ = Σ √(P_k Q_k)``, the bins
-and "no trigger" being the outcomes (Bhattacharyya 1943); those of n pulses overlap by ``ρⁿ``. Their
-own total variation, the most by which the probability of any event can differ, lies between ``1 -
-ρⁿ`` and ``√(1 - ρ²ⁿ)`` (Le Cam 1973; Tsybakov 2009, section 2.4). Where many pulses see a small
-difference the logarithm of the likelihood ratio is normal, and it is ``2 Φ(z) - 1`` with ``z² / 2 =
--n ln ρ``, the evidence. Two thresholds follow.
+Two distributions ``P`` and ``Q`` of the outcome of a pulse (a bin or "no trigger") overlap by ``ρ =
+Σ √(P_k Q_k)`` (Bhattacharyya 1943), those of n pulses by ``ρⁿ``. Their total variation, the largest
+difference in the probability of any event, lies between ``1 - ρⁿ`` and ``√(1 - ρ²ⁿ)`` (Le Cam 1973;
+Tsybakov 2009, section 2.4). For many pulses and a small difference the logarithm of the likelihood
+ratio is normal, and the total variation is ``2 Φ(z) - 1`` with the evidence ``z² / 2 = -n ln ρ``.
+Two thresholds follow.
 
-Told: the best test, that of the likelihood ratio (Neyman & Pearson 1933), takes either model for
-the other with a probability of ``Φ(-z)``, at most `ERROR`. A model that is told is wrong as the
-data show.
+Resolved: the best test, that of the likelihood ratio (Neyman & Pearson 1933), confuses the models
+with a probability of ``Φ(-z)``, at most `ERROR`.
 
-Hidden: no event is more likely by `ERROR` under one than under the other, a right answer of any
-estimator included.
+Hidden: the probability of any event, including that of a right estimate, differs by at most
+`ERROR` between the models.
 
-Between the two a single histogram does not show the difference, but answers may move.
+In between, a single histogram does not show the difference, but estimates may change.
 """
 
 from __future__ import annotations
@@ -29,42 +28,42 @@ from core.acquisition import Floats
 
 ERROR = 0.05
 
-TOLD = NormalDist().inv_cdf(ERROR) ** 2 / 2
-"""Evidence from which a difference is told: 1.35."""
+RESOLVED = NormalDist().inv_cdf(ERROR) ** 2 / 2
+"""Least evidence of a resolved difference, 1.35."""
 
 HIDDEN = NormalDist().inv_cdf((1 + ERROR) / 2) ** 2 / 2
-"""Evidence up to which it is hidden: 0.002."""
+"""Largest evidence of a hidden difference, 0.002."""
 
 FEW = 0.01
-"""What holds in no larger a share of the pixels does not count for an image."""
+"""Share of the pixels that is negligible in an image."""
 
 
 class Difference(NamedTuple):
-    """How far two models lie apart, in one pulse and in all; each of shape (...)."""
+    """Difference of two models, in one pulse and in all; each of shape (...)."""
 
     total_variation: Floats
-    """``½ Σ |P_k - Q_k|``, the largest difference of any event's probability."""
+    """``½ Σ |P_k - Q_k|``, the largest difference in the probability of any event."""
     evidence: Floats
     """``-n ln ρ``."""
 
     @property
-    def told(self) -> NDArray[np.bool_]:
-        """Whether the pulses tell the models apart, shape (...)."""
-        return np.asarray(self.evidence >= TOLD)
+    def is_resolved(self) -> NDArray[np.bool_]:
+        """Whether the pulses resolve the difference, shape (...)."""
+        return np.asarray(self.evidence >= RESOLVED)
 
     @property
     def is_hidden(self) -> bool:
-        """Whether all but a few pixels hide the difference."""
+        """Whether the difference is hidden in all but a negligible share of the pixels."""
         return bool(np.mean(self.evidence > HIDDEN) <= FEW)
 
     @property
     def resolvable(self) -> Floats:
-        """Total variation from which a difference of this shape would be told.
+        """Least total variation of a resolved difference of this shape; NaN for no difference.
 
-        ``-ln ρ`` grows with the square of a small difference. NaN where there is none.
+        ``-ln ρ`` is proportional to the square of a small difference.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self.total_variation * np.sqrt(TOLD / self.evidence))
+            return np.asarray(self.total_variation * np.sqrt(RESOLVED / self.evidence))
 
 
 def difference(one: ArrayLike, other: ArrayLike, n_pulses: int | None) -> Difference:
@@ -73,12 +72,15 @@ def difference(one: ArrayLike, other: ArrayLike, n_pulses: int | None) -> Differ
     Parameters
     ----------
     one, other : array_like, shape (..., bin)
-        Probability that a pulse triggers in each bin; what they lack of 1 is that of no trigger.
-        Where `n_pulses` is None: the photons expected in each bin, whose counts are then Poisson
-        (``½ Σ (√μ - √ν)²`` being their ``-ln ρ``, and a difference's share of all photons its total
-        variation).
+        Probability that a pulse triggers in each bin; the remainder to 1 is that of no trigger. If
+        `n_pulses` is None: expected photons in each bin of Poisson counts, with ``½ Σ (√μ - √ν)²``
+        as ``-ln ρ`` and the differing share of all photons as total variation.
     n_pulses : int or None
         Pulses sent.
+
+    Returns
+    -------
+    Difference
     """
     p, q = np.asarray(one, float), np.asarray(other, float)
     if n_pulses is None:
@@ -90,21 +92,25 @@ def difference(one: ArrayLike, other: ArrayLike, n_pulses: int | None) -> Differ
 
 
 def pile_up(fired: ArrayLike, n_pulses: int) -> Difference:
-    """What early photons do by hiding later ones, against the same triggers spread as photons are.
+    """Compare triggers with pile-up to as many triggers distributed as the photons.
 
-    On the axis ``u`` of expected photons ``Λ u`` before each moment, triggers have the density
-    ``Λ exp(-Λ u)``; without pile-up it were even. Whatever the light's course in time, the two lie
-    as far apart as here, and bins can only bring them closer: ``Λ² / 8`` and, in one pulse,
-    ``-ln ρ = Λ³ / 96`` where ``Λ`` is small.
+    With ``Λ u`` expected photons before a time, triggers have the density ``Λ exp(-Λ u)`` in u, and
+    without pile-up a uniform one. The difference does not depend on the temporal shape of the flux,
+    and binning can only reduce it. For small ``Λ`` it is ``Λ² / 8`` and, in one pulse, ``-ln ρ =
+    Λ³ / 96``.
 
     Parameters
     ----------
     fired : array_like, shape (...)
         Share of the pulses that fire, ``1 - exp(-Λ)``.
     n_pulses : int
+
+    Returns
+    -------
+    Difference
     """
     photons = np.asarray(-np.log1p(-np.clip(np.asarray(fired, float), 0.0, 1 - 1e-12)))
-    small = photons < 0.01  # where differences of nearly equal numbers would be left
+    small = photons < 0.01  # avoids cancellation
     safe = np.where(small, 1.0, photons)
     share = -np.expm1(-safe)
     crossing = -np.log(share / safe) / safe
@@ -120,12 +126,12 @@ def _with_none(probability: Floats) -> Floats:
 
 
 def _squares(p: Floats, q: Floats) -> Floats:
-    """``1 - Σ √(P Q)`` of distributions, which itself would be lost in rounding."""
+    """Compute ``1 - Σ √(P Q)`` of distributions without cancellation."""
     return np.asarray(((np.sqrt(p) - np.sqrt(q)) ** 2).sum(axis=-1) / 2)
 
 
 def _in_pulses(variation: Floats, apart: Floats, n_pulses: int) -> Difference:
-    """Of one pulse's total variation and ``1 - ρ``."""
-    with np.errstate(divide="ignore"):  # models that never agree
+    """Difference from the total variation and ``1 - ρ`` of one pulse."""
+    with np.errstate(divide="ignore"):  # disjoint distributions
         evidence = n_pulses * -np.log1p(-np.minimum(apart, 1.0))
     return Difference(np.asarray(variation), np.asarray(evidence))

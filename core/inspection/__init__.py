@@ -1,16 +1,17 @@
-"""What is known of a pixel, of a region and of a capture, and how well."""
+"""Reports on a pixel, a region and a capture, with uncertainties."""
 
 from core.inspection.capture import CaptureReport, Suggestion, capture_report
 from core.inspection.flux import estimate_flux
 from core.inspection.maps import maps
 from core.inspection.mean_flux import estimate_mean_flux
-from core.inspection.pixel import Candidate, PixelReport, pixel_report
+from core.inspection.pixel import PixelReport, RangeCandidate, pixel_report
 from core.inspection.profile import LEVEL, FluxEstimate
 from core.inspection.pulses import Accuracy, accuracy_over_pulses
 from core.inspection.region import RegionReport, pixels_in, region_report
 
 # Deprecated names, to be removed after the next release.
 LightFound, light_found, mean_light = FluxEstimate, estimate_flux, estimate_mean_flux
+Candidate = RangeCandidate
 
 __all__ = [
     "LEVEL",
@@ -20,6 +21,7 @@ __all__ = [
     "FluxEstimate",
     "LightFound",
     "PixelReport",
+    "RangeCandidate",
     "RegionReport",
     "Suggestion",
     "accuracy_over_pulses",

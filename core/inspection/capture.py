@@ -1,4 +1,4 @@
-"""All that is known of a capture as a whole, and what gate and T_n its echoes suggest."""
+"""Report on a capture as a whole, with the gate and T_n that its echoes suggest."""
 
 from __future__ import annotations
 
@@ -10,24 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.capture import Capture, cached_per_capture
-from core.deprecation import renamed
-from core.inference.faults import standing_out
+from core.inference.faults import outlier_pixels
 from core.inference.posterior import TOLERANCE_BINS
 from core.inspection.maps import likeliest
 from core.inspection.mean_flux import METHOD, estimate_mean_flux
 from core.inspection.pixel import flux_unit, lag_bins
-from core.inspection.profile import FluxEstimate
+from core.inspection.profile import FluxEstimate, OldFluxNames
 from core.tracking import START_BINS, TrackingParameters
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """Settings that the capture's own echoes suggest."""
+    """Settings suggested by the echoes of the capture."""
 
     gate: tuple[int, int]
-    """First bin and end of the window that holds them, in bins of the capture. First photons are
-    not cut in front: that would cost pulses (`core.reductions.cut_gate`), and more than it gains.
-    """
+    """First bin and end of the window with the echoes, in bins of the capture. First-photon data
+    are not cut in front, which would cost pulses (`core.reductions.cut_gate`)."""
     why_gate: str
     t_n: int
     """First bin in which the tracking residual may peak, in bins of the whole gate."""
@@ -35,8 +33,8 @@ class Suggestion:
 
 
 @dataclass(frozen=True, eq=False)
-class CaptureReport:
-    """All that is known of a capture as a whole."""
+class CaptureReport(OldFluxNames):
+    """Report on a capture as a whole."""
 
     histogram: NDArray[np.int64]
     """Counts of all pixels together, shape (bin,)."""
@@ -45,20 +43,17 @@ class CaptureReport:
     flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
-    """How they are estimated."""
+    """Method by which the fluxes are estimated."""
     n_hot: int | None
-    """Pixels that stand out as hot; None where an image is too narrow to tell."""
+    """Hot pixels; None if the image is too narrow to find them."""
     n_dead: int | None
+    """Dead pixels, likewise."""
     suggestion: Suggestion
-
-    light = renamed("flux")
-    light_unit = renamed("flux_unit")
-    light_method = renamed("flux_method")
 
 
 def capture_report(capture: Capture) -> CaptureReport:
-    """All that is known of a capture as a whole; the first time it takes as long as ranging it."""
-    faulty = standing_out(capture)
+    """Report on a capture as a whole; the first call takes as long as an estimate."""
+    faulty = outlier_pixels(capture)
     return CaptureReport(
         histogram=aggregate(capture),
         flux=estimate_mean_flux(capture),
@@ -77,23 +72,23 @@ def aggregate(capture: Capture) -> NDArray[np.int64]:
 
 
 _CONFIDENT = 0.9
-_FEWEST = 10  # confident answers
+_FEWEST = 10  # confident estimates
 _MARGIN_BINS = 3 * START_BINS
 
 
 class _Echoes(NamedTuple):
-    """Where confident answers lie."""
+    """Delays of confident estimates, in bins."""
 
     first: float
     last: float
-    how_many: int
+    n_found: int
 
 
 @cached_per_capture
 def _echoes(capture: Capture) -> _Echoes | None:
-    """Between which delays; None where too few are confident.
+    """Find the first and last delay; None if there are too few confident estimates.
 
-    As many as are expected to be wrong are left out, half of them at each end.
+    Leaves out as many estimates as are expected to be wrong, half of them at each end.
     """
     delay, probability = likeliest(capture)
     sure = probability >= _CONFIDENT
@@ -107,30 +102,30 @@ def _echoes(capture: Capture) -> _Echoes | None:
 
 @cached_per_capture
 def suggestion(capture: Capture) -> Suggestion:
-    """Gate and T_n, with the reason in a sentence each."""
+    """Suggest gate and T_n, with a reason in a sentence each."""
     n_bins, echoes = capture.acquisition.n_bins, _echoes(capture)
     if echoes is None:
-        why = f"Fewer than {_FEWEST} answers are confident: where echoes lie is not known."
+        why = f"Fewer than {_FEWEST} estimates are confident: the delays of echoes are unknown."
         t_n = min(_MARGIN_BINS, n_bins - 1)
         return Suggestion((0, n_bins), why, t_n, f"{why} The differentiators need {t_n} bins.")
     lag = lag_bins(capture, "tracking", TrackingParameters())
     echo, tap = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
     between = f"in bins {echoes.first:.0f} to {echoes.last:.0f}"
-    where = f"The {echoes.how_many:,} confident answers lie {between}"
+    where = f"The {echoes.n_found:,} confident estimates lie {between}"
     end = min(math.ceil(echoes.last) + tap + echo.size + _MARGIN_BINS, n_bins)
     if capture.gated_pulses is not None:
-        # What is cut in front takes pulses with it, of each pixel another number.
-        first, side = 0, "behind them; in front, a cut would cost the pulses that fired there"
+        # A cut in front loses pulses, a different number in each pixel.
+        first, side = 0, "after them; a cut in front would lose the pulses that fired there"
     else:
         first = max(math.floor(echoes.first) + min(tap, 0) - TOLERANCE_BINS - _MARGIN_BINS, 0)
         side = "on either side"
-    why = f"{where}; {_MARGIN_BINS} bins more let the differentiators settle {side}."
+    why = f"{where}; a margin of {_MARGIN_BINS} bins lets the differentiators settle {side}."
     if (first, end) == (0, n_bins):
-        why = f"{where}; with a margin of {_MARGIN_BINS} bins that is the whole gate."
+        why = f"{where}; with a margin of {_MARGIN_BINS} bins this is the whole gate."
     t_n = max(math.floor(echoes.first + lag) - TOLERANCE_BINS, 0)
     return Suggestion(
         (first, end),
         why,
         t_n,
-        f"{where}: what peaks more than {TOLERANCE_BINS} bins before them is noise.",
+        f"{where}: peaks more than {TOLERANCE_BINS} bins before them are noise.",
     )

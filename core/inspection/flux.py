@@ -1,8 +1,8 @@
-"""How much signal and background a pixel has seen, and how well that is known.
+"""Signal and background of a pixel, with intervals.
 
-The likelihood of a histogram (`core.inference.posterior`), given signal and background, is averaged
-over all delays of the gate, none being likelier than another: where the echo lies is not known, and
-the largest peak is not taken for it. What is left is a likelihood of signal and background alone.
+The likelihood of a histogram (`core.inference.likelihood`) is averaged over all delays of the gate
+with a uniform prior, which leaves a likelihood of signal and background alone. The largest peak is
+not assumed to be the echo.
 """
 
 from __future__ import annotations
@@ -21,27 +21,31 @@ METHOD = (
 
 _COARSE, _FINE = (9, 17), (13, 25)
 _RIGHT = math.pi / 2
-_DARKEST = 1e-200  # photons: without any a count would be impossible, and its logarithm infinite
+_LEAST_BACKGROUND = 1e-200  # photons; without any, the log likelihood of a count is infinite
 _NEGLIGIBLE = 25.0
-_AT_ONCE = 2**21  # likelihoods of lights and delays: 16 MiB
-_STEPS, _STEPS_CLOSE = 2, 16  # delays in a bin; where few bins are left
-_FEW_BINS, _MANY_BINS = 8, 8  # left; of an echo so wide that one delay in a bin will do
+_AT_ONCE = 2**21  # likelihoods of fluxes and delays: 16 MiB
+_STEPS, _STEPS_CLOSE = 2, 16  # delays per bin; likewise if few bins remain
+_FEW_BINS, _MANY_BINS = 8, 8  # that remain; width of an echo for which one delay per bin is enough
 
 
 def estimate_flux(
     histograms: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
 ) -> FluxEstimate:
-    """Signal, background and their ratio, with 95 % intervals.
+    """Estimate signal, background and their ratio, with 95 % intervals.
 
     Parameters
     ----------
     histograms : ndarray, shape (bin,) or (pixel, bin)
-        Counts of one pixel, or of some that see the same light, each with a delay of its own.
+        Counts of one pixel, or of several with the same fluxes and different delays.
     acquisition : Acquisition
     pulse : Pulse
     n_pulses : int or None
-        Pulses sent, where these are first photons; where None counts are taken for Poisson, and
-        photons are told instead of photons per pulse.
+        Pulses sent, for first photons. If None, counts are Poisson, and fluxes are in photons
+        instead of photons per pulse.
+
+    Returns
+    -------
+    FluxEstimate
     """
     counts = np.atleast_2d(np.asarray(histograms, float))
     box = _whole_range(counts, n_pulses)
@@ -52,15 +56,15 @@ def estimate_flux(
         return np.asarray(sum(pixel(signal, background) for pixel in pixels))
 
     box = zoomed(box, together, _COARSE)
-    # Now that the light is about known, so are the delays.
-    forgotten = [pixel.forget_delays() for pixel in pixels]
-    if any(forgotten):
+    # With approximate fluxes, most delays can be excluded.
+    excluded = [pixel.exclude_delays() for pixel in pixels]
+    if any(excluded):
         box = zoomed(box, together, _COARSE)
     likelihood = together(*box.grid(_FINE))
 
     def flux_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
         signal, background = _flux_at(root, angle)
-        if box.high[0] == box.most[0]:  # where every pulse fires, it may be by any light
+        if box.high[0] == box.most[0]:  # if every pulse fires, the flux has no upper bound
             signal[-1, angle > 0] = background[-1, angle < _RIGHT] = np.inf
         return signal, background
 
@@ -70,7 +74,7 @@ def estimate_flux(
 def _whole_range(counts: Floats, n_pulses: int | None) -> Box:
     """Bounds of ``√(S + B)`` and of ``asin √(S / (S + B))`` for pixels (pixel, bin).
 
-    In these, which have about the same standard deviation everywhere, a likelihood's peak is round.
+    The standard deviation of these is nearly constant, so that the likelihood has a round peak.
     """
     n_pixels, n_bins = counts.shape
     detected = float(counts.sum())
@@ -81,7 +85,7 @@ def _whole_range(counts: Floats, n_pulses: int | None) -> Box:
         sent = n_pulses * n_pixels
         left, one = max(sent - detected, 0.5), 1 / sent
         total, sd = math.log(sent / left), math.sqrt(1 / left - one)
-        most = n_bins * math.log(1000.0 * sent)  # where all pulses fire beyond any doubt
+        most = n_bins * math.log(1000.0 * sent)  # all pulses fire with certainty
     low, high = max(total - 4 * sd - one, 0.0), min(total + 4 * sd + 4 * one, most)
     return Box(
         low=(math.sqrt(low), 0.0),
@@ -98,7 +102,7 @@ def _flux_at(root: Floats, angle: Floats) -> tuple[Floats, Floats]:
 
 
 class _Pixel:
-    """A pixel's likelihood of signal and background, averaged over delays."""
+    """Likelihood of signal and background of a pixel, averaged over delays."""
 
     def __init__(
         self, counts: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
@@ -112,24 +116,24 @@ class _Pixel:
         self._take_steps(1 if wide else _STEPS)
 
     def _take_steps(self, per_bin: int) -> None:
-        """Try so many delays in each of the bins that are left."""
+        """Set the number of delays in each of the remaining bins."""
         n_bins = self._counts.size
         delay = (np.arange(per_bin) + 0.5) / per_bin
         self._echo, first = self._pulse.taps(n_bins, self._acquisition.bin_width_s, delay)
         n_taps = self._echo.shape[1]
-        # What an echo at each bin meets, shape (tap, bin): nothing beyond the gate.
+        # Bins that an echo at each bin covers, shape (tap, bin), with zeros beyond the gate.
         before, behind = max(-first, 0), max(first + n_taps - 1, 0)
         at = before + first + self._bins
         self._met_counts, met_unfired = (
             sliding_window_view(np.pad(each, (before, behind)), n_taps)[at].T
             for each in (self._counts, self._unfired)
         )
-        self._reach = self._echo @ met_unfired
+        self._unfired_echo = self._echo @ met_unfired
         self._best = np.full(self._bins.size, -np.inf)
 
     def __call__(self, signal: Floats, background: Floats) -> Floats:
-        """Log likelihood, of the shape of both."""
-        s, b = signal.ravel(), np.maximum(background.ravel(), _DARKEST) / self._counts.size
+        """Log likelihood, of the shape of both arguments."""
+        s, b = signal.ravel(), np.maximum(background.ravel(), _LEAST_BACKGROUND) / self._counts.size
         top, mean = np.empty((2, s.size))
         self._best[:] = -np.inf
         at_once = max(1, _AT_ONCE // (len(self._echo) * self._bins.size))
@@ -145,23 +149,23 @@ class _Pixel:
         return np.asarray((self._flat(b) + top + np.log(mean)).reshape(signal.shape))
 
     def _flat(self, b: Floats) -> Floats:
-        """Log likelihood of background alone, ``b`` photons in each bin."""
+        """Log likelihood of ``b`` background photons per bin without an echo."""
         fires = b if self._n_pulses is None else -np.expm1(-b)
         return np.asarray(self._counts.sum() * np.log(fires) - self._unfired.sum() * b)
 
     def _ratio(self, signal: Floats, b: Floats) -> Floats:
-        """What an echo adds to it at each delay, shape (light, step, bin)."""
+        """Log likelihood ratio of an echo at each delay, shape (flux, step, bin)."""
         s = signal * self._echo
         if self._n_pulses is None:
             gain = np.log1p(s / b)
         else:
             gain = np.log1p(np.expm1(-s) * np.exp(-b) / np.expm1(-b))
-        return np.asarray(gain @ self._met_counts - signal * self._reach)
+        return np.asarray(gain @ self._met_counts - signal * self._unfired_echo)
 
-    def forget_delays(self) -> bool:
-        """Leave out delays that no light of the last call makes likely; look closer at the rest.
+    def exclude_delays(self) -> bool:
+        """Exclude delays that are unlikely for all fluxes of the last call, and refine the rest.
 
-        Whether there were any.
+        Return whether any were excluded.
         """
         likely = self._best >= self._best.max() - _NEGLIGIBLE
         self._bins = self._bins[likely]

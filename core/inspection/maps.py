@@ -1,4 +1,4 @@
-"""Images to navigate a capture by; each found once, NaN where there is nothing."""
+"""Maps for the navigation of a capture, cached; NaN where undefined."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def peak_counts(capture: Capture) -> Floats:
 
 @cached_per_capture
 def share_fired(capture: Capture) -> Floats:
-    """Share of each pixel's pulses that fired; NaN where that is not known, shape (row, col)."""
+    """Share of pulses that fired in each pixel, shape (row, col); NaN if it is unknown."""
     if capture.gated_pulses is None:
         return np.full(capture.shape, np.nan)
     return capture.counts / capture.gated_pulses
@@ -29,19 +29,19 @@ def share_fired(capture: Capture) -> Floats:
 
 @cached_per_capture
 def likeliest(capture: Capture) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Bin that the surface is most probably within 3 bins of, and that probability; (row, col)."""
-    near = posterior_of(capture).tolerance_probability
-    delay = near.argmax(axis=2)
-    return delay, np.take_along_axis(near, delay[..., np.newaxis], axis=2)[..., 0]
+    """Bin with the highest probability of a surface within 3 bins, and that probability."""
+    probability = posterior_of(capture).tolerance_probability
+    delay = probability.argmax(axis=2)
+    return delay, np.take_along_axis(probability, delay[..., np.newaxis], axis=2)[..., 0]
 
 
 @cached_per_capture
 def sbr(capture: Capture) -> Floats:
-    """Signal over background of each pixel, shape (row, col); NaN where it saw nothing.
+    """Signal over background of each pixel, shape (row, col); NaN without detections.
 
-    Of the delay that the posterior holds likeliest: the rate beside its echo is the background's,
-    what the echo's bins hold beyond is signal, and counts as far as there is a surface at all.
-    Infinite where nothing but the echo was seen.
+    For an echo at the most probable delay: the rate outside it is the background, the excess inside
+    is the signal, multiplied by the probability of a surface. Infinite without detections outside
+    the echo.
     """
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     echo, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
@@ -65,7 +65,7 @@ def sbr(capture: Capture) -> Floats:
 
 @njit(**PARALLEL)
 def _count(cube, begin, end, before, inside):  # type: ignore[no-untyped-def]
-    """Counts of each pixel before the bin where something begins, and from there to its end."""
+    """Count detections of each pixel before the bin `begin`, and from there to `end`."""
     for row in prange(cube.shape[0]):
         for col in range(cube.shape[1]):
             total = 0
@@ -78,4 +78,4 @@ def _count(cube, begin, end, before, inside):  # type: ignore[no-untyped-def]
 
 
 maps = {"Peak": peak_counts, "Fired": share_fired, "SBR": sbr}
-"""By the name that the app gives them; each takes a capture and gives an image (row, col)."""
+"""Functions from a capture to an image (row, col), by name on screen."""

@@ -1,13 +1,12 @@
-"""How much signal and background the pixels of a capture see on average, and how well it is known.
+"""Mean signal and background of the pixels of a capture, with intervals.
 
-Pixels differ: some see no echo, others a brighter one. Of a sample of them a share is taken to see
-an echo, whose signal is gamma distributed; neither the share nor the shape of that distribution is
-known. What each pixel tells of its own signal, all its delays being alike, adds up to a likelihood
-of the mean signal and the mean background alone, the share and the shape being those that make each
-most likely: profile likelihood intervals, as of a single pixel (`core.inspection.flux`).
+Pixels differ: some have no echo, others a stronger one. In a sample of pixels, an unknown share has
+an echo, with a gamma distributed signal of unknown shape. The likelihoods of the pixels, averaged
+over uniform delays, give a likelihood of mean signal and mean background, maximised over share and
+shape, and profile likelihood intervals as for a single pixel (`core.inspection.flux`).
 
-At a given mean a gamma distribution's most likely one has the mean of what is seen, whatever the
-pixels' true distribution: where signals are clear it need not be one.
+The maximum-likelihood gamma distribution has the mean of the observed signals, whatever their
+true distribution, so that the model need not be exact where signals are clear.
 """
 
 from __future__ import annotations
@@ -18,10 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
+from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
-from core.inference.faults import standing_out
+from core.inference.faults import outlier_pixels
 from core.inference.flux import detailed_flux_prior_of, level_likelihoods, total_rates
 from core.inspection.flux import estimate_flux
 from core.inspection.profile import LEVEL, Box, FluxEstimate, spans, zoomed
@@ -29,24 +29,24 @@ from core.metrics import Interval
 from core.reductions import share_of_pulses
 
 METHOD = (
-    "95 % profile likelihood intervals; signals of the pixels that see an echo are taken for "
-    "gamma distributed"
+    "95 % profile likelihood intervals; signals of pixels with an echo are modelled as gamma "
+    "distributed"
 )
 
 _SAMPLE = 512  # pixels
-_FEW = 24  # pixels, of which the scatter of the signals is not told
-_DARK = 30  # photons in all, that tell next to nothing
-_BRIGHT = 400  # photons of the brightest echo: more tell nothing more of the mean
+_FEW = 24  # pixels, too few to estimate the scatter of the signals
+_DARK = 30  # photons in all, too few to separate signal and background
+_BRIGHT = 400  # photons of the brightest echo, enough for the mean
 _COARSE, _FINE = (5, 9), (7, 15)
 
 
 @cached_per_capture
 def estimate_mean_flux(capture: Capture) -> FluxEstimate:
-    """Mean signal and background of all pixels, and their ratio, with 95 % intervals.
+    """Estimate mean signal and background of all pixels, and their ratio, with 95 % intervals.
 
-    In photons per pulse where the pulses are known, else in photons. Pixels without an echo count,
-    as ones of no signal; hot and dead ones do not. Fewer than 24 pixels are taken to see the same
-    light.
+    In photons per pulse if the number of pulses is known, otherwise in photons. Pixels without an
+    echo count as having no signal; hot and dead ones are left out. Fewer than 24 pixels are assumed
+    to have the same fluxes.
     """
     capture = _ordinary(capture)
     n_pixels, acquisition, pulse = capture.shape[1], capture.acquisition, capture.pulse
@@ -56,11 +56,11 @@ def estimate_mean_flux(capture: Capture) -> FluxEstimate:
         )
         return found.of(capture)
     if 2 * capture.echo_bins >= acquisition.n_bins or capture.counts.sum() < _DARK:
-        return _untold(capture).of(capture)
+        return _unresolved(capture).of(capture)
     some, share = _dimmer(capture)
     surface = _Mixture(some)
     box = zoomed(surface.box, surface, _COARSE)
-    # What of an echo lies behind the bins that are looked at is not the background's.
+    # The tail of an echo beyond its taps is not background.
     echo, _ = pulse.taps(acquisition.n_bins, acquisition.bin_width_s)
     missed = max(1 - float(echo.sum()), 0.0)
 
@@ -78,20 +78,25 @@ def estimate_mean_flux(capture: Capture) -> FluxEstimate:
 
 
 def _ordinary(capture: Capture) -> Capture:
-    """The pixels that are neither hot nor dead, in one row; all of them where none is ordinary."""
-    faulty = standing_out(capture)
+    """Return the pixels that are neither hot nor dead, in one row; all if there are none."""
+    faulty = outlier_pixels(capture)
     kept = np.ones(capture.shape, bool) if faulty is None else ~(faulty.hot | faulty.dead)
     if not kept.any():
         kept[:] = True
-    cube = capture.cube[kept][np.newaxis]
+    return selected_pixels(capture, kept)
+
+
+def selected_pixels(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
+    """Return the pixels of a mask (row, col) in one row, without truth and flux prior."""
+    cube = capture.cube[mask][np.newaxis]
     return replace(capture, cube=cube, truth_range_m=None, signal=None, flux_prior=None)
 
 
-def _untold(capture: Capture) -> FluxEstimate:
-    """Of a gate that an echo fills, or of next to no photons: all may be signal, or background.
+def _unresolved(capture: Capture) -> FluxEstimate:
+    """Estimate fluxes that cannot be separated: all photons may be signal, or background.
 
-    The total's interval is the exact one of a binomial share (Clopper & Pearson 1934) of all pulses
-    together or, of photons, of a Poisson mean (Garwood 1936).
+    The interval of the total is the exact one of a binomial share of all pulses (Clopper & Pearson
+    1934) or of a Poisson mean (Garwood 1936).
     """
     n_pixels, n_pulses, seen = capture.counts.size, capture.gated_pulses, int(capture.counts.sum())
     tail = 0.5 - LEVEL / 2
@@ -108,14 +113,14 @@ def _untold(capture: Capture) -> FluxEstimate:
 
 
 def _dimmer(capture: Capture) -> tuple[Capture, float]:
-    """The capture with a share of its pulses, where echoes are brighter than a mean requires."""
+    """Reduce the pulses of a capture whose echoes are brighter than the mean requires."""
     strongest = float(detailed_flux_prior_of(capture).levels[-1])
     share = _BRIGHT / max(strongest * (capture.gated_pulses or 1), _BRIGHT)
     return (share_of_pulses(capture, share), share) if share < 1 else (capture, 1.0)
 
 
 class _Mixture:
-    """The likelihood of mean background and mean signal, from the pixels of a sample."""
+    """Likelihood of mean background and mean signal, from a sample of the pixels."""
 
     def __init__(self, capture: Capture) -> None:
         known = detailed_flux_prior_of(capture)
@@ -132,18 +137,18 @@ class _Mixture:
         self.box = Box(
             low=(math.log(background) - half, 0.6 * math.sqrt(signal)),
             high=(math.log(background) + half, 1.3 * math.sqrt(signal)),
-            least=(math.log(1e-4 / n_pulses / self._pixels.size), 0.0),  # beyond: none, or any
+            least=(math.log(1e-4 / n_pulses / self._pixels.size), 0.0),  # beyond: no bound
             most=(math.log(1000 * (background + top + acquisition.n_bins)), math.sqrt(top)),
         )
-        self._know(self.box.low[0], self.box.high[0])
+        self._tabulate(self.box.low[0], self.box.high[0])
 
-    def _know(self, low: float, high: float) -> None:
-        """Find what the pixels tell of each level at some backgrounds, given as logarithms."""
+    def _tabulate(self, low: float, high: float) -> None:
+        """Tabulate log likelihoods of the levels between two backgrounds (as logarithms)."""
         self._nodes = np.linspace(low, high, _NODES)
         self._logs = np.stack([self._log_likelihoods(math.exp(each)) for each in self._nodes])
 
     def _log_likelihoods(self, background: float) -> Floats:
-        """Of each level, shape (pixel, level)."""
+        """Log likelihood of each level, shape (pixel, level)."""
         flux_prior = self._known._replace(
             levels=self._levels,
             share=np.full(self._levels.size, 1 / self._levels.size),
@@ -154,13 +159,13 @@ class _Mixture:
     def __call__(self, log_background: Floats, root_signal: Floats) -> Floats:
         """Log likelihood, shape (background, signal)."""
         if log_background[0] < self._nodes[0] or log_background[-1] > self._nodes[-1]:
-            self._know(log_background[0], log_background[-1])
+            self._tabulate(log_background[0], log_background[-1])
         return np.stack([self._of_signals(each, root_signal**2) for each in log_background])
 
     def _of_signals(self, log_background: float, signal: Floats) -> Floats:
         log = np.tensordot(_lagrange(self._nodes, log_background), self._logs, axes=1)
         top = log.max(axis=1, keepdims=True)
-        # A few pixels at a time: for larger products threads are started, that wait for each other.
+        # A few pixels at a time: larger products start threads, which take longer.
         parts = np.array_split(np.exp(log - top), math.ceil(len(log) / _PIXELS_AT_ONCE))
 
         def fit(share: Floats, shape: Floats) -> Floats:
@@ -175,14 +180,14 @@ class _Mixture:
 
 _NODES = 4
 _PIXELS_AT_ONCE = 128
-_LEAST_SHARE = 1e-6  # of pixels that see an echo
-_STEPS = 2  # delays in a bin
-_SHAPES = (0.3, 3000.0)  # of gamma distributions, from most pixels faint to all alike
+_LEAST_SHARE = 1e-6  # of pixels with an echo
+_STEPS = 2  # delays per bin
+_SHAPES = (0.3, 3000.0)  # of gamma distributions, from mostly faint pixels to equal ones
 _TRIED, _ZOOMS = 5, 7
 
 
 def _lagrange(nodes: Floats, x: float) -> Floats:
-    """Weights of the values at the nodes in the polynomial through them, at `x`."""
+    """Weights of the nodes in the interpolating polynomial at `x`."""
     apart = nodes[:, np.newaxis] - nodes
     np.fill_diagonal(apart, 1.0)
     off = np.tile(x - nodes, (nodes.size, 1))
@@ -191,7 +196,7 @@ def _lagrange(nodes: Floats, x: float) -> Floats:
 
 
 def _largest(fit: Callable[[Floats, Floats], Floats], least_share: Floats) -> Floats:
-    """Largest of a function of share and shape, shape (signal,), for each on its own.
+    """Maximise a function over share and shape for each signal, shape (signal,).
 
     The function takes shares (signal, share, 1) and shapes (signal, 1, shape).
     """
@@ -211,12 +216,12 @@ def _largest(fit: Callable[[Floats, Floats], Floats], least_share: Floats) -> Fl
 
 
 def _gamma_weights(levels: Floats, mean: Floats, share: Floats, shape: Floats) -> Floats:
-    """Share of the pixels at each level, (signal, share, shape, level), of a given mean each.
+    """Share of the pixels at each level, (signal, share, shape, level), with given means.
 
-    A share of gamma distributed signals, split between the two levels around each so that the mean
-    stays, and the rest at none.
+    A share of gamma distributed signals, each split between its two adjacent levels so that the
+    mean is preserved; the rest has no signal.
     """
-    bright = mean[:, np.newaxis, np.newaxis] / share  # mean of those that see an echo
+    bright = mean[:, np.newaxis, np.newaxis] / share  # mean of pixels with an echo
     x = levels * (shape / np.maximum(bright, 1e-12 * levels[-1]))[..., np.newaxis]
     k = np.broadcast_to(shape[..., np.newaxis], x.shape)
     below = scipy.special.gammainc(k, x)  # share of the signals below each level

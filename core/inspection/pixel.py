@@ -1,4 +1,4 @@
-"""All that is known of one pixel."""
+"""Report on one pixel."""
 
 from __future__ import annotations
 
@@ -15,72 +15,72 @@ from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
-from core.inference.faults import Verdict, verdict
+from core.inference.faults import PixelVerdict, pixel_verdict
 from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import posterior_of
 from core.inspection.flux import METHOD, estimate_flux
-from core.inspection.profile import FluxEstimate
+from core.inspection.profile import FluxEstimate, OldFluxNames
 
 MOST_CANDIDATES = 5
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A place where the surface may be: a peak of an estimator's score."""
+class RangeCandidate:
+    """A possible delay of the surface: a peak of an estimator's score."""
 
     bin: float
-    """Delay in fractional bins, the estimator's lag removed."""
+    """Delay in fractional bins, corrected for the lag of the estimator."""
     range_m: float
     score: float
     relative: float
     """Score over that of the best candidate; 1 for that one."""
     probability: float
-    """That there is a surface within 3 bins of it (`core.inference.posterior`)."""
+    """Probability of a surface within 3 bins (`core.inference.posterior`)."""
 
 
 @dataclass(frozen=True, eq=False)
-class PixelReport:
-    """All that is known of one pixel, or of a region's pixels added to one."""
+class PixelReport(OldFluxNames):
+    """Report on one pixel, or on the sum of the pixels of a region."""
 
     row: int
     col: int
     counts: Floats
     """Detections in each bin, shape (bin,)."""
     rate: Floats
-    """Photons per pulse in each bin with the pile-up undone (Coates 1968), shape (bin,). The counts
-    themselves where that cannot be done: photons that hide none, or pulses that are not known."""
+    """Photons per pulse in each bin with pile-up corrected (Coates 1968), shape (bin,). The counts
+    themselves for all photons or an unknown number of pulses."""
     rate_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     method: str
     """Key of `core.ESTIMATORS`."""
     curve: Floats
-    """The estimator's score of each bin, its lag not removed; shape (bin,)."""
+    """Score of each bin, not corrected for the lag, shape (bin,)."""
     lag_bins: float
-    """How far behind the surface's delay the score is largest."""
+    """Distance from the delay of the surface to the maximum of the score."""
     answer_bin: float
-    """The range image's answer; NaN where it has none."""
+    """Delay in the range image; NaN without an estimate."""
     answer_m: float
+    """Range in the range image, likewise."""
     confidence: float
-    candidates: tuple[Candidate, ...]
-    """The best peaks of the score, best first; none where the pixel is empty."""
+    candidates: tuple[RangeCandidate, ...]
+    """Highest peaks of the score, in descending order; empty without detections."""
     find_flux: Callable[[], FluxEstimate] = field(repr=False)
-    """Finds `flux`."""
+    """Function that estimates `flux`."""
     flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
-    """How they are found."""
-    verdict: Verdict
+    """Method by which the fluxes are estimated."""
+    verdict: PixelVerdict
     """Whether the pixel is hot or dead."""
 
-    light = renamed("flux")
-    light_unit = renamed("flux_unit")
-    light_method = renamed("flux_method")
     find_light = renamed("find_flux")
 
     @cached_property
     def flux(self) -> FluxEstimate:
-        """Signal, background and their ratio, with 95 % intervals, in photons per pulse where the
-        pulses are known. Found when first asked for: it takes longer than all else."""
+        """Signal, background and their ratio with 95 % intervals, estimated on first access.
+
+        In photons per pulse if the number of pulses is known, otherwise in photons.
+        """
         return self.find_flux()
 
 
@@ -92,23 +92,21 @@ def pixel_report(
     method: str = "tracking",
     settings: Any = None,
 ) -> PixelReport:
-    """All that is known of one pixel.
+    """Report on one pixel.
 
     Parameters
     ----------
     capture : Capture
     image : RangeImage
-        The capture's, by this method and these settings.
+        Estimate of the capture with this method and these settings.
     row, col : int
-    method : str
-        A key of `core.ESTIMATORS`.
-    settings : object, optional
-        The method's own settings; its defaults where None.
+    method, settings
+        As for `core.estimate`.
 
     Raises
     ------
     ValueError
-        If there is no such pixel, or the method or its settings are not known.
+        If there is no such pixel, or the method or its settings are unknown.
     """
     rows, cols = capture.shape
     inside = 0 <= row < rows and 0 <= col < cols
@@ -138,25 +136,25 @@ def pixel_report(
         find_flux=find_flux,
         flux_unit=flux_unit(capture),
         flux_method=METHOD,
-        verdict=verdict(capture, row, col),
+        verdict=pixel_verdict(capture, row, col),
     )
 
 
 def flux_unit(capture: Capture) -> str:
-    """In which light is told: ``"photons per pulse"``, or ``"photons"`` without known pulses."""
+    """Return the unit of fluxes: ``"photons"`` if the number of pulses is unknown."""
     return "photons" if capture.acquisition.n_pulses is None else "photons per pulse"
 
 
 @cached_per_capture
 def lag_bins(capture: Capture, method: str, settings: Any) -> float:
-    """Return the estimator's lag, in bins; see `Estimator.lag_bins`."""
+    """Return `Estimator.lag_bins`, cached; 0 for an estimator without a lag."""
     estimator = ESTIMATORS[method]
     return 0.0 if estimator.finds_delay else estimator.lag_bins(capture, settings)
 
 
 def _candidates(
     capture: Capture, row: int, col: int, curve: Floats, lag_bins: float
-) -> tuple[Candidate, ...]:
+) -> tuple[RangeCandidate, ...]:
     if not capture.counts[row, col]:
         return ()
     peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
@@ -165,9 +163,9 @@ def _candidates(
     if not peaks.size:
         return ()
     bins = np.clip(peaks - lag_bins, 0.0, capture.acquisition.n_bins)
-    near = posterior_of(capture).tolerance_probability[row, col]
-    probability = np.clip(np.interp(bins, np.arange(near.size), near), 0.0, 1.0)
+    table = posterior_of(capture).tolerance_probability[row, col]
+    probability = np.clip(np.interp(bins, np.arange(table.size), table), 0.0, 1.0)
     range_m = capture.acquisition.bin_to_range_m(bins)
     score = curve[peaks]
     columns = (bins, range_m, score, score / score[0], probability)
-    return tuple(Candidate(*map(float, each)) for each in zip(*columns, strict=True))
+    return tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))

@@ -1,7 +1,7 @@
-"""Profile likelihood intervals of signal, background and their ratio, from a likelihood of two.
+"""Profile likelihood intervals of signal, background and their ratio.
 
-The 95 % interval of each is the span of its values wherever the likelihood falls short of its
-largest by a logarithm of 1.92 or less: half of chi-square's 95 % quantile with one degree of
+The 95 % interval of each is the span of its values where the log likelihood of signal and
+background is within 1.92 of its maximum: half of the 95 % quantile of chi-square with one degree of
 freedom (Wilks 1938).
 """
 
@@ -16,30 +16,39 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture
+from core.deprecation import renamed
 from core.metrics import Interval
 
 LEVEL = 0.95
 _DROP = 1.920729
 
 Surface = Callable[[Floats, Floats], Floats]
-"""Log likelihood at each of some values of one coordinate and of another, shape (one, other)."""
+"""Function from values of two coordinates to log likelihoods, shape (first, second)."""
 
 Coordinates = Callable[[Floats, Floats], tuple[Floats, Floats]]
-"""Signal and background there, each of that shape."""
+"""Function from values of two coordinates to signal and background, of the same shape."""
+
+
+class OldFluxNames:
+    """Deprecated attributes of reports, to be removed after the next release."""
+
+    light = renamed("flux")
+    light_unit = renamed("flux_unit")
+    light_method = renamed("flux_method")
 
 
 class FluxEstimate(NamedTuple):
     """Signal and background, with 95 % intervals."""
 
     signal: Interval
-    """Signal photons, per pulse or, where the pulses are not known, in all."""
+    """Signal photons, per pulse or, if the number of pulses is unknown, in all."""
     background: Interval
     """Background photons over the whole gate, likewise."""
     sbr: Interval
-    """Signal over background: infinite where there may be no background, NaN without a photon."""
+    """Signal over background: infinite without background, NaN without photons."""
 
     def scaled(self, factor: float) -> FluxEstimate:
-        """So many times the light."""
+        """Return the fluxes multiplied by `factor`."""
         signal, background = (
             Interval(x.value * factor, x.low * factor, x.high * factor)
             for x in (self.signal, self.background)
@@ -47,7 +56,7 @@ class FluxEstimate(NamedTuple):
         return self._replace(signal=signal, background=background)
 
     def of(self, capture: Capture) -> FluxEstimate:
-        """In photons per pulse, where photons of all pulses were found and the pulses are known."""
+        """Convert photons of all pulses to photons per pulse if the number of pulses is known."""
         n_pulses = capture.acquisition.n_pulses
         if capture.gated_pulses is not None or n_pulses is None:
             return self
@@ -55,7 +64,7 @@ class FluxEstimate(NamedTuple):
 
 
 class Box(NamedTuple):
-    """Bounds of two coordinates, and how far they can go."""
+    """Bounds of two coordinates, and the limits of these bounds."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -63,12 +72,12 @@ class Box(NamedTuple):
     most: tuple[float, float]
 
     def grid(self, size: tuple[int, int]) -> tuple[Floats, Floats]:
-        """Values of both along the sides."""
+        """Return values of both coordinates along the sides."""
         one, other = (np.linspace(*each) for each in zip(self.low, self.high, size, strict=True))
         return one, other
 
     def around(self, inside: NDArray[np.bool_]) -> Box:
-        """The bounds of what is inside, a step more on each side; wider where it is cut off."""
+        """Bound the points `inside` with a margin of a step, and more where they are cut off."""
         low, high = [], []
         for axis, size in enumerate(inside.shape):
             found = np.flatnonzero(inside.any(axis=1 - axis))
@@ -79,7 +88,7 @@ class Box(NamedTuple):
         return self._replace(low=(low[0], low[1]), high=(high[0], high[1]))
 
     def is_much_of(self, other: Box) -> bool:
-        """Whether going on to this box gains little: within the other, and half as wide or more."""
+        """Return whether this box lies in the other and is at least half as wide."""
         return all(
             other.low[i] <= self.low[i]
             and self.high[i] <= other.high[i]
@@ -89,7 +98,7 @@ class Box(NamedTuple):
 
 
 def zoomed(box: Box, surface: Surface, size: tuple[int, int]) -> Box:
-    """The bounds of where a likelihood is close to its largest, and little more."""
+    """Zoom in on the region where a likelihood is close to its maximum."""
     for _ in range(_MOST_ZOOMS):
         likelihood = surface(*box.grid(size))
         around = box.around(likelihood >= likelihood.max() - _DROP)
@@ -104,7 +113,7 @@ _FINEST = (81, 121)
 
 
 def spans(box: Box, likelihood: Floats, flux_at: Coordinates) -> FluxEstimate:
-    """Where a likelihood is largest, and the intervals, from its values on a grid of the box."""
+    """Find the maximum and the intervals of a likelihood given on a grid of the box."""
     coarse, fine = box.grid(likelihood.shape), box.grid(_FINEST)
     log = np.maximum(likelihood - likelihood.max(), -50.0)
     smooth = scipy.interpolate.RectBivariateSpline(*coarse, log)(*fine)

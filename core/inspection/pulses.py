@@ -1,4 +1,4 @@
-"""What fewer pulses would have told."""
+"""Accuracy with fewer pulses."""
 
 from __future__ import annotations
 
@@ -22,46 +22,47 @@ from core.reductions import share_of_pulses
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How good answers to a share of a capture's pulses are."""
+    """Accuracy of estimates with a share of the pulses of a capture."""
 
     share: float
     n_pulses: int | None
-    """None where the capture does not know its pulses."""
+    """None if unknown."""
     against: Literal["truth", "all pulses"]
-    """What answers are held against: the truth or, where it is not known, the answers to all
-    pulses, which may be wrong themselves."""
+    """Reference: the truth or, if it is unknown, the estimates with all pulses, which may be
+    wrong."""
     within: Interval | None
-    """Share of the pixels within 3 bins of it, with Wilson's 95 % interval; None where there is
-    nothing to hold against."""
+    """Share of the pixels within 3 bins of the reference, with Wilson's 95 % interval; None
+    without a reference."""
     rmse_m: Interval | None
-    """Root mean square distance from it, over answered pixels, with a 95 % interval from the
-    scatter of its squares; None where there is none."""
+    """Root mean square difference from the reference over estimated pixels, with a 95 % interval
+    from the scatter of its squares; None without estimates."""
     confidence: float
-    """Mean over all pixels, 0 where there is no answer."""
+    """Mean over all pixels, with 0 for pixels without an estimate."""
 
 
 def accuracy_over_pulses(
     capture: Capture, shares: Sequence[float], method: str = "tracking", settings: Any = None
 ) -> Iterator[Accuracy]:
-    """Range a capture with some of its pulses, one step for each share.
+    """Estimate a capture with shares of its pulses, and yield the accuracy of each.
 
-    Nothing is computed before the first step is asked for. Fewer pulses are a part of more
-    (`core.reductions.share_of_pulses`).
+    Computation is lazy. Fewer pulses are a subset of more (`core.reductions.share_of_pulses`).
 
     Parameters
     ----------
     capture : Capture
     shares : sequence of float
         Shares of the pulses, each above 0 and at most 1.
-    method : str
-        A key of `core.ESTIMATORS`.
-    settings : object, optional
-        The method's own settings; its defaults where None.
+    method, settings
+        As for `core.estimate`.
+
+    Yields
+    ------
+    Accuracy
 
     Raises
     ------
     ValueError
-        If a share is out of its range, or the method or its settings are not known.
+        If a share is out of its range, or the method or its settings are unknown.
     """
     for share in shares:
         require("share", share, 0 < share <= 1, "above 0 and at most 1")

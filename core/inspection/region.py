@@ -1,4 +1,4 @@
-"""All that is known of a region: its pixels one by one, and added to one."""
+"""Report on a region: its pixels one by one, and their sum."""
 
 from __future__ import annotations
 
@@ -11,35 +11,34 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.deprecation import renamed
 from core.estimators import RangeImage, estimate
-from core.inspection.mean_flux import METHOD, estimate_mean_flux
+from core.inspection.mean_flux import METHOD, estimate_mean_flux, selected_pixels
 from core.inspection.pixel import PixelReport, flux_unit, pixel_report
-from core.inspection.profile import FluxEstimate
+from core.inspection.profile import FluxEstimate, OldFluxNames
 
 
 @dataclass(frozen=True, eq=False)
-class RegionReport:
-    """All that is known of a region.
+class RegionReport(OldFluxNames):
+    """Report on a region.
 
-    Added to one, the pixels' histograms are that of one pixel that was sent all their pulses: true
-    where they see the same surface in the same light. Where they do not, `pixel` holds several
-    surfaces, and its signal and background are no pixel's.
+    The sum of the histograms is that of one pixel with all the pulses, provided that the pixels see
+    the same surface with the same fluxes. Otherwise `pixel` holds several surfaces, and its signal
+    and background are not those of any pixel.
     """
 
     n_pixels: int
     summed: Capture
-    """Their histograms added, shape (1, 1, bin), and their pulses."""
+    """Sum of the histograms, shape (1, 1, bin), and of the pulses."""
     image: RangeImage
-    """The answer of that one pixel, shape (1, 1)."""
+    """Estimate of the sum, shape (1, 1)."""
     pixel: PixelReport
-    """All that is known of it."""
+    """Report on the sum."""
     share_answered: float
-    """Of the region's pixels."""
+    """Share of the pixels with an estimate."""
     median_m: float
-    """Of the answers; NaN where there is none."""
+    """Median of the estimates; NaN without any."""
     spread_m: float
-    """Half the range of the middle 68 % of the answers; NaN where there is none."""
+    """Half the range of the middle 68 % of the estimates; NaN without any."""
     mean_confidence: float
     mean_counts: float
     flux: FluxEstimate
@@ -47,35 +46,31 @@ class RegionReport:
     flux_unit: str
     flux_method: str
 
-    light = renamed("flux")
-    light_unit = renamed("flux_unit")
-    light_method = renamed("flux_method")
-
 
 def pixels_in(polygon: Sequence[tuple[float, float]], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels whose centre lies in a polygon or on its edge, shape (row, col).
+    """Find the pixels whose centres lie in a polygon or on its edge, shape (row, col).
 
     Parameters
     ----------
     polygon : sequence of (row, col)
-        Its corners, at least 3, in pixels; the centre of the first pixel is (0, 0).
+        Corners, at least 3, in pixels; the centre of the first pixel is (0, 0).
     shape : tuple of int
         Rows and columns of the image.
 
     Raises
     ------
     ValueError
-        If the corners are fewer, or not finite.
+        If there are fewer corners, or one is not finite.
     """
-    from matplotlib.path import Path  # noqa: PLC0415 - only who draws waits for it
+    from matplotlib.path import Path  # noqa: PLC0415 - slow to load
 
     corners = np.asarray(polygon, float)
     usable = corners.ndim == 2 and corners.shape[1] == 2 and len(corners) >= 3
     usable = usable and bool(np.isfinite(corners).all())
     require("polygon", f"{len(polygon)} corners", usable, "3 or more finite (row, col)")
     path, centres = Path(corners), np.indices(shape).reshape(2, -1).T
-    # On the edge: a hair outside is inside, on whichever side the polygon's turn puts it.
-    inside = [path.contains_points(centres, radius=hair) for hair in (-1e-9, 1e-9)]
+    # The sign of the margin that includes the edge depends on the orientation of the polygon.
+    inside = [path.contains_points(centres, radius=margin) for margin in (-1e-9, 1e-9)]
     return np.asarray(np.logical_or(*inside).reshape(shape))
 
 
@@ -86,29 +81,27 @@ def region_report(
     method: str = "tracking",
     settings: Any = None,
 ) -> RegionReport:
-    """All that is known of a region.
+    """Report on a region.
 
     Parameters
     ----------
     capture : Capture
     image : RangeImage
-        The capture's, by this method and these settings.
+        Estimate of the capture with this method and these settings.
     mask : ndarray of bool, shape (row, col)
-        Its pixels, at least one.
-    method : str
-        A key of `core.ESTIMATORS`.
-    settings : object, optional
-        The method's own settings; its defaults where None.
+        Pixels of the region, at least one.
+    method, settings
+        As for `core.estimate`.
 
     Raises
     ------
     ValueError
-        If the region is empty or of another shape, or the method or its settings are not known.
+        If the region is empty or of another shape, or the method or its settings are unknown.
     """
     require("mask", f"shape {mask.shape}", mask.shape == capture.shape, f"{capture.shape}")
     n_pixels = int(np.count_nonzero(mask))
-    require("region", f"{n_pixels} pixels", n_pixels > 0, "one that holds the centre of a pixel")
-    own, summed = _own(capture, mask), _summed(capture, mask)
+    require("region", f"{n_pixels} pixels", n_pixels > 0, "one that contains the centre of a pixel")
+    own, summed = selected_pixels(capture, mask), _summed(capture, mask)
     of_sum = estimate(summed, method, settings)
     range_m = image.range_m[mask & image.valid]
     low_m, median_m, high_m = (
@@ -130,20 +123,8 @@ def region_report(
     )
 
 
-def _own(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
-    """The region's pixels in one row."""
-    return replace(
-        capture,
-        cube=capture.cube[mask][np.newaxis],
-        truth_range_m=None,
-        signal=None,
-        source=f"{capture.source}; a region of it",
-        flux_prior=None,
-    )
-
-
 def _summed(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
-    """The region's pixels added to one, and their pulses."""
+    """Return the sum of the pixels of the region, and of their pulses."""
     total = capture.cube[mask].sum(axis=0, dtype=np.int64)
     require("counts", int(total.max()), int(total.max()) < 2**32, "a region of sums below 2**32")
     n_pulses, n_pixels = capture.acquisition.n_pulses, int(np.count_nonzero(mask))

@@ -1,1 +1,1 @@
-"""Compiled code, and how it is compiled, laid out and entered."""
+"""Compiled code, its compilation options, data layout and thread locks."""

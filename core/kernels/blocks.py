@@ -1,4 +1,4 @@
-"""A cube laid out for kernels that treat many pixels at once."""
+"""Layout of a cube for kernels that process many pixels at once."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from core.kernels.parallel import COMPILED
 
 LANES = 64
-"""Pixels treated together: four vectors of sixteen float32, in flight side by side."""
+"""Pixels processed together: four vectors of sixteen float32."""
 
 _PIXELS_AT_ONCE = 8
-_BINS_AT_ONCE = 4  # between reading and writing their sums, which costs more than to add
+_BINS_AT_ONCE = 4  # per read and write of the sums, which cost more than the additions
 
 
 class Blocks(NamedTuple):
-    """Counts with neighbouring pixels side by side; the last block is filled up with zeros."""
+    """Counts with neighbouring pixels in adjacent lanes; the last block is padded with zeros."""
 
     counts: NDArray[np.unsignedinteger]
     """Shape (block, bin, LANES)."""
@@ -32,9 +32,9 @@ class Blocks(NamedTuple):
 
 
 def to_blocks(cube: NDArray[np.unsignedinteger]) -> Blocks:
-    """Lay out a cube (..., bin) in blocks, pixels in their order.
+    """Lay out a cube (..., bin) in blocks, in the order of its pixels.
 
-    Counts that fit are uint16 there, whatever they come as: kernels are compiled for each type.
+    Counts become uint16 if they fit, since kernels are compiled for each type.
     """
     counts = lane_counts(cube, LANES)
     largest, sigma = lane_spread(counts, cube.shape[-1])
@@ -42,7 +42,7 @@ def to_blocks(cube: NDArray[np.unsignedinteger]) -> Blocks:
 
 
 def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.unsignedinteger]:
-    """Counts (..., bin) as (block, bin, lane), as `to_blocks` lays them out.
+    """Return counts (..., bin) as (block, bin, lane).
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.uns
         cube = cube.astype(np.uint16)
     n_bins = cube.shape[-1]
     pixels = np.ascontiguousarray(cube).reshape(-1, n_bins)
-    pixels.setflags(write=False)  # one kernel for both: whether writable is part of a type
+    pixels.setflags(write=False)  # writability is part of a numba type: compile for one
     filled, left = divmod(pixels.shape[0], lanes)
     counts = np.empty((filled + (left > 0), n_bins, lanes), cube.dtype)
     if lanes == LANES:
@@ -68,9 +68,9 @@ def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.uns
 
 @njit(**COMPILED)
 def _lay_out(pixels, counts):  # type: ignore[no-untyped-def]
-    """Pixels (pixel, bin) side by side in full blocks."""
+    """Transpose pixels (pixel, bin) into full blocks."""
     for b in range(counts.shape[0]):
-        # A few pixels at a time: their rows lie far apart, and the cache holds few such lines.
+        # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
         for first in range(0, LANES, _PIXELS_AT_ONCE):
             for k in range(counts.shape[1]):
                 for i in range(first, first + _PIXELS_AT_ONCE):
@@ -109,9 +109,9 @@ def lane_spread(counts, n_bins):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED, inline="always")
 def _with(count, first, sums):  # type: ignore[no-untyped-def]
-    """Sum, sum of squares and maximum, a count added.
+    """Add a count to sum, sum of squares and maximum.
 
-    Moments about the first count: a constant histogram has a σ of exactly 0.
+    Moments are about the first count, so that σ of a constant histogram is exactly 0.
     """
     total, squares, top = sums
     more = np.int64(count) - np.int64(first)
@@ -120,7 +120,7 @@ def _with(count, first, sums):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def lane_rows(n_rows, lanes=LANES):  # type: ignore[no-untyped-def]
-    """Scratch of `n_rows` rows of `lanes` float32, on a cache line's boundary."""
+    """Scratch memory of `n_rows` rows of `lanes` float32, aligned to a cache line."""
     memory = np.empty(n_rows * lanes + 16, np.float32)
     start = (-(memory.ctypes.data // 4)) % 16
     return memory[start : start + n_rows * lanes]

@@ -1,4 +1,4 @@
-"""How kernels are compiled and entered, in one place."""
+"""Compilation options of kernels, and the lock under which parallel ones run."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ log = logging.getLogger(__name__)
 
 
 def can_cache() -> bool:
-    """Whether a folder for compiled kernels can be written; logs a warning if none can.
+    """Return whether compiled kernels can be cached on disk; log a warning if not.
 
-    Without one numba refuses to define a cached kernel at all: in a read-only checkout of a user
-    without a home folder, nothing would start.
+    Without a writable folder numba refuses to define a cached kernel, so that nothing would start
+    in a read-only checkout of a user without a home folder.
     """
     try:
-        numba.njit(cache=True)(can_cache)  # looks for the folder, compiles nothing
+        numba.njit(cache=True)(can_cache)  # looks for the folder without compiling
     except RuntimeError:
         log.warning(
-            "No folder for compiled kernels can be written, so that each start compiles them "
-            "again (some 20 s): set NUMBA_CACHE_DIR to a folder of your own."
+            "No folder for compiled kernels is writable, so that each start compiles them again "
+            "(about 20 s): set NUMBA_CACHE_DIR to a writable folder."
         )
         return False
     return True
 
 
-# "contract" alone lets a multiply and an add fuse; full fastmath would drop NaN and infinity.
+# "contract" fuses multiply and add; full fastmath would not respect NaN and infinity.
 COMPILED: dict[str, Any] = {
     "cache": can_cache(),
     "nogil": True,
@@ -38,22 +38,22 @@ COMPILED: dict[str, Any] = {
     "error_model": "numpy",  # a division by zero gives infinity or NaN, as in numpy
 }
 PARALLEL: dict[str, Any] = {**COMPILED, "parallel": True}
-# Sums may be added up in any order, and so several numbers at a time.
+# Sums in any order can be vectorised.
 SUMMING: dict[str, Any] = {**COMPILED, "fastmath": {"contract", "reassoc"}}
 
-# Where OpenMP is missing numba falls back to a threading layer that aborts the process when two
-# Python threads enter parallel kernels at once.
+# Without OpenMP, numba's threading layer aborts the process if two Python threads run parallel
+# kernels at once.
 KERNEL_LOCK = threading.Lock()
 
-# Counts in a cube below which starting threads costs more than it saves.
+# Counts in a cube up to which threads cost more than they save.
 SERIAL_BELOW = 2_000_000
 
 
 @contextmanager
 def entering(n_counts: int) -> Iterator[None]:
-    """Alone in a parallel kernel, on one thread where the work is small.
+    """Hold the lock of parallel kernels; use one thread for small work.
 
-    Threads that wait for each other cost a multiple of small work as soon as the machine is busy.
+    On a busy machine, synchronising threads takes longer than small work itself.
     """
     with KERNEL_LOCK:
         threads = numba.get_num_threads()

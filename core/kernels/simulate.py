@@ -1,4 +1,4 @@
-"""Kernels of the simulation: photons of echoes, and draws of first photons."""
+"""Kernels of the simulation: expected photons of echoes, and draws of first photons."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SQRT_HALF = math.sqrt(0.5)
 
 @njit(**COMPILED)
 def _arrived(t, shape, share):  # type: ignore[no-untyped-def]
-    """`Pulse.cdf` at `t` time constants; of a measured pulse `share` is that at its samples."""
+    """`Pulse.cdf` at `t` time constants; `share` holds the values at the samples if measured."""
     if shape == _GAUSSIAN:
         return 0.5 * math.erfc(-t * _SQRT_HALF)
     if t <= 0.0:
@@ -32,7 +32,7 @@ def _arrived(t, shape, share):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def add_echo_photons(onset_bin, signal, bin_taus, shape, share, before):  # type: ignore[no-untyped-def]
-    """Add the photons of each pixel's echo before each bin edge to `before`."""
+    """Add the expected photons of each pixel's echo before each bin edge to `before`."""
     n_pixels, n_edges = before.shape
     for pixel in range(n_pixels):
         onset = onset_bin[pixel]
@@ -41,19 +41,18 @@ def add_echo_photons(onset_bin, signal, bin_taus, shape, share, before):  # type
         early = _arrived(-onset * bin_taus, shape, share)  # before the gate opened
         arrived = early
         for edge in range(n_edges):
-            # Photons never leave again, as rounding would have it where bins are tiny.
+            # Monotonic in spite of rounding, which matters for tiny bins.
             arrived = max(arrived, _arrived((edge - onset) * bin_taus, shape, share))
             before[pixel, edge] += signal[pixel] * (arrived - early)
 
 
 @njit(**COMPILED)
 def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
-    """Add `n_pulses` first-photon draws to `counts`, whose last element stands for "no trigger".
+    """Add `n_pulses` first-photon draws to `counts`, whose last element counts "no trigger".
 
-    ``fired_by[k]`` is the probability to have fired by the end of bin k; its last element, above 1,
-    ends every search. The guide holds, for each of its cells of ``[0, 1)``, the bin in which the
-    cell's lowest number falls. `uniform` is room for a batch of numbers: drawn apart from their
-    use, they are computed several at a time.
+    ``fired_by[k]`` is the probability of a trigger by the end of bin k; its last element, above 1,
+    ends every search. The guide table holds the bin of the lowest number in each of its cells of
+    ``[0, 1)``. `uniform` is a buffer for a batch of numbers, drawn in a loop that vectorises.
     """
     k = np.uint64(0)
     for cell in range(guide.size):
@@ -67,7 +66,7 @@ def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignor
             uniform[i] = uniform_at(key, done + i)
         for i in range(batch):
             k = np.uint64(guide[np.uint64(uniform[i] * guide.size)])
-            # One step without a jump settles nearly every draw; a mispredicted jump costs five.
+            # A step without a branch settles nearly every draw; a mispredicted branch costs five.
             k += np.uint64(fired_by[k] <= uniform[i])
             while fired_by[k] <= uniform[i]:
                 k += np.uint64(1)
@@ -77,7 +76,7 @@ def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignor
 
 @njit(**PARALLEL)
 def draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-def]
-    """Draw first-photon counts (pixel, bin), pulse by pulse."""
+    """Draw first-photon counts (pixel, bin) pulse by pulse."""
     n_pixels, n_bins = cube.shape
     for pixel in prange(n_pixels):
         fired_by = np.full(n_bins + 1, 2.0)
@@ -92,7 +91,7 @@ def draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-def
 
 @njit(**PARALLEL)
 def fire_once(photons, n_pulses, seed, fired):  # type: ignore[no-untyped-def]
-    """Keep the first photon of each pulse: photons fall in any of the pulses alike."""
+    """Assign photons to pulses at random and keep the first photon of each pulse."""
     rows, cols, n_bins = photons.shape
     for row in prange(rows):
         for col in range(cols):

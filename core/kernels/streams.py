@@ -1,6 +1,6 @@
-"""Random numbers for kernels: one stream for each pixel, each number found by its place in it.
+"""Counter-based random numbers for kernels, with one stream per pixel.
 
-Which thread draws a number, and whether those before it were drawn, makes no difference.
+A number depends only on the seed, the pixel and its position in the stream, not on the thread.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ def _splitmix64(state):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED, inline="always")
 def pixel_key(seed, pixel):  # type: ignore[no-untyped-def]
-    """Where the stream of random numbers of a pixel begins."""
+    """Key of a pixel's random stream."""
     return _splitmix64(_splitmix64(seed + np.uint64(1)) + np.uint64(pixel))
 
 
 @njit(**COMPILED, inline="always")
 def uniform_at(key, draw):  # type: ignore[no-untyped-def]
-    """Number `draw` of a stream, uniform in [0, 1)."""
+    """Uniform number in [0, 1) at position `draw` of a stream."""
     state = key + np.uint64(draw) * np.uint64(0x9E3779B97F4A7C15)
     return np.float64(_splitmix64(state) >> np.uint64(11)) * 2.0**-53

@@ -1,14 +1,14 @@
 """Kernels of the tracking differentiators.
 
 `differentiator_step` is one step of the equations in `core.tracking`, as written. The block kernel
-runs the same recursion in float32 with its units divided out: with ``K = (m·h)²·l·σ`` and
+runs the same recursion in float32 and in scaled units: with ``K = (m·h)²·l·σ`` and
 ``S = s/K, X1 = x1/K, X2 = h0·x2/K`` the small scale has ``R = 1``, the large one ``R = n``, and ::
 
     Y   = X1 + X2 - S
     A   = X2 + copysign(sqrt(R²/4 + 2·R·|Y|) - R/2   if |Y| > R,   else   |Y|,   Y)
     X1' = X1 + X2/m            X2' = X2 - clamp(A, -R, R)/m
 
-so that σ scales the input, ``(m·h)²·l`` is one parameter, and the loop holds no division.
+so that σ scales the input, ``(m·h)²·l`` is one parameter, and the loop has no division.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from core.kernels.blocks import LANES, lane_rows
 from core.kernels.parallel import COMPILED, PARALLEL
 
-# A residual below this share of the largest count is rounding: both scales moved alike.
+# Residuals below this share of the largest count are rounding errors.
 ROUNDING_32 = float(16 * np.finfo(np.float32).eps)
 
 
 class Lanes(NamedTuple):
-    """One number a pixel, each of shape (block, LANES): what goes in, and what comes out."""
+    """Input and output of the kernel, one number per pixel, each of shape (block, LANES)."""
 
     sigma: NDArray[np.float64]
     largest: NDArray[np.unsignedinteger]
@@ -37,10 +37,10 @@ class Lanes(NamedTuple):
 
 
 class KernelSettings(NamedTuple):
-    """What the kernel needs to know; 0 in `start_bins` and `n_pulses` means "not used".
+    """Settings of the kernel; 0 in `start_bins` and `n_pulses` means "not used".
 
-    `r_small` is always 1. Were it written in the kernel, clamping to it would take other
-    instructions than to `n`, and a tenth of the time more.
+    `r_small` is always 1. As a constant it would be clamped with other instructions than `n`, which
+    takes 10 % longer.
     """
 
     k_per_sigma: float
@@ -53,7 +53,7 @@ class KernelSettings(NamedTuple):
 
 @njit(**COMPILED)
 def differentiator_step(x1, x2, s, r, h, h0):  # type: ignore[no-untyped-def]
-    """One step of a tracking differentiator, the equations as written: x1 and x2 after it."""
+    """Return x1 and x2 after one step of a tracking differentiator, the equations as written."""
     d = r * h0
     d0 = h0 * d
     y = x1 - s + h0 * x2
@@ -62,14 +62,14 @@ def differentiator_step(x1, x2, s, r, h, h0):  # type: ignore[no-untyped-def]
         a = x2 + (a0 - d) / 2.0 * np.sign(y)
     else:
         a = x2 + y / h0
-    # With r = 0 the second form is 0/0: nothing may accelerate.
+    # With r = 0 the second form is 0/0; the acceleration is 0.
     fh = -r * np.sign(a) if abs(a) > d else (-r * a / d if d > 0.0 else 0.0)
     return x1 + h * x2, x2 + h * fh
 
 
 @njit(**COMPILED)
 def differentiate(s, r, h, m, x1, out):  # type: ignore[no-untyped-def]
-    """One tracking differentiator over one row."""
+    """Run a tracking differentiator over one row."""
     x2 = 0.0
     for k in range(s.size):
         x1, x2 = differentiator_step(x1, x2, s[k], r, h, m * h)
@@ -78,25 +78,25 @@ def differentiate(s, r, h, m, x1, out):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def differentiate_rows(rows, r, h, m, first, out):  # type: ignore[no-untyped-def]
-    """One tracking differentiator over each row."""
+    """Run a tracking differentiator over each row."""
     for i in range(rows.shape[0]):
         differentiate(rows[i], r[i], h, m, first[i], out[i])
 
 
-# The kernel's registers: one row of LANES float32 each, at a constant place in one array, which is
-# what lets the compiler keep 16 pixels in a vector and see that no two rows overlap.
+# State of the kernel: rows of LANES float32 at constant offsets in one array, so that the compiler
+# keeps 16 pixels in a vector and knows that rows do not overlap.
 _X1_SMALL, _X2_SMALL, _X1_LARGE, _X2_LARGE = 0 * LANES, 1 * LANES, 2 * LANES, 3 * LANES
 _SCALE, _FLOOR, _GAIN, _ARMED = 4 * LANES, 5 * LANES, 6 * LANES, 7 * LANES
 _BEST, _AT = 8 * LANES, 9 * LANES
 _ROWS = 10
 
-_ALTERNATING = np.float32(1e-20)  # keeps a filter at rest out of the slow subnormal numbers
-_SCALED_MAX = 1e18  # a count beyond this many K: squares still fit a float32, echoes no longer show
+_ALTERNATING = np.float32(1e-20)  # avoids slow subnormal numbers in a filter at rest
+_SCALED_MAX = 1e18  # counts in units of K: beyond, squares overflow float32
 
 
 @njit(**COMPILED, inline="always")
 def _follow(x1, x2, s, r, per_m):  # type: ignore[no-untyped-def]
-    """One step of a scale in its own units: X1' and X2' of the module's docstring."""
+    """Return X1' and X2' of the module's docstring after one step of a scale."""
     quarter, half, two = np.float32(0.25), np.float32(0.5), np.float32(2.0)
     y = x1 + x2 - s
     t = abs(y)
@@ -108,9 +108,9 @@ def _follow(x1, x2, s, r, per_m):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def _track_block(b, blocks, lanes, weight, settings, row):  # type: ignore[no-untyped-def]
-    """Position and score of the pixels of block `b`; `row` is scratch.
+    """Fill position and score of the pixels of block `b`, by the recursion of the module.
 
-    See the module's docstring for the recursion.
+    `row` is scratch memory.
     """
     counts = blocks[b]
     _prepare_rows(counts, lanes.sigma[b], lanes.largest[b], settings, row)
@@ -122,7 +122,7 @@ def _track_block(b, blocks, lanes, weight, settings, row):  # type: ignore[no-un
             for i in range(LANES):
                 row[_GAIN + i] = np.float32(settings.n_pulses) / max(row[_ARMED + i], one)
                 row[_ARMED + i] -= np.float32(counts[k, i])
-        weight_of_bin = weight[k]  # each lane would gather it, at many times the cost
+        weight_of_bin = weight[k]  # otherwise each lane gathers it, which is slow
         bin_number = np.float32(k)
         offset = _ALTERNATING if k & 1 else -_ALTERNATING
         for i in range(LANES):
@@ -148,7 +148,7 @@ def _track_block(b, blocks, lanes, weight, settings, row):  # type: ignore[no-un
 
 @njit(**COMPILED)
 def _prepare_rows(counts, sigma, largest, settings, row):  # type: ignore[no-untyped-def]
-    """Scale, floor and start value of each lane; everything else zero."""
+    """Set scale, floor and initial value of each lane, and everything else to zero."""
     row[:] = 0.0
     for k in range(settings.start_bins):
         for i in range(LANES):
@@ -158,7 +158,7 @@ def _prepare_rows(counts, sigma, largest, settings, row):  # type: ignore[no-unt
         ranged = 0.0 < largest[i] < _SCALED_MAX * k_unit
         scale = 1.0 / k_unit if ranged else 0.0
         row[_SCALE + i] = scale
-        # Never below what the alternating offset does to a filter at rest.
+        # At least the effect of the alternating offset on a filter at rest.
         floor = max(scale * largest[i] * ROUNDING_32, 1e-18)
         row[_FLOOR + i] = floor if ranged else np.inf
         if settings.start_bins > 0:

@@ -1,9 +1,9 @@
 """Windows of captures larger than memory: some rows and columns, read without the rest.
 
-A window is a `Capture` like any other: one pixel of each ``step`` x ``step``, with all its bins.
-The flux that its pixels share with the whole image is learned from a sample of the whole, so
-that the results of a window equal those of the whole. A preview is a window of
-everything; it can be looked at while it is being read, from all over the image.
+A window is a `Capture` of one pixel of each ``step`` x ``step``, with all its bins. The flux that
+its pixels share with the whole image is learned from a sample of the whole, so that the estimates
+in a window equal those of the whole. A preview is a window of the whole image with a large step;
+its pieces are read from all over the image, so that it can be shown before it is complete.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from core.reductions import coarser
 if TYPE_CHECKING:
     import xarray as xr
 
-_AT_ONCE = 4  # pieces that are unpacked side by side; each holds a chunk or two while it is
+_AT_ONCE = 4  # pieces that are read in parallel; each takes the memory of a chunk or two
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Window:
     Parameters
     ----------
     rows, cols : tuple of int
-        First one, and the one behind the last.
+        First row or column, and one after the last.
     step : int
         One pixel of each ``step`` x ``step`` is kept, the middle one (left and up of it where
         even).
@@ -47,7 +47,7 @@ class Window:
     Raises
     ------
     ValueError
-        If there are none, or a number is not whole.
+        If the window is empty, or a number is not whole.
     """
 
     rows: tuple[int, int]
@@ -64,9 +64,9 @@ class Window:
 
     @classmethod
     def fitting(cls, rows: tuple[int, int], cols: tuple[int, int], most_pixels: int) -> Window:
-        """The one of the finest step that keeps no more than so many pixels, at least 1."""
+        """Return the window of the finest step that keeps at most `most_pixels`, at least 1."""
         n_pixels = (rows[1] - rows[0]) * (cols[1] - cols[0])
-        # From half of what would fit were there no edges.
+        # Start from half of the step that would fit without edges.
         step = max(1, math.isqrt(n_pixels // max(most_pixels, 1)) // 2)
         window = cls(rows, cols, step)
         while math.prod(window.shape) > max(most_pixels, 1):
@@ -90,11 +90,9 @@ class Window:
         return len(rows), len(cols)
 
     def __str__(self) -> str:
-        told = ", ".join(
-            f"{name} {first} to {end - 1}"
-            for name, (first, end) in (("rows", self.rows), ("columns", self.cols))
-        )
-        return told if self.step == 1 else f"{told}, 1 pixel of each {self.step} x {self.step}"
+        (top, bottom), (left, right) = self.rows, self.cols
+        place = f"rows {top} to {bottom - 1}, columns {left} to {right - 1}"
+        return place if self.step == 1 else f"{place}, 1 pixel of each {self.step} x {self.step}"
 
 
 class WindowReader:
@@ -109,9 +107,9 @@ class WindowReader:
     Attributes
     ----------
     seen : ndarray of bool, shape (row, col)
-        Which pixels of the window have been read.
+        Pixels of the window that have been read.
     done, of : int
-        Pieces that have been read, and all of them.
+        Number of pieces that have been read, and of all pieces.
 
     Raises
     ------
@@ -138,7 +136,7 @@ class WindowReader:
 
     @property
     def done(self) -> int:
-        """Pieces that have been read."""
+        """Number of pieces that have been read."""
         return self.of - len(self._left)
 
     @property
@@ -152,7 +150,7 @@ class WindowReader:
         Raises
         ------
         CaptureError
-            If one of them cannot be read, or holds what is no count. It may be tried again.
+            If a piece cannot be read, or holds a number that is no count. Calling again retries.
         """
         import dask  # noqa: PLC0415
 
@@ -164,12 +162,12 @@ class WindowReader:
         self._left = self._left[_AT_ONCE:]
 
     def capture(self, flux_prior: FluxPrior | None = None) -> Capture:
-        """Return what has been read so far; other pixels have no counts.
+        """Return the pixels read so far; the others have no counts.
 
         Parameters
         ----------
         flux_prior : FluxPrior, optional
-            Of the whole image (`sampled_flux_prior`); learned from what has been read where None.
+            That of the whole image (`sampled_flux_prior`); learned from the pixels read where None.
         """
         source = f"{self._description.source}; {self.window} of {' x '.join(map(str, self._shape))}"
         acquisition = coarser(self._description.acquisition, self.window.step)
@@ -197,7 +195,7 @@ def read_window(
     window : Window
         Rows and columns.
     flux_prior : FluxPrior, optional
-        `sampled_flux_prior`, where it is known already.
+        That of the whole image, where it is known already.
     progress : callable
         Called with the numbers of pieces read and of all pieces.
     lighting : FluxPrior, optional
@@ -223,19 +221,19 @@ def sampled_flux_prior(counts: xr.DataArray) -> FluxPrior:
 
 
 def _spread(chunks: tuple[tuple[int, ...], ...]) -> list[tuple[slice, slice]]:
-    """Boxes of an image cut into chunks, first some from all over it, then those in between."""
+    """Return boxes of an image cut into chunks: first a coarse grid, then those in between."""
     across = [np.cumsum((0, *sizes)).tolist() for sizes in chunks]
     boxes = [
         (slice(top, bottom), slice(left, right), _coarseness(row, col))
         for row, (top, bottom) in enumerate(zip(across[0], across[0][1:], strict=False))
         for col, (left, right) in enumerate(zip(across[1], across[1][1:], strict=False))
     ]
-    order = np.random.default_rng(0).permutation(len(boxes))  # of those alike: from all over
+    order = np.random.default_rng(0).permutation(len(boxes))  # spreads boxes of equal coarseness
     ordered = sorted((boxes[k] for k in order), key=lambda box: -box[2])
     return [(rows, cols) for rows, cols, _ in ordered]
 
 
 def _coarseness(row: int, col: int) -> int:
-    """Largest power of two that divides both, 2**62 for none."""
+    """Return the largest power of two that divides both, 2**62 if both are 0."""
     both = row | col
     return both & -both if both else 2**62

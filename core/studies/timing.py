@@ -1,10 +1,11 @@
-"""Times that can be compared: taken in turn, with intervals, and on which machine."""
+"""Timing whose results can be compared: interleaved calls on a described machine."""
 
 from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
@@ -13,31 +14,27 @@ import numba
 import numpy as np
 import psutil
 from llvmlite import binding
-from scipy.special import bdtr
 
 from core.acquisition import Floats
-from core.checks import require
 from core.metrics import Interval
 from core.studies.outputs import Table
-
-FEWEST_REPEATS = 6
-"""Below, not even the fastest and the slowest hold the median between them with 95 %."""
+from core.studies.statistics import MIN_REPEATS, median_interval
 
 
 def interleaved(
     calls: Mapping[str, Callable[[], object]], repeats: int, warm_up: int = 1
 ) -> dict[str, Floats]:
-    """Time some calls in turn, so that what else the machine does meets all of them alike.
+    """Time several calls in turn, so that other load on the machine affects all of them alike.
 
     Parameters
     ----------
     calls : mapping
         What to time, by name.
     repeats : int
-        Rounds; each calls each once, in an order drawn anew (by a fixed seed), so that none always
-        follows the same other.
+        Rounds, each of which makes every call once in a new random order (of a fixed seed), so that
+        none always follows the same other.
     warm_up : int
-        Rounds before, which are not timed: compilation, caches, pages that are touched first.
+        Untimed rounds before: compilation, caches, first touch of memory pages.
 
     Returns
     -------
@@ -57,44 +54,42 @@ def interleaved(
     return seconds
 
 
-def median_interval(seconds: Floats) -> Interval:
-    """Median with its 95 % interval from order statistics, whatever the distribution.
+def time_ratio(
+    one: Callable[[], object], other: Callable[[], object], repeats: int = MIN_REPEATS + 3
+) -> Interval:
+    """Return the median ratio of two times, taken in turn."""
+    seconds = interleaved({"one": one, "other": other}, repeats)
+    return median_interval(seconds["one"] / seconds["other"])
 
-    Between the j-th smallest and the j-th largest of n values lies the median but where fewer than
-    j of them fall on one of its sides: twice a binomial tail.
 
-    Raises
-    ------
-    ValueError
-        If there are fewer than `FEWEST_REPEATS` values.
-    """
-    n = len(seconds)
-    require("repeats", n, n >= FEWEST_REPEATS, f"at least {FEWEST_REPEATS}")
-    tail = 2 * bdtr(np.arange(n // 2), n, 0.5)  # of 0, 1, ... values on one side
-    outermost = int(np.count_nonzero(tail <= 0.05))
-    ordered = np.sort(seconds)
-    low, high = ordered[outermost - 1], ordered[n - outermost]
-    return Interval(float(np.median(ordered)), float(low), float(high))
+@contextmanager
+def kernel_threads(n_threads: int | None) -> Iterator[None]:
+    """Run compiled kernels on this number of threads; None changes nothing."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(n_threads or before)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 def machine() -> Table:
-    """What was measured on, and with which versions."""
-    memory_gib = psutil.virtual_memory().total / 2**30
+    """Return processor, memory, system and versions."""
     rows = [
         ("processor", _processor()),
         ("compiled for", binding.get_host_cpu_name()),
         ("cores", str(os.cpu_count())),
         ("threads of kernels", str(numba.get_num_threads())),
-        ("memory GiB", f"{memory_gib:.1f}"),
+        ("memory GiB", f"{psutil.virtual_memory().total / 2**30:.1f}"),
         ("system", platform.platform()),
         ("Python", platform.python_version()),
         *((name, version(name)) for name in ("numpy", "numba", "llvmlite", "scipy", "firstphoton")),
     ]
-    return Table("machine", "The machine and the versions", ("what", "which"), tuple(rows))
+    return Table("machine", "Machine and versions", ("item", "value"), tuple(rows))
 
 
 def _processor() -> str:
-    told = Path("/proc/cpuinfo")  # where Linux keeps what `platform` does not tell there
-    lines = told.read_text(encoding="utf-8").splitlines() if told.exists() else []
+    cpu_info = Path("/proc/cpuinfo")  # on Linux, where `platform` does not name the model
+    lines = cpu_info.read_text(encoding="utf-8").splitlines() if cpu_info.exists() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.processor() or platform.machine()

@@ -1,4 +1,4 @@
-"""Many simulated captures, every method on each of them: paired seeds, resumable, on all cores."""
+"""Monte Carlo trials: every method on the same simulated captures, resumable, on all cores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from scipy.special import stdtrit
 
 import core
 from core import metrics
@@ -27,38 +26,50 @@ from core.inference.flux import flux_model_of
 from core.metrics import Interval
 from core.scene import scenes
 from core.simulation import simulate
+from core.studies.statistics import mean_interval
 
-__all__ = ["Condition", "Method", "Results", "Score", "as_they_come", "trials"]
+__all__ = [
+    "Condition",
+    "Method",
+    "Results",
+    "Score",
+    "as_they_come",
+    "default_methods",
+    "trials",
+]
 
 TOLERANCES_BINS = (1, 2, 3)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A built-in scene under some light; the seed draws the depths, too, where they are random."""
+    """A built-in scene and its flux; for scenes with random depths the seed draws these, too."""
 
     scene: str
     sbr: float
     signal: float = 0.1041
 
     def capture(self, seed: int) -> Capture:
-        """One simulated capture."""
+        """Simulate one capture."""
         scene = scenes[self.scene](**({"seed": seed} if self.scene == "uniform" else {}))
         return simulate(scene, scene.acquisition, Flux(self.signal, self.sbr), seed=seed)
 
 
 @dataclass(frozen=True)
 class Method:
-    """An estimator with its settings, under a name of its own."""
+    """An estimator with settings, under a name of its own."""
 
     name: str
     estimator: str
     settings: Any
 
 
-def as_they_come() -> list[Method]:
-    """Every registered estimator with its defaults."""
+def default_methods() -> list[Method]:
+    """Return every registered estimator with its default settings."""
     return [Method(name, name, each.parameters()) for name, each in ESTIMATORS.items()]
+
+
+as_they_come = default_methods  # deprecated name, to be removed after the next release
 
 
 @dataclass(frozen=True)
@@ -69,27 +80,28 @@ class Score:
     """Target pixels within each of `TOLERANCES_BINS`."""
     targets: int
     answered: int
+    """Target pixels with an estimate."""
     absolute_m: float
-    """Sum over the answered targets, of errors' magnitudes; the following likewise."""
+    """Sum of absolute errors over them; the following are sums, too."""
     signed_m: float
     square_m2: float
     inlier_square_m2: float
-    """Of errors within 3 bins."""
+    """Over errors within 3 bins."""
     seconds: float
 
 
 def score(capture: Capture, method: Method) -> Score:
     """Range a capture by one method and compare with its truth."""
-    flux_model_of(capture)  # once for each capture, whatever the method
+    flux_model_of(capture)  # estimated once per capture, whatever the method
     started = perf_counter()
     bins, _ = ESTIMATORS[method.estimator].delays(capture, method.settings)
     seconds = perf_counter() - started
     acquisition, truth_m = capture.acquisition, np.asarray(capture.truth_range_m)
-    return compared(acquisition.bin_to_range_m(bins), truth_m, acquisition.bin_length_m, seconds)
+    return compare(acquisition.bin_to_range_m(bins), truth_m, acquisition.bin_length_m, seconds)
 
 
-def compared(range_m: Floats, truth_m: Floats, bin_m: float, seconds: float) -> Score:
-    """An answer beside the truth, both of one shape, and what it took."""
+def compare(range_m: Floats, truth_m: Floats, bin_m: float, seconds: float) -> Score:
+    """Score estimates against the truth, both of one shape."""
     within = [metrics.restored(range_m, truth_m, t * bin_m) for t in TOLERANCES_BINS]
     error = metrics.errors_m(range_m, truth_m)
     error = error[np.isfinite(error)]
@@ -118,23 +130,26 @@ class Summary:
     bias_m: float
     inlier_rmse_m: float
     answered: float
+    """Share of target pixels with an estimate."""
     rd_variance: float
-    """Of the restoration degree within 3 bins over captures: the paper's Var, most plausibly."""
+    """Variance of the restoration degree within 3 bins over captures, probably the paper's Var."""
     milliseconds: float
-    """Median over captures, of this run on this machine."""
+    """Median over captures, on this machine."""
 
 
 def summary(scores: Sequence[Score]) -> Summary:
-    """Add up scores over captures, at least two of them."""
+    """Add up scores over at least two captures."""
     targets, answered = (sum(getattr(s, name) for s in scores) for name in ("targets", "answered"))
     hits = np.array([s.restored for s in scores])
 
     def mean(name: str, of: int) -> float:
         return sum(getattr(s, name) for s in scores) / of if of else math.nan
 
+    squares = [s.square_m2 / s.answered if s.answered else np.nan for s in scores]
+    mean_square = mean_interval(np.array(squares))
     return Summary(
         rd=tuple(metrics.wilson(int(h), targets) for h in hits.sum(axis=0)),
-        rmse_m=_root_of_mean([s.square_m2 / s.answered if s.answered else np.nan for s in scores]),
+        rmse_m=Interval(*np.sqrt(np.maximum(astuple(mean_square), 0.0)).tolist()),
         mae_m=mean("absolute_m", answered),
         bias_m=mean("signed_m", answered),
         inlier_rmse_m=math.sqrt(mean("inlier_square_m2", int(hits[:, -1].sum()))),
@@ -144,17 +159,10 @@ def summary(scores: Sequence[Score]) -> Summary:
     )
 
 
-def _root_of_mean(squares: Sequence[float]) -> Interval:
-    """Root of a mean over captures, with Student's 95 % interval of that mean."""
-    mean, count = float(np.mean(squares)), len(squares)
-    half = float(stdtrit(count - 1, 0.975) * np.std(squares, ddof=1) / math.sqrt(count))
-    return Interval(math.sqrt(mean), math.sqrt(max(mean - half, 0.0)), math.sqrt(mean + half))
-
-
 Results = dict[tuple[Condition, str], list[Score]]
-"""Scores in the order of the seeds, by condition and method's name."""
+"""Scores in the order of the seeds, by condition and name of the method."""
 
-_SEEDS_AT_ONCE = 5  # a piece of work: large enough to start, small enough to lose
+_SEEDS_PER_PIECE = 5  # large enough to be worth a process, small enough to lose
 
 
 def trials(
@@ -165,19 +173,19 @@ def trials(
     processes: int = 1,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Results:
-    """Score every method of a plan on one capture for each seed.
+    """Score every method of a plan on one capture per seed.
 
     Parameters
     ----------
     plan : mapping
         The methods to run under each condition.
     seeds : sequence of int
-        The same seeds under every condition and for every method: differences are paired.
+        The same for every condition and method, so that differences are paired.
     store : path, optional
-        A file to which every finished piece is added at once, and from which pieces that are there
-        already are taken: a run that was interrupted goes on where it stopped.
+        A file to which each finished piece of work is appended and from which finished pieces are
+        read: an interrupted run continues where it stopped.
     processes : int
-        Processes that share the work; the numbers do not depend on it.
+        Does not affect the numbers.
     progress : callable
         ``(pieces done, pieces in all)``, called after each piece.
 
@@ -186,18 +194,18 @@ def trials(
     dict
     """
     pieces = [
-        (condition, tuple(methods), tuple(seeds[first : first + _SEEDS_AT_ONCE]))
+        (condition, tuple(methods), tuple(seeds[first : first + _SEEDS_PER_PIECE]))
         for condition, methods in plan.items()
-        for first in range(0, len(seeds), _SEEDS_AT_ONCE)
+        for first in range(0, len(seeds), _SEEDS_PER_PIECE)
     ]
     known = dict(_read(store)) if store else {}
     if store and store.exists() and not store.read_bytes().endswith(b"\n"):
         with store.open("a", encoding="utf-8") as file:
-            file.write("\n")  # behind a line that an interruption cut short
+            file.write("\n")  # ends a line that an interruption cut short
     done = {piece: known[_key(piece)] for piece in pieces if _key(piece) in known}
     progress(len(done), len(pieces))
     missing = [piece for piece in pieces if piece not in done]
-    for piece, scores in computed(_work, missing, processes):
+    for piece, scores in mapped(_score_piece, missing, processes):
         done[piece] = scores
         if store:
             with store.open("a", encoding="utf-8") as file:
@@ -207,10 +215,9 @@ def trials(
     for piece in pieces:
         condition, methods, _ = piece
         for per_seed in done[piece]:
-            for method, values in zip(methods, per_seed, strict=True):
-                restored, *rest = values
-                found = Score(tuple(restored), *rest)
-                results.setdefault((condition, method.name), []).append(found)
+            for method, (restored, *rest) in zip(methods, per_seed, strict=True):
+                so_far = results.setdefault((condition, method.name), [])
+                so_far.append(Score(tuple(restored), *rest))
     return results
 
 
@@ -220,20 +227,20 @@ Piece = TypeVar("Piece")
 Found = TypeVar("Found")
 
 
-def computed(
-    work: Callable[[Piece], Found], pieces: Sequence[Piece], processes: int
+def mapped(
+    work: Callable[[Piece], Found],
+    pieces: Sequence[Piece],
+    processes: int,
+    in_new_process: bool = False,
 ) -> Iterator[tuple[Piece, Found]]:
-    """Do pieces of work, each as soon as a process is free; `work` is a module's own function."""
-    if processes == 1:
-        return ((piece, work(piece)) for piece in pieces)
-    return apart(work, pieces, processes)
+    """Yield pieces and their results as they finish; `work` is a module-level function.
 
-
-def apart(
-    work: Callable[[Piece], Found], pieces: Sequence[Piece], processes: int = 1
-) -> Iterator[tuple[Piece, Found]]:
-    """The same in processes of their own in any case, of one thread each."""
-    # Forked processes would inherit the state of kernels' threads without the threads.
+    With one process the work is done in this one, unless `in_new_process`.
+    """
+    if processes == 1 and not in_new_process:
+        yield from ((piece, work(piece)) for piece in pieces)
+        return
+    # A forked process would inherit the state of kernel threads without the threads.
     pool = ProcessPoolExecutor(
         processes,
         mp_context=multiprocessing.get_context("spawn"),
@@ -249,7 +256,7 @@ def apart(
             pool.shutdown(cancel_futures=True)
 
 
-def _work(piece: _Piece) -> _Scores:
+def _score_piece(piece: _Piece) -> _Scores:
     condition, methods, seeds = piece
     scores = []
     for seed in seeds:
@@ -259,22 +266,22 @@ def _work(piece: _Piece) -> _Scores:
 
 
 def _key(piece: _Piece) -> str:
-    """What a piece is, told by everything that its numbers depend on."""
+    """Return a digest of everything that the numbers of a piece depend on."""
     condition, methods, seeds = piece
-    told = [asdict(condition), [[m.estimator, asdict(m.settings)] for m in methods], seeds]
-    return sha256((json.dumps(told, sort_keys=True) + _code()).encode()).hexdigest()
+    parts = [asdict(condition), [[m.estimator, asdict(m.settings)] for m in methods], seeds]
+    return sha256((json.dumps(parts, sort_keys=True) + code_digest()).encode()).hexdigest()
 
 
 @cache
-def _code() -> str:
-    """A digest of the code: what another version computed is not taken for this one's."""
+def code_digest() -> str:
+    """Return a digest of the code, so that results of another version are not reused."""
     root = Path(core.__file__).parent
     sources = sorted(p for p in root.rglob("*.py") if "tests" not in p.parts)
     return sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
 
 
 def _read(store: Path) -> Iterator[tuple[str, _Scores]]:
-    """Pieces in a store; a line that an interruption cut short is left out."""
+    """Yield the pieces of a store; a line that an interruption cut short is left out."""
     if not store.exists():
         return
     for line in store.read_text(encoding="utf-8").splitlines():

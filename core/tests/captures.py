@@ -1,4 +1,4 @@
-"""Published captures, too large and not ours to keep in the project."""
+"""Published captures, which are too large for the project and belong to others."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ CAPTURES = Path(__file__).resolve().parents[3] / "shared" / "captures"
 
 
 def real_capture_path(name: str) -> Path:
-    """Where a published capture lies; CI always has them, and fails without."""
+    """Path of a published capture; without it a test is skipped, but fails in CI."""
     path = CAPTURES / name
     if not path.exists():
-        reason = f"{path} is absent: the published captures are kept beside the checkout"
+        reason = f"{path} is absent: see CONTRIBUTING.md on real captures"
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
     return path

@@ -1,8 +1,8 @@
-"""What all tests of core share."""
+"""Shared fixtures and settings of the tests of core."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numba
@@ -21,7 +21,7 @@ pytest.register_assert_rewrite("core.tests.refusing")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Run as plain Python, uint64 numbers that wrap round, as SplitMix64 needs, make numpy warn."""
+    """Ignore numpy's overflow warnings for the uint64 arithmetic of uncompiled kernels."""
     if numba.config.DISABLE_JIT:
         config.addinivalue_line(
             "filterwarnings",
@@ -31,10 +31,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what would take hours where nothing is compiled, and what tells nothing of kernels.
-
-    It runs where kernels are compiled.
-    """
+    """Without compiled kernels, leave out tests that take hours or do not depend on kernels."""
     if numba.config.DISABLE_JIT:
         marks = ("compiled", "files")
         left_out = [item for item in items if any(map(item.get_closest_marker, marks))]
@@ -43,8 +40,24 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture
+def threads() -> Iterator[None]:
+    """Restore the number of threads after a test."""
+    before = numba.get_num_threads()
+    yield
+    numba.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def quick_draws() -> Iterator[None]:
+    """Draw captures with numpy's multinomial, which is fast without compiled kernels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("core.simulation.PULSES_DRAWN_ONE_BY_ONE", 0)
+        yield
+
+
+@pytest.fixture
 def write(tmp_path: Path) -> Callable[[str, bytes], Path]:
-    """Makes a file of a name and a content."""
+    """Function that writes a file with a given name and content."""
 
     def written(name: str, content: bytes) -> Path:
         path = tmp_path / name
@@ -56,5 +69,5 @@ def write(tmp_path: Path) -> Callable[[str, bytes], Path]:
 
 @pytest.fixture
 def real_capture() -> Callable[[str], Path]:
-    """Path of a published capture."""
+    """Function that returns the path of a published capture."""
     return real_capture_path

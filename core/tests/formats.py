@@ -1,8 +1,7 @@
-"""Every way to keep the same counts in a file: what the readers' contract runs over.
+"""The same counts in every file format: samples for the contract of the readers.
 
-A new format is one entry of `FORMATS`; `test_readers.py` then holds it to the contract, damages its
-bytes, and demands an entry for each suffix that `core.io.readers.READERS` knows. What writes it
-lives in a module of its own, or in `core.tests.samples`.
+A new format is one entry of `FORMATS`; `test_readers.py` then checks it by the contract, damages
+its bytes, and requires an entry for each suffix of `core.io.readers.READERS`.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from core.tests.samples import (
 )
 
 Content = bytes | Mapping[str, bytes]
-"""What lies in a file; or, by their paths, in the files of a directory."""
+"""Content of a file; or, by their paths, of the files of a directory."""
 
 
 CUBES_REFUSE = (
@@ -55,7 +54,7 @@ CUBES_REFUSE = (
     {"shape": (3, 4)},
     {"first_detections": 7},
 )
-ARRAYS_REFUSE = tuple(told for told in CUBES_REFUSE if "no_trigger" not in told)
+ARRAYS_REFUSE = tuple(each for each in CUBES_REFUSE if "no_trigger" not in each)
 FRAMES_REFUSE = (
     {"n_bins": 50},
     {"n_pulses": 499},
@@ -68,30 +67,28 @@ TIMES_REFUSE = ({"no_trigger": 0}, {"shape": (3, 4)})
 
 @dataclass(frozen=True)
 class Format:
-    """A file that holds counts, and what a reader must make of it.
+    """A file that holds counts, and the expected result of reading it.
 
     Parameters
     ----------
     name : str
-        Of the file; its suffix chooses the reader.
+        Name of the file.
     build : callable
-        Gives the file's content, or the contents of a directory's files.
+        Returns the file's content, or the contents of a directory's files.
     cube : ndarray, shape (row, col, bin)
-        What must come out.
+        Expected counts.
     acquisition : Acquisition
-        What the test tells the reader, so that nothing is left to guess; what is guessed of the bin
-        width must agree with it.
+        Passed to the reader so that nothing is left to guess; a guessed bin width must equal its.
     needs : dict
         Arguments without which the file cannot be read.
-    told : dict
-        What must be told beyond the acquisition, the pulse and ``detection="first"``, so that
-        nothing is left to guess.
+    given : dict
+        Arguments that leave nothing to guess, with acquisition, pulse and ``detection="first"``.
     guesses : tuple of str
-        What the source must say is guessed, where nothing but `needs` is told; empty: nothing is.
+        Guesses that the source must list where only `needs` is passed; empty if there are none.
     refuses : tuple of dict
-        Arguments that make no sense for this file; the first is the one that must be named.
+        Arguments that do not apply to this file; the first of each must be named.
     n_damaged : int
-        How many damaged copies the fuzz test makes.
+        Number of damaged copies that the test reads.
     """
 
     name: str
@@ -99,14 +96,14 @@ class Format:
     cube: NDArray[Any] = field(default_factory=lambda: CUBE)
     acquisition: Acquisition = ACQUISITION
     needs: Mapping[str, Any] = field(default_factory=dict)
-    told: Mapping[str, Any] = field(default_factory=lambda: {"axes": "row col bin"})
+    given: Mapping[str, Any] = field(default_factory=lambda: {"axes": "row col bin"})
     guesses: tuple[str, ...] = ("bin width 1 ns",)
     refuses: Sequence[Mapping[str, Any]] = CUBES_REFUSE
     n_damaged: int = 50
 
 
 def put(path: Path, content: Content) -> Path:
-    """Write a file, or a directory of files, anew."""
+    """Write a file, or a directory of files."""
     if isinstance(content, bytes):
         path.write_bytes(content)
         return path
@@ -118,7 +115,7 @@ def put(path: Path, content: Content) -> Path:
 
 
 def damaged(content: Content, rng: random.Random) -> Content:
-    """The same for one file of a directory, which may also be lost."""
+    """Damage the content of a file, or one file of a directory, which may also be lost."""
     if isinstance(content, bytes):
         return mutated(content, rng)
     name = rng.choice(sorted(content))
@@ -127,13 +124,13 @@ def damaged(content: Content, rng: random.Random) -> Content:
 
 
 CELLS: dict[str, Any] = {
-    "told": {"axes": "row col", "time_unit_s": 1e-12},
+    "given": {"axes": "row col", "time_unit_s": 1e-12},
     "guesses": ("time unit 1 ps", "bin width 1 ns"),
     "refuses": TIMES_REFUSE,
 }
 
 FRAMES: dict[str, Any] = {
-    "told": {"axes": "pulse row col"},
+    "given": {"axes": "pulse row col"},
     "refuses": FRAMES_REFUSE,
 }
 
@@ -172,7 +169,7 @@ FORMATS: dict[str, Format] = {
         lambda: gmapd_bytes(CAMERA_CUBE, 500),
         cube=CAMERA_CUBE,
         acquisition=Acquisition(153, 250e-12, 1e-6, 500, pixel_angle_rad=1e-3),
-        told={"axes": "pulse row col"},
+        given={"axes": "pulse row col"},
         guesses=("bin width 250 ps", "gate 0-38.25 ns"),
         refuses=(*FRAMES_REFUSE, {"no_trigger": 0}),
     ),
@@ -184,7 +181,7 @@ FORMATS: dict[str, Format] = {
     "mat cube of doubles": Format("c.mat", lambda: mat_bytes(True, counts=CUBE * 1.0)),
 }
 
-# What instruments write tells the bins' width, except that of the TMF8820, always 91 ps.
+# Files of instruments give the bin width, except those of the TMF8820, always 91 ps.
 GATE = {"guesses": ("gate 0-100 ns", "pulse Gaussian of 1 ns")}
 FORMATS |= {
     "ptu": Format("c.ptu", lambda: ptu_bytes(CUBE), **GATE),
@@ -205,7 +202,7 @@ FORMATS |= {
 
 
 def known() -> Any:
-    """The counts and all else that is known."""
+    """The counts with all metadata."""
     return dataset(Capture(CUBE.copy(), ACQUISITION, Pulse.gaussian(2e-9)))
 
 
@@ -238,7 +235,7 @@ def list_of(cube: Any) -> Any:
 
 SPARSE: dict[str, Any] = {
     "needs": {"shape": (3, 4)},
-    "told": {"axes": "col row"},
+    "given": {"axes": "col row"},
     "guesses": ("pixels column by column", "bin width 1 ns"),
     "refuses": (
         {"n_bins": 99},
@@ -251,7 +248,7 @@ SPARSE: dict[str, Any] = {
 OWN: dict[str, Any] = {"guesses": ()}
 GZIP: dict[str, Any] = {"chunks": (2, 3, 64), "compression": "gzip", "shuffle": True}
 
-# A process of its own looks at each HDF5 file: fewer of them are damaged.
+# Damaged HDF5 often ends the process that reads it, which takes long: fewer copies.
 FORMATS |= {
     "mat sparse": Format("c.mat", lambda: mat_bytes(spad=list_of(CUBE), bins=100.0), **SPARSE),
     "mat sparse, compressed": Format(

@@ -1,4 +1,4 @@
-"""Small files as instruments write them."""
+"""Builders of small files of instruments."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def sdt_bytes(
     range_s : float
         Time that the bins cover together.
     changes, of_blocks, of_measurement : dict
-        Fields to write instead into the file's header, each block's, and the measurement's.
+        Values of fields to replace in the headers of the file, each block, and the measurement.
     """
     info = b"*IDENTIFICATION\r\n  ID        : SPC Setup & Data File\r\n*END\r\n"
     header = np.zeros(1, np.dtype(sdtfile.FILE_HEADER).newbyteorder("<"))
@@ -69,7 +69,7 @@ def sdt_bytes(
         measurement[name] = value
     begin = header.itemsize + len(info) + measurement.itemsize
     body = b"".join(_sdt_blocks(blocks, kind, begin, of_blocks or {}))
-    words = {
+    known = {
         "revision": 0x28 << 4 | 15,
         "info_offs": header.itemsize,
         "info_length": len(info),
@@ -81,7 +81,7 @@ def sdt_bytes(
         "header_valid": 0x5555,
         "chksum": 0x55AA,
     }
-    for name, value in {**words, **(changes or {})}.items():
+    for name, value in {**known, **(changes or {})}.items():
         header[name] = value
     return header.tobytes() + info + measurement.tobytes() + body
 

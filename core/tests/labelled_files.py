@@ -1,4 +1,4 @@
-"""HDF5, netCDF, Zarr and MATLAB 7.3 files of the samples, laid out as others write them."""
+"""Builders of HDF5, netCDF, Zarr and MATLAB 7.3 files, laid out as other programs write them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.io.readers.stored import Numbers
+from core.io.readers.stored import Stored
 
 
 def hdf5_bytes(user_block: int = 0, **arrays: Any) -> bytes:
-    """A file of arrays; one given as a mapping is ``data`` with how to keep it."""
+    """A file of arrays; a mapping holds ``data``, its ``attributes`` and how to store it."""
     file = io.BytesIO()
     with h5py.File(file, "w", userblock_size=user_block) as target:
         for name, array in arrays.items():
-            how = dict(array) if isinstance(array, Mapping) else {"data": array}
-            known = how.pop("attributes", {})
-            target.create_dataset(name, **how).attrs.update(known)
+            options = dict(array) if isinstance(array, Mapping) else {"data": array}
+            known = options.pop("attributes", {})
+            target.create_dataset(name, **options).attrs.update(known)
     return file.getvalue()
 
 
@@ -38,23 +38,15 @@ def zarr_files(dataset: Any, version: int, **encoding: Any) -> dict[str, bytes]:
         dataset.to_zarr(
             folder, zarr_format=version, consolidated=False, encoding={"counts": encoding}
         )
-        return files_of(Path(folder))
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    """The files of a directory by their paths in it."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+        files = sorted(file for file in Path(folder).rglob("*") if file.is_file())
+        return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
 
 
 class Matlab73:
     """A file as MATLAB's ``save -v7.3`` lays it out: HDF5 behind a header of 512 bytes.
 
-    Every dataset tells its class; axes lie in the reverse order; a cell array is an array of
-    references into a group ``#refs#``; what is empty is its size instead, marked as empty.
+    Every dataset has the attribute MATLAB_class; axes are in reverse order; a cell array is an
+    array of references into a group ``#refs#``; an empty array is stored as its size.
     """
 
     def __init__(self) -> None:
@@ -62,11 +54,13 @@ class Matlab73:
         self._hdf5 = h5py.File(self._file, "w", userblock_size=512)
         self._n_cells = 0
 
-    def number(self, name: str, values: Any, kind: str | None = None, **how: Any) -> h5py.Dataset:
+    def number(
+        self, name: str, values: Any, kind: str | None = None, **options: Any
+    ) -> h5py.Dataset:
         """Numbers, at least a matrix."""
         array = np.atleast_2d(np.asarray(values))
         if array.size:
-            dataset = self._hdf5.create_dataset(name, data=array.transpose(), **how)
+            dataset = self._hdf5.create_dataset(name, data=array.transpose(), **options)
         else:
             dataset = self._hdf5.create_dataset(name, data=np.array(array.shape, np.uint64))
             dataset.attrs["MATLAB_empty"] = np.uint8(1)
@@ -75,11 +69,11 @@ class Matlab73:
         dataset.attrs["MATLAB_class"] = np.bytes_(kind)
         return dataset
 
-    def cells(self, name: str, cells: NDArray[np.object_], **how: Any) -> h5py.Dataset:
+    def cells(self, name: str, cells: NDArray[np.object_], **options: Any) -> h5py.Dataset:
         """A cell array of vectors."""
         references = np.empty(cells.shape, h5py.ref_dtype)
         for place in np.ndindex(cells.shape):
-            content = self.number(f"#refs#/c{self._n_cells}", cells[place], **how)
+            content = self.number(f"#refs#/c{self._n_cells}", cells[place], **options)
             self._n_cells += 1
             references[place] = content.ref
         dataset = self._hdf5.create_dataset(name, data=references.T, dtype=h5py.ref_dtype)
@@ -91,7 +85,7 @@ class Matlab73:
         codes = np.array([[ord(letter) for letter in text]], np.uint16)
         self.number(name, codes, "char").attrs["MATLAB_int_decode"] = np.int32(2)
 
-    def sparse(self, name: str, matrix: Any) -> None:
+    def sparse(self, name: str, matrix: Any) -> h5py.Group:
         """A sparse matrix."""
         kept = matrix.tocsc()
         group = self._hdf5.create_group(name)
@@ -100,6 +94,7 @@ class Matlab73:
         group["data"] = kept.data.astype(float)
         group["ir"] = kept.indices.astype(np.uint64)
         group["jc"] = kept.indptr.astype(np.uint64)
+        return group
 
     def bytes(self) -> bytes:
         """The file, which is then closed."""
@@ -113,11 +108,11 @@ class Reads:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.n_bytes = 0
-        read = Numbers.__getitem__
+        read = Stored.__getitem__
 
-        def counted(array: Numbers, box: tuple[slice, ...]) -> NDArray[Any]:
+        def counted(array: Stored, box: tuple[slice, ...]) -> NDArray[Any]:
             found = read(array, box)
             self.n_bytes += found.nbytes
             return found
 
-        monkeypatch.setattr(Numbers, "__getitem__", counted)
+        monkeypatch.setattr(Stored, "__getitem__", counted)

@@ -1,4 +1,4 @@
-"""How a bad file is refused: by one type of error, that names the file, in little memory."""
+"""Assertion that a bad file is refused: one type of error that names the file, little memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def assert_refused(
     error: type[ValueError],
     most_bytes: int,
 ) -> None:
-    """Fail unless a file is refused with a message that matches, in no more memory than that."""
+    """Fail unless a file is refused with a message that matches, within `most_bytes` of memory."""
     with pytest.raises(error):
         read(path)  # the first call of a format loads its library
     tracemalloc.start()

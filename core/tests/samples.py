@@ -1,4 +1,4 @@
-"""The counts that every format keeps, and how to write them."""
+"""The counts of all sample files, and builders of NumPy and MATLAB files."""
 
 from __future__ import annotations
 
@@ -82,30 +82,27 @@ def mat_bytes(compressed: bool = False, **arrays: Any) -> bytes:
     return file.getvalue()
 
 
-# MATLAB's own byte layout, for what SciPy cannot write.
+# MATLAB's own byte layout, for files that SciPy cannot write.
 
 UINT16, INT32, UINT32, MATRIX = 4, 5, 6, 14
 CELL, UINT16_CLASS = 1, 11
 
 
-def element(order: str, kind: int, payload: bytes) -> bytes:
-    return struct.pack(order + "II", kind, len(payload)) + payload + bytes(-len(payload) % 8)
+def element(kind: int, payload: bytes) -> bytes:
+    return struct.pack("<II", kind, len(payload)) + payload + bytes(-len(payload) % 8)
 
 
-def matrix(order: str, array_class: int, dims: tuple[int, ...], name: bytes, body: bytes) -> bytes:
-    flags = element(order, UINT32, struct.pack(order + "II", array_class, 0))
-    shape = element(order, INT32, struct.pack(f"{order}{len(dims)}i", *dims))
-    return element(order, MATRIX, flags + shape + element(order, 1, name) + body)
+def matrix(array_class: int, dims: tuple[int, ...], name: bytes, body: bytes) -> bytes:
+    flags = element(UINT32, struct.pack("<II", array_class, 0))
+    shape = element(INT32, struct.pack(f"<{len(dims)}i", *dims))
+    return element(MATRIX, flags + shape + element(1, name) + body)
 
 
-def mat_file(order: str, *variables: bytes) -> bytes:
-    header = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(order + "H", 0x100)
-    return header + (b"IM" if order == "<" else b"MI") + b"".join(variables)
+def mat_file(variable: bytes) -> bytes:
+    return b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x100) + b"IM" + variable
 
 
-def photon_cell(order: str, *times: int) -> bytes:
-    values = element(order, UINT16, struct.pack(f"{order}{len(times)}H", *times))
-    return matrix(order, UINT16_CLASS, (len(times), 1), b"", values)
+PHOTON_CELL = matrix(UINT16_CLASS, (1, 1), b"", element(UINT16, struct.pack("<H", 5)))
 
 
 OWN_FIELDS = {
@@ -128,15 +125,15 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
     changed = bytearray(content)
     for _ in range(rng.choice([1, 1, 2, 4])):
         place = rng.randrange(len(changed))
-        way = rng.random()
-        if way < 0.6:
+        kind = rng.random()
+        if kind < 0.6:
             changed[place] = rng.randrange(256)
-        elif way < 0.8:
+        elif kind < 0.8:
             word = rng.choice([0, 1, 14, 2**16, 2**31 - 1, 2**31, 2**32 - 1])
             changed[place : place + 4] = word.to_bytes(4, "little")
-        elif way < 0.87:
+        elif kind < 0.87:
             changed[place:place] = rng.randbytes(4)
-        elif way < 0.94 and len(changed) > 100:
+        elif kind < 0.94 and len(changed) > 100:
             del changed[place : place + 4]
         else:
             changed = changed[: max(place, 1)]

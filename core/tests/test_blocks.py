@@ -1,4 +1,4 @@
-"""Cubes laid out for kernels: nothing lost, nothing added, and σ as it is defined."""
+"""Tests of the layout of cubes for kernels."""
 
 from __future__ import annotations
 
@@ -27,11 +27,6 @@ def test_blocks_hold_the_cube_and_zeros(n_pixels: int, n_bins: int, dtype: type)
     assert (pixels[n_pixels:] == 0).all()
     assert len(pixels) < n_pixels + LANES
     np.testing.assert_array_equal(blocks.largest.ravel()[:n_pixels], cube[0].max(axis=1))
-
-
-def test_pixels_follow_each_other_row_by_row() -> None:
-    cube = random_cube(70, 5).reshape(7, 10, 5)
-    np.testing.assert_array_equal(to_blocks(cube).counts[1, :, 0], cube[6, 4])
 
 
 def test_blocks_of_a_view_are_those_of_its_copy() -> None:

@@ -1,4 +1,4 @@
-"""Lines of sight, and the points on them."""
+"""Tests of lines of sight and points."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_neighbours_at_the_centre_are_one_pixel_angle_apart() -> None:
     assert angle_between(lines[10, 0], lines[10, 1]) < ANGLE
 
 
-def test_coordinates_are_right_away_and_up() -> None:
+def test_coordinates_are_right_handed() -> None:
     lines = sight_lines((21, 33), ANGLE)
     np.testing.assert_array_equal(lines[10, 16], [0, 1, 0])
     assert np.all(np.diff(lines[..., 0], axis=1) > 0)  # the last column is on the right
@@ -65,7 +65,7 @@ def test_an_image_upside_down_is_the_cloud_upside_down(rows: int, cols: int, ang
     np.testing.assert_allclose(turned[::-1, ::-1] * [-1, 1, -1], upright, rtol=1e-9, atol=1e-9)
 
 
-def test_no_answers_are_no_points() -> None:
+def test_pixels_without_a_range_have_no_points() -> None:
     points = points_m(np.full((2, 3), np.nan), ANGLE)
     assert points.xyz_m.shape == (0, 3)
     assert points.row.shape == points.col.shape == (0,)
@@ -77,6 +77,6 @@ def test_an_impossible_angle_is_refused(angle: float) -> None:
         points_m(np.ones((2, 3)), angle)
 
 
-def test_what_is_no_image_is_refused() -> None:
+def test_ranges_of_another_shape_are_refused() -> None:
     with pytest.raises(ValueError, match=r"range_m = 'shape \(3,\)'.*image \(row, col\)"):
         points_m([1.0, 2.0, 3.0], ANGLE)

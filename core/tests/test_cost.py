@@ -1,4 +1,4 @@
-"""Memory and time of an estimate: predicted, bounded, and refused where they are too much."""
+"""Tests of the prediction of memory and time, and of the refusal of too large estimates."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def empty(*shape: int) -> Capture:
 
 
 @pytest.mark.parametrize("method", ["tracking", "likelihood", "chi", "unmixing"])
-def test_a_long_gate_takes_no_more_memory_than_its_pixels_want(method: str) -> None:
+def test_memory_of_a_long_gate_depends_on_its_pixels(method: str) -> None:
     # A block of 64 lanes would take 3.3 kB a bin, for a single pixel: 660 MB.
     assert working_bytes(method, 1, 1, 200_000) < 150 * MB
 
@@ -49,14 +49,17 @@ def test_a_long_gate_takes_no_more_memory_than_its_pixels_want(method: str) -> N
         ("likelihood", (128, 128, 512)),
     ],
 )
-def test_the_memory_predicted_is_what_is_taken(method: str, shape: tuple[int, int, int]) -> None:
+def test_predicted_memory_is_measured(method: str, shape: tuple[int, int, int]) -> None:
     expected = predicted(shape, method).working_bytes
     assert expected / 3 < working_bytes(method, *shape) < 1.3 * expected
 
 
-def test_a_posterior_that_is_kept_is_not_counted_again() -> None:
+def test_a_cached_posterior_is_not_counted() -> None:
     shape = (256, 256, 100)
-    whole, rest = (predicted(shape, "coates", is_lit=is_lit) for is_lit in (False, True))
+    whole, rest = (
+        predicted(shape, "coates", posterior_is_cached=posterior_is_cached)
+        for posterior_is_cached in (False, True)
+    )
     assert rest.working_bytes <= whole.working_bytes - 4 * 256 * 256 * 100
     assert rest.seconds < whole.seconds
 
@@ -82,20 +85,20 @@ def test_an_estimate_that_does_not_fit_is_refused_before_it_begins(call, monkeyp
 
 
 @pytest.mark.parametrize("method", ["tracking", "likelihood", "kde", "chi", "unmixing"])
-def test_an_answer_is_the_same_bit_for_bit_however_much_is_held_at_once(method, monkeypatch):
+def test_estimates_do_not_depend_on_the_numbers_held_at_once(method, monkeypatch):
     rng = np.random.default_rng(0)
     cube = rng.poisson(rng.gamma(2, 0.05, (11, 17, 1)), (11, 17, 40)).astype(np.uint16)
     cube[..., 20:22] += rng.poisson(2.0, (11, 17, 2)).astype(np.uint16)
 
-    def answer() -> tuple[np.ndarray, ...]:
+    def found() -> tuple[np.ndarray, ...]:
         image = estimate(Capture(cube, Acquisition(40, 1e-9, n_pulses=200)), method)
         return image.bin, image.score, image.confidence
 
-    expected = answer()
-    monkeypatch.setattr("core.inference.likelihood._TABLE_NUMBERS", 1000)  # two pixels side by side
-    monkeypatch.setattr("core.inference.likelihood._FLUX_NUMBERS", 1000)
-    monkeypatch.setattr("core.inference.likelihood._AT_ONCE", 100)
+    expected = found()
+    monkeypatch.setattr("core.inference.likelihood.TABLE_NUMBERS", 1000)  # two pixels side by side
+    monkeypatch.setattr("core.inference.likelihood.FLUX_NUMBERS", 1000)
+    monkeypatch.setattr("core.inference.likelihood.NUMBERS_AT_ONCE", 100)
     for module in ("base", "chi", "unmixing"):
-        monkeypatch.setattr(f"core.estimators.{module}._AT_ONCE", 2000)
-    for one, other in zip(answer(), expected, strict=True):
+        monkeypatch.setattr(f"core.estimators.{module}.NUMBERS_AT_ONCE", 2000)
+    for one, other in zip(found(), expected, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
-from importlib import import_module
 from typing import Any
 
 import numba
@@ -15,7 +13,7 @@ from scipy import stats
 
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
-from core.estimators import ESTIMATORS, FALSE_ALARM, base, estimate
+from core.estimators import ESTIMATORS, base, estimate
 from core.io.readers.dense import guess_detection
 from core.scene import Scene
 from core.simulation import simulate
@@ -28,20 +26,18 @@ FOUR_SIGMA = float(stats.norm.sf(4))
 
 every_estimator = pytest.mark.parametrize("method", ESTIMATORS)
 
-SEES_NEIGHBOURS = {"chi": 7, "unmixing": 7}
-"""Rows and columns of the pixels whose counts may change an answer, beside `Estimator.reach`."""
+WINDOWS = {"chi": 7, "unmixing": 7}
+"""Rows and columns of the pixels that may change an estimate, if not `Estimator.window_size`."""
 
 
-def reach_of(method: str) -> int:
-    return SEES_NEIGHBOURS.get(method, ESTIMATORS[method].reach(ESTIMATORS[method].parameters()))
+def window_of(method: str) -> int:
+    return WINDOWS.get(method, ESTIMATORS[method].window_size(ESTIMATORS[method].parameters()))
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _quick() -> Iterator[None]:
-    """Small images of no echo, and numpy's multinomial, which test_simulate shows to draw alike."""
+def _small_null_images(quick_draws: None) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(base, "NULL_SIDE", NULL_SIDE)
-        patch.setattr(import_module("core.simulation"), "PULSES_DRAWN_ONE_BY_ONE", 0)
         yield
 
 
@@ -60,13 +56,13 @@ def delays(share: float) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def sky(_quick: None) -> Capture:
+def sky(_small_null_images: None) -> Capture:
     return simulated(delays(0.0), seed=7, sbr=0.1)
 
 
 @pytest.fixture(scope="module")
-def uneven(_quick: None) -> Capture:
-    """Rows that see no echo, the later ones three times as much background."""
+def uneven(_small_null_images: None) -> Capture:
+    """Rows without echoes, the lower half with three times the background."""
     dark, bright = (
         simulated(delays(0.0)[: SIZE // 2], seed=10 + i, signal=0.1, sbr=0.3 / (1 + 2 * i))
         for i in (0, 1)
@@ -76,21 +72,13 @@ def uneven(_quick: None) -> Capture:
 
 
 @pytest.fixture(scope="module")
-def half(_quick: None) -> Capture:
+def half(_small_null_images: None) -> Capture:
     return simulated(delays(0.5), seed=8, sbr=0.1)
 
 
 @pytest.fixture(scope="module")
-def unseen(half: Capture) -> Capture:
-    """The same, but for a row of pixels that saw nothing."""
-    cube = half.cube.copy()
-    cube[0] = 0
-    return replace(half, cube=cube)
-
-
-@pytest.fixture(scope="module")
-def strong(_quick: None) -> Capture:
-    """Strong echoes, all from about one depth, as who looks at the neighbours expects."""
+def strong(_small_null_images: None) -> Capture:
+    """Strong echoes from one depth, so that neighbours agree."""
     onset_bin = np.random.default_rng(1).uniform(28, 29, (SIZE, SIZE))
     return simulated(onset_bin, seed=9, signal=0.5, sbr=5.0)
 
@@ -110,17 +98,17 @@ def expected_alarms(false_alarm: float, n_null: float, n_pixels: float) -> tuple
 
 
 def assert_alarms(method: str, capture: Capture, empty: np.ndarray, false_alarm: float) -> None:
-    """As many false alarms among the `empty` pixels (row, col) as were allowed."""
+    """Require the allowed number of false alarms among the `empty` pixels (row, col)."""
     image = estimate(capture, method, false_alarm=false_alarm)
     parameters = ESTIMATORS[method].parameters()
     least = ESTIMATORS[method].threshold(capture, parameters, false_alarm)
     # Neighbours that share counts say as much as one of them, at worst.
-    reach = reach_of(method)
+    window = window_of(method)
     some = np.zeros(capture.shape, bool)
-    some[reach // 2 :: reach, reach // 2 :: reach] = True
+    some[window // 2 :: window, window // 2 :: window] = True
     some &= empty
-    side = base._whole(min(base.NULL_SIDE, ESTIMATORS[method].null_side), SIZE)
-    n_null = side**2 / reach**2
+    side = base.whole_patches(min(base.NULL_SIDE, ESTIMATORS[method].null_side), SIZE)
+    n_null = side**2 / window**2
     low, most = expected_alarms(false_alarm, n_null, np.count_nonzero(some))
     assert np.count_nonzero(image.valid[some]) <= most
     # Scores that are counts are often equal: fewer exceed the threshold, but no fewer reach it.
@@ -129,23 +117,19 @@ def assert_alarms(method: str, capture: Capture, empty: np.ndarray, false_alarm:
 
 @every_estimator
 @pytest.mark.parametrize("false_alarm", [0.1, 0.01])
-def test_false_alarms_of_an_empty_image_are_as_many_as_allowed(
-    sky: Capture, method: str, false_alarm: float
-) -> None:
+def test_false_alarm_rate_of_an_empty_image(sky: Capture, method: str, false_alarm: float) -> None:
     assert_alarms(method, sky, np.full(sky.shape, True), false_alarm)
 
 
 @every_estimator
-def test_false_alarms_over_an_uneven_background_are_as_many_as_allowed(
-    uneven: Capture, method: str
-) -> None:
+def test_false_alarm_rate_over_an_uneven_background(uneven: Capture, method: str) -> None:
     assert_alarms(method, uneven, np.full(uneven.shape, True), 0.1)
 
 
 @every_estimator
-def test_false_alarms_beside_targets_are_as_many_as_allowed(half: Capture, method: str) -> None:
+def test_false_alarm_rate_next_to_targets(half: Capture, method: str) -> None:
     empty = np.full(half.shape, True)
-    empty[:, : SIZE // 2 + reach_of(method) // 2] = False  # whose counts have no part of an echo's
+    empty[:, : SIZE // 2 + window_of(method) // 2] = False  # whose counts have no part of an echo's
     assert_alarms(method, half, empty, 0.1)
 
 
@@ -154,9 +138,7 @@ def same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 @every_estimator
-def test_every_pixel_is_answered_where_all_false_alarms_are_allowed(
-    half: Capture, method: str
-) -> None:
+def test_a_false_alarm_rate_of_1_is_no_threshold(half: Capture, method: str) -> None:
     expected = estimate(half, method)
     for all_allowed in (1, 1.0, None):
         image = estimate(half, method, false_alarm=all_allowed)
@@ -165,7 +147,7 @@ def test_every_pixel_is_answered_where_all_false_alarms_are_allowed(
 
 
 @every_estimator
-def test_a_stricter_threshold_leaves_some_of_the_answers(half: Capture, method: str) -> None:
+def test_a_stricter_threshold_keeps_a_subset(half: Capture, method: str) -> None:
     looser = estimate(half, method)
     for false_alarm in (0.5, 0.1, 0.01, 0.001):
         image = estimate(half, method, false_alarm=false_alarm)
@@ -191,24 +173,19 @@ def test_strong_echoes_stay(strong: Capture, method: str) -> None:
     assert (np.abs(error[image.valid]) < 4 * strong.acquisition.bin_length_m).mean() > 0.95
 
 
-@every_estimator
-def test_a_pixel_that_saw_nothing_is_no_detection(unseen: Capture, method: str) -> None:
-    assert not estimate(unseen, method, false_alarm=0.5).valid[0].any()
-
-
-def told(cube: np.ndarray, n_pulses: int | None = 1000) -> Capture:
-    """Counts, and a light for the oracle to be told."""
-    light: dict[str, Any] = {"signal": np.full(cube.shape[:2], 0.1), "background": 1.7}
+def with_fluxes(cube: np.ndarray, n_pulses: int | None = 1000) -> Capture:
+    """Return a capture with true fluxes, which the oracle needs."""
+    fluxes: dict[str, Any] = {"signal": np.full(cube.shape[:2], 0.1), "background": 1.7}
     setting = Acquisition(n_bins=cube.shape[2], n_pulses=n_pulses)
-    return Capture(cube, setting, detection=guess_detection(cube, n_pulses), **light)
+    return Capture(cube, setting, detection=guess_detection(cube, n_pulses), **fluxes)
 
 
 CAPTURES = {
-    "one photon": told(np.eye(20, dtype=np.uint16)[np.newaxis, :1]),
-    "one bin": told(np.arange(12, dtype=np.uint16).reshape(3, 4, 1)),
-    "empty": told(np.zeros((3, 4, 20), np.uint16)),
-    "full narrow counters": told(np.full((3, 4, 20), 255, np.uint8)),
-    "pulses unknown": told(np.full((3, 4, 20), 3, np.uint32), n_pulses=None),
+    "one photon": with_fluxes(np.eye(20, dtype=np.uint16)[np.newaxis, :1]),
+    "one bin": with_fluxes(np.arange(12, dtype=np.uint16).reshape(3, 4, 1)),
+    "empty": with_fluxes(np.zeros((3, 4, 20), np.uint16)),
+    "full narrow counters": with_fluxes(np.full((3, 4, 20), 255, np.uint8)),
+    "pulses unknown": with_fluxes(np.full((3, 4, 20), 3, np.uint32), n_pulses=None),
 }
 
 
@@ -224,17 +201,12 @@ def test_thresholds_are_always_defined(capture: Capture, method: str) -> None:
 def test_a_long_gates_threshold_is_found_on_fewer_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(base, "NULL_SIDE", 256)
     for n_bins in (2**14, 2**20):
-        capture = told(np.zeros((1, 1, n_bins), np.uint16))
-        side = base._null_pixels(capture).shape[0]
+        capture = with_fluxes(np.zeros((1, 1, n_bins), np.uint16))
+        side = base.null_pixels(capture).shape[0]
         assert side == max(1, math.isqrt(2**23 // n_bins)) < 256
 
 
-def test_what_is_no_share_of_false_alarms_is_refused(half: Capture) -> None:
+def test_other_false_alarm_rates_are_refused(half: Capture) -> None:
     for bad in (0, 0.0, -0.1, 0.0001, 1.001, 2, math.nan, math.inf, "x", True):
         with pytest.raises(ValueError, match=r"false_alarm = .* is not accepted"):
             estimate(half, "peak", false_alarm=bad)  # type: ignore[arg-type]
-
-
-def test_the_strictest_share_is_accepted(half: Capture) -> None:
-    assert FALSE_ALARM.least == 0.001
-    assert estimate(half, "peak", false_alarm=FALSE_ALARM.least).valid.shape == half.shape

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from importlib import import_module
 from typing import Any
 
 import numba
@@ -24,7 +23,7 @@ from core.simulation import simulate
 from core.tracking import PRESETS, TrackingParameters
 from core.trigger import rate_per_bin, trigger_probability
 
-pytestmark = pytest.mark.compiled
+pytestmark = [pytest.mark.compiled, pytest.mark.usefixtures("quick_draws")]
 
 SIZE = 48  # rows and columns where many pixels are wanted
 THREADS = sorted({1, numba.config.NUMBA_NUM_THREADS})
@@ -35,25 +34,11 @@ CASES["tracking as printed"] = ("tracking", PRESETS["as printed"])
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 every_estimator = pytest.mark.parametrize("method", ESTIMATORS)
-# What looks at one pixel at a time; what sees shapes alone and not how many counts make them.
+# Methods that use single pixels; methods that are invariant to a factor on all counts.
 single_pixel = pytest.mark.parametrize(
     "method", [name for name in ESTIMATORS if name not in ("kde", "chi", "unmixing")]
 )
 scale_free = pytest.mark.parametrize("method", ["tracking", "peak", "matched_filter"])
-
-
-@pytest.fixture(autouse=True)
-def _quick_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Numpy's multinomial, which test_simulate shows to draw alike, is quick without a compiler."""
-    monkeypatch.setattr(import_module("core.simulation"), "PULSES_DRAWN_ONE_BY_ONE", 0)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts the number of threads back."""
-    before = numba.get_num_threads()
-    yield
-    numba.set_num_threads(before)
 
 
 def simulated(size: int = 8, n_pulses: int = 1000, sbr: float = 0.06, **more: Any) -> Capture:
@@ -64,7 +49,7 @@ def simulated(size: int = 8, n_pulses: int = 1000, sbr: float = 0.06, **more: An
 
 
 def capture_of(cube: Any, n_pulses: int | None = 1000, dtype: type = np.uint16) -> Capture:
-    """Counts, and a light for the oracle to be told."""
+    """Return a capture with true fluxes, which the oracle needs."""
     cube = np.array(cube, dtype)
     return Capture(
         cube,
@@ -86,8 +71,8 @@ def assert_contract(capture: Capture, image: RangeImage) -> None:
     assert np.isfinite(image.score).all()
     assert ((image.confidence >= 0) & (image.confidence <= 1)).all()
     assert (image.confidence[~image.valid] == 0).all()
-    answered = image.bin[image.valid]
-    assert ((answered >= 0) & (answered <= capture.acquisition.n_bins)).all()
+    found = image.bin[image.valid]
+    assert ((found >= 0) & (found <= capture.acquisition.n_bins)).all()
     np.testing.assert_array_equal(image.range_m, capture.acquisition.bin_to_range_m(image.bin))
 
 
@@ -121,7 +106,7 @@ CAPTURES: dict[str, Callable[[], Capture]] = {
 
 @every_case
 @pytest.mark.parametrize("build", CAPTURES.values(), ids=CAPTURES)
-def test_answers_keep_the_contract(build: Callable[[], Capture], case: tuple[str, Any]) -> None:
+def test_estimates_keep_the_contract(build: Callable[[], Capture], case: tuple[str, Any]) -> None:
     capture = build()
     before = capture.cube.copy()
     image = estimate(capture, *case)
@@ -133,7 +118,7 @@ def test_answers_keep_the_contract(build: Callable[[], Capture], case: tuple[str
 
 
 @every_case
-def test_no_photon_gives_no_answer(case: tuple[str, Any]) -> None:
+def test_a_pixel_without_photons_gets_no_estimate(case: tuple[str, Any]) -> None:
     cube = simulated().cube.copy()
     cube[2] = 0
     image = estimate(capture_of(cube), *case)
@@ -177,7 +162,7 @@ def test_depths_do_not_bias_a_strong_echo(method: str) -> None:
 
 
 def lone_echo(onset_bin: float = 40.3, n_pulses: int = 1000, **acquisition: Any) -> Capture:
-    """Four pixels that see the same echo, to the last count, and nothing else."""
+    """Return four pixels with the same echo and no background."""
     setting = Acquisition(n_pulses=n_pulses, **acquisition)
     pulse = Pulse(setting.bin_width_s)
     rate = rate_per_bin(np.full((2, 2), onset_bin), np.full((2, 2), 0.4), 0.0, pulse, setting)
@@ -187,7 +172,7 @@ def lone_echo(onset_bin: float = 40.3, n_pulses: int = 1000, **acquisition: Any)
 
 @every_estimator
 @pytest.mark.parametrize("later", [1, 7, 33])
-def test_a_later_echo_gives_a_later_answer(method: str, later: int) -> None:
+def test_a_later_echo_gives_a_later_estimate(method: str, later: int) -> None:
     capture = lone_echo()
     cube, flux_prior = np.roll(capture.cube, later, axis=2), flux_prior_of(capture)
     shifted = replace(capture, cube=cube, flux_prior=flux_prior)  # the flux decides on the lag
@@ -195,7 +180,7 @@ def test_a_later_echo_gives_a_later_answer(method: str, later: int) -> None:
     assert near.valid.all()
     # Rounding, once of bins near a hundred in float64 and once of densities in float32.
     np.testing.assert_allclose(far.bin - near.bin, later, rtol=0, atol=1e-4)
-    if method in ("peak", "matched_filter", "cfar", "shi"):  # others know how late it is
+    if method in ("peak", "matched_filter", "cfar", "shi"):  # other scores depend on the delay
         np.testing.assert_allclose(far.score, near.score, rtol=1e-5)
 
 
@@ -225,7 +210,7 @@ def assert_same(found: RangeImage, expected: RangeImage) -> None:
 @every_case
 @pytest.mark.parametrize("n_threads", THREADS)
 @pytest.mark.usefixtures("threads")
-def test_answers_do_not_depend_on_threads(
+def test_estimates_do_not_depend_on_threads(
     monkeypatch: pytest.MonkeyPatch, case: tuple[str, Any], n_threads: int
 ) -> None:
     capture = simulated(size=14)
@@ -238,12 +223,12 @@ def test_answers_do_not_depend_on_threads(
 @single_pixel
 def test_pixels_are_ranged_one_by_one(method: str) -> None:
     capture = simulated(size=14)
-    capture = capture_of(capture.cube)  # a light that does not follow the pixels around
+    capture = capture_of(capture.cube)  # the same true fluxes in all pixels
     order = np.random.default_rng(1).permutation(14 * 14)
     shuffled = capture_of(capture.cube.reshape(1, 196, 100)[:, order])
     expected, found = estimate(capture, method), estimate(shuffled, method)
     for field in ("range_m", "bin", "score", "confidence", "valid"):
-        # The light is a mean over all pixels, which rounds as their order has it.
+        # The flux model is a mean over all pixels, whose rounding depends on their order.
         np.testing.assert_allclose(
             getattr(found, field)[0], getattr(expected, field).ravel()[order], rtol=0, atol=1e-3
         )
@@ -258,7 +243,7 @@ def test_narrow_counts_are_ranged_like_wide_ones(case: tuple[str, Any]) -> None:
 
 @cache
 def sky(tau_s: float, sbr: float) -> Capture:
-    """No target; what it tells of its light is found once for all cases."""
+    """Return an image without targets, shared by all cases."""
     scene = Scene(np.full((2 * SIZE, 2 * SIZE), np.nan))
     return simulate(scene, Acquisition(), Flux(sbr=sbr), Pulse(tau_s), seed=3)
 
@@ -323,14 +308,14 @@ def test_settings_may_be_given_field_by_field() -> None:
         (("tracking",), {"weight": "survival"}, r"weight = 'survival' needs the number of pulses"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(
+def test_wrong_arguments_are_refused(
     arguments: tuple[Any, ...], fields: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
         estimate(capture_of(simulated().cube, n_pulses=None), *arguments, **fields)
 
 
-def test_the_oracle_must_be_told() -> None:
+def test_the_oracle_needs_true_fluxes() -> None:
     capture = replace(simulated(), background=None)
     with pytest.raises(ValueError, match=r"method = 'oracle' needs the true .*take 'likelihood'"):
         estimate(capture, "oracle")

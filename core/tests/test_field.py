@@ -1,4 +1,4 @@
-"""The study on published captures: what it reads of them, and that its figures are sane."""
+"""The study on published captures: its input and the plausibility of its figures."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ pytestmark = pytest.mark.compiled
 
 @pytest.fixture
 def folder(real_capture: Callable[[str], Path]) -> Path:
-    """Where the published captures lie."""
+    """Folder of the published captures."""
     for name in (field.FACE_TRUTH, field.TMF8820):
         real_capture(name)
     return real_capture(field.FACE).parent
 
 
-def test_the_truth_has_a_face_before_a_wall(folder: Path) -> None:
+def test_the_truth_is_a_face_in_front_of_a_wall(folder: Path) -> None:
     truth = field.face_truth(folder)
     assert truth.range_m.shape == (340, 340)
     assert not (truth.is_face & truth.is_wall).any()
     assert truth.range_m[truth.is_face].max() < truth.range_m[truth.is_wall].min()
 
 
-def test_the_wall_returns_a_pulse_that_rises_fast_and_decays(folder: Path) -> None:
+def test_the_pulse_measured_on_the_wall_rises_fast_and_decays(folder: Path) -> None:
     pulse = field.wall_pulse(folder, field.face_truth(folder))
     begin_s, end_s = pulse.span_s
     assert 0.2e-9 < end_s - begin_s < 1e-9
@@ -38,16 +38,16 @@ def test_the_wall_returns_a_pulse_that_rises_fast_and_decays(folder: Path) -> No
     assert samples.argmax() < len(samples) / 3
 
 
-def test_the_distances_of_a_sensor_are_those_of_the_plane(folder: Path) -> None:
+def test_the_distances_of_the_sensor_agree_with_the_plane(folder: Path) -> None:
     table = field.tmf8820_table(folder)
     assert tuple(row[0] for row in table.rows) == field.METHODS
-    for method, median_mm, half_mm, answered in table.rows:
+    for method, median_mm, half_mm, estimated in table.rows:
         assert abs(float(median_mm)) < 13.6, method  # a bin of 91 ps
         assert float(half_mm) < 13.6, method
-        assert float(answered) > 0.95, method
+        assert float(estimated) > 0.95, method
 
 
-def test_background_is_added_as_told() -> None:
+def test_background_is_added_at_the_given_sbr() -> None:
     cube = np.zeros((40, 40, 50), np.uint16)
     cube[..., 20] = 5
     capture = Capture(cube, Acquisition(50, n_pulses=None), detection="all")

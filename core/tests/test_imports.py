@@ -1,4 +1,4 @@
-"""Which module of core may import which."""
+"""Tests of the order in which modules import each other, and of public names."""
 
 from __future__ import annotations
 
@@ -69,9 +69,19 @@ def test_each_room_imports_from_lower_rooms_only() -> None:
 
 
 @pytest.mark.parametrize("name", ["core", *core.PUBLIC_MODULES])
-def test_public_names_exist_and_are_sorted_out(name: str) -> None:
+def test_public_names_exist(name: str) -> None:
     module = import_module(name)
     assert module.__doc__
     assert len(module.__all__) == len(set(module.__all__))
     for each in module.__all__:
         assert hasattr(module, each)
+
+
+def test_old_names_of_attributes_warn() -> None:
+    estimator = core.ESTIMATORS["coates"]
+    for old, new in (("light", "flux_model"), ("reach", "window_size"), ("spares", "omits")):
+        with pytest.warns(DeprecationWarning, match=f"is now called {new}"):
+            assert getattr(estimator, old) is getattr(estimator, new)
+    assert core.metrics.Told is core.metrics.ReliabilityBin
+    assert core.metrics.Detection is core.metrics.DetectionRates
+    assert core.inspection.Candidate is core.inspection.RangeCandidate

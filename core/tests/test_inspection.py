@@ -1,4 +1,4 @@
-"""What is known of a pixel, a region and a capture: right, and as well known as it says."""
+"""Tests of reports on pixels, regions and captures, and of their intervals."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def covers(found: Interval, truth: float) -> bool:
 
 
 def is_covered_often_enough(hits: int, trials: int) -> bool:
-    """Whether an interval of 95 % would cover so seldom by chance."""
+    """Return whether 95 % intervals cover the truth so rarely only by chance."""
     return bool(stats.binom.cdf(hits, trials, inspection.LEVEL) > SIGNIFICANCE)
 
 
@@ -48,7 +48,7 @@ def is_covered_often_enough(hits: int, trials: int) -> bool:
     ("signal", "sbr", "n_pulses"),
     [(0.2, 0.1, 400), (0.5, 1.0, 100), (0.3, 30.0, 400), (0.0, 1, 99)],
 )
-def test_the_interval_of_a_pixels_light_covers_it(signal: float, sbr: float, n_pulses: int) -> None:
+def test_flux_intervals_cover_the_truth(signal: float, sbr: float, n_pulses: int) -> None:
     acquisition = replace(ACQUISITION, n_pulses=n_pulses)
     flux = Flux(signal, sbr) if signal else Flux(1.0, sbr)
     scene = random_depths(12, acquisition=acquisition)
@@ -77,7 +77,7 @@ def test_photons_of_unknown_pulses_are_counted() -> None:
     assert all(is_covered_often_enough(each, 100) for each in hits)
 
 
-def test_pixels_of_the_same_light_tell_more_of_it() -> None:
+def test_more_pixels_narrow_the_interval() -> None:
     capture = simulate(random_depths(4), ACQUISITION, Flux(0.2, 0.2), seed=2)
     pixels = capture.cube.reshape(16, -1)
     one, all_of_them = (
@@ -91,7 +91,7 @@ def test_pixels_of_the_same_light_tell_more_of_it() -> None:
 
 
 @pytest.mark.parametrize("method", [name for name in ESTIMATORS if name != "oracle"])
-def test_a_pixels_best_candidate_is_its_answer(method: str) -> None:
+def test_the_best_candidate_is_the_estimate(method: str) -> None:
     capture = simulate(random_depths(8), ACQUISITION, Flux(0.6, 1.0), seed=4)
     image = estimate(capture, method)
     right = 0
@@ -106,7 +106,7 @@ def test_a_pixels_best_candidate_is_its_answer(method: str) -> None:
     assert right >= 8  # neighbours may move a spatial method's
 
 
-def test_a_tracking_candidate_is_told_what_the_image_is() -> None:
+def test_a_tracking_candidate_has_the_confidence_of_the_image() -> None:
     capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)
     image = estimate(capture, "tracking")
     for row, col in np.ndindex(8, 8):
@@ -115,7 +115,7 @@ def test_a_tracking_candidate_is_told_what_the_image_is() -> None:
         assert best.probability == pytest.approx(image.confidence[row, col], abs=1e-6)
 
 
-def test_hot_and_dead_pixels_are_told() -> None:
+def test_hot_and_dead_pixels_are_found() -> None:
     hot, dead = np.zeros((9, 9)), np.zeros((9, 9), bool)
     hot[4, 4] = hot[0, 8] = 3e7
     dead[7, 2] = dead[0, 0] = True
@@ -137,7 +137,7 @@ def test_hot_and_dead_pixels_are_told() -> None:
     )
 
 
-def test_a_pixel_that_is_none_is_refused() -> None:
+def test_a_pixel_outside_the_image_is_refused() -> None:
     capture = Capture(np.ones((2, 2, 60), np.uint8), ACQUISITION)
     image = estimate(capture, "peak")
     with pytest.raises(ValueError, match=r"row, col = \(2, 0\)"):
@@ -209,10 +209,10 @@ def _mean_flux_of(scene: Scene, flux: Flux) -> tuple[float, float, float]:
 
 
 def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
-    """All photons of so many pulses as `capture` was sent, which are not known."""
+    """Draw all photons of as many pulses, whose number is unknown."""
     fires = Flux(flux.signal / 1000, flux.sbr)
     many = replace(capture.acquisition, n_pulses=1000 * (capture.gated_pulses or 0))
-    # Of so dim a light next to no photon hides another.
+    # At this flux hardly any photon hides another.
     dim = simulate(scene, many, fires, seed=seed)
     unknown = replace(many, n_pulses=None)
     return replace(dim, acquisition=unknown, detection="all", signal=None, background=None)
@@ -229,7 +229,7 @@ def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
     ],
     ids=["dim", "clear", "half sky", "hot pixels", "unknown pulses"],
 )
-def test_the_interval_of_a_captures_light_covers_it(
+def test_mean_flux_intervals_cover_the_truth(
     scene: Callable[..., Scene], flux: Flux, n_pulses: int, counting: bool
 ) -> None:
     acquisition, trials = replace(ACQUISITION, n_pulses=n_pulses), 16
@@ -262,7 +262,7 @@ def _counts(shape: tuple[int, int, int], kind: str, n_pulses: int | None) -> np.
 @pytest.mark.parametrize("kind", ["empty", "full", "one"])
 @pytest.mark.parametrize("n_pulses", [1, 1000, None])
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 30), (5, 5, 1), (5, 6, 30)])
-def test_the_extremes_have_an_answer(
+def test_extreme_captures_have_reports(
     shape: tuple[int, int, int], n_pulses: int | None, kind: str
 ) -> None:
     acquisition = Acquisition(n_bins=shape[2], n_pulses=n_pulses)
@@ -299,7 +299,7 @@ def test_maps_are_of_each_pixel() -> None:
 
 
 @pytest.mark.parametrize("name", ["building", "staircase"])
-def test_what_a_capture_suggests_does_it_good(name: str) -> None:
+def test_suggested_settings_improve_the_estimate(name: str) -> None:
     scene = scenes[name](32)
     capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.05), seed=1)
     suggested = inspection.capture_report(capture).suggestion
@@ -314,7 +314,7 @@ def test_what_a_capture_suggests_does_it_good(name: str) -> None:
     assert suggested.t_n == pytest.approx(nearest, abs=6)
 
 
-def test_a_gate_is_cut_in_front_where_that_costs_no_pulse() -> None:
+def test_a_gate_is_cut_in_front_only_without_loss_of_pulses() -> None:
     acquisition = Acquisition(n_bins=200, n_pulses=100)
     wall = Scene(np.full((8, 8), acquisition.bin_to_range_m(90.0)), acquisition=acquisition)
     capture = simulate(wall, acquisition, Flux(0.5, 5.0), seed=9)
@@ -324,7 +324,7 @@ def test_a_gate_is_cut_in_front_where_that_costs_no_pulse() -> None:
     assert 90 + 8 < first.gate[1] == photons.gate[1] < 200
     assert photons.gate[0] < photons.t_n
     assert first.t_n == photons.t_n <= 92
-    assert "64 confident answers lie in bins 8" in first.why_gate
+    assert "64 confident estimates lie in bins 8" in first.why_gate
 
 
 # -- fewer pulses ----------------------------------------------------------------------------------

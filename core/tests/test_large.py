@@ -1,4 +1,4 @@
-"""Captures larger than memory: the answer is that of the whole image, however it is cut."""
+"""Captures larger than memory: estimates are those of the whole image, whatever the tiles."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from core.acquisition import Acquisition, Flux, Pulse
+from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
-from core.io.readers import open_capture, read_capture, sample
-from core.io.readers.labelled import dataset, describe
-from core.io.readers.options import ReadOptions
-from core.out_of_core import tiles as large
+from core.io.readers import sample
+from core.io.readers.labelled import dataset
+from core.out_of_core import tiles
 from core.out_of_core.tiles import IMAGES, as_image, computed, estimate_large
 from core.scene import Scene, scenes
 from core.simulation import simulate
@@ -43,9 +42,9 @@ COUNTS = dataset(CAPTURE).counts
 @pytest.mark.parametrize(
     ("chunks", "false_alarm"),
     [({"row": 7, "col": 13}, 0.05), ({"row": 25, "col": 1, "bin": 30}, None)],
-    ids=["small chunks, some without answer", "chunks of a column"],
+    ids=["small chunks, some invalid pixels", "chunks of a column"],
 )
-def test_parts_give_the_answer_of_the_whole(
+def test_tiles_give_the_estimates_of_the_whole(
     method: str, chunks: dict[str, int], false_alarm: float | None
 ) -> None:
     whole = estimate(CAPTURE, method, false_alarm=false_alarm)
@@ -66,7 +65,7 @@ def test_settings_are_those_of_estimate() -> None:
 
 
 @pytest.mark.parametrize("method", [name for name in ESTIMATORS if ESTIMATORS[name].whole_image])
-def test_what_needs_the_whole_image_is_refused(method: str) -> None:
+def test_methods_that_need_the_whole_image_are_refused(method: str) -> None:
     with pytest.raises(ValueError, match=rf"method = '{method}' .*'tracking' or .*whole image"):
         estimate_large(COUNTS, method)
 
@@ -76,19 +75,19 @@ def test_axes_must_be_named() -> None:
         estimate_large(COUNTS.rename(row="x"), "peak")
 
 
-def test_nothing_is_ranged_before_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
-    ranged = large.range_part
+def test_nothing_is_estimated_before_compute(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+    ranged = tiles.range_part
 
     def counted(*arguments: Any) -> Any:
-        asked.append(arguments)
+        calls.append(arguments)
         return ranged(*arguments)
 
-    monkeypatch.setattr(large, "range_part", counted)
+    monkeypatch.setattr(tiles, "range_part", counted)
     parts = estimate_large(COUNTS.chunk(row=5), "peak")
-    assert asked == []
+    assert calls == []
     parts.compute(scheduler="synchronous")
-    assert len(asked) == 5
+    assert len(calls) == 5
 
 
 def test_a_large_image_is_learned_from_patches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,8 +103,8 @@ def test_a_large_image_is_learned_from_patches(monkeypatch: pytest.MonkeyPatch) 
     np.testing.assert_array_equal(some, sample.sample_of(array))
 
 
-def test_a_sample_tells_what_the_image_would(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Answers of an image ranged by what a tenth of it tells: nearly all the same."""
+def test_a_sample_represents_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Estimates with the flux prior of a tenth of the image are nearly all the same."""
     scene = scenes["uniform"](128)
     capture = simulate(scene, scene.acquisition, Flux(sbr=0.1))
     whole = estimate(capture, "likelihood")
@@ -113,32 +112,11 @@ def test_a_sample_tells_what_the_image_would(monkeypatch: pytest.MonkeyPatch) ->
     parts = estimate_large(dataset(capture).counts.chunk(row=32), "likelihood").compute()
     changed = np.abs(parts["bin"].to_numpy() - whole.bin) > 1
     assert changed.mean() < 0.01
-    told = np.abs(parts["confidence"].to_numpy() - whole.confidence)[~changed]
-    assert np.quantile(told, 0.99) < 0.1
+    difference = np.abs(parts["confidence"].to_numpy() - whole.confidence)[~changed]
+    assert np.quantile(difference, 0.99) < 0.1
 
 
-@pytest.mark.parametrize("suffix", [".nc", ".zarr", ".h5"])
-def test_what_is_guessed_does_not_depend_on_the_way_in(tmp_path: Path, suffix: str) -> None:
-    scene = scenes["uniform"](32)
-    known = simulate(scene, scene.acquisition, Flux(signal=0.5, sbr=1.0), Pulse.gaussian(3e-9))
-    path = tmp_path / f"bare{suffix}"
-    counts = dataset(known).counts.drop_attrs().drop_vars(["time_s", "range_m"])
-    counts = counts.assign_attrs(n_pulses=int(known.counts.max()) - 1)
-    named = counts.to_dataset(name="counts")
-    if suffix == ".zarr":
-        named.to_zarr(path, consolidated=False)
-    else:
-        named.to_netcdf(path, engine="h5netcdf")
-    read, opened = read_capture(path), open_capture(path)
-    acquisition, pulse, detection, source = describe(opened, ReadOptions())
-    assert (acquisition, pulse) == (read.acquisition, read.pulse)
-    assert (detection, source) == (read.detection, read.source) and detection == "all"
-    assert pulse.tau_s == pytest.approx(3e-9, rel=0.2)
-    whole, parts = estimate(read, "likelihood"), estimate_large(opened, "likelihood").compute()
-    np.testing.assert_array_equal(parts["range_m"], whole.range_m)
-
-
-def test_an_answer_in_parts_is_an_image_with_what_is_known(
+def test_a_result_of_tiles_is_an_image_with_metadata(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     seen, image = as_image(computed(estimate_large(COUNTS.chunk(row=9), "peak")))
@@ -169,7 +147,7 @@ def test_a_cluster_gives_the_same_and_loses_nothing_with_a_worker(tmp_path: Path
     shown: list[tuple[int, int]] = []
     found = list(study.study(path, 2, 2 * 10**9, lambda *done: shown.append(done)))
     assert [each.title for each in found] == [
-        "part after part, without Dask",
+        "tile by tile, without Dask",
         "1 worker",
         "2 workers",
         "2 workers, one killed",
@@ -185,7 +163,7 @@ def test_a_suspended_worker_is_reported_and_loses_nothing(
 ) -> None:
     from dask.distributed import LocalCluster  # noqa: PLC0415 - slow to come
 
-    monkeypatch.setattr(large, "SILENT_S", 2.0)
+    monkeypatch.setattr(tiles, "SILENT_S", 2.0)
     with LocalCluster(
         n_workers=1,
         threads_per_worker=1,
@@ -199,17 +177,18 @@ def test_a_suspended_worker_is_reported_and_loses_nothing(
             os.kill(worker.pid, signal.SIGCONT)
 
         def resume_if_reported(record: logging.LogRecord) -> bool:
-            if record.name == large.__name__:
+            if record.name == tiles.__name__:
                 resume()
             return True
 
         caplog.handler.addFilter(resume_if_reported)
-        unreported = threading.Timer(20, resume)
+        unreported = threading.Timer(120, resume)
         unreported.start()
         os.kill(worker.pid, signal.SIGSTOP)
         found = computed(estimate_large(COUNTS.chunk(row=9), "peak"), cluster.scheduler_address)
         unreported.cancel()
         caplog.handler.removeFilter(resume_if_reported)
-    (report,) = [each.getMessage() for each in caplog.records if each.name == large.__name__]
-    assert address in report and "worker-ttl" in report
+    reports = [each.getMessage() for each in caplog.records if each.name == tiles.__name__]
+    assert reports  # several where a busy machine delays the resumed worker, too
+    assert all(address in report and "worker-ttl" in report for report in reports)
     np.testing.assert_array_equal(found["range_m"], estimate(CAPTURE, "peak").range_m)

@@ -1,4 +1,4 @@
-"""The limits, against their definitions and against the exact likelihood on simulated pixels."""
+"""Tests of the limits against their definitions and against simulated estimates."""
 
 from __future__ import annotations
 
@@ -96,13 +96,6 @@ def test_cramer_rao_is_its_definition(background: float) -> None:
     assert in_m == pytest.approx(found * gate.bin_length_m, rel=1e-14)
 
 
-@pytest.mark.parametrize("pulse", PULSES)
-def test_cramer_rao_falls_with_the_root_of_the_pulses(pulse: Pulse) -> None:
-    once = cramer_rao_bins(53.6, 0.1, 1.0, pulse, replace(GATE, n_pulses=100))
-    often = cramer_rao_bins(53.6, 0.1, 1.0, pulse, replace(GATE, n_pulses=10_000))
-    assert often == pytest.approx(once / 10, rel=1e-14)
-
-
 @pytest.mark.parametrize("pulse", [Pulse(2e-9), Pulse.gaussian(2e-9)])
 def test_the_likelihood_reaches_cramer_rao_and_no_more(pulse: Pulse) -> None:
     trials, onset, signal, background = 2000, 53.6, 0.5, 0.5
@@ -198,17 +191,6 @@ def test_an_echo_outside_the_gate_has_no_right_place(pulse: Pulse) -> None:
     np.testing.assert_array_equal(cramer_rao_bins(onset, 0.1, 1.0, pulse, GATE), np.inf)
 
 
-@pytest.mark.parametrize("background", [0.0, 1e-300, 1e-6, 1.0, 1e4])
-@pytest.mark.parametrize("pulse", PULSES)
-def test_limits_are_numbers_for_any_light(pulse: Pulse, background: float) -> None:
-    onset, signal = np.meshgrid([-2.0, 0.0, 50.3, 99.5], [0.0, 1e-12, 0.1, 1e4])
-    probability = right_bin_probability(onset, signal, background, pulse, GATE)
-    assert ((probability >= 0) & (probability <= 1)).all()
-    bound = cramer_rao_bins(onset, signal, background, pulse, GATE)
-    assert (bound > 0).all()
-    assert np.isinf(bound[0]).all()
-
-
 def test_no_echo_has_no_limit() -> None:
     onset = np.array([[np.nan, 50.0]])
     for figure in (right_bin_probability, cramer_rao_bins, best_exposure):
@@ -254,10 +236,10 @@ def test_a_capture_that_does_not_know_its_truth_is_refused() -> None:
 @pytest.mark.parametrize("figure", [right_bin_probability, cramer_rao_bins, best_exposure])
 def test_impossible_rates_are_refused(figure) -> None:  # type: ignore[no-untyped-def]
     for signal in (-0.1, np.inf, np.nan, [0.1, -0.1]):
-        with pytest.raises(ValueError, match=r"signal = .*0 or more"):
+        with pytest.raises(ValueError, match=r"signal = .*non-negative"):
             figure(50.0, signal, 1.0, Pulse(), GATE)
     for background in (-0.1, np.inf, np.nan):
-        with pytest.raises(ValueError, match=r"background = .*0 or more"):
+        with pytest.raises(ValueError, match=r"background = .*non-negative"):
             figure(50.0, 0.1, background, Pulse(), GATE)
 
 
@@ -289,6 +271,6 @@ def test_best_exposure_is_best_for_both_limits(
     assert likeliest > at(right_bin_probability, 1.0) + 0.05
 
 
-def test_faint_light_is_not_attenuated() -> None:
+def test_faint_fluxes_are_not_attenuated() -> None:
     found = best_exposure([[20.0, 90.0]], [[0.1, 0.5]], 0.4, Pulse(), GATE)
     np.testing.assert_array_equal(found, [[1.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Settings know their bounds, and refuse the rest in words."""
+"""Tests of the bounds of settings."""
 
 from __future__ import annotations
 

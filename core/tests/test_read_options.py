@@ -47,9 +47,9 @@ def test_the_command_line_has_an_option_for_each_field() -> None:
     arguments = []
     for name, option in reading_options().items():
         text = all_of_them.as_text(name)
-        words = [text] if not option.kind.words else text.split(" x ")
+        parts = [text] if not option.kind.metavars else text.split(" x ")
         arguments += (
-            [f"--{option.flag}={text}"] if len(words) == 1 else [f"--{option.flag}", *words]
+            [f"--{option.flag}={text}"] if len(parts) == 1 else [f"--{option.flag}", *parts]
         )
     assert reading(parser.parse_args(arguments)) == EXAMPLES
     assert reading(parser.parse_args([])) == dict.fromkeys(NAMES)

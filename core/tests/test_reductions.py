@@ -1,4 +1,4 @@
-"""Less of a capture is a capture: its counts follow the law that its own acquisition promises."""
+"""Tests that counts of reduced captures follow the model of their acquisition."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def wall() -> Capture:
 
 
 def expected_share(capture: Capture) -> np.ndarray:
-    """What a pulse does, by the light and the acquisition that a capture of one range tells of."""
+    """Probability of each bin, and of no trigger, by the model of a capture of one range."""
     acquisition = capture.acquisition
     onset = acquisition.range_m_to_bin(np.asarray(capture.truth_range_m)[0, 0])
     signal = np.asarray(capture.signal)[0, 0]
@@ -71,12 +71,6 @@ def test_merged_bins_are_what_wider_bins_would_have_recorded(wall: Capture, fact
     np.testing.assert_array_equal(merged.counts, wall.cube[:, :, :end].sum(axis=2))
 
 
-def test_merging_commutes_with_the_expectation(wall: Capture) -> None:
-    fine, coarse = expected_share(wall), expected_share(merge_bins(wall, 4))
-    np.testing.assert_allclose(fine[:60].reshape(15, 4).sum(axis=1), coarse[:15], rtol=1e-12)
-    assert fine[60] == pytest.approx(coarse[15], rel=1e-12)
-
-
 def test_a_later_window_is_a_gate_that_opens_later(wall: Capture) -> None:
     window = cut_gate(wall, 20, 50)
     armed = 500 - wall.cube[:, :, :20].sum(axis=2, dtype=np.int64)
@@ -84,7 +78,7 @@ def test_a_later_window_is_a_gate_that_opens_later(wall: Capture) -> None:
     assert f"{window.acquisition.n_pulses} pulses are armed" in window.source
     assert window.acquisition.bin_to_range_m(0) == pytest.approx(ACQUISITION.bin_to_range_m(20))
     assert fits(window, int(armed.sum()))
-    # As simulated with a gate that does open later: each pixel's counts are told the same share.
+    # The same as a simulation with a gate that opens later.
     later = simulate(
         Scene(np.asarray(wall.truth_range_m)),
         window.acquisition,
@@ -207,7 +201,7 @@ def test_pulses_are_drawn_as_one_would_by_hand() -> None:
             np.testing.assert_array_equal(drawn[0, pixel], by_hand)
 
 
-def test_counts_too_many_to_be_drawn_one_by_one_follow_the_same_law(
+def test_draws_bin_by_bin_follow_the_same_law(
     wall: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("core.reductions.DRAWN_ONE_BY_ONE", 0)
@@ -217,7 +211,7 @@ def test_counts_too_many_to_be_drawn_one_by_one_follow_the_same_law(
     assert kept == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(wall.cube.sum()))
 
 
-def test_a_share_of_pulses_that_are_not_known_keeps_each_detection_by_chance(wall: Capture) -> None:
+def test_a_share_of_unknown_pulses_keeps_detections_at_random(wall: Capture) -> None:
     unknown = replace(wall, acquisition=replace(wall.acquisition, n_pulses=None))
     some = share_of_pulses(unknown, 0.1, seed=4)
     assert some.acquisition.n_pulses is None
@@ -232,7 +226,7 @@ def test_a_share_of_pulses_that_are_not_known_keeps_each_detection_by_chance(wal
 
 
 @given(st.tuples(st.integers(1, 12), st.integers(1, 12)), st.integers(1, 4), st.integers(1, 3))
-def test_what_is_left_out_takes_its_neighbours_answer(
+def test_missing_pixels_take_the_value_of_a_neighbour(
     shape: tuple[int, int], skip: int, pool: int
 ) -> None:
     row, col = np.indices(shape)
@@ -242,7 +236,7 @@ def test_what_is_left_out_takes_its_neighbours_answer(
         truth_range_m=(row + 0.01 * col).astype(float),
     )
     if min(shape) < skip or len(range((skip - 1) // 2, min(shape), skip)) < pool:
-        with pytest.raises(ValueError, match="an integer from 1 to"):
+        with pytest.raises(ValueError, match="a whole number from 1 to"):
             Reduction(skip=skip, pool=pool).of(marked)
         return
     reduction = Reduction(skip=skip, pool=pool)
@@ -257,7 +251,7 @@ def test_what_is_left_out_takes_its_neighbours_answer(
         np.testing.assert_array_equal(found_m[kept], np.asarray(marked.truth_range_m)[kept])
 
 
-def test_reductions_add_up(wall: Capture) -> None:
+def test_reductions_combine(wall: Capture) -> None:
     both = Reduction(merge=2, gate=(10, 50), skip=2, pool=2, pulses=0.5)
     found = both.of(wall)
     assert share_of_pulses(wall, 0.5).acquisition.n_pulses == 250
@@ -290,6 +284,6 @@ def test_reductions_add_up(wall: Capture) -> None:
         lambda c: first_pulses(replace(c, acquisition=Acquisition(n_bins=60, n_pulses=None)), 5),
     ],
 )
-def test_what_does_not_fit_is_refused(wall: Capture, refused: Callable[[Capture], Capture]) -> None:
+def test_wrong_reductions_are_refused(wall: Capture, refused: Callable[[Capture], Capture]) -> None:
     with pytest.raises(ValueError, match="is not accepted: give"):
         refused(wall)

@@ -1,4 +1,4 @@
-"""What so many pulses can tell: overlaps, their thresholds, and pile-up's closed form."""
+"""Tests of overlaps, their thresholds, and the closed form of pile-up."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.optimize import brentq
 
-from core.inference.resolution import ERROR, HIDDEN, TOLD, Difference, difference, pile_up
+from core.inference.resolution import ERROR, HIDDEN, RESOLVED, Difference, difference, pile_up
 from core.trigger import trigger_probability
 
 FLAT = np.full(20, 0.01)
@@ -24,7 +24,7 @@ def pulses_for(evidence: float) -> int:
 
 
 def test_the_best_test_errs_as_often_as_the_threshold_says() -> None:
-    n_pulses, draws = pulses_for(TOLD), 40_000
+    n_pulses, draws = pulses_for(RESOLVED), 40_000
     assert n_pulses > 500
     rng = np.random.default_rng(0)
     outcomes = [np.append(model, 1 - model.sum()) for model in (FLAT, TILTED)]
@@ -67,18 +67,18 @@ def test_evidence_adds_up_and_nothing_differs_from_itself() -> None:
     same = difference(FLAT, FLAT, 10**9)
     assert same.total_variation == same.evidence == 0
     assert same.is_hidden
-    assert not same.told.any()
+    assert not same.is_resolved.any()
     assert np.isnan(same.resolvable)
 
 
-def test_models_that_never_agree_are_told_at_once() -> None:
+def test_disjoint_models_are_resolved_by_one_pulse() -> None:
     sure = difference([1.0, 0.0], [0.0, 1.0], 1)
     assert sure.total_variation == 1
-    assert sure.told.all()
+    assert sure.is_resolved.all()
     assert sure.resolvable == 0
 
 
-def test_a_difference_as_large_as_is_resolvable_is_just_told() -> None:
+def test_the_least_resolvable_difference_does_not_depend_on_its_size() -> None:
     n_pulses = 200
     at = float(difference(FLAT, TILTED, n_pulses).resolvable)
     small = difference(FLAT, FLAT + (TILTED - FLAT) / 3, n_pulses)
@@ -98,9 +98,7 @@ def test_counts_of_photons_are_the_limit_of_many_faint_pulses() -> None:
     st.lists(st.floats(0.0, 0.5), min_size=2, max_size=30),
     st.integers(1, 5000),
 )
-def test_pile_up_of_any_light_is_at_most_that_of_fine_bins(
-    rate: list[float], n_pulses: int
-) -> None:
+def test_pile_up_of_any_flux_is_at_most_that_of_fine_bins(rate: list[float], n_pulses: int) -> None:
     rates = np.array(rate)
     fires = trigger_probability(rates)
     fired, photons = fires.sum(), rates.sum()

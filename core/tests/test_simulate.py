@@ -1,8 +1,7 @@
-"""Simulated captures follow Eq. 1 exactly, by seed, whatever the number of threads."""
+"""Tests that simulated captures follow Eq. 1 and depend on the seed only."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 
@@ -14,7 +13,7 @@ from scipy import stats
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.scene import Scene
-from core.simulation import add_echo, first_photons, simulate, triggered_by_each_edge
+from core.simulation import add_echo, cumulative_trigger_probability, first_photons, simulate
 from core.trigger import no_trigger_probability, rate_per_bin, trigger_probability
 
 module = import_module("core.simulation")  # the package's attribute of that name is the function
@@ -29,15 +28,9 @@ ONSET_BIN = 22.3
 PIXELS = DRAWS // 500
 THREADS = sorted({1, numba.config.NUMBA_NUM_THREADS})
 
-each_way = pytest.mark.parametrize("one_by_one_up_to", [8192, 0], ids=["one by one", "multinomial"])
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts the number of threads back."""
-    before = numba.get_num_threads()
-    yield
-    numba.set_num_threads(before)
+each_draw = pytest.mark.parametrize(
+    "one_by_one_up_to", [8192, 0], ids=["one by one", "multinomial"]
+)
 
 
 def wall(n_pixels: int, onset_bin: float = ONSET_BIN) -> Scene:
@@ -46,7 +39,7 @@ def wall(n_pixels: int, onset_bin: float = ONSET_BIN) -> Scene:
 
 
 def outcomes(capture: Capture) -> np.ndarray:
-    """How often each bin triggered over all pixels, and, last, how often none did."""
+    """Return the triggers of each bin over all pixels and, last, pulses without a trigger."""
     bins = capture.cube.sum(axis=(0, 1), dtype=np.int64)
     n_pulses = capture.acquisition.n_pulses or 0
     return np.append(bins, capture.cube[..., 0].size * n_pulses - bins.sum())
@@ -57,7 +50,7 @@ def expected_share(flux: Flux, pulse: Pulse, onset_bin: float = ONSET_BIN) -> np
     return np.append(trigger_probability(rate), no_trigger_probability(rate))
 
 
-@each_way
+@each_draw
 @pytest.mark.parametrize(
     ("flux", "pulse"),
     [
@@ -75,30 +68,6 @@ def test_histograms_follow_equation_1(
     expected = expected_share(flux, pulse) * found.sum()
     assert expected.min() > 5  # where chi-square holds
     assert stats.chisquare(found, expected).pvalue > SIGNIFICANCE
-
-
-@each_way
-def test_detections_of_a_pixel_vary_binomially(
-    monkeypatch: pytest.MonkeyPatch, one_by_one_up_to: int
-) -> None:
-    monkeypatch.setattr(module, "PULSES_DRAWN_ONE_BY_ONE", one_by_one_up_to)
-    flux = Flux(0.1041, 0.06)
-    counts = simulate(wall(PIXELS), ACQUISITION, flux, seed=2).counts
-    share = 1 - expected_share(flux, Pulse())[-1]
-    squares = ((counts - 500 * share) ** 2).sum() / (500 * share)
-    # Squared deviations over their variance are chi-square; five in six pulses trigger here, so
-    # that a Poisson variance would be six times too large.
-    lower, upper = stats.chi2.ppf([SIGNIFICANCE / 2, 1 - SIGNIFICANCE / 2], counts.size)
-    assert lower < squares / (1 - share) < upper
-    assert squares < lower
-
-
-def test_both_ways_of_drawing_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    one_by_one = outcomes(simulate(wall(PIXELS), ACQUISITION, Flux(), seed=3))
-    monkeypatch.setattr(module, "PULSES_DRAWN_ONE_BY_ONE", 0)
-    multinomial = outcomes(simulate(wall(PIXELS), ACQUISITION, Flux(), seed=3))
-    assert (one_by_one != multinomial).any()
-    assert stats.chi2_contingency([one_by_one, multinomial]).pvalue > SIGNIFICANCE
 
 
 @pytest.mark.parametrize("n_pulses", [8192, 8193])
@@ -184,7 +153,7 @@ def test_draws_equal_a_plain_twin_bit_for_bit(
     onset_bin = np.array([np.nan, -1.5, 0.0, n_bins / 2, n_bins - 0.5])
     scene = Scene(acquisition.bin_to_range_m(onset_bin[np.newaxis]))
     capture = simulate(scene, acquisition, flux, seed=seed)
-    triggered = triggered_by_each_edge(scene, acquisition, flux, Pulse())
+    triggered = cumulative_trigger_probability(scene, acquisition, flux, Pulse())
     np.testing.assert_array_equal(capture.cube[0], twin_cube(triggered, n_pulses, seed))
 
 
@@ -215,7 +184,7 @@ def test_photons_that_have_arrived_stay(tau_bins: float) -> None:
 def test_distribution_of_the_first_photon_is_equation_1_summed() -> None:
     onset_bin, signal = np.array([ONSET_BIN, np.nan, -2.5]), np.array([2.0, 0.0, 2.0])
     scene = Scene(ACQUISITION.bin_to_range_m(onset_bin[np.newaxis]))
-    triggered = triggered_by_each_edge(scene, ACQUISITION, Flux(2.0, 2 / 3), Pulse())
+    triggered = cumulative_trigger_probability(scene, ACQUISITION, Flux(2.0, 2 / 3), Pulse())
     rate = rate_per_bin(onset_bin, signal, 3.0, Pulse(), ACQUISITION)
     expected = np.cumsum(trigger_probability(rate), axis=1)
     assert (triggered[:, 0] == 0).all()
@@ -245,7 +214,7 @@ def test_a_surface_that_reflects_nothing_is_no_target() -> None:
     np.testing.assert_array_equal(black, sky)
 
 
-def test_a_stronger_background_moves_the_scene_and_not_the_dice() -> None:
+def test_a_stronger_background_keeps_the_random_numbers() -> None:
     weak, strong = (simulate(wall(30), ACQUISITION, Flux(sbr=sbr)).cube for sbr in (0.08, 0.07))
     # With the same dice every pulse triggers as early as before, or earlier.
     earlier = np.cumsum(strong, axis=2, dtype=int) - np.cumsum(weak, axis=2, dtype=int)
@@ -259,7 +228,7 @@ def test_impossible_seeds_are_refused(seed: int) -> None:
 
 
 def test_an_unknown_number_of_pulses_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"n_pulses = None .*number of pulses to simulate"):
+    with pytest.raises(ValueError, match=r"n_pulses = None .*give the number of pulses"):
         simulate(wall(1), Acquisition(n_pulses=None), Flux())
 
 
@@ -299,13 +268,13 @@ def test_first_photons_are_some_of_all() -> None:
     assert not np.array_equal(first.cube, first_photons(photons, 50, seed=1).cube)
     assert "first photons of 50 pulses" in first.source
     assert first.signal is None
-    lit = replace(
+    with_fluxes = replace(
         photons,
         acquisition=replace(photons.acquisition, n_pulses=500),
         signal=np.full(photons.shape, 0.1),
         background=0.2,
     )
-    first = first_photons(lit, 50)  # as many photons on a tenth of the pulses
+    first = first_photons(with_fluxes, 50)  # as many photons on a tenth of the pulses
     np.testing.assert_allclose(first.signal, 1.0)
     assert first.background == pytest.approx(2.0)
     many = first_photons(photons, 10**9)

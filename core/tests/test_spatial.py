@@ -1,4 +1,4 @@
-"""Neighbourhoods: each fast sum beside the loop that defines it."""
+"""Tests of sums over neighbourhoods against loops."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ def summed(cube: np.ndarray, row: int, col: int, half: int, beyond: str) -> np.n
     return total.astype(float)
 
 
-@pytest.mark.parametrize("reach", [1, 3, 5, 11])
+@pytest.mark.parametrize("window_size", [1, 3, 5, 11])
 @pytest.mark.parametrize("beyond", ["edge", "constant"])
-def test_box_sum_is_the_explicit_sum(reach: int, beyond: str) -> None:
-    found = box_sum(CUBE, reach, beyond)  # type: ignore[arg-type]
+def test_box_sum_is_the_explicit_sum(window_size: int, beyond: str) -> None:
+    found = box_sum(CUBE, window_size, beyond)  # type: ignore[arg-type]
     for row in range(5):
         for col in range(7):
-            expected = summed(CUBE, row, col, reach // 2, beyond)
+            expected = summed(CUBE, row, col, window_size // 2, beyond)
             np.testing.assert_array_equal(found[row, col], expected)
 
 
 def test_box_sum_leaves_its_argument_alone() -> None:
     before = CUBE.copy()
-    for reach in (1, 3):
-        box_sum(CUBE, reach, "edge")[:] = 0
+    for window_size in (1, 3):
+        box_sum(CUBE, window_size, "edge")[:] = 0
     np.testing.assert_array_equal(CUBE, before)
 
 
@@ -47,10 +47,10 @@ def test_pooled_counts_are_the_explicit_sum_however_narrow(dtype: type) -> None:
     cube[1, 2] = [0, 7]
     found = pooled(cube, 3)
     rows, cols, _ = cube.shape
-    for reach in (1, 3, 5):
-        whole = pooled(cube, reach)
+    for window_size in (1, 3, 5):
+        whole = pooled(cube, window_size)
         for row, col in ((0, 0), (rows - 1, 0), (rows // 2, cols // 2)):
-            np.testing.assert_array_equal(pooled_at(cube, row, col, reach), whole[row, col])
+            np.testing.assert_array_equal(pooled_at(cube, row, col, window_size), whole[row, col])
     for row in range(4):
         for col in range(4):
             np.testing.assert_array_equal(

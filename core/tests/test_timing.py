@@ -1,17 +1,20 @@
-"""Timing: that every call is called, in every round, and that the interval is what it says."""
+"""Timing and its intervals."""
 
 from __future__ import annotations
 
 from collections import Counter
 
+import numba
 import numpy as np
 import pytest
+from scipy import stats
 
 from core.studies import timing
-from core.studies.timing import FEWEST_REPEATS, interleaved, machine, median_interval
+from core.studies.statistics import MIN_REPEATS, mean_interval, median_interval
+from core.studies.timing import interleaved, kernel_threads, machine
 
 
-def test_each_round_calls_each_once_in_an_order_of_its_own() -> None:
+def test_each_round_makes_every_call_once_in_random_order() -> None:
     called: list[str] = []
     calls = {name: (lambda name=name: called.append(name)) for name in "abc"}
     seconds = interleaved(calls, repeats=20, warm_up=2)
@@ -33,30 +36,42 @@ def test_the_warm_up_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(interleaved({"call": call}, repeats=2)["call"], [2.0, 3.0])
 
 
-@pytest.mark.parametrize("n", [FEWEST_REPEATS, 7, 11, 30, 101])
-def test_the_interval_holds_the_median_with_95_percent(n: int) -> None:
-    # Of a skewed distribution whose median is known; the interval's share is an exact binomial's.
+@pytest.mark.parametrize("n", [MIN_REPEATS, 7, 11, 30, 101])
+def test_the_interval_covers_the_median_with_95_percent(n: int) -> None:
+    # A skewed distribution of known median; the coverage is an exact binomial's.
     drawn = np.random.default_rng(n).exponential(size=(4000, n))
     found = [median_interval(row) for row in drawn]
-    held = sum(each.low <= np.log(2) <= each.high for each in found)
+    covered = sum(each.low <= np.log(2) <= each.high for each in found)
     # At least 95 %, four standard deviations allowed.
-    assert held / 4000 >= 0.95 - 4 * np.sqrt(0.95 * 0.05 / 4000)
-    assert all(each.low <= each.value <= each.high for each in found)
+    assert covered / 4000 >= 0.95 - 4 * np.sqrt(0.95 * 0.05 / 4000)
 
 
-def test_the_interval_is_no_wider_than_it_must() -> None:
+def test_the_interval_is_the_narrowest() -> None:
     # n = 11: from the second smallest to the second largest value 98.8 %, from the third 93.5 %.
     found = median_interval(np.random.default_rng(1).permutation(11).astype(float))
     assert (found.value, found.low, found.high) == (5.0, 1.0, 9.0)
-
-
-def test_too_few_repeats_are_refused() -> None:
     with pytest.raises(ValueError, match=r"repeats = 5 is not accepted: give at least 6"):
         median_interval(np.ones(5))
 
 
-def test_the_machine_is_told() -> None:
-    told = dict(machine().rows)
-    assert told["processor"]
-    assert int(told["cores"]) >= 1
-    assert told["numpy"] == np.__version__
+def test_the_interval_of_a_mean_is_student_s() -> None:
+    values = np.array([1.0, 2.0, 4.0])
+    found = mean_interval(values)
+    expected = stats.t.interval(0.95, 2, values.mean(), stats.sem(values))
+    assert (found.low, found.high) == pytest.approx(expected)
+    assert np.isnan(mean_interval(values[:1]).value)
+
+
+def test_threads_are_restored() -> None:
+    before = numba.get_num_threads()
+    with pytest.raises(ZeroDivisionError), kernel_threads(1):
+        assert numba.get_num_threads() == 1
+        raise ZeroDivisionError
+    assert numba.get_num_threads() == before
+
+
+def test_the_machine_is_described() -> None:
+    known = dict(machine().rows)
+    assert known["processor"]
+    assert int(known["cores"]) >= 1
+    assert known["numpy"] == np.__version__

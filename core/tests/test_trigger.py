@@ -1,4 +1,4 @@
-"""Eq. 1 as probabilities, its differences, and the way back to rates."""
+"""Tests of trigger probabilities, their differences and Coates' rates."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_coates_counts_only_armed_pulses() -> None:
     np.testing.assert_allclose(coates_rate([2, 3, 0, 1], 10), expected, rtol=1e-15)
 
 
-def test_coates_says_when_nothing_is_left_to_tell() -> None:
+def test_coates_rates_without_armed_pulses_are_nan() -> None:
     np.testing.assert_array_equal(coates_rate([0, 5, 0, 0], 5), [0, np.inf, np.nan, np.nan])
 
 

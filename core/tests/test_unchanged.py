@@ -1,4 +1,4 @@
-"""Every answer is what it was: to the last bit where the same machine computes it."""
+"""Results are those stored: to the last bit on the machine that stored them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from core.tests.unchanged import CASES, Record
 
 pytestmark = pytest.mark.compiled
 
-SAME_MACHINE = unchanged.fingerprint() == unchanged.stored_fingerprint()
+STORED, WRITTEN_BY = unchanged.stored()
+SAME_MACHINE = unchanged.fingerprint() == WRITTEN_BY
 
 ELSEWHERE = {"bin": (0.0, 5e-5), "range_m": (0.0, 7.5e-6), "confidence": (0.0, 5e-5)}
-"""Relative and absolute tolerance on another machine, by the last part of a name; that of metres
-is one of 5e-5 bins of 1 ns. Kernels are of single precision: without AVX and FMA delays moved by up
-to 8.2e-6 bins, and confidences by up to 3.6e-6."""
+"""Relative and absolute tolerance on another machine, by the last part of a name; that in metres is
+5e-5 bins of 1 ns. Kernels use single precision: without AVX and FMA delays changed by up to 8.2e-6
+bins, and confidences by up to 3.6e-6."""
 OTHERS = (1e-4, 1e-9)
-LEAST_ALIKE = 0.99  # of a case's numbers of one name: where two scores are equal, rounding decides
+LEAST_ALIKE = 0.99  # of the numbers of one name: rounding decides between equal scores
 
 
 def differing(found: Record, stored: Record) -> list[str]:
-    """Names of arrays that are not the same to the last bit."""
+    """Return the names of arrays that differ in any bit."""
     return [
         name
         for name, was in stored.items()
@@ -32,7 +33,7 @@ def differing(found: Record, stored: Record) -> list[str]:
 
 
 def shares_alike(found: Record, stored: Record) -> dict[str, float]:
-    """Of all numbers of a kind in a case, such as ``range_m``, those that are within tolerance."""
+    """Return the share within tolerance of the numbers of each kind, such as ``range_m``."""
     alike: dict[str, list[np.ndarray]] = {}
     for name, was in stored.items():
         assert (found[name].dtype, found[name].shape) == (was.dtype, was.shape), name
@@ -45,8 +46,8 @@ def shares_alike(found: Record, stored: Record) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_every_answer_is_what_it_was(case: str, tmp_path: Path) -> None:
-    found, stored = unchanged.answers(case, tmp_path), unchanged.stored_answers(case)
+def test_results_are_those_stored(case: str, tmp_path: Path) -> None:
+    found, stored = unchanged.answers(case, tmp_path), STORED[case]
     assert list(found) == list(stored)
     if SAME_MACHINE:
         assert differing(found, stored) == []
@@ -56,7 +57,7 @@ def test_every_answer_is_what_it_was(case: str, tmp_path: Path) -> None:
 
 
 def test_the_file_holds_all_cases_and_no_others() -> None:
-    assert unchanged.stored_cases() == set(CASES)
+    assert set(STORED) == set(CASES)
 
 
 def test_a_change_of_one_bit_is_noticed() -> None:

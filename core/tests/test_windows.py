@@ -1,4 +1,4 @@
-"""Windows of captures larger than memory: the pixels that were asked for, and no others read."""
+"""Windows of captures larger than memory: their pixels are read, and few others."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def opened(tmp_path: Path, small_blocks: None) -> xr.DataArray:
     return open_capture(put(tmp_path / "c.zarr", FILES["two.zarr"]()))
 
 
-# -- which pixels ----------------------------------------------------------------------------------
+# -- geometry --------------------------------------------------------------------------------------
 
 
 @given(SIDES, SIDES, st.integers(0, 50), st.integers(1, 4000))
@@ -70,12 +70,12 @@ def test_the_finest_step_that_fits_is_taken(rows: int, cols: int, first: int, mo
     assert window.step == 1 or np.prod(finer.shape) > most
     for (begin, end), picked in zip((window.rows, window.cols), window.picked, strict=True):
         assert begin <= picked[0] and picked[-1] < end and picked.step == window.step
-        # What stands for a tile lies in its middle.
+        # The pixel that represents a tile lies in its middle.
         assert picked[0] - begin <= (window.step - 1) // 2
 
 
 @pytest.mark.parametrize(
-    ("told", "field"),
+    ("changes", "field"),
     [
         ({"rows": (3, 3)}, "rows"),
         ({"rows": (-1, 3)}, "rows"),
@@ -85,9 +85,9 @@ def test_the_finest_step_that_fits_is_taken(rows: int, cols: int, first: int, mo
         ({"step": 1.5}, "step"),
     ],
 )
-def test_what_is_no_window_is_refused(told: dict[str, Any], field: str) -> None:
+def test_an_invalid_window_is_refused(changes: dict[str, Any], field: str) -> None:
     with pytest.raises(ValueError, match=f"^{field} = "):
-        Window(**({"rows": (0, 9), "cols": (0, 9)} | told))
+        Window(**({"rows": (0, 9), "cols": (0, 9)} | changes))
 
 
 @pytest.mark.parametrize("window", [Window((0, 97), (0, 9)), Window((0, 9), (90, 100))])
@@ -96,7 +96,7 @@ def test_a_window_beyond_the_image_is_refused(window: Window) -> None:
         read_window(STORED.counts, window)
 
 
-# -- what is read ----------------------------------------------------------------------------------
+# -- reading ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -109,8 +109,8 @@ def test_a_window_holds_its_pixels_and_reads_few_others(
     name: str, window: Window, tmp_path: Path, small_blocks: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts = open_capture(put(tmp_path / name, FILES[name]()))
-    light, reads = flux_prior_of(CAPTURE), Reads(monkeypatch)
-    found = read_window(counts, window, flux_prior=light)
+    prior, reads = flux_prior_of(CAPTURE), Reads(monkeypatch)
+    found = read_window(counts, window, flux_prior=prior)
     rows, cols = window.picked
     np.testing.assert_array_equal(found.cube, CAPTURE.cube[np.ix_(rows, cols)])
     assert found.shape == window.shape
@@ -126,13 +126,13 @@ def test_a_window_holds_its_pixels_and_reads_few_others(
 
 
 def test_progress_counts_the_pieces(opened: xr.DataArray) -> None:
-    told: list[tuple[int, int]] = []
-    read_window(opened, Window((0, 96), (0, 48), 4), progress=lambda *done: told.append(done))
-    assert [of for _, of in told] == [18] * len(told)
-    assert [done for done, _ in told] == [*range(4, 18, 4), 18]
+    steps: list[tuple[int, int]] = []
+    read_window(opened, Window((0, 96), (0, 48), 4), progress=lambda *step: steps.append(step))
+    assert [of for _, of in steps] == [18] * len(steps)
+    assert [done for done, _ in steps] == [*range(4, 18, 4), 18]
 
 
-def test_what_has_been_read_so_far_can_be_looked_at(opened: xr.DataArray) -> None:
+def test_the_pixels_read_so_far_are_a_capture(opened: xr.DataArray) -> None:
     reader = WindowReader(opened, Window((0, 96), (0, 96), 4))
     reader.read_some()
     assert not reader.is_complete
@@ -145,14 +145,14 @@ def test_what_has_been_read_so_far_can_be_looked_at(opened: xr.DataArray) -> Non
     np.testing.assert_array_equal(reader.capture().cube, kept)
 
 
-# -- what it says ----------------------------------------------------------------------------------
+# -- estimates ------------------------------------------------------------------------------------
 
 
 @pytest.mark.compiled
-def test_a_window_says_what_the_whole_says(
+def test_estimates_in_a_window_are_those_of_the_whole(
     opened: xr.DataArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the light of the whole image, and not its own."""
+    """With the flux prior of the whole image, not its own."""
     monkeypatch.setattr(sample, "SAMPLE_COUNTS", CAPTURE.cube.size // 4)
     whole = estimate_large(opened, "likelihood").compute()
     window = Window((40, 72), (30, 62))
@@ -164,20 +164,22 @@ def test_a_window_says_what_the_whole_says(
     np.testing.assert_array_equal(image.confidence, whole["confidence"].isel(here))
 
 
-def test_what_is_not_read_yet_tells_nothing_of_the_light(opened: xr.DataArray) -> None:
+def test_pixels_not_read_yet_do_not_affect_the_flux_prior(opened: xr.DataArray) -> None:
     reader = WindowReader(opened, Window((0, 96), (0, 96), 2))
     reader.read_some()
-    light = flux_prior_of(reader.capture())
+    prior = flux_prior_of(reader.capture())
     known = Capture(
         reader.capture().cube[reader.seen][np.newaxis], CAPTURE.acquisition, CAPTURE.pulse
     )
-    assert light.background == flux_prior_of(known).background
+    assert prior.background == flux_prior_of(known).background
 
 
-# -- what goes wrong -------------------------------------------------------------------------------
+# -- failures --------------------------------------------------------------------------------------
 
 
-def test_a_damaged_chunk_is_told_and_can_be_tried_again(tmp_path: Path, small_blocks: None) -> None:
+def test_a_damaged_chunk_is_reported_and_can_be_read_again(
+    tmp_path: Path, small_blocks: None
+) -> None:
     path = put(tmp_path / "c.zarr", FILES["two.zarr"]())
     reader = WindowReader(open_capture(path), Window((0, 96), (0, 96), 4))
     chunk = path / "counts" / "0.0.0"
@@ -191,8 +193,8 @@ def test_a_damaged_chunk_is_told_and_can_be_tried_again(tmp_path: Path, small_bl
     assert reader.done == 4
 
 
-def test_a_file_that_has_gone_is_told(opened: xr.DataArray, tmp_path: Path) -> None:
-    """And not taken for chunks that were never written, which are zeros."""
+def test_a_deleted_file_is_reported(opened: xr.DataArray, tmp_path: Path) -> None:
+    """It is not mistaken for chunks that were never written, which are zeros."""
     shutil.rmtree(tmp_path / "c.zarr")
     with pytest.raises(CaptureError, match=r"c\.zarr: .*has not gone"):
         read_window(opened, Window((0, 9), (0, 9)))

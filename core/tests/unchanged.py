@@ -1,13 +1,11 @@
-"""What `core` answers to many small questions, kept to the last bit.
+"""Results of many small computations with `core`, stored to the last bit.
 
-``python -m core.tests.unchanged --write`` writes ``unchanged.npz`` beside this module, which
-`core.tests.test_unchanged` holds the answers against: to be done anew, and said so in the commit,
-only where an answer is meant to change. Only public names of `core` are used, so that its modules
-may be moved.
+``python -m core.tests.unchanged --write`` writes ``unchanged.npz``, with which
+`core.tests.test_unchanged` compares the results. Rewrite it only if a result is meant to change,
+and say so in the commit. Only public names of `core` are used, so that modules may be moved.
 
-The file holds one record for each case, such as ``estimate: car``, whose fields are the arrays of
-its answers, such as ``tracking.range_m``. The last bits of floating-point numbers depend on the
-machine and on what computes: the file says on which they were found.
+The file holds one record per case, such as ``estimate: car``, whose fields are arrays, such as
+``tracking.range_m``. Since last bits depend on processor and libraries, it also names these.
 """
 
 from __future__ import annotations
@@ -32,21 +30,21 @@ import scipy
 import core
 
 FILE = Path(__file__).with_suffix(".npz")
-FINGERPRINT = "fingerprint"  # the key of what tells one machine from another
+FINGERPRINT = "fingerprint"  # key of the description of the machine
 SAMPLE = Path(core.__file__).parents[1] / "assets" / "sample_capture.npz"
 
 Answers = Iterable[tuple[str, Any]]
-"""Names, and numbers in whatever the package gives them in."""
+"""Names, and values of any type that contain numbers."""
 
 Record = dict[str, np.ndarray]
-"""Arrays by their name, as ``tracking.range_m``."""
+"""Arrays by name, such as ``tracking.range_m``."""
 
 
-# -- what is looked at -----------------------------------------------------------------------------
+# -- scenes and captures ---------------------------------------------------------------------------
 
 
 def cut(scene: Any, rows: slice, cols: slice) -> Any:
-    """Some pixels of a scene, or of a part of one; what is not an image stays."""
+    """Cut all images of a scene, or of a part of one, to some pixels."""
     changed = {}
     for each in fields(scene):
         value = getattr(scene, each.name)
@@ -58,13 +56,13 @@ def cut(scene: Any, rows: slice, cols: slice) -> Any:
 
 
 def some_of(name: str, size: int = 64) -> core.Scene:
-    """Some 5 x 6 pixels of a built-in scene, on and beside what there is to see."""
+    """Cut a built-in scene to 5 x 6 pixels with and without targets."""
     row, col = size * 7 // 16, size // 8
     return cut(core.scenes[name](size), slice(row, row + 5), slice(col, col + 6))
 
 
 def everything() -> core.Scene:
-    """A scene with every part that there is."""
+    """Return a scene with every part."""
     foggy, worn, edges = some_of("fog"), some_of("worn"), some_of("edges", 16)
     bright = np.linspace(0.2, 1.5, 30).reshape(5, 6)
     behind_m = foggy.range_m + 3.0
@@ -79,7 +77,7 @@ def everything() -> core.Scene:
 
 
 def depths(acquisition: core.Acquisition, seed: int = 5) -> core.Scene:
-    """Random depths of 5 x 6 pixels in any gate, one pixel without a target."""
+    """Return 5 x 6 random depths in any gate, with one pixel without a target."""
     onset = np.random.default_rng(seed).uniform(0.15, 0.85, (5, 6)) * acquisition.n_bins
     onset[2, 3] = np.nan
     return core.Scene(acquisition.bin_to_range_m(onset), acquisition=acquisition)
@@ -90,7 +88,7 @@ def drawn(scene: core.Scene, *light: float, seed: int = 0, **more: Any) -> core.
 
 
 def photons(n_pulses: int | None) -> core.Capture:
-    """All photons, as of photon counting (TCSPC), in bins of 250 ps with a measured pulse."""
+    """Draw multi-detection data (TCSPC) in bins of 250 ps with a measured pulse."""
     acquisition = core.Acquisition(80, 250e-12, 100e-9, n_pulses, 1e-3)
     pulse = core.Pulse.measured([0, 1, 6, 4, 2, 1], 250e-12)
     scene = depths(acquisition)
@@ -101,7 +99,7 @@ def photons(n_pulses: int | None) -> core.Capture:
 
 
 def sample() -> core.Capture:
-    """Some pixels of the capture that comes with the package, read as a window."""
+    """Read a window of the sample capture of the package."""
     return core.read_window(core.open_capture(SAMPLE), core.Window((20, 30), (16, 28), 2))
 
 
@@ -140,28 +138,28 @@ MORE_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {
     "likelihood": ({"steps_per_bin": 5}, {"depths": "learned"}),
     "oracle": ({"steps_per_bin": 1}, {"depths": "learned"}),
 }
-"""Settings that are not the default ones, of the methods that have any."""
+"""Settings other than the defaults."""
 
 
-# -- what is asked ---------------------------------------------------------------------------------
+# -- cases -----------------------------------------------------------------------------------------
 
 
 def estimates(name: str, _: Path) -> Answers:
-    """A capture's counts, and the answers of all methods that can range it."""
+    """Counts of a capture, and estimates of all applicable methods."""
     capture = CAPTURES[name]()
     yield "capture", capture
-    told = capture.signal is not None and capture.background is not None
+    known = capture.signal is not None and capture.background is not None
     for method in core.ESTIMATORS:
-        if told or method != "oracle":
+        if known or method != "oracle":
             yield method, core.estimate(capture, method)
 
 
 def settings(method: str, _: Path) -> Answers:
-    """A method's answers with other settings, and with a rate of false alarms."""
+    """Estimates of a method with other settings, and with a false-alarm rate."""
     capture = drawn(some_of("car"), 0.15, 0.15, seed=10)
     for each in MORE_SETTINGS.get(method, ()):
-        told = ", ".join(f"{key} {value}" for key, value in each.items())
-        yield told, core.estimate(capture, method, **each)
+        name = ", ".join(f"{key} {value}" for key, value in each.items())
+        yield name, core.estimate(capture, method, **each)
     short = core.reductions.cut_gate(capture, 0, 60)
     yield "false alarms 0.1", core.estimate(short, method, false_alarm=0.1)
 
@@ -287,7 +285,7 @@ def formulas(_: Path) -> Answers:
 
 
 def files(folder: Path) -> Answers:
-    """What is written, read, read in part and ranged part by part."""
+    """Files written and read, windows read, and estimates in tiles."""
     capture = drawn(some_of("car"), 0.2, 0.2, seed=12)
     for suffix in (".npz", ".nc", ".zarr"):
         path = folder / f"capture{suffix}"
@@ -313,7 +311,7 @@ def files(folder: Path) -> Answers:
 
 
 def scene_files(folder: Path) -> Answers:
-    """A tetrahedron that is looked at."""
+    """Scenes from a mesh of a tetrahedron."""
     corners, faces = (
         np.array([[0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 2]]),
         np.array([[0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 2, 1]]),
@@ -340,14 +338,14 @@ CASES: dict[str, Callable[[Path], Answers]] = {
     "files": files,
     "scene files": scene_files,
 }
-"""Questions by the name of what they are about; each may write into a folder."""
+"""Functions by case; each may write into a folder."""
 
 
-# -- what is kept of it ----------------------------------------------------------------------------
+# -- records ---------------------------------------------------------------------------------------
 
 
 def numbers_in(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
-    """All numbers of an answer, with a name for each array; words and functions are left out."""
+    """Yield all numbers in a value, with a name for each array."""
     if isinstance(value, bool | int | float | np.generic | np.ndarray):
         array = np.asarray(value)
         if array.dtype.kind in "biuf":
@@ -368,33 +366,25 @@ def numbers_in(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def answers(case: str, folder: Path) -> Record:
-    """The answers to one of `CASES`."""
+    """Compute one of `CASES`."""
     named = (numbers_in(value, name) for name, value in CASES[case](folder))
     return dict(chain.from_iterable(named))
 
 
-def stored_cases() -> set[str]:
-    """The cases that the file holds answers to."""
-    with np.load(FILE) as stored:
-        return set(stored.files) - {FINGERPRINT}
-
-
-def stored_answers(case: str) -> Record:
-    """As `answers`, but those of the file."""
-    with np.load(FILE, max_header_size=10**6) as stored:
-        record = stored[case]
-    return {name: np.asarray(record[name]) for name in record.dtype.names}
-
-
-def stored_fingerprint() -> dict[str, Any]:
-    """The `fingerprint` of the machine that the file was written on."""
-    with np.load(FILE) as stored:
-        told: dict[str, Any] = json.loads(str(stored[FINGERPRINT]))
-        return told
+def stored() -> tuple[dict[str, Record], dict[str, Any]]:
+    """Read the records of all cases, and the `fingerprint` of the machine that wrote them."""
+    with np.load(FILE, max_header_size=10**6) as file:
+        records = {case: file[case] for case in file.files}
+    written_by: dict[str, Any] = json.loads(str(records.pop(FINGERPRINT)))
+    found = {
+        case: {name: np.asarray(record[name]) for name in record.dtype.names}
+        for case, record in records.items()
+    }
+    return found, written_by
 
 
 def fingerprint() -> dict[str, Any]:
-    """Whatever the last bits of an answer depend on: processor, libraries and their versions."""
+    """Describe the processor and libraries on which last bits depend."""
     config: Any = np.show_config(mode="dicts")
     return {
         "machine": platform.machine(),
@@ -410,7 +400,7 @@ def fingerprint() -> dict[str, Any]:
 
 
 def write() -> None:
-    """Write the file anew."""
+    """Write the file."""
     records: dict[str, np.ndarray] = {FINGERPRINT: np.array(json.dumps(fingerprint()))}
     n_arrays = 0
     for case in CASES:
@@ -426,6 +416,6 @@ def write() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--write", action="store_true", required=True, help="write the file anew")
+    parser.add_argument("--write", action="store_true", required=True, help="rewrite the file")
     parser.parse_args()
     write()

@@ -1,4 +1,4 @@
-"""An attack, what became of it, and the processes that it is tried on."""
+"""An attack, its outcome, and the processes that it is tried on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryFile
@@ -26,12 +26,7 @@ from tests.wire import Wire
 
 MIB = 2**20
 MOST_BYTES = 6 * 1024 * MIB
-"""A process that holds more is killed, so that the machine survives the attack."""
-
-PATIENCE_S = 5.0
-"""Another session must never wait longer than this."""
-
-TOKEN = "a token of the attacks"
+"""A process with more memory is killed, so that the machine survives the attack."""
 
 
 @dataclass(frozen=True)
@@ -39,48 +34,29 @@ class Outcome:
     """Result of an attack."""
 
     times: int
-    """How often it was tried."""
-    said: str
-    """Sentence on what was observed."""
+    """Number of attempts."""
+    text: str
+    """Observation."""
     held: bool
     peak_bytes: int = 0
-    """Resident memory of the attacked process and its children at its highest."""
-
-
-@dataclass(frozen=True)
-class Served:
-    """How the attacked server is started."""
-
-    arguments: tuple[str, ...] = ()
-    environment: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def has_token(self) -> bool:
-        """Whether a client must know a token."""
-        return bool(self.environment)
-
-
-HERE = Served()
-WITH_TOKEN = Served(("--origin", "localhost"), (("FIRSTPHOTON_TOKEN", TOKEN),))
+    """Highest resident memory of the attacked process and its children."""
 
 
 @dataclass(frozen=True)
 class Attack:
-    """Something hostile to try.
+    """A hostile action.
 
     Parameters
     ----------
     title : str
-        What is tried.
     run : callable
-        Tries it on a `Server`; on the folder for its files if `served` is None.
-    served : Served, optional
-        How the server is started; None where the command line is attacked.
+        Tries it on a `Server`, or with a folder for its files.
+    needs_server : bool
     """
 
     title: str
     run: Callable[[Any], Outcome | Awaitable[Outcome]]
-    served: Served | None = HERE
+    needs_server: bool = True
 
 
 class Memory:
@@ -88,14 +64,14 @@ class Memory:
 
     def __init__(self, pid: int) -> None:
         self._process = psutil.Process(pid)
-        self._over = threading.Event()
+        self._stopped = threading.Event()
         self.peak_bytes = self.now()
         self.is_killed = False
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
 
     def now(self) -> int:
-        """Bytes that they hold at present; 0 once the process has ended."""
+        """Return the present memory; 0 once the process has ended."""
         held = 0
         with suppress(psutil.NoSuchProcess):
             for each in (self._process, *self._process.children(recursive=True)):
@@ -108,12 +84,12 @@ class Memory:
         self.peak_bytes = self.now()
 
     def stop(self) -> None:
-        """Watch no longer."""
-        self._over.set()
+        """Stop watching."""
+        self._stopped.set()
         self._thread.join()
 
     def _watch(self) -> None:
-        while not self._over.wait(0.05):
+        while not self._stopped.wait(0.05):
             now = self.now()
             self.peak_bytes = max(self.peak_bytes, now)
             if now > MOST_BYTES:
@@ -129,15 +105,11 @@ class Server:
     address: str
     process: subprocess.Popen[bytes]
     memory: Memory
-    folder: Path
-    """First entry of the server's module search path; for modules and files of attacks."""
     log: IO[str]
-    headers: dict[str, str] = field(default_factory=dict)
-    """Headers of a client that knows the token."""
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """TCP port."""
         return int(self.address.rstrip("/").rpartition(":")[2])
 
     @property
@@ -146,26 +118,22 @@ class Server:
         return self.process.poll() is None
 
     def logged(self, since: int = 0) -> str:
-        """Text that it has printed, from this character on."""
+        """Return the output from this character on."""
         with open(f"/proc/self/fd/{self.log.fileno()}", encoding="utf-8", errors="replace") as log:
             return log.read()[since:]
 
 
 @contextmanager
-def running(served: Served, folder: Path) -> Iterator[Server]:
-    """Start a server and end it, whatever has become of it."""
+def running(*arguments: str) -> Iterator[Server]:
+    """Start a server, and kill it at the end."""
     port = free_port()
-    command = [sys.executable, "-m", "app", "--port", str(port), *served.arguments]
-    path = os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
-    environment = {**os.environ, "PYTHONPATH": path, **dict(served.environment)}
+    options = [sys.executable, "-m", "app", "--port", str(port), *arguments]
     with TemporaryFile("w+") as log:
-        process = subprocess.Popen(
-            command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, env=environment
-        )
+        process = subprocess.Popen(options, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT)
         try:
             address = when_up(f"http://127.0.0.1:{port}/", process, log)
             memory = Memory(process.pid)
-            yield Server(address, process, memory, folder, log)
+            yield Server(address, process, memory, log)
             memory.stop()
         finally:
             process.kill()
@@ -173,15 +141,15 @@ def running(served: Served, folder: Path) -> Iterator[Server]:
 
 
 class Bystander:
-    """Another session, which moves controls all the time and notes how long it waits."""
+    """Another session, which moves controls all the time and measures how long it waits."""
 
-    def __init__(self, server: Server) -> None:
-        self._server = server
+    def __init__(self, address: str) -> None:
+        self._address = address
         self.is_lost = False
         self._longest_s = 0.0
         self._sent_s: float | None = None
-        self._over, self._ready = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._live()), daemon=True)
+        self._stopped, self._ready = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._use()), daemon=True)
         self._thread.start()
         self._ready.wait(60)
 
@@ -197,24 +165,24 @@ class Bystander:
 
     def leave(self) -> None:
         """Close the session."""
-        self._over.set()
+        self._stopped.set()
         self._thread.join(60)
 
-    async def _live(self) -> None:
+    async def _use(self) -> None:
         wire = Wire()
         try:
-            await wire.open(self._server.address, **self._server.headers)
+            await wire.open(self._address)
             hand = Hand(wire, Random(0))
             self._ready.set()
-            while not (self._over.is_set() or wire.is_closed or hand.troubles):
+            while not (self._stopped.is_set() or wire.is_closed or hand.troubles):
                 self._sent_s = time.monotonic()
                 await hand.step()
                 self._longest_s = max(self._longest_s, time.monotonic() - self._sent_s)
                 self._sent_s = None
                 await asyncio.sleep(0.1)
-            self.is_lost = not self._over.is_set()
+            self.is_lost = not self._stopped.is_set()
             wire.close()
-        except Exception:  # whatever it is, this session is served no longer
+        except Exception:  # in any case, this session is not served any more
             self.is_lost = True
         finally:
             self._ready.set()
@@ -222,10 +190,10 @@ class Bystander:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended."""
+    """Outcome of a command."""
 
     status: int | None
-    """None where it was stopped for taking too long or too much."""
+    """None if it was stopped for taking too long or too much."""
     seconds: float
     peak_bytes: int
     printed: str
@@ -237,7 +205,7 @@ def command(
     largest_file_bytes: int | None = None,
     **environment: str,
 ) -> Ended:
-    """Run this Python with arguments, bounded in time and memory."""
+    """Run this Python with arguments, limited in time and memory."""
     begun = time.monotonic()
     with TemporaryFile("w+", encoding="utf-8", errors="replace") as printed:
         process = subprocess.Popen(
@@ -263,17 +231,16 @@ def command(
             status = None if memory.is_killed else process.returncode
         memory.stop()
         printed.seek(0)
-        seconds = time.monotonic() - begun
-        return Ended(status, seconds, memory.peak_bytes, printed.read())
+        return Ended(status, time.monotonic() - begun, memory.peak_bytes, printed.read())
 
 
 def last_line(text: str, most: int = 160) -> str:
-    """The last line that says something, shortened."""
+    """Return the last line that is not empty, shortened."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     line = lines[-1] if lines else "nothing printed"
     return line if len(line) <= most else line[: most - 1] + "…"
 
 
 def counted(things: Sequence[Any]) -> str:
-    """Number of each, such as ``3 × 403, 1 × closed``."""
+    """Return the number of each thing, such as ``3 × 403, 1 × closed``."""
     return ", ".join(f"{things.count(each)} × {each}" for each in dict.fromkeys(things))

@@ -1,4 +1,4 @@
-"""Small files that ask for much, given to the command line."""
+"""Small files that take much memory or time, given to the command line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.attacks.attack import MIB, Attack, Ended, Outcome, command, last_line
 
 MOST_BYTES = 1536 * MIB
 MOST_S = 30.0
-"""Limits on a command for any of these files, its start and compilation included."""
+"""Limits on a command for one of these files, its start and compilation included."""
 
 CUBE = np.random.default_rng(0).poisson(0.1, (3, 4, 100)).astype(np.uint8)
 
@@ -58,7 +58,7 @@ HUNGRY: dict[str, bytes] = {
         pulse_samples=np.ones(2**20),
     ),
 }
-"""Files of some kilobytes that ranging takes minutes or gigabytes for."""
+"""Files of some kilobytes whose estimates would take minutes or gigabytes."""
 
 STRAY: dict[str, bytes] = {
     "photons at 1 ms and 1 ps.mat": stray(1e-3 - 1e-9, 1e-12),
@@ -85,11 +85,11 @@ EXTREME: dict[str, bytes] = {
     "samples of 5e-324.npz": numbers(pulse_samples=np.array([5e-324, 5e-324, 5e-324])),
     "background of 1e300.npz": numbers(background=1e300),
 }
-"""Numbers that no instrument writes: refused, or ranged without harm."""
+"""Numbers that no instrument writes: refused, or processed without harm."""
 
 
 def verdict(ended: Ended, must_refuse: bool = False) -> tuple[str, bool]:
-    """How a command ended, in words, and whether that is as it should be."""
+    """Return how a command ended, and whether that is acceptable."""
     n_mib = ended.peak_bytes / MIB
     took = f"{ended.seconds:.1f} s, {n_mib:.0f} MiB"
     if ended.status is None:
@@ -109,13 +109,13 @@ def judged(ended: Ended, must_refuse: bool = False) -> Outcome:
 
 
 def ranged(name: str, content: bytes, folder: Path) -> Outcome:
-    """Range a file by the tracking differentiator."""
+    """Estimate ranges by the tracking differentiator."""
     path = put(folder / name, content)
     return judged(command("-m", "core", "estimate", "tracking", "--capture", path))
 
 
 def looked_into(name: str, content: bytes, folder: Path) -> Outcome:
-    """Ask what a file holds."""
+    """Describe a file."""
     return judged(command("-m", "core", "info", put(folder / name, content)))
 
 
@@ -132,7 +132,7 @@ for name in ESTIMATORS:
 
 
 def by_every_method(name: str, content: bytes, folder: Path) -> Outcome:
-    """Range a file by every method, one after the other."""
+    """Estimate ranges by every method, one after the other."""
     ended = command("-c", EVERY_METHOD, put(folder / name, content), limit_s=60)
     said, _ = verdict(ended)
     held = ended.status == 0 and ended.peak_bytes < MOST_BYTES
@@ -174,7 +174,7 @@ for path in sys.argv[1:]:
 
 
 def ports(folder: Path) -> Outcome:
-    """Ports that there are not."""
+    """Ports that do not exist."""
     said, wrong, peak = [], [], 0
     for port in ("70000", "-1", "1e3"):
         ended = command("-m", "app", f"--port={port}", limit_s=30)
@@ -186,7 +186,7 @@ def ports(folder: Path) -> Outcome:
 
 
 def long_name(folder: Path) -> Outcome:
-    """A name that no file system takes, to read and to write."""
+    """A name that no file system accepts, to read and to write."""
     name, wrong, peak = "x" * 300, [], 0
     sample = "assets/sample_capture.npz"
     for arguments in (
@@ -225,7 +225,7 @@ def full_disk(folder: Path) -> Outcome:
 
 
 def plain_locale(folder: Path) -> Outcome:
-    """A file name beyond ASCII where the locale knows none."""
+    """A file name beyond ASCII with an ASCII locale."""
     content, wrong, peak, said = numbers(), [], 0, []
     (folder / "Dämmerung").mkdir(exist_ok=True)
     path = put(folder / "Dämmerung" / "größe.npz", content)
@@ -243,7 +243,7 @@ def plain_locale(folder: Path) -> Outcome:
 
 
 def _attack(title: str, run: Callable[[Path], Outcome]) -> Attack:
-    return Attack(title, run, None)
+    return Attack(title, run, needs_server=False)
 
 
 ATTACKS = [

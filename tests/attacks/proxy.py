@@ -1,4 +1,4 @@
-"""A connection that can be cut: what stands between a browser and its server in a network."""
+"""A proxy between a browser and its server whose connections can be cut."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files and messages that a page sends, while another session is at work."""
+"""Files and messages that a page sends while another session is used."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ANSWERED_S = 60.0
 
 
 class Tab:
-    """A page that files are opened in."""
+    """A page in which files are opened."""
 
     def __init__(self, wire: Wire) -> None:
         self.wire = wire
@@ -32,7 +32,7 @@ class Tab:
 
     @property
     def alert(self) -> str:
-        """What the page complains of."""
+        """Error message of the page."""
         return str(self.wire.values.get((self._alert, "text"), ""))
 
     @property
@@ -64,7 +64,7 @@ class Tab:
         )
 
     async def until(self, name: str, limit_s: float = ANSWERED_S) -> str:
-        """What became of a file: opened, refused with a sentence, or nothing."""
+        """Wait until a file has been opened or refused; return what happened."""
         begun = time.monotonic()
 
         def is_open() -> bool:
@@ -90,7 +90,7 @@ def _id(reference: Any) -> str | None:
 async def opened(server: Server, query: str = "") -> Tab:
     """A new page."""
     wire = Wire()
-    await wire.open(server.address + query, **server.headers)
+    await wire.open(server.address + query)
     return Tab(wire)
 
 

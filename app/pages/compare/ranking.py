@@ -1,4 +1,4 @@
-"""What each method answers and how right it is: runs `core` for many methods, knows no widget."""
+"""Results of several methods and their accuracy, computed by `core`, without widgets."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Array = NDArray[Any]
 
 TOLERANCES_BINS = (1, 2, 3)
 
-FEWEST = 20
-"""Pixels that a tenth of confidence needs to say something."""
+MIN_PIXELS = 20
+"""Pixels that a tenth of confidence needs to be drawn."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A method to be run, and how."""
+    """A method to run, and its settings."""
 
     method: str
     settings: Any
@@ -32,7 +32,7 @@ class Task:
 
 
 def tasks_of(chosen: Comparison, tracking: TrackingParameters) -> dict[str, Task]:
-    """What is compared, in the order of the registry."""
+    """Return the chosen methods, in the order of the registry."""
     settings = {**chosen.settings, "tracking": tracking}
     return {
         method: Task(method, settings[method], chosen.false_alarm)
@@ -42,61 +42,61 @@ def tasks_of(chosen: Comparison, tracking: TrackingParameters) -> dict[str, Task
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """How right an answer is, besides the figures of its `core.Run`."""
+class Accuracy:
+    """The accuracy of an estimate, besides the figures of its `core.Run`."""
 
     within: tuple[metrics.Interval, ...]
     """Share of target pixels within each of `TOLERANCES_BINS`, with its 95 % Wilson interval;
-    empty where there is no target."""
-    detection: metrics.Detection | None
+    empty without targets."""
+    detection: metrics.DetectionRates | None
     """None where every pixel has a target."""
-    told: Array
-    """Mean confidence of each step that holds enough pixels."""
-    right: Array
-    """Share of those pixels within 3 bins; one without a target is wrong."""
+    confidence: Array
+    """Mean confidence of each tenth with enough pixels."""
+    correct: Array
+    """Share of those pixels within 3 bins; pixels without a target are wrong."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """A method's answer, and what it is worth where the truth is known."""
+    """A method's estimate, and its accuracy where the truth is known."""
 
     answer: Answer
-    verdict: Verdict | None
+    accuracy: Accuracy | None
 
 
 @dataclass(frozen=True)
-class Yardstick:
-    """What all methods are measured by, besides the truth."""
+class Reference:
+    """Reference that methods are compared with, besides the truth."""
 
     limit: limits.Limit | None
-    """What physics allows; None where truth, light or number of pulses is not known."""
+    """The physical limit; None where truth, flux or number of pulses is not known."""
     likelihood: RangeImage | None
-    """What answers are compared with where there is no truth."""
-    failed: str = ""
-    """Why neither could be found, where that has failed."""
+    """The likelihood's estimate, for captures without truth."""
+    failure: str = ""
+    """Why neither could be computed."""
 
 
 def run_task(task: Task, explored: Answer) -> Result:
-    """Range the capture of an answer by another method, or take that answer if it is the same."""
+    """Run a method on the capture of an estimate, or take that estimate if it is the same."""
     capture, request = explored.capture, explored.request
     if task == Task("tracking", request.tracking):
         answer = explored
     else:
         with ranging(capture, task.method, task.settings, task.false_alarm):
-            ranked = run(capture, task.method, task.settings, task.false_alarm)
-        answer = replace(explored, run=ranked)
-    return Result(answer, judge(answer))
+            ran = run(capture, task.method, task.settings, task.false_alarm)
+        answer = replace(explored, run=ran)
+    return Result(answer, accuracy_of(answer))
 
 
-def judge(answer: Answer) -> Verdict | None:
-    """Compare an answer with the truth; None without one."""
+def accuracy_of(answer: Answer) -> Accuracy | None:
+    """Compare an estimate with the truth; None without one."""
     capture, image = answer.capture, answer.run.image
     truth_m, bin_m = capture.truth_range_m, capture.acquisition.bin_length_m
     if truth_m is None:
         return None
     restored = [metrics.restored(image.range_m, truth_m, n * bin_m) for n in TOLERANCES_BINS]
     has_empty = bool(np.isnan(truth_m).any())
-    return Verdict(
+    return Accuracy(
         tuple(metrics.wilson(hits, of) for hits, of in restored if of),
         metrics.precision_recall(image.valid, truth_m) if has_empty else None,
         *reliability(answer),
@@ -104,30 +104,31 @@ def judge(answer: Answer) -> Verdict | None:
 
 
 def reliability(answer: Answer) -> tuple[Array, Array]:
-    """Mean confidence and share right of the answers in each tenth of confidence."""
+    """Return mean confidence and share of correct estimates for each tenth of confidence."""
     image, wrong = answer.run.image, is_wrong(answer)
     if wrong is None:
         return np.empty(0), np.empty(0)
-    told = metrics.reliability(image.confidence[image.valid], ~wrong[image.valid])
-    enough = [each for each in told if each.count >= FEWEST]
-    return np.array([each.confidence for each in enough]), np.array(
-        [each.right.value for each in enough]
+    tenths = metrics.reliability(image.confidence[image.valid], ~wrong[image.valid])
+    enough = [each for each in tenths if each.count >= MIN_PIXELS]
+    return (
+        np.array([each.confidence for each in enough]),
+        np.array([each.right.value for each in enough]),
     )
 
 
-def yardstick(capture: Capture) -> Yardstick:
-    """Find what all methods of a capture are measured by."""
+def reference_of(capture: Capture) -> Reference:
+    """Compute what the methods are compared with."""
     known = (capture.truth_range_m, capture.signal, capture.background)
     has_limit = all(each is not None for each in known) and capture.acquisition.n_pulses is not None
     with ranging(capture, "likelihood"):
-        return Yardstick(
+        return Reference(
             limits.limit(capture) if has_limit else None,
             estimate(capture, "likelihood") if capture.truth_range_m is None else None,
         )
 
 
 def agreement(image: RangeImage, other: RangeImage, tolerance_bins: float = 3.0) -> float:
-    """Share of pixels that both answer in which they agree; NaN where there is no such pixel."""
+    """Share of pixels with both estimates in which they agree; NaN if there is no such pixel."""
     both = image.valid & other.valid
     close = np.abs(image.bin - other.bin)[both] <= tolerance_bins
     return float(close.mean()) if close.size else float("nan")
@@ -136,9 +137,9 @@ def agreement(image: RangeImage, other: RangeImage, tolerance_bins: float = 3.0)
 def score_curves(
     capture: Capture, tasks: Mapping[str, Task], row: int, col: int
 ) -> dict[str, Array]:
-    """Each method's score of each bin, from 0 at its median over the bins to 1 at its maximum.
+    """Each method's score of each bin, scaled to 0 at its median and 1 at its maximum.
 
-    Methods that cannot say, or whose curve is flat, are left out.
+    Methods whose score is flat or not finite are left out.
     """
     curves = {}
     for method, task in tasks.items():

@@ -1,4 +1,4 @@
-"""What the Inspect page shows of an answer: runs `core`, knows no widget."""
+"""Data of the Inspect page, computed by `core`, without widgets."""
 
 from __future__ import annotations
 
@@ -8,90 +8,82 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.model.budget import spending
-from app.model.state import Less
+from app.model.state import ReductionSettings
 from app.model.store import Answer, Pixel, inspect, reduced
-from app.pages.inspect.views import Corners, Curves
 from core import inspection
 from core.cost import predicted_flux_time
 from core.inspection import Accuracy, CaptureReport, PixelReport, RegionReport, Suggestion
 
+Corners = tuple[tuple[float, float], ...]
+"""Corners (row, col) of a polygon."""
+
 SHARES = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0)
-"""Of the pulses, for which it is found how good answers are."""
+"""Shares of the pulses for which the accuracy is computed."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A pixel, or a region's pixels added to one, with all that is known of it."""
+class Inspected:
+    """A pixel, or a region's pixels summed to one histogram."""
 
+    answer: Answer
+    """The estimate that it belongs to."""
     pixel: Pixel
     report: PixelReport
     region: RegionReport | None = None
     """None for a pixel."""
 
-    @property
-    def curves(self) -> Curves:
-        """What its plots show."""
-        pixel, signals = self.pixel, self.pixel.signals
-        return Curves(
-            raw=signals.raw,
-            expected=pixel.expected,
-            small=signals.small,
-            large=signals.large,
-            rate=self.report.rate,
-            rate_unit=self.report.rate_unit,
-            residual=signals.residual,
-            enhanced=signals.enhanced,
-            truth_bin=pixel.truth_bin,
-            answer_bin=pixel.answer_bin,
-            candidate_bins=[each.bin for each in self.report.candidates],
-        )
 
-
-def pixel_seen(answer: Answer, row: int, col: int) -> Seen:
-    """All that is known of one pixel of an answer."""
+def inspect_pixel(answer: Answer, row: int, col: int) -> Inspected:
+    """Inspect one pixel; its flux is estimated when it is first used."""
     report = inspection.pixel_report(
         answer.capture, answer.run.image, row, col, "tracking", answer.request.tracking
     )
-    return Seen(inspect(answer, row, col), report)
+    return Inspected(answer, inspect(answer, row, col), report)
 
 
-def pixel_lit(answer: Answer, row: int, col: int) -> Seen:
-    """The same, its light found: on a worker, where to find it would hold up the page."""
+def inspect_pixel_with_flux(answer: Answer, row: int, col: int) -> Inspected:
+    """Inspect one pixel and estimate its flux, for a worker thread."""
     n_bins = answer.capture.acquisition.n_bins
-    with spending((1, 1, n_bins), "light", predicted_flux_time(1, n_bins)):
-        seen = pixel_seen(answer, row, col)
-        _ = seen.report.flux
-        return seen
+    with spending((1, 1, n_bins), "flux", predicted_flux_time(1, n_bins)):
+        found = inspect_pixel(answer, row, col)
+        _ = found.report.flux
+        return found
 
 
-def region_seen(answer: Answer, region: Corners) -> Seen:
-    """All that is known of a region of an answer's pixels."""
+def inspect_region(answer: Answer, region: Corners) -> Inspected:
+    """Inspect the pixels within a polygon.
+
+    Raises
+    ------
+    ValueError
+        If no pixel lies in it.
+    """
     mask = inspection.pixels_in(region, answer.capture.shape)
     n_pixels, n_bins = int(np.count_nonzero(mask)), answer.capture.acquisition.n_bins
-    with spending((1, n_pixels, n_bins), "light", predicted_flux_time(n_pixels, n_bins)):
+    with spending((1, n_pixels, n_bins), "flux", predicted_flux_time(n_pixels, n_bins)):
         report = inspection.region_report(
             answer.capture, answer.run.image, mask, "tracking", answer.request.tracking
         )
     of_sum = replace(answer, run=replace(answer.run, capture=report.summed, image=report.image))
-    return Seen(inspect(of_sum, 0, 0), report.pixel, report)
+    return Inspected(answer, inspect(of_sum, 0, 0), report.pixel, report)
 
 
-def capture_known(answer: Answer) -> CaptureReport:
-    """All that is known of the capture of an answer."""
+def inspect_capture(answer: Answer) -> CaptureReport:
+    """Inspect the capture of an estimate as a whole."""
     rows, cols, n_bins = answer.capture.cube.shape
-    with spending((rows, cols, n_bins), "light", predicted_flux_time(rows * cols, n_bins)):
+    with spending((rows, cols, n_bins), "flux", predicted_flux_time(rows * cols, n_bins)):
         return inspection.capture_report(answer.capture)
 
 
 def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:
-    """How good answers to each of `SHARES` of the pulses are, a piece of work each."""
+    """Return one function for each of `SHARES`, to be called in this order."""
     started: list[Iterator[Accuracy]] = []
 
     def step() -> Accuracy:
-        if not started:  # on the worker: to have all pulses again may take a while
+        if not started:  # on the worker thread, since restoring all pulses may take long
             request = answer.request
-            every = replace(request, less=replace(request.less, pulses=1.0))
-            capture = reduced(answer.whole, every)
+            all_pulses = replace(request, less=replace(request.less, pulses=1.0))
+            capture = reduced(answer.whole, all_pulses)
             started.append(
                 inspection.accuracy_over_pulses(capture, SHARES, "tracking", request.tracking)
             )
@@ -100,10 +92,10 @@ def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:
     return [step] * len(SHARES)
 
 
-def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[Less, int]:
-    """The reduction of an answer with the suggested gate instead, and T_n at its old place."""
+def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[ReductionSettings, int]:
+    """Return the reduction that crops to the suggested gate, and T_n at its old place."""
     less, n_bins = answer.request.less, answer.whole.acquisition.n_bins
     opens, _ = less.reduction(n_bins).gate or (0, n_bins)
-    first, end = (opens + less.merge * each for each in suggestion.gate)
+    first, end = (opens + less.merge * edge for edge in suggestion.gate)
     t_n = max(answer.request.tracking.t_n - suggestion.gate[0], 0)
     return replace(less, gate_from=first / n_bins, gate_to=min(end / n_bins, 1.0)), t_n

@@ -1,9 +1,8 @@
-"""Viewers of the Inspect page: the picture to navigate by, and plots along the gate."""
+"""Plots of the Inspect page: the map, and plots along the gate."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,92 +19,89 @@ from bokeh.models import (
 )
 from numpy.typing import NDArray
 
+from app.pages.inspect.results import Corners, Inspected
 from app.pages.shared.outputs import layers_of
 from app.plots import elements as plots
-from app.plots import inspect as inspector_plots
-from app.plots.gate import GateAxes, GateReadOut
+from app.plots import inspect as inspect_plots
+from app.plots.gate_axes import GateAxes, GateReadOut
 from app.theme import Palette
 from app.widgets.figures import Layers, cover, paint_frame, pane_of, round_up
 from app.widgets.image_view import ImageView
 from core import Acquisition
 
 Array = NDArray[Any]
-Corners = tuple[tuple[float, float], ...]
-"""Of a polygon, as (row, col)."""
 
-ENOUGH_CORNERS = 60
-"""Of a region that was drawn by hand: enough for its shape, and short enough for an address."""
+MAX_DRAWN_CORNERS = 60
+"""Corners kept of a lasso: enough for its shape, few enough for a link."""
 
 
 class Navigator(ImageView):
-    """The picture to navigate by, with a region outlined and pins framed.
+    """The map, with the region outlined and the pins framed.
 
     Parameters
     ----------
     tapped : callable
         Called with the row and column of a tapped pixel.
     selected : callable
-        Called with the corners of a region that was drawn.
+        Called with the corners of a drawn region.
 
     Attributes
     ----------
     drags : dict of str to bokeh.models.Tool
-        What dragging on the picture can do.
+        What dragging on the map can do.
     """
 
     def __init__(
         self, tapped: Callable[[int, int], None], selected: Callable[[Corners], None]
     ) -> None:
         super().__init__(tapped)
-        drawing = self.figure
-        # Nothing is selected in the picture itself: what was drawn is outlined by a layer.
+        figure = self.figure
+        # The tools select nothing in the image itself: a layer outlines the region.
         by_hand = {
             "Rectangle": BoxSelectTool(renderers=[]),
             "Lasso": LassoSelectTool(renderers=[], continuous=False),
         }
         wheel = WheelZoomTool()
-        drawing.add_tools(*by_hand.values(), wheel)
-        drawing.toolbar.active_scroll = wheel
-        (zoom,) = (tool for tool in drawing.toolbar.tools if isinstance(tool, BoxZoomTool))
+        figure.add_tools(*by_hand.values(), wheel)
+        figure.toolbar.active_scroll = wheel
+        (zoom,) = (tool for tool in figure.toolbar.tools if isinstance(tool, BoxZoomTool))
         self.drags = {"Zoom": zoom, **by_hand}
+        self._region = inspect_plots.empty("xs", "ys")
         for name, color, width in (("shadow", "#000000", 4), ("line", "#ffd000", 2)):
-            drawing.patches(
+            figure.patches(
                 "xs",
                 "ys",
-                source=inspector_plots.empty("xs", "ys"),
+                source=self._region,
                 fill_alpha=0,
                 line_color=color,
                 line_width=width,
                 name=f"region {name}",
             )
-        drawing.quad(
+        self._pins = inspect_plots.empty("left", "right", "top", "bottom", "color")
+        figure.quad(
             "left",
             "right",
             "top",
             "bottom",
-            source=inspector_plots.empty("left", "right", "top", "bottom", "color"),
+            source=self._pins,
             fill_alpha=0,
             line_color="color",
             line_width=2.5,
             name="pins",
         )
-        own = {each.name: each for each in drawing.renderers if each.name}
-        self._region = [own["region shadow"].data_source, own["region line"].data_source]
-        self._pins = own["pins"].data_source
 
         def select(event: SelectionGeometry) -> None:
             if event.final:
-                drawn = corners_of(event.geometry)
-                selected(tuple(_rounded(self._grid.index(*each)) for each in drawn))
+                corners = (self._grid.index(*each) for each in corners_of(event.geometry))
+                selected(tuple((round(row, 2), round(col, 2)) for row, col in corners))
 
-        drawing.on_event(SelectionGeometry, select)
+        figure.on_event(SelectionGeometry, select)
 
     def outline(self, region: Corners) -> None:
-        """Draw a region's outline; none if it is empty."""
+        """Outline a region; none if it is empty."""
         places = [self._grid.place(*corner) for corner in region]
         cols, rows = [col for _, col in places], [row for row, _ in places]
-        for source in self._region:
-            source.data = {"xs": [cols] if region else [], "ys": [rows] if region else []}
+        self._region.data = {"xs": [cols] if region else [], "ys": [rows] if region else []}
 
     def pin(self, pins: Sequence[tuple[int, int]], colors: Sequence[str]) -> None:
         """Frame pixels, each in its colour."""
@@ -117,47 +113,24 @@ class Navigator(ImageView):
 
 
 def corners_of(geometry: Mapping[str, Any]) -> Corners:
-    """Corners (row, col) of what was drawn by one of Bokeh's selection tools."""
+    """Return the corners (row, col) of a selection drawn with one of Bokeh's tools."""
     if geometry["type"] == "rect":
         (left, right), (top, bottom) = (
             sorted((geometry[f"{axis}0"], geometry[f"{axis}1"])) for axis in "xy"
         )
-        drawn = [(top, left), (top, right), (bottom, right), (bottom, left)]
-    else:
-        drawn = list(zip(geometry["y"], geometry["x"], strict=True))
-        drawn = drawn[:: -(-len(drawn) // ENOUGH_CORNERS)]
-    return tuple((float(row), float(col)) for row, col in drawn)
-
-
-def _rounded(corner: tuple[float, float]) -> tuple[float, float]:
-    """As fine as an address needs it."""
-    return round(corner[0], 2), round(corner[1], 2)
+        return (top, left), (top, right), (bottom, right), (bottom, left)
+    drawn = list(zip(geometry["y"], geometry["x"], strict=True))
+    kept = drawn[:: -(-len(drawn) // MAX_DRAWN_CORNERS)]
+    return tuple((float(row), float(col)) for row, col in kept)
 
 
 def rectangle(rows: tuple[int, int], cols: tuple[int, int]) -> Corners:
-    """Corners of the region of whole pixels from one row to another, and from column to column."""
+    """Return the corners of a rectangle of whole pixels, from first to last row and column."""
     (top, bottom), (left, right) = ((low - 0.5, high + 0.5) for low, high in (rows, cols))
     return (top, left), (top, right), (bottom, right), (bottom, left)
 
 
-@dataclass(frozen=True)
-class Curves:
-    """What the plots of a pixel, or of a region's sum, show; all of shape (bin,)."""
-
-    raw: Array
-    expected: Array | None
-    small: Array
-    large: Array
-    rate: Array
-    rate_unit: str
-    residual: Array
-    enhanced: Array
-    truth_bin: float
-    answer_bin: float
-    candidate_bins: Sequence[float]
-
-
-COLORS = {
+PALETTE_NAMES = {
     "rate": "raw",
     "candidates": "text",
     "ranks": "text",
@@ -168,71 +141,82 @@ COLORS = {
     "points": "small",
     "interval": "small",
 }
-"""The palette's names of layers that have others."""
+"""Layers that the palette knows under another name."""
 
 
-class Marked(Layers):
-    """A figure of named renderers that takes on the colours of the mode."""
+class NamedLayers(Layers):
+    """A figure whose renderers are coloured by their names."""
 
-    def __init__(self, drawing: Any) -> None:
-        super().__init__(drawing, layers_of(drawing).layers)
+    def __init__(self, figure: Any) -> None:
+        super().__init__(figure, layers_of(figure).layers)
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Take on the colours of a mode."""
         paint_frame(self.figure, colors)
         for layer, handles in self.layers.items():
-            glyph, color = handles["glyph"], getattr(colors, COLORS.get(layer, layer), None)
-            if color is None:  # it has a column of them
-                continue
-            for part in ("line_color", "fill_color", "text_color"):
-                if hasattr(glyph, part):
-                    setattr(glyph, part, color)
+            glyph = handles["glyph"]
+            color = getattr(colors, PALETTE_NAMES.get(layer, layer), None)
+            if color is not None:  # else a column of the data holds the colours
+                for part in ("line_color", "fill_color", "text_color"):
+                    if hasattr(glyph, part):
+                        setattr(glyph, part, color)
+
+    def mark(self, layer: str, position: float) -> None:
+        """Move an upright line."""
+        x, y = plots.marker_line(position, 1.0)
+        self.source(layer).data = {"x": x, "y": y}
 
 
-class GatePlot(Marked):
-    """A plot over the gate whose curves stand in one source, of the first layer.
+class GatePlot(NamedLayers):
+    """A plot over the gate; its curves are columns of the first layer's source.
 
     Parameters
     ----------
-    drawing : bokeh.plotting.figure
-        Of `app.plots.inspect`.
+    figure : bokeh.plotting.figure
+        From `app.plots.inspect`.
     read_out : mapping of str to str
-        Column of each value that is read out under the pointer, by its name.
+        Columns to read out under the pointer, by their names on screen.
     has_top : bool
         Whether it has a second axis along the gate.
     """
 
     def __init__(
-        self, drawing: Any, read_out: Mapping[str, str] | None = None, has_top: bool = False
+        self, figure: Any, read_out: Mapping[str, str] | None = None, has_top: bool = False
     ) -> None:
-        super().__init__(drawing)
-        self._axes = GateAxes(drawing, has_top)
+        super().__init__(figure)
+        self._axes = GateAxes(figure, has_top)
+        self._curves = next(iter(self.layers))
         self._read_out = None
         if read_out:
-            first = next(iter(self.layers.values()))
-            source, renderer = first["source"], first["glyph_renderer"]
+            source = self.source(self._curves)
+            renderer = self.layers[self._curves]["glyph_renderer"]
             rows = [(name, source, column) for name, column in read_out.items()]
-            self._read_out = GateReadOut(drawing, renderer, rows)
-        drawing.yaxis.ticker = BasicTicker(desired_num_ticks=4)
+            self._read_out = GateReadOut(figure, renderer, rows)
+        figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
+
+    def curve(self, name: str) -> Array:
+        """Return a curve (bin,) as it is drawn."""
+        return np.asarray(self.source(self._curves).data[name])
 
     def follow(self, unit: str, acquisition: Acquisition) -> None:
-        """Take on another unit or gate."""
+        """Change the unit or the gate of the axes."""
         self._axes.follow(unit, acquisition)
         if self._read_out is not None:
             self._read_out.follow(acquisition)
 
     def show_curves(self, **curves: Array) -> None:
-        """Draw other curves (bin,) in the first layer's source."""
-        first = next(iter(self.layers))
+        """Draw curves (bin,)."""
         bins = plots.centres(next(iter(curves.values())).size)
-        if len(self.source(first).data["bin"]) != bins.size:
-            every = {"bin": bins, **curves}
-            self.source(first).data = {n: np.asarray(x, np.float32) for n, x in every.items()}
+        if len(self.curve("bin")) != bins.size:
+            columns = {"bin": bins, **curves}
+            self.source(self._curves).data = {
+                name: np.asarray(values, np.float32) for name, values in columns.items()
+            }
         else:
-            self.write(first, **curves)
+            self.write(self._curves, **curves)
 
     def frame(self, *curves: Array, axis: str = "") -> None:
-        """Fit the vertical axis to what it shows."""
+        """Fit the vertical axis to these curves."""
         top = round_up(1.15 * max(float(np.nanmax(curve, initial=0.0)) for curve in curves)) or 1.0
         vertical = self.figure.extra_y_ranges[axis] if axis else self.figure.y_range
         if vertical.end != top:
@@ -240,63 +224,72 @@ class GatePlot(Marked):
 
 
 class PixelPlots:
-    """Counts, rate and stages of a pixel or a region, linked along the gate."""
+    """Counts, rate and stages of a pixel or a region, linked along the gate.
+
+    Attributes
+    ----------
+    bins : Range1d
+        The common axis along the gate.
+    counts, rate, stages : GatePlot
+    candidates : ColumnDataSource
+        Marks of the candidates.
+    """
 
     def __init__(self) -> None:
         nowhere, upright = plots.marker_line(np.nan, 1.0)
-        self._marks = {
+        self.candidates = inspect_plots.empty("x", "y", "rank")
+        marks = {
             "truth": ColumnDataSource({"x": nowhere, "y": upright}),
             "answer": ColumnDataSource({"x": nowhere, "y": upright}),
-            "candidates": inspector_plots.empty("x", "y", "rank"),
+            "candidates": self.candidates,
         }
-        self._bins = Range1d(0, 1)
-        drawn = (self._bins, self._marks)
+        self.bins = Range1d(0, 1)
         counts = {"Counts": "raw", "Small scale": "small", "Large scale": "large"}
         stages = {"Residual": "residual", "Enhanced": "enhanced"}
-        self.counts = GatePlot(inspector_plots.counts(*drawn), counts, has_top=True)
-        self.rate = GatePlot(inspector_plots.rate(*drawn), {"Rate": "rate"})
-        self.stages = GatePlot(inspector_plots.stages(*drawn), stages)
+        self.counts = GatePlot(inspect_plots.counts(self.bins, marks), counts, has_top=True)
+        self.rate = GatePlot(inspect_plots.rate(self.bins, marks), {"Rate": "rate"})
+        self.stages = GatePlot(inspect_plots.stages(self.bins, marks), stages)
+        self._plots = self.counts, self.rate, self.stages
 
     @property
     def panes(self) -> list[pn.pane.Bokeh]:
         """The plots, from top to bottom."""
         return [pane_of(plot.figure) for plot in self._plots]
 
-    @property
-    def _plots(self) -> tuple[GatePlot, GatePlot, GatePlot]:
-        return self.counts, self.rate, self.stages
-
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Take on the colours of a mode."""
         for plot in self._plots:
             plot.paint(colors)
 
-    def update(self, shown: Curves, unit: str, acquisition: Acquisition) -> None:
-        """Show a pixel or a region, positions in a unit."""
-        n_bins = acquisition.n_bins
-        cover(self._bins, n_bins)
-        expected = np.full(n_bins, np.nan) if shown.expected is None else shown.expected
+    def update(self, found: Inspected, unit: str) -> None:
+        """Show a pixel or a region, with positions in a unit."""
+        pixel, report, signals = found.pixel, found.report, found.pixel.signals
+        acquisition = found.answer.capture.acquisition
+        cover(self.bins, acquisition.n_bins)
         for plot in self._plots:
             plot.follow(unit, acquisition)
+        has_model = pixel.expected is not None
+        expected = pixel.expected if has_model else np.full(acquisition.n_bins, np.nan)
+        assert expected is not None
         self.counts.show_curves(
-            raw=shown.raw, expected=expected, small=shown.small, large=shown.large
+            raw=signals.raw, expected=expected, small=signals.small, large=signals.large
         )
-        self.counts.show("expected", shown.expected is not None)
-        self.counts.frame(shown.raw, shown.large, expected)
-        self.rate.show_curves(rate=shown.rate)
-        self.rate.frame(shown.rate)
-        self.rate.figure.yaxis[0].axis_label = shown.rate_unit.capitalize()
-        self.rate.figure.title.text = inspector_plots.RATE_TITLES[shown.rate_unit]
-        self.stages.show_curves(residual=shown.residual, enhanced=shown.enhanced)
-        self.stages.frame(shown.residual)
-        self.stages.frame(shown.enhanced, axis="enhanced")
-        for name, position in (("truth", shown.truth_bin), ("answer", shown.answer_bin)):
+        self.counts.show("expected", has_model)
+        self.counts.frame(signals.raw, signals.large, expected)
+        self.rate.show_curves(rate=report.rate)
+        self.rate.frame(report.rate)
+        self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
+        self.rate.figure.title.text = inspect_plots.RATE_TITLES[report.rate_unit]
+        self.stages.show_curves(residual=signals.residual, enhanced=signals.enhanced)
+        self.stages.frame(signals.residual)
+        self.stages.frame(signals.enhanced, axis="enhanced")
+        for name, position in (("truth", pixel.truth_bin), ("answer", pixel.answer_bin)):
             self.counts.write(name, x=np.full(2, position))
             for plot in self._plots:
                 plot.show(name, bool(np.isfinite(position)))
-        places = np.asarray(shown.candidate_bins, np.float32)
-        self._marks["candidates"].data = {
+        places = np.array([each.bin for each in report.candidates], np.float32)
+        self.candidates.data = {
             "x": places,
-            "y": np.full(places.size, inspector_plots.CANDIDATE_HEIGHT, np.float32),
+            "y": np.full(places.size, inspect_plots.CANDIDATE_HEIGHT, np.float32),
             "rank": [str(n + 1) for n in range(places.size)],
         }

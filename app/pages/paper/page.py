@@ -1,11 +1,11 @@
-"""The page that computes what the paper prints, at settings of one's own."""
+"""The Paper page: the paper's figures and tables, computed for chosen settings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import panel as pn
@@ -13,29 +13,23 @@ from bokeh.models import Range1d
 
 from app.model.text import NOT_COMPUTED
 from app.pages.navigation import Page, Pages, View
-from app.pages.paper import text as paper_words
+from app.pages.paper import text
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject
 from app.pages.shared.outputs import CurveCard, Gallery, TableCard
-from app.pages.shared.studies import Study, aside
+from app.pages.shared.section import Checked, Repetitions, Settings, SettingsSection, StudySection
 from app.tasks.scheduler import Step
-from app.theme import palette
-from app.widgets.controls import Sentence, SettingsPanel
+from app.widgets.controls import Sentence
 from core import PRESETS, Flux
-from core.parameters import Choice, Number, check_fields, parameter
-from core.studies import outputs as items
+from core.parameters import Choice, Number, parameter
+from core.studies import outputs
 from core.studies.paper import figures as paper
 from core.studies.trials import Condition, Method, Results, trials
 
-Settings = TypeVar("Settings")
-
-PAPER = "paper"
-"""What files are named after that hold something of it."""
-
-# The paper's own method before those that bound it.
+# The paper's own method before the methods that bound it.
 TABLE_2_METHODS = sorted(paper.TABLE_2_METHODS, key=lambda method: method.estimator != "tracking")
 
-# The parts' buttons and controls on the left of what they control; above it on a phone.
+# Buttons and controls on the left of what they control; above it on a phone.
 BOARD = """
 :host { display: grid !important; gap: 14px; align-items: start;
   grid-template-columns: 270px minmax(0, 1fr); flex: none !important; height: auto !important; }
@@ -52,101 +46,69 @@ STACK = """
 @media (max-width: 900px) { :host { height: auto !important; } }
 """
 
-_LIGHT = Number("SBR", 0.02, 0.2, log=True, least=0.0, open_below=True)
-_PLACE = Number("Echo's bin", 20, 99, whole=True, least=0, most=99)
-_PRESET = Choice("Preset", tuple(PRESETS))
-_SBR_HELP = "Signal over background, both in photons per pulse. The paper has 0.03 to 0.08."
+_SBR = Number("SBR", 0.02, 0.2, log=True, least=0.0, open_below=True)
+_SBR_HELP = "Signal divided by background flux. The paper has 0.03 to 0.08."
+_ECHO = Number("Echo's bin", 20, 99, whole=True, least=0, most=99)
 
 
 @dataclass(frozen=True)
-class Jump:
+class Jump(Checked):
     """Settings of Figures 1 and 2."""
 
-    onset_bin: int = parameter(50, _PLACE, "Where the echo begins: 50 in the paper.")
+    onset_bin: int = parameter(50, _ECHO, "Where the echo begins: 50 in the paper.")
     signal: float = parameter(
         paper.FIGURE_1.signal,
         Number("Signal", 0.01, 5.0, log=True, least=0.0, unit="photons per pulse"),
-        "Photons of the echo, were the detector always armed: 0.5203 in the paper.",
+        "Signal flux, if the detector were always armed: 0.5203 in the paper.",
     )
-    sbr: float = parameter(0.08, _LIGHT, _SBR_HELP)
-
-    def __post_init__(self) -> None:
-        check_fields(self)
+    sbr: float = parameter(0.08, _SBR, _SBR_HELP)
 
 
 @dataclass(frozen=True)
-class Scales:
+class Scales(Checked):
     """Settings of Figures 4 and 5."""
 
-    onset_bin: int = parameter(50, _PLACE, "Where the target is: 20, 50 and 90 in Figure 4.")
-    sbr: float = parameter(0.08, _LIGHT, _SBR_HELP)
+    onset_bin: int = parameter(50, _ECHO, "Bin of the target: 20, 50 and 90 in Figure 4.")
+    sbr: float = parameter(0.08, _SBR, _SBR_HELP)
     preset: str = parameter(
-        "recommended", _PRESET, "The best on random depths, or the paper's text taken literally."
+        "recommended",
+        Choice("Preset", tuple(PRESETS)),
+        "recommended: best on random depths. as printed: the paper's text, literally.",
     )
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
 
 @dataclass(frozen=True)
-class Weights:
+class Weights(Checked):
     """Settings of Figure 6."""
 
-    onset_bin: int = parameter(80, _PLACE, "Where the target is.")
-    sbr: float = parameter(0.08, _LIGHT, _SBR_HELP)
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-
-_REPETITIONS = Number("Repetitions", 2, 100, log=True, whole=True, least=2)
-_REPETITIONS_HELP = "Captures of the same scene with other noise: more make intervals narrower."
+    onset_bin: int = parameter(80, _ECHO, "Bin of the target.")
+    sbr: float = parameter(0.08, _SBR, _SBR_HELP)
 
 
 @dataclass(frozen=True)
-class Repeated:
-    """Settings of Table 2."""
-
-    repetitions: int = parameter(5, _REPETITIONS, _REPETITIONS_HELP)
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-
-@dataclass(frozen=True)
-class RepeatedAt:
+class RepeatedAt(Repetitions):
     """Settings of Table 3."""
 
-    sbr: float = parameter(0.06, _LIGHT, _SBR_HELP)
-    repetitions: int = parameter(5, _REPETITIONS, _REPETITIONS_HELP)
-
-    def __post_init__(self) -> None:
-        check_fields(self)
+    sbr: float = parameter(0.06, _SBR, _SBR_HELP)
 
 
 @dataclass(frozen=True)
-class Images:
+class Images(Checked):
     """Settings of the range images."""
 
     figure: str = parameter(
         "Figure 8",
         Choice("Figure", ("Figure 8", "Figure 9", "Figure 12")),
-        "8: the car under six SBRs. 9: the car by every method. 12: the building likewise.",
+        "8: the car at six SBRs. 9: the car with every method. 12: the building with every method.",
     )
-    sbr: float = parameter(0.06, _LIGHT, "Of Figure 9. " + _SBR_HELP)
-
-    def __post_init__(self) -> None:
-        check_fields(self)
+    sbr: float = parameter(0.06, _SBR, "SBR of Figure 9. " + _SBR_HELP)
 
 
 @dataclass(frozen=True)
-class Unsaid:
-    """Settings of what the paper leaves unsaid."""
+class AtSBR(Checked):
+    """Settings of what the paper does not report."""
 
-    sbr: float = parameter(0.06, _LIGHT, _SBR_HELP)
-
-    def __post_init__(self) -> None:
-        check_fields(self)
+    sbr: float = parameter(0.06, _SBR, _SBR_HELP)
 
 
 class Paper:
@@ -155,44 +117,38 @@ class Paper:
     Parameters
     ----------
     session : Session
-        Whose page it is; its capture has no part in this.
+        The session of the page; its capture is not used.
     """
 
     def __init__(self, session: Session) -> None:
+        def table_2(results: Results, _: Repetitions) -> outputs.Table:
+            return paper.table_2(results, TABLE_2_METHODS)
+
+        def table_3(results: Results, settings: RepeatedAt) -> outputs.Table:
+            return paper.table_3(results, settings.sbr)
+
         self._sections = Pages(
             {
                 "Figures 1, 2: the jump": lambda: (
-                    Sliders(session, Jump(), paper_words.JUMP, jump, count=2).view
+                    LiveFigures(session, Jump(), text.JUMP, jump, count=2).view
                 ),
                 "Figures 4, 5: two scales": lambda: (
-                    Sliders(session, Scales(), paper_words.SCALES, two_scales, count=2).view
+                    LiveFigures(session, Scales(), text.SCALES, two_scales, count=2).view
                 ),
                 "Figure 6: the weights": lambda: (
-                    Sliders(session, Weights(), paper_words.WEIGHTS, weights, count=1).view
+                    LiveFigures(session, Weights(), text.WEIGHTS, weights, count=1).view
                 ),
                 "Table 2: six SBRs": lambda: (
-                    Trials(
-                        session,
-                        Repeated(),
-                        paper_words.TABLE_2,
-                        lambda _: dict.fromkeys(paper.NEAR.values(), TABLE_2_METHODS),
-                        lambda results, _: paper.table_2(results, TABLE_2_METHODS),
-                    ).view
+                    RepeatedTable(session, Repetitions(5), text.TABLE_2, plan_2, table_2).view
                 ),
                 "Table 3: all methods": lambda: (
-                    Trials(
-                        session,
-                        RepeatedAt(),
-                        paper_words.TABLE_3,
-                        lambda chosen: {Condition("car", chosen.sbr): paper.COMPARED},
-                        lambda results, chosen: paper.table_3(results, chosen.sbr),
-                    ).view
+                    RepeatedTable(session, RepeatedAt(5), text.TABLE_3, plan_3, table_3).view
                 ),
                 "Figures 8, 9, 12: images": lambda: RangeImages(session).view,
-                "What is left unsaid": lambda: LeftUnsaid(session).view,
+                "What the paper does not report": lambda: NotReported(session).view,
             },
-            label="Part of the paper",
-            help=paper_words.SECTIONS_HELP,
+            label="Section",
+            help=text.SECTIONS_HELP,
             orientation="vertical",
         )
 
@@ -206,229 +162,245 @@ class Paper:
         right = pn.Column(*sections.mains.values(), sizing_mode="stretch_both", margin=0)
         return View(
             pn.Column(left, right, stylesheets=[BOARD], sizing_mode="stretch_both", margin=0),
-            Sentence(text=paper_words.SIDEBAR_AWAY, margin=8),
+            Sentence(text=text.NO_SIDEBAR, margin=8),
             show=sections.show,
             paint=sections.paint,
         )
 
 
-# What the sliders compute
+# Figures and plans as functions of their settings
 
 
-def jump(chosen: Jump) -> list[items.Plot]:
-    """Figures 1 and 2."""
-    flux = Flux(chosen.signal, chosen.sbr)
-    return [figure(flux, chosen.onset_bin) for figure in (paper.figure_1, paper.figure_2)]
+def jump(settings: Jump) -> list[outputs.Plot]:
+    """Return Figures 1 and 2."""
+    flux = Flux(settings.signal, settings.sbr)
+    return [figure(flux, settings.onset_bin) for figure in (paper.figure_1, paper.figure_2)]
 
 
-# The curve is the same for all places of the target, and takes three times as long as the pixel.
+# The curve does not depend on the echo's bin, and takes three times as long as the pixel.
 _figure_5 = lru_cache(maxsize=64)(paper.figure_5)
 
 
-def two_scales(chosen: Scales) -> list[items.Plot]:
-    """One pixel of Figure 4, and Figure 5 with the pixel's place marked."""
-    parameters, flux = PRESETS[chosen.preset], Flux(sbr=chosen.sbr)
-    pixel = paper.figure_5_at(chosen.onset_bin, parameters, flux)
-    curve = replace(_figure_5(parameters, flux), marks={"the echo above": float(chosen.onset_bin)})
-    return [pixel, curve]
+def two_scales(settings: Scales) -> list[outputs.Plot]:
+    """Return a pixel as in Figure 4, and Figure 5 with the pixel's bin marked."""
+    parameters, flux = PRESETS[settings.preset], Flux(sbr=settings.sbr)
+    pixel = paper.figure_5_at(settings.onset_bin, parameters, flux)
+    marks = {"the echo above": float(settings.onset_bin)}
+    return [pixel, replace(_figure_5(parameters, flux), marks=marks)]
 
 
-def weights(chosen: Weights) -> list[items.Plot]:
-    """Figure 6."""
-    return [paper.figure_6(Flux(sbr=chosen.sbr), chosen.onset_bin)]
+def weights(settings: Weights) -> list[outputs.Plot]:
+    """Return Figure 6."""
+    return [paper.figure_6(Flux(sbr=settings.sbr), settings.onset_bin)]
 
 
-class Sliders(Generic[Settings]):
-    """Figures that follow their controls at once, above each other on one axis.
+Plan = Mapping[Condition, Sequence[Method]]
+"""The methods to run under each condition."""
+
+
+def plan_2(settings: Repetitions) -> Plan:
+    """Return the plan of Table 2."""
+    return dict.fromkeys(paper.NEAR.values(), TABLE_2_METHODS)
+
+
+def plan_3(settings: RepeatedAt) -> Plan:
+    """Return the plan of Table 3."""
+    return {Condition("car", settings.sbr): paper.COMPARED}
+
+
+# Sections
+
+
+class PaperSection(SettingsSection[Settings]):
+    """A section of this page: its files are named after the paper and the settings."""
+
+    def about(self) -> Subject:
+        """Return what the section's files are about."""
+        return Subject("paper", "", (self.settings,))
+
+
+class LiveFigures(PaperSection[Settings]):
+    """Figures that follow their settings at once, one below the other on a common axis.
 
     Parameters
     ----------
-    settings : dataclass
-        What the figures begin with, its fields made by `core.parameters.parameter`.
-    words : str
-        What there is to see.
+    session : Session
+    settings : Checked
+        Initial settings.
+    explanation : str
+        Text above the controls.
     compute : callable
-        Settings to as many plots as `count`.
+        Maps settings to `count` plots.
+    count : int
+
+    Attributes
+    ----------
+    cards : list of CurveCard
+    shown : list of core.studies.outputs.Plot
+        What is drawn.
     """
 
     def __init__(
         self,
         session: Session,
         settings: Settings,
-        words: str,
-        compute: Callable[[Settings], Sequence[items.Plot]],
+        explanation: str,
+        compute: Callable[[Settings], Sequence[outputs.Plot]],
         count: int,
     ) -> None:
-        self._session = session
+        super().__init__(session, settings, explanation)
         self._compute = compute
-        self._words = words
-        self._jobs = session.tasks.latest()
+        self.shown: Sequence[outputs.Plot] = []
         across = Range1d(-0.5, 100)
-        self._cards = [CurveCard(across, NOT_COMPUTED) for _ in range(count)]
-        self._settings = settings
-        self._panel = SettingsPanel(settings, self._ask)
-        for card in self._cards:
-            card.offer(session, lambda: Subject(PAPER, "", (self._settings,)))
-        self._ask(settings)
+        self.cards = [CurveCard(across, NOT_COMPUTED) for _ in range(count)]
+        self._painted = [*self.cards]
+        for card in self.cards:
+            card.offer(session, self.about)
+        self.change(settings)
 
-    @property
-    def view(self) -> View:
-        """The figures, and their controls."""
-        return View(_stack(*self._cards), aside(self._words, self._panel.layout), paint=self._paint)
+    def layout(self) -> tuple[Any, Any]:
+        """Return the figures, and their controls."""
+        return _stack(*self.cards), self.controls()
 
-    def _ask(self, settings: Settings) -> None:
-        self._settings = settings
-        fail = partial(self._session.failures.report, part=self)
-        self._jobs.submit(partial(self._compute, settings), self._draw, fail)
+    def change(self, settings: Settings) -> None:
+        """Compute the figures for other settings."""
+        super().change(settings)
+        self._jobs.submit(partial(self._compute, settings), self._draw, self.report_error)
 
-    def _draw(self, plots: Sequence[items.Plot]) -> None:
-        self._session.failures.resolve(self)
-        with pn.io.hold(self._session.page):
-            for card, plot in zip(self._cards, plots, strict=True):
+    def _draw(self, plots: Sequence[outputs.Plot]) -> None:
+        self.session.failures.resolve(self)
+        with self.session.tasks.hold():
+            for card, plot in zip(self.cards, plots, strict=True):
                 card.show(plot)
-
-    def _paint(self, dark: bool) -> None:
-        for card in self._cards:
-            card.paint(palette(dark))
+        self.shown = plots
 
 
-class Trials(Generic[Settings]):
-    """A table over repetitions, which grows with each of them.
+class RepeatedTable(PaperSection[Settings], StudySection[Settings]):
+    """A table over repetitions that is refined with each of them.
 
     Parameters
     ----------
-    settings : dataclass
-        What the controls begin with; it has a field `repetitions`.
-    words : str
-        What there is to see.
+    session : Session
+    settings : Checked
+        Initial settings, with a field `repetitions`.
+    explanation : str
+        Text above the controls.
     plan : callable
-        Settings to the methods under each condition.
+        Maps settings to a `Plan`.
     table : callable
-        Results and settings to the table.
+        Maps results and settings to the table.
+
+    Attributes
+    ----------
+    shown : core.studies.outputs.Table or None
+        What the table shows.
     """
 
     def __init__(
         self,
         session: Session,
         settings: Settings,
-        words: str,
-        plan: Callable[[Settings], Mapping[Condition, Sequence[Method]]],
-        table: Callable[[Results, Settings], items.Table],
+        explanation: str,
+        plan: Callable[[Settings], Plan],
+        table: Callable[[Results, Settings], outputs.Table],
     ) -> None:
-        self._session = session
-        self._settings = settings
-        self._words = words
-        self._plan = plan
-        self._item = table
-        self._panel = SettingsPanel(settings, self._choose)
-        self._study = Study(session, self._steps, "repetitions")
-        self._card = TableCard(paper_words.NEEDS_TWO)
-        self._card.offer(session, lambda: Subject(PAPER, "", (self._settings,)))
+        super().__init__(session, settings, explanation, "repetitions")
+        self._plan, self._table = plan, table
+        self.shown: outputs.Table | None = None
+        self._card = TableCard(text.NEEDS_TWO)
+        self._card.offer(session, self.about)
 
-    @property
-    def view(self) -> View:
-        """The table, and its controls."""
-        controls = aside(self._words, self._panel.layout, *self._study.controls)
-        return View(self._card.layout, controls, show=self._study.show)
+    def layout(self) -> tuple[Any, Any]:
+        """Return the table, and its controls."""
+        return self._card.layout, self.controls(*self.study.controls)
 
-    def _choose(self, settings: Settings) -> None:
-        self._settings = settings
-
-    def _steps(self) -> list[Step[Results]]:
-        chosen: Any = self._settings
-        plan = self._plan(chosen)
+    def steps(self) -> list[Step[Results]]:
+        """Return a step for each repetition."""
+        settings: Any = self.settings
+        plan = self._plan(settings)
         results: Results = {}
-        draw = partial(self._draw, chosen, results)
-        return [Step(partial(trials, plan, [seed]), draw) for seed in range(chosen.repetitions)]
+        draw = partial(self._draw, settings, results)
+        return [Step(partial(trials, plan, [seed]), draw) for seed in range(settings.repetitions)]
 
-    def _draw(self, chosen: Settings, results: Results, new: Results) -> None:
+    def _draw(self, settings: Settings, results: Results, new: Results) -> None:
         for key, scores in new.items():
             results.setdefault(key, []).extend(scores)
         count = len(next(iter(results.values())))
-        if count > 1:  # an interval needs two
-            item = self._item(results, chosen)
-            title = f"{item.title}, {count} repetitions"
-            note = f"{item.note} {paper_words.READING_TRIALS}".strip()
-            with pn.io.hold(self._session.page):
-                self._card.show(replace(item, title=title, note=note))
+        if count < 2:
+            return  # an interval needs two
+        table = self._table(results, settings)
+        title = f"{table.title}, {count} repetitions"
+        note = f"{table.note} {text.READING_TRIALS}".strip()
+        with self.session.tasks.hold():
+            self._card.show(replace(table, title=title, note=note))
+        self.shown = table
 
 
-class RangeImages:
-    """Figures 8, 9 and 12."""
+class RangeImages(PaperSection[Images], StudySection[Images]):
+    """Figures 8, 9 and 12.
+
+    Attributes
+    ----------
+    gallery : Gallery
+    """
 
     def __init__(self, session: Session) -> None:
-        self._session = session
-        self._settings = Images()
-        self._panel = SettingsPanel(self._settings, self._choose)
-        self._study = Study(session, self._steps, "figure")
-        self._gallery = Gallery()
-        self._gallery.offer(session, lambda: Subject(PAPER, "", (self._settings,)))
+        super().__init__(session, Images(), text.IMAGES, "figure")
+        self.gallery = Gallery()
+        self.gallery.offer(session, self.about)
+        self._painted = [self.gallery]
+        self.panel.controls["sbr"].visible = False
 
-    @property
-    def view(self) -> View:
-        """The images, and their controls."""
-        self._panel.controls["sbr"].visible = False
-        controls = aside(
-            paper_words.IMAGES,
-            self._panel.layout,
-            *self._study.controls,
-            *self._gallery.place,
-        )
-        return View(self._gallery.layout, controls, self._study.show, paint=self._paint)
+    def layout(self) -> tuple[Any, Any]:
+        """Return the images, and their controls."""
+        return self.gallery.layout, self.controls(*self.study.controls, *self.gallery.place)
 
-    def _choose(self, settings: Images) -> None:
-        self._settings = settings
-        self._panel.controls["sbr"].visible = settings.figure == "Figure 9"
-        self._study.start()
+    def change(self, settings: Images) -> None:
+        """Show another figure."""
+        super().change(settings)
+        self.panel.controls["sbr"].visible = settings.figure == "Figure 9"
+        self.study.start()
 
-    def _steps(self) -> list[Step[items.Pictures]]:
-        work: dict[str, Callable[[], items.Pictures]] = {
+    def steps(self) -> list[Step[outputs.Pictures]]:
+        """Return the one step, which computes the chosen figure."""
+        work: dict[str, Callable[[], outputs.Pictures]] = {
             "Figure 8": paper.figure_8,
-            "Figure 9": partial(paper.figure_9, self._settings.sbr),
+            "Figure 9": partial(paper.figure_9, self.settings.sbr),
             "Figure 12": paper.figure_12,
         }
-        return [Step(work[self._settings.figure], self._draw)]
+        return [Step(work[self.settings.figure], self._draw)]
 
-    def _draw(self, pictures: items.Pictures) -> None:
-        with pn.io.hold(self._session.page):
-            self._gallery.show(pictures)
-
-    def _paint(self, dark: bool) -> None:
-        self._gallery.paint(palette(dark))
+    def _draw(self, pictures: outputs.Pictures) -> None:
+        with self.session.tasks.hold():
+            self.gallery.show(pictures)
 
 
-class LeftUnsaid:
-    """What methods assume, what an echo's place does, what physics allows, and sums that fail."""
+class NotReported(PaperSection[AtSBR], StudySection[AtSBR]):
+    """False alarms, dependence on the echo's bin, limits, and the paper's inconsistent sums."""
 
     def __init__(self, session: Session) -> None:
-        self._session = session
-        self._settings = Unsaid()
-        self._panel = SettingsPanel(self._settings, self._choose)
-        self._study = Study(session, self._steps, "steps")
+        super().__init__(session, AtSBR(), text.NOT_REPORTED, "steps")
         across = Range1d(0, 100)
         self._no_echo, self._by_place = (CurveCard(across, NOT_COMPUTED) for _ in range(2))
         self._limits, self._arithmetic = TableCard(), TableCard()
+        self._painted = [self._no_echo, self._by_place]
         for each in (self._no_echo, self._by_place, self._limits, self._arithmetic):
-            each.offer(session, lambda: Subject(PAPER, "", (self._settings,)))
+            each.offer(session, self.about)
 
-    @property
-    def view(self) -> View:
-        """Plots and tables, and their controls."""
+    def layout(self) -> tuple[Any, Any]:
+        """Return plots and tables, and their controls."""
         main = [
             _stack(self._no_echo, self._by_place),
             self._limits.layout,
             self._arithmetic.layout,
         ]
-        controls = aside(paper_words.UNSAID, self._panel.layout, *self._study.controls)
-        return View(main, controls, self._study.show, paint=self._paint)
+        return main, self.controls(*self.study.controls)
 
-    def _choose(self, settings: Unsaid) -> None:
-        self._settings = settings
+    def steps(self) -> list[Step[Any]]:
+        """Return a step for each plot and table, and for each bin of the echo."""
+        sbr, found = self.settings.sbr, []
 
-    def _steps(self) -> list[Step[Any]]:
-        sbr, found = self._settings.sbr, []
-
-        def draw(plot: items.Plot) -> None:
+        def draw(plot: outputs.Plot) -> None:
             found.append(plot)
             self._by_place.show(joined(found, paper.PLACES))
 
@@ -439,13 +411,9 @@ class LeftUnsaid:
             *(Step(partial(paper.by_place, sbr, onset=[place]), draw) for place in paper.PLACES),
         ]
 
-    def _paint(self, dark: bool) -> None:
-        for card in (self._no_echo, self._by_place):
-            card.paint(palette(dark))
 
-
-def joined(plots: Sequence[items.Plot], x: Sequence[float]) -> items.Plot:
-    """Plots of the same curves over one part of `x` after the other; NaN where none has come."""
+def joined(plots: Sequence[outputs.Plot], x: Sequence[float]) -> outputs.Plot:
+    """Join plots of the same curves over consecutive parts of `x`; NaN where none exists yet."""
     missing = np.full(len(x) - sum(plot.x.size for plot in plots), np.nan)
     curves = {
         name: np.concatenate([*(plot.curves[name] for plot in plots), missing])
@@ -462,7 +430,7 @@ def _stack(*cards: CurveCard) -> pn.Column:
 PAGE = Page(
     "Paper",
     Paper,
-    "computes what the paper prints",
+    "computes the paper's figures and tables",
     shared=frozenset(),
     is_standalone=True,
 )

@@ -1,12 +1,12 @@
-"""What the page "Paper" says."""
+"""Texts of the Paper page."""
 
 from __future__ import annotations
 
-SECTIONS_HELP = "Each figure and table of the paper, computed here and now."
+SECTIONS_HELP = "Figures and tables of the paper, computed on this server."
 
-SIDEBAR_AWAY = "This page has its own controls; those of the other pages are put away."
+NO_SIDEBAR = "This page has its own controls; the other pages' controls are hidden."
 
-RECONSTRUCTION = "reconstruction, from its abstract"
+RECONSTRUCTION = "reconstructed from its abstract"
 
 TITLES_OF_PRESETS = {
     "tracking": "Tracking differentiator, recommended",
@@ -14,61 +14,61 @@ TITLES_OF_PRESETS = {
 }
 
 JUMP = """
-Most pulses are spent on background before the echo comes: the probability that a bin triggers falls
-from bin to bin (Figure 1). The echo is a jump in it, which the first difference shows (Figure 2).
+Background fires most pulses before the echo arrives: the probability that a bin triggers falls from
+bin to bin (Figure 1). The echo is a jump in it, which the first difference shows (Figure 2).
 """
 SCALES = """
-Above, one pixel's histogram, with the small scale that follows its trend and the large scale that
-follows a jump. Figure 4 shows such pixels. Below, Figure 5: the height of the residual against the
-echo's place. Where it falls to what noise alone reaches, the echo is lost.
+Top: histogram of a pixel as in Figure 4; the small scale follows the trend, the large scale follows
+a jump. Bottom: Figure 5, the height of the residual against the echo's bin. Where it falls to the
+level of noise alone, the echo is lost.
 """
 WEIGHTS = """
-The residual times a weight is the enhanced signal; its largest value is the answer. The weight
-decides between a late echo and early noise, and so carries a guess about range.
+The enhanced signal is the residual times a weight; the estimate is its maximum. The weight trades
+late echoes against early noise, and is therefore an assumption about range.
 """
 TABLE_2 = """
-The paper's method on the car under six SBRs, by the recommended preset and by the settings as
-printed; below them the likelihood, and the oracle that is told the true light.
+The paper's method on the car at six SBRs, with the recommended preset and with the settings as
+printed. Below: the likelihood, and the oracle, which knows the true fluxes.
 """
 TABLE_3 = """
-Every method on the car at the SBR you choose. The paper prints this table for 0.06; at its five
+All methods on the car at the chosen SBR. The paper prints this table for 0.06 only; for its five
 other SBRs it prints its own method alone, in Table 2.
 """
 IMAGES = """
-The restored range images. A tap on a picture, or a row and a column, compare a pixel in all.
+Estimated range images. Tap an image, or choose a row and a column, to compare a pixel in all of
+them.
 """
-UNSAID = """
-What a method assumes without saying so, how its merit depends on the echo's place, what physics
-allows, and what does not follow from the paper's own tables.
+NOT_REPORTED = """
+What each method estimates without an echo, how its accuracy depends on the echo's bin, the physical
+limit, and statements of the paper that its own tables contradict.
 """
 READING_TRIALS = (
-    "Below each figure its 95 % interval. A difference is ours minus the printed value: better, "
-    "worse, or so small that chance may do it. All methods see the same captures, one for each "
-    "repetition. Reconstructions were rebuilt from abstracts: their distance from the paper says "
-    "little about the method."
+    "Below each number: its 95 % interval. Difference: computed here minus printed, marked as "
+    "better, worse, or within chance. All methods use the same captures, one per repetition. "
+    "Methods reconstructed from abstracts may differ from the paper's."
 )
-OUTSIDE_NOTE = "Grey: answers beyond both ends of the scale."
-PLACE_HELP = "Of the pixel whose range stands above each picture; a tap on one chooses it, too."
-NEEDS_TWO = "The table begins with the second repetition: an interval needs two."
+OUTSIDE_NOTE = "Grey: estimates beyond the ends of the colour scale."
+PLACE_HELP = "Pixel whose range is shown above each image; a tap on an image also selects it."
+NEEDS_TWO = "The table appears after the second repetition: an interval needs two."
 
 COLUMN_HELP: dict[str, tuple[str, int]] = {
-    "SBR": ("Signal over background, both in photons per pulse.", -1),
-    "method": ("As this app calls it.", 1),
+    "SBR": ("Signal-to-background ratio.", -1),
+    "method": ("Name of the method in this app.", 1),
     "RD, 3 bins": ("Share of target pixels within 3 bins of the truth: the paper's RD.", -1),
-    "RMSE m": ("Root mean square error over target pixels with an answer.", 1),
-    "printed RD": ("As the paper prints it.", -1),
-    "printed RMSE m": ("As the paper prints it.", 1),
-    "difference": ("Ours minus the printed value.", -1),
+    "RMSE m": ("Root mean square error over target pixels with an estimate.", 1),
+    "printed RD": ("Value printed in the paper.", -1),
+    "printed RMSE m": ("Value printed in the paper.", 1),
+    "difference": ("Computed here minus printed.", -1),
     "RD, 1 bin": ("Share of target pixels within 1 bin of the truth.", -1),
     "RD, 2 bins": ("Share of target pixels within 2 bins of the truth.", -1),
-    "MAE m": ("Mean error, without sign.", 1),
-    "bias m": ("Mean error, with sign.", 1),
-    "inlier RMSE m": ("Root mean square error of the answers within 3 bins.", 1),
-    "Var of RD": ("Variance of the RD over repetitions: the paper's Var, most plausibly.", 1),
-    "answered": ("Share of target pixels with an answer.", -1),
-    "ms": ("Time to range one capture here, the median.", 1),
-    "scene": ("What is looked at.", 1),
-    "probability of the right bin": ("That the true bin beats every other, at best.", -1),
-    "Cramér-Rao bound m": ("Least scatter of answers that are not grossly wrong.", 1),
+    "MAE m": ("Mean absolute error.", 1),
+    "bias m": ("Mean error.", 1),
+    "inlier RMSE m": ("Root mean square error of the estimates within 3 bins.", 1),
+    "Var of RD": ("Variance of the RD over repetitions, probably the paper's Var.", 1),
+    "answered": ("Share of target pixels with an estimate.", -1),
+    "ms": ("Median time to estimate one capture on this server.", 1),
+    "scene": ("The scene.", 1),
+    "probability of the right bin": ("Largest possible probability of the true bin.", -1),
+    "Cramér-Rao bound m": ("Smallest possible standard deviation of unbiased estimates.", 1),
 }
-"""Of each column a line of help, and 1 or -1: whether its lowest or highest value comes first."""
+"""Help and sort order of each column: 1 or -1, lowest or highest value first."""

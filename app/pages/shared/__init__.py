@@ -1,1 +1,1 @@
-"""What several pages have in common."""
+"""Parts shared by several pages."""

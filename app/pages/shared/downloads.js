@@ -1,6 +1,6 @@
-// A quiet button in the corner of a card, and a menu of the formats in which what the card shows can
-// be taken away. Pictures are made here, of what is on screen; other files come from the server, a
-// piece at a time, each asked for when the last has arrived.
+// A button in the corner of a card, with a menu of the formats in which its content can be saved.
+// Pictures are made here, from what is on screen; other files come from the server in pieces, each
+// requested when the previous one has arrived.
 
 const ICON = "M12 3v12m-5-5l5 5 5-5M4 20h16";
 const FONT = "Roboto, system-ui, sans-serif";
@@ -9,17 +9,15 @@ const SCALE_PX = 44;
 const MARGIN_PX = 10;
 
 const STYLE = `
+.download > button, [role="menuitem"] { all: unset; box-sizing: border-box; cursor: pointer; }
 .download > button {
-  all: unset; box-sizing: border-box; display: block; width: 24px; height: 24px; padding: 4px;
-  border-radius: 6px; cursor: pointer; opacity: 0.55;
+  display: block; width: 24px; height: 24px; padding: 4px; border-radius: 6px; opacity: 0.55;
   color: var(--mui-palette-text-primary, #1c2430);
   background: var(--mui-palette-background-paper, #fff);
 }
 .download > button:hover, .download > button:focus-visible, .download > button[aria-expanded="true"] {
   opacity: 1;
-  background: color-mix(in srgb, currentColor 12%, var(--mui-palette-background-paper, #fff));
 }
-.download > button:focus-visible { outline: 2px solid #4c8dff; }
 .download > button[aria-busy="true"] { cursor: progress; animation: waiting 1s infinite alternate; }
 @keyframes waiting { to { opacity: 0.15; } }
 @media (prefers-reduced-motion: reduce) { .download > button[aria-busy="true"] { animation: none; } }
@@ -36,14 +34,14 @@ const STYLE = `
   font: 13px/1.3 var(--mui-font-family, Roboto, system-ui, sans-serif);
 }
 [role="menuitem"] {
-  all: unset; box-sizing: border-box; display: grid; grid-template-columns: 42px auto; gap: 4px;
-  width: 100%; padding: 5px 10px 5px 8px; border-radius: 4px; cursor: pointer;
+  display: grid; grid-template-columns: 42px auto; gap: 4px; width: 100%; padding: 5px 10px 5px 8px;
+  border-radius: 4px;
 }
 [role="menuitem"] span { color: var(--mui-palette-text-secondary, #5a6675); }
-[role="menuitem"]:hover, [role="menuitem"]:focus-visible {
-  background: color-mix(in srgb, currentColor 12%, transparent);
+button:hover, button:focus-visible {
+  background: color-mix(in srgb, currentColor 12%, var(--mui-palette-background-paper, #fff));
 }
-[role="menuitem"]:focus-visible { outline: 2px solid #4c8dff; outline-offset: -2px; }
+button:focus-visible { outline: 2px solid #4c8dff; outline-offset: -2px; }
 .status { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }`;
 
 const element = (tag, text = "", attributes = {}) => {
@@ -60,8 +58,8 @@ function* within(view) {
   for (const child of view.child_views ?? []) yield* within(child);
 }
 
-// The plots and clouds of a card that can be seen.
-function seen(card) {
+// The visible plots and clouds of a card.
+function contentOf(card) {
   const views = [...within(card)].filter(({ el }) => el.getClientRects().length > 0);
   const plots = views.filter(({ model }) => model.type === "Figure");
   const clouds = views.map(({ shadow_el }) => shadow_el.querySelector(".cloud"));
@@ -70,7 +68,7 @@ function seen(card) {
 
 // --------------------------------------------------------------------------------------- pictures
 
-// Something to draw on, in pixels of the page, that becomes a file.
+// A pen that draws in CSS pixels, and a function that returns the drawing as a PNG.
 function canvasSheet(width, height, ratio) {
   const canvas = element("canvas", "", { width: width * ratio, height: height * ratio });
   const pen = canvas.getContext("2d");
@@ -82,16 +80,17 @@ function canvasSheet(width, height, ratio) {
   return { pen, blob };
 }
 
-function svgSheet(Layer, width, height, name, about) {
+// The same for SVG, with Bokeh's own layer.
+function svgSheet(Layer, width, height, texts) {
   const layer = new Layer("svg", false);
   layer.resize(width, height);
   const root = layer.ctx.get_svg();
-  const told = { title: name, desc: about };
-  for (const [tag, text] of Object.entries(told).reverse()) {
+  const described = Object.entries(texts).map(([tag, text]) => {
     const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
     node.textContent = text;
-    root.prepend(node);
-  }
+    return node;
+  });
+  root.prepend(...described);
   const blob = () => {
     keepWidths(root);
     return layer.to_blob();
@@ -99,22 +98,20 @@ function svgSheet(Layer, width, height, name, about) {
   return { pen: layer.ctx, blob };
 }
 
-// Texts as wide as here, where the reader's machine lacks the font: legends would overlap.
+// Fix the widths of texts: legends would overlap where the reader's machine lacks the font.
 function keepWidths(root) {
   const pen = element("canvas").getContext("2d");
   for (const text of root.querySelectorAll("text")) {
-    const [style, weight, size, family] = ["style", "weight", "size", "family"].map(
-      (name) => text.getAttribute(`font-${name}`) ?? "",
-    );
-    pen.font = `${style} ${weight} ${size} ${family}`;
+    const names = ["style", "weight", "size", "family"];
+    pen.font = names.map((name) => text.getAttribute(`font-${name}`) ?? "").join(" ");
     text.setAttribute("textLength", pen.measureText(text.textContent).width.toFixed(1));
     text.setAttribute("lengthAdjust", "spacingAndGlyphs");
   }
 }
 
-// The picture of a card, with a heading and a colour scale where those stand elsewhere on the page.
+// The picture of a card, with the heading and the colour scale that the page shows elsewhere.
 async function pictureOf(card, { suffix, name, about, heading, scale }) {
-  const { plots, clouds } = seen(card);
+  const { plots, clouds } = contentOf(card);
   const layers = plots.map((plot) => plot.export(suffix));
   const parts = [
     ...layers.map(({ canvas, bbox: { width, height } }) => ({ canvas, width, height })),
@@ -126,7 +123,7 @@ async function pictureOf(card, { suffix, name, about, heading, scale }) {
   const height = parts.reduce((sum, part) => sum + part.height, above + below);
   const { pen, blob } =
     suffix === "svg"
-      ? svgSheet(layers[0].constructor, width, height, name, about)
+      ? svgSheet(layers[0].constructor, width, height, { title: name, desc: about })
       : canvasSheet(width, height, parts[0].canvas.width / parts[0].width);
   const { backgroundColor: paper, color: ink } = getComputedStyle(card.el);
   pen.fillStyle = paper;
@@ -156,7 +153,7 @@ function drawScale(pen, { title, low, high, colors }, top, width) {
   colors.forEach((color, place) => {
     pen.fillStyle = color;
     const left = (place * length) / colors.length;
-    // Each reaches under the next: no seam is left between two.
+    // Each rectangle extends below the next ones, so that no seam shows.
     pen.fillRect(MARGIN_PX + left, top + 6, length - left, 9);
   });
   pen.fillStyle = ink;
@@ -166,8 +163,8 @@ function drawScale(pen, { title, low, high, colors }, top, width) {
   write(pen, title, width / 2, top + 38, "center", font, width);
 }
 
-// A PNG with texts (chunks iTXt, in UTF-8) behind its header.
-async function withText(png, texts) {
+// Add texts to a PNG (chunks iTXt, in UTF-8) behind its header.
+function withText(png, texts) {
   const header = 33; // signature and first chunk
   const chunks = Object.entries(texts).map(([key, text]) => textChunk(key, text));
   return new Blob([png.slice(0, header), ...chunks, png.slice(header)], { type: "image/png" });
@@ -183,7 +180,7 @@ function textChunk(key, text) {
   return chunk;
 }
 
-// CRC-32, as PNG asks for it.
+// CRC-32, as PNG requires it.
 function checksum(bytes) {
   let sum = ~0;
   for (const byte of bytes) {
@@ -192,8 +189,6 @@ function checksum(bytes) {
   }
   return ~sum >>> 0;
 }
-
-// ------------------------------------------------------------------------------------------ files
 
 function save(blob, name) {
   const link = element("a", "", { href: URL.createObjectURL(blob), download: name });
@@ -204,60 +199,52 @@ function save(blob, name) {
 // --------------------------------------------------------------------------------- button and menu
 
 export function render({ model, view }) {
-  const button = element("button", "", { type: "button" });
-  button.innerHTML = `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${ICON}"/></svg>`;
+  const root = element("div", "", { class: "download" });
+  const button = element("button", "", { type: "button", "aria-haspopup": "menu" });
   const menu = element("div", "", { role: "menu", popover: "auto" });
   const status = element("div", "", { class: "status", role: "status" });
-  button.setAttribute("aria-haspopup", "menu");
-  button.popoverTargetElement = menu;
-
+  button.innerHTML = `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${ICON}"/></svg>`;
+  root.append(element("style", STYLE), button, menu, status);
   let pieces = [];
-  const settle = (text = "") => {
-    pieces = [];
-    button.removeAttribute("aria-busy");
-    button.popoverTargetElement = menu;
+
+  // While a file is prepared the button opens no menu; disabled it would lose the keyboard focus.
+  const show = (isBusy, text) => {
+    button.ariaBusy = String(isBusy);
+    button.popoverTargetElement = isBusy ? null : menu;
     status.textContent = text;
+    pieces = [];
   };
   const close = () => {
     menu.hidePopover();
     button.focus();
   };
-  const ask = (suffix) => {
-    close();
-    button.setAttribute("aria-busy", "true");
-    button.popoverTargetElement = null; // not disabled: it keeps the keyboard
-    status.textContent = `Preparing ${suffix.toUpperCase()} …`;
-    model.send_msg({ suffix });
-  };
-  let items = [];
   const entry = ([suffix, help]) => {
     const item = element("button", "", { type: "button", role: "menuitem", tabindex: "-1" });
     item.append(element("b", suffix.toUpperCase()), element("span", help));
-    item.addEventListener("click", () => ask(suffix));
+    item.addEventListener("click", () => {
+      close();
+      show(true, `Preparing ${suffix.toUpperCase()} …`);
+      model.send_msg({ suffix });
+    });
     return item;
   };
   const list = () => {
-    items = model.formats.map(entry);
-    menu.replaceChildren(...items);
+    menu.replaceChildren(...model.formats.map(entry));
+    button.title = button.ariaLabel = menu.ariaLabel = `Download: ${model.what}`;
   };
-  const name = () => {
-    button.title = `Download: ${model.what}`;
-    for (const part of [button, menu]) part.setAttribute("aria-label", button.title);
-  };
-  model.on("formats", list);
-  model.on("what", name);
+  model.on(["formats", "what"], list);
   list();
-  name();
+  show(false, "");
 
   menu.addEventListener("toggle", ({ newState }) => {
     const isOpen = newState === "open";
-    button.setAttribute("aria-expanded", String(isOpen));
+    button.ariaExpanded = String(isOpen);
     if (!isOpen) return;
     const [at, size] = [button.getBoundingClientRect(), menu.getBoundingClientRect()];
+    const hasRoom = at.bottom + size.height + 4 < window.innerHeight;
     menu.style.left = `${Math.max(4, at.right - size.width)}px`;
-    const isRoom = at.bottom + size.height + 4 < window.innerHeight;
-    menu.style.top = `${isRoom ? at.bottom + 2 : Math.max(4, at.top - size.height - 2)}px`;
-    items[0].focus();
+    menu.style.top = `${hasRoom ? at.bottom + 2 : Math.max(4, at.top - size.height - 2)}px`;
+    menu.firstChild.focus();
   });
   button.addEventListener("keydown", (event) => {
     if (event.key !== "ArrowDown" || button.popoverTargetElement === null) return;
@@ -265,40 +252,35 @@ export function render({ model, view }) {
     menu.showPopover();
   });
   menu.addEventListener("keydown", (event) => {
+    const items = [...menu.children];
     const place = items.indexOf(menu.getRootNode().activeElement);
-    const last = items.length - 1;
-    const moves = { ArrowDown: place + 1, ArrowUp: place - 1, Home: 0, End: last };
+    const moves = { ArrowDown: place + 1, ArrowUp: place - 1, Home: 0, End: -1 };
     event.stopPropagation(); // arrow keys move pixels elsewhere
     if (event.key === "Tab" || event.key === "Escape") close();
     if (!(event.key in moves)) return;
     event.preventDefault();
-    items[(moves[event.key] + items.length) % items.length].focus();
+    items.at(moves[event.key] % items.length).focus();
   });
 
-  model.on("msg:custom", async (told) => {
-    if (told.failed) {
-      settle();
-    } else if (told.picture) {
-      try {
-        save(await pictureOf(view.parent, told.picture), told.picture.name);
-        settle(`Saved ${told.picture.name}`);
-      } catch (error) {
-        settle();
-        model.send_msg({ failed: error.message });
-      }
+  const receive = async ({ failed, picture, piece, size, name }) => {
+    if (failed) {
+      show(false, "");
+    } else if (picture) {
+      save(await pictureOf(view.parent, picture), picture.name);
+      show(false, `Saved ${picture.name}`);
     } else {
-      pieces.push(told.piece);
-      const got = pieces.reduce((sum, piece) => sum + piece.byteLength, 0);
-      if (got < told.size) {
-        model.send_msg({ from: got });
-      } else {
-        save(new Blob(pieces), told.name);
-        settle(`Saved ${told.name}`);
-      }
+      pieces.push(piece);
+      const received = pieces.reduce((sum, each) => sum + each.byteLength, 0);
+      if (received < size) return model.send_msg({ from: received });
+      save(new Blob(pieces), name);
+      show(false, `Saved ${name}`);
     }
-  });
-
-  const root = element("div", "", { class: "download" });
-  root.append(element("style", STYLE), button, menu, status);
+  };
+  model.on("msg:custom", (message) =>
+    receive(message).catch((error) => {
+      show(false, "");
+      model.send_msg({ failed: error.message });
+    }),
+  );
   return root;
 }

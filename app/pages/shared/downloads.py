@@ -1,8 +1,12 @@
-"""Taking away what is on screen: a button for each card, the names of files, and what they hold.
+"""Downloads of what is on screen: a button for each card, file names, and contents.
 
-Nothing is computed before it is asked for. Pictures are made by the browser, of what it shows;
-other files are written by a worker to a temporary file on the disk, which travels in pieces and is
-gone once it has arrived.
+Files are made on demand. The browser makes pictures of what it shows, with heading, colour scale
+and description; a worker writes other files to a temporary file, which is sent in pieces, so that
+other messages pass in between, and then deleted.
+
+The menu is our own: that of panel-material-ui 0.16 (`MenuButton`) announces to screen readers
+neither that it is a menu nor whether it is open, and loses the keyboard focus while a file is
+prepared.
 """
 
 from __future__ import annotations
@@ -20,8 +24,8 @@ from typing import IO, Any, BinaryIO, cast
 import panel as pn
 import param
 
-from app.model import download_text as words
-from app.model.colors import Look
+from app.model import download_text
+from app.model.colors import ColorScale
 from app.model.exports import Write, image_files, plot_file
 from app.model.state import Viewing
 from app.model.store import Answer, Request
@@ -34,7 +38,7 @@ from core.parameters import spec_of
 log = logging.getLogger(__name__)
 
 PIECE_BYTES = 2**20
-"""What travels at once: other messages of the page pass in between."""
+"""Size of a piece, which is one message."""
 
 PICTURES = ("png", "svg")
 """Formats that the browser makes."""
@@ -46,122 +50,121 @@ TABLE = ("csv",)
 """Formats of each kind of card."""
 
 MOST_LETTERS = 120
-"""In a file's name; some systems take 143 bytes at most."""
+"""Longest file name; some systems accept at most 143 bytes."""
 
 CORNER_PX = 26
-"""Height and width that a button takes."""
+"""Height and width of a button."""
 
 CORNER = {"position": "absolute", "top": "1px", "right": "2px", "z-index": "3"}
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What a file is about.
+    """Capture, estimator and settings that a file is about.
 
     Parameters
     ----------
     capture : str
         A scene's key, or a file's name without its suffix.
     estimator : str
-        Empty where several, or none, have a part in it.
+        Empty for several or none.
     settings : sequence of dataclass
-        Settings as controls are made of; only those that are not the default are told.
-    told : str
-        Where the capture came from.
+        Settings objects; only fields that differ from their default are named.
+    source : str
+        Origin of the capture.
     part : str
-        Which rows and columns of the capture, if not all.
+        Rows and columns of the capture, if not all.
     """
 
     capture: str
     estimator: str = ""
     settings: Sequence[Any] = ()
-    told: str = ""
+    source: str = ""
     part: str = ""
 
     @property
     def chosen(self) -> list[str]:
-        """Settings that are not the default, as ``symbol value`` without the space."""
+        """Settings that differ from their default, as ``symbol value`` without the space."""
         return [
-            _told(_symbol(each), _plain(getattr(settings, each.name)))
+            _named(_symbol(each), _plain(getattr(settings, each.name)))
             for settings in self.settings
             for each in fields(settings)
             if getattr(settings, each.name) != each.default
         ]
 
     def file_name(self, what: str, suffix: str) -> str:
-        """Name of a file, of letters that harm no system and no shell.
+        """Return a file name that is safe for every system and shell.
 
         Parameters
         ----------
         what : str
-            What the file shows of the subject.
+            The plot, image or table in the file.
         suffix : str
-            Of the format, without the point.
+            Suffix of the format without the point.
         """
         capture, what = _plain(self.capture)[:40].strip("-._") or "capture", _plain(what)[:40]
-        part = f"_{self.part}" if self.part else ""
-        room = MOST_LETTERS - len(f"{capture}{part}_{self.estimator}_{what}.{suffix}")
-        told = ""
+        begin = "_".join(filter(None, (capture, self.part, self.estimator)))
+        room = MOST_LETTERS - len(f"{begin}_{what}.{suffix}")
+        chosen = ""
         for each in self.chosen:
-            if len(told) + len(each) < room:
-                told += f"_{each}"
-        method = f"_{self.estimator}" if self.estimator else ""
-        return f"{capture}{part}{method}{told}_{what}.{suffix}"
+            if len(chosen) + len(each) < room:
+                chosen += f"_{each}"
+        return f"{begin}{chosen}_{what}.{suffix}"
 
     def about(self, what: str) -> str:
-        """What a picture's file says of itself."""
-        parts = (self.estimator.replace("_", " "), " ".join(self.chosen), self.told)
+        """Return the description inside a picture's file."""
+        parts = (self.estimator.replace("_", " "), " ".join(self.chosen), self.source)
         return "; ".join([f"firstphoton: {what}", *filter(None, parts)])
 
 
 def _plain(value: Any) -> str:
-    """Letters without accents, digits, points, dashes and underscores."""
+    """Reduce a value to letters without accents, digits, points, dashes and underscores."""
     text = f"{value:.6g}" if isinstance(value, float) else str(value)
     ascii_ = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     return re.sub(r"[^\w.+-]+", "-", ascii_).strip("-._")
 
 
-def _told(symbol: str, value: str) -> str:
+def _named(symbol: str, value: str) -> str:
     return value if value.startswith(symbol) else symbol + value
 
 
-def _symbol(of: Any) -> str:
-    """A setting's symbol, or its name where that is no short one of plain letters."""
-    symbol = spec_of(of).symbol.replace("_", "")
-    return symbol if symbol.isascii() and symbol.isalnum() else of.name.replace("_", "-")
+def _symbol(field: Any) -> str:
+    """Return a setting's symbol, or its name where the symbol has other than plain letters."""
+    symbol = spec_of(field).symbol.replace("_", "")
+    return symbol if symbol.isascii() and symbol.isalnum() else field.name.replace("_", "-")
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a card shows at the moment, ready to be written.
+    """The present content of a card.
 
     Parameters
     ----------
     subject : Subject
     what : str
-        What is shown of it; ends up in the files' names.
+        The plot, image or table that is shown; part of the files' names.
     files : mapping of str to callable
-        What writes each format that is no picture of the screen, by suffix without the point.
+        A writer for each format that is not a picture, by suffix without the point.
     heading : str
-        What stands above a picture that tells it nowhere itself.
-    scale : Look, optional
-        Colours of a picture that has no colour bar of its own.
+        Heading of a picture without a title.
+    scale : ColorScale, optional
+        Colour scale of a picture without a colour bar.
     """
 
     subject: Subject
     what: str
     files: Mapping[str, Write] = field(default_factory=dict)
     heading: str = ""
-    scale: Look | None = None
+    scale: ColorScale | None = None
 
 
 class Download(Component):
     """The button of a card; see `downloadable`."""
 
-    what = param.String(doc="What a screen reader says the card shows.")
-    formats = param.List(doc="Suffix without the point, and a line of help, of each.")
+    what = param.String(doc="Name of the card's content for screen readers.")
+    formats = param.List(doc="Suffix without the point, and a line of help, of each format.")
 
-    # A page has many of these: the browser fetches the code once, by its address.
+    # A page has many buttons: the browser fetches the code once, by its address.
     _bundle = Path(__file__).with_name("downloads.js")
 
     def __init__(
@@ -171,25 +174,25 @@ class Download(Component):
         self.offer(formats)
         self._session = session
         self._show = show
-        self._jobs = session.tasks.latest(FILES)
+        self._work = session.tasks.latest(FILES)
         self._file: IO[bytes] | None = None
         self._name = ""
         self._size = 0
 
     def offer(self, formats: Iterable[str]) -> None:
         """Offer these formats, by their suffixes without the point."""
-        self.formats = [[suffix, words.FORMATS[suffix]] for suffix in formats]
+        self.formats = [[suffix, download_text.FORMATS[suffix]] for suffix in formats]
 
-    def _handle_msg(self, asked: Any) -> None:
-        """The browser asks for a format, for the next piece of a file, or tells what failed."""
+    def _handle_msg(self, message: Any) -> None:
+        """Handle the browser's request for a format or for the next piece, or its failure."""
         try:
-            if "suffix" in asked:
-                self._begin(asked["suffix"])
-            elif "from" in asked:
-                self._send_piece(asked["from"])
-            elif "failed" in asked:
-                self._session.failures.show(words.no_picture(str(asked["failed"])))
-        except Exception as error:  # whatever it is, the page must tell it
+            if "suffix" in message:
+                self._begin(message["suffix"])
+            elif "from" in message:
+                self._send_piece(message["from"])
+            elif "failed" in message:
+                self._session.failures.show(download_text.no_picture(str(message["failed"])))
+        except Exception as error:  # a message may be malformed in many ways
             self._fail(error)
 
     def _begin(self, suffix: str) -> None:
@@ -200,7 +203,7 @@ class Download(Component):
         if suffix in PICTURES:
             self._send_msg({"picture": self._picture(shown, suffix)})
         else:
-            self._jobs.submit(partial(_written, shown.files[suffix]), self._send_first, self._fail)
+            self._work.submit(partial(_written, shown.files[suffix]), self._send_first, self._fail)
 
     def _picture(self, shown: Shown, suffix: str) -> dict[str, Any]:
         scale = shown.scale and {
@@ -230,7 +233,7 @@ class Download(Component):
     def _fail(self, error: Exception) -> None:
         log.warning("a download failed", exc_info=error)
         self._close()
-        self._session.failures.show(words.not_saved(error))
+        self._session.failures.show(download_text.not_saved(error))
         self._send_msg({"failed": True})
 
     def _close(self) -> None:
@@ -240,8 +243,8 @@ class Download(Component):
 
 
 def _written(write: Write) -> IO[bytes]:
-    """A file, at its end; gone once it is closed."""
-    # tifffile wants a file that has a name.
+    """Write a temporary file; return it open, at its end. Closing it deletes it."""
+    # tifffile requires a file that has a name.
     file = NamedTemporaryFile(prefix="firstphoton-")  # noqa: SIM115 - outlives this function
     try:
         write(cast(BinaryIO, file))
@@ -265,13 +268,12 @@ def downloadable(
     Parameters
     ----------
     card : pn.Column
-        What holds the plot, the cloud or the table.
+        The card of a plot, a cloud or a table.
     session : Session
-        Whose page it is.
     what : str
-        What is to be downloaded, for a tooltip and a screen reader.
+        Name of the content, for the tooltip and screen readers.
     show : callable
-        What the card shows when the button is pressed; raises ``ValueError`` where that is nothing.
+        Returns the content when the button is pressed; raises ``ValueError`` where there is none.
     formats : iterable of str
         Suffixes without the point: "png" and "svg", and keys of `Shown.files`.
     """
@@ -280,86 +282,84 @@ def downloadable(
 
 
 def below(table: Any) -> pn.Column:
-    """A table that leaves the corner above it to a download button."""
+    """Return a table with room for a download button above it."""
     table.margin = (CORNER_PX, 0, 0, 0)
     return pn.Column(table, sizing_mode="stretch_width", margin=0)
 
 
 def downloadable_facts(facts: Any, session: Session, show: Callable[[], Shown]) -> pn.Column:
-    """Named values that leave the corner beside them to a download button."""
+    """Return named values with a download button beside them."""
     facts.margin = (0, CORNER_PX, 0, 0)
     holder = pn.Column(facts, sizing_mode="stretch_width", margin=0)
     return downloadable(holder, session, "numbers", show, TABLE)
 
 
-# What cards show
+# Contents of cards
 
 
 def looked_at(session: Session, request: Request) -> Subject:
-    """The scene or capture of a request, whatever is made of it."""
-    source = request.source
+    """Return the scene or capture of a request as a subject without an estimator."""
+    source, window = request.source, request.window
     capture = session.key(source) if source.is_scene else Path(source.title).stem
     absent = "".join(f" without {name}" for name in sorted(request.absent))
-    lit = (request.light,) if source.is_scene else ()
-    window, part = request.window, ""
+    simulated = (request.light,) if source.is_scene else ()
+    part = ""
     if window is not None:
-        part = _part(*((first, behind - 1) for first, behind in (window.rows, window.cols)))
-    return Subject(capture + absent, "", (*lit, request.less), part=part)
+        part = _part(*((first, end - 1) for first, end in (window.rows, window.cols)))
+    return Subject(capture + absent, settings=(*simulated, request.less), part=part)
 
 
 def _part(rows: tuple[int, int], cols: tuple[int, int]) -> str:
-    """First and last row and column of a part, as `Subject` takes them."""
+    """Return first and last row and column as `Subject.part`."""
     return "rows{}-{}_cols{}-{}".format(*rows, *cols)
 
 
 def ranged(session: Session, answer: Answer, estimator: str, settings: Any) -> Subject:
-    """An answer of a method with its settings."""
-    of = looked_at(session, answer.request)
-    told = answer.capture.source
-    return replace(of, estimator=estimator, settings=(*of.settings, settings), told=told)
+    """Return the subject of an estimate."""
+    subject = looked_at(session, answer.request)
+    settings = (*subject.settings, settings)
+    source = answer.capture.source
+    return replace(subject, estimator=estimator, settings=settings, source=source)
 
 
 def explored(session: Session) -> Subject:
-    """The session's own answer."""
+    """Return the subject of the session's own estimate."""
     return ranged(session, session.answer, "tracking", session.answer.request.tracking)
 
 
 def viewed(session: Session, subject: Subject, viewing: Viewing) -> Subject:
-    """An answer's image or cloud, told from which confidence it is shown, and how wide it is seen.
-
-    As wide as suits the capture is not told.
-    """
+    """Add confidence threshold and field of view; the capture's own field of view is not named."""
     if viewing.field_of_view_deg == session.own_field_of_view_deg:
         viewing = Viewing(viewing.least_confidence)
     return replace(subject, settings=(*subject.settings, viewing))
 
 
 def over_the_gate(session: Session, figure: Any, what: str) -> Shown:
-    """A plot over the gate of the session's capture."""
+    """Return the content of a plot over the gate."""
     table = plot_file(figure, session.answer.capture.acquisition)
     return Shown(explored(session), what, {"csv": table})
 
 
 def pixel_plot(session: Session, figure: Any, what: str) -> Shown:
-    """A plot of the session's pixel."""
+    """Return the content of a plot of the session's pixel."""
     return over_the_gate(session, figure, f"{what} {pixel_on_show(session)}")
 
 
 def pixel_on_show(session: Session) -> str:
-    """Row and column of the session's pixel, in its file."""
+    """Return row and column of the session's pixel in its file."""
     row, col = session.answer.grid.place(*session.state.pixel)
     return f"row{row} col{col}"
 
 
 def region_on_show(session: Session) -> str:
-    """First and last row and column with pixels of the session's region, in its file."""
+    """Return first and last row and column of the session's region in its file."""
     answer = session.answer
     inside = inspection.pixels_in(session.state.region, answer.capture.shape)
     return _part(*((each.min(), each.max()) for each in answer.grid.place(*inside.nonzero())))
 
 
 def image_on_show(session: Session, kind: str, figure: Any, what: str) -> Shown:
-    """An image of the session's answer, as `app.model.exports.image_files` takes it."""
+    """Return the content of an image; `kind` is that of `app.model.exports.image_files`."""
     viewing = session.state.viewing
     files = image_files(session.answer, kind, viewing.least_confidence, figure)
     return Shown(viewed(session, explored(session), viewing), what, files)

@@ -1,4 +1,4 @@
-"""The present estimate of a session: computed from the state whenever that changes."""
+"""The current estimate of a session, computed whenever the state changes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.model.capture_defaults import enter, own_field_of_view_deg
 from app.model.restore import parameters_of, request_of
 from app.model.state import State
 from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute, same_view
-from app.model.text import lack
+from app.model.text import no_estimates
 from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane
@@ -21,17 +21,17 @@ from app.tasks.signals import Signal
 from core.cost import cost_of
 
 BUSY_MS = 200
-"""A request that takes longer is shown to be under way."""
+"""Time after which a progress bar is shown."""
 
 FEW_COUNTS = 2**20
-"""Counts of a capture up to which an estimate takes less time than drawing it."""
+"""Size of a cube (pixels × bins) up to which an estimate takes less time than drawing it."""
 
 FEW_S = 0.25
-"""Estimated time up to which an estimate may run on the page's thread; an upper bound."""
+"""Predicted time up to which an estimate may run on the page's thread."""
 
 
 class CurrentEstimate:
-    """Keeps the answer to the state's request up to date.
+    """Keep the estimate for the state up to date.
 
     Parameters
     ----------
@@ -40,18 +40,18 @@ class CurrentEstimate:
     tasks : PageTasks
     failures : FailureLog
     first : Answer
-        The answer to the state's present request.
+        The estimate for the present state.
 
     Attributes
     ----------
     answer : Answer
-        The latest answer that could be computed.
+        The latest estimate that could be computed.
     changed : Signal of Answer
-        Emitted on the page with each new answer, and with the old one again where a request failed.
+        Emitted with each new estimate, and with the old one again where a request failed.
     own_field_of_view_deg : float
         The field of view that suits the present capture.
     busy : Signal of bool
-        Emitted with True when a request takes long, and with False when it is answered.
+        Emitted with True when a request takes long, and with False when it is done.
     """
 
     def __init__(
@@ -69,21 +69,21 @@ class CurrentEstimate:
         self._tasks, self._failures = tasks, failures
         self._channel = tasks.latest()
         self._is_busy = False
-        self._asked_s: float | None = None
+        self._began_s: float | None = None
         self.own_field_of_view_deg = own_field_of_view_deg(first)
         self._take_reduction(first)
         state.param.watch(lambda *_: self.refresh(), list(COMPUTED_FROM))
 
     @property
     def request(self) -> Request:
-        """What the state asks for."""
+        """The request described by the state."""
         return request_of(self._state, self._sources)
 
     def refresh(self) -> None:
         """Compute the state's request, or again when more of its file has been read."""
         request = self.request
-        if self._asked_s is None:
-            self._begin_waiting()
+        if self._began_s is None:
+            self._begin()
         self._channel.submit(
             partial(compute, request, self.answer),
             self._accept,
@@ -97,54 +97,54 @@ class CurrentEstimate:
         if not same_view(answer.request, previous.request):
             self.own_field_of_view_deg = own_field_of_view_deg(answer)
             enter(self._state, answer, previous)
-        with self._tasks.hold():  # all that follows reaches the browser at once
-            self._failures.clear(lack(answer))
-            self._end_waiting()
+        with self._tasks.hold():  # one message for all consequences
+            self._failures.clear(no_estimates(answer))
+            self._end()
             self.changed.emit(answer)
 
     def _take_reduction(self, answer: Answer) -> None:
-        """Show the reduction that was needed to stay within the limits of a request."""
-        if self._state.less == answer.asked != answer.request.less:
+        """Show the reduction that was added to keep the request within its limits."""
+        if self._state.less == answer.requested != answer.request.less:
             with param.discard_events(self._state):
                 self._state.less = answer.request.less
 
     def _restore(self, request: Request, error: Exception) -> None:
         """Return to the request that the page still shows, unless the user has moved on."""
         if request == self.request:
-            # Sliders stay where they are: the next move starts from there.
+            # Sliders keep their values: the next move starts from there.
             shown = replace(self.answer.request, light=request.light, tracking=request.tracking)
             with param.discard_events(self._state):
                 self._state.param.update(parameters_of(shown, self._sources))
-        self._end_waiting()
+        self._end()
         self.changed.emit(self.answer)
         self._failures.report(error)
 
-    # How long a request has been under way
+    # Progress bar
 
-    def _begin_waiting(self) -> None:
-        self._asked_s = perf_counter()
+    def _begin(self) -> None:
+        self._began_s = perf_counter()
         self._tasks.call_later(BUSY_MS, self._check_busy)
 
     def _check_busy(self) -> None:
-        if self._asked_s is not None and perf_counter() - self._asked_s >= 0.9e-3 * BUSY_MS:
+        if self._began_s is not None and perf_counter() - self._began_s >= 0.9e-3 * BUSY_MS:
             self._is_busy = True
             self._tasks.run_next(partial(self.busy.emit, True))
 
-    def _end_waiting(self) -> None:
-        self._asked_s = None
+    def _end(self) -> None:
+        self._began_s = None
         if self._channel.has_more:
-            self._begin_waiting()
-        elif self._is_busy:  # a following request keeps the sign, which would only flicker
+            self._begin()
+        elif self._is_busy:  # a following request keeps the bar, which would flicker
             self._tasks.call_later(BUSY_MS, partial(self._tasks.run_next, self._end_busy))
 
     def _end_busy(self) -> None:
-        if self._asked_s is None and self._is_busy:
+        if self._began_s is None and self._is_busy:
             self._is_busy = False
             self.busy.emit(False)
 
 
 def lane_of(request: Request, previous: Answer) -> Lane:
-    """Return the lane in which a request is computed, by what it costs after the previous one."""
+    """Return the lane in which to compute a request, by its cost after the previous one."""
     before = previous.request
     if previous.cutout is not None or previous.whole.cube.size > FEW_COUNTS:
         return GENERAL

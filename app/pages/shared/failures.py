@@ -1,4 +1,4 @@
-"""Failures of the parts of a page, and the one sentence that the page shows about them."""
+"""Failures of the parts of a page, of which the page shows one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 class FailureLog:
-    """Sentences on failures, by the part of the page that failed.
+    """Error sentences by the part of the page that failed.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Under a picture of a file larger than memory: what is shown of it, and how to look closer."""
+"""Controls below a picture of a file larger than memory: the window that is shown."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from core import Window
 from core.checks import require
 
 Bounds = tuple[int, int]
-"""Of rows or columns: the first, and the one behind the last."""
+"""First row or column, and the one behind the last."""
 
 
 class LargeView:
-    """Controls of the window that is shown; nothing where the capture is in memory as a whole.
+    """Controls of the window that is shown; hidden for a capture that fits into memory.
 
     Parameters
     ----------
     session : Session
     figure : bokeh.plotting.figure
-        The picture, its axes in rows and columns of the file. What it is zoomed to can be read.
+        The picture, its axes in rows and columns of the file.
     """
 
     def __init__(self, session: Session, figure: Any) -> None:
@@ -44,7 +44,7 @@ class LargeView:
         self._bounds = {
             name: pmui.TextInput(
                 label=label,
-                description=f"{label} to look at, first to last. A zoom sets them.",
+                description=f"{label}: first to last. Zooming the picture sets them.",
                 size="small",
                 sizing_mode="stretch_width",
                 margin=(6, 4, 2, 8),
@@ -56,12 +56,12 @@ class LargeView:
             self._reading,
             self._arrived,
             "parts read",
-            label="Look closer",
-            help="Look closer: reads these rows and columns alone, as finely as they can be shown.",
+            label="Read window",
+            help="Read window: reads these rows and columns at the highest resolution possible.",
         )
-        whole = "The whole: all rows and columns; reads what is missing of them."
+        whole = "Show all: all rows and columns; reads those that are missing."
         buttons, *rest = self._work.controls
-        buttons.append(button("The whole", whole, self._go_back, margin=(6, 4)))
+        buttons.append(button("Show all", whole, self._go_back, margin=(6, 4)))
         self.layout = pn.Column(
             self._sentence,
             pn.Row(*self._bounds.values(), sizing_mode="stretch_width", margin=0),
@@ -77,24 +77,24 @@ class LargeView:
         self._figure = figure
         self.follow(session.answer)
 
-    # What the session and the page tell
+    # Events of the session and the page
 
     def follow(self, answer: Answer) -> None:
-        """Show what of the file is looked at; read on where there is more of a preview."""
+        """Show the window of an estimate; continue to read an unfinished preview."""
         cutout, previous = answer.cutout, self._cutout
         self._cutout = cutout
         self.layout.visible = cutout is not None
         if previous is not None and (cutout is None or cutout.file is not previous.file):
-            self._stop()  # reading what nobody looks at any more
+            self._stop()
         if cutout is None:
             return
-        self._sentence.text = told(cutout)
+        self._sentence.text = describe(cutout)
         if previous is None or cutout.window != previous.window:
             self._show_bounds(cutout.window.rows, cutout.window.cols)
         self._begin()
 
     def show(self, is_on_screen: bool) -> None:
-        """Go on reading a preview when it comes on screen, and stop when it leaves."""
+        """Continue to read a preview on screen, and stop off screen."""
         self._is_on_screen = is_on_screen
         if is_on_screen:
             self._begin()
@@ -106,7 +106,7 @@ class LargeView:
         self._work.cancel()
 
     def _begin(self) -> None:
-        """Read the rest of a preview, once for each file unless asked for again."""
+        """Read the rest of a preview, once for each file unless requested again."""
         cutout = self._cutout
         if cutout is None or not self._is_on_screen or not cutout.is_preview or cutout.is_final:
             return
@@ -115,7 +115,7 @@ class LargeView:
             self._work.start(self._reading_on(cutout.file))
 
     def _zoomed(self) -> None:
-        """Write what the picture is zoomed to into the fields."""
+        """Write the window to which the picture is zoomed into the fields."""
         if self._cutout is None:
             return
         across, down = self._figure.x_range, self._figure.y_range
@@ -127,12 +127,12 @@ class LargeView:
 
     def _show_bounds(self, *bounds: Bounds) -> None:
         if bounds == self._shown:
-            return  # what was typed since then stays
+            return  # keep what was typed since then
         self._shown = bounds
         for name, (first, end) in zip(self._bounds, bounds, strict=True):
             self._bounds[name].value = f"{first} to {end - 1}"
 
-    # What the user asks for
+    # Actions of the user
 
     def _go_back(self) -> None:
         self._begun = None
@@ -141,7 +141,7 @@ class LargeView:
         self._session.state.window = None
 
     def _reading(self) -> Work[Window | None]:
-        """Reads the window that the fields tell."""
+        """Return the work that reads the window in the fields."""
         assert self._cutout is not None
         file = self._cutout.file
         rows, cols = (
@@ -158,7 +158,7 @@ class LargeView:
         return work
 
     def _reading_on(self, file: LargeFile) -> Work[Window | None]:
-        """Reads the rest of the preview, and shows it now and then."""
+        """Return the work that reads the rest of the preview and shows it from time to time."""
 
         def work(
             progress: Callable[[int, int], None], cancelled: Callable[[], bool]
@@ -170,34 +170,34 @@ class LargeView:
         return work
 
     def _arrived(self, window: Window | None) -> None:
-        """Show what has been read."""
+        """Show the window that has been read; None stands for the preview."""
         if window is None:
             self._session.estimate.refresh()
         else:
             self._session.state.window = window
 
 
-def told(cutout: Cutout) -> str:
-    """What is seen of a file."""
+def describe(cutout: Cutout) -> str:
+    """Return a sentence on the part of the file that is shown."""
     window, (_, rows), (_, cols) = cutout.window, cutout.file.whole.rows, cutout.file.whole.cols
     if not cutout.is_preview:
-        return f"Seen: {window}, of {rows} × {cols} pixels."
+        return f"Shown: {window}, of {rows} × {cols} pixels."
     sentence = (
-        f"Preview of {rows} × {cols} pixels, 1 of each {window.step} × {window.step}: zoom into "
-        f"the picture, and look closer."
+        f"Preview of {rows} × {cols} pixels, 1 of each {window.step} × {window.step}. Zoom into "
+        "the picture, then press Read window."
     )
     if cutout.read < 1:
-        sentence += f" {cutout.read:.0%} of it has been read; what is blank has not."
+        sentence += f" {cutout.read:.0%} has been read; blank pixels have not."
     return sentence
 
 
 def bounds_of(name: str, text: str, size: int) -> Bounds:
-    """First row or column and the one behind the last, as typed: first to last.
+    """Return the rows or columns of a text such as "10 to 20".
 
     Raises
     ------
     ValueError
-        If the text is something else, or does not lie in the file.
+        If the text has another form, or exceeds the file.
     """
     found = re.fullmatch(r"\s*(\d{1,12})\s*(?:to|[-–:])\s*(\d{1,12})\s*", text)
     first, last = (int(each) for each in found.groups()) if found else (1, 0)
@@ -210,9 +210,9 @@ def _is_number(value: object) -> bool:
 
 
 def _within(axis: Any, bounds: Bounds, step: int) -> Bounds:
-    """Rows or columns of a window between the ends of an axis, as far as there are any."""
+    """Return the rows or columns of a window between the ends of an axis."""
     low, high = sorted((axis.start, axis.end))
     first = min(max(math.floor(low + 0.5), bounds[0]), bounds[1] - 1)
     end = max(math.ceil(high + 0.5), first + 1)
-    # A picture of one pixel of many ends short of its last rows and columns.
+    # The picture of a preview ends before its last rows and columns.
     return first, bounds[1] if end > bounds[1] - step else end

@@ -1,11 +1,11 @@
-"""Viewers of what a study shows: its curves, its pictures and its tables."""
+"""Cards that show the outputs of a study: curves, pictures and tables."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import panel as pn
@@ -13,7 +13,7 @@ import panel_material_ui as pmui
 from bokeh.events import Tap
 from bokeh.models import Range1d
 
-from app.model.colors import Look
+from app.model.colors import ColorScale
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import image_file, plot_file, table_file
 from app.model.large import Grid
@@ -37,6 +37,8 @@ from app.widgets.method_picture import ScaleBar
 from core.parameters import Number
 from core.studies import outputs as items
 
+Item = TypeVar("Item", items.Plot, items.Table, items.Pictures)
+
 GRID = """
 :host { display: grid !important; gap: 8px; width: 100%;
   grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); }
@@ -45,18 +47,18 @@ GRID = """
 PICTURE_HEIGHT = 300
 
 FORMATS = {"SBR": "g", "ms": ".1f"}
-"""Of columns whose numbers do not want four decimals."""
+"""Formats of columns whose numbers need no four decimals."""
 
 
 class CurveCard:
-    """Curves with a note below them; drawn when the first come, then only their values change.
+    """Curves with a note below them; further curves of the same names only replace values.
 
     Parameters
     ----------
     across : Range1d, optional
-        The horizontal axis, that of several plots above each other; its own where None.
+        A horizontal axis shared by several plots.
     waiting : str
-        Shown until there is something to show.
+        Text to show before the first curves.
     """
 
     def __init__(self, across: Range1d | None = None, waiting: str = "") -> None:
@@ -69,21 +71,20 @@ class CurveCard:
 
     @property
     def figure(self) -> Any:
-        """What is drawn; None before the first curves."""
+        """The figure; None before the first curves."""
         return self._plot and self._plot.figure
 
     def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
-        """Have a download button, for files about a subject."""
+        """Add a download button."""
 
         def show() -> Shown:
-            if self._item is None:
-                raise ValueError(NOTHING_DRAWN)
-            return Shown(subject(), self._item.key, {"csv": plot_file(self.figure)})
+            item = _required(self._item)
+            return Shown(subject(), item.key, {"csv": plot_file(self.figure)})
 
         downloadable(self.card, session, "curves", show, PLOT)
 
     def show(self, item: items.Plot) -> None:
-        """Draw curves; those of the same names are only given other values."""
+        """Show curves in place of the last ones."""
         if self._plot is None or self._item is None or _names(item) != _names(self._item):
             self._plot = self._built(item)
         self._item = item
@@ -105,7 +106,7 @@ class CurveCard:
         figure.title.text, self._note.text = item.title, item.note
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Apply the colours of a theme."""
         self._colors = colors
         if self._plot is None or self._item is None:
             return
@@ -135,7 +136,7 @@ class CurveCard:
 
 
 def _names(item: items.Plot) -> list[str]:
-    """What a plot's layers are called."""
+    """Return the names of a plot's layers."""
     return [*item.curves, *item.marks]
 
 
@@ -152,17 +153,16 @@ class TableCard:
         )
 
     def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
-        """Have a download button, for files about a subject."""
+        """Add a download button."""
 
         def show() -> Shown:
-            if self._item is None:
-                raise ValueError(NOTHING_DRAWN)
-            return Shown(subject(), self._item.key, {"csv": table_file(self._item)})
+            item = _required(self._item)
+            return Shown(subject(), item.key, {"csv": table_file(item)})
 
         downloadable(self.layout, session, "table", show, TABLE)
 
     def show(self, item: items.Table) -> None:
-        """Show a table, in place of the last."""
+        """Show a table in place of the last one."""
         self._item = item
         columns, rows = table_of(item)
         self._table.param.update(title=item.title, columns=columns, rows=rows)
@@ -170,7 +170,7 @@ class TableCard:
 
 
 class Gallery:
-    """Pictures on one colour scale; a tap, or a row and a column, compare a pixel in all."""
+    """Pictures on one colour scale; a tap, or row and column, compare one pixel in all of them."""
 
     def __init__(self) -> None:
         self._drawn: list[Layers] = []
@@ -192,16 +192,14 @@ class Gallery:
         )
 
     def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
-        """Have a download button on each picture, for files about a subject."""
+        """Add a download button to each picture."""
         self._framed = partial(self._with_button, session, subject)
 
     def _with_button(
         self, session: Session, subject: Callable[[], Subject], pane: Any, name: str
     ) -> pn.Column:
         def show() -> Shown:
-            item = self._item
-            if item is None:
-                raise ValueError(NOTHING_DRAWN)
+            item = _required(self._item)
             look = _look(item)
             files = {"csv": image_file(item.images[name], look, pane.object, Grid())}
             return Shown(subject(), f"{item.key} {name}", files, scale=look)
@@ -211,12 +209,12 @@ class Gallery:
 
     @property
     def figures(self) -> list[Any]:
-        """What is drawn, in the order of the pictures."""
+        """The figures, in the order of the pictures."""
         return [each.figure for each in self._drawn]
 
     def show(self, item: items.Pictures) -> None:
-        """Draw pictures of one size, in place of the last."""
-        before, self._item = self._item, None  # no mark before all is there
+        """Show pictures of one size in place of the last ones."""
+        before, self._item = self._item, None  # no mark before all pictures are drawn
         shape = next(iter(item.images.values())).shape
         for knob, size in zip(self.place, shape, strict=True):
             knob.param.update(high=size - 1, initial=size // 2, value=min(knob.value, size - 1))
@@ -230,7 +228,7 @@ class Gallery:
         self._scale.pane.visible, self._note.text = True, f"{item.note} {OUTSIDE_NOTE}"
 
     def paint(self, colors: Palette) -> None:
-        """Take on the colours of the mode."""
+        """Apply the colours of a theme."""
         self._colors = colors
         self._scale.paint(colors)
         for drawing in self.figures:
@@ -252,7 +250,7 @@ class Gallery:
             knob.value = min(max(math.floor(at + 0.5), 0), knob.high)
 
     def _mark(self) -> None:
-        """Frame the pixel in all pictures, and say what each makes of it."""
+        """Frame the pixel in all pictures, and write its range into their titles."""
         if self._item is None:
             return
         row, col = (int(knob.value) for knob in self.place)
@@ -261,14 +259,20 @@ class Gallery:
         )
         for drawn, (name, image) in zip(self._drawn, self._item.images.items(), strict=True):
             range_m = float(image[row, col])
-            told = "no target" if math.isnan(range_m) else number(range_m, "m")
+            text = "no target" if math.isnan(range_m) else number(range_m, "m")
             for layer in ("shadow", "frame"):
                 drawn.write(layer, **{side: [at] for side, at in sides.items()})
-            drawn.figure.title.text = f"{spelled(name)}: {told}"
+            drawn.figure.title.text = f"{spelled(name)}: {text}"
+
+
+def _required(item: Item | None) -> Item:
+    if item is None:
+        raise ValueError(NOTHING_DRAWN)
+    return item
 
 
 def layers_of(drawing: Any) -> Layers:
-    """The named renderers of a Bokeh figure."""
+    """Return the named renderers of a Bokeh figure as layers."""
     found = {
         each.name: {"source": each.data_source, "glyph": each.glyph, "glyph_renderer": each}
         for each in drawing.renderers
@@ -276,26 +280,26 @@ def layers_of(drawing: Any) -> Layers:
     return Layers(drawing, found)
 
 
-def _look(item: items.Pictures) -> Look:
-    """The colours that all pictures share."""
-    return Look(item.label, "", item.low, item.high, RANGE_COLORS)
+def _look(item: items.Pictures) -> ColorScale:
+    """Return the colour scale of all pictures."""
+    return ColorScale(item.label, "", item.low, item.high, RANGE_COLORS)
 
 
 def _frame(item: items.Pictures) -> tuple[Any, ...]:
-    """What figures are built for: pictures that agree in it differ in their values alone."""
+    """Return what requires new figures when it changes."""
     return item.low, item.high, [image.shape for image in item.images.values()]
 
 
 def spelled(name: str) -> str:
-    """A method's key, or any other name, as one writes it."""
+    """Return a key as text, with spaces."""
     return name.replace("_", " ")
 
 
 def table_of(item: items.Table) -> tuple[list[Any], list[dict[str, Any]]]:
-    """Columns and rows for `app.widgets.controls.Table`.
+    """Return columns and rows for `app.widgets.controls.Table`.
 
-    "low" and "high" become a smaller line under the value before them, "kind" one under the name; a
-    difference from what is printed is said in words, too. Columns without a value are left out.
+    "low" and "high" become a smaller line below the value before them, "kind" one below the name,
+    and a difference from a printed value is also classified. Empty columns are left out.
     """
     names = item.columns
     hidden = {"low", "high", "kind"}
@@ -304,7 +308,7 @@ def table_of(item: items.Table) -> tuple[list[Any], list[dict[str, Any]]]:
         for place, name in enumerate(names)
         if name not in hidden and any(row[place] != "" for row in item.rows)
     ]
-    if "method" in names:  # it names the row, wherever it stands
+    if "method" in names:  # it names the row, in whichever column
         shown.sort(key=lambda place: names[place] != "method")
     first, *others = shown
     columns = [[names[place], *COLUMN_HELP.get(names[place], ("", 1))] for place in shown]
@@ -320,7 +324,7 @@ def table_of(item: items.Table) -> tuple[list[Any], list[dict[str, Any]]]:
 
 
 def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]:
-    """Text, value to sort by, and what stands smaller below."""
+    """Return text, value to sort by, and the smaller second line."""
     value = row[place]
     if isinstance(value, str):
         return [_name(value), value or None, ""]
@@ -334,7 +338,7 @@ def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]
         low, high, printed = row[place - 3 : place]
         larger_is_better = names[place - 4].startswith("RD")
         is_better = (value > 0) == larger_is_better
-        below = "chance may do" if low <= printed <= high else "better" if is_better else "worse"
+        below = "within chance" if low <= printed <= high else "better" if is_better else "worse"
         return [f"{value:+.4f}", value, below]
     known = not math.isnan(value)
     return [items.as_text(value) if known else "–", value if known else None, below]

@@ -1,4 +1,4 @@
-"""Long work with its controls."""
+"""Long work with its controls: buttons that start and cancel it, a progress bar and a sentence."""
 
 from __future__ import annotations
 
@@ -11,60 +11,67 @@ import panel_material_ui as pmui
 
 from app.model.text import progress, unfinished
 from app.pages.session import Session
-from app.tasks.scheduler import LongWork, Step, Work
+from app.tasks.scheduler import Step, Work
+from app.widgets.cards import button
 from app.widgets.controls import Sentence
 
 Result = TypeVar("Result")
 
 
-class WorkControls:
-    """Buttons that start and cancel long work, a progress bar, and a sentence on the progress."""
+class _ControlledWork:
+    """Base of long work with controls.
+
+    Parameters
+    ----------
+    session : Session
+    noun : str
+        Unit of the progress.
+    label, help : str
+        Label and description of the button that starts it.
+    """
 
     def __init__(
         self,
-        start: Callable[[], None],
-        cancel: Callable[[], None],
+        session: Session,
         noun: str,
         label: str = "Compute",
         help: str = "Compute: starts again with the settings above.",
     ) -> None:
-        self._noun = noun
-        self._start = pmui.Button(
-            label=label,
-            description=help,
-            size="small",
-            margin=(6, 4, 6, 8),
-        )
-        self._cancel = pmui.Button(
-            label="Cancel",
-            description="Cancel: stops the work and keeps its results so far.",
-            variant="outlined",
-            size="small",
-            disabled=True,
-            margin=(6, 4),
-        )
+        self._session, self._noun = session, noun
+        fail = partial(session.failures.report, describe=unfinished, part=self)
+        self._work = session.tasks.long_work(self._show_progress, fail)
+        self._start = button(label, help, self.start, margin=(6, 4, 6, 8))
+        self._start.variant = "contained"
+        cancel_help = "Cancel: stops the work and keeps its results so far."
+        self._cancel = button("Cancel", cancel_help, self.cancel, margin=(6, 4))
+        self._cancel.disabled = True
         self._bar = pmui.LinearProgress(
             variant="determinate", value=0, sizing_mode="stretch_width", margin=(4, 8)
         )
         self._sentence = Sentence(sizing_mode="stretch_width", margin=(0, 8, 8, 8))
-        self._start.on_click(lambda _: start())
-        self._cancel.on_click(lambda _: cancel())
 
     @property
-    def layout(self) -> list[Any]:
+    def controls(self) -> list[Any]:
         """Buttons, bar and sentence."""
-        buttons = pn.Row(self._start, self._cancel, margin=0)
-        return [buttons, self._bar, self._sentence]
+        return [pn.Row(self._start, self._cancel, margin=0), self._bar, self._sentence]
 
-    def show(self, work: LongWork) -> None:
-        """Show the progress of the work."""
+    def start(self) -> None:
+        """Start with the present settings, in place of the present work."""
+        raise NotImplementedError
+
+    def cancel(self) -> None:
+        """Cancel the work."""
+        self._work.cancel()
+
+    def _show_progress(self) -> None:
+        work = self._work
         self._cancel.disabled = not work.is_running
         self._bar.value = round(100 * work.done / max(work.of, 1))
         self._sentence.text = progress(work.done, work.of, self._noun, work.is_running)
 
 
-class Study:
-    """Long work in steps with its controls.
+class Study(_ControlledWork):
+    """Long work in steps, with controls.
 
     It starts when it first comes on screen, and pauses while it is off screen.
 
@@ -72,24 +79,16 @@ class Study:
     ----------
     session : Session
     steps : callable
-        Returns the steps, from the present settings.
+        Returns the steps for the present settings.
     noun : str
-        What the steps are called.
+        Name of the steps.
     """
 
     def __init__(
         self, session: Session, steps: Callable[[], Sequence[Step[Any]]], noun: str
     ) -> None:
-        self._session = session
+        super().__init__(session, noun)
         self._steps = steps
-        fail = partial(session.failures.report, describe=unfinished, part=self)
-        self._work = session.tasks.long_work(self._show_progress, fail)
-        self._controls = WorkControls(self.start, self._work.cancel, noun)
-
-    @property
-    def controls(self) -> list[Any]:
-        """Buttons, bar and sentence."""
-        return self._controls.layout
 
     def start(self) -> None:
         """Start with the present settings, in place of the present work."""
@@ -102,22 +101,19 @@ class Study:
         if is_on_screen and self._work.of == 0:
             self.start()
 
-    def _show_progress(self) -> None:
-        self._controls.show(self._work)
 
-
-class OnePiece(Generic[Result]):
-    """Long work of one piece with its controls.
+class OnePiece(_ControlledWork, Generic[Result]):
+    """Long work in one piece, with controls; a cancelled result is not drawn.
 
     Parameters
     ----------
     session : Session
     work : callable
-        Returns the work, from the present settings.
+        Returns the work for the present settings.
     draw : callable
         Shows the result on the page.
     noun : str
-        What its progress counts.
+        Unit of the progress.
     **start : str
         ``label`` and ``help`` of the button that starts it.
     """
@@ -130,33 +126,18 @@ class OnePiece(Generic[Result]):
         noun: str,
         **start: str,
     ) -> None:
-        self._session = session
+        super().__init__(session, noun, **start)
         self._make_work = work
         self._draw = draw
-        fail = partial(session.failures.report, describe=unfinished, part=self)
-        self._work = session.tasks.long_work(self._show_progress, fail)
-        self._controls = WorkControls(self.start, self.cancel, noun, **start)
-
-    @property
-    def controls(self) -> list[Any]:
-        """Buttons, bar and sentence."""
-        return self._controls.layout
 
     def start(self, work: Work[Result] | None = None) -> None:
-        """Start this work, or the button's, in place of the present work."""
+        """Start this work, or that for the present settings, in place of the present work."""
         work = work or self._make_work()
         self._session.failures.resolve(self)
         self._work.start_piece(work, self._draw)
 
-    def cancel(self) -> None:
-        """Ask the work to end; its result is not drawn."""
-        self._work.cancel()
-
-    def _show_progress(self) -> None:
-        self._controls.show(self._work)
-
 
 def aside(explanation: str, *controls: Any) -> pn.Column:
-    """Explanatory text above controls."""
+    """Return explanatory text above controls."""
     text = pmui.Typography(explanation, variant="body2", margin=(8, 8, 4, 8))
     return pn.Column(text, *controls, sizing_mode="stretch_width", margin=0)

@@ -1,24 +1,22 @@
-"""The part of Trade-off that sweeps a method's settings: where its answers are to be trusted."""
+"""The sensitivity study: accuracy of a method as a function of each of its settings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import panel as pn
 
 from app.model.methods import METHOD_TITLES
-from app.pages.navigation import View
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject
 from app.pages.shared.outputs import CurveCard, TableCard
-from app.pages.shared.studies import Study, aside
-from app.pages.tradeoff import sensitivity_text as trust_words
+from app.pages.shared.section import Checked, StudySection
+from app.pages.tradeoff import text
 from app.tasks.scheduler import Step
-from app.theme import palette
 from app.widgets.cards import part
-from app.widgets.controls import SettingsPanel
-from core.parameters import Choice, Number, check_fields, parameter
+from core.parameters import Choice, Number, parameter
 from core.studies.sensitivity import (
     Sweep,
     along,
@@ -28,8 +26,7 @@ from core.studies.sensitivity import (
     setting_sweep,
 )
 
-SWEPT = tuple(dict.fromkeys(method for method, *_ in numbers()))
-METHODS = {METHOD_TITLES[method]: method for method in SWEPT}
+METHODS = {METHOD_TITLES[method]: method for method, *_ in numbers()}
 
 CARDS = """
 :host {{ display: grid !important; gap: 8px; flex: none !important; height: {wide}px !important;
@@ -38,87 +35,75 @@ CARDS = """
   :host {{ grid-template-columns: minmax(0, 1fr); height: {narrow}px !important; }}
 }}
 """
-ROW = 308
+ROW_PX = 308
 
 
 @dataclass(frozen=True)
-class Swept:
-    """Which method's settings are swept."""
+class Swept(Checked):
+    """The method whose settings are swept."""
 
     method: str = parameter(
-        METHOD_TITLES["tracking"], Choice("Method", tuple(METHODS)), trust_words.METHOD_HELP
+        METHOD_TITLES["tracking"], Choice("Method", tuple(METHODS)), text.METHOD_HELP
     )
 
-    def __post_init__(self) -> None:
-        check_fields(self)
 
+class SensitivitySection(StudySection[Swept]):
+    """A sweep over each numeric setting of a method; the session's capture is not used.
 
-class Trust:
-    """Sweeps over all settings of a method that are numbers, a plot for each.
-
-    Parameters
+    Attributes
     ----------
-    session : Session
-        Whose page it is; its capture has no part in this.
+    found : list of Sweep
+        The sweeps that are shown.
+    cards : list of CurveCard
+    study : Study
     """
 
     def __init__(self, session: Session) -> None:
-        self._session = session
-        self._swept = Swept()
-        self._found: list[Sweep] = []
-        self._dark = False
-        self._panel = SettingsPanel(self._swept, self._changed)
-        self._study = Study(session, self._steps, "settings")
-        self._cards: list[CurveCard] = []
+        super().__init__(session, Swept(), text.SENSITIVITY, "settings")
+        self.found: list[Sweep] = []
+        self.cards: list[CurveCard] = []
         self._grid = pn.Column(sizing_mode="stretch_width", margin=0)
         self._table = TableCard()
-        self._table.offer(session, self._subject)
+        self._table.offer(session, self.about)
 
-    @property
-    def view(self) -> View:
-        """The plots and the table, and their controls."""
-        controls = aside(trust_words.EXPLANATION, self._panel.layout, *self._study.controls)
-        return View(
-            [self._grid, self._table.layout],
-            part("What is swept", controls),
-            show=self._study.show,
-            paint=self._paint,
-        )
+    def layout(self) -> tuple[Any, Any]:
+        """Return the plots and the table, and their controls."""
+        controls = self.controls(*self.study.controls)
+        return [self._grid, self._table.layout], part("Sweep", controls)
 
-    def _subject(self) -> Subject:
-        return Subject("settings swept", METHODS[self._swept.method])
+    def about(self) -> Subject:
+        """Return what the section's files are about."""
+        return Subject("settings swept", METHODS[self.settings.method])
 
-    def _changed(self, swept: Swept) -> None:
-        self._swept = swept
-        self._study.start()
+    def change(self, settings: Swept) -> None:
+        """Sweep the settings of another method."""
+        super().change(settings)
+        self.study.start()
 
-    def _paint(self, dark: bool) -> None:
-        self._dark = dark
-        for each in self._cards:
-            each.paint(palette(dark))
-
-    def _steps(self) -> list[Step[Sweep]]:
-        method = METHODS[self._swept.method]
+    def steps(self) -> list[Step[Sweep]]:
+        """Return a sweep of each setting."""
+        method = METHODS[self.settings.method]
         swept = [(field, spec, default) for of, field, spec, default in numbers() if of == method]
-        self._found = []
-        self._cards = [CurveCard(waiting=trust_words.swept(spec)) for _, spec, _ in swept]
-        for each in self._cards:
-            each.offer(self._session, self._subject)
-        self._paint(self._dark)
+        self.found = []
+        self.cards = [CurveCard(waiting=text.not_swept(spec)) for _, spec, _ in swept]
+        self._painted = [*self.cards]
+        for each in self.cards:
+            each.offer(self.session, self.about)
+        self.paint(self.is_dark)
         rows = (len(swept) + 1) // 2
-        with pn.io.hold(self._session.page):
-            self._grid.stylesheets = [CARDS.format(wide=rows * ROW, narrow=len(swept) * ROW)]
-            self._grid.objects = [each.card for each in self._cards]
+        with self.session.tasks.hold():
+            self._grid.stylesheets = [CARDS.format(wide=rows * ROW_PX, narrow=len(swept) * ROW_PX)]
+            self._grid.objects = [each.card for each in self.cards]
         return [
             Step(
                 partial(setting_sweep, method, field, along(spec, default)),
-                partial(self._show, card, spec),
+                partial(self._draw, card, spec),
             )
-            for card, (field, spec, default) in zip(self._cards, swept, strict=True)
+            for card, (field, spec, default) in zip(self.cards, swept, strict=True)
         ]
 
-    def _show(self, card: CurveCard, spec: Number, sweep: Sweep) -> None:
-        self._found.append(sweep)
-        with pn.io.hold(self._session.page):
+    def _draw(self, card: CurveCard, spec: Number, sweep: Sweep) -> None:
+        self.found.append(sweep)
+        with self.session.tasks.hold():
             card.show(setting_plot(sweep, spec))
-            self._table.show(ranges_table("trust", trust_words.TABLE, self._found))
+            self._table.show(ranges_table("sensitivity", text.SENSITIVITY_TABLE, self.found))

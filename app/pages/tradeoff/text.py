@@ -1,110 +1,100 @@
-"""What the page "Trade-off" says."""
+"""Texts of the Trade-off page: explanations, help, sentences and table rows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from app.model.methods import METHOD_TITLES
+from app.model.text import cell, interval_cell
 from core.metrics import Interval
+from core.parameters import Number
 from core.studies.tradeoff import Candidate, Point, Recommendation
 
-EXPLANATION = """
-Each point is a way to range this scene, or this capture: a method, with some bins merged or not.
-To the left is faster, lower is right more often; whiskers cover 95 %, dashes are what you ask for.
-On the line are the ways that no other one beats: to be faster is to be wrong more often.
-A tap on a point, or its button in the table, opens it.
-"""
-
-WAITING = "Compute measures every method here and now: some ten seconds for 64 × 64 pixels."
-
 SECTIONS_HELP = (
-    "What ranging costs and gives, what recording costs and gives, which parts of a model are "
-    "needed, and within which range of each setting answers are to be trusted."
+    "Speed and accuracy: computing time and accuracy of each method. Acquisition: pulses, flux and "
+    "gate that a restoration degree requires. Ablation: parts of the model that the data require. "
+    "Sensitivity: accuracy as a function of each setting."
 )
 
-ACQUIRING = """
-How many pulses, how much light, and how long a gate reach the restoration degree that is wanted:
-by the limit's theory, for one who knows the light, and by simulation, for the likelihood that is
-told the light and the one that estimates it. Bands cover 95 %.
+# Speed and accuracy
+
+EXPLANATION = """
+Each point is a configuration for this scene or capture: a method, with or without merged bins.
+Further left is faster, further down is more accurate. Whiskers: 95 % intervals. Dashed: the goal.
+The line joins the Pareto front, the configurations that no other one beats in both.
+Tap a point, or press its button in the table, to open it.
 """
-ACQUIRING_WAITS = "Compute simulates this scene, acquired in 25 ways: half a minute."
 
-TITLE = "Speed against accuracy"
+NOT_MEASURED = (
+    "Press Compute to measure all methods on this server: about ten seconds for 64 × 64 pixels."
+)
 
-TIME_HELP = "What an image may take. The best that keeps to it is named above the plot."
+TITLE = "Speed and accuracy"
+
+TIME_HELP = "Time limit for an image. The most accurate configuration within it is named above."
 RD_HELP = (
-    "Share of the target pixels that must be within 3 bins. The fastest that reaches it is named."
+    "Required share of target pixels within 3 bins of the truth. The fastest configuration that "
+    "reaches it is named above."
 )
-REPETITIONS_HELP = (
-    "Captures of the same scene with other noise, the same for all methods: more make the "
-    "restoration degree surer."
-)
-REPEATS_HELP = "How often each method is timed, in turn with all others."
-MERGES_HELP = "With the capture's own bins only, or with 2 and 4 merged as well."
-LIGHT_HELP = (
-    "The light that methods rest on is found once for each capture. Counted in, it is what an "
-    "image costs that is new; left out, what a slider costs."
+REPEATS_HELP = "How often each method is timed, alternating with the others."
+MERGES_HELP = "Use the capture's own bins only, or also merge 2 and 4 of them."
+FLUX_HELP = (
+    "The fluxes are estimated once per capture. Included: time for a new image. Excluded: time "
+    "after a change of a setting."
 )
 
 COLUMNS = (
-    ("Way", "What ranges, and on how much of the capture.", 1),
+    ("Configuration", "Method, and how much of the capture it uses.", 1),
     ("Within 3 bins", "Share of the target pixels, with its 95 % interval.", -1),
     ("Within 1 bin", "Share of the target pixels, with its 95 % interval.", -1),
     ("RMSE (m)", "Root mean square error, with its 95 % interval.", 1),
-    ("ms", "For an image: the median of the rounds, with its 95 % interval.", 1),
-    ("Light (ms)", "To find the light, once for each capture.", 1),
-    ("ns", "For each pixel and bin of the whole image.", 1),
-    ("Memory (MB)", "Most that arrays held at once, beyond the capture.", 1),
+    ("Time (ms)", "Per image: median of the rounds, with its 95 % interval.", 1),
+    ("Flux (ms)", "Time to estimate the fluxes, once per capture.", 1),
+    ("ns", "Time per pixel and bin of the whole image.", 1),
+    ("Memory (MB)", "Largest size of all arrays at once, without the capture.", 1),
 )
 
 
 def name_of(candidate: Candidate) -> str:
-    """A way to range, as one reads it."""
+    """Return the name of a configuration."""
     title = METHOD_TITLES[candidate.method.estimator]
     reduction = str(candidate.reduction)
     return title if reduction == "whole" else f"{title}, {reduction}"
 
 
-def rows(points: Sequence[Point], unbeaten: Sequence[Point]) -> list[dict[str, object]]:
-    """The table's rows: first what no other way beats, the fastest first."""
-    others = [point for point in points if point not in unbeaten]
-    ordered = [*unbeaten, *sorted(others, key=lambda point: -point.rd().value)]
-    return [_row(point, points.index(point), point in unbeaten) for point in ordered]
+def rows(points: Sequence[Point], pareto: Sequence[Point]) -> list[dict[str, object]]:
+    """Return the table's rows: first the Pareto front, fastest first."""
+    others = [point for point in points if point not in pareto]
+    ordered = [*pareto, *sorted(others, key=lambda point: -point.rd().value)]
+    return [_row(point, points.index(point), point in pareto) for point in ordered]
 
 
-def _row(point: Point, key: int, is_unbeaten: bool) -> dict[str, object]:
-    told = point.candidate.is_told_the_light
-    note = "on the line" if is_unbeaten else "is told the light: a bound, no choice" if told else ""
+def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
+    is_bound = point.candidate.knows_flux
+    note = "Pareto front" if is_pareto else "knows the true fluxes: a bound" if is_bound else ""
     return {
         "key": key,
         "action": "Open",
         "name": name_of(point.candidate),
         "note": note,
         "cells": [
-            _share(point.rd(3)),
-            _share(point.rd(1)),
-            _cell(point.rmse_m, "{:.3g}"),
-            _cell(point.milliseconds, "{:.3g}"),
-            [f"{point.light_ms.value:.3g}", point.light_ms.value, ""],
-            [f"{point.ns_per_pixel_bin:.3g}", point.ns_per_pixel_bin, ""],
-            [f"{point.peak_bytes / 1e6:.3g}", point.peak_bytes, ""],
+            interval_cell(_percent(point.rd(3)), "{:.2f} %"),
+            interval_cell(_percent(point.rd(1)), "{:.2f} %"),
+            interval_cell(point.rmse_m, "{:.3g}"),
+            interval_cell(point.milliseconds, "{:.3g}"),
+            cell(point.flux_ms.value, "{:.3g}"),
+            cell(point.ns_per_pixel_bin, "{:.3g}"),
+            cell(point.peak_bytes / 1e6, "{:.3g}"),
         ],
     }
 
 
-def _share(found: Interval) -> list[object]:
-    percent = Interval(100 * found.value, 100 * found.low, 100 * found.high)
-    return _cell(percent, "{:.2f} %")
+def _percent(found: Interval) -> Interval:
+    return Interval(100 * found.value, 100 * found.low, 100 * found.high)
 
 
-def _cell(found: Interval, form: str) -> list[object]:
-    number = form.removesuffix(" %")
-    below = f"{number.format(found.low)} to {number.format(found.high)}"
-    return [form.format(found.value), found.value, below]
-
-
-def told(point: Point) -> str:
-    """What a point's tip says below its name."""
+def tip(point: Point) -> str:
+    """Return the second line of a point's tip."""
     ms, rd = point.milliseconds, point.rd()
     return (
         f"{ms.value:.3g} ms ({ms.low:.3g} to {ms.high:.3g}), {100 * rd.value:.2f} % within 3 bins "
@@ -113,43 +103,64 @@ def told(point: Point) -> str:
 
 
 def subject(point: Point, is_present: bool) -> str:
-    """What was measured, and whether that is what the other pages show."""
+    """Return what was measured, and whether the other pages still show it."""
     rows, cols, bins = point.shape
-    light = "" if point.sbr is None else f", SBR {point.sbr:.3g}"
+    sbr = "" if point.sbr is None else f", SBR {point.sbr:.3g}"
     pulses = "" if point.n_pulses is None else f", {point.n_pulses:,} pulses"
     note = f" ({point.note})" if point.note else ""
-    outdated = "" if is_present else " The other pages show another capture by now: compute again."
-    return f"{point.source}{note}, {rows} × {cols} × {bins}{light}{pulses}.{outdated}"
+    outdated = "" if is_present else " The capture has changed since: press Compute to repeat it."
+    return f"{point.source}{note}, {rows} × {cols} × {bins}{sbr}{pulses}.{outdated}"
 
 
 def advice(
     milliseconds: float, rd: float, best: Recommendation | None, cheapest: Recommendation | None
 ) -> tuple[str, str]:
-    """The answers to both questions."""
-    within, reaching = (
-        f"Best within {milliseconds:.3g} ms",
-        f"Cheapest that reaches {100 * rd:.3g} %",
-    )
+    """Return the most accurate configuration in time, and the fastest accurate one."""
     return (
-        _recommended(within, best, "keeps to the time"),
-        _recommended(reaching, cheapest, "reaches it"),
+        _recommended(f"Most accurate within {milliseconds:.3g} ms", best, "is fast enough"),
+        _recommended(f"Fastest with {100 * rd:.3g} % within 3 bins", cheapest, "reaches it"),
     )
 
 
-def _recommended(asked: str, found: Recommendation | None, keeps: str) -> str:
-    """What to choose, and how sure that is."""
+def _recommended(goal: str, found: Recommendation | None, keeps: str) -> str:
     if found is None:
-        return f"{asked}: none of these ways."
+        return f"{goal}: no configuration."
     point = found.point
     rd, ms = point.rd(), point.milliseconds
     sentence = (
-        f"{asked}: {name_of(point.candidate)}, right within 3 bins for {100 * rd.value:.1f} % in "
-        f"{ms.value:.3g} ms. With captures and times drawn anew it is chosen again in "
-        f"{100 * found.is_best:.0f} % of draws, and {keeps} in {100 * found.keeps:.0f} %."
+        f"{goal}: {name_of(point.candidate)}, {100 * rd.value:.1f} % within 3 bins in "
+        f"{ms.value:.3g} ms. In bootstrap samples of captures and times it is selected again in "
+        f"{100 * found.is_best:.0f} %, and {keeps} in {100 * found.keeps:.0f} %."
     )
     if found.runners_up:
         names = "; ".join(
             f"{name_of(other.candidate)} ({100 * share:.0f} %)" for other, share in found.runners_up
         )
-        sentence += f" Not told apart from it: {names}."
+        sentence += f" Not significantly worse: {names}."
     return sentence
+
+
+# Acquisition
+
+ACQUISITION = """
+Number of pulses, flux and length of the gate that reach a restoration degree: from theory, with
+known signal and background; and from simulation, for the likelihood with known and with estimated
+fluxes. Bands: 95 % intervals.
+"""
+NOT_SIMULATED = "Press Compute to simulate 25 acquisitions of this scene: about half a minute."
+
+# Sensitivity
+
+SENSITIVITY = """
+Each setting of a method is swept with all others at their defaults, for depths uniform over the
+gate, at the lowest SBR at which the method finds nine of ten pixels. A value is safe where it loses
+at most a tenth of the pixels against the best value. Vertical lines mark the zones that sliders
+show as doubtful.
+"""
+METHOD_HELP = "Method whose settings are swept; methods without numeric settings are not listed."
+SENSITIVITY_TABLE = "Ranges in which settings are safe, degrade and fail"
+
+
+def not_swept(spec: Number) -> str:
+    """Return the placeholder of a plot."""
+    return f"{spec.symbol} has not been swept yet."

@@ -1,10 +1,10 @@
 """Changes to Panel and Bokeh, one file each.
 
 A patch is a module with a function ``apply``, or a script that runs in the browser once Bokeh is
-loaded. Each file states what the library does, the upstream issue, and what the patch gains. A
-patch is left out, with a line in the log, where a library is of another version than the patch was
-read against, and by name in the environment variable ``FIRSTPHOTON_PATCHES_OFF``. The app works
-without any of them.
+loaded. Each file states what the library does, the upstream issue, and its gain or the error that
+it fixes. ``python -m tests.patches`` measures gains by switching off one patch at a time. A patch
+is left out, with a line in the log, with another version of a library than it was read against, and
+by name in the environment variable ``FIRSTPHOTON_PATCHES_OFF``. The app works without any of them.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ class Patch:
     """A file of this folder."""
 
     name: str
-    """Of the file, without ``.py`` or ``.js``."""
+    """Name of the file, without ``.py`` or ``.js``."""
     versions: Mapping[str, str]
-    """Version of each library that it was read against, as far as it matters."""
+    """Version of each patched library that it was read against."""
 
     @property
     def mismatch(self) -> str | None:
         """The first library of another version; None if all match."""
-        for library, wanted in self.versions.items():
+        for library, expected in self.versions.items():
             found = version(library)
-            if found != wanted and not found.startswith(f"{wanted}."):
-                return f"{library} {found} instead of {wanted}"
+            if found != expected and not found.startswith(f"{expected}."):
+                return f"{library} {found} instead of {expected}"
         return None
 
 
@@ -56,7 +56,7 @@ PATCHES = (
     Patch("default_values", _BOKEH),
     Patch("early_changes", _BOKEH | _PANEL),
     Patch("freed_memory", _PANEL),
-    Patch("incoming_messages", _BOKEH),
+    Patch("removed_models", _BOKEH),
     Patch("outgoing_messages", _BOKEH),
     Patch("whole_messages", _BOKEH),
     # In the browser
@@ -75,7 +75,7 @@ PATCHES = (
 
 
 def in_use(patches: tuple[Patch, ...] = PATCHES) -> Iterator[Patch]:
-    """Return the patches that are neither switched off nor for other versions.
+    """Return the patches that are neither switched off nor made for other versions.
 
     Raises
     ------

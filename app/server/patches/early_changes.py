@@ -2,7 +2,7 @@
 
 Panel regards a page as disconnected until the browser reports that it has drawn it, and drops what
 changes between then and the moment at which the browser pulled the document. Upstream: none found.
-Gain: no lost changes; a link to a region used to show "Computing ..." for ever.
+Fixes lost changes: a link to a region would show "Computing …" for ever.
 """
 
 from __future__ import annotations

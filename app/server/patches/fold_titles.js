@@ -1,7 +1,7 @@
 // Name the button that folds a card after the card, and fold by the title, too.
 //
 // Panel names the button of every card "show more", and its title does nothing. Upstream: none found.
-// Gain: screen readers announce which part is folded.
+// Fixes: screen readers do not announce which part is folded.
 {
   const view = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype.default_view.prototype;
   const { after_rendered: rendered } = view;

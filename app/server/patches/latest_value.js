@@ -2,7 +2,8 @@
 //
 // A slider changes sixty times a second, whether or not the server has handled the last value, and
 // Bokeh sends every value. Upstream: https://github.com/bokeh/bokeh/issues/5985 and
-// https://github.com/bokeh/bokeh/issues/4540.
+// https://github.com/bokeh/bokeh/issues/4540. Gain: of 200 values set at once, 2 are sent and computed
+// instead of 200 (`tests.test_browser`).
 {
   // Longest time to wait for an answer.
   const LONGEST_PAUSE_MS = 250;
@@ -32,7 +33,7 @@
     for (const each of (event.events ?? [event]).filter((each) => each.sync)) {
       // Each change of theme adds a style to a toolbar, which the server does not need.
       if (each.model?.type === "Toolbar") continue;
-      // A click may depend on values that were set before it: send all of them, in order.
+      // A click may depend on values set before it: send all of them, in order.
       isUrgent ||= each.kind !== "ModelChanged";
       const what = each.kind === "ModelChanged" ? `${each.model.id} ${each.attr}` : each;
       this.waiting.delete(what);

@@ -2,7 +2,7 @@
 //
 // A browser may empty all canvases, as when a laptop wakes up, those of images and colour bars
 // included, and restores them one after the other. Bokeh does not repaint. Upstream: none found.
-// Gain: plots are not left empty.
+// Fixes empty plots.
 {
   // Time within which a browser that restores one canvas has restored all.
   const RESTORED_MS = 200;

@@ -1,7 +1,7 @@
 // Open a page in a narrow window with the sidebar closed.
 //
 // Panel's template opens its sidebar on top of the page, which it covers until everything is drawn.
-// Upstream: none found. Gain: the page is visible at once on a phone.
+// Upstream: none found. Fixes: the page is covered on a phone.
 {
   // Width below which the sidebar covers the page.
   const NARROW_PX = 900;

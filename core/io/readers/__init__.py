@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from core.acquisition import Pulse
 from core.capture import Capture, CaptureError
 from core.checks import refusing, require, shown
-from core.io.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820, zarr
+from core.io.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820
 from core.io.readers.content import Reader, decompressed, is_gzip, reader_of, suffixes_of
 from core.io.readers.guards import MAX_CUBE_BYTES, FileVersion
 from core.io.readers.options import ReadOptions, reading_options
+from core.io.readers.stored import ZARR_MARKS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -42,7 +43,7 @@ READERS: tuple[Reader, ...] = (
     Reader("NumPy archive, this project's own layout", (".npz",), npz.read, npz.recognizes),
     Reader("NumPy array: counts or raw frames", (".npy",), npy.read, npy.recognizes),
     Reader("HDF5 or netCDF", (".h5", ".hdf5", ".nc"), *_LABELLED),
-    Reader("Zarr folder", (".zarr",), *_LABELLED, folder_marks=zarr.MARKS),
+    Reader("Zarr folder", (".zarr",), *_LABELLED, folder_marks=ZARR_MARKS),
     Reader("MATLAB", (".mat",), matlab.read, matlab.recognizes),
     Reader("Princeton Lightwave camera frames", (".bin",), gmapd.read),
     Reader("PicoQuant image", (".ptu",), ptu.read, ptu.recognizes),

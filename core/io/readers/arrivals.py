@@ -1,27 +1,27 @@
-"""Photon arrival times to a histogram cube, with a guess at whatever is not given.
+"""Histogram cubes from photon arrival times; settings that are not given are guessed.
 
-The time unit. Whole numbers, the largest above 100,000: picoseconds. Fractions, all below 0.001:
-seconds. Other whole numbers: bins of the instrument, 8 ps as in published captures. Other fractions
-are refused, since microseconds and nanoseconds cannot be distinguished.
+Time unit. Whole numbers of which the largest exceeds 100,000 are picoseconds; other whole numbers
+are bins of the instrument, 8 ps as in published captures. Fractions below 0.001 are seconds. Other
+fractions are refused, since microseconds and nanoseconds cannot be distinguished.
 
-The bin width. 1 ns (the nearest multiple of the unit) if that gives 100 to 65,536 bins from the
-gate's opening to the last photon; else the smallest power-of-two multiple of the unit that gives at
-most 1024 bins for a shorter gate, at most 65,536 for a longer one. Where ``n_bins`` is given both
-must fit in it. A multiple of the unit, because any other width would hold more units in one bin
-than in the next. Times that are fractions have 1 ps for a unit here.
+Bin width. 1 ns (the nearest multiple of the unit) if that gives 100 to 65,536 bins from the opening
+of the gate to the last photon. Otherwise the smallest power-of-two multiple of the unit that gives
+at most 1024 bins for a shorter gate, at most 65,536 for a longer one. Both must fit in ``n_bins``
+where it is given. The width is a multiple of the unit, since otherwise some bins would hold more
+units than others; for fractions the unit is 1 ps here.
 
-The gate. From the first photon, rounded down to a multiple of the bin width, to the last. All
-photons count, however far from the others, as long as the gate has no more than 65,536 bins of
-1 ns, 10 km (of ``bin_width_s`` where that is longer; ``n_bins`` where that is more). If it would
-have more, the stretch of that length with the most photons is found. The gate covers only this
-stretch if it holds at least nine in ten of all photons; the others are dropped, and the source
-gives their number. Otherwise the gate covers all photons, in wider bins.
+Gate. From the first photon, rounded down to a multiple of the bin width, to the last. All photons
+count as long as the gate has at most 65,536 bins of 1 ns, 10 km (of ``bin_width_s`` where that is
+longer; ``n_bins`` where that is more). For a longer gate, the stretch of that length with the most
+photons is found. If it holds at least nine tenths of all photons, the gate covers only this
+stretch, and the source gives the number of dropped photons. Otherwise the gate covers all photons,
+in wider bins.
 
-The pulse. A Gaussian as wide as `core.io.readers.pulse_guess` finds the echoes, or of one bin
-width. The number of pulses stays unknown.
+Pulse. A Gaussian of the width that `core.io.readers.pulse_guess` estimates, or of one bin. The
+number of pulses stays unknown.
 
-A common-stop instrument's times count backwards from ``stop_s``; a time in whole units stands for
-all of its unit, so the last one before the stop becomes the first after the pulse.
+Times of a common-stop instrument count backwards from ``stop_s``. A time in whole units covers all
+of its unit, so the last one before the stop becomes the first after the pulse.
 """
 
 from __future__ import annotations
@@ -32,15 +32,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.acquisition import LONGEST_S, MOST_BINS, Acquisition, Floats
+from core.acquisition import LONGEST_S, MOST_BINS, Floats
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import count_dtype, guess_detection
+from core.io.readers.dense import capture_of, count_dtype, description_of
 from core.io.readers.guards import require_fits
 from core.io.readers.options import ReadOptions
-from core.io.readers.pulse_guess import guessed_pulse
 from core.io.readers.times import time_text
-from core.io.readers.wording import guesses, sentence
 
 NATIVE_BIN_S = 8e-12
 PICOSECONDS_ABOVE = 100_000
@@ -63,7 +61,7 @@ def arrivals_capture(
     origin: str,
     request: ReadOptions,
 ) -> Capture:
-    """A capture from the arrival time of each photon.
+    """Return a capture from the arrival time of each photon.
 
     Parameters
     ----------
@@ -91,10 +89,12 @@ def arrivals_capture(
         pixel, shape = col * shape[0] + row, (shape[1], shape[0])
     times = times.astype(np.float64)
     whole = bool(np.all(times == np.floor(times)))
-    unit_s = request.time_unit_s or guess_time_unit(times, whole, name)
+    unit_s = request.time_unit_s or _guess_time_unit(times, whole, name)
     tick_s = unit_s if whole else 1e-12
     ticks = times if whole else _snapped(times * (unit_s / tick_s))
-    _require_countable(float(ticks.max()), tick_s, name)
+    last = float(ticks.max())
+    below = f"times below {_LARGEST_TICK * tick_s:.3g} s, or another time_unit_s"
+    require(f"largest time of {name}", last * tick_s, last < _LARGEST_TICK, below)
     if request.stop_s is not None:
         ticks = _from_stop(ticks, float(_snapped(request.stop_s / tick_s)), whole, tick_s)
 
@@ -106,24 +106,50 @@ def arrivals_capture(
     require(f"gate of {name}", time_text(gate_s), gate_s <= LONGEST_S, closer)
     bins = np.floor((ticks - opening) / per_bin)
     inside = (bins >= 0) & (bins < n_bins)
-    _require_some_inside(inside, ticks * tick_s, name)
-    acquisition = Acquisition(
-        n_bins=n_bins,
-        bin_width_s=request.bin_width_s or per_bin * tick_s,
-        gate_delay_s=opening * tick_s if request.gate_delay_s is None else request.gate_delay_s,
-        n_pulses=request.n_pulses,
-        pixel_angle_rad=request.pixel_angle_rad,
-    )
+    n_dropped = inside.size - int(np.count_nonzero(inside))
+    found = " to ".join(time_text(time * tick_s) for time in (ticks.min(), ticks.max()))
+    remedy = "a gate_delay_s, n_bins, bin_width_s and time_unit_s that take in some of them"
+    require(name, f"photons from {found}", n_dropped < inside.size, remedy)
     cube = _cube(bins[inside].astype(np.int64), pixel[inside], shape, n_bins, name)
-    pulse = request.pulse or guessed_pulse(cube, acquisition.bin_width_s)
-    detection = request.detection or guess_detection(cube, request.n_pulses)
-    guessed = guesses(request, acquisition, pulse, detection, unit_s)
-    source = sentence(origin, guessed, _dropped(inside))
-    return Capture(cube, acquisition, pulse, source=source, detection=detection)
+    dropped = f"dropped: {n_dropped:,} of {inside.size:,} photons, outside the gate"
+    known = description_of(
+        request,
+        n_bins,
+        lambda: cube,
+        origin,
+        time_unit_s=unit_s,
+        bin_width_s=per_bin * tick_s,
+        gate_delay_s=opening * tick_s,
+        remark=dropped if n_dropped else "",
+    )
+    return capture_of(cube, known)
 
 
-def guess_time_unit(times: Floats, whole: bool, name: str) -> float:
-    """The unit of arrival times in seconds, by the rules above."""
+def _require_times(
+    times: NDArray[Any], pixel: NDArray[np.int64], shape: tuple[int, int], name: str
+) -> None:
+    kind = times.dtype
+    require(f"type of {name}", str(kind), kind.kind in "biuf", "real numbers")
+    require(f"photons of {name}", times.size, times.size > 0, "at least one photon")
+    require_fits(f"{times.size:,} photons", times.size * BYTES_A_PHOTON)
+    odd = np.flatnonzero(~((times >= 0) & (times < np.inf)))
+    if odd.size:
+        row, col = divmod(int(pixel[odd[0]]), shape[1])
+        value = times[odd[0]].item()
+        require(f"{name} in pixel ({row}, {col})", value, False, "arrival times, 0 or more")
+
+
+def _rank(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how many photons of the same pixel come before each, in the order of the file."""
+    order = np.argsort(pixel, kind="stable")
+    _, begin, n_photons = np.unique(pixel[order], return_index=True, return_counts=True)
+    rank = np.empty(pixel.size, np.int64)
+    rank[order] = np.arange(pixel.size) - np.repeat(begin, n_photons)
+    return rank
+
+
+def _guess_time_unit(times: Floats, whole: bool, name: str) -> float:
+    """Return the unit of arrival times in seconds, by the rules above."""
     if whole:
         return 1e-12 if times.max() > PICOSECONDS_ABOVE else NATIVE_BIN_S
     fraction = float(times[times != np.floor(times)].max())
@@ -132,63 +158,50 @@ def guess_time_unit(times: Floats, whole: bool, name: str) -> float:
     return 1.0
 
 
-def guess_ticks_per_bin(
-    first: float, last: float, delay: float | None, tick_s: float, n_bins: int | None
-) -> int:
-    """The bin width in ticks, by the rules above.
-
-    Parameters
-    ----------
-    first, last : float
-        Earliest and latest photon, in ticks.
-    delay : float or None
-        Where the gate opens, in ticks, if given.
-    tick_s : float
-        The finest step of the times, in seconds.
-    n_bins : int or None
-        Bins to fit in, where given.
-    """
-
-    def bins_of(per_bin: int) -> int:
-        return floor((last - _opening(first, per_bin, delay)) / per_bin) + 1
-
-    nanosecond = _nanosecond(tick_s)
-    in_nanoseconds = bins_of(nanosecond)
-    is_long = in_nanoseconds >= FEWEST_BINS_OF_1_NS
-    most = n_bins or (MOST_BINS_OF_1_NS if is_long else MOST_SHORT_BINS)
-    if is_long and in_nanoseconds <= most:
-        return nanosecond
-    per_bin = 1
-    while bins_of(per_bin) > most:
-        per_bin *= 2
-    return per_bin
+def _from_stop(ticks: Floats, stop: float, whole: bool, tick_s: float) -> Floats:
+    """Return times after the pulse, in ticks, from times before a stop that comes `stop` after."""
+    after = stop - ticks - (1.0 if whole else 0.0)
+    least = f"the stop's time after the pulse, at least the largest time, {ticks.max() * tick_s} s"
+    require("stop_s", stop * tick_s, bool(after.min() >= 0), least)
+    return np.asarray(after)
 
 
 def _gate(ticks: Floats, tick_s: float, request: ReadOptions) -> tuple[float, float, int]:
-    """Width of a bin and opening of the gate, both in ticks, and the number of bins."""
-    delay_s, width_s = request.gate_delay_s, request.bin_width_s
+    """Return the width of a bin and the opening of the gate in ticks, and the number of bins."""
+    delay_s, width_s, n_bins = request.gate_delay_s, request.bin_width_s, request.n_bins
     delay = None if delay_s is None else float(_snapped(delay_s / tick_s))
     width = None if width_s is None else float(_snapped(width_s / tick_s))
     wider = f"a width that is not far below the unit of the times, {time_text(tick_s)}"
     require("bin_width_s", width_s, width is None or width > 0, wider)
-    longest = max(MOST_BINS_OF_1_NS, request.n_bins or 0) * max(_nanosecond(tick_s), width or 0)
+    nanosecond = max(1, round(1e-9 / tick_s))
+    longest = max(MOST_BINS_OF_1_NS, n_bins or 0) * max(nanosecond, width or 0)
     first, last = _bulk(ticks, delay, longest)
-    per_bin = (
-        guess_ticks_per_bin(first, last, delay, tick_s, request.n_bins) if width is None else width
-    )
-    opening = _opening(first, per_bin, delay)
-    return per_bin, opening, request.n_bins or max(1, floor((last - opening) / per_bin) + 1)
+
+    def opening(per_bin: float) -> float:
+        return floor(first / per_bin) * per_bin if delay is None else delay
+
+    def bins_of(per_bin: float) -> int:
+        return floor((last - opening(per_bin)) / per_bin) + 1
+
+    per_bin = width
+    if per_bin is None:  # guessed by the rules above
+        is_long = bins_of(nanosecond) >= FEWEST_BINS_OF_1_NS
+        most = n_bins or (MOST_BINS_OF_1_NS if is_long else MOST_SHORT_BINS)
+        per_bin = nanosecond if is_long and bins_of(nanosecond) <= most else 1
+        while bins_of(per_bin) > most:
+            per_bin *= 2
+    return per_bin, opening(per_bin), n_bins or max(1, bins_of(per_bin))
 
 
 def _bulk(ticks: Floats, delay: float | None, longest: float) -> tuple[float, float]:
-    """First and last photon of the gate, without strays where they would make it too long.
+    """Return first and last photon of the gate, without strays that would make it too long.
 
     Parameters
     ----------
     ticks : ndarray, shape (photon,)
         Arrival times.
     delay : float or None
-        Where the gate opens, if given: earlier photons are left out.
+        Opening of the gate, if given: earlier photons are left out.
     longest : float
         Length of a gate that takes all photons, however far apart, in ticks.
     """
@@ -207,70 +220,8 @@ def _bulk(ticks: Floats, delay: float | None, longest: float) -> tuple[float, fl
     return float(ordered[begin]), float(ordered[end - 1])
 
 
-def _nanosecond(tick_s: float) -> int:
-    """The whole number of ticks nearest to 1 ns, at least one."""
-    return max(1, round(1e-9 / tick_s))
-
-
-def _rank(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How many photons of the same pixel come before each, in the order of the file."""
-    order = np.argsort(pixel, kind="stable")
-    _, begin, n_photons = np.unique(pixel[order], return_index=True, return_counts=True)
-    rank = np.empty(pixel.size, np.int64)
-    rank[order] = np.arange(pixel.size) - np.repeat(begin, n_photons)
-    return rank
-
-
-def _from_stop(ticks: Floats, stop: float, whole: bool, tick_s: float) -> Floats:
-    """Times after the pulse, in ticks, from times before a stop that comes `stop` after it."""
-    after = stop - ticks - (1.0 if whole else 0.0)
-    least = f"the stop's time after the pulse, at least the largest time, {ticks.max() * tick_s} s"
-    require("stop_s", stop * tick_s, bool(after.min() >= 0), least)
-    return np.asarray(after)
-
-
-def _opening(first: float, per_bin: float, delay: float | None) -> float:
-    """Where the gate opens, in ticks: the `delay` given, or just before the first photon."""
-    return floor(first / per_bin) * per_bin if delay is None else delay
-
-
-def _require_times(
-    times: NDArray[Any], pixel: NDArray[np.int64], shape: tuple[int, int], name: str
-) -> None:
-    kind = times.dtype
-    require(f"type of {name}", str(kind), kind.kind in "biuf", "real numbers")
-    require(f"photons of {name}", times.size, times.size > 0, "at least one photon")
-    require_fits(f"{times.size:,} photons", times.size * BYTES_A_PHOTON)
-    odd = np.flatnonzero(~((times >= 0) & (times < np.inf)))
-    if odd.size:
-        row, col = divmod(int(pixel[odd[0]]), shape[1])
-        value = times[odd[0]].item()
-        require(f"{name} in pixel ({row}, {col})", value, False, "arrival times, 0 or more")
-
-
-def _require_countable(last: float, tick_s: float, name: str) -> None:
-    require(
-        f"largest time of {name}",
-        last * tick_s,
-        last < _LARGEST_TICK,
-        f"times below {_LARGEST_TICK * tick_s:.3g} s, or another time_unit_s",
-    )
-
-
-def _require_some_inside(inside: NDArray[np.bool_], times_s: Floats, name: str) -> None:
-    found = f"photons from {time_text(times_s.min())} to {time_text(times_s.max())}"
-    remedy = "a gate_delay_s, n_bins, bin_width_s and time_unit_s that take in some of them"
-    require(name, found, bool(inside.any()), remedy)
-
-
-def _dropped(inside: NDArray[np.bool_]) -> str:
-    """A remark on the photons outside the gate; empty if there are none."""
-    n_dropped = inside.size - int(np.count_nonzero(inside))
-    return f"dropped: {n_dropped:,} of {inside.size:,} photons, outside the gate" * (n_dropped > 0)
-
-
 def _snapped(ticks: ArrayLike) -> Floats:
-    """`ticks`, or where a quotient of floats missed a whole number by rounding, that number."""
+    """Return `ticks`; where a quotient of floats missed a whole number by rounding, that number."""
     nearest = np.rint(ticks)
     is_near = np.abs(np.subtract(ticks, nearest)) <= 1e-9 * np.maximum(1.0, np.abs(ticks))
     return np.where(is_near, nearest, ticks)

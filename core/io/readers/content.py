@@ -1,4 +1,4 @@
-"""The reader for a file, chosen by its content; the suffix decides where several or none fit."""
+"""Choice of the reader by the content of a file; the suffix decides where several or none fit."""
 
 from __future__ import annotations
 
@@ -23,20 +23,6 @@ GZIP = ".gz"
 _GZIP_MAGIC = b"\x1f\x8b"
 _START_BYTES = 2**13  # the largest user block before an HDF5 signature that is recognized
 _PIECE_BYTES = 2**18
-
-_OTHER_CONTENT = {
-    b"\x89PNG": "a PNG picture",
-    b"\xff\xd8\xff": "a JPEG picture",
-    b"II*\0": "a TIFF picture",
-    b"MM\0*": "a TIFF picture",
-    b"LASF": "a LAS point cloud",
-    b"ply": "a PLY point cloud",
-    b"glTF": "a glTF scene",
-    b"%PDF": "a PDF document",
-    b"BZh": "a bzip2 archive",
-    b"\xfd7zXZ\0": "an xz archive",
-    b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive",
-}
 
 
 def never(_: bytes) -> bool:
@@ -89,21 +75,14 @@ def reader_of(path: Path, readers: Sequence[Reader]) -> Reader:
         for reader in possible
         if reader.recognizes(start) or any((path / name).exists() for name in reader.folder_marks)
     ]
-    for reader in of_suffix:
-        if reader in fitting:
-            return reader
     if fitting:
-        return fitting[0]
-    found = _description(start)
-    known = ", ".join(suffixes_of(readers))
+        return next((reader for reader in of_suffix if reader in fitting), fitting[0])
     if of_suffix:
-        other = found in _OTHER_CONTENT.values()
-        require("content", found, not other, f"a capture: {known}")
         return of_suffix[0]
     require("path", str(path), not is_folder, "an existing file, or a Zarr folder")
     raise ValueError(
-        f"suffix = {path.suffix!r} is not accepted, and the content looks like {found}: "
-        f"give one of {known}."
+        f"suffix = {path.suffix!r} is not accepted, and the content looks like "
+        f"{_description(start)}: give one of {', '.join(suffixes_of(readers))}."
     )
 
 
@@ -114,7 +93,7 @@ def suffixes_of(readers: Sequence[Reader]) -> dict[str, str]:
 
 
 def is_gzip(path: Path) -> bool:
-    """Whether a file is compressed by gzip, whatever its name."""
+    """Return whether a file is compressed by gzip, regardless of its name."""
     return path.is_file() and _start(path).startswith(_GZIP_MAGIC)
 
 
@@ -132,16 +111,13 @@ def decompressed(path: Path) -> Iterator[Path]:
         return
     with TemporaryDirectory(prefix="firstphoton-") as folder:
         content = Path(folder) / (path.stem if path.suffix.lower() == GZIP else path.name)
-        n_bytes = 0
         with gzip.open(path) as packed, content.open("wb") as target:
-            while True:
+            piece = b"start"
+            while piece:
                 with decoding("the gzip file"):
                     piece = packed.read(_PIECE_BYTES)
-                if not piece:
-                    break
-                n_bytes += len(piece)
-                require_fits("the decompressed file", n_bytes)
                 target.write(piece)
+                require_fits("the decompressed file", target.tell())
         yield content
 
 
@@ -151,14 +127,10 @@ def _start(path: Path) -> bytes:
 
 
 def _description(start: bytes) -> str:
-    """Name the content of a file that no reader recognizes."""
-    for magic, name in _OTHER_CONTENT.items():
-        if start.startswith(magic):
-            return name
+    """Describe the content of a file that no reader recognizes."""
     if not start:
         return "an empty file"
     try:
-        text = start.decode()
+        return "text" if "\0" not in start.decode() else "binary data of an unknown format"
     except UnicodeDecodeError:
         return "binary data of an unknown format"
-    return "text" if "\0" not in text else "binary data of an unknown format"

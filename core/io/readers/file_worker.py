@@ -1,7 +1,7 @@
-"""Read files with the libraries of their formats, in a process of limited memory and time.
+"""Decode files with the libraries of their formats, in a process of limited memory and time.
 
 `core.io.readers.isolation` starts this script. The libraries are not robust to malformed files:
-some keep them busy forever, others crash them. The script imports nothing of the package.
+some files keep them busy forever, others crash them. The script imports nothing of the package.
 
 Each line of the standard input is a JSON object: ``task``, its arguments, and the ``memory_bytes``
 and ``seconds`` that it may take. Each reply is a line of JSON followed by the bytes of its arrays.
@@ -27,38 +27,53 @@ import numpy as np
 MOST_LINKS = 10_000
 MOST_DEPTH = 10
 MOST_IN_ATTRIBUTE = 2**20
+MOST_METADATA_BYTES = 2**24
 MOST_REPLY_CHARACTERS = 2**24
 IDLE_SECONDS = 60
-_OF_NETCDF = ("CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_NCProperties")
+_NETCDF_ATTRIBUTES = ("CLASS", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_NCProperties")
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
+_ZARR_MARKS = ("zarr.json", ".zarray", ".zgroup")
 _ZARR_CODECS = {"zlib", "gzip", "zstd", "blosc", "shuffle", "fletcher32", "crc32c", "delta", "lz4"}
-
-
-class Refused(ValueError):
-    """The file holds no capture; the message is a sentence."""
-
+_DEPTH_MODES = ("I;16", "I;16L", "I;16B", "I;16N", "F")
 
 Reply = tuple[dict[str, Any], list[Any]]
 """A description in JSON, and arrays."""
 
 
-def list_hdf5(path: str) -> Reply:
-    """Describe all arrays of a file: name, shape, type, chunk, axes and attributes."""
-    import h5py  # noqa: PLC0415
+class Refused(ValueError):
+    """Refusal of a file; the message is a sentence for the user."""
 
-    arrays: list[dict[str, Any]] = []
-    with _open_hdf5(path) as file:
-        groups = {"": _attributes(file)}
-        for name, found in _walk(file):
-            if isinstance(found, str):
-                arrays.append({"name": name, "refused": found})
-            elif isinstance(found, h5py.Group):
-                groups[name] = _attributes(found)
-            else:
-                known = _attributes(found)
-                if not str(known.get("NAME", "")).startswith(_NO_VARIABLE):
-                    arrays.append({"name": name, "attributes": known, **_described(found)})
-    return {"arrays": arrays, "groups": groups}, []
+
+def require(name: str, value: object, accepted: bool, what: str) -> None:
+    """Refuse a value with the message of `core.checks.require`."""
+    if not accepted:
+        raise Refused(f"{name} = {value!r} is not accepted: give {what}.")
+
+
+def _require_numbers(dtype: np.dtype[Any]) -> None:
+    if dtype.kind not in "iuf" or dtype.itemsize > 8:
+        raise ValueError("no numbers")
+
+
+def _plain(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Keep the attributes that are numbers, lists of numbers, or text."""
+    found: dict[str, Any] = {}
+    for name, value in attributes.items():
+        if isinstance(value, bytes):
+            found[name] = value.decode("utf-8", "replace")
+        elif isinstance(value, str):
+            found[name] = value
+        elif not isinstance(value, bool | dict) and np.asarray(value).dtype.kind in "iuf":
+            array = np.asarray(value)
+            found[name] = array.item() if array.size == 1 else array.ravel().tolist()
+    return found
+
+
+def _slices(box: list[list[int]]) -> tuple[slice, ...]:
+    return tuple(slice(*edges) for edges in box)
+
+
+# -- HDF5, netCDF-4 and MATLAB 7.3 -----------------------------------------------------------------
 
 
 def _open_hdf5(path: str) -> Any:
@@ -67,33 +82,50 @@ def _open_hdf5(path: str) -> Any:
     return h5py.File(path, "r", locking=False)
 
 
-def _walk(group: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the name of each object in a group, and the object or why it is refused."""
+def list_hdf5(path: str) -> Reply:
+    """Describe all arrays of a file: name, shape, type, chunk, axes and attributes."""
     import h5py  # noqa: PLC0415
 
-    waiting, seen = [(group, "")], 0
-    while waiting:
-        group, prefix = waiting.pop(0)
+    arrays: list[dict[str, Any]] = []
+    with _open_hdf5(path) as file:
+        groups = {"": _hdf5_attributes(file)}
+        for name, found in _walk_hdf5(file):
+            if found is None:
+                arrays.append({"name": name, "refused": "a link"})
+            elif isinstance(found, h5py.Group):
+                groups[name] = _hdf5_attributes(found)
+            else:
+                known = _hdf5_attributes(found)
+                if not str(known.get("NAME", "")).startswith(_NO_VARIABLE):
+                    arrays.append({"name": name, "attributes": known, **_described_hdf5(found)})
+    return {"arrays": arrays, "groups": groups}, []
+
+
+def _walk_hdf5(group: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the name of each object in a group, and the object; None for a link, never followed."""
+    import h5py  # noqa: PLC0415
+
+    groups, n_links = [(group, "")], 0
+    while groups:
+        group, prefix = groups.pop(0)
         for key in group:
-            seen += 1
-            if seen > MOST_LINKS:
-                raise Refused(f"arrays of the file = more than {MOST_LINKS:,}: split the file.")
+            n_links += 1
+            most = f"up to {MOST_LINKS:,}: split the file"
+            require("arrays of the file", n_links, n_links <= MOST_LINKS, most)
             name = prefix + key.encode(errors="surrogateescape").decode("utf-8", "replace")
             if name.startswith("#"):  # the contents of MATLAB's cells
                 continue
-            link = group.get(key, getlink=True)
-            if not isinstance(link, h5py.HardLink):
-                external = isinstance(link, h5py.ExternalLink)
-                yield name, "an external link" if external else "a soft link"
+            if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+                yield name, None
                 continue
             found = group.get(key)
             if isinstance(found, h5py.Group) and name.count("/") < MOST_DEPTH:
-                waiting.append((found, name + "/"))
+                groups.append((found, name + "/"))
             if isinstance(found, h5py.Group | h5py.Dataset):
                 yield name, found
 
 
-def _described(array: Any) -> dict[str, Any]:
+def _described_hdf5(array: Any) -> dict[str, Any]:
     import h5py  # noqa: PLC0415
 
     try:
@@ -117,66 +149,42 @@ def _require_inside(array: Any) -> None:
 
     if not isinstance(array, h5d.DatasetID):
         raise ValueError("no array")
-    created = array.get_create_plist()
-    if created.get_layout() == h5d.VIRTUAL:
+    layout = array.get_create_plist().get_layout()
+    if layout == h5d.VIRTUAL:
         raise ValueError("a virtual array")
-    if created.get_layout() != h5d.CHUNKED and created.get_external_count():
+    if layout != h5d.CHUNKED and array.get_create_plist().get_external_count():
         raise ValueError("an array kept in other files")
 
 
-def _require_numbers(dtype: np.dtype[Any]) -> None:
-    if dtype.kind not in "iuf" or dtype.itemsize > 8:
-        raise ValueError("no numbers")
-
-
 def _axes(array: Any) -> list[str | None]:
-    """Names of the axes where scales or labels give any."""
+    """Return the names of the axes, from scales or labels."""
     if array.is_scale and array.ndim == 1:
-        return [_last(array.name)]
-    names = []
-    for axis in array.dims:
-        scale = axis[0].name if len(axis) else axis.label
-        names.append(_last(scale) or None)
-    return names
+        names = [array.name]
+    else:
+        names = [axis[0].name if len(axis) else axis.label for axis in array.dims]
+    return [(name or "").rpartition("/")[2] or None for name in names]
 
 
-def _last(name: str | None) -> str:
-    return (name or "").rpartition("/")[2]
-
-
-def _attributes(place: Any) -> dict[str, Any]:
-    """Attributes that are numbers or text; one that is too long becomes a text saying so."""
+def _hdf5_attributes(place: Any) -> dict[str, Any]:
+    """Return attributes that are numbers or text; one that is too long becomes a remark."""
     known: dict[str, Any] = {}
     for name in place.attrs:
         try:
             length = place.attrs.get_id(name).get_space().get_simple_extent_npoints()
             if length > MOST_IN_ATTRIBUTE:
                 known[name] = f"{length:,} values, more than {MOST_IN_ATTRIBUTE:,}"
-            elif name not in _OF_NETCDF or name == "NAME":
+            elif name not in _NETCDF_ATTRIBUTES:
                 known[name] = place.attrs[name]
         except (OSError, TypeError, ValueError):  # of a type that is neither number nor text
             continue
     return _plain(known)
 
 
-def _plain(known: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in known.items():
-        if isinstance(value, bytes):
-            found[name] = value.decode("utf-8", "replace")
-        elif isinstance(value, str):
-            found[name] = value
-        elif not isinstance(value, bool | dict) and np.asarray(value).dtype.kind in "iuf":
-            array = np.asarray(value)
-            found[name] = array.item() if array.size == 1 else array.ravel().tolist()
-    return found
-
-
 def read_hdf5(path: str, name: str, box: list[list[int]]) -> Reply:
     """Read the numbers in a box of an array."""
     with _open_hdf5(path) as file:
         _require_inside(file[name].id)
-        return {}, [file[name][tuple(slice(*edges) for edges in box)]]
+        return {}, [file[name][_slices(box)]]
 
 
 def read_cells(path: str, name: str, most_values: int) -> Reply:
@@ -188,23 +196,26 @@ def read_cells(path: str, name: str, most_values: int) -> Reply:
         array = h5o.open(file.id, name.encode())
         _require_inside(array)
         n_cells = array.get_space().get_simple_extent_npoints()
-        if not 0 < n_cells <= most_values:
-            raise Refused(f"cells of {name} = {n_cells:,}: give up to {most_values:,}.")
+        require(f"cells of {name}", n_cells, 0 < n_cells <= most_values, f"up to {most_values:,}")
         references = np.empty(array.shape, h5py.ref_dtype)
         array.read(h5py.h5s.ALL, h5py.h5s.ALL, references)
-        values, sizes, total = [], np.zeros(n_cells, np.int64), 0
+        values, n_left = [], most_values
         for k, reference in enumerate(references.ravel().tolist()):
             try:
-                vector = _vector(h5r.dereference(reference, file.id), most_values - total)
+                values.append(_vector(h5r.dereference(reference, file.id), n_left))
             except ValueError as error:
                 # MATLAB's first axis is HDF5's last.
                 place = tuple(int(n) for n in np.unravel_index(k, array.shape)[::-1])
                 raise Refused(f"{name} in pixel {place} = {error}") from error
-            sizes[k] = vector.size
-            total += vector.size
-            values.append(vector)
-        filled = [vector for vector in values if vector.size] or values[:1]
-        return {}, [np.concatenate(filled), sizes]
+            n_left -= values[-1].size
+    return {}, _joined(values)
+
+
+def _joined(vectors: list[Any]) -> list[Any]:
+    """Return the values of all cells one after the other, and the size of each cell."""
+    filled = [vector for vector in vectors if vector.size] or vectors[:1]
+    sizes = np.array([vector.size for vector in vectors], np.int64)
+    return [np.concatenate(filled, axis=None), sizes]
 
 
 def _vector(array: Any, most: int) -> Any:
@@ -227,14 +238,19 @@ def _vector(array: Any, most: int) -> Any:
     if n_values != max(shape, default=1):
         raise ValueError(f"array of shape {shape[::-1]} is not accepted: give a vector.")
     if n_values > most:
-        raise ValueError(f"{n_values:,} photons, too many with those before: give fewer.")
+        raise ValueError(
+            f"{n_values:,} photons is not accepted: give {most:,}, the rest of the limit."
+        )
     values = np.empty(n_values, dtype)
     if n_values:
         array.read(h5py.h5s.ALL, h5py.h5s.ALL, values.reshape(shape))
     return values
 
 
-def _open_zarr(path: str) -> Any:
+# -- Zarr ------------------------------------------------------------------------------------------
+
+
+def _open_zarr(folder: Path) -> Any:
     import zarr  # noqa: PLC0415
     from numcodecs import blosc, registry  # noqa: PLC0415
 
@@ -244,8 +260,8 @@ def _open_zarr(path: str) -> Any:
         del registry.codec_registry[name]
     blosc.Blosc.decode = _decode_blosc
     zarr.config.set({"threading.max_workers": 1, "async.concurrency": 2})
-    is_new = (Path(path) / "zarr.json").exists()
-    return zarr.open_array(path, mode="r", zarr_format=3 if is_new else 2)
+    is_new = (folder / "zarr.json").exists()
+    return zarr.open(folder, mode="r", zarr_format=3 if is_new else 2, use_consolidated=False)
 
 
 def _decode_blosc(_: Any, data: Any, out: Any = None) -> Any:
@@ -259,45 +275,78 @@ def _decode_blosc(_: Any, data: Any, out: Any = None) -> Any:
     return blosc.decompress(data, out)
 
 
-def list_zarr(path: str, described_folders: list[str]) -> Reply:
-    """Describe the arrays in some folders of a Zarr directory."""
-    arrays, groups = [], {}
-    for name in described_folders:
-        folder = Path(path) / name
-        try:
-            attributes = folder / ".zattrs"
-            if not (folder / "zarr.json").exists():
-                is_array = (folder / ".zarray").exists()
-                about = json.loads(attributes.read_bytes()) if attributes.exists() else {}
-                axes = about.get("_ARRAY_DIMENSIONS")
-            else:
-                metadata = json.loads((folder / "zarr.json").read_bytes())
-                is_array = metadata.get("node_type") == "array"
-                about = metadata.get("attributes") or {}
-                axes = metadata.get("dimension_names")
-            known = _plain(about)
-            if not is_array:
-                groups[name] = known
-                continue
-            one: dict[str, Any] = {"name": name or Path(path).name, "attributes": known}
-        except (ValueError, AttributeError, RecursionError) as error:
-            raise Refused(
-                f"metadata of {name!r} cannot be read ({error}): copy it again."
-            ) from error
-        try:
-            array = _open_zarr(str(folder))
-            _require_numbers(array.dtype)
-            known |= _missing(array, known)
-            named = isinstance(axes, list) and len(axes) == array.ndim
-            one["axes"] = (
-                [axis if isinstance(axis, str) else None for axis in axes if named] if axes else []
-            )
-            one |= {"shape": array.shape, "type": array.dtype.newbyteorder("=").str}
-            one["chunk"] = array.shards or array.chunks
-        except Exception as error:  # undocumented: any
-            one["refused"] = f"{type(error).__name__}: {str(error)[:500]}"
-        arrays.append(one)
+def list_zarr(path: str) -> Reply:
+    """Describe the arrays of a Zarr directory, with its folders and files that must not change."""
+    root, groups, n_bytes = Path(path), {}, 0
+    arrays: list[dict[str, Any]] = []
+
+    def version(place: Path) -> tuple[str, int, int]:
+        status = place.stat()
+        return place.relative_to(root).as_posix(), status.st_size, status.st_mtime_ns
+
+    for folder, files in _walk_zarr(root):
+        described = [folder / name for name in _ZARR_MARKS if name in files]
+        inside = folder.relative_to(root).as_posix().removeprefix(".")
+        if not described:
+            if arrays and folder.is_relative_to(root / arrays[-1]["folders"][0][0]):
+                arrays[-1]["folders"].append(version(folder))
+            continue
+        metadata = [folder / name for name in (*_ZARR_MARKS, ".zattrs") if name in files]
+        n_bytes += sum(file.stat().st_size for file in metadata)
+        most = f"up to {MOST_METADATA_BYTES:,}"
+        require("bytes of metadata", n_bytes, n_bytes <= MOST_METADATA_BYTES, most)
+        mixed = "zarr.json" in files and bool(files & {".zarray", ".zgroup"})
+        require(f"metadata of {inside or root.name}", "versions 2 and 3", not mixed, "one of them")
+        place = {"version": version(described[0]), "folders": [version(folder)]}
+        one = _described_zarr(folder)
+        if "group" in one:
+            groups[inside] = one["group"]
+        else:
+            arrays.append({"name": inside or root.name, **place, **one})
+    require("arrays", 0, bool(arrays), "a directory that holds some, of Zarr version 2 or 3")
     return {"arrays": arrays, "groups": groups}, []
+
+
+def _walk_zarr(root: Path) -> Iterator[tuple[Path, set[str]]]:
+    """Yield every directory, depth first, with the names of its files; refuse links and pipes."""
+    folders = [root]
+    while folders:
+        folder = folders.pop()
+        files = set()
+        with os.scandir(folder) as entries:
+            for entry in sorted(entries, key=lambda entry: entry.name, reverse=True):
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(folder / entry.name)
+                    continue
+                inside = Path(entry.path).relative_to(root).as_posix()
+                plain = entry.is_file(follow_symlinks=False)
+                require("a file of the directory", inside, plain, "plain files, no links")
+                files.add(entry.name)
+        yield folder, files
+
+
+def _described_zarr(folder: Path) -> dict[str, Any]:
+    """Describe the array in a folder, or give the attributes of a group."""
+    known: dict[str, Any] = {}
+    try:
+        found = _open_zarr(folder)
+        known = _plain(found.attrs.asdict())
+        if not hasattr(found, "shape"):
+            return {"group": known}
+        _require_numbers(found.dtype)
+        known |= _missing(found, known)
+        is_old = found.metadata.zarr_format == 2
+        axes = found.attrs.get("_ARRAY_DIMENSIONS") if is_old else found.metadata.dimension_names
+        named = isinstance(axes, list | tuple) and len(axes) == found.ndim
+        return {
+            "attributes": known,
+            "axes": [axis if isinstance(axis, str) and named else None for axis in axes or ()],
+            "shape": found.shape,
+            "type": found.dtype.newbyteorder("=").str,
+            "chunk": found.shards or found.chunks,
+        }
+    except Exception as error:  # undocumented: any
+        return {"attributes": known, "refused": f"{type(error).__name__}: {str(error)[:500]}"}
 
 
 def _missing(array: Any, known: dict[str, Any]) -> dict[str, float]:
@@ -316,10 +365,10 @@ def _missing(array: Any, known: dict[str, Any]) -> dict[str, float]:
 
 
 def read_zarr(path: str, name: str, box: list[list[int]]) -> Reply:
-    """Read the numbers in a box of the array in a folder; tell whether a chunk is absent."""
+    """Read the numbers in a box of the array in a folder, and whether a chunk is absent."""
     folder = Path(path) / name if (Path(path) / name).is_dir() else Path(path)
-    array = _open_zarr(str(folder))
-    found = np.asarray(array[tuple(slice(*edges) for edges in box)])
+    array = _open_zarr(folder)
+    found = np.asarray(array[_slices(box)])
     steps = array.shards or array.chunks
     touched = (
         sorted({k // step for k in range(*edges)}) for edges, step in zip(box, steps, strict=True)
@@ -329,6 +378,9 @@ def read_zarr(path: str, name: str, box: list[list[int]]) -> Reply:
         for index in product(*touched)
     )
     return {"absent": absent}, [found]
+
+
+# -- SciPy: classic netCDF, and MATLAB before version 7.3 ------------------------------------------
 
 
 def _open_netcdf3(path: str) -> Any:
@@ -354,15 +406,14 @@ def list_netcdf3(path: str) -> Reply:
 
 def read_netcdf3(path: str, name: str, box: list[list[int]]) -> Reply:
     """Read the numbers in a box of a variable."""
-    data = _open_netcdf3(path).variables[name].data
-    return {}, [data[tuple(slice(*edges) for edges in box)]]
+    return {}, [_open_netcdf3(path).variables[name].data[_slices(box)]]
 
 
 def list_mat5(path: str) -> Reply:
     """List name, shape and class of the variables of a MATLAB file before version 7.3."""
     from scipy.io import whosmat  # noqa: PLC0415
 
-    return {"variables": [(name, list(shape), kind) for name, shape, kind in whosmat(path)]}, []
+    return {"variables": whosmat(path)}, []
 
 
 def read_mat5(path: str, name: str) -> Reply:
@@ -373,24 +424,21 @@ def read_mat5(path: str, name: str) -> Reply:
     found = loadmat(path, variable_names=[name])[name]
     if issparse(found):
         arrays = [found.data, found.indices, found.indptr]
-    elif found.dtype == object:
-        vectors = found.ravel().tolist()
-        arrays = [vector for vector in vectors if isinstance(vector, np.ndarray)]
-        arrays = arrays if len(arrays) == len(vectors) else [found]
     else:
-        arrays = [found]
-    if any(array.dtype.kind not in "iuf" for array in arrays):
-        found = "'a nested, complex or non-numeric array' is not accepted"
-        raise Refused(f"content of {name} = {found}: give real numbers, a vector in each cell.")
+        arrays = found.ravel().tolist() if found.dtype == object else [found]
+    numeric = all(isinstance(each, np.ndarray) and each.dtype.kind in "iuf" for each in arrays)
+    other = "a nested, complex or non-numeric array"
+    require(f"content of {name}", other, numeric, "real numbers, a vector in each cell")
     if issparse(found) or found.dtype != object:
         return {}, arrays
     for k, vector in enumerate(arrays):
         if vector.size > max(vector.shape):
-            place = divmod(k, found.shape[1])
-            what = f"{name} in pixel {place} = array of shape {vector.shape}"
-            raise Refused(f"{what} is not accepted: give a vector.")
-    sizes = np.array([vector.size for vector in arrays], np.int64)
-    return {}, [np.concatenate(arrays, axis=None), sizes]
+            odd = f"{name} in pixel {divmod(k, found.shape[1])} = array of shape {vector.shape}"
+            raise Refused(f"{odd} is not accepted: give a vector.")
+    return {}, _joined(arrays)
+
+
+# -- instruments -----------------------------------------------------------------------------------
 
 
 def list_sdt(path: str) -> Reply:
@@ -427,9 +475,9 @@ def read_ptu(path: str, channel: int | None, shape: list[int]) -> Reply:
 
     with PtuFile(path, trimdims="T") as file:
         channels = [int(one) for one in file.active_channels]
-        told = {"channels": channels, "n_frames": int(file.shape[0])}
+        known = {"channels": channels, "n_frames": int(file.shape[0])}
         if not channels or channel not in (None, *channels):
-            return told, []
+            return known, []
         rows, cols, n_bins = shape
         n_bins = min(n_bins, int(file.number_bins_max))
         image = file.decode_image(
@@ -438,14 +486,77 @@ def read_ptu(path: str, channel: int | None, shape: list[int]) -> Reply:
             dtime=n_bins,
             dtype=np.uint16 if file.number_records < 2**16 else np.uint32,  # no bin holds more
         )
-        return told, [image.reshape(rows, cols, n_bins)]
+        return known, [image.reshape(rows, cols, n_bins)]
+
+
+def read_tmf8820(path: str, variable: str | None) -> Reply:
+    """Read histograms, reference histograms and distances of all records, or of one."""
+    records = json.loads(Path(path).read_bytes(), parse_constant=_refuse_constant)
+    is_list = isinstance(records, list)
+    require("the file", type(records).__name__, is_list, "a list of records")
+    require("records", len(records), len(records) > 0, "at least one")
+    for k, record in enumerate(records):
+        is_record = isinstance(record, dict) and "hists" in record
+        what = "a record with the histograms of a TMF8820, hists"
+        require(f"record {k}", type(record).__name__, is_record, what)
+    named = {f"record {k}": record for k, record in enumerate(records)}
+    last = f"None for all, or 'record 0' to 'record {len(records) - 1}'"
+    require("variable", variable, variable is None or variable in named, last)
+    chosen = named if variable is None else {variable: named[variable]}
+    distances_m = []
+    for name, record in chosen.items():
+        value = record.get("dist_to_plane")
+        plain = value is None or (isinstance(value, int | float) and 0 <= value < math.inf)
+        require(f"dist_to_plane of {name}", value, plain, "metres, or null")
+        distances_m.append(math.nan if value is None else value)
+    arrays = [_stacked(chosen, "hists", 2), np.array(distances_m, float)]
+    if any("reference_hist" in record for record in chosen.values()):
+        arrays.append(_stacked(chosen, "reference_hist", 1))
+    return {}, arrays
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _stacked(records: dict[str, Any], field: str, n_axes: int) -> Any:
+    """Return lists of numbers, the same field of each record, as one array (record, ...)."""
+    found: list[Any] = []
+    for record, known in records.items():
+        name, value = f"{field} of {record}", known.get(field)
+        # As objects first: one long text would make room for itself in place of every number.
+        array = np.array(value, object)
+        if {*map(type, array.flat)} <= {int, float}:
+            array = np.array(value)
+        fits = array.ndim == n_axes and array.size > 0 and array.dtype.kind in "iuf"
+        what = f"numbers in {n_axes} axes, as many in each list"
+        require(name, f"{array.dtype} array of shape {array.shape}", fits, what)
+        found.append(array)
+        same = array.shape == found[0].shape
+        require(f"shape of {name}", array.shape, same, f"{found[0].shape}, that of the first")
+    return np.stack(found)
+
+
+# -- scenes ----------------------------------------------------------------------------------------
+
+
+def read_depths(path: str, kind: str, most_pixels: int) -> Reply:
+    """Read a picture of 16-bit numbers or 32-bit floats."""
+    from PIL import Image  # noqa: PLC0415
+
+    with Image.open(path, formats=[kind]) as image:
+        n_pixels, most = image.width * image.height, f"up to {most_pixels:,}"
+        require("pixels of the image", n_pixels, n_pixels <= most_pixels, most)
+        what = "one 16-bit number or 32-bit float for each"
+        require("kind of pixels", image.mode, image.mode in _DEPTH_MODES, what)
+        return {}, [np.asarray(image)]
 
 
 def read_mesh(path: str, suffix: str, most_faces: int) -> Reply:
     """Read vertices (vertex, 3) and faces (face, 3) of all parts of a mesh, each in its place."""
     import trimesh  # noqa: PLC0415
 
-    # From memory and without a resolver of names, a loader cannot reach another file.
+    # From memory and without a resolver of names, a loader cannot open another file.
     data = Path(path).read_bytes()
     if b"\0" not in data:  # text: do not guess its encoding
         data = data.decode(errors="replace").encode()
@@ -462,14 +573,12 @@ def read_mesh(path: str, suffix: str, most_faces: int) -> Reply:
         if not len(getattr(part, "faces", ())):
             continue
         n_faces += len(part.faces)
-        if n_faces > most_faces:
-            raise Refused(
-                f"faces of the mesh = {n_faces} is not accepted: give 1 to {most_faces:,}."
-            )
+        require("faces of the mesh", n_faces, n_faces <= most_faces, f"1 to {most_faces:,}")
         placed, triangles = _placed(part, np.asarray(matrix, float))
         vertices.append(placed)
         faces.append(triangles + n_vertices)
         n_vertices += len(placed)
+    require("faces of the mesh", n_faces, n_faces > 0, f"1 to {most_faces:,}")
     return {}, [np.concatenate(vertices), np.concatenate(faces)]
 
 
@@ -477,36 +586,20 @@ def _placed(part: Any, matrix: np.ndarray[Any, Any]) -> tuple[Any, Any]:
     """Move a part by a (4, 4) matrix; leave out vertices that no face has."""
     vertices, faces = np.asarray(part.vertices, float), np.asarray(part.faces, np.int64)
     lowest, highest, last = int(faces.min()), int(faces.max()), len(vertices) - 1
-    if lowest < 0 or highest > last:
-        found = f"vertices of a face = {(lowest, highest)}"
-        raise Refused(f"{found} is not accepted: give from 0 to {last}, the last one.")
+    inside = lowest >= 0 and highest <= last
+    require("vertices of a face", (lowest, highest), inside, f"from 0 to {last}, the last one")
     is_used = np.zeros(len(vertices), bool)
     is_used[faces] = True
     vertices = vertices[is_used]
     n_odd = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
-    if n_odd:
-        raise Refused(f"vertices at no place = {n_odd} is not accepted: give finite coordinates.")
+    require("vertices without a place", n_odd, n_odd == 0, "finite coordinates")
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], (np.cumsum(is_used) - 1)[faces]
 
 
+# -- the process -----------------------------------------------------------------------------------
+
 TASKS: dict[str, Callable[..., Reply]] = {
-    task.__name__: task
-    for task in (
-        list_hdf5,
-        read_hdf5,
-        read_cells,
-        list_zarr,
-        read_zarr,
-        list_netcdf3,
-        read_netcdf3,
-        list_mat5,
-        read_mat5,
-        list_sdt,
-        read_sdt,
-        list_ptu,
-        read_ptu,
-        read_mesh,
-    )
+    name: task for name, task in globals().items() if name.startswith(("list_", "read_"))
 }
 
 
@@ -517,43 +610,42 @@ def limit(memory_bytes: int, seconds: int) -> None:
     except ImportError:
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
-    wanted = {
+    limits = {
         resource.RLIMIT_AS: memory_bytes,
         resource.RLIMIT_CPU: math.ceil(used.ru_utime + used.ru_stime) + seconds,
         resource.RLIMIT_FSIZE: 0,
         resource.RLIMIT_CORE: 0,
     }
-    for kind, most in wanted.items():
+    for kind, most in limits.items():
         hard = resource.getrlimit(kind)[1]
         least = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (least, hard))
 
 
 def reply(line: bytes, target: BinaryIO) -> None:
-    """Do what a line asks for, and write the reply."""
+    """Do the task of a line, and write the reply."""
     arrays: list[Any] = []
     try:
-        asked = json.loads(line)
-        limit(asked.pop("memory_bytes"), asked.pop("seconds"))
-        most_bytes, what = asked.pop("most_bytes"), asked.get("name", "the file")
-        told, arrays = TASKS[asked.pop("task")](**asked)
+        request = json.loads(line)
+        limit(request.pop("memory_bytes"), request.pop("seconds"))
+        most_bytes, what = request.pop("most_bytes"), request.get("name", "the file")
+        found, arrays = TASKS[request.pop("task")](**request)
         n_bytes = max((array.nbytes for array in arrays), default=0)
-        if n_bytes > most_bytes:
-            accepted = f"give a smaller file: at most {most_bytes:,} bytes are read"
-            raise Refused(f"bytes of {what} = {n_bytes} is not accepted: {accepted}.")
+        smaller = f"a smaller file: at most {most_bytes:,} bytes are read"
+        require(f"bytes of {what}", n_bytes, n_bytes <= most_bytes, smaller)
     except Refused as error:
-        told, arrays = {"refused": str(error)}, []
+        found, arrays = {"refused": str(error)}, []
     except MemoryError:
-        told = {"error": "more memory than it may have", "exhausted": True}
+        found, arrays = {"error": "more memory than it may have", "exhausted": True}, []
     except ModuleNotFoundError as error:
-        told = {"missing": f"{type(error).__name__}: {error}"}
+        found = {"missing": f"{type(error).__name__}: {error}"}
     except Exception as error:  # undocumented: any
-        told = {"error": f"{type(error).__name__}: {str(error)[:2000]}"}
+        found = {"error": f"{type(error).__name__}: {str(error)[:2000]}"}
     arrays = [np.ascontiguousarray(array, array.dtype.newbyteorder("=")) for array in arrays]
-    text = json.dumps({"told": told, "arrays": [(one.dtype.str, one.shape) for one in arrays]})
+    text = json.dumps({"found": found, "arrays": [(one.dtype.str, one.shape) for one in arrays]})
     if len(text) > MOST_REPLY_CHARACTERS:
         refused = {"refused": "attributes = too many: give fewer."}
-        text, arrays = json.dumps({"told": refused, "arrays": []}), []
+        text, arrays = json.dumps({"found": refused, "arrays": []}), []
     target.write(text.encode() + b"\n")
     for array in arrays:
         target.write(array.reshape(-1).view(np.uint8).data)

@@ -1,8 +1,8 @@
 """Raw frames of a Geiger-mode camera: for each pulse and pixel the bin that triggered, or none.
 
 Frames are counted as they are read, a stretch of the file at a time. So only the cube must fit in
-`core.io.readers.guards.MAX_CUBE_BYTES`, never the frames: besides the cube, and a second one while
-the number of bins is still being found, a stretch of `STRETCH` values takes some 40 bytes for each.
+`core.io.readers.guards.MAX_CUBE_BYTES`, never the frames: in addition to the cube, and a second one
+while the number of bins is still unknown, a stretch of `STRETCH` values takes 40 bytes for each.
 
 Each frame is one pulse, and each pixel triggers once in it or never: these are first photons, as
 many pulses as frames. Without ``n_bins`` the gate ends with the last trigger, which may lie in one
@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from math import prod
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,46 @@ STRETCH = 2**20
 MOST_GUESSED_BINS = 2**16
 
 Stretch = tuple[tuple[int, int, int], NDArray[Any]]
-"""Frames (pulse, row, col), and the pulse, row and column of the first of them."""
+"""Pulse, row and column of the first of some frames, and the frames (pulse, row, col)."""
+
+
+class Header(NamedTuple):
+    """Header of an array in a file."""
+
+    shape: tuple[int, ...]
+    fortran_order: bool
+    dtype: np.dtype[Any]
+
+
+def frames_from(
+    file: IO[bytes], header: Header, name: str, origin: str, request: ReadOptions
+) -> Capture:
+    """Return a capture from an array of frames in an open file, at its first number.
+
+    Parameters are those of `frames_capture`; the request's ``no_trigger`` marks no trigger.
+    """
+    shape, is_fortran, dtype = header
+    fits = len(shape) == 3 and min(shape) > 0 and dtype.kind in "iuf"
+    accepted = "numbers of shape (pulse, row, col), none of them 0"
+    require(name, f"{dtype} array of shape {shape}", fits, accepted)
+    order = request.order(AXES) or (0, 1, 2)
+    n_pulses, n_rows, n_cols = (shape[axis] for axis in order)
+    if is_fortran:
+        shape, order = shape[::-1], tuple(2 - axis for axis in order)
+
+    def stretches() -> Iterator[Stretch]:
+        for box in boxes(shape, STRETCH):
+            size = [part.stop - part.start for part in box]
+            with decoding("a frame"):
+                data = file.read(prod(size) * dtype.itemsize)
+                frames = np.frombuffer(data, dtype).reshape(size)
+            pulse, row, col = (box[axis].start for axis in order)
+            yield (pulse, row, col), frames.transpose(order)
+
+    guessed = [f"axes ({', '.join(AXES)})"] if request.axes is None and name != "frames" else []
+    counted = n_pulses, n_rows, n_cols
+    no_trigger = int(request.no_trigger or 0)
+    return frames_capture(stretches(), counted, no_trigger, name, origin, request, guessed=guessed)
 
 
 def frames_capture(
@@ -40,11 +79,12 @@ def frames_capture(
     name: str,
     origin: str,
     request: ReadOptions,
+    *,
     first_bin: int | None = None,
     bin_width_s: float | None = None,
-    also_guessed: Sequence[str] = (),
+    guessed: Sequence[str] = (),
 ) -> Capture:
-    """A capture from frames of trigger bins.
+    """Return a capture from frames of trigger bins.
 
     Parameters
     ----------
@@ -60,47 +100,38 @@ def frames_capture(
         Value of the first bin; by default 0, or 1 if 0 marks no trigger.
     bin_width_s : float, optional
         Bin width of the camera, used if none is given.
-    also_guessed : sequence of str
-        What was guessed before.
+    guessed : sequence of str
+        Guesses made before.
 
     Raises
     ------
     ValueError
-        If a value is neither a bin nor `no_trigger`, the number of pulses told is not that of the
-        frames, or nothing triggered and ``n_bins`` is not given.
+        If a value is neither a bin nor `no_trigger`, the requested number of pulses is not that of
+        the frames, or nothing triggered and ``n_bins`` is not given.
     """
     n_pulses = shape[0]
-    require(f"frames of {name}", shape, min(shape) > 0, "pulses, rows and columns, none of them 0")
     request.refuse(["time_unit_s"], "frames hold bins: bin_width_s is their unit")
     request.refuse(["first_detections"], "frames hold one detection of a pulse")
-    request.refuse(["shape"], "frames tell their pixels")
-    asked = request.n_pulses
-    require(
-        "n_pulses", asked, asked in (None, n_pulses), f"{n_pulses}, one for each frame, or None"
-    )
+    request.refuse(["shape"], "frames have rows and columns")
+    agrees = request.n_pulses in (None, n_pulses)
+    require("n_pulses", request.n_pulses, agrees, f"{n_pulses}, one for each frame, or None")
     if first_bin is None and no_trigger == 0:
-        first_bin, also_guessed = 1, [*also_guessed, "1 stands for the first bin"]
-    cube = count_triggers(stretches, shape, no_trigger, name, request.n_bins, first_bin or 0)
-    told = replace(
-        request, n_pulses=n_pulses, no_trigger=None, detection=request.detection or "first"
-    )
-    return dense_capture(
-        cube, origin, told, also_guessed=also_guessed, guessed_bin_width_s=bin_width_s
-    )
+        first_bin, guessed = 1, [*guessed, "1 stands for the first bin"]
+    cube = _count_triggers(stretches, shape, no_trigger, name, request.n_bins, first_bin or 0)
+    detection = request.detection or "first"
+    known = replace(request, n_pulses=n_pulses, no_trigger=None, detection=detection)
+    return dense_capture(cube, origin, known, guessed=guessed, bin_width_s=bin_width_s)
 
 
-def count_triggers(
+def _count_triggers(
     stretches: Iterable[Stretch],
     shape: tuple[int, int, int],
     no_trigger: int,
     name: str,
-    n_bins: int | None = None,
-    first_bin: int = 0,
+    n_bins: int | None,
+    first_bin: int,
 ) -> NDArray[np.unsignedinteger]:
-    """Histograms (row, col, bin) of the trigger bins of all frames.
-
-    Parameters are those of `frames_capture`; without `n_bins` there are as many as triggered.
-    """
+    """Return histograms (row, col, bin) of all frames; without `n_bins` up to the last trigger."""
     n_pulses, n_rows, n_cols = shape
     dtype = count_dtype(n_pulses)
     cube = _more_bins(np.zeros((n_rows, n_cols, 0), dtype), n_bins or 0, name)
@@ -127,51 +158,6 @@ def count_triggers(
         np.add.at(cube.reshape(-1), place, dtype.type(1))
     require(f"triggers of {name}", 0, cube.shape[2] > 0, "n_bins, or frames in which a pixel fired")
     return cube
-
-
-def stretches_of(
-    file: IO[bytes],
-    shape: tuple[int, ...],
-    dtype: np.dtype[Any],
-    request: ReadOptions,
-    fortran_order: bool = False,
-) -> tuple[Iterable[Stretch], tuple[int, int, int]]:
-    """Frames from an open file, and their number, rows and columns.
-
-    Parameters
-    ----------
-    file : file
-        At the first number of an array, of which all the rest is read.
-    shape : tuple of int
-        Of that array.
-    dtype : dtype
-    request : ReadOptions
-        May give the order of the axes.
-    fortran_order : bool
-        Whether the first axis of the array is the fastest.
-    """
-    order = request.order(AXES) or (0, 1, 2)
-    n_pulses, n_rows, n_cols = (shape[axis] for axis in order)
-    if fortran_order:
-        shape, order = shape[::-1], tuple(2 - axis for axis in order)
-
-    def read() -> Iterable[Stretch]:
-        for box in boxes(shape, STRETCH):
-            size = [part.stop - part.start for part in box]
-            n_bytes = int(np.prod(size)) * dtype.itemsize
-            with decoding("a frame"):
-                frames = np.frombuffer(file.read(n_bytes), dtype).reshape(size)
-            pulse, row, col = (box[axis].start for axis in order)
-            yield (pulse, row, col), frames.transpose(order)
-
-    return read(), (n_pulses, n_rows, n_cols)
-
-
-def require_frames(shape: tuple[int, ...], dtype: np.dtype[Any], name: str) -> None:
-    """Raise ``ValueError`` unless an array of that shape and type can be frames."""
-    fits = len(shape) == 3 and min(shape) > 0 and dtype.kind in "iuf"
-    wanted = "numbers of shape (pulse, row, col), none of them 0"
-    require(name, f"{dtype} array of shape {shape}", fits, wanted)
 
 
 def _more_bins(

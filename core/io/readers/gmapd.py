@@ -2,9 +2,8 @@
 
 A frame is one pulse: a header row of 32 numbers, then 32 rows of 32, all little-endian uint16. 0
 stands where nothing fired, any other number is the bin plus 4. The gate has 153 bins, of 250 ps
-by default. Frames are counted as they are read, see `core.io.readers.frames`: the
-file may be larger than memory. Only its length and its range of numbers identify the
-format.
+by default. Frames are counted as they are read, see `core.io.readers.frames`: the file may be
+larger than memory. It has no signature: only its suffix identifies the format.
 """
 
 from __future__ import annotations
@@ -41,15 +40,14 @@ def read(path: Path, request: ReadOptions) -> Capture:
     size = path.stat().st_size
     whole = f"a multiple of {_FRAME_BYTES}, whole frames of a 32 x 32 camera with a header row each"
     require("bytes of the file", size, size > 0 and size % _FRAME_BYTES == 0, whole)
-    shape = (size // _FRAME_BYTES, SIZE, SIZE)
-    told = replace(request, n_bins=request.n_bins or N_BINS)
+    n_pulses = size // _FRAME_BYTES
     return frames_capture(
-        _stretches(path, order, shape[0]),
-        shape,
+        _stretches(path, order, n_pulses),
+        (n_pulses, SIZE, SIZE),
         _NO_TRIGGER,
         "the frames",
         path.name,
-        told,
+        replace(request, n_bins=request.n_bins or N_BINS),
         first_bin=FIRST_BIN,
         bin_width_s=BIN_WIDTH_S,
     )

@@ -10,10 +10,11 @@ from pathlib import Path
 from core.capture import CaptureError
 from core.checks import require
 
-# Largest cube, file, and decompressed part of a file, each by itself: to read one takes a few times
-# as much memory in addition. Checked before memory is allocated: a header of a hundred
-# bytes can claim any size.
 MAX_CUBE_BYTES = 2 * 1024**3
+"""Largest cube, file, and decompressed part of a file; reading takes a few times as much memory.
+
+Sizes are checked before memory is allocated, since a header of a hundred bytes can claim any size.
+"""
 
 
 def require_fits(name: str, n_bytes: int, remedy: str = "a smaller file") -> None:
@@ -24,7 +25,7 @@ def require_fits(name: str, n_bytes: int, remedy: str = "a smaller file") -> Non
 
 @dataclass(frozen=True)
 class FileVersion:
-    """A file or folder as it was when it was opened.
+    """Version of a file or folder at the time when it was opened.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ class FileVersion:
 
     @classmethod
     def of(cls, path: Path) -> FileVersion:
-        """The file as it is now."""
+        """Return the present version."""
         status = path.stat()
         return cls(path, (status.st_size, status.st_mtime_ns))
 
@@ -67,9 +68,9 @@ class FileVersion:
 
 @contextmanager
 def decoding(what: str) -> Iterator[None]:
-    """Turn whatever a library raises on a damaged file into one clear refusal.
+    """Turn any exception of a library on a damaged file into a `CaptureError`.
 
-    The decoders document no list of their exceptions, so every one of them is taken.
+    The decoders do not document their exceptions, so every type is caught.
     """
     try:
         yield

@@ -1,4 +1,8 @@
-"""Run file libraries in processes of limited memory and time, so that no file harms this one.
+"""Decode files in processes of limited memory and time, so that no file harms this one.
+
+All formats that a library parses are decoded there, the records of a TMF8820 and depth maps too.
+Only NumPy's formats, raw camera frames and gzip are read in this process: their sizes are checked
+before memory is allocated, and nothing in them is interpreted.
 
 Processes that are idle are used again, one for each thread that reads at the same time.
 """
@@ -11,6 +15,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from math import prod
 from pathlib import Path
 from threading import Lock, Timer
@@ -37,16 +42,19 @@ WORKER = Path(__file__).with_name("file_worker.py")
 
 _MOST_REPLY_BYTES = 2**27
 
+Reply = tuple[dict[str, Any], list[NDArray[Any]]]
+"""Description and arrays."""
+
 _idle: list[_Process] = []
 _lock = Lock()
 
 
 class _Ended(Exception):
-    """A process ended in place of a reply."""
+    """The process ended without a reply."""
 
 
 class _Process:
-    """A process that reads files."""
+    """Process that reads files."""
 
     def __init__(self) -> None:
         # No BLAS threads, which reserve memory; no plugins that a file may name.
@@ -62,6 +70,8 @@ class _Process:
             stderr=subprocess.DEVNULL,
             env=environment,
         )
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._input, self._output = self._process.stdin, self._process.stdout
         self.owner = os.getpid()
         self.is_used = False
 
@@ -69,36 +79,20 @@ class _Process:
     def is_alive(self) -> bool:
         return self.owner == os.getpid() and self._process.poll() is None
 
-    def ask(self, request: dict[str, Any]) -> tuple[Any, list[NDArray[Any]]]:
-        """Send a request; return the JSON reply and the arrays that follow it."""
-        assert self._process.stdin is not None and self._process.stdout is not None
+    def ask(self, request: dict[str, Any]) -> Reply:
+        """Send a request; return the reply."""
         timer = Timer(request["seconds"], self._process.kill)
         timer.daemon = True
         timer.start()
         try:
-            self._process.stdin.write(json.dumps(request).encode() + b"\n")
-            self._process.stdin.flush()
-            line = self._process.stdout.readline(_MOST_REPLY_BYTES)
+            self._input.write(json.dumps(request).encode() + b"\n")
+            self._input.flush()
+            line = self._output.readline(_MOST_REPLY_BYTES)
             if not line:
                 raise _Ended
             reply = json.loads(line)
-            arrays, most_bytes = [], request["most_bytes"]
-            for kind, shape in reply["arrays"]:
-                dtype = np.dtype(kind)
-                n_bytes = prod(shape) * dtype.itemsize
-                plain = dtype.kind in "iuf" and 0 <= n_bytes <= most_bytes
-                require("bytes of a reply", n_bytes, plain, f"up to {most_bytes:,}")
-                array = np.empty(shape, dtype)
-                if (
-                    n_bytes
-                    and self._process.stdout.readinto(  # type: ignore[attr-defined]
-                        array.reshape(-1).view(np.uint8).data
-                    )
-                    != n_bytes
-                ):
-                    raise _Ended
-                arrays.append(array)
-            return reply["told"], arrays
+            kinds = [(np.dtype(kind), shape) for kind, shape in reply["arrays"]]
+            return reply["found"], [self._array(*each, request["most_bytes"]) for each in kinds]
         except OSError as error:
             raise _Ended from error
         finally:
@@ -106,25 +100,32 @@ class _Process:
             timer.join()
             self.is_used = True
 
+    def _array(self, dtype: np.dtype[Any], shape: list[int], most_bytes: int) -> NDArray[Any]:
+        n_bytes = prod(shape) * dtype.itemsize
+        plain = dtype.kind in "iuf" and 0 <= n_bytes <= most_bytes
+        require("bytes of a reply", n_bytes, plain, f"up to {most_bytes:,}")
+        array = np.empty(shape, dtype)
+        data = array.reshape(-1).view(np.uint8).data
+        if n_bytes and self._output.readinto(data) != n_bytes:  # type: ignore[attr-defined]
+            raise _Ended
+        return array
+
     def end(self) -> str:
         """End the process; return how it ended."""
-        assert self._process.stdin is not None and self._process.stdout is not None
         try:
             status = self._process.wait(0.1)
         except subprocess.TimeoutExpired:
             self._process.kill()
             status = self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            try:
+        for pipe in (self._input, self._output):
+            with suppress(OSError):
                 pipe.close()
-            except OSError:
-                continue
         return signal.Signals(-status).name if status < 0 else f"status {status}"
 
 
 def isolated(
-    path: Path, what: str, task: str, working_bytes: int = 0, **arguments: Any
-) -> tuple[Any, list[NDArray[Any]]]:
+    path: Path, what: str, task: str, *, working_bytes: int | None = None, **arguments: Any
+) -> Reply:
     """Run a task of `core.io.readers.file_worker` in a process of its own.
 
     Parameters
@@ -135,14 +136,15 @@ def isolated(
         Name for error messages.
     task : str
         Name of the task.
-    working_bytes : int
-        Memory that the task may take beyond `BASE_BYTES`.
+    working_bytes : int, optional
+        Memory that the task may take beyond `BASE_BYTES`; by default that of two of the largest
+        cubes.
     **arguments
         Passed to the task with the path.
 
     Returns
     -------
-    told : object
+    found : dict
         The reply's JSON.
     arrays : list of ndarray
 
@@ -152,6 +154,7 @@ def isolated(
         If the file is refused or damaged, or the task ends or takes more than it may.
     """
     allowed = LEAST_SECONDS + SECONDS_PER_MIB * path.stat().st_size // 2**20
+    working_bytes = 2 * guards.MAX_CUBE_BYTES if working_bytes is None else working_bytes
     request = {
         "task": task,
         "path": str(path.absolute()),
@@ -161,43 +164,39 @@ def isolated(
         **arguments,
     }
     with decoding(what):
-        told, arrays = _asked(request)
-    if "refused" in told:
-        raise CaptureError(told["refused"])
-    if "missing" in told:
-        raise CaptureError(f"{what} needs a library ({told['missing']}): install it.")
-    if "error" in told:
+        found, arrays = _reply_to(request)
+    if "refused" in found:
+        raise CaptureError(found["refused"])
+    if "missing" in found:
+        raise CaptureError(f"{what} needs a library ({found['missing']}): install it.")
+    if "error" in found:
         raise CaptureError(
-            f"{what} cannot be read, the file is damaged or too large ({told['error']}): copy or "
+            f"{what} cannot be read, the file is damaged or too large ({found['error']}): copy or "
             "save it again."
         )
-    return told, arrays
+    return found, arrays
 
 
-def _asked(request: dict[str, Any]) -> tuple[Any, list[NDArray[Any]]]:
+def _reply_to(request: dict[str, Any]) -> Reply:
     """Ask an idle process; if it fails, where an earlier file may be the cause, a new one."""
     process = _take()
     while True:
         was_used, began = process.is_used, monotonic()
-        told: dict[str, Any] | None = None
-        arrays: list[NDArray[Any]] = []
-        ending = ""
         try:
-            told, arrays = process.ask(request)
+            found, arrays = process.ask(request)
         except _Ended:
-            ending = process.end()
+            found, arrays = {"error": f"its library ended by {process.end()}", "ended": True}, []
         except BaseException:
             process.end()
             raise
-        if told is not None and "exhausted" not in told:
+        if not {"ended", "exhausted"} & found.keys():
             _give(process)
-            return told, arrays
-        if told is not None:
-            process.end()
+            return found, arrays
+        process.end()
         if monotonic() - began >= request["seconds"]:
             return {"error": f"more than {request['seconds']} s"}, []
         if not was_used:
-            return told or {"error": f"its library ended by {ending}"}, []
+            return found, []
         process = _Process()
 
 

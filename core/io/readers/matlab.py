@@ -1,9 +1,13 @@
 """MATLAB ``.mat`` of version 5 (saved with ``-v6`` or ``-v7``) and 7.3 (``-v7.3``, HDF5).
 
 Either a cell array (row, col) holding each pixel's photon arrival times as a vector, or a cube
-(row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts as in `core.io.readers.sparse`.
-The file may have other variables if only one fits; a number named like ``bin_width`` or
-``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
+(row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts, as published simulated
+captures are stored. The file may have other variables if only one fits; a number named like
+``bin_width`` or ``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
+
+The pixels of a sparse matrix follow each other column by column, as MATLAB's ``reshape`` lists
+them, or row by row with ``axes="row col"``. Rows and columns come from ``shape``; without it the
+image is guessed to be square.
 
 SciPy and h5py read the variables in an isolated process (`core.io.readers.isolation`). In version
 7.3 the axes are reversed, a cell array is an array of references, and a sparse matrix a group of
@@ -12,8 +16,9 @@ three arrays.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from math import isqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,14 +27,13 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.io.readers import guards, hdf5
+from core.io.readers import guards
 from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
-from core.io.readers.dense import cube_capture
+from core.io.readers.dense import LARGEST_COUNT, count_dtype, cube_capture, dense_capture
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
 from core.io.readers.options import ReadOptions
-from core.io.readers.sparse import Sparse, sparse_capture
-from core.io.readers.stored import Numbers, Stored, whole
+from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
 
 _USER_BLOCK = 512  # before the HDF5 of version 7.3
 _VERSIONS_5 = (b"\x00\x01IM", b"\x01\x00MI")
@@ -41,16 +45,16 @@ _SHORTEST_S, _LONGEST_S = 1e-13, 1e-6
 
 
 class Variable(NamedTuple):
-    """A variable of a file.
+    """Variable of a file.
 
-    ``shape`` is MATLAB's, ``kind`` the class of its elements, or ``"sparse"``; ``content`` loads it
-    in version 7.3.
+    ``shape`` is MATLAB's, ``kind`` the class of its elements, or ``"sparse"``; ``parts`` are its
+    arrays in version 7.3.
     """
 
     name: str
     shape: tuple[int, ...]
     kind: str
-    content: Any
+    parts: tuple[Stored, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.name} ({self.kind}, {' x '.join(map(str, self.shape))})"
@@ -69,16 +73,122 @@ class Variable(NamedTuple):
         return self.kind in NUMERIC and set(self.shape) == {1} and plain in _WIDTH_NAMES
 
 
-def _choose(variables: Sequence[Variable], name: str | None) -> Variable:
-    """The variable asked for, or the only one that fits.
+class _Version5:
+    """Variables of a file of version 5."""
 
-    Raises
-    ------
-    ValueError
-        If no variable fits, or more than one.
-    """
-    for known, times in Counter(variable.name for variable in variables).items():
-        require(f"variables named {known!r}", times, times == 1, "each name once")
+    def __init__(self, path: Path) -> None:
+        self._path, self._version = path, FileVersion.of(path)
+        require_fits("the file", path.stat().st_size)
+        listed, _ = isolated(path, "the list of variables", "list_mat5", working_bytes=0)
+        self.variables = [
+            Variable(name, tuple(shape), kind) for name, shape, kind in listed["variables"]
+        ]
+
+    def cells(self, variable: Variable) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Return arrival times, and the pixel of each."""
+        times, sizes = self._read(variable, 2)
+        return times, np.repeat(np.arange(sizes.size), sizes)
+
+    def array(self, variable: Variable) -> NDArray[Any]:
+        """Return the numbers of an array."""
+        return self._read(variable, 1)[0]
+
+    def sparse(self, variable: Variable) -> list[NDArray[Any]]:
+        """Return values, rows and starts of a sparse matrix."""
+        return self._read(variable, 3)
+
+    def _read(self, variable: Variable, n_arrays: int) -> list[NDArray[Any]]:
+        name = variable.name
+        with self._version.unchanged():
+            _, found = isolated(self._path, name, "read_mat5", name=name)
+        require(f"parts of {name}", len(found), len(found) == n_arrays, f"{n_arrays}")
+        return found
+
+
+class _Version73:
+    """Variables of a file of version 7.3."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.variables = _variables(*arrays(path))
+
+    def cells(self, variable: Variable) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Return arrival times, and the pixel of each."""
+        name, most = variable.name, guards.MAX_CUBE_BYTES // BYTES_A_PHOTON
+        _, (times, sizes) = isolated(self._path, name, "read_cells", name=name, most_values=most)
+        n_rows, n_cols = variable.shape
+        with decoding(name):
+            col, row = np.divmod(np.arange(n_rows * n_cols), n_rows)
+            return times, np.repeat(row * n_cols + col, sizes)
+
+    def array(self, variable: Variable) -> NDArray[Any]:
+        """Return the numbers of an array."""
+        return variable.parts[0].whole().transpose()
+
+    def sparse(self, variable: Variable) -> list[NDArray[Any]]:
+        """Return values, rows and starts of a sparse matrix."""
+        return [part.whole() for part in variable.parts]
+
+
+def _variables(arrays: Sequence[Stored], groups: dict[str, dict[str, Any]]) -> list[Variable]:
+    """Return the variables that the arrays and groups of a file of version 7.3 make."""
+    found = []
+    for array in arrays:
+        known = array.attributes
+        kind = str(known.get("MATLAB_class", array.dtype.name))
+        hollow = "MATLAB_empty" in known or (array.refused and not array.references)
+        if hollow or "MATLAB_int_decode" in known:
+            kind = array.refused or f"{kind}, not numbers"
+        shape = array.references or array.shape
+        if "/" not in array.name:
+            found.append(Variable(array.name, shape[::-1], kind, (array,)))
+    named = {array.name: array for array in arrays if not array.refused}
+    for name, known in groups.items():
+        names = [f"{name}/{part}" for part in ("data", "ir", "jc")]
+        if "MATLAB_sparse" in known and named.keys() >= set(names):
+            parts = tuple(named[part] for part in names)
+            shape = (int(known["MATLAB_sparse"]), parts[2].shape[0] - 1)
+            found.append(Variable(name, shape, "sparse", parts))
+        elif name and "/" not in name:
+            found.append(Variable(name, (), str(known.get("MATLAB_class", "group"))))
+    return found
+
+
+def recognizes(start: bytes) -> bool:
+    """Return whether a file starts like MATLAB, or like HDF5 that may be of version 7.3."""
+    return start[124:128] in _VERSIONS_5 or _is_hdf5(start)
+
+
+def _is_hdf5(start: bytes) -> bool:
+    return any(start[k:].startswith(HDF5_SIGNATURE) for k in (0, _USER_BLOCK))
+
+
+def read(path: Path, request: ReadOptions) -> Capture:
+    """Read a cell array of arrival times, a cube, or a sparse matrix."""
+    with path.open("rb") as opened:
+        start = opened.read(_USER_BLOCK + len(HDF5_SIGNATURE))
+    if not _is_hdf5(start):
+        # SciPy takes a zero in the first four bytes for version 4.
+        known = start[124:128] in _VERSIONS_5 and 0 not in start[:4]
+        require("version", start[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
+    file = _Version73(path) if _is_hdf5(start) else _Version5(path)
+    variable = _choose(file.variables, request.variable)
+    name, origin = variable.name, f"{path.name}, variable {variable.name}"
+    if variable.kind == "cell":
+        times, pixel = file.cells(variable)
+        shape = (variable.shape[0], variable.shape[1])
+        return arrivals_capture(times, pixel, shape, name, origin, request)
+    width_s = _bin_width(
+        float(file.array(one).item()) for one in file.variables if one.may_be_bin_width
+    )
+    if variable.kind == "sparse":
+        parts = file.sparse(variable)
+        return _sparse_capture(parts, variable.shape, name, origin, request, width_s)
+    return cube_capture(file.array(variable), name, origin, request, bin_width_s=width_s)
+
+
+def _choose(variables: Sequence[Variable], name: str | None) -> Variable:
+    """Return the requested variable, else the only one that fits."""
     fitting = {variable.name: variable for variable in variables if variable.fits}
     listed = ", ".join(map(str, variables)) or "nothing"
     remedy = (
@@ -94,124 +204,62 @@ def _choose(variables: Sequence[Variable], name: str | None) -> Variable:
 
 
 def _bin_width(values: Iterable[float]) -> float | None:
-    """The one of some numbers that can be the width of a bin in seconds; None if not just one."""
+    """Return the one number that can be the width of a bin in seconds; None if not just one."""
     found = {value for value in values if _SHORTEST_S <= value <= _LONGEST_S}
     return found.pop() if len(found) == 1 else None
 
 
-class _Version5:
-    """The variables of a file of version 5."""
+def _sparse_capture(
+    parts: list[NDArray[Any]],
+    shape: tuple[int, ...],
+    name: str,
+    origin: str,
+    request: ReadOptions,
+    bin_width_s: float | None,
+) -> Capture:
+    """Return a capture from a sparse matrix (pixel, bin) of counts.
 
-    def __init__(self, path: Path) -> None:
-        self._version = FileVersion.of(path)
-        require_fits("the file", path.stat().st_size)
-        told, _ = isolated(path, "the list of variables", "list_mat5")
-        with decoding("the list of variables"):
-            self.variables = [
-                Variable(str(name), tuple(shape), str(kind), None)
-                for name, shape, kind in told["variables"]
-            ]
-
-    def cells(self, variable: Variable) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Arrival times, and the pixel of each."""
-        times, sizes = self._read(variable, 2)
-        return times, np.repeat(np.arange(sizes.size), sizes)
-
-    def array(self, variable: Variable) -> NDArray[Any]:
-        """The numbers of an array."""
-        return self._read(variable, 1)[0]
-
-    def sparse(self, variable: Variable) -> Sparse:
-        """A sparse matrix."""
-        values, rows, starts = self._read(variable, 3)
-        return Sparse(values, rows, starts, (variable.shape[0], variable.shape[1]))
-
-    def _read(self, variable: Variable, n_arrays: int) -> list[NDArray[Any]]:
-        name, memory = variable.name, 2 * guards.MAX_CUBE_BYTES
-        with self._version.unchanged():
-            _, found = isolated(self._version.path, name, "read_mat5", memory, name=name)
-        require(f"parts of {name}", len(found), len(found) == n_arrays, f"{n_arrays}")
-        return found
-
-
-class _Version73:
-    """The variables of a file of version 7.3."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        arrays, groups = hdf5.arrays(path)
-        self.variables = _variables({array.name: array for array in arrays}, groups)
-
-    def cells(self, variable: Variable) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Arrival times, and the pixel of each."""
-        most = guards.MAX_CUBE_BYTES // BYTES_A_PHOTON
-        times, sizes = hdf5.cells(self._path, variable.name, most)
-        n_rows, n_cols = variable.shape
-        with decoding(variable.name):
-            col, row = np.divmod(np.arange(n_rows * n_cols), n_rows)
-            return times, np.repeat(row * n_cols + col, sizes)
-
-    def array(self, variable: Variable) -> NDArray[Any]:
-        """The numbers of an array."""
-        return whole(variable.content).transpose()
-
-    def sparse(self, variable: Variable) -> Sparse:
-        """A sparse matrix."""
-        values, rows, starts = (whole(part) for part in variable.content)
-        return Sparse(values, rows, starts, (variable.shape[0], variable.shape[1]))
+    Its `parts` are the values column by column, the row of each, and the start of each column,
+    followed by the end of the last one.
+    """
+    n_pixels, n_bins = shape
+    by_row = request.order(("row", "col")) == (0, 1)
+    side = isqrt(n_pixels)
+    rows, cols = request.shape or (side, side)
+    accepted = f"rows and columns of {n_pixels} pixels in all"
+    require("shape", request.shape, rows * cols == n_pixels, accepted)
+    guessed = [] if request.shape else [f"shape {rows} x {cols}"]
+    guessed += [] if request.axes else ["pixels column by column"]
+    pixel, bins, counts = _entries(parts, n_pixels, n_bins, name)
+    if not by_row:
+        col, row = np.divmod(pixel, rows)
+        pixel = row * cols + col
+    dtype = count_dtype(int(counts.max(initial=0)))
+    require_fits(f"the cube of {name}", n_pixels * n_bins * dtype.itemsize)
+    cube = np.zeros((n_pixels, n_bins), dtype)
+    cube[pixel, bins] = counts
+    known = replace(request, shape=None, axes=None)
+    cube = cube.reshape(rows, cols, n_bins)
+    return dense_capture(cube, origin, known, guessed=guessed, bin_width_s=bin_width_s)
 
 
-def recognizes(start: bytes) -> bool:
-    """Return whether a file starts like MATLAB, or like HDF5 that may be of version 7.3."""
-    return start[124:128] in _VERSIONS_5 or hdf5.SIGNATURE in (start[:8], start[512:520])
-
-
-def read(path: Path, request: ReadOptions) -> Capture:
-    """Read a cell array of arrival times, a cube, or a sparse matrix."""
-    with path.open("rb") as opened:
-        start = opened.read(_USER_BLOCK + len(hdf5.SIGNATURE))
-    file: _Version5 | _Version73
-    if hdf5.SIGNATURE in (start[: len(hdf5.SIGNATURE)], start[_USER_BLOCK:]):
-        file = _Version73(path)
-    else:
-        # SciPy takes a zero in the first four bytes for version 4.
-        known = start[124:128] in _VERSIONS_5 and 0 not in start[:4]
-        require("version", start[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
-        file = _Version5(path)
-    variable = _choose(file.variables, request.variable)
-    name, origin = variable.name, f"{path.name}, variable {variable.name}"
-    if variable.kind == "cell":
-        times, pixel = file.cells(variable)
-        shape = (variable.shape[0], variable.shape[1])
-        return arrivals_capture(times, pixel, shape, name, origin, request)
-    width_s = _bin_width(
-        float(file.array(one).item()) for one in file.variables if one.may_be_bin_width
-    )
-    if variable.kind == "sparse":
-        return sparse_capture(file.sparse(variable), name, origin, request, width_s)
-    return cube_capture(file.array(variable), name, origin, request, guessed_bin_width_s=width_s)
-
-
-def _variables(arrays: dict[str, Stored], groups: dict[str, dict[str, Any]]) -> list[Variable]:
-    found = []
-    for name, array in arrays.items():
-        known = array.attributes
-        kind = known.get("MATLAB_class", array.numbers and array.numbers.dtype.name)
-        shape = array.references if array.numbers is None else array.numbers.shape
-        hollow = "MATLAB_empty" in known or (array.numbers is None and not array.references)
-        if "/" in name:
-            continue
-        if hollow or "MATLAB_int_decode" in known:
-            kind = array.refused or f"{kind}, not numbers"
-        found.append(Variable(name, shape[::-1], str(kind), array.numbers))
-    for name, known in groups.items():
-        parts = [arrays.get(f"{name}/{part}") for part in ("data", "ir", "jc")]
-        numbers: list[Numbers] = [
-            part.numbers for part in parts if part is not None and part.numbers is not None
-        ]
-        if "MATLAB_sparse" in known and len(numbers) == len(parts):
-            shape = (int(known["MATLAB_sparse"]), numbers[2].shape[0] - 1)
-            found.append(Variable(name, shape, "sparse", numbers))
-        elif name and "/" not in name:
-            found.append(Variable(name, (), str(known.get("MATLAB_class", "group")), None))
-    return found
+def _entries(
+    parts: list[NDArray[Any]], n_rows: int, n_cols: int, name: str
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return row, column and value of each entry of a sparse matrix after checking them."""
+    values, rows, starts = parts[0], parts[1], parts[2].astype(np.int64)
+    n_found = len(starts) - 1
+    require(f"columns of {name}", n_found, n_found == n_cols, f"{n_cols}, as its shape says")
+    steps: NDArray[np.int64] = np.diff(starts)
+    n_entries, most = int(starts[-1]), min(len(values), len(rows))
+    rising = starts[0] == 0 and bool((steps >= 0).all()) and n_entries <= most
+    require(f"entries of {name}", n_entries, rising, f"columns one after the other, up to {most}")
+    values, row = values[:n_entries], rows[:n_entries].astype(np.int64)
+    col = np.repeat(np.arange(n_cols), steps)
+    inside = bool(((row >= 0) & (row < n_rows)).all())
+    once = bool((np.diff(col * n_rows + row) > 0).all())
+    require(f"rows of {name}", "out of order", inside and once, f"rising ones below {n_rows}")
+    odd = ~((values >= 0) & (values <= LARGEST_COUNT) & (values == np.floor(values)))
+    if odd.any():
+        require(name, values[odd][0].item(), False, f"whole counts from 0 to {LARGEST_COUNT:,}")
+    return row, col, values.astype(np.int64)

@@ -24,7 +24,7 @@ Check = Callable[[str, Any], None]
 
 @dataclass(frozen=True)
 class Kind:
-    """How a value is typed, written, and checked."""
+    """Type of an option: how its values are parsed, written and checked."""
 
     annotation: str
     """Type in the documentation."""
@@ -34,25 +34,29 @@ class Kind:
     check: Check
     write: Callable[[Any], str] = str
     """As text from which `parse` returns the same value."""
-    words: tuple[str, ...] = ()
-    """Names of the parts, where a value is given as several arguments of the command line."""
+    metavars: tuple[str, ...] = ()
+    """Names of the parts of a value that takes several arguments of the command line."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """How a field of `ReadOptions` is presented."""
+    """Presentation of a field of `ReadOptions`."""
 
     label: str
-    """In a form."""
+    """Label in a form."""
     flag: str
-    """Of the command line, without the dashes."""
+    """Option of the command line, without the dashes."""
     kind: Kind
     help: str
-    """What the option is, as a sentence."""
+    """Description, as a sentence."""
 
 
 def _option(label: str, flag: str, kind: Kind, help: str) -> Any:
     return field(default=None, metadata={"option": Option(label, flag, kind, help)})
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer)
 
 
 def _time(least_s: float) -> Kind:
@@ -69,33 +73,8 @@ def _count(most: int) -> Kind:
     return Kind("int", int, "a whole number", check)
 
 
-def _check_angle(name: str, value: Any) -> None:
-    require(name, value, 0 < value < 1, "between 0 and 1 radian")
-
-
-def _check_whole(name: str, value: Any) -> None:
-    require(name, value, isinstance(value, int | np.integer), "a whole number")
-
-
-def _check_detection(name: str, value: Any) -> None:
-    require(name, value, value in get_args(Detection), " or ".join(map(repr, get_args(Detection))))
-
-
-def _check_shape(name: str, value: Any) -> None:
-    pair = (
-        isinstance(value, tuple)
-        and len(value) == 2
-        and all(isinstance(size, int | np.integer) and size >= 1 for size in value)
-    )
-    require(name, value, pair, "rows and columns, each at least 1")
-
-
-def _check_pulse(name: str, value: Any) -> None:
-    require(name, value, isinstance(value, Pulse), "a Pulse")
-
-
-def _accept(_name: str, _value: Any) -> None:
-    """Accept any text: the file determines which names exist."""
+def _required(accepts: str, is_valid: Callable[[Any], bool]) -> Check:
+    return lambda name, value: require(name, value, is_valid(value), accepts)
 
 
 def _parsed_shape(text: str) -> tuple[int, int]:
@@ -103,16 +82,32 @@ def _parsed_shape(text: str) -> tuple[int, int]:
     return int(rows), int(cols)
 
 
-_TEXT = Kind("str", str, "a name", _accept)
-_AXES = Kind("str", str, "names", _accept)
-_ANGLE = Kind("float", float, "a number such as 1e-3", _check_angle, repr)
-_WHOLE = Kind("int", int, "a whole number", _check_whole)
-_DETECTION = Kind("str", str, "first or all", _check_detection)
+def _is_shape(value: Any) -> bool:
+    is_pair = isinstance(value, tuple) and len(value) == 2
+    return is_pair and all(_is_whole(size) and size >= 1 for size in value)
+
+
+_DETECTIONS = get_args(Detection)
+_NAMES = Kind("str", str, "names", _required("text", lambda value: isinstance(value, str)))
+_ANGLE = Kind(
+    "float",
+    float,
+    "a number such as 1e-3",
+    _required("between 0 and 1 radian", lambda value: 0 < value < 1),
+    repr,
+)
+_WHOLE = Kind("int", int, "a whole number", _required("a whole number", _is_whole))
+_DETECTION = Kind(
+    "str",
+    str,
+    "first or all",
+    _required(" or ".join(map(repr, _DETECTIONS)), lambda value: value in _DETECTIONS),
+)
 _SHAPE = Kind(
     "tuple of int",
     _parsed_shape,
     "rows and columns such as 64 x 64",
-    _check_shape,
+    _required("rows and columns, each at least 1", _is_shape),
     lambda shape: " x ".join(map(str, shape)),
     ("ROWS", "COLS"),
 )
@@ -120,14 +115,14 @@ _PULSE = Kind(
     "Pulse",
     lambda text: Pulse.gaussian(parsed_time(text)),
     EXAMPLE,
-    _check_pulse,
+    _required("a Pulse", lambda value: isinstance(value, Pulse)),
     lambda pulse: time_as_typed(pulse.tau_s),
 )
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the user specifies about a file. None takes a value from the file, or guesses it.
+    """User overrides for a file; None takes the value from the file, or guesses it.
 
     Raises
     ------
@@ -160,7 +155,7 @@ class ReadOptions:
         "Pulses sent", "pulses", _count(MOST_PULSES), "Pulses sent for each pixel; never guessed."
     )
     variable: str | None = _option(
-        "Variable", "variable", _TEXT, "Name of the array, where the file holds several."
+        "Variable", "variable", _NAMES, "Name of the array, where the file holds several."
     )
     pulse: Pulse | None = _option(
         "Echo's standard deviation (s)",
@@ -181,7 +176,7 @@ class ReadOptions:
     axes: str | None = _option(
         "Axes (such as bin row col)",
         "axes",
-        _AXES,
+        _NAMES,
         "Names of the file's axes in its own order, such as 'bin row col', for raw frames 'pulse "
         "col row', for lists of photons 'col row'.",
     )
@@ -243,12 +238,12 @@ class ReadOptions:
         return "" if value is None else reading_options()[name].kind.write(value)
 
     def order(self, canonical: tuple[str, ...]) -> tuple[int, ...] | None:
-        """Return the position in the file of each axis that a reader wants, for `numpy.transpose`.
+        """Return the position in the file of each axis, for `numpy.transpose`.
 
         Parameters
         ----------
         canonical : tuple of str
-            Names of the axes as the reader wants them, such as ``("row", "col", "bin")``.
+            Names of the axes in the order of the result, such as ``("row", "col", "bin")``.
 
         Returns
         -------

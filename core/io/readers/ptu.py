@@ -23,14 +23,14 @@ from typing import Any
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import AXES, cube_capture
-from core.io.readers.guards import MAX_CUBE_BYTES, require_fits
+from core.io.readers.guards import require_fits
 from core.io.readers.isolation import isolated
 from core.io.readers.options import ReadOptions
 
 _BYTES_A_RECORD = 4
 _BYTES_A_COUNT = 4
 
-# What whole numbers the header must hold; `ptufile` raises 2 to the power of a marker.
+# Whole numbers that the header must hold; `ptufile` raises 2 to the power of a marker.
 _ACCEPTED = {
     "Measurement_Mode": (3, 3, "T3 records"),
     "Measurement_SubMode": (3, 3, "an image"),
@@ -50,20 +50,17 @@ def recognizes(start: bytes) -> bool:
 
 def read(path: Path, request: ReadOptions) -> Capture:
     """Read the histograms of an image."""
-    told, _ = isolated(path, "the header", "list_ptu")
-    tags = told["tags"]
-    bin_width_s, n_bins = _bins(tags)
-    shape = _require_image(tags, path.stat().st_size - told["record_offset"], n_bins)
+    header, _ = isolated(path, "the header", "list_ptu", working_bytes=0)
+    bin_width_s, n_bins = _bins(header["tags"])
+    n_bytes = path.stat().st_size - header["record_offset"]
+    rows, cols = _require_image(header["tags"], n_bytes, n_bins)
     channel = _channel(request.variable)
-    memory = 2 * MAX_CUBE_BYTES
-    known, cubes = isolated(
-        path, "the records", "read_ptu", memory, channel=channel, shape=[*shape, n_bins]
-    )
+    shape = [rows, cols, n_bins]
+    known, cubes = isolated(path, "the records", "read_ptu", channel=channel, shape=shape)
     channels, n_frames = known["channels"], known["n_frames"]
     listed = ", ".join(f"channel {one}" for one in channels) or "none"
     require("photons of the image", listed, bool(channels), "a file with photons")
     require("variable", request.variable, bool(cubes), f"None for all, or one of {listed}")
-    (cube,) = cubes
     summed = [f"{n_frames} frames"] * (n_frames > 1)
     summed += [f"{len(channels)} channels"] * (channel is None and len(channels) > 1)
     origin = path.name if channel is None else f"{path.name}, channel {channel}"
@@ -73,11 +70,11 @@ def read(path: Path, request: ReadOptions) -> Capture:
         bin_width_s=request.bin_width_s or bin_width_s,
         detection=request.detection or "all",
     )
-    return cube_capture(cube, "the image", origin, complete, " ".join(AXES))
+    return cube_capture(cubes[0], "the image", origin, complete, axes=" ".join(AXES))
 
 
 def _bins(tags: Mapping[str, Any]) -> tuple[float, int]:
-    """Width of a bin in seconds, and the bins that begin within one period of the laser."""
+    """Return the width of a bin in seconds, and how many begin within one period of the laser."""
     width_s = _positive(tags, "MeasDesc_Resolution")
     period_s = _positive(tags, "MeasDesc_GlobalResolution")
     n_bins = period_s / width_s
@@ -98,7 +95,7 @@ def _positive(tags: Mapping[str, Any], name: str) -> float:
 
 
 def _require_image(tags: Mapping[str, Any], size: int, n_bins: int) -> tuple[int, int]:
-    """Rows and columns, once the header proved to be an image's, and no larger than its file."""
+    """Return rows and columns of a header that describes an image no larger than its file."""
     found = {"ImgHdr_Dimensions": 3, "ImgHdr_Frame": 3, **tags}  # these may be missing
     for name, (lowest, highest, what) in _ACCEPTED.items():
         value = found.get(name)
@@ -116,7 +113,7 @@ def _require_image(tags: Mapping[str, Any], size: int, n_bins: int) -> tuple[int
 
 
 def _channel(variable: str | None) -> int | None:
-    """Number of the channel asked for, None for all, -1 for a name of none."""
+    """Return the number of the requested channel, None for all, -1 for a name of none."""
     if variable is None:
         return None
     number = variable.removeprefix("channel ")

@@ -1,4 +1,4 @@
-"""A sample of an image too large to be looked at as a whole."""
+"""Sample of an image that is too large to be processed as a whole."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 SAMPLE_COUNTS = 2**25
 """Largest sample, in counts of bins: 64 MiB of uint16. A smaller image is its own."""
 
-_PATCH = 32  # rows and columns that stay together, for what looks at neighbours
+_PATCH = 32  # rows and columns that stay together, for estimates from neighbours
 
 
 def sample_of(array: Any) -> NDArray[Any]:
-    """Patches of an array (row, col, bin), Dask's or numpy's, from all over the image.
+    """Return patches of an array (row, col, bin), Dask's or numpy's, from all over the image.
 
     All of it if it is small. Of a larger one few chunks are read: those in which the patches lie.
     """

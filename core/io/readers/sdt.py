@@ -3,8 +3,8 @@
 A file holds one block or several, one for each detector or measurement; ``variable`` picks one,
 such as ``"block 0"``. A block is an image (row, col, bin), or curves of one pixel each, which make
 an image of one row; the images of several routing channels in one block are summed. The bin's width
-follows from the measurement's TAC range and gain. The gate opens with the pulse by
-default. All photons of a pulse count.
+follows from the measurement's TAC range and gain. The gate opens with the pulse by default.
+All photons of a pulse count.
 
 `sdtfile` reads the blocks in an isolated process (`core.io.readers.isolation`).
 """
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import AXES, cube_capture
-from core.io.readers.guards import MAX_CUBE_BYTES, require_fits
+from core.io.readers.guards import require_fits
 from core.io.readers.isolation import isolated
 from core.io.readers.options import ReadOptions
 
@@ -37,15 +37,14 @@ def recognizes(start: bytes) -> bool:
 
 def read(path: Path, request: ReadOptions) -> Capture:
     """Read the histograms of a block."""
-    memory = 2 * MAX_CUBE_BYTES
-    told, _ = isolated(path, "the list of blocks", "list_sdt", memory)
-    block = _choose(told["types"], request.variable)
+    listed, _ = isolated(path, "the list of blocks", "list_sdt")
+    block = _choose(listed["types"], request.variable)
     name = f"block {block}"
-    _, (histograms, times) = isolated(path, name, "read_sdt", memory, block=block)
+    _, (histograms, times) = isolated(path, name, "read_sdt", block=block)
     # The format's numbers of 4 bytes: the shortest one in decimals is what was meant.
     bin_width_s = float(str(np.float32(times[1]))) if times.size > 1 else 0.0
     if request.bin_width_s is None:
-        accepted = "a positive one: tell bin_width_s"
+        accepted = "a positive one, by bin_width_s"
         require(f"bin width of {name}", bin_width_s, 0 < bin_width_s < 1, accepted)
     known = replace(
         request,
@@ -53,11 +52,11 @@ def read(path: Path, request: ReadOptions) -> Capture:
         detection=request.detection or "all",
     )
     cube = _image(histograms, name)
-    return cube_capture(cube, name, f"{path.name}, {name}", known, " ".join(AXES))
+    return cube_capture(cube, name, f"{path.name}, {name}", known, axes=" ".join(AXES))
 
 
 def _choose(types: list[int], variable: str | None) -> int:
-    """Number of the block asked for, or of the only one that holds histograms."""
+    """Return the number of the requested block, or of the only one that holds histograms."""
     kinds = [_HISTOGRAMS.get(kind & _CONTENT) for kind in types]
     fitting = {f"block {number}": number for number, kind in enumerate(kinds) if kind}
     listed = ", ".join(f"{name} ({kinds[number]})" for name, number in fitting.items()) or "none"
@@ -71,9 +70,9 @@ def _choose(types: list[int], variable: str | None) -> int:
 
 
 def _image(data: NDArray[Any], name: str) -> NDArray[Any]:
-    """Counts (row, col, bin) of a block: curves as one row, routing channels summed."""
-    wanted = "curves, or images of them"
-    require(f"shape of {name}", data.shape, 2 <= data.ndim <= 5 and data.size > 0, wanted)
+    """Return counts (row, col, bin) of a block: curves as one row, routing channels summed."""
+    fits = 2 <= data.ndim <= 5 and data.size > 0
+    require(f"shape of {name}", data.shape, fits, "curves, or images of them")
     if data.ndim == 2:
         return data[np.newaxis]
     if data.ndim == 3:

@@ -27,7 +27,7 @@ _N_PULSES = 1000
 
 
 class SceneError(ValueError):
-    """A file that cannot be read as a scene: names the file, the field, the value, the remedy."""
+    """File that cannot be read as a scene: names the file, the field, the value, the remedy."""
 
 
 def read_scene(
@@ -64,10 +64,10 @@ def read_scene(
         From the sensor to the nearest point of a mesh, along `direction`, the middle of its
         bounding box in the middle of the image; 50 m by default.
     position_m : sequence of 3 floats, optional
-        Where the sensor stands instead, in metres.
+        Position of the sensor, in place of `distance_m`, in metres.
     direction : sequence of 3 floats, optional
-        Where the sensor looks at a mesh, (0, 1, 0) by default. What is up in the image is up, or
-        for a look straight up or down, the y axis.
+        Line of sight of the sensor, (0, 1, 0) by default. The z axis points up in the image, or
+        for a view straight up or down, the y axis.
 
     Returns
     -------
@@ -77,8 +77,7 @@ def read_scene(
     Raises
     ------
     SceneError
-        Whatever is wrong with the file or its description: names the file, the field, its value
-        and the remedy.
+        If the file or an argument is refused: names the file, the field, its value and the remedy.
     """
     path = Path(path)
     view = mesh.View(size, pixel_angle_rad, distance_m, position_m, direction)
@@ -93,14 +92,13 @@ def read_scene(
         if suffix in mesh.SUFFIXES:
             range_m, pixel_angle_rad = mesh.read(path, unit_m or 1.0, view)
         else:
-            for name, value in view.of_a_mesh.items():
-                require(name, value, value is None, "None: a depth map has a view of its own")
+            view.refuse("a depth map has a view of its own")
             range_m = depth.read(path, unit_m)
         return Scene(range_m, acquisition=suitable_acquisition(range_m, pixel_angle_rad))
 
 
 def suitable_acquisition(range_m: Floats, pixel_angle_rad: float | None) -> Acquisition:
-    """The gate for surfaces at these ranges, by the rule above.
+    """Return the gate for surfaces at these ranges, by the rule above.
 
     Parameters
     ----------

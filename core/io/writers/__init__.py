@@ -7,7 +7,7 @@ written in the layouts of `core.io.readers.npz` and `core.io.readers.labelled`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Integral
 from pathlib import Path
 from typing import BinaryIO
@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from core.capture import Capture, Seen
+from core.capture import Capture, CaptureInfo
 from core.checks import require
 from core.estimators import RangeImage
 from core.io.readers.labelled import dataset
@@ -66,7 +66,7 @@ CAPTURE_SUFFIXES = (".npz", ".nc", ".h5", ".zarr")
 def save_capture(
     capture: Capture, path: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
-    """Write a capture atomically; `core.io.readers.read_capture` gives it back.
+    """Write a capture atomically, so that `core.read_capture` reads it back.
 
     Parameters
     ----------
@@ -86,10 +86,7 @@ def save_capture(
     OSError
         If the folder cannot be written; an older file is then left as it was.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    accepted = "one of " + ", ".join(CAPTURE_SUFFIXES)
-    require("suffix", path.suffix, suffix in CAPTURE_SUFFIXES, accepted)
+    path, suffix = _path_and_suffix(path, CAPTURE_SUFFIXES)
     if suffix == ".zarr":
         with whole_folder(path, overwrite=overwrite) as folder:
             netcdf.write_folder(dataset(capture), folder)
@@ -103,7 +100,7 @@ def save_capture(
 
 
 def save_image(
-    capture: Seen,
+    capture: CaptureInfo,
     image: RangeImage,
     path: str | os.PathLike[str],
     *,
@@ -136,7 +133,7 @@ def save_image(
         Source of the range image; for one larger than memory, the overview that
         `core.out_of_core.tiles.as_image` returns.
     image : RangeImage
-        The answer, of the capture's shape.
+        Estimates, of the capture's shape.
     path : path-like
         A name ending in one of the suffixes of `WRITERS`.
     overwrite : bool
@@ -159,10 +156,7 @@ def save_image(
     OSError
         If the folder cannot be written; an older file is then left as it was.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    known = [*WRITERS, *FOLDER_WRITERS]
-    require("suffix", path.suffix, suffix in known, "one of " + ", ".join(known))
+    path, suffix = _path_and_suffix(path, (*WRITERS, *FOLDER_WRITERS))
     if pixel_angle_rad is None:
         pixel_angle_rad = capture.acquisition.pixel_angle_rad
     product = Product(capture, image, pixel_angle_rad, title, rgb)
@@ -183,7 +177,7 @@ def save_pixel(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write what the tracking differentiators make of one pixel, one line a bin, as CSV.
+    """Write the signals of the tracking differentiators in one pixel as CSV, one line a bin.
 
     The columns are ``bin``, ``time_s`` and ``range_m`` (where the bin begins), ``counts`` (whole
     numbers), and the stages of `core.Signals` in counts: ``raw``, ``small``, ``large``,
@@ -211,10 +205,17 @@ def save_pixel(
     OSError
         If the folder cannot be written; an older file is then left as it was.
     """
-    path = Path(path)
-    require("path", str(path), path.suffix.lower() == ".csv", "a name ending in .csv")
+    path, _ = _path_and_suffix(path, (".csv",))
     for name, index, size in zip(("row", "col"), (row, col), capture.shape, strict=True):
         inside = isinstance(index, Integral) and 0 <= index < size
         require(name, index, inside, f"an integer from 0 to {size - 1}, within the image")
     with whole_file(path, overwrite=overwrite) as file:
         table.write_pixel(capture, row, col, settings or TrackingParameters(), file)
+
+
+def _path_and_suffix(path: str | os.PathLike[str], accepted: Sequence[str]) -> tuple[Path, str]:
+    """Return a path and its suffix in lower case, which must be one of those accepted."""
+    path = Path(path)
+    suffix = path.suffix.lower()
+    require("suffix", path.suffix, suffix in accepted, f"one of {', '.join(accepted)}")
+    return path, suffix

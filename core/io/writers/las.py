@@ -1,9 +1,9 @@
-"""LAS 1.4 point clouds, and LAZ, their compressed twin.
+"""LAS 1.4 point clouds, and LAZ, their compressed form.
 
 Coordinates are whole multiples of a step: the power of ten that is a thousandth of a bin or less,
 down to a hundredth of that; only a cloud too wide for 32 bits gets coarser ones. ``intensity`` is
-the counts, at most 65535, and colours fill 16 bits as the standard asks. Extra bytes hold all else,
-their units in their descriptions.
+the counts, at most 65535, and colours fill 16 bits as the standard requires. Extra bytes hold the
+other columns, with units in their descriptions.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
     colors = {name: columns.pop(name) for name in COLORS if name in columns}
     header = laspy.LasHeader(version="1.4", point_format=7 if colors else 6)
     header.generating_software = "firstphoton"
-    header.global_encoding.wkt = True  # which the standard demands of this point format
+    header.global_encoding.wkt = True  # as the standard requires of this point format
     header.offsets, header.scales = _grid(points.xyz_m, product.capture.acquisition.bin_length_m)
     header.add_extra_dims(
         [
@@ -64,9 +64,7 @@ def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
 
 
 def _grid(xyz_m: Floats, bin_length_m: float) -> tuple[Floats, Floats]:
-    """Offsets and scales of x, y and z in metres."""
-    if not len(xyz_m):
-        return np.zeros(3), np.full(3, 10.0 ** math.floor(math.log10(bin_length_m / 1000)))
+    """Return offsets and scales of x, y and z in metres."""
     low, high = xyz_m.min(axis=0), xyz_m.max(axis=0)
     offsets = np.round((low + high) / 2)
     extent = float(np.abs(xyz_m - offsets).max())

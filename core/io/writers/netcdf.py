@@ -1,4 +1,4 @@
-"""netCDF-4 with the metadata of the CF conventions; such a file is an HDF5 file, too. And Zarr.
+"""netCDF-4 (which is HDF5) and Zarr, with the metadata of the CF conventions.
 
 Variables ``range_m``, ``confidence``, ``counts``, ``bin``, ``score``, ``valid`` (1 or 0) over the
 dimensions ``row`` and ``col``; acquisition and source are attributes of the file.
@@ -10,14 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from core.io.writers.product import Plane, Product
+from core.io.writers.product import Product
 
 if TYPE_CHECKING:
     import xarray as xr
 
-_FLAGS = {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "no_answer answer"}
+_FLAGS: dict[str, Any] = {
+    "flag_values": np.array([0, 1], np.int8),
+    "flag_meanings": "no_estimate estimate",
+}
 
 
 def write(product: Product, file: BinaryIO) -> None:
@@ -33,7 +35,7 @@ def write_zarr(product: Product, folder: Path) -> None:
 def write_folder(data: xr.Dataset, folder: Path) -> None:
     """Write a dataset as Zarr.
 
-    It is packed in memory before: of files, Zarr's own threads write more after one has failed.
+    It is packed in memory first: Zarr's own threads go on writing files after one has failed.
     """
     from zarr.storage import MemoryStore  # noqa: PLC0415
 
@@ -48,19 +50,14 @@ def write_folder(data: xr.Dataset, folder: Path) -> None:
 def _dataset(product: Product) -> xr.Dataset:
     import xarray as xr  # noqa: PLC0415 - slow to import
 
-    variables = {
-        name: (("row", "col"), _numbers(plane), _attributes(plane))
-        for name, plane in product.planes.items()
-    }
+    variables = {}
+    for name, (values, unit, meaning) in product.planes.items():
+        is_flag = values.dtype == bool  # which netCDF does not have
+        attributes = {"units": unit, "long_name": meaning} | (_FLAGS if is_flag else {})
+        variables[name] = (
+            ("row", "col"),
+            values.astype(np.int8) if is_flag else values,
+            attributes,
+        )
     about = {"Conventions": "CF-1.11", "title": product.heading}
     return xr.Dataset(variables, attrs={**about, **product.facts})
-
-
-def _numbers(plane: Plane) -> NDArray[Any]:
-    """The values; netCDF has no booleans."""
-    return plane.values.astype(np.int8) if plane.values.dtype == bool else plane.values
-
-
-def _attributes(plane: Plane) -> dict[str, object]:
-    flags = _FLAGS if plane.values.dtype == bool else {}
-    return {"units": plane.unit, "long_name": plane.meaning, **flags}

@@ -1,6 +1,6 @@
-"""Pictures of a range image: PNG and SVG, the same file each time for the same answer.
+"""Pictures of a range image: PNG and SVG, the same bytes each time for the same image.
 
-The colours span the confident answers; what lies beyond them is grey, what has no answer white.
+The colours span the confident estimates; ranges beyond them are grey, pixels without one white.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from core.io.writers.product import Product
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_OUTSIDE, _WITHOUT_ANSWER = "#9aa2ab", "#ffffff"
+_OUTSIDE, _INVALID = "#9aa2ab", "#ffffff"
 
 
 def write_png(product: Product, file: BinaryIO) -> None:
@@ -42,7 +42,7 @@ def _drawn(product: Product) -> Figure:
     rows, cols = product.image.range_m.shape
     low_m, high_m = _limits_m(product)
     colors = matplotlib.colormaps["viridis"].with_extremes(
-        bad=_WITHOUT_ANSWER, under=_OUTSIDE, over=_OUTSIDE
+        bad=_INVALID, under=_OUTSIDE, over=_OUTSIDE
     )
     figure = Figure(
         figsize=(6.4, float(np.clip(5.2 * rows / cols, 1.6, 10.0))), layout="constrained"
@@ -54,12 +54,12 @@ def _drawn(product: Product) -> Figure:
     axes.set_title(product.heading, parse_math=False, wrap=True)
     axes.set(xlabel="Column (px)", ylabel="Row (px)")
     figure.colorbar(shown, ax=axes, label="Range (m)", extend="both")
-    figure.supxlabel("white: no answer · grey: beyond the colours", fontsize="small")
+    figure.supxlabel("white: no estimate · grey: beyond the colours", fontsize="small")
     return figure
 
 
 def _limits_m(product: Product) -> tuple[float, float]:
-    """Ends of the colours: of confident answers, else of all answers, else of the gate."""
+    """Return the ends of the colours: of confident estimates, else of all, else of the gate."""
     image, acquisition = product.image, product.capture.acquisition
     sure = image.range_m[image.valid & (image.confidence >= 0.9)]
     sure = sure if sure.size else image.range_m[image.valid]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.capture import Seen
+from core.capture import CaptureInfo
 from core.checks import require
 from core.estimators import RangeImage
 from core.geometry import Points, points_m
@@ -32,14 +32,14 @@ class Product:
 
     Parameters
     ----------
-    capture : Seen
+    capture : CaptureInfo
         Source of the range image.
     image : RangeImage
         Range image of the capture's shape.
     pixel_angle_rad : float, optional
         Angle between the lines of sight of neighbouring pixels, in radians.
     title : str
-        For people; see `heading`.
+        Title; see `heading`.
     rgb : ndarray of uint8, shape (row, col, 3), optional
         Colours of the points of a cloud.
     shown : mapping of str to Plane
@@ -52,7 +52,7 @@ class Product:
         angle is not between 0 and π/2.
     """
 
-    capture: Seen
+    capture: CaptureInfo
     image: RangeImage
     pixel_angle_rad: float | None = None
     title: str = ""
@@ -75,22 +75,24 @@ class Product:
 
     @property
     def heading(self) -> str:
-        """The title, if there is one."""
+        """Title, or a general one."""
         return _plain(self.title) or "Range image"
 
     @property
     def planes(self) -> dict[str, Plane]:
-        """The images, by name."""
+        """Images by name."""
         image, shown = self.image, dict(self.shown)
         known = {
-            "range_m": Plane(image.range_m, "m", "range of the surface, NaN without an answer"),
+            "range_m": Plane(image.range_m, "m", "range of the surface, NaN without an estimate"),
             "confidence": Plane(
-                image.confidence, "1", "probability that the surface is within 3 bins of the answer"
+                image.confidence,
+                "1",
+                "probability that the estimate is right within 3 bins",
             ),
             "counts": Plane(self.capture.counts, "1", "detections of the pixel"),
             "bin": Plane(image.bin, "1", "delay of the echo in bins, from the opening of the gate"),
-            "score": Plane(image.score, "1", "score at the answer, of the estimator's own scale"),
-            "valid": Plane(image.valid, "1", "whether there is an answer"),
+            "score": Plane(image.score, "1", "score of the estimate, of the estimator's own scale"),
+            "valid": Plane(image.valid, "1", "whether there is an estimate"),
         }
         return shown | {name: plane for name, plane in known.items() if name not in shown}
 
@@ -110,15 +112,15 @@ class Product:
         return facts
 
     def points(self) -> Points:
-        """The answers in space.
+        """Return the estimates in space.
 
         Raises
         ------
         ValueError
             If there are none, or the angle between pixels is not known.
         """
-        answers = int(self.image.valid.sum())
-        require("answers", answers, answers > 0, "an image with answers: a cloud needs points")
+        n_valid = int(self.image.valid.sum())
+        require("valid pixels", n_valid, n_valid > 0, "an image with some: a cloud needs points")
         angle_rad = self.pixel_angle_rad
         if angle_rad is None:
             raise ValueError(
@@ -142,5 +144,5 @@ class Product:
 
 
 def _plain(text: str) -> str:
-    """Text on one line, of characters that every format can hold."""
+    """Return text on one line, of characters that every format can hold."""
     return "".join(character if character.isprintable() else " " for character in text)

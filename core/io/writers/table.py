@@ -18,7 +18,7 @@ from core.io.writers.product import Product
 from core.tracking import TrackingParameters, tracking_signals
 
 ROWS_AT_ONCE = 2**11
-"""Turned into text together: memory stays bounded, and other threads wait for milliseconds only."""
+"""Rows converted to text together: memory stays bounded, and other threads get their turn."""
 
 
 def write(product: Product, file: BinaryIO) -> None:
@@ -58,7 +58,7 @@ def write_pixel(
 
 
 def write_columns(columns: Mapping[str, ArrayLike], file: BinaryIO) -> None:
-    """Write columns of one length, one line a place, whatever their shapes.
+    """Write columns of one size as CSV, one line for each index.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def write_columns(columns: Mapping[str, ArrayLike], file: BinaryIO) -> None:
 def _cells(values: NDArray[Any]) -> list[object]:
     if values.dtype.kind != "f":
         return list(values.tolist())
-    # Of 32 bits the digits that they have, not those of the double that is equal.
+    # 32-bit floats with their own digits, not those of the equal double.
     numbers = values.tolist() if values.itemsize > 4 else values.astype(str).tolist()
     missing = np.isnan(values).tolist()
     return ["" if is_nan else cell for cell, is_nan in zip(numbers, missing, strict=True)]

@@ -1,11 +1,9 @@
-"""TIFF: pages of 32-bit floats, ``range_m``, ``confidence`` and ``counts``.
-
-What else the product shows comes first.
+"""TIFF: pages of 32-bit floats: images that the product adds, range, confidence, counts.
 
 Ranges are exact to 6e-8 of themselves, counts up to 2**24. Each page has its name (the tag
 PageName), its meaning and unit (ImageDescription, and for GIS the tags of GDAL), and the
 acquisition. Image programs open the pages as a stack; a GIS opens the first, and the others as
-subdatasets. Where there is no answer the range is NaN; a page with NaN declares it "no data".
+subdatasets. Invalid ranges are NaN; a page with NaN declares it "no data".
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files and folders that are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _REMEDIES |= dict.fromkeys(
 
 
 class _Watched(io.FileIO):
-    """A file that keeps the first failure to write to it: some libraries report it as their own."""
+    """File that keeps its first failure to write: some libraries raise errors of their own."""
 
     failure: OSError | None = None
 
@@ -58,14 +58,7 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
-    """A file to be written, which takes its name only once all of it lies on the disk.
-
-    Parameters
-    ----------
-    path : Path
-        The name.
-    overwrite : bool
-        Replace a file of that name.
+    """Open a file that takes its name only once all of it lies on the disk.
 
     Yields
     ------
@@ -80,11 +73,12 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
         If the folder cannot be written; an older file is then left as it was.
     """
     with writing(path):
-        if path.exists() and not overwrite:
-            raise _refusal(path)
+        _require_free(path, overwrite)
         unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
+        raw = None
         try:
-            with _opened(unfinished) as file:
+            raw = _Watched(unfinished, "x+")
+            with io.BufferedRandom(raw) as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -92,59 +86,37 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
                 os.replace(unfinished, path)
             else:
                 _take_free_name(unfinished, path)
+        except Exception as error:
+            if raw is None or raw.failure is None or isinstance(error, OSError):
+                raise
+            raise raw.failure from error  # rather than what a library made of it
         finally:
             unfinished.unlink(missing_ok=True)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """A new file to write and read, which reports its own failure before that of a library."""
-    raw = _Watched(path, "x+")
-    try:
-        with io.BufferedRandom(raw) as file:
-            yield file
-    except Exception as error:
-        if raw.failure is not None and not isinstance(error, OSError):
-            raise raw.failure from error
-        raise
-
-
-@contextmanager
 def whole_folder(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """A folder to be filled, which takes its name only once it is full; like `whole_file`.
-
-    Yields
-    ------
-    Path
-        Where to write.
-    """
+    """Yield a folder to be filled, which takes its name only once it is full; as `whole_file`."""
     with writing(path):
-        if path.exists() and not overwrite:
-            raise _refusal(path)
-        unfinished = path.with_name(f".{secrets.token_hex(8)}.part")
-        older = path.with_name(f".{secrets.token_hex(8)}.older")
+        _require_free(path, overwrite)
+        unfinished, older = (
+            path.with_name(f".{secrets.token_hex(8)}.{kind}") for kind in ("part", "older")
+        )
         try:
             yield unfinished
             if overwrite and path.exists():
                 path.rename(older)
             try:
-                unfinished.rename(path)  # fails where something full of that name came meanwhile
+                unfinished.rename(path)  # fails where a folder of that name came meanwhile
             except BaseException as error:
-                _put_back(older, path, error)
+                if os.path.lexists(older) and os.path.lexists(path):
+                    error.add_note(f"What was {path} is now {older}.")
+                elif os.path.lexists(older):
+                    older.rename(path)
                 raise
             _remove(older)
         finally:
             _remove(unfinished)
-
-
-def _put_back(older: Path, path: Path, error: BaseException) -> None:
-    """Give what was to be replaced its name again, or say where it is now."""
-    if not os.path.lexists(older):
-        return
-    if os.path.lexists(path):
-        error.add_note(f"What was {path} is now {older}.")
-    else:
-        older.rename(path)
 
 
 def _remove(path: Path) -> None:
@@ -155,6 +127,11 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def _require_free(path: Path, overwrite: bool) -> None:
+    if path.exists() and not overwrite:
+        raise _refusal(path)
+
+
 def _refusal(path: Path) -> FileExistsError:
     return FileExistsError(
         f"{shown(path)} exists: give another name, or overwrite=True to replace it."
@@ -162,23 +139,13 @@ def _refusal(path: Path) -> FileExistsError:
 
 
 def _take_free_name(unfinished: Path, path: Path) -> None:
-    """Name a file; a link, unlike renaming, never replaces what came to exist meanwhile."""
-    try:
-        os.link(unfinished, path)
-    except FileExistsError:
-        raise _refusal(path) from None
-    except OSError:  # this file system has no hard links
-        _claim(path)
-        try:
-            os.replace(unfinished, path)
-        except OSError:
-            path.unlink()
-            raise
-
-
-def _claim(path: Path) -> None:
-    """Make an empty file of a name that must be free."""
+    """Rename a file, but never over another: an empty file claims the name first."""
     try:
         path.open("xb").close()
     except FileExistsError:
         raise _refusal(path) from None
+    try:
+        os.replace(unfinished, path)
+    except OSError:
+        path.unlink()
+        raise

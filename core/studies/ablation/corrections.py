@@ -1,13 +1,11 @@
-"""What it changes that an estimator takes something into account of a capture."""
+"""Effect of an estimator's corrections on its estimates and their time."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-from scipy.special import stdtrit
 
 from core import metrics
 from core.acquisition import Floats
@@ -22,11 +20,12 @@ from core.inference.flux import (
 from core.inference.posterior import TOLERANCE_BINS
 from core.inference.resolution import Difference
 from core.metrics import Interval
-from core.studies.timing import FEWEST_REPEATS, interleaved, median_interval
+from core.studies.statistics import mean_interval
+from core.studies.timing import time_ratio
 
 
 def with_correction(capture: Capture, correction: str) -> Capture:
-    """The same counts for an estimator that makes one of `CORRECTIONS`, whatever it would spare."""
+    """Return the same counts for an estimator that always makes one of `CORRECTIONS`."""
     if correction == "pulse_shape":
         return capture
     flux_prior = detailed_flux_prior_of(capture)
@@ -35,8 +34,8 @@ def with_correction(capture: Capture, correction: str) -> Capture:
     return replace(capture, flux_prior=flux_prior)
 
 
-def levels_apart(capture: Capture) -> Difference:
-    """How far each pixel's level of signal lies from the mean level, for 1000 pixels."""
+def level_deviation(capture: Capture) -> Difference:
+    """Compare the signal levels of 1000 pixels with their mean level."""
     flux_prior = detailed_flux_prior_of(capture)
     share = flux_prior.share[1:] / flux_prior.share[1:].sum()
     pixels = np.maximum(np.round(1000 * share), 1).astype(int)
@@ -44,18 +43,18 @@ def levels_apart(capture: Capture) -> Difference:
 
 
 def delays(capture: Capture, method: str) -> Floats:
-    """A method's answers by its defaults, in fractional bins; shape (row, col)."""
+    """Return the estimates of a method with default settings in fractional bins (row, col)."""
     estimator = ESTIMATORS[method]
     return estimator.delays(capture, estimator.parameters())[0]
 
 
-def answers_m(capture: Capture, method: str) -> Floats:
-    """The same as ranges, NaN where there is none."""
+def ranges_m(capture: Capture, method: str) -> Floats:
+    """Return the same estimates as ranges, NaN where there are none."""
     return capture.acquisition.bin_to_range_m(delays(capture, method))
 
 
 def score(range_m: Floats, truth_m: Floats, capture: Capture) -> tuple[float, float]:
-    """Restoration degree within 3 bins, and RMSE in metres, of answers to some of its pixels."""
+    """Return restoration degree within 3 bins and RMSE in metres, over some of the pixels."""
     tolerance_m = TOLERANCE_BINS * capture.acquisition.bin_length_m
     return (
         metrics.restoration_degree(range_m, truth_m, tolerance_m),
@@ -64,44 +63,26 @@ def score(range_m: Floats, truth_m: Floats, capture: Capture) -> tuple[float, fl
 
 
 def changes(with_it: Floats, without_it: Floats) -> tuple[Interval, Interval]:
-    """Of restoration degree and of RMSE, from paired scores (repetition, 2)."""
-    rd, rmse_m = (with_it - without_it).T
-    return student(rd), student(rmse_m)
-
-
-def student(change: Floats) -> Interval:
-    """Mean of paired changes (n,), NaN left out, with Student's 95 % interval."""
-    known = change[np.isfinite(change)]
-    if known.size < 2:
-        return Interval(math.nan, math.nan, math.nan)
-    mean = float(np.mean(known))
-    half = float(stdtrit(known.size - 1, 0.975) * np.std(known, ddof=1) / math.sqrt(known.size))
-    return Interval(mean, mean - half, mean + half)
+    """Return the mean changes of restoration degree and RMSE, from paired scores (n, 2)."""
+    rd, rmse_m = (mean_interval(each[np.isfinite(each)]) for each in (with_it - without_it).T)
+    return rd, rmse_m
 
 
 def ranging_ratio(with_it: Capture, without_it: Capture, method: str) -> Interval:
-    """Time of a method on one capture over that on another, on some rows, their light known."""
-    one, other = _some_rows(with_it), _some_rows(without_it)
-    return time_ratio(lambda: delays(one, method), lambda: delays(other, method))
+    """Return the ratio of the times to range two captures (their first rows), flux known."""
+    one, other = _first_rows(with_it), _first_rows(without_it)
+    return time_ratio(partial(delays, one, method), partial(delays, other, method))
 
 
-def _some_rows(capture: Capture) -> Capture:
-    """As many as are ranged in some milliseconds."""
+def _first_rows(capture: Capture) -> Capture:
+    """Return as many rows as are ranged within milliseconds, their flux model computed."""
     rows = max(1, 2**19 // capture.cube[0].size)
-    some = replace(
+    part = replace(
         capture,
         cube=capture.cube[:rows].copy(),
         truth_range_m=None,
         signal=None,
         flux_prior=flux_prior_of(capture),
     )
-    flux_model_of(some)
-    return some
-
-
-def time_ratio(
-    one: Callable[[], object], other: Callable[[], object], repeats: int = FEWEST_REPEATS + 3
-) -> Interval:
-    """Median of the ratio of two times, taken in turn."""
-    seconds = interleaved({"one": one, "other": other}, repeats)
-    return median_interval(seconds["one"] / seconds["other"])
+    flux_model_of(part)
+    return part

@@ -1,7 +1,4 @@
-"""One echo over uniform background and nothing else: what absent parts are compared with.
-
-It is `core.simulate.triggered_by_each_edge` with every part left out of its code.
-"""
+"""Cost of absent parts: the simulation's model against code that has no parts at all."""
 
 from __future__ import annotations
 
@@ -11,13 +8,17 @@ import numpy as np
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.scene import PARTS, Scene, without
-from core.simulation import add_echo, triggered_by_each_edge
-from core.studies.ablation.corrections import time_ratio
+from core.simulation import add_echo, cumulative_trigger_probability
 from core.studies.outputs import Table
+from core.studies.timing import time_ratio
 
 
 def plain_triggered(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse) -> Floats:
-    """Probability to have fired before each bin edge, shape (pixel, n_bins + 1)."""
+    """Return the probability of a trigger before each bin edge, shape (pixel, n_bins + 1).
+
+    `core.simulation.cumulative_trigger_probability` for one echo over uniform background, without
+    the code of any part.
+    """
     onset_bin = np.ravel(acquisition.range_m_to_bin(scene.range_m))
     signal = np.where(np.isfinite(onset_bin), flux.signal, 0.0)
     before = np.empty((onset_bin.size, acquisition.n_bins + 1))
@@ -28,24 +29,19 @@ def plain_triggered(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: P
 
 
 def bare(scene: Scene) -> Scene:
-    """The scene with every part absent."""
+    """Return the scene without any part."""
     for part in PARTS:
         scene = without(scene, part)
     return scene
 
 
 def table(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse) -> Table:
-    """What absent parts cost: the time of the model over that of the plain one, and whether the
-    numbers are the same."""
+    """Return the time of the model over that of the plain code, and whether results are equal."""
     given = (bare(scene), acquisition, flux, pulse)
     ratio = time_ratio(
-        partial(triggered_by_each_edge, *given), partial(plain_triggered, *given), 41
+        partial(cumulative_trigger_probability, *given), partial(plain_triggered, *given), 41
     )
-    same = np.array_equal(triggered_by_each_edge(*given), plain_triggered(*given))
-    told = f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
-    return Table(
-        "absent",
-        "Absent parts cost nothing",
-        ("all parts absent, against code without them", "time", "same bits"),
-        ((", ".join(PARTS.values()), told, "yes" if same else "NO"),),
-    )
+    same = np.array_equal(cumulative_trigger_probability(*given), plain_triggered(*given))
+    columns = ("absent parts", "time, ratio to code without them", "bit for bit equal")
+    row = (", ".join(PARTS.values()), ratio, "yes" if same else "NO")
+    return Table("absent", "Cost of absent parts", columns, (row,), formats={columns[1]: ".3f"})

@@ -1,8 +1,8 @@
-"""Is a confidence of 0.9 right nine times in ten? For every method, on two scenes, at six SBRs."""
+"""Calibration of the confidence: is 0.9 right nine times in ten?"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture
-from core.estimators import ESTIMATORS, RangeImage
+from core.estimators import RangeImage, estimate
 from core.inference.posterior import TOLERANCE_BINS
-from core.metrics import Told, calibration_error, reliability
-from core.studies.outputs import Table
+from core.metrics import ReliabilityBin, calibration_error, reliability
+from core.studies.outputs import Table, table
 from core.studies.paper.printed import TABLE_2
 from core.studies.trials import Condition
 
 METHODS = ("likelihood", "tracking", "coates", "peak")
+SCENES = ("uniform", "car")
 
 
-def told_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, NDArray[np.bool_]]:
-    """Confidence of all answers, and whether each is right; where there is no surface it is wrong.
+def confidence_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the confidence of all estimates and whether each is right; wrong without a surface.
 
     Raises
     ------
@@ -42,48 +43,50 @@ class Report:
     scene: str
     sbr: float | None
     method: str
-    told: list[Told]
+    tenths: list[ReliabilityBin]
+    """Estimates by tenths of confidence, from `core.metrics.reliability`."""
 
     @property
     def error(self) -> float:
         """Expected calibration error."""
-        return calibration_error(self.told)
+        return calibration_error(self.tenths)
 
 
 def reports(seeds: Sequence[int]) -> Iterator[Report]:
-    """Compute the report, one method, scene and SBR at a time, and all SBRs together last."""
-    for scene in ("uniform", "car"):
-        pooled: dict[str, list[tuple[Floats, NDArray[np.bool_]]]] = {m: [] for m in METHODS}
+    """Yield a report per scene, SBR and method, and last of each scene one over all SBRs."""
+    for scene in SCENES:
+        found: dict[tuple[float, str], tuple[Floats, NDArray[np.bool_]]] = {}
         for sbr in TABLE_2:
-            here: dict[str, list[tuple[Floats, NDArray[np.bool_]]]] = {m: [] for m in METHODS}
-            for seed in seeds:
-                capture = Condition(scene, sbr).capture(seed)
-                for method in METHODS:
-                    estimator = ESTIMATORS[method]
-                    image = estimator(capture, estimator.parameters())
-                    here[method].append(told_and_right(capture, image))
+            captures = [Condition(scene, sbr).capture(seed) for seed in seeds]
             for method in METHODS:
-                yield Report(scene, sbr, method, _pooled(here[method]))
-                pooled[method] += here[method]
+                pairs = [confidence_and_right(c, estimate(c, method)) for c in captures]
+                found[sbr, method] = _joined(pairs)
+                yield Report(scene, sbr, method, reliability(*found[sbr, method]))
         for method in METHODS:
-            yield Report(scene, None, method, _pooled(pooled[method]))
+            pooled = _joined([found[sbr, method] for sbr in TABLE_2])
+            yield Report(scene, None, method, reliability(*pooled))
 
 
-def _pooled(pairs: Sequence[tuple[Floats, NDArray[np.bool_]]]) -> list[Told]:
+def _joined(
+    pairs: Sequence[tuple[Floats, NDArray[np.bool_]]],
+) -> tuple[Floats, NDArray[np.bool_]]:
     confidence, right = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    return reliability(confidence, right)
+    return confidence, right
 
 
-def table(reports: Iterable[Report]) -> Table:
-    """Return a row for each report: its calibration error, and the share right by confidence."""
-    rows = []
-    for report in reports:
-        bins = (f"{t.confidence:.2f}: {t.right.value:.2f} ({t.count})" for t in report.told)
-        sbr = "all six" if report.sbr is None else f"{report.sbr:g}"
-        rows.append((report.scene, sbr, report.method, report.error, ", ".join(bins)))
-    return Table(
+def calibration_table(seeds: Sequence[int]) -> Table:
+    """Return calibration error and share of right estimates by confidence of each report."""
+    return table(
         "calibration",
         "Calibration of confidence",
-        ("scene", "SBR", "method", "calibration error", "confidence: share right (estimates)"),
-        tuple(rows),
+        reports(seeds),
+        {
+            "scene": lambda report: report.scene,
+            "SBR": lambda report: "all six" if report.sbr is None else f"{report.sbr:g}",
+            "method": lambda report: report.method,
+            "calibration error": lambda report: report.error,
+            "confidence: share right (estimates)": lambda report: ", ".join(
+                f"{t.confidence:.2f}: {t.right.value:.2f} ({t.count})" for t in report.tenths
+            ),
+        },
     )

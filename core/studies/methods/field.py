@@ -1,9 +1,9 @@
-"""Published captures with a truth: how near each method comes to it.
+"""Published captures with a truth: how accurate each method is on measured data.
 
-The mannequin's face, a raster scan of 340 x 340 pixels and 8 photons a pixel (photon counting), is
-compared with a scan of many photons: one offset, the median over the face, is taken off, and a
-pixel without an answer counts as wrong. The distances of a TMF8820 are compared with the plane that
-it was held before.
+The mannequin's face, a raster scan of 340 x 340 pixels with 8 photons per pixel (photon counting),
+is compared with a scan of many photons: the median offset over the face is subtracted, and a pixel
+without an estimate counts as wrong. The distances of a TMF8820 are compared with the plane in front
+of which it was held.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from core.studies.outputs import Table
 FACE, FACE_TRUTH = "data_face.mat", "data_mannequin_face_truth.mat"
 TMF8820 = "tmf8820_distance_data.json"
 
-_IN_SCAN = np.s_[0:340, 3:343]  # of the truth's 350 x 350: what registers to the capture
+_IN_SCAN = np.s_[0:340, 3:343]  # the part of the truth's 350 x 350 that the capture covers
 _FACE_BINS = 3550.0, 3700.0
 _WALL_BIN = 4000.0
 NEAR_M, FAR_M = 0.03, 0.15
 
 GAUSSIAN = Pulse.gaussian(45 * NATIVE_BIN_S)
-METHODS = tuple(name for name in ESTIMATORS if name != "oracle")  # none knows the true light
+METHODS = tuple(name for name in ESTIMATORS if name != "oracle")  # the true flux is unknown
 
 KNOWN = {
     "all photons": (0.824, 0.940, 0.914, 0.966),
@@ -44,12 +44,12 @@ KNOWN = {
     "background, SBR 0.30": (0.599, 0.694, 0.816, 0.861),
     "background, SBR 0.06": (0.367, 0.446, 0.647, 0.701),
 }
-"""Of pixels with a photon, peak and matched filter each within 30 mm and 150 mm, as measured by
-others on this capture with a Gaussian of 360 ps."""
+"""Shares of pixels with a photon within 30 mm and 150 mm, by peak and matched filter, as measured
+by others on this capture with a Gaussian of 360 ps."""
 
 
 class Face(NamedTuple):
-    """The capture's truth."""
+    """The truth of the face capture."""
 
     range_m: Floats
     """Shape (row, col)."""
@@ -58,7 +58,7 @@ class Face(NamedTuple):
 
 
 def face_truth(folder: Path) -> Face:
-    """Read what `FACE` is compared with."""
+    """Read the truth of `FACE`."""
     cells = loadmat(folder / FACE_TRUTH)["D_true"]
     bins = np.array([cell.item() if cell.size else np.nan for cell in cells.ravel()])
     bins = bins.reshape(cells.shape)[_IN_SCAN]
@@ -68,28 +68,27 @@ def face_truth(folder: Path) -> Face:
 
 
 def wall_pulse(folder: Path, truth: Face) -> Pulse:
-    """The pulse as the wall behind the face returns it; the wall is not scored.
+    """Measure the pulse on the wall behind the face, which is not scored.
 
-    The mean background is taken off, and what is left kept from where it first exceeds a hundredth
-    of the peak to where it last does.
+    The background is subtracted, and the rest cut to where it exceeds a hundredth of its peak.
     """
     capture = read_capture(folder / FACE, bin_width_s=NATIVE_BIN_S, pulse=GAUSSIAN)
     seen = capture.cube[truth.is_wall].sum(axis=0, dtype=np.int64).astype(float)
     echo = np.maximum(seen - np.median(seen), 0.0)
     kept = np.flatnonzero(echo > 0.01 * echo.max())
-    around = kept[np.abs(kept - echo.argmax()) < 300]  # other things stand in the gate, too
+    around = kept[np.abs(kept - echo.argmax()) < 300]  # there are other surfaces in the gate
     return Pulse.measured(echo[around[0] : around[-1] + 1], bin_width_s=NATIVE_BIN_S)
 
 
 def with_background(capture: Capture, sbr: float, seed: int = 0) -> Capture:
-    """The capture with uniform background added, its own photons taken for signal."""
+    """Add uniform background, taking the capture's own photons for signal."""
     rate = capture.counts.mean() / sbr / capture.acquisition.n_bins
     added = np.random.default_rng(seed).poisson(rate, capture.cube.shape).astype(np.uint16)
     return replace(capture, cube=capture.cube + added, source=f"{capture.source}; SBR {sbr:g}")
 
 
 def face_captures(folder: Path, pulse: Pulse) -> Iterator[tuple[str, Capture]]:
-    """The four conditions."""
+    """Yield the four conditions."""
     everything = read_capture(folder / FACE, pulse=pulse)
     names = iter(KNOWN)
     yield next(names), everything
@@ -99,7 +98,7 @@ def face_captures(folder: Path, pulse: Pulse) -> Iterator[tuple[str, Capture]]:
 
 
 def face_table(folder: Path, pulse: Pulse, title: str, progress: Callable[[str], None]) -> Table:
-    """Share of the face's pixels within 30 mm and within 150 mm, for each method.
+    """Return the share of the face's pixels within 30 mm and 150 mm, for each method.
 
     Raises
     ------
@@ -111,7 +110,7 @@ def face_table(folder: Path, pulse: Pulse, title: str, progress: Callable[[str],
     spent_s = dict.fromkeys(METHODS, 0.0)
     known = ["", *(f"{p:.3f} {q:.3f} / {m:.3f} {n:.3f}" for p, q, m, n in KNOWN.values())]
     for condition, capture in face_captures(folder, pulse):
-        posterior_of(capture)  # found once for each capture, whatever the method
+        posterior_of(capture)  # computed once per capture, whatever the method
         for method in METHODS:
             progress(f"{title}, {condition}: {method}")
             started = perf_counter()
@@ -124,12 +123,12 @@ def face_table(folder: Path, pulse: Pulse, title: str, progress: Callable[[str],
         seen = float((capture.counts[truth.is_face] > 0).mean())
         known[len(cells[METHODS[0]])] += f" x {seen:.3f}"
     rows = [(method, *cells[method], f"{spent_s[method] / 4:.1f}") for method in METHODS]
-    rows.append(("others: peak / matched filter, x share of pixels with a photon", *known[1:], ""))
+    rows.append(("published: peak / matched filter, x share with a photon", *known[1:], ""))
     return Table("face", title, ("method", *KNOWN, "s"), tuple(rows))
 
 
 def tmf8820_table(folder: Path) -> Table:
-    """Distances of the middle zone against the plane's, for each method: median error and spread.
+    """Return median and spread of the errors of the middle zone, for each method.
 
     Raises
     ------
@@ -144,20 +143,20 @@ def tmf8820_table(folder: Path) -> Table:
     for method in METHODS:
         error_m = (estimate(capture, method).range_m - capture.truth_range_m)[:, middle]
         low, median, high = np.nanpercentile(error_m, [16, 50, 84])
-        answered = float(np.isfinite(error_m).mean())
+        estimated = float(np.isfinite(error_m).mean())
         rows.append(
-            (method, f"{median * 1e3:.1f}", f"{(high - low) / 2e-3:.1f}", f"{answered:.2f}")
+            (method, f"{median * 1e3:.1f}", f"{(high - low) / 2e-3:.1f}", f"{estimated:.2f}")
         )
     return Table(
         "tmf8820",
         f"TMF8820, middle zone of {capture.shape[0]} records, against the plane's distance",
-        ("method", "median error, mm", "half the middle 68 %, mm", "answered"),
+        ("method", "median error, mm", "half the middle 68 %, mm", "estimated"),
         tuple(rows),
     )
 
 
 def tables(folder: Path, progress: Callable[[str], None]) -> Iterator[Table]:
-    """Everything that can be compared with a truth.
+    """Yield a table for each comparison with a truth.
 
     Raises
     ------
@@ -165,8 +164,8 @@ def tables(folder: Path, progress: Callable[[str], None]) -> Iterator[Table]:
         If a capture is absent from the folder.
     """
     for name in (FACE, FACE_TRUTH, TMF8820):
-        require("captures", str(folder / name), (folder / name).is_file(), "a folder that holds it")
+        require("captures", str(folder / name), (folder / name).is_file(), "a folder with it")
     wall = wall_pulse(folder, face_truth(folder))
     yield tmf8820_table(folder)
     yield face_table(folder, GAUSSIAN, "Face, pulse a Gaussian of 360 ps", progress)
-    yield face_table(folder, wall, "Face, pulse as the wall returns it", progress)
+    yield face_table(folder, wall, "Face, pulse measured on the wall", progress)

@@ -1,4 +1,4 @@
-"""The paper: its figures and tables beside ours."""
+"""Figures and tables of the paper, reproduced."""
 
 from core.studies.paper import figures
 

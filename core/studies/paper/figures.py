@@ -1,18 +1,16 @@
-"""The paper's figures and tables as data, ours beside what it prints, and what it leaves unsaid.
+"""The paper's figures and tables as data, compared with what it prints and what it omits.
 
-Of the figures only the settings are printed in the text that this is made from; what each shows is
-inferred from them, and each says so.
+Only the settings of its figures were available; their content is inferred and marked so.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import combinations
+from dataclasses import astuple
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
@@ -20,15 +18,13 @@ from core.estimators import ESTIMATORS
 from core.inference.limits import limit
 from core.scene import Scene, scenes
 from core.simulation import simulate
-from core.studies.outputs import Item, Pictures, Plot, Table
+from core.studies.outputs import Item, Pictures, Plot, Table, table
 from core.studies.paper.printed import TABLE_2, TABLE_3, TABLE_5, Printed
-from core.studies.trials import Condition, Method, Results, Score, as_they_come, summary
+from core.studies.trials import Condition, Method, Results, Score, default_methods, summary
 from core.tracking import PRESETS, TrackingParameters, tracking_signals
 from core.trigger import first_difference, rate_per_bin, trigger_probability
 
-INFERRED = (
-    "What the paper's figure shows is inferred from its settings; the picture is not at hand."
-)
+INFERRED = "The content of the paper's figure is inferred from its settings."
 FIGURE_1 = Flux(0.5203, 0.08)
 FIGURE_4 = Flux(sbr=0.08)
 N_PULSES = 1000
@@ -37,25 +33,25 @@ PULSE = Pulse()
 NEAR = {sbr: Condition("car", sbr) for sbr in TABLE_2}
 FAR = Condition("building", 0.038, 0.13)
 PLACES = tuple(np.arange(2.5, GATE.n_bins - 2, 5.0).tolist())
-"""Bins at which echoes are put to see what their place does."""
+"""Bins of the echo over which its position is varied."""
 
 RECOMMENDED = Method("tracking", "tracking", PRESETS["recommended"])
 AS_PRINTED = Method("tracking as printed", "tracking", PRESETS["as printed"])
-COMPARED = [*as_they_come(), AS_PRINTED]
+COMPARED = [*default_methods(), AS_PRINTED]
 TABLE_2_METHODS = [m for m in COMPARED if m.estimator in ("tracking", "likelihood", "oracle")]
 
 
 def plan() -> dict[Condition, list[Method]]:
-    """Which methods the tables need under which conditions."""
+    """Return the methods that the tables need under each condition."""
     compared = {NEAR[0.06]: COMPARED, FAR: COMPARED}
     return {c: compared.get(c, TABLE_2_METHODS) for c in (*NEAR.values(), FAR)}
 
 
-# --- Figures of the model
+# -- Figures of the model --------------------------------------------------------------------------
 
 
 def figure_1(flux: Flux = FIGURE_1, onset_bin: float = 50.0) -> Plot:
-    """Trigger probability of each bin, with and without an echo (Eq. 1)."""
+    """Plot the trigger probability of each bin, with and without an echo (Eq. 1)."""
     with_echo, without = (_probability(flux, onset_bin, signal) for signal in (flux.signal, 0.0))
     rate = rate_per_bin(onset_bin, flux.signal, flux.background, PULSE, GATE)
     echo = float((with_echo * (1 - flux.background / GATE.n_bins / rate)).sum())
@@ -68,12 +64,12 @@ def figure_1(flux: Flux = FIGURE_1, onset_bin: float = 50.0) -> Plot:
         {"with an echo": with_echo, "background alone": without},
         {"echo's onset": onset_bin},
         f"Signal {flux.signal:g} and background {flux.background:g} photons per pulse: the echo "
-        f"fires {echo:.1%} of the pulses, background nearly all others.",
+        f"triggers {echo:.1%} of the pulses, background nearly all others.",
     )
 
 
 def figure_2(flux: Flux = FIGURE_1, onset_bin: float = 50.0) -> Plot:
-    """Change of the trigger probability from bin to bin (Eq. 3)."""
+    """Plot the change of the trigger probability from bin to bin (Eq. 3)."""
     return Plot(
         "figure_2",
         "Figure 2: the first difference shows the jump",
@@ -91,7 +87,7 @@ def figure_4(
     onsets_bin: Sequence[float] = (20.0, 50.0, 90.0),
     seed: int = 0,
 ) -> list[Plot]:
-    """Histogram and both scales for targets near, in the middle, and far."""
+    """Plot histogram and both scales for a near, a middle and a far target."""
     return [
         figure_5_at(onset, parameters, Flux(sbr=0.08), f"figure_4_bin_{onset:g}", seed)
         for onset in onsets_bin
@@ -105,7 +101,7 @@ def figure_5_at(
     key: str = "figure_5_pixel",
     seed: int = 0,
 ) -> Plot:
-    """One pixel's histogram and signals with the target at one bin."""
+    """Plot the histogram and signals of one pixel with the target at one bin."""
     scene = Scene(np.full((1, 1), GATE.bin_to_range_m(onset_bin)))
     histogram = simulate(scene, GATE, flux, PULSE, seed).cube[0, 0]
     signals = tracking_signals(histogram, parameters, N_PULSES)
@@ -121,7 +117,7 @@ def figure_5_at(
             "large scale": signals.large,
             "residual": signals.residual,
         },
-        {"echo's onset": onset_bin, "answer, lag included": float(signals.position_bin)},
+        {"echo's onset": onset_bin, "estimate, lag included": float(signals.position_bin)},
         INFERRED,
     )
 
@@ -129,13 +125,13 @@ def figure_5_at(
 def figure_5(
     parameters: TrackingParameters = PRESETS["recommended"], flux: Flux = FIGURE_4
 ) -> Plot:
-    """How high the residual of an echo stands above that of noise, by the echo's place."""
+    """Compare the residual of an echo with that of noise, by the position of the echo."""
     onset = np.arange(20.0, 96.0)
     signals = tracking_signals(
         np.stack([_probability(flux, d, flux.signal) for d in onset]) * N_PULSES, parameters
     )
-    nothing = simulate(Scene(np.full((32, 32), np.nan)), GATE, flux, PULSE, seed=1)
-    noise = tracking_signals(nothing.cube, parameters, N_PULSES).residual
+    echo_free = simulate(Scene(np.full((32, 32), np.nan)), GATE, flux, PULSE, seed=1)
+    noise = tracking_signals(echo_free.cube, parameters, N_PULSES).residual
     highest = np.quantile(noise[..., parameters.t_n :].max(axis=-1), [0.5, 0.95])
     return Plot(
         "figure_5",
@@ -148,13 +144,12 @@ def figure_5(
             "largest of noise alone, median": np.full(onset.size, highest[0]),
             "largest of noise alone, 95 %": np.full(onset.size, highest[1]),
         },
-        note="Pile-up takes the pulses before a late echo comes; noise keeps its place. "
-        + INFERRED,
+        note="Pile-up leaves fewer armed pulses for a late echo; noise stays the same. " + INFERRED,
     )
 
 
 def figure_6(flux: Flux = FIGURE_4, onset_bin: float = 80.0, seed: int = 0) -> Plot:
-    """What each weight makes of one pixel's residual; every curve over its largest value."""
+    """Plot one pixel's residual under each weight, every curve over its maximum."""
     scene = Scene(np.full((1, 1), GATE.bin_to_range_m(onset_bin)))
     histogram = simulate(scene, GATE, flux, PULSE, seed).cube[0, 0]
     curves = {}
@@ -164,21 +159,21 @@ def figure_6(flux: Flux = FIGURE_4, onset_bin: float = 80.0, seed: int = 0) -> P
         curves[f"weight {weight}"] = enhanced / max(float(enhanced.max()), 1e-300)
     return Plot(
         "figure_6",
-        f"Figure 6: the weight lifts what is late (echo at bin {onset_bin:g}, SBR {flux.sbr:g})",
+        f"Figure 6: the weight raises late bins (echo at bin {onset_bin:g}, SBR {flux.sbr:g})",
         "Bin (1 ns)",
         "Enhanced signal, over its largest value",
         np.arange(GATE.n_bins, dtype=float),
         curves,
         {"echo's onset": onset_bin},
-        "A cubic weight multiplies bins by the same factors whatever α is. " + INFERRED,
+        "With a cubic weight α has no effect on the normalized curve. " + INFERRED,
     )
 
 
-# --- Figures of range images
+# -- Figures of range images -----------------------------------------------------------------------
 
 
 def figure_8(seed: int = 0) -> Pictures:
-    """The car under the six SBRs, by the recommended preset."""
+    """Show the car at the six SBRs, by the recommended preset."""
     images = {"truth": scenes["car"]().range_m}
     for sbr, condition in NEAR.items():
         images[f"SBR {sbr:g}"] = _range_image(condition.capture(seed), RECOMMENDED)
@@ -186,14 +181,14 @@ def figure_8(seed: int = 0) -> Pictures:
 
 
 def figure_9(sbr: float = 0.06, seed: int = 0) -> Pictures:
-    """The car by every method the paper compares, at one SBR."""
+    """Show the car by every method the paper compares, at one SBR."""
     capture = Condition("car", sbr).capture(seed)
     images = {"truth": np.asarray(capture.truth_range_m), **_by_method(capture, TABLE_3)}
     return _pictures("figure_9", f"Figure 9: the methods at SBR {sbr:g}", images)
 
 
 def figure_11(seed: int = 0) -> Plot:
-    """One pixel of the field experiment's simulated twin."""
+    """Plot one pixel of the simulated twin of the field experiment."""
     capture = FAR.capture(seed)
     row, col = (size // 2 for size in capture.shape)
     signals = tracking_signals(capture.cube[row, col], PRESETS["recommended"])
@@ -211,17 +206,17 @@ def figure_11(seed: int = 0) -> Plot:
 
 
 def figure_12(seed: int = 0) -> Pictures:
-    """The field experiment's simulated twin by every method the paper compares."""
+    """Show the simulated twin of the field experiment by every method the paper compares."""
     capture = FAR.capture(seed)
     images = {"truth": np.asarray(capture.truth_range_m), **_by_method(capture, TABLE_5)}
     return _pictures("figure_12", "Figure 12, simulated twin: the building", images)
 
 
-# --- Tables
+# -- Tables ----------------------------------------------------------------------------------------
 
 
 def table_2(results: Results, methods: Sequence[Method] = TABLE_2_METHODS) -> Table:
-    """The car under six SBRs: recommended, as printed, and the two that bound them."""
+    """Return the car at six SBRs by tracking, the exact likelihood and the oracle."""
     rows = [
         _row(f"{sbr:g}", method, results[condition, method.name], TABLE_2[sbr])
         for sbr, condition in NEAR.items()
@@ -233,22 +228,22 @@ def table_2(results: Results, methods: Sequence[Method] = TABLE_2_METHODS) -> Ta
 
 
 def table_3(results: Results, sbr: float = 0.06) -> Table:
-    """Every method at SBR 0.06; at others the paper prints none but its own, in Table 2."""
+    """Return every method at one SBR; the paper prints all of them at 0.06 only."""
     printed = TABLE_3 if sbr == 0.06 else {"tracking": TABLE_2[sbr]} if sbr in TABLE_2 else {}
     title = f"Table 3: every method on the car at SBR {sbr:g}"
     return _methods_table("table_3", title, Condition("car", sbr), printed, results)
 
 
 def table_5(results: Results) -> Table:
-    """Every method on the simulated twin of the field experiment."""
+    """Return every method on the simulated twin of the field experiment."""
     return _methods_table(
         "table_5",
         "Tables 4 and 5, simulated twin: the building, PPP 0.13, SBR 0.038",
         FAR,
         TABLE_5,
         results,
-        "The paper's field data are not public. This building is ours, simulated with Table 4's "
-        "parameters, and its figures are no reproduction of a measurement.",
+        "The paper's field data are not public. This building is simulated with the parameters of "
+        "Table 4 and does not reproduce a measurement.",
     )
 
 
@@ -279,16 +274,14 @@ def _row(
     first: str, method: Method, scores: Sequence[Score], printed: Printed | None
 ) -> tuple[Any, ...]:
     s = summary(scores)
-    rd, rmse = s.rd[2], s.rmse_m
-    printed = printed if method.estimator in TABLE_3 else None  # the paper has no more methods
-    nothing = ("", "")
-    against_rd = (printed.rd, rd.value - printed.rd) if printed else nothing
-    against_rmse = (printed.rmse_m, rmse.value - printed.rmse_m) if printed else nothing
+    rd, rmse = astuple(s.rd[2]), astuple(s.rmse_m)
+    if method.estimator not in TABLE_3:  # the paper has no other methods
+        printed = None
     return (
         first,
         method.name,
-        *(rd.value, rd.low, rd.high, *against_rd),
-        *(rmse.value, rmse.low, rmse.high, *against_rmse),
+        *(*rd, *((printed.rd, rd[0] - printed.rd) if printed else ("", ""))),
+        *(*rmse, *((printed.rmse_m, rmse[0] - printed.rmse_m) if printed else ("", ""))),
         *(s.rd[0].value, s.rd[1].value, s.mae_m, s.bias_m, s.inlier_rmse_m),
         *(s.rd_variance, s.answered, s.milliseconds),
     )
@@ -304,42 +297,38 @@ def _methods_table(
 ) -> Table:
     rows = []
     for method in COMPARED:
-        as_in_paper = printed.get(method.estimator)
-        rows.append(_row(_kind(method), method, results[condition, method.name], as_in_paper))
+        reconstructed = ESTIMATORS[method.estimator].reconstructed
+        kind = "reconstruction" if reconstructed else "as defined"
+        scores = results[condition, method.name]
+        rows.append(_row(kind, method, scores, printed.get(method.estimator)))
     return Table(key, title, ("kind", *_COLUMNS), tuple(rows), note)
 
 
-def _kind(method: Method) -> str:
-    reconstructed = ESTIMATORS[method.estimator].reconstructed
-    return "reconstruction" if reconstructed else "as defined"
-
-
-# --- What the paper leaves unsaid
+# -- What the paper does not report ----------------------------------------------------------------
 
 
 def limits(seed: int = 0) -> Table:
-    """What physics allows at each SBR: the car's mean over target pixels."""
-    rows = []
-    for condition in (*NEAR.values(), FAR):
-        found = limit(condition.capture(seed))
-        right, bound = (
-            float(np.nanmean(image)) for image in (found.right_bin_probability, found.cramer_rao_m)
-        )
-        rows.append((condition.scene, condition.sbr, right, bound))
-    columns = ("scene", "SBR", "probability of the right bin", "Cramér-Rao bound m")
-    return Table(
+    """Return the limits of physics at each SBR, mean over the car's target pixels."""
+    found = [(each, limit(each.capture(seed))) for each in (*NEAR.values(), FAR)]
+    return table(
         "limits",
-        "The limit: what one pixel can tell, all depths being alike beforehand",
-        columns,
-        tuple(rows),
-        "The bound is on the scatter of answers that are not grossly wrong, and says nothing about "
-        "those that are. A method that passes the limit uses more than the pixel: its neighbours, "
-        "or where in the gate targets tend to be.",
+        "Limits of a single pixel without prior knowledge of depth",
+        found,
+        {
+            "scene": lambda row: row[0].scene,
+            "SBR": lambda row: row[0].sbr,
+            "probability of the right bin": lambda row: float(
+                np.nanmean(row[1].right_bin_probability)
+            ),
+            "Cramér-Rao bound m": lambda row: float(np.nanmean(row[1].cramer_rao_m)),
+        },
+        "The bound holds for the scatter of estimates without gross errors. A method beyond the "
+        "limit uses more than the pixel: its neighbours, or where in the gate targets tend to be.",
     )
 
 
 def arithmetic() -> Table:
-    """What follows, and what does not, from the paper's own tables."""
+    """Check statements of the paper against its own tables."""
     ours = TABLE_3["tracking"]
     scene = scenes["car"]()
     truth_m = scene.range_m[np.isfinite(scene.range_m)]
@@ -359,94 +348,88 @@ def arithmetic() -> Table:
     rows.append(
         (
             "Largest RMSE possible in the gate of 42 to 57 m, this car",
-            f"{front_m:.2f} m if all answers are the gate's beginning, {worst_m:.2f} m if each is "
-            "as wrong as it can be",
+            f"{front_m:.2f} m if all estimates are at the start of the gate, {worst_m:.2f} m if "
+            "each is as wrong as possible",
             f"peak printed as {TABLE_3['peak'].rmse_m} m",
         )
     )
     return Table(
         "arithmetic",
-        "What does not follow from the paper's own tables",
+        "Statements of the paper against its own tables",
         ("statement", "value", "the paper"),
         tuple(rows),
-        '"At least" holds against KDE only; against Chi the paper\'s own Table 3 gives far less.',
+        '"At least" holds against KDE only; for Chi, Table 3 gives far less.',
     )
 
 
 def echo_free(sbr: float = 0.06, size: int = 64, seed: int = 0) -> Plot:
-    """Where each method's answers lie on pixels that see no echo at all."""
+    """Plot where each method's estimates lie in pixels without echo."""
     capture = simulate(Scene(np.full((size, size), np.nan)), GATE, Flux(sbr=sbr), PULSE, seed)
     edges = np.arange(0, GATE.n_bins + 1, 5)
     curves = {}
     for method in COMPARED:
-        if method.estimator == "oracle":
-            continue  # it would be told that there is nothing
-        bins, _ = ESTIMATORS[method.estimator].delays(capture, method.settings)
-        curves[method.name] = np.histogram(bins[np.isfinite(bins)], edges)[0] / bins.size
+        if method.estimator != "oracle":  # which would know that there is no echo
+            bins = _delays(capture, method)
+            curves[method.name] = np.histogram(bins[np.isfinite(bins)], edges)[0] / bins.size
     return Plot(
         f"echo_free_{sbr:g}",
-        f"Where the answers lie when there is no echo (background of SBR {sbr:g})",
-        "Bin of the answer (5 bins together)",
+        f"Estimates without an echo (background of SBR {sbr:g})",
+        "Bin of the estimate (in groups of 5)",
         "Share of pixels",
         edges[:-1].astype(float) + 2.5,
         curves,
-        note="A method without a favourite place would give every bin the same. Where a method's "
-        "answers gather it is right about a target there by luck as well as by merit.",
+        note="A method without preference would be uniform. Where the estimates of a method "
+        "cluster, some of its correct estimates are luck.",
     )
 
 
 def by_place(
     sbr: float = 0.06, size: int = 64, onset: Sequence[float] = PLACES, seed: int = 0
 ) -> Plot:
-    """Restoration degree against the echo's place in the gate, all pixels at the same depth."""
+    """Plot the restoration degree against the position of the echo, equal in all pixels."""
     curves: dict[str, list[float]] = {method.name: [] for method in COMPARED}
     bounds = []
-    for place in onset:
-        scene = Scene(np.full((size, size), GATE.bin_to_range_m(place)))
+    for onset_bin in onset:
+        scene = Scene(np.full((size, size), GATE.bin_to_range_m(onset_bin)))
         capture = simulate(scene, GATE, Flux(sbr=sbr), PULSE, seed)
         for method in COMPARED:
-            bins, _ = ESTIMATORS[method.estimator].delays(capture, method.settings)
-            curves[method.name].append(float((np.abs(bins - place) <= 3).mean()))
+            error = np.abs(_delays(capture, method) - onset_bin)
+            curves[method.name].append(float((error <= 3).mean()))
         bounds.append(float(limit(capture).right_bin_probability[0, 0]))
     found = {name: np.array(shares) for name, shares in curves.items()}
     return Plot(
         f"by_place_{sbr:g}",
-        f"Restoration degree against the echo's place (SBR {sbr:g}, 3 bins)",
+        f"Restoration degree against the position of the echo (SBR {sbr:g}, 3 bins)",
         "Bin of the echo's onset",
         "Share of pixels within 3 bins",
         np.asarray(onset, dtype=float),
         {**found, "limit: probability of the right bin": np.array(bounds)},
-        note="The paper's targets lie in bins 45 to 70. Bins before T_n are excluded by tracking.",
+        note="The paper's targets lie in bins 45 to 70. Tracking excludes bins before T_n.",
     )
 
 
 def agreement(capture: Capture, name: str) -> Table:
-    """Share of pixels in which two methods agree within 3 bins: no truth, hence no accuracy."""
-    answers: dict[str, NDArray[np.float64]] = {}
-    for method in COMPARED:
-        estimator = ESTIMATORS[method.estimator]
-        if method.estimator == "oracle" and capture.signal is None:
-            continue
-        answers[method.name], _ = estimator.delays(capture, method.settings)
-    share = {
-        pair: float((np.abs(answers[pair[0]] - answers[pair[1]]) <= 3).mean())
-        for pair in combinations(answers, 2)
+    """Return the share of pixels in which two methods agree within 3 bins; needs no truth."""
+    bins = {
+        method.name: _delays(capture, method)
+        for method in COMPARED
+        if method.estimator != "oracle" or capture.signal is not None
     }
-    rows = tuple(
-        (a, *(1.0 if a == b else share.get((a, b), share.get((b, a), math.nan)) for b in answers))
-        for a in answers
-    )
-    return Table(
+
+    def share(one: str, other: str) -> float:
+        return 1.0 if one == other else float((np.abs(bins[one] - bins[other]) <= 3).mean())
+
+    return table(
         "agreement",
         f"Agreement within 3 bins on {name}",
-        ("method", *answers),
-        rows,
-        "A measured capture without truth: methods that agree may be wrong together.",
+        bins,
+        {"method": str, **{other: partial(share, other=other) for other in bins}},
+        "A measured capture without truth: methods that agree may all be wrong.",
     )
 
 
 def model_items(size: int = 64) -> Iterator[Item]:
-    """Everything that needs no repetitions; `size` squared pixels tell of places in the gate."""
+    """Yield what needs no repetitions; `size` is the side of images with one echo position."""
     yield figure_1()
     yield figure_2()
     yield from figure_4()
@@ -468,11 +451,14 @@ def _probability(flux: Flux, onset_bin: float, signal: float) -> Floats:
     return trigger_probability(rate)
 
 
+def _delays(capture: Capture, method: Method) -> Floats:
+    return ESTIMATORS[method.estimator].delays(capture, method.settings)[0]
+
+
 def _range_image(capture: Capture, method: Method) -> Floats:
-    bins, _ = ESTIMATORS[method.estimator].delays(capture, method.settings)
-    # Without a target there is nothing to restore: the paper shows targets alone, too.
+    """Return ranges of target pixels, which are all that the paper shows."""
     target = np.isfinite(np.asarray(capture.truth_range_m))
-    return np.where(target, capture.acquisition.bin_to_range_m(bins), np.nan)
+    return np.where(target, capture.acquisition.bin_to_range_m(_delays(capture, method)), np.nan)
 
 
 def _by_method(capture: Capture, names: Mapping[str, Printed]) -> dict[str, Floats]:
@@ -482,5 +468,5 @@ def _by_method(capture: Capture, names: Mapping[str, Printed]) -> dict[str, Floa
 def _pictures(key: str, title: str, images: Mapping[str, Floats]) -> Pictures:
     truth_m = images["truth"]
     low, high = float(np.nanmin(truth_m)), float(np.nanmax(truth_m))
-    note = "Pixels without a target are left out. " + INFERRED
+    note = "Pixels without a target are blank. " + INFERRED
     return Pictures(key, title, "Range (m)", images, low - 0.5, high + 0.5, note)

@@ -1,50 +1,37 @@
-"""The paper, reproduced and questioned, on one page."""
+"""All reproduced figures and tables of the paper."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from core.capture import Capture
+from core.studies.outputs import Item
 from core.studies.paper import figures as paper
-from core.studies.report import write
 from core.studies.trials import Results
 
 INTRODUCTION = (
     "Xie et al., Electronics 2026, 15(13), 2816, find the echo in first-photon histograms by the "
     "difference of two tracking differentiators. Every figure and table below is computed by "
-    "`python -m core paper`; no measurement of the paper's is public, so that ours are "
-    "simulations, and where the paper does not print a setting (pulses, pulse length, tolerance) "
-    "they use what makes its tables come out: 1000 pulses, 1 ns, 3 bins.",
-    "Printed values stand beside ours, with the difference and a 95 % interval. A difference "
-    "within it is chance; a larger one has a cause, and ours is not always better: those marked "
-    "as reconstructions were rebuilt from abstracts.",
-    "Read first: 'The limit' (what one pixel can tell at all), 'Where the answers lie when there "
-    "is no echo' (what a method assumes about range without saying so), and 'Restoration degree "
-    "against the echo's place' (what a target at 50 m alone does not show).",
+    "`python -m core paper`. The paper's measurements are not public, so these are simulations; "
+    "settings that it does not print (pulses, pulse length, tolerance) have the values that "
+    "reproduce its tables: 1000 pulses, 1 ns, 3 bins.",
+    "Printed values are shown with the difference and a 95 % interval. A difference within the "
+    "interval is chance. Methods marked as reconstructions were rebuilt from abstracts.",
+    "Start with the limits (what a single pixel allows), the estimates without an echo (which "
+    "ranges a method prefers) and the restoration degree against the position of the echo (which "
+    "a target at 50 m alone does not show).",
 )
 
 
-def write_page(
-    results: Results, folder: Path, repetitions: int, field: Capture | None = None
-) -> Path:
-    """Write all items into a folder; returns the page.
+def items(results: Results, measured: Capture | None = None) -> Iterator[Item]:
+    """Yield all items; `results` are those of `figures.plan`.
 
-    Parameters
-    ----------
-    results : dict
-        Of `paper.plan`, over `repetitions` seeds.
-    folder : path
-    repetitions : int
-    field : Capture, optional
-        A measured capture on which to compare the methods.
+    On a measured capture, the agreement of the methods is added.
     """
-    items = [
-        paper.table_2(results),
-        paper.table_3(results),
-        paper.table_5(results),
-        *paper.model_items(),
-    ]
-    if field is not None:
-        items.append(paper.agreement(field, Path(field.source.split(":")[0]).name))
-    title = f"The paper, reproduced and questioned ({repetitions} repetitions)"
-    return write(items, folder, title, INTRODUCTION)
+    yield paper.table_2(results)
+    yield paper.table_3(results)
+    yield paper.table_5(results)
+    yield from paper.model_items()
+    if measured is not None:
+        yield paper.agreement(measured, Path(measured.source.split(":")[0]).name)

@@ -1,4 +1,4 @@
-"""What the paper prints: Xie et al., Electronics 2026, 15(13), 2816."""
+"""Values printed in Xie et al., Electronics 2026, 15(13), 2816."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from core.studies.trials import Summary
 
 
 class Printed(NamedTuple):
-    """Root mean square error and target restoration degree, as printed."""
+    """Printed root mean square error and restoration degree."""
 
     rmse_m: float
     rd: float
 
     def passed_by(self, ours: Summary) -> bool:
-        """Whether both of our figures are at least as good as the printed ones."""
+        """Return whether both figures of a summary are at least as good as the printed ones."""
         return ours.rd[2].value >= self.rd and ours.rmse_m.value <= self.rmse_m
 
 

@@ -1,9 +1,9 @@
-"""How the recommended preset was found, so that anyone can find it again or look for a better one.
+"""The search that found the recommended preset.
 
-Searched on depths that are uniform over the gate, because a preset must not know where the target
-is: the car of Table 2 only has to pass. What counts is the worst of three margins, over what the
-method is known to reach there at three SBRs: a mean would trade the common SBR for the hopeless
-one. The seeds differ from those of every reported table.
+It maximizes the smallest of three margins over the known restoration degree on uniform depths, one
+per SBR: a mean would trade the common SBR for the hopeless one. Uniform depths keep the preset from
+depending on the range of the target; the car of Table 2 only has to pass. The seeds differ from
+those of every reported table.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
-from core.studies.methods.uniform import SBRS, TO_REACH
+from core.studies.methods.uniform import EXPECTED, SBRS
 from core.studies.paper.printed import TABLE_2
 from core.studies.trials import Condition, Method, score, summary
 from core.tracking import TrackingParameters, Weight
 
 SEEDS = range(1000, 1008)
 
-# h stays 1, because only (m·h)²·l matters. T_n stays at the paper's 20.
+# h stays 1, since only (m·h)²·l matters. T_n stays at the paper's 20.
 L = (0.0036, 0.0038, 0.004, 0.0042)
 N = (300.0, 1000.0)
 M = (1.2, 1.3, 1.4, 1.5)
@@ -32,7 +32,7 @@ WEIGHTS: tuple[tuple[Weight, float], ...] = (
 
 
 def grid() -> list[TrackingParameters]:
-    """Every setting that is tried."""
+    """Return every setting of the search."""
     return [
         TrackingParameters(l=l, n=n, m=m, weight=weight, alpha=alpha)
         for l, n, m, (weight, alpha) in product(L, N, M, WEIGHTS)  # noqa: E741 - the paper's letter
@@ -41,7 +41,7 @@ def grid() -> list[TrackingParameters]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting, its RD on uniform depths at each SBR, and whether it passes Table 2."""
+    """Settings, their RD on uniform depths at each SBR, and whether they pass Table 2."""
 
     settings: TrackingParameters
     rd: dict[float, float]
@@ -49,15 +49,15 @@ class Candidate:
 
     @property
     def margin(self) -> float:
-        """What the search maximises."""
-        known = zip(SBRS, TO_REACH["tracking"], strict=True)
+        """Return the quantity that the search maximizes."""
+        known = zip(SBRS, EXPECTED["tracking"], strict=True)
         return min(self.rd[sbr] - least for sbr, least in known)
 
 
 def candidates(
     settings: Sequence[TrackingParameters] | None = None, seeds: Sequence[int] = SEEDS
 ) -> Iterator[Candidate]:
-    """Every setting, of the grid where not given, as it is computed."""
+    """Yield settings (by default the grid) as they are computed."""
     uniform = {sbr: [Condition("uniform", sbr).capture(s) for s in seeds] for sbr in SBRS}
     car = {sbr: [Condition("car", sbr).capture(s) for s in seeds] for sbr in TABLE_2}
     for each in settings or grid():

@@ -1,4 +1,4 @@
-"""Working memory and time of estimates, measured beside what `core.cost` predicts.
+"""Compare memory and time of estimates with what `core.cost` predicts.
 
 ``python -m core.studies.performance.costs [method ...]``
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 from time import process_time
 
 import numpy as np
@@ -29,35 +30,32 @@ SHAPES = (
 
 
 def measured(shape: tuple[int, int, int], method: str) -> Cost:
-    """Run an estimate of counts drawn at random: its working memory and its processor time.
+    """Range random counts; return working memory and processor time.
 
-    The memory is that of this process, which should do nothing else; read from ``/proc``, it is 0
-    where there is none (outside Linux).
+    The memory is that of this process, which should do nothing else, from ``/proc``; 0 where that
+    does not exist (outside Linux).
     """
-
-    def drawn(rows: int, cols: int, n_bins: int) -> Capture:
-        cube = np.empty((rows, cols, n_bins), np.uint16)
-        rng = np.random.default_rng(0)
-        for row in cube:
-            row[:] = rng.random((cols, n_bins), np.float32) < min(0.3, 200 / n_bins)
-        cube[:, :, n_bins // 2] += 5
-        signal = np.full((rows, cols), 0.05)
-        n_pulses = int(cube.sum(axis=2).max()) + 1000
-        acquisition = Acquisition(n_bins, 1e-9, n_pulses=n_pulses)
-        return Capture(cube, acquisition, signal=signal, background=0.5)
-
-    estimate(drawn(8, 8, 50), method)  # compiled, and loaded
-    capture = drawn(*shape)
+    estimate(_random(8, 8, 50), method)  # loads and compiles the kernels
+    capture = _random(*shape)
     before, started = _reset_peak_bytes(), process_time()
     estimate(capture, method)
     return Cost(_status_bytes("VmHWM") - before, process_time() - started)
 
 
+def _random(rows: int, cols: int, n_bins: int) -> Capture:
+    cube = np.empty((rows, cols, n_bins), np.uint16)
+    rng = np.random.default_rng(0)
+    for row in cube:
+        row[:] = rng.random((cols, n_bins), np.float32) < min(0.3, 200 / n_bins)
+    cube[:, :, n_bins // 2] += 5
+    acquisition = Acquisition(n_bins, 1e-9, n_pulses=int(cube.sum(axis=2).max()) + 1000)
+    return Capture(cube, acquisition, signal=np.full((rows, cols), 0.05), background=0.5)
+
+
 def _reset_peak_bytes() -> int:
-    """Forget the highest memory of this process so far; what it holds now."""
+    """Reset the peak memory of this process; return its present memory."""
     try:
-        with open("/proc/self/clear_refs", "w") as file:
-            file.write("5")
+        Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         return 0
     return _status_bytes("VmRSS")
@@ -71,29 +69,22 @@ def _status_bytes(name: str) -> int:
         return 0
 
 
-def _main(arguments: list[str]) -> None:
+def main(arguments: list[str]) -> None:
     """Compare all methods on all shapes, each in a process of its own."""
     if arguments and "x" in arguments[-1]:
-        method, written = arguments
-        rows, cols, n_bins = map(int, written.split("x"))
-        found, expected = (
-            measured((rows, cols, n_bins), method),
-            predicted((rows, cols, n_bins), method),
-        )
-        print(
-            f"{method:20} {written:>14} {found.working_bytes / 1e6:8.0f} MB "
-            f"{expected.working_bytes / 1e6:8.0f} MB {found.seconds:8.2f} s "
-            f"{expected.seconds:8.2f} s",
-            flush=True,
-        )
+        method, text = arguments
+        rows, cols, n_bins = map(int, text.split("x"))
+        costs = (f((rows, cols, n_bins), method) for f in (measured, predicted))
+        cells = (f"{each.working_bytes / 1e6:8.0f} MB {each.seconds:8.2f} s" for each in costs)
+        print(f"{method:20} {text:>14}", *cells, flush=True)
         return
-    print(f"{'method':20} {'shape':>14} measured, predicted working memory; time on one thread")
+    print(f"{'method':20} {'shape':>14}   measured              predicted, on one thread")
     for shape in SHAPES:
         for method in arguments or ESTIMATORS:
-            written = "x".join(map(str, shape))
-            command = [sys.executable, "-m", "core.studies.performance.costs", method, written]
+            text = "x".join(map(str, shape))
+            command = [sys.executable, "-m", "core.studies.performance.costs", method, text]
             subprocess.run(command, check=True)
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1:])
+    main(sys.argv[1:])

@@ -1,4 +1,4 @@
-"""A capture of 8 GB on a small cluster: same answer, bounded memory, nothing lost with a worker."""
+"""A capture of 8 GB on a small cluster: equal estimates, bounded memory, a worker lost."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from core.io.writers.whole import whole_folder
 from core.out_of_core.tiles import IMAGES, estimate_large, learned, range_part
 from core.scene import Scene, scenes
 from core.simulation import simulate
-from core.studies.outputs import Table
+from core.studies.outputs import Table, table
 
 METHOD = "tracking"
 FLUX = Flux(sbr=0.2)
@@ -40,19 +40,19 @@ Progress = Callable[[int, int], None]
 
 
 class Pass(NamedTuple):
-    """One time that the whole capture was ranged."""
+    """One ranging of the whole capture."""
 
     title: str
     seconds: float
     pixels_per_s: float
     peak_bytes: int
-    """Most that the ranging processes held together, as the machine counts it (resident)."""
+    """Peak resident memory of the ranging processes together."""
     same: bool
-    """Whether the answer is that of part after part without Dask, bit for bit."""
+    """Whether the estimates equal those without Dask bit for bit."""
 
 
 def generate(path: Path, rows: int, n_bins: int, chunk: int) -> None:
-    """Write a simulated capture as Zarr, whole or not at all: the built-in building.
+    """Write a simulated capture of the built-in building as Zarr, completely or not at all.
 
     Parameters
     ----------
@@ -90,10 +90,9 @@ def _simulated(
 
 
 def study(path: Path, workers: int, memory_bytes: int, progress: Progress) -> Iterator[Pass]:
-    """Range a capture in several ways, one after the other.
+    """Range a capture tile by tile without Dask, on one worker, on all, and with one killed.
 
-    Part after part in this process; on one worker; on all of them; and on all of them with one
-    killed when a third is done.
+    The worker is killed when a third of the tasks is done.
 
     Parameters
     ----------
@@ -102,17 +101,17 @@ def study(path: Path, workers: int, memory_bytes: int, progress: Progress) -> It
     workers : int
         Processes of one thread each.
     memory_bytes : int
-        What all of them may hold together; one that takes more than its share is ended by Dask.
+        Limit of all workers together; Dask ends a worker that exceeds its share.
     progress : callable
-        Told how many of how many tasks are done.
+        ``(tasks done, tasks in all)``.
     """
     expected: NDArray[Any] | None = None
     n_pixels = int(np.prod(open_capture(path).shape[:2]))
 
-    def told(title: str, rang: Callable[[], tuple[NDArray[Any], int]]) -> Pass:
+    def ranged(title: str, work: Callable[[], tuple[NDArray[Any], int]]) -> Pass:
         nonlocal expected
         started = perf_counter()
-        images, peak = rang()
+        images, peak = work()
         seconds = perf_counter() - started
         expected = images if expected is None else expected
         same = np.array_equal(images, expected, equal_nan=True)
@@ -127,13 +126,13 @@ def study(path: Path, workers: int, memory_bytes: int, progress: Progress) -> It
             raise ValueError(f"workers lost = {len(lost)} is not accepted: give more memory.")
         return np.stack([ranged[name].to_numpy() for name in IMAGES], axis=2), watched.peak_bytes
 
-    yield told("part after part, without Dask", lambda: _one_by_one(path, progress))
-    yield told("1 worker", lambda: on_cluster(1))
-    yield told(f"{workers} workers", lambda: on_cluster(workers))
-    yield told(f"{workers} workers, one killed", lambda: on_cluster(workers, killed=True))
+    yield ranged("tile by tile, without Dask", lambda: _tile_by_tile(path, progress))
+    yield ranged("1 worker", lambda: on_cluster(1))
+    yield ranged(f"{workers} workers", lambda: on_cluster(workers))
+    yield ranged(f"{workers} workers, one killed", lambda: on_cluster(workers, killed=True))
 
 
-def _one_by_one(path: Path, progress: Progress) -> tuple[NDArray[Any], int]:
+def _tile_by_tile(path: Path, progress: Progress) -> tuple[NDArray[Any], int]:
     counts = open_capture(path)
     description, settings = describe(counts, ReadOptions()), settings_of(METHOD)
     flux_prior, calibration, _ = learned(counts.data, description, METHOD, settings, None)
@@ -148,7 +147,7 @@ def _one_by_one(path: Path, progress: Progress) -> tuple[NDArray[Any], int]:
 
 
 class _Memory:
-    """Most that some processes hold together, looked at ten times a second."""
+    """Peak memory of some processes together, sampled ten times a second."""
 
     def __init__(self, pids: Callable[[], list[int]]) -> None:
         self.peak_bytes = 0
@@ -171,12 +170,12 @@ class _Memory:
 def _resident_bytes(pid: int) -> int:
     try:
         return int(psutil.Process(pid).memory_info().rss)
-    except psutil.NoSuchProcess:  # killed, and not started again yet
+    except psutil.NoSuchProcess:  # killed and not restarted yet
         return 0
 
 
 class _Tasks(SchedulerPlugin):  # type: ignore[misc]
-    """Counts tasks; does something once when a third of them is done."""
+    """Counts tasks; calls a function once when a third of them is done."""
 
     def __init__(self, scheduler: Any, progress: Progress, at_a_third: Callable[[], None]) -> None:
         self._scheduler, self._progress, self._at_a_third = scheduler, progress, at_a_third
@@ -184,7 +183,7 @@ class _Tasks(SchedulerPlugin):  # type: ignore[misc]
         self._is_past = False
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
-        """Called by Dask whenever a task changes its state."""
+        """Count a task that Dask reports as done."""
         if finish != "memory":
             return
         self._done.add(key)
@@ -199,7 +198,7 @@ class _Tasks(SchedulerPlugin):  # type: ignore[misc]
 def _cluster(
     workers: int, memory_bytes: int, progress: Progress, killed: bool
 ) -> Iterator[_Memory]:
-    """A cluster on this machine, its client open; one worker is killed at a third if asked for."""
+    """Open a cluster on this machine; if `killed`, one worker is killed at a third of the tasks."""
 
     def pids() -> list[int]:
         return [worker.pid for worker in cluster.workers.values() if worker.pid]
@@ -214,7 +213,7 @@ def _cluster(
             threads_per_worker=1,
             memory_limit=memory_bytes,
             dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": ":0"},  # another cluster may have the usual port
+            scheduler_kwargs={"dashboard_address": ":0"},  # the default port may be taken
             env={"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         ) as cluster,
         Client(cluster),
@@ -224,20 +223,18 @@ def _cluster(
         yield memory
 
 
-def table(passes: list[Pass]) -> Table:
-    """What each pass took, as a table."""
-    return Table(
+def passes_table(passes: list[Pass]) -> Table:
+    """Return time and memory of each pass."""
+    return table(
         "large",
         "A capture ranged in several ways",
-        ("way", "s", "pixels per s", "peak memory MB", "same answer"),
-        tuple(
-            (
-                each.title,
-                f"{each.seconds:.1f}",
-                f"{each.pixels_per_s:.0f}",
-                f"{each.peak_bytes / 1e6:.0f}",
-                "bit for bit" if each.same else "NO",
-            )
-            for each in passes
-        ),
+        passes,
+        {
+            "execution": lambda each: each.title,
+            "s": lambda each: each.seconds,
+            "pixels per s": lambda each: each.pixels_per_s,
+            "peak memory MB": lambda each: each.peak_bytes / 1e6,
+            "same estimates": lambda each: "bit for bit" if each.same else "NO",
+        },
+        formats={"s": ".1f", "pixels per s": ".0f", "peak memory MB": ".0f"},
     )

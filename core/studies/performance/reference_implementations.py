@@ -1,11 +1,13 @@
-"""The tracking estimator as one writes it at first: what the fast kernel is measured against.
+"""Straightforward implementations of tracking that the fast kernel is compared with.
 
-As exact as the numbers given (float64, mostly), the equations as they stand. Each gives the
-position of the echo in every pixel, as `core.tracking.track` does, for settings whose start is
-"mean", whose σ is that of the gate and whose weight all pixels share; others are the estimator's.
+`numpy_over_bins` and `plain_loop` return the position of the echo in every pixel as
+`core.tracking.track` does, in the precision of their input, for settings with start "mean", σ from
+the gate and a weight common to all pixels.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import njit
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.kernels.parallel import COMPILED
-from core.kernels.tracking import ROUNDING_32, differentiate, differentiator_step
+from core.kernels.tracking import ROUNDING_32, differentiate
 from core.tracking import START_BINS, TrackingParameters, common_weight
 
 Pixels = NDArray[np.floating]
@@ -21,7 +23,7 @@ Pixels = NDArray[np.floating]
 
 
 def numpy_over_bins(pixels: Pixels, settings: TrackingParameters) -> Pixels:
-    """All pixels at once by numpy, one bin after the other, as exact as the numbers given."""
+    """Advance all pixels together with numpy, bin by bin."""
     r_small = settings.l * pixels.std(axis=1)
     first = pixels[:, :START_BINS].mean(axis=1)
     floor = ROUNDING_32 * pixels.max(axis=1)
@@ -40,7 +42,7 @@ def numpy_over_bins(pixels: Pixels, settings: TrackingParameters) -> Pixels:
 def _numpy_step(
     x1: Pixels, x2: Pixels, s: Pixels, r: Pixels, settings: TrackingParameters
 ) -> tuple[Pixels, Pixels]:
-    """`core.kernels.tracking.differentiator_step` of many pixels."""
+    """Apply `core.kernels.tracking.differentiator_step` to many pixels."""
     h, h0 = settings.h, settings.m * settings.h
     d = r * h0
     y = x1 - s + h0 * x2
@@ -51,16 +53,9 @@ def _numpy_step(
 
 
 def plain_loop(pixels: Pixels, settings: TrackingParameters) -> Floats:
-    """Pixel after pixel, compiled; each signal of a pixel is stored before the next is made."""
+    """Compiled loop over pixels that stores each signal before it computes the next."""
     weight = common_weight(pixels.shape[1], settings)
     position: Floats = _plain_loop(pixels, weight, settings.l, settings.n, settings.h, settings.m)
-    return position
-
-
-def fused_loop(pixels: Pixels, settings: TrackingParameters) -> Floats:
-    """Pixel after pixel, compiled; both scales and the maximum in one pass, nothing stored."""
-    weight = common_weight(pixels.shape[1], settings)
-    position: Floats = _fused_loop(pixels, weight, settings.l, settings.n, settings.h, settings.m)
     return position
 
 
@@ -83,19 +78,8 @@ def _plain_loop(pixels, weight, l, n, h, m):  # type: ignore[no-untyped-def]  # 
 
 
 @njit(**COMPILED)
-def _fused_loop(pixels, weight, l, n, h, m):  # type: ignore[no-untyped-def]  # noqa: E741
-    position = np.full(pixels.shape[0], np.nan)
-    for i in range(pixels.shape[0]):
-        s = pixels[i]
-        r = l * np.std(s)
-        floor = ROUNDING_32 * np.max(s)
-        small = large = np.mean(s[:START_BINS])
-        small_speed = large_speed = best = 0.0
-        for k in range(s.size):
-            small, small_speed = differentiator_step(small, small_speed, s[k], r, h, m * h)
-            large, large_speed = differentiator_step(large, large_speed, s[k], n * r, h, m * h)
-            residual = large - small
-            if residual > floor and residual * weight[k] > best:
-                best = residual * weight[k]
-                position[i] = k
-    return position
+def take_roots(numbers, times):  # type: ignore[no-untyped-def]
+    """Replace each number by its square root, a number of times: the roofline of tracking."""
+    for _ in range(times):
+        for i in range(numbers.size):
+            numbers[i] = math.sqrt(numbers[i])

@@ -1,4 +1,4 @@
-"""How long a new process takes to its first range image, and what of it is compilation."""
+"""Time from the start of a process to its first range image, stage by stage."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 
 from core.acquisition import Floats
 
-STAGES = ("interpreter", "import core", "simulation", "positions", "light and confidence")
-"""What a first image waits for, in this order; each compiles, or loads, its kernels."""
+STAGES = ("interpreter", "import core", "simulation", "positions", "flux and confidence")
+"""In this order; each compiles its kernels or loads them from the cache."""
 
-_FIRST_IMAGE = """
+FIRST_IMAGE = """
 from time import time
 marks = [time()]
 import core
@@ -31,30 +31,21 @@ core.estimate(capture, "tracking")
 marks.append(time())
 print(marks)
 """
+"""Prints the time at the end of each stage."""
 
 
-def first_image(cache: Path) -> Floats:
-    """Start a process that simulates the car and ranges it.
+def first_image(cache: Path, script: str = FIRST_IMAGE) -> Floats:
+    """Return the seconds of each of `STAGES` in a process that simulates and ranges the car.
 
-    Parameters
-    ----------
-    cache : Path
-        Folder of compiled kernels: an empty one is filled.
-
-    Returns
-    -------
-    ndarray, shape (stage,)
-        Seconds of each of `STAGES`.
+    Compiled kernels are cached in the folder `cache`.
     """
-    root = Path(__file__).parents[3]
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
     started = time()
-    told = subprocess.run(
-        [sys.executable, "-c", _FIRST_IMAGE],
-        cwd=root,
-        env=environment,
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=Path(__file__).parents[3],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
         capture_output=True,
         text=True,
         check=True,
     )
-    return np.diff([started, *json.loads(told.stdout)])
+    return np.diff([started, *json.loads(done.stdout)])

@@ -1,4 +1,4 @@
-"""The range of each setting within which a method can be trusted."""
+"""Sensitivity of each method to its settings and to the scene."""
 
 from core.studies.sensitivity.page import ranges_table, setting_plot
 from core.studies.sensitivity.sweep import Sweep, along, numbers, setting_sweep

@@ -1,8 +1,8 @@
-"""Within which range of each parameter is each estimator to be trusted, and what it does beyond?
+"""Sensitivity: the range of each parameter in which each estimator can be trusted.
 
-One parameter at a time is swept through all that it may be, everything else as it comes, on depths
-that are uniform over the gate. A value is trusted where no more than `LOSS` of the pixels are lost
-against the best value of the sweep; the loss is over the same pixels, hence paired.
+One parameter at a time is swept through all accepted values, the others at their defaults, on
+depths uniform over the gate. A value is trusted where it loses at most `LOSS` of the pixels against
+the best value of its sweep; differences are paired over pixels.
 """
 
 from __future__ import annotations
@@ -36,27 +36,31 @@ LOSS = 0.1
 """Share of the pixels that a trusted value may lose against the best one."""
 
 FAILING = 0.5
-"""Share of the best value's right answers below which a method no longer degrades, but fails."""
+"""Share of the best value's correct estimates below which a method fails."""
 
-DIFFERING = 0.01
-"""Share of pixels in which two precisions choose other bins from which on rounding decides."""
+MAX_DISAGREEMENT = 0.01
+"""Share of pixels with another bin in float32 above which rounding decides."""
+
+MAX_RINGING = 1e-6
+"""Share of an echo that a filter at rest may still move by."""
 
 BASES = (0.06, 0.1, 0.2, 0.5, 1.0)
-"""SBRs to sweep at: of each method the first at which, as it comes, it finds nine in ten."""
+"""SBRs of sweeps: the first at which a method restores nine pixels in ten by its defaults."""
 
-SEED = 2000  # apart from those of the tables and of the search for the preset
+SEED = 2000  # not used by the tables or by the search for the preset
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A method's answers with one value of the parameter that is swept."""
+    """A method's result with one value of the swept parameter."""
 
     value: float
     right: NDArray[np.bool_]
-    """Whether each target pixel is answered within 3 bins."""
+    """Whether each target pixel is estimated within 3 bins."""
     answered: float
+    """Share of target pixels with an estimate."""
     confidence: float
-    """Mean of the answers' confidence."""
+    """Mean over the estimates."""
 
     @property
     def share(self) -> float:
@@ -66,24 +70,23 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """One parameter of one method, the values in rising order."""
+    """One parameter of one method, values in rising order."""
 
     method: str
     parameter: str
     sbr: float
-    """That of everything else as it comes."""
+    """With all parameters at their defaults."""
     points: Sequence[Point]
 
     @property
     def best(self) -> Point:
-        """The value with most right answers."""
+        """The value with most correct estimates."""
         return max(self.points, key=lambda point: point.share)
 
     def loss(self, point: Point) -> tuple[float, float]:
-        """Share of pixels lost against the best value, and its standard deviation.
+        """Return the share of pixels lost against the best value, and its standard deviation.
 
-        Where two values are not of the same pixels (as many pixels do not fit into every gate) it
-        is that of two shares.
+        Paired over pixels where both values have the same number of them.
         """
         best, here = self.best.right, point.right
         if best.size == here.size:
@@ -93,21 +96,21 @@ class Sweep:
         return float(best.mean() - here.mean()), math.sqrt(variance)
 
     def state(self, point: Point) -> str:
-        """``trusted``, ``degraded`` or ``failing``; a loss that may be chance is none."""
+        """Return ``trusted``, ``degraded`` or ``failing``; a loss within chance is ignored."""
         loss, deviation = self.loss(point)
         if loss - 2 * deviation <= LOSS:
             return "trusted"
         return "failing" if point.share < FAILING * self.best.share else "degraded"
 
     def ranges(self, state: str) -> str:
-        """The values in one state, as ranges."""
+        """Return the values in one state as ranges."""
         runs = groupby(self.points, self.state)
         values = [[point.value for point in run] for kind, run in runs if kind == state]
         return ", ".join(_span(run[0], run[-1]) for run in values)
 
     @property
     def worst(self) -> Point:
-        """The value with fewest right answers."""
+        """The value with fewest correct estimates."""
         return min(self.points, key=lambda point: point.share)
 
 
@@ -115,18 +118,18 @@ def _span(low: float, high: float) -> str:
     return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
 
 
-# --- What a scene may be ---
+# -- Scenes ----------------------------------------------------------------------------------------
 
 
 def tile(method: str) -> int:
-    """Rows and columns that see the same depth: more than one for what looks at neighbours."""
+    """Return the side of tiles of equal depth: above 1 for methods that use neighbours."""
     each = ESTIMATORS[method]
-    return 8 if each.whole_image or each.reach(each.parameters()) > 1 else 1
+    return 8 if each.whole_image or each.window_size(each.parameters()) > 1 else 1
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A scene of depths uniform over the middle of a gate; each field is one parameter to sweep."""
+class SweepScene:
+    """Depths uniform over the middle of a gate; each field is a parameter to sweep."""
 
     signal: float = SIGNAL
     background: float = SIGNAL / 0.06
@@ -134,9 +137,9 @@ class Seen:
     n_bins: int = 100
     tau_bins: float = 1.0
 
-    @cache  # noqa: B019 - as many as there are values to sweep, in a process that ends
+    @cache  # noqa: B019 - one entry per swept value
     def capture(self, tile: int = 1, side: int = 32) -> Capture:
-        """Rows and columns as told, or as many as a long gate leaves room for."""
+        """Simulate `side` x `side` pixels, fewer with a long gate."""
         gate = Acquisition(self.n_bins, n_pulses=self.n_pulses)
         side = min(side, max(tile, math.isqrt(2**22 // self.n_bins)))
         drawn = np.random.default_rng(SEED).uniform(0.2, 0.94, (side // tile, side // tile))
@@ -153,11 +156,11 @@ SCENE_VALUES: dict[str, tuple[float, ...]] = {
     "n_bins": (10, 20, 30, 50, 100, 300, 1000, 4096, 100_000),
     "tau_bins": (1e-3, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0, 1e3),
 }
-"""Sweeps of a scene; with the signal as it comes a background of 1e5 is an SBR of 1e-6."""
+"""With the default signal a background of 1e5 is an SBR of 1e-6."""
 
 
-def judged(capture: Capture, method: str, settings: Any, value: float) -> Point:
-    """What a method makes of a capture with a truth."""
+def measured(capture: Capture, method: str, settings: Any, value: float) -> Point:
+    """Compare a method's estimates with the truth of a capture."""
     image = estimate(capture, method, settings)
     truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
     target = np.isfinite(truth)
@@ -173,20 +176,20 @@ def judged(capture: Capture, method: str, settings: Any, value: float) -> Point:
 
 @cache
 def base_sbr(method: str) -> float:
-    """The first of `BASES` at which a method as it comes finds nine pixels in ten."""
+    """Return the first of `BASES` at which a method restores nine pixels in ten."""
     for sbr in BASES:
-        if judged(base(method, sbr), method, None, sbr).share >= 0.9:
+        if measured(reference_capture(method, sbr), method, None, sbr).share >= 0.9:
             return sbr
     return BASES[-1]
 
 
-def base(method: str, sbr: float) -> Capture:
-    """What a method's settings are swept on."""
-    return Seen(background=SIGNAL / sbr).capture(tile(method), side=64)
+def reference_capture(method: str, sbr: float) -> Capture:
+    """Return the capture on which a method's settings are swept."""
+    return SweepScene(background=SIGNAL / sbr).capture(tile(method), side=64)
 
 
 def scene_sweeps(progress: Callable[[], None] = lambda: None) -> list[Sweep]:
-    """Every parameter of a scene, for every estimator."""
+    """Sweep every parameter of a scene, for every estimator."""
     points: dict[tuple[str, str], list[Point]] = {}
     for parameter, values in SCENE_VALUES.items():
         for value in values:
@@ -195,9 +198,9 @@ def scene_sweeps(progress: Callable[[], None] = lambda: None) -> list[Sweep]:
                 if not methods:
                     continue
                 changed: dict[str, Any] = {"background": SIGNAL / sbr, parameter: value}
-                seen = Seen(**changed)
+                scene = SweepScene(**changed)
                 for method in methods:
-                    found = judged(seen.capture(tile(method)), method, None, value)
+                    found = measured(scene.capture(tile(method)), method, None, value)
                     points.setdefault((method, parameter), []).append(found)
             progress()
     sweeps = [Sweep(m, p, base_sbr(m), found) for (m, p), found in points.items()]
@@ -205,7 +208,7 @@ def scene_sweeps(progress: Callable[[], None] = lambda: None) -> list[Sweep]:
 
 
 def _as_sbr(sweep: Sweep) -> Sweep:
-    """A sweep over the background as one over the SBR."""
+    """Convert a sweep over the background into one over the SBR."""
     points = [
         replace(point, value=SIGNAL / point.value if point.value else math.inf)
         for point in reversed(sweep.points)
@@ -213,11 +216,11 @@ def _as_sbr(sweep: Sweep) -> Sweep:
     return replace(sweep, parameter="sbr", points=points)
 
 
-# --- What a method may be told ---
+# -- Settings --------------------------------------------------------------------------------------
 
 
 def setting_sweeps(progress: Callable[[], None] = lambda: None) -> list[Sweep]:
-    """Every setting of every estimator that is a number, along its slider and beyond."""
+    """Sweep every numeric setting of every estimator, along its slider and beyond."""
     found = []
     for method, field, spec, default in numbers():
         found.append(setting_sweep(method, field, along(spec, default)))
@@ -226,7 +229,7 @@ def setting_sweeps(progress: Callable[[], None] = lambda: None) -> list[Sweep]:
 
 
 def numbers() -> list[tuple[str, str, Number, Any]]:
-    """Method, field, specification and default of every setting that is a number."""
+    """Return method, field, specification and default of every numeric setting."""
     return [
         (method, field.name, spec, field.default)
         for method, each in ESTIMATORS.items()
@@ -235,19 +238,16 @@ def numbers() -> list[tuple[str, str, Number, Any]]:
     ]
 
 
-N_SETTINGS = len(numbers())
-
-
 def setting_sweep(method: str, field: str, values: Sequence[float]) -> Sweep:
-    """One setting, everything else as it comes."""
+    """Sweep one setting, the others at their defaults."""
     sbr, kind = base_sbr(method), ESTIMATORS[method].parameters
-    capture = base(method, sbr)
-    points = [judged(capture, method, kind(**{field: v}), v) for v in values]
+    capture = reference_capture(method, sbr)
+    points = [measured(capture, method, kind(**{field: v}), v) for v in values]
     return Sweep(method, field, sbr, points)
 
 
 def along(spec: Number, default: float, steps: int = 13) -> list[float]:
-    """Values along a slider and beyond it as far as is accepted, and beside each zone's edges."""
+    """Return values along a slider, beyond it, and on both sides of each zone's ends."""
     space = np.geomspace if spec.log else np.linspace
     values = {float(f"{x:.3g}") for x in space(spec.low, spec.high, steps)}
     values |= {float(default), spec.low / 10, 10 * spec.high, 0.0, spec.least, spec.most}
@@ -258,16 +258,16 @@ def along(spec: Number, default: float, steps: int = 13) -> list[float]:
 
 
 STEP = 0.2
-"""How far from a zone's edge is looked, as a share of it."""
+"""Relative distance from the end of a zone at which it is measured."""
 
 
 def inside(spec: Number, zone: Zone) -> list[float]:
-    """Values in a zone, as near to its edges as is to be told apart, that a slider reaches."""
+    """Return values just inside both ends of a zone, within the slider."""
     return [max(zone.low * (1 + STEP), spec.low), min(zone.high * (1 - STEP), spec.high)]
 
 
 def outside(spec: Number, zone: Zone) -> list[float]:
-    """Values just beyond a zone's edges that a slider reaches and that lie in no zone."""
+    """Return values just outside a zone, within the slider and in no other zone."""
     near = (zone.low * (1 - STEP), zone.high * (1 + STEP))
     within = [value for value in near if spec.low <= value <= spec.high]
     return [v for v in within if not any(v in each for each in spec.doubtful)]
@@ -275,45 +275,41 @@ def outside(spec: Number, zone: Zone) -> list[float]:
 
 @dataclass(frozen=True)
 class Signs:
-    """What makes settings doubtful; the last three are the tracking differentiator's alone."""
+    """Signs of doubtful settings; the last three apply to tracking only."""
 
     loss: float
-    """Share of pixels lost against the settings as they come, less what may be chance."""
+    """Share of pixels lost against the defaults, minus two standard deviations."""
     disagreement: float = 0.0
-    """Share of pixels in which float32 and float64 choose other bins, at the worst of `BASES`."""
+    """Share of pixels with another bin in float32 than in float64, at the worst of `BASES`."""
     noise: float = 0.0
-    """What a scale in its linear zone leaves of white noise: the ratio of standard deviations."""
+    """Standard deviation of white noise after a scale in its linear zone, over that before it."""
     ringing: float = 0.0
-    """How much a scale still moves a thousand bins behind an echo, as a share of that echo."""
+    """Movement of a scale a thousand bins after an echo, as a share of that echo."""
 
     def __str__(self) -> str:
-        told = {
+        texts = {
             "pixels lost": self.loss > LOSS and f"{self.loss:.2f}",
-            "float32 differs": self.disagreement > DIFFERING and f"{self.disagreement:.2f}",
+            "float32 differs": self.disagreement > MAX_DISAGREEMENT and f"{self.disagreement:.2f}",
             "noise passed": self.noise >= 1 and f"{self.noise:.2f}",
-            "ringing": self.ringing > RESTLESS and f"{self.ringing:.1g}",
+            "ringing": self.ringing > MAX_RINGING and f"{self.ringing:.1g}",
         }
-        return ", ".join(f"{name} {text}" for name, text in told.items() if text)
+        return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether any of them says so."""
+        """Whether there is any sign."""
         return bool(str(self))
 
 
-RESTLESS = 1e-6
-"""Share of an echo that a filter may still move by when it is long at rest."""
-
-
 def signs(method: str, settings: Any) -> Signs:
-    """Measure them."""
-    capture = base(method, base_sbr(method))
-    usual, here = (judged(capture, method, each, 0.0).right for each in (None, settings))
-    lost = usual.astype(float) - here
+    """Measure the signs of doubt of some settings."""
+    capture = reference_capture(method, base_sbr(method))
+    default, here = (measured(capture, method, each, 0.0).right for each in (None, settings))
+    lost = default.astype(float) - here
     loss = float(lost.mean() - 2 * lost.std() / math.sqrt(lost.size))
     if method != "tracking":
         return Signs(loss)
-    rows = [base(method, sbr).cube[:16].reshape(-1, 100) for sbr in BASES]
+    rows = [reference_capture(method, sbr).cube[:16].reshape(-1, 100) for sbr in BASES]
     noise = np.random.default_rng(SEED).normal(0.0, 1.0, (64, 400))
     linear = replace(settings, l=1e6, weight="none", start="zero")
     echo = np.zeros((1, 1000))
@@ -373,27 +369,27 @@ JOINT: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {"sigma_from": "before T_n", "t_n": 20},
     ),
 }
-"""Settings that are in doubt together, beside some of their kind that are not."""
+"""Settings that are doubtful together, and similar ones that are not."""
 
 
 def zone_rows() -> Iterator[tuple[str, ...]]:
-    """Method, parameter, zone, why, signs in it, signs beyond it, and whether they bear it out."""
+    """Yield method, parameter, zone, reason, signs inside, signs outside, and whether confirmed."""
     for method, field, spec, _ in numbers():
         for zone in spec.doubtful:
             within = [{field: value} for value in inside(spec, zone)]
             beyond = [{field: value} for value in outside(spec, zone)]
-            where = _span(zone.low, zone.high)
-            yield method, field, where, zone.why, *_borne_out(method, within, beyond)
+            span = _span(zone.low, zone.high)
+            yield method, field, span, zone.why, *_confirmed(method, within, beyond)
     for name, (doubtful, sound) in JOINT.items():
         (why,) = joint_doubts(TrackingParameters(**doubtful))
-        where = ", ".join(f"{field} {as_text(value)}" for field, value in doubtful.items())
-        yield "tracking", name, where, why, *_borne_out("tracking", [doubtful], [sound])
+        values = ", ".join(f"{field} {as_text(value)}" for field, value in doubtful.items())
+        yield "tracking", name, values, why, *_confirmed("tracking", [doubtful], [sound])
 
 
-def _borne_out(method: str, within: Sequence[Any], beyond: Sequence[Any]) -> tuple[str, str, str]:
-    """Signs of settings that should be in doubt, of some that should not, and whether it is so."""
+def _confirmed(method: str, within: Sequence[Any], beyond: Sequence[Any]) -> tuple[str, str, str]:
+    """Return the signs of doubtful and of sound settings, and whether they confirm the zone."""
     kind = ESTIMATORS[method].parameters
     doubtful, sound = ([signs(method, kind(**each)) for each in side] for side in (within, beyond))
     good = all(each.is_doubtful for each in doubtful) and not any(x.is_doubtful for x in sound)
-    told = ["; ".join(str(x) or "nothing" for x in side) or "–" for side in (doubtful, sound)]
-    return told[0], told[1], "yes" if good else "NO"
+    texts = ["; ".join(str(x) or "nothing" for x in side) or "–" for side in (doubtful, sound)]
+    return texts[0], texts[1], "yes" if good else "NO"

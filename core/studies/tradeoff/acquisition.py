@@ -1,8 +1,8 @@
-"""How to acquire: how many pulses, how much light, how long a gate reach a wanted accuracy.
+"""Pulses, exposure and gate length required for a restoration degree.
 
-Two answers side by side. The limit's theory (`core.limits`) says how often a pixel can be right at
-all with signal and background known, in milliseconds for an image; simulated captures say how
-often the exact likelihood is, told the light (oracle) or estimating it.
+Two predictions side by side: the theoretical limit (`core.limits`) with known signal and
+background, in milliseconds per image, and simulated captures, ranged by the exact likelihood with
+known flux (oracle) and with estimated flux.
 """
 
 from __future__ import annotations
@@ -16,36 +16,34 @@ from scipy.optimize import brentq
 from scipy.special import logit
 
 from core.acquisition import Floats, Flux
-from core.estimators import ESTIMATORS
 from core.inference.limits import best_exposure, right_bin_probability
 from core.metrics import Interval
 from core.studies.tradeoff.measure import Candidate, Piece, scored
 from core.studies.tradeoff.surrogate import Simulation
-from core.studies.trials import Method, Score, computed, summary
+from core.studies.trials import Score, default_methods, mapped, summary
 
 METHODS = ("oracle", "likelihood")
 PULSES = (50, 100, 200, 500, 1000, 2000, 5000, 10_000)
 EXPOSURES = tuple(np.geomspace(0.01, 4, 10).round(3).tolist())
 GATES = 7
-"""Lengths of gate that are tried, from one that just holds the targets to `LONGEST` times it."""
-LONGEST = 16
-_PIXELS = 64  # of which the theory is computed: its tables are quicker for few
-_MOST_PULSES = 1e8
+"""Number of gate lengths, from one that just holds the targets to `MAX_GATE` times it."""
+MAX_GATE = 16
+_PIXELS = 64  # for which the theory is computed
+_MAX_PULSES = 1e8
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """One knob of the acquisition, everything else as it is.
+    """One quantity of the acquisition varied, all others fixed.
 
     Parameters
     ----------
-    x : ndarray, shape (place,)
-        The knob.
-    theory : ndarray, shape (place,)
-        Mean over the targets of the probability of the right bin (within 3.2 bins for the paper's
-        pulse), signal and background known.
+    x : ndarray, shape (value,)
+    theory : ndarray, shape (value,)
+        Probability of the right bin (within 3.2 bins for the paper's pulse), mean over the targets,
+        with known signal and background.
     simulated : mapping
-        For each of `METHODS` the restoration degree within 3 bins, with 95 % intervals.
+        Restoration degree within 3 bins of each of `METHODS`, with 95 % intervals.
     """
 
     x: Floats
@@ -54,29 +52,28 @@ class Sweep:
 
 
 def over_pulses(simulation: Simulation, n_pulses: Sequence[int]) -> list[Simulation]:
-    """The simulation with other numbers of pulses."""
+    """Return the simulation with other numbers of pulses."""
     return [simulation.with_pulses(n) for n in n_pulses]
 
 
 def over_exposures(simulation: Simulation, factors: Sequence[float]) -> list[Simulation]:
-    """The simulation with signal and background times a factor: attenuated below 1."""
+    """Return the simulation with signal and background times each factor."""
     flux = simulation.flux
     return [replace(simulation, flux=Flux(flux.signal * each, flux.sbr)) for each in factors]
 
 
 def over_gates(simulation: Simulation) -> list[Simulation]:
-    """The simulation with gates of several lengths, the targets in their middle.
+    """Return the simulation with gates of several lengths around the targets.
 
-    The background's rate in each bin stays what it is, so that a longer gate has more of it before
-    and behind the targets.
+    The background rate per bin is kept, so that a longer gate has more background.
     """
     acquisition, flux = simulation.acquisition, simulation.flux
     first, end = simulation.window
-    # No gate opens before its pulse leaves.
-    most_before = first + max(0, math.floor(acquisition.gate_delay_s / acquisition.bin_width_s))
+    # No gate opens before its pulse is emitted.
+    max_before = first + max(0, math.floor(acquisition.gate_delay_s / acquisition.bin_width_s))
     gates = []
-    for length in np.geomspace(end - first, LONGEST * (end - first), GATES):
-        before = min(round((length - (end - first)) / 2), most_before)
+    for length in np.geomspace(end - first, MAX_GATE * (end - first), GATES):
+        before = min(round((length - (end - first)) / 2), max_before)
         n_bins = max(round(length), end - first)
         opens = first - before
         delay_s = acquisition.gate_delay_s + opens * acquisition.bin_width_s
@@ -92,7 +89,7 @@ def over_gates(simulation: Simulation) -> list[Simulation]:
 
 
 def theory(simulation: Simulation) -> float:
-    """Mean over the targets of `core.limits.right_bin_probability`, of some of them if many."""
+    """Return `core.limits.right_bin_probability`, mean over (a sample of) the targets."""
     onset, signal = _targets(simulation)
     return float(
         right_bin_probability(
@@ -106,9 +103,9 @@ def theory(simulation: Simulation) -> float:
 
 
 def exposure(simulation: Simulation, most: float = EXPOSURES[-1]) -> float:
-    """Factor on the light, up to `most`, that tells most: median over the targets, of some if many.
+    """Return the most informative factor on the flux, up to `most` (`core.limits.best_exposure`).
 
-    By `core.limits.best_exposure`.
+    It is the median over (a sample of) the targets.
     """
     (brightest,) = over_exposures(simulation, [most])
     onset, signal = _targets(brightest)
@@ -118,49 +115,50 @@ def exposure(simulation: Simulation, most: float = EXPOSURES[-1]) -> float:
 
 
 def _targets(simulation: Simulation) -> tuple[Floats, Floats]:
-    """Delays in bins and signals of targets, evenly taken in the order of their delays."""
+    """Return delays in bins and signals of a sample of the targets, even in their delay."""
     onset = simulation.acquisition.range_m_to_bin(simulation.scene.range_m).ravel()
     reflectivity = simulation.scene.reflectivity
     signal = np.full(onset.size, simulation.flux.signal)
     if reflectivity is not None:
         signal = signal * np.ravel(reflectivity)
     order = np.argsort(onset)[: np.isfinite(onset).sum()]  # NaN last
-    some = order[np.linspace(0, order.size - 1, min(_PIXELS, order.size)).round().astype(int)]
-    return onset[some], signal[some]
-
-
-Knob = tuple[Sequence[float], Sequence[Simulation]]
-"""Places of a knob, and the simulation at each."""
+    sample = order[np.linspace(0, order.size - 1, min(_PIXELS, order.size)).round().astype(int)]
+    return onset[sample], signal[sample]
 
 
 def sweeps(
-    knobs: Sequence[Knob],
+    varied: Sequence[tuple[Sequence[float], Sequence[Simulation]]],
     *,
     seeds: Sequence[int],
     processes: int = 1,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Sweep]:
-    """Theory and simulation at each place of each knob.
+    """Compute theory and simulation for each value of each quantity.
 
     Parameters
     ----------
-    knobs : sequence
-        Of simulations of first photons.
+    varied : sequence
+        For each quantity its values, and the simulation of first photons at each.
     seeds : sequence of int
-        At least 2, the same for all places.
+        At least 2, the same for all values.
     processes : int
     progress : callable
         ``(captures ranged, captures in all)``.
     """
-    ways = tuple(Candidate(Method(name, name, ESTIMATORS[name].parameters())) for name in METHODS)
-    places = [simulation for _, simulations in knobs for simulation in simulations]
-    pieces = [Piece(at, each, ways, seed) for at, each in enumerate(places) for seed in seeds]
-    scores: dict[str, list[list[Score]]] = {name: [[] for _ in places] for name in METHODS}
-    for done, (piece, found) in enumerate(computed(scored, pieces, processes)):
+    methods = {each.name: Candidate(each) for each in default_methods() if each.name in METHODS}
+    configurations = tuple(methods[name] for name in METHODS)
+    all_simulations = [each for _, simulations in varied for each in simulations]
+    pieces = [
+        Piece(place, simulation, configurations, seed)
+        for place, simulation in enumerate(all_simulations)
+        for seed in seeds
+    ]
+    scores: dict[str, list[list[Score]]] = {name: [[] for _ in all_simulations] for name in METHODS}
+    for done, (piece, found) in enumerate(mapped(scored, pieces, processes)):
         for name, each in zip(METHODS, found, strict=True):
             scores[name][piece.place] += each
         progress(done + 1, len(pieces))
-    ends = np.cumsum([len(x) for x, _ in knobs])
+    ends = np.cumsum([len(x) for x, _ in varied])
     return [
         Sweep(
             np.asarray(x, float),
@@ -170,34 +168,31 @@ def sweeps(
                 for name in METHODS
             },
         )
-        for (x, simulations), end in zip(knobs, ends, strict=True)
+        for (x, simulations), end in zip(varied, ends, strict=True)
     ]
 
 
 def pulses_by_theory(simulation: Simulation, rd: float) -> float:
-    """Pulses with which the theory reaches a restoration degree; infinite where no number does."""
+    """Return the pulses with which the theory reaches a restoration degree, or infinity."""
 
     def excess(log_pulses: float) -> float:
         return theory(simulation.with_pulses(round(math.exp(log_pulses)))) - rd
 
-    most = math.log(_MOST_PULSES)
+    most = math.log(_MAX_PULSES)
     if excess(most) < 0:
         return math.inf
     return math.exp(brentq(excess, 0.0, most, xtol=1e-3)) if excess(0.0) < 0 else 1.0
 
 
 def pulses_by_simulation(found: Sweep, method: str, rd: float) -> Interval:
-    """Pulses with which a method reaches a restoration degree, between those of a sweep.
+    """Return the pulses with which a method reaches a restoration degree in a sweep.
 
-    Interpolated on the logarithm of the pulses and the log odds of the degree; the interval is
-    where the interval of the degree reaches it. 0 where the fewest pulses of the sweep are enough,
-    infinite where the most are not.
+    Interpolated between log pulses and log odds of the degree; the interval is where the degree's
+    interval reaches it. 0 where the fewest pulses suffice, infinite where the most do not.
     """
-    intervals = found.simulated[method]
 
     def reaching(degrees: Sequence[float]) -> float:
-        # More pulses do not tell less: what goes down is chance.
-        rising = np.maximum.accumulate(degrees)
+        rising = np.maximum.accumulate(degrees)  # a decrease is chance
         if rising[0] >= rd:
             return 0.0
         if rising[-1] < rd:
@@ -208,8 +203,8 @@ def pulses_by_simulation(found: Sweep, method: str, rd: float) -> Interval:
         log_pulses = np.interp(logit(min(rd, 1 - 1e-9)), odds, np.log(found.x[pair]))
         return math.exp(log_pulses)
 
-    return Interval(
-        reaching([each.value for each in intervals]),
-        reaching([each.high for each in intervals]),
-        reaching([each.low for each in intervals]),
-    )
+    intervals = found.simulated[method]
+    return Interval(*(reaching([getattr(i, end) for i in intervals]) for end in _ENDS))
+
+
+_ENDS = ("value", "high", "low")  # a higher degree needs fewer pulses

@@ -1,4 +1,4 @@
-"""What the trade looks like: its answers, its pictures, its tables."""
+"""Plots and tables of the trade-off study."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from core.acquisition import Floats
 from core.metrics import Interval
-from core.studies.outputs import Item, Plot, Scatter, Table
-from core.studies.timing import machine, median_interval
-from core.studies.tradeoff import acquisition as acquiring
+from core.studies.outputs import Item, Plot, Scatter, Table, as_text, table
+from core.studies.statistics import mean_interval, median_interval
+from core.studies.timing import machine
+from core.studies.tradeoff import acquisition
 from core.studies.tradeoff.acquisition import Sweep
 from core.studies.tradeoff.measure import Candidate, Point
 from core.studies.tradeoff.pareto import (
@@ -24,307 +25,270 @@ from core.studies.tradeoff.pareto import (
     best_within,
     by_condition,
     cheapest_reaching,
-    front,
+    pareto_front,
 )
 from core.studies.tradeoff.surrogate import Simulation
 
-WITHIN_MS = (2.0, 5.0, 10.0, 20.0, 50.0)
-REACHED = (0.5, 0.9, 0.95, 0.99, 0.999)
+TIMES_MS = (2.0, 5.0, 10.0, 20.0, 50.0)
+DEGREES = (0.5, 0.9, 0.95, 0.99, 0.999)
+
+_Columns = dict[str, Callable[[Any], Any]]
+_FORMATS = {"ms": ".2f", "flux, ms": ".1f", "ns per pixel and bin": ".1f", "peak memory, MB": ".1f"}
 
 
 def items(
     points: Sequence[Point],
-    found: Sequence[Acquiring],
-    within_ms: Sequence[float] = WITHIN_MS,
-    reached: Sequence[float] = REACHED,
+    sweeps: Sequence[AcquisitionSweeps],
+    times_ms: Sequence[float] = TIMES_MS,
+    degrees: Sequence[float] = DEGREES,
     tolerance_bins: int = 3,
 ) -> list[Item]:
-    """Everything that is shown: answers first, then pictures, then numbers."""
+    """Return everything that is shown: recommendations first, then plots, then all numbers."""
     return [
-        answers(points, within_ms, reached, tolerance_bins),
+        recommendations(points, times_ms, degrees, tolerance_bins),
         *front_items(points, tolerance_bins),
         fronts_table(points, tolerance_bins),
         differences(points),
-        *acquiring_items(found),
+        *acquisition_items(sweeps),
         points_table(points),
         machine(),
     ]
 
 
-# -- the front -------------------------------------------------------------------------------------
+# -- Pareto front ----------------------------------------------------------------------------------
 
 
 def front_items(points: Sequence[Point], tolerance_bins: int = 3) -> Iterator[Item]:
-    """The points of each source and SBR with their front, and the fronts of all pulses."""
-    for some in _by_light(points):
-        yield _scatter(_fullest(some), tolerance_bins)
-        fronts = {n: front(each, tolerance_bins) for (_, _, n), each in by_condition(some).items()}
+    """Plot the points of each source and SBR with their front, and the fronts of all pulses."""
+    for group in _by_source_and_sbr(points):
+        largest = _most_varied(group)
+        chosen = pareto_front(largest, tolerance_bins)
+        source, sbr, n_pulses = largest[0].condition
+        methods: dict[str, list[Point]] = {}
+        for point in largest:
+            methods.setdefault(point.candidate.method.name, []).append(point)
+        x, y = _coordinates(chosen, tolerance_bins)
+        axes = _time_label(group), f"Targets not within {_bins(tolerance_bins)} (share)"
+        yield Scatter(
+            _key("front", source, sbr, n_pulses),
+            f"{_subject(source, sbr)}, {_pulses(n_pulses)}: error rate against time per image",
+            *axes,
+            {name: _coordinates(some, tolerance_bins) for name, some in methods.items()},
+            (x[0], y[0], [str(point.candidate) for point in chosen]),
+            "Pareto front",
+            "Bars are 95 % intervals. A share of 0 is drawn at half a target. The oracle knows the "
+            "true flux and is never on the front. Gates cut to some bins require that the targets "
+            "are known to be there.",
+        )
+        fronts = {
+            f"{n} pulses": _coordinates(pareto_front(some, tolerance_bins), tolerance_bins)
+            for (_, _, n), some in by_condition(group).items()
+        }
         if len(fronts) > 1:
-            source, sbr, _ = some[0].condition
             yield Scatter(
                 _key("fronts", source, sbr),
-                f"{_told(source, sbr)}: the fronts of all numbers of pulses",
-                _time_label(some),
-                _missed_label(tolerance_bins),
-                {f"{n} pulses": _places(each, tolerance_bins) for n, each in fronts.items()},
+                f"{_subject(source, sbr)}: Pareto fronts by number of pulses",
+                *axes,
+                fronts,
                 (np.empty(0), np.empty(0), ()),
                 "",
-                note="Only points that no other one of as many pulses beats.",
             )
 
 
-def _by_light(points: Sequence[Point]) -> list[list[Point]]:
-    """Points by source and SBR, whatever the pulses."""
+def _by_source_and_sbr(points: Sequence[Point]) -> list[list[Point]]:
     found: dict[tuple[str, float | None], list[Point]] = {}
     for point in points:
         found.setdefault((point.source, point.sbr), []).append(point)
     return list(found.values())
 
 
-def _fullest(points: Sequence[Point]) -> list[Point]:
-    """Those of the number of pulses with most to choose from."""
+def _most_varied(points: Sequence[Point]) -> list[Point]:
+    """Return the points of the number of pulses with most candidates."""
     return max(by_condition(points).values(), key=len)
 
 
 def _time_label(points: Sequence[Point]) -> str:
-    if any(point.light_ms.value for point in points):
-        return "Time to reduce and range an image, its light known (ms)"
-    return "Time to reduce an image, find its light and range it (ms)"
+    if any(point.flux_ms.value for point in points):
+        return "Time to reduce and range an image, flux model known (ms)"
+    return "Time to reduce an image, estimate its flux model and range it (ms)"
 
 
-def _missed_label(tolerance_bins: int) -> str:
-    return f"Targets not within {_bins(tolerance_bins)} (share)"
-
-
-def _bins(n: int) -> str:
-    return f"{n} bin" if n == 1 else f"{n} bins"
-
-
-def _scatter(points: Sequence[Point], tolerance_bins: int) -> Scatter:
-    """All points of a condition, by method, and their front."""
-    chosen = front(points, tolerance_bins)
-    source, sbr, n_pulses = points[0].condition
-    groups: dict[str, list[Point]] = {}
-    for point in points:
-        groups.setdefault(point.candidate.method.name, []).append(point)
-    x, y = _places(chosen, tolerance_bins)
-    return Scatter(
-        _key("front", source, sbr, n_pulses),
-        f"{_told(source, sbr)}, {_pulses(n_pulses)}: what each way costs, how often it errs",
-        _time_label(points),
-        _missed_label(tolerance_bins),
-        {name: _places(some, tolerance_bins) for name, some in groups.items()},
-        (x[0], y[0], [str(point.candidate) for point in chosen]),
-        "not beaten by any",
-        note="Bars are 95 % intervals. A share of 0 is drawn where half a target would be. The "
-        "oracle is told the light, which no instrument knows: it is never on the front. A gate cut "
-        "to some bins is for who knows that the targets are there.",
-    )
-
-
-def _places(points: Sequence[Point], tolerance_bins: int) -> tuple[Floats, Floats]:
-    """Milliseconds and missed shares, (3, n) each, kept above what a logarithm cannot show."""
-    x = np.array([_ends(point.milliseconds) for point in points]).reshape(-1, 3).T
-    y = 1 - np.array([_ends(point.rd(tolerance_bins)) for point in points]).reshape(-1, 3).T
+def _coordinates(points: Sequence[Point], tolerance_bins: int) -> tuple[Floats, Floats]:
+    """Return milliseconds and error rates, (3, n) each, above zero for the logarithmic axis."""
+    x = np.array([astuple(point.milliseconds) for point in points]).reshape(-1, 3).T
+    y = 1 - np.array([astuple(point.rd(tolerance_bins)) for point in points]).reshape(-1, 3).T
     least = [0.5 / sum(score.targets for score in point.scores) for point in points]
     return x, np.maximum(y, least)
 
 
-def _ends(interval: Interval) -> tuple[float, float, float]:
-    return interval.value, interval.low, interval.high
+# -- Tables ----------------------------------------------------------------------------------------
+
+_CONDITION: _Columns = {
+    "source": lambda point: point.source,
+    "SBR": lambda point: _number(point.sbr),
+    "pulses": lambda point: _number(point.n_pulses),
+}
+_CONFIGURATION: _Columns = _CONDITION | {"configuration": lambda point: str(point.candidate)}
+_RESULTS: _Columns = {
+    "ms": lambda point: point.milliseconds,
+    "flux, ms": lambda point: point.flux_ms.value,
+    "ns per pixel and bin": lambda point: point.ns_per_pixel_bin,
+    "RD 3 bins": lambda point: point.rd(3),
+    "RD 1 bin": lambda point: point.rd(1),
+    "RMSE m": lambda point: point.rmse_m,
+    "peak memory, MB": lambda point: point.peak_bytes / 1e6,
+}
+_MAX_NAMED = 4
 
 
-# -- answers ---------------------------------------------------------------------------------------
+def _of_first(columns: _Columns) -> _Columns:
+    """Return columns of records whose first element is the point."""
+    return {name: (lambda row, cell=cell: cell(row[0])) for name, cell in columns.items()}  # type: ignore[misc]
 
 
-def answers(
+def recommendations(
     points: Sequence[Point],
-    within_ms: Sequence[float],
-    reached: Sequence[float],
+    times_ms: Sequence[float],
+    degrees: Sequence[float],
     tolerance_bins: int = 3,
 ) -> Table:
-    """Both questions for each source and SBR, with how sure the answers are."""
-    rows: list[tuple[Any, ...]] = []
-    for some in map(_fullest, _by_light(points)):
-        where = _where(some[0])
-        for each in within_ms:
+    """Return the best configuration within each time and the fastest for each degree."""
+    found: list[tuple[Point, str, Recommendation | None]] = []
+    for some in map(_most_varied, _by_source_and_sbr(points)):
+        for each in times_ms:
             best = best_within(some, each, tolerance_bins)
-            rows.append((*where, f"best within {each:g} ms", *_answer(best, tolerance_bins)))
-        for each in reached:
+            found.append((some[0], f"best within {each:g} ms", best))
+        for each in degrees:
             best = cheapest_reaching(some, each, tolerance_bins)
-            rows.append((*where, f"cheapest with RD ≥ {each:g}", *_answer(best, tolerance_bins)))
-    return Table(
-        "answers",
-        "Which way to take",
-        (
-            *_WHERE,
-            "asked",
-            "answer",
-            "ms",
-            f"RD, {_bins(tolerance_bins)}",
-            "the best, probability",
-            "keeps to what was asked, probability",
-            "others that may be the best",
-        ),
-        tuple(rows),
-        note="Probabilities are those of a paired bootstrap over seeds (or parts of a capture) and "
-        "rounds of timing. The others named would have been chosen in 5 % of the draws or more. A "
-        "gate cut to some bins is for who knows that the targets are there.",
+            found.append((some[0], f"fastest with RD ≥ {each:g}", best))
+
+    def of_best(cell: Callable[[Recommendation], Any]) -> Callable[[Any], Any]:
+        return lambda row: "" if row[2] is None else cell(row[2])
+
+    def runners_up(best: Recommendation) -> str:
+        others = [f"{point.candidate} ({share:.2f})" for point, share in best.runners_up]
+        more = len(others) - _MAX_NAMED
+        return "; ".join(others[:_MAX_NAMED] + ([f"{more} more"] if more > 0 else []))
+
+    return table(
+        "recommendations",
+        "Recommended configurations",
+        found,
+        {
+            **_of_first(_CONDITION),
+            "limit": lambda row: row[1],
+            "configuration": lambda row: "none" if row[2] is None else str(row[2].point.candidate),
+            "ms": of_best(lambda best: best.point.milliseconds),
+            f"RD, {_bins(tolerance_bins)}": of_best(lambda best: best.point.rd(tolerance_bins)),
+            "P(best)": of_best(lambda best: best.is_best),
+            "P(limit kept)": of_best(lambda best: best.keeps),
+            "runners-up": of_best(runners_up),
+        },
+        "Probabilities are those of a paired bootstrap over seeds (or parts of a capture) and "
+        "rounds of timing. Runners-up are chosen in 5 % of the draws or more. Gates cut to some "
+        "bins require that the targets are known to be there.",
+        _FORMATS | {"P(best)": ".2f", "P(limit kept)": ".2f"},
     )
-
-
-_MOST_NAMED = 4
-
-
-def _answer(found: Recommendation | None, tolerance_bins: int) -> tuple[Any, ...]:
-    if found is None:
-        return "none", "", "", "", "", ""
-    others = [f"{point.candidate} ({share:.2f})" for point, share in found.runners_up]
-    more = len(others) - _MOST_NAMED
-    others = others[:_MOST_NAMED] + ([f"{more} more"] if more > 0 else [])
-    return (
-        str(found.point.candidate),
-        _interval(found.point.milliseconds, 2),
-        _interval(found.point.rd(tolerance_bins), 4),
-        f"{found.is_best:.2f}",
-        f"{found.keeps:.2f}",
-        "; ".join(others),
-    )
-
-
-# -- tables ----------------------------------------------------------------------------------------
 
 
 def fronts_table(points: Sequence[Point], tolerance_bins: int = 3) -> Table:
-    """The fronts of all conditions, as people read them."""
-    rows = tuple(
+    """Return the Pareto fronts of all conditions."""
+    return table(
+        "fronts",
+        "Pareto fronts",
         (
-            *_where(point),
-            str(point.candidate),
-            _interval(point.milliseconds, 2),
-            f"{point.light_ms.value:.1f}",
-            f"{point.ns_per_pixel_bin:.1f}",
-            _interval(point.rd(3), 4),
-            _interval(point.rd(1), 4),
-            _interval(point.rmse_m, 3),
-            f"{point.peak_bytes / 1e6:.1f}",
-        )
-        for some in by_condition(points).values()
-        for point in front(some, tolerance_bins)
+            point
+            for some in by_condition(points).values()
+            for point in pareto_front(some, tolerance_bins)
+        ),
+        _CONFIGURATION | _RESULTS,
+        "Milliseconds are those of reducing the capture and ranging it with its flux model known; "
+        "estimating that model, once per capture, is a separate column, or included and shown as "
+        "0. Memory is the peak of numpy's allocations beyond the capture. Errors are those of the "
+        "whole image at the capture's own bin width: pixels that are left out take the estimate "
+        "of their neighbour.",
+        _FORMATS,
     )
-    intervals = ("RD, 3 bins [95 %]", "RD, 1 bin [95 %]", "RMSE, m [95 %]")
-    costs = ("ms [95 %]", "light, ms", "ns per pixel and bin")
-    columns = (*_WHERE, "way", *costs, *intervals, "peak memory, MB")
-    return Table("fronts", "What no other way beats", columns, rows, note=_WHAT_IS_TIMED)
-
-
-_WHAT_IS_TIMED = (
-    "Milliseconds are those of reducing the capture and ranging it, the light that it tells of "
-    "being known (a capture keeps it); finding that light, once for each capture, stands beside "
-    "them, or is counted in and stands as 0. Memory is what numpy holds at most meanwhile, beyond "
-    "the capture. Errors are those of the whole image at the capture's own bin width: pixels that "
-    "are left out take their neighbour's answer."
-)
 
 
 def differences(points: Sequence[Point]) -> Table:
-    """What leaving something out, or doing it otherwise, changes of a method; paired."""
-    rows = []
-    for some in map(_fullest, _by_light(points)):
+    """Compare each variation with the same method on the whole capture, paired."""
+    pairs = []
+    for some in map(_most_varied, _by_source_and_sbr(points)):
         plain = {
             (each.candidate.method, each.candidate.threads): each
             for each in some
             if each.candidate == Candidate(each.candidate.method, threads=each.candidate.threads)
         }
         for point in some:
-            candidate = point.candidate
-            base = plain.get((candidate.method, None), plain.get((candidate.method, 1)))
-            if base is None or base is point:
-                continue
-            ratio = median_interval(np.divide(point.seconds, base.seconds))
-            light = point.light_ms.value / base.light_ms.value if base.light_ms.value else math.nan
-            rows.append(
-                (
-                    *_where(point),
-                    str(candidate),
-                    _interval(ratio, 2),
-                    f"{light:.2f}",
-                    *(_interval(_more_restored(point, base, n), 4) for n in (3, 1)),
-                    f"{(point.peak_bytes - base.peak_bytes) / 1e6:+.1f}",
-                )
+            method = point.candidate.method
+            base = plain.get((method, None), plain.get((method, 1)))
+            if base is not None and base is not point:
+                pairs.append((point, base))
+
+    def flux_ratio(pair: tuple[Point, Point]) -> float:
+        point, base = pair
+        return point.flux_ms.value / base.flux_ms.value if base.flux_ms.value else math.nan
+
+    def rd_difference(n: int) -> Callable[[tuple[Point, Point]], Interval]:
+        return lambda pair: mean_interval(
+            np.array(
+                [
+                    (one.restored[n - 1] - other.restored[n - 1]) / one.targets
+                    for one, other in zip(pair[0].scores, pair[1].scores, strict=True)
+                ]
             )
-    degrees = [f"RD, {_bins(n)}, difference [95 %]" for n in (3, 1)]
-    return Table(
+        )
+
+    return table(
         "differences",
-        "What one change does, against the same method on the whole capture",
-        (*_WHERE, "way", "time, ratio [95 %]", "light, ratio", *degrees, "memory, MB more"),
-        tuple(rows),
-        note="Paired: ratios of the same rounds of timing, differences on the same seeds.",
+        "Effect of one change, against the same method on the whole capture",
+        pairs,
+        {
+            **_of_first(_CONFIGURATION),
+            "time, ratio": lambda pair: median_interval(
+                np.divide(pair[0].seconds, pair[1].seconds)
+            ),
+            "flux, ratio": flux_ratio,
+            "RD 3 bins, difference": rd_difference(3),
+            "RD 1 bin, difference": rd_difference(1),
+            "memory, MB more": lambda pair: (pair[0].peak_bytes - pair[1].peak_bytes) / 1e6,
+        },
+        "Paired: ratios of the same rounds of timing, differences on the same seeds.",
+        {"time, ratio": ".2f", "flux, ratio": ".2f", "memory, MB more": "+.1f"},
     )
 
 
-def _more_restored(point: Point, base: Point, tolerance_bins: int) -> Interval:
-    """Mean difference of the restoration degree over seeds, with Student's 95 % interval."""
-    more = [
-        (mine.restored[tolerance_bins - 1] - theirs.restored[tolerance_bins - 1]) / mine.targets
-        for mine, theirs in zip(point.scores, base.scores, strict=True)
-    ]
-    mean, count = float(np.mean(more)), len(more)
-    half = float(stdtrit(count - 1, 0.975) * np.std(more, ddof=1) / math.sqrt(count))
-    return Interval(mean, mean - half, mean + half)
-
-
 def points_table(points: Sequence[Point]) -> Table:
-    """Everything that was measured, as numbers."""
-    ends = ("", ", low", ", high")
-    measured = [
-        f"{name}{end}" for name in ("ms", "RD 3 bins", "RD 1 bin", "RMSE m") for end in ends
-    ]
-    rows = [
-        (
-            *_where(point),
-            str(point.candidate),
-            *_ends(point.milliseconds),
-            *_ends(point.rd(3)),
-            *_ends(point.rd(1)),
-            *_ends(point.rmse_m),
-            point.light_ms.value,
-            point.ns_per_pixel_bin,
-            point.peak_bytes / 1e6,
-            point.note,
-        )
-        for point in points
-    ]
-    more = ("light, ms", "ns per pixel and bin", "peak memory, MB", "note")
-    return Table(
+    """Return every measured point."""
+    return table(
         "points",
-        "Everything that was measured",
-        (*_WHERE, "way", *measured, *more),
-        tuple(rows),
-        note="points.json, beside this page, holds the settings that make each of them again.",
+        "All measurements",
+        points,
+        {**_CONFIGURATION, **_RESULTS, "note": lambda point: point.note},
+        "points.json, in the same folder, holds the settings that reproduce each of them.",
     )
 
 
 def write_settings(points: Sequence[Point], folder: Path) -> None:
-    """``points.json``: of each point the settings and the figures."""
-    told = [
+    """Write ``points.json``: settings and figures of each point."""
+    records = [
         {
-            "way": str(point.candidate),
+            "configuration": str(point.candidate),
             **point.settings,
-            "milliseconds": _ends(point.milliseconds),
-            "rd_3_bins": _ends(point.rd(3)),
-            "rd_1_bin": _ends(point.rd(1)),
+            "milliseconds": astuple(point.milliseconds),
+            "rd_3_bins": astuple(point.rd(3)),
+            "rd_1_bin": astuple(point.rd(1)),
         }
         for point in points
     ]
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "points.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
+    (folder / "points.json").write_text(json.dumps(records, indent=1), encoding="utf-8")
 
 
-# -- how to acquire --------------------------------------------------------------------------------
+# -- How to acquire --------------------------------------------------------------------------------
 
 
-class Acquiring(NamedTuple):
+class AcquisitionSweeps(NamedTuple):
     """Sweeps of a simulation."""
 
     simulation: Simulation
@@ -333,151 +297,132 @@ class Acquiring(NamedTuple):
     gate: Sweep
 
 
-def acquired(
+def acquisition_sweeps(
     simulations: Sequence[Simulation],
     seeds: Sequence[int],
     processes: int = 1,
     progress: Callable[[int, int], None] = lambda done, of: None,
-) -> list[Acquiring]:
-    """All three sweeps of each simulation."""
-    knobs: list[acquiring.Knob] = []
+) -> list[AcquisitionSweeps]:
+    """Vary pulses, exposure and gate of each simulation."""
+    varied: list[tuple[Sequence[float], Sequence[Simulation]]] = []
     for each in simulations:
-        gates = acquiring.over_gates(each)
-        knobs += [
-            (acquiring.PULSES, acquiring.over_pulses(each, acquiring.PULSES)),
-            (acquiring.EXPOSURES, acquiring.over_exposures(each, acquiring.EXPOSURES)),
+        gates = acquisition.over_gates(each)
+        varied += [
+            (acquisition.PULSES, acquisition.over_pulses(each, acquisition.PULSES)),
+            (acquisition.EXPOSURES, acquisition.over_exposures(each, acquisition.EXPOSURES)),
             ([gate.acquisition.n_bins for gate in gates], gates),
         ]
-    found = acquiring.sweeps(knobs, seeds=seeds, processes=processes, progress=progress)
-    return [Acquiring(each, *found[3 * i : 3 * i + 3]) for i, each in enumerate(simulations)]
+    found = acquisition.sweeps(varied, seeds=seeds, processes=processes, progress=progress)
+    return [
+        AcquisitionSweeps(each, *found[3 * i : 3 * i + 3]) for i, each in enumerate(simulations)
+    ]
 
 
-def acquiring_items(found: Sequence[Acquiring]) -> Iterator[Item]:
-    """The sweeps as curves, and the pulses that are needed as a table."""
-    for each in found:
-        simulation, pulses = each.simulation, _pulses(each.simulation.acquisition.n_pulses)
-        bins = simulation.acquisition.n_bins
-        factor = acquiring.exposure(simulation)
-        yield _curves("pulses", each, each.pulses, "Pulses", {})
-        yield _curves(
-            "exposure",
-            each,
-            each.exposure,
-            f"Factor on signal and background ({pulses}; attenuated below 1)",
-            {f"best by theory: {factor:.2f}": factor, "as it is": 1.0},
-        )
-        yield _curves(
-            "gate",
-            each,
-            each.gate,
-            f"Gate (bins; {pulses}, the same background in each bin)",
-            {f"as it is: {bins}": float(bins)},
-        )
-    if found:
-        yield _needed(found)
+def acquisition_items(sweeps: Sequence[AcquisitionSweeps]) -> Iterator[Item]:
+    """Return the sweeps as curves, and the required pulses as a table."""
+    for simulation, pulses, exposure, gate in sweeps:
+        n_pulses, bins = _pulses(simulation.acquisition.n_pulses), simulation.acquisition.n_bins
+        factor = acquisition.exposure(simulation)
+        best = {f"best by theory: {factor:.2f}": factor, "present": 1.0}
+        for name, sweep, x_label, marks in (
+            ("pulses", pulses, "Pulses", {}),
+            (
+                "exposure",
+                exposure,
+                f"Factor on signal and background ({n_pulses}; attenuated below 1)",
+                best,
+            ),
+            (
+                "gate",
+                gate,
+                f"Gate (bins; {n_pulses}, the same background in each bin)",
+                {f"present: {bins}": float(bins)},
+            ),
+        ):
+            yield _sweep_plot(name, simulation, sweep, x_label, marks)
+    if sweeps:
+        yield _required_pulses(sweeps)
 
 
-_SAID = {
-    "pulses": "how many pulses reach a restoration degree",
-    "exposure": "how much light reaches a restoration degree",
-    "gate": "how long a gate still reaches a restoration degree",
-}
+# Deprecated names, to be removed after the next release.
+acquired, acquiring_items = acquisition_sweeps, acquisition_items
 
 
-def _curves(
-    key: str, found: Acquiring, sweep: Sweep, x_label: str, marks: dict[str, float]
+def _sweep_plot(
+    name: str, simulation: Simulation, sweep: Sweep, x_label: str, marks: dict[str, float]
 ) -> Plot:
-    source, sbr = found.simulation.name, found.simulation.flux.sbr
+    source, sbr = simulation.name, simulation.flux.sbr
     ends = {
-        f"{name}, simulated": np.array([_ends(each) for each in intervals]).T
-        for name, intervals in sweep.simulated.items()
+        f"{method}, simulated": np.array([astuple(each) for each in intervals]).T
+        for method, intervals in sweep.simulated.items()
     }
     return Plot(
-        _key(key, source, sbr),
-        f"{_told(source, sbr)}: {_SAID[key]}",
+        _key(name, source, sbr),
+        f"{_subject(source, sbr)}: restoration degree against {name}",
         x_label,
         "Restoration degree within 3 bins",
         sweep.x,
-        {"theory, light known": sweep.theory, **{name: each[0] for name, each in ends.items()}},
+        {"theory, flux known": sweep.theory, **{key: each[0] for key, each in ends.items()}},
         marks,
-        bands={name: (each[1], each[2]) for name, each in ends.items()},
+        bands={key: (each[1], each[2]) for key, each in ends.items()},
         x_is_log=True,
     )
 
 
-def _needed(found: Sequence[Acquiring]) -> Table:
-    """Pulses with which each degree of `REACHED` is reached."""
-    rows = []
-    for each in found:
-        few, many = int(each.pulses.x[0]), int(each.pulses.x[-1])
-        for rd in REACHED:
-            simulated = [
-                acquiring.pulses_by_simulation(each.pulses, name, rd) for name in acquiring.METHODS
-            ]
-            rows.append(
-                (
-                    each.simulation.name,
-                    _number(each.simulation.flux.sbr),
-                    f"{rd:g}",
-                    _whole(acquiring.pulses_by_theory(each.simulation, rd), few, many),
-                    *(
-                        f"{_whole(n.value, few, many)} "
-                        f"[{_whole(n.low, few, many)}, {_whole(n.high, few, many)}]"
-                        for n in simulated
-                    ),
-                )
-            )
-    return Table(
-        "needed",
-        "Pulses needed for a restoration degree within 3 bins",
-        (
-            "source",
-            "SBR",
-            "RD",
-            "theory, light known",
-            *(f"{name}, simulated [95 %]" for name in acquiring.METHODS),
-        ),
-        tuple(rows),
-        note="Theory: the probability that the exact likelihood with known light peaks within 3.2 "
-        "bins, its scores taken as Gaussian; it is too high below 0.9. Simulated: interpolated "
-        "between the numbers of pulses of the sweep.",
+def _required_pulses(sweeps: Sequence[AcquisitionSweeps]) -> Table:
+    def whole(n_pulses: float, swept: Floats) -> str:
+        if n_pulses < swept[0]:
+            return f"< {swept[0]:g}"
+        return f"> {swept[-1]:g}" if n_pulses > swept[-1] else str(math.ceil(n_pulses))
+
+    def simulated(method: str) -> Callable[[tuple[AcquisitionSweeps, float]], str]:
+        def text(row: tuple[AcquisitionSweeps, float]) -> str:
+            swept, rd = row[0].pulses, row[1]
+            found = astuple(acquisition.pulses_by_simulation(swept, method, rd))
+            value, low, high = (whole(n, swept.x) for n in found)
+            return f"{value} [{low}, {high}]"
+
+        return text
+
+    return table(
+        "required_pulses",
+        "Pulses required for a restoration degree within 3 bins",
+        [(each, rd) for each in sweeps for rd in DEGREES],
+        {
+            "source": lambda row: row[0].simulation.name,
+            "SBR": lambda row: _number(row[0].simulation.flux.sbr),
+            "RD": lambda row: f"{row[1]:g}",
+            "theory, flux known": lambda row: whole(
+                acquisition.pulses_by_theory(row[0].simulation, row[1]), row[0].pulses.x
+            ),
+            **{f"{name}, simulated [95 %]": simulated(name) for name in acquisition.METHODS},
+        },
+        "Theory: probability that the exact likelihood with known flux peaks within 3.2 bins, in a "
+        "Gaussian approximation that is too high below 0.9. Simulated: interpolated between the "
+        "numbers of pulses of the sweep.",
     )
 
 
-def _whole(n_pulses: float, few: int, many: int) -> str:
-    """A number of pulses as far as a sweep from few to many pulses knows it."""
-    if n_pulses < few:
-        return f"< {few}"
-    return f"> {many}" if n_pulses > many else str(math.ceil(n_pulses))
-
-
-# -- words -----------------------------------------------------------------------------------------
+# -- Text ------------------------------------------------------------------------------------------
 
 
 def _key(what: str, *of: object) -> str:
-    """A file's name."""
-    told = "_".join(f"{each:g}" if isinstance(each, float) else str(each) for each in of if each)
-    return re.sub(r"[^\w.]+", "_", f"{what}_{told}")[:80]
+    """Return a file name."""
+    parts = "_".join(f"{each:g}" if isinstance(each, float) else str(each) for each in of if each)
+    return re.sub(r"[^\w.]+", "_", f"{what}_{parts}")[:80]
 
 
-def _told(source: str, sbr: float | None) -> str:
+def _subject(source: str, sbr: float | None) -> str:
     return source if sbr is None else f"{source} at SBR {sbr:.3g}"
 
 
 def _pulses(n_pulses: int | None) -> str:
-    return "pulses not known" if n_pulses is None else f"{n_pulses} pulses"
+    return "number of pulses unknown" if n_pulses is None else f"{n_pulses} pulses"
 
 
-_WHERE = ("source", "SBR", "pulses")
-
-
-def _where(point: Point) -> tuple[str, str, str]:
-    return point.source, _number(point.sbr), _number(point.n_pulses)
+def _bins(n: int) -> str:
+    return f"{n} bin" if n == 1 else f"{n} bins"
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def _interval(found: Interval, digits: int) -> str:
-    return f"{found.value:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
+    return "" if value is None else as_text(value, ".3g")

@@ -1,4 +1,4 @@
-"""What the trade is measured on: built-in scenes, and what ranges them."""
+"""Plan of a study: candidates to measure on built-in scenes."""
 
 from __future__ import annotations
 
@@ -11,49 +11,51 @@ from core.scene import scenes
 from core.studies.tradeoff.acquisition import PULSES
 from core.studies.tradeoff.measure import MERGES, Candidate, Source, candidates, variations
 from core.studies.tradeoff.surrogate import Simulation
-from core.studies.trials import as_they_come
+from core.studies.trials import default_methods
 
 MERGED_AT = (100, 10_000)
-"""Numbers of pulses, besides the scene's own, with which bins are merged, too."""
+"""Numbers of pulses, besides the scene's own, with which bins are merged."""
 THREADED = ("tracking", "likelihood")
 THREADED_SIZE = 256
-"""Rows and columns of the image on which threads are tried: of smaller ones kernels use one."""
+"""Rows and columns of the image on which threads are compared; small images use one thread."""
 
 Plan = list[tuple[Source, Sequence[Candidate]]]
 
 
 def simulated(scene: str, sbr: float, signal: float, n_pulses: int | None = None) -> Simulation:
-    """A built-in scene; with its own number of pulses where none is given."""
+    """Return a built-in scene, with its own number of pulses where none is given."""
     built = scenes[scene]()
     simulation = Simulation(scene, built, built.acquisition, Flux(signal, sbr))
     return simulation if n_pulses is None else simulation.with_pulses(n_pulses)
 
 
-def around(simulation: Simulation) -> list[Candidate]:
-    """Everything that is tried on a scene at its own number of pulses."""
-    return candidates() + variations(window=simulation.window)
+def all_candidates(simulation: Simulation) -> list[Candidate]:
+    """Return what is measured on a scene with its own number of pulses."""
+    return candidates() + variations(simulation.window)
 
 
 def over_pulses(simulation: Simulation) -> Plan:
-    """Every method at every number of pulses; with bins merged at some; all there is at its own."""
+    """Return every method at every number of pulses, and all candidates at the scene's own."""
     own = simulation.acquisition.n_pulses
-    plan: Plan = []
-    for n_pulses in sorted({*PULSES, *([own] if own else [])}):
-        ways = candidates(merges=MERGES if n_pulses in MERGED_AT else (1,))
-        plan.append(
-            (simulation.with_pulses(n_pulses), around(simulation) if n_pulses == own else ways)
+    return [
+        (
+            simulation.with_pulses(n_pulses),
+            all_candidates(simulation)
+            if n_pulses == own
+            else candidates(merges=MERGES if n_pulses in MERGED_AT else (1,)),
         )
-    return plan
+        for n_pulses in sorted({*PULSES, *([own] if own else [])})
+    ]
 
 
 def threaded(sbr: float, signal: float) -> Plan:
-    """A large car, by 1 thread and by more."""
+    """Return a large car, ranged on one thread and on more."""
     built = scenes["car"](THREADED_SIZE)
     name = f"car, {THREADED_SIZE} x {THREADED_SIZE}"
-    ways = [
+    configurations = [
         Candidate(method, threads=n)
-        for method in as_they_come()
+        for method in default_methods()
         if method.name in THREADED
         for n in range(1, numba.config.NUMBA_NUM_THREADS + 1)
     ]
-    return [(Simulation(name, built, built.acquisition, Flux(signal, sbr)), ways)]
+    return [(Simulation(name, built, built.acquisition, Flux(signal, sbr)), configurations)]

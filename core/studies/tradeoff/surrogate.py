@@ -1,4 +1,4 @@
-"""Simulations that stand for a capture: where a capture has no truth, its likeness has one."""
+"""Simulated scenes, and surrogates: simulations fitted to a capture that has no truth."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from core.trigger import rate_per_bin
 
 MARGIN_BINS = 5
 
-_AT_ONCE = 2**20  # counts whose rates are held
+_AT_ONCE = 2**20  # counts whose rates are held in memory
 
-SURE = 0.5
-"""Least confidence of an answer that `like` takes for the truth."""
+MIN_CONFIDENCE = 0.5
+"""Confidence from which a surrogate takes an estimate for the truth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A scene under some light, to be captured with any seed.
+    """A scene and its flux, to be captured with any seed.
 
     Parameters
     ----------
     name : str
-        As shown to people.
+        Shown in tables and plots.
     scene : Scene
     acquisition : Acquisition
-        Where the number of pulses is not known, or `detection` is ``"all"``, counts are Poisson and
-        the flux is that of all pulses.
+        If the number of pulses is unknown, or `detection` is ``"all"``, counts are Poisson and the
+        flux is that of all pulses together.
     flux : Flux
     pulse : Pulse
     detection : str
         As `Capture.detection`.
     note : str
-        What to know of captures that are simulated so.
+        A remark on its captures.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Simulation:
     note: str = ""
 
     def capture(self, seed: int) -> Capture:
-        """One capture, with its truth."""
+        """Simulate one capture, with its truth."""
         if self.detection == "first" and self.acquisition.n_pulses is not None:
             return simulate(self.scene, self.acquisition, self.flux, self.pulse, seed)
         truth_m = np.asarray(self.scene.range_m, float)
@@ -79,16 +79,16 @@ class Simulation:
 
     @property
     def window(self) -> tuple[int, int]:
-        """First bin and end of the shortest window of the gate that holds the targets' echoes."""
+        """First bin and end of the shortest window that holds the targets' echoes."""
         return window(self.scene.range_m, self.pulse, self.acquisition)
 
     def with_pulses(self, n_pulses: int) -> Simulation:
-        """The same with another number of pulses."""
+        """Return the same simulation with another number of pulses."""
         return replace(self, acquisition=replace(self.acquisition, n_pulses=n_pulses))
 
 
 def window(range_m: Floats, pulse: Pulse, acquisition: Acquisition) -> tuple[int, int]:
-    """First bin and end of the shortest window that holds the echoes, `MARGIN_BINS` to spare.
+    """Return first bin and end of the shortest window with the echoes, plus `MARGIN_BINS`.
 
     Parameters
     ----------
@@ -102,71 +102,72 @@ def window(range_m: Floats, pulse: Pulse, acquisition: Acquisition) -> tuple[int
     return max(0, first), min(acquisition.n_bins, end)
 
 
-def like(capture: Capture, name: str) -> Simulation:
-    """A simulation of what a capture seems to have seen.
+def surrogate_of(capture: Capture, name: str) -> Simulation:
+    """Return a simulation fitted to a capture.
 
-    The range of each pixel is the likelihood's answer where its confidence is at least `SURE`, else
-    that of the nearest such pixel; pixels that more likely than not see no surface have no target.
-    The levels of signal and their shares are those of `core.inference.posterior.flux_model_of`, the
-    stronger ones given to the pixels that show more photons at their answer; the background is its
-    mean.
+    The range of each pixel is the likelihood's estimate where its confidence is at least
+    `MIN_CONFIDENCE`, else that of the nearest such pixel; pixels that are more likely to see no
+    surface than one have no target. Levels of signal and their shares are those of
+    `core.inference.flux.flux_model_of`, the higher ones assigned to the pixels with more photons at
+    their estimate; the background is its mean.
 
-    Errors measured on it are those of a scene like this one, not those of this capture: what the
-    model leaves out (a second surface, a background that is not uniform, another pulse) is not in
-    it, and where the answers were wrong it is rougher than the scene.
+    Errors measured on it are those of a similar scene, not of this capture: it lacks what the model
+    leaves out (a second surface, a background that is not uniform, another pulse), and where
+    estimates were wrong it is rougher than the scene.
 
     Raises
     ------
     ValueError
-        If no pixel is ranged with that confidence.
+        If no pixel has an estimate of that confidence.
     """
-    light, image = flux_model_of(capture), estimate(capture, "likelihood")
-    target = posterior_of(capture).surface > SURE
-    sure = target & image.valid & (image.confidence >= SURE)
-    if not sure.any():
-        most = float(image.confidence.max())
+    flux, image = flux_model_of(capture), estimate(capture, "likelihood")
+    target = posterior_of(capture).surface > 0.5
+    clear = target & image.valid & (image.confidence >= MIN_CONFIDENCE)
+    if not clear.any():
         raise ValueError(
-            f"confidence = {most:.2f} at most is not accepted: give a capture of which some pixels "
-            f"are ranged with {SURE:g} or more, since its likeness needs their ranges."
+            f"confidence = {image.confidence.max():.2f} at most is not accepted: give a capture in "
+            f"which some pixels are ranged with {MIN_CONFIDENCE:g} or more."
         )
-    nearest = distance_transform_edt(~sure, return_distances=False, return_indices=True)
+    nearest = distance_transform_edt(~clear, return_distances=False, return_indices=True)
     delay_bin = image.bin[tuple(nearest)]
     signal = np.zeros(capture.shape)
-    signal[target] = _shared_out(
-        light.signal[1:, 0, 0], light.share[1:], _echo(capture, delay_bin)[target]
+    signal[target] = _assigned(
+        flux.signal[1:, 0, 0], flux.share[1:], _echo_rate(capture, delay_bin)[target]
     )
     mean = float(signal[target].mean())
     return Simulation(
         name,
         Scene(
-            np.where(target, capture.acquisition.bin_to_range_m(delay_bin), np.nan),
-            signal / mean,
+            np.where(target, capture.acquisition.bin_to_range_m(delay_bin), np.nan), signal / mean
         ),
         capture.acquisition,
-        Flux(mean, mean / float(light.typical_background.mean())),
+        Flux(mean, mean / float(flux.typical_background.mean())),
         capture.pulse,
         capture.detection,
         "the capture has no truth: errors are those of a simulated scene like it",
     )
 
 
-def _echo(capture: Capture, delay_bin: Floats) -> Floats:
-    """Rate of each pixel over the bins that hold the middle of an echo, pile-up undone."""
+like = surrogate_of  # deprecated name, to be removed after the next release
+
+
+def _echo_rate(capture: Capture, delay_bin: Floats) -> Floats:
+    """Return each pixel's rate over the bins of the middle of its echo, corrected for pile-up."""
     n_bins = capture.acquisition.n_bins
     ends = delay_bin[..., np.newaxis] + np.divide(
         capture.pulse.span_s, capture.acquisition.bin_width_s
     )
     first, last = np.moveaxis(np.clip(np.floor(ends), 0, n_bins - 1).astype(int), 2, 0)
     edges, echo = np.stack([first, last + 1], axis=2), np.empty(capture.shape)
-    for here in patches(capture.cube.shape, _AT_ONCE):
-        rate, _ = rate_and_n_armed(capture.cube[here].astype(float), capture.gated_pulses)
+    for patch in patches(capture.cube.shape, _AT_ONCE):
+        rate, _ = rate_and_n_armed(capture.cube[patch].astype(float), capture.gated_pulses)
         until = np.pad(np.cumsum(rate, axis=2), ((0, 0), (0, 0), (1, 0)))
-        echo[here] = np.diff(np.take_along_axis(until, edges[here], axis=2), axis=2)[..., 0]
+        echo[patch] = np.diff(np.take_along_axis(until, edges[patch], axis=2), axis=2)[..., 0]
     return echo
 
 
-def _shared_out(levels: Floats, share: Floats, seen: Floats) -> Floats:
-    """Levels in rising order, each given to its share of the pixels (n,), most to who saw most."""
-    rank = (np.argsort(np.argsort(seen)) + 0.5) / seen.size
+def _assigned(levels: Floats, share: Floats, rate: Floats) -> Floats:
+    """Assign rising levels to their shares of the pixels (n,), the highest to the highest rates."""
+    rank = (np.argsort(np.argsort(rate)) + 0.5) / rate.size
     until = np.cumsum(share) / share.sum()
     return np.asarray(levels[np.searchsorted(until[:-1], rank)])

@@ -1,6 +1,6 @@
-"""Positions along the gate in the unit of the user's choice: on axes, in tables, in words.
+"""Axes and read-outs along the gate in the chosen unit.
 
-Data stay in bins; only what is written at a position changes with the unit.
+Data stay in bins; only the labels change with the unit.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ for (let n = Math.ceil(low / every); n * every <= high + 1e-9 * every; n++) {
 return ticks;
 """
 
-# As many decimals as tell neighbouring ticks apart.
-WORDS = """
+# As many decimals as distinguish neighbouring ticks.
+LABELS = """
 const every = ticks.length > 1 ? Math.abs(step * (ticks[1] - ticks[0])) : Math.abs(step);
 const isWhole = (value) => Math.abs(value - Math.round(value)) < 1e-6;
 const decimals = [0, 1, 2, 3, 4, 5].find((n) => isWhole(every * 10 ** n)) ?? 6;
@@ -45,14 +45,14 @@ return (origin + step * tick).toFixed(decimals);
 
 
 class GateAxes:
-    """Both horizontal axes of a plot over bins: the unit below, its complement above.
+    """Both horizontal axes of a plot over bins: the chosen unit below, its complement above.
 
     Parameters
     ----------
     figure : bokeh.plotting.figure
-        With one horizontal axis, over bins.
+        Has one horizontal axis, over bins.
     has_top : bool
-        Whether it gets a second one, above.
+        Whether to add the upper axis.
     """
 
     def __init__(self, figure: Any, has_top: bool = True) -> None:
@@ -63,11 +63,11 @@ class GateAxes:
         for axis in self._axes:
             args = {"origin": 0.0, "step": 1.0, "name": "bins"}
             axis.ticker = CustomJSTicker(args=args, major_code=TICKS)
-            axis.formatter = CustomJSTickFormatter(args=args, code=WORDS)
+            axis.formatter = CustomJSTickFormatter(args=args, code=LABELS)
         self.follow("bins", Acquisition())
 
     def follow(self, unit: str, acquisition: Acquisition) -> None:
-        """Take on another unit or gate."""
+        """Set the unit and the gate."""
         for axis, name in zip(self._axes, (unit, OPPOSITE_UNIT[unit]), strict=False):
             along = scale(name, acquisition)
             args = {"origin": along.origin, "step": along.step, "name": name}
@@ -76,7 +76,7 @@ class GateAxes:
             axis.axis_label = AXIS_TITLES[name]
 
 
-# What stands where the pointer is: the bin's own number, the place of its middle, or a curve there.
+# At the pointer: the number of the bin, the position of its centre, or the value of a curve.
 READ_OUT = """
 const bin = special_vars.index;
 if (format === "bin") return String(bin);
@@ -90,15 +90,15 @@ return Number.isFinite(found) ? String(Number(found.toPrecision(4))) : "–";
 
 
 class GateReadOut:
-    """Bin, time, range and values of curves under the pointer, as the browser knows them.
+    """Bin, time, range and values of curves under the pointer, computed in the browser.
 
     Parameters
     ----------
     figure : bokeh.plotting.figure
     renderer : GlyphRenderer
-        One item for each bin; over these the read-out opens.
+        Opens the read-out; has one item for each bin.
     rows : sequence of (name, source, column)
-        What is read out, each a column with a value for each bin.
+        Values that are read out, each a column with a value for each bin.
     """
 
     def __init__(self, figure: Any, renderer: Any, rows: Sequence[tuple[str, Any, str]]) -> None:
@@ -124,7 +124,7 @@ class GateReadOut:
         )
 
     def follow(self, acquisition: Acquisition) -> None:
-        """Take on another gate."""
+        """Set the gate."""
         if acquisition == self._acquisition:
             return
         self._acquisition = acquisition

@@ -1,0 +1,245 @@
+"""Base classes of the parts of a page: downloads, background work, and settings of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Generic, Protocol, TypeVar
+
+import panel as pn
+
+from app.model.exports import Write, facts_file, plot_file, shown_table_file
+from app.model.store import Answer
+from app.pages.navigation import View
+from app.pages.session import Session
+from app.pages.shared.downloads import (
+    PLOT,
+    TABLE,
+    Shown,
+    Subject,
+    below,
+    downloadable,
+    downloadable_facts,
+    explored,
+)
+from app.pages.shared.studies import Study, aside
+from app.tasks.scheduler import Step
+from app.theme import Palette, palette
+from app.widgets.controls import Facts, SettingsPanel, Table
+from core.parameters import Number, check_fields, parameter
+
+Result = TypeVar("Result")
+
+
+class Paintable(Protocol):
+    """Parts that follow the page between light and dark mode."""
+
+    def paint(self, colors: Palette) -> None:
+        """Take on the colours of a mode."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Base of settings whose fields, made by `core.parameters.parameter`, are validated."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+Settings = TypeVar("Settings", bound=Checked)
+
+
+@dataclass(frozen=True)
+class Repetitions(Checked):
+    """Amount of simulation."""
+
+    repetitions: int = parameter(
+        2,
+        Number("Repetitions", 2, 100, log=True, whole=True, least=2),
+        "Captures of the same scene with other noise, the same for all methods. More repetitions "
+        "narrow the intervals.",
+    )
+
+
+class Section:
+    """A part of a page.
+
+    Parameters
+    ----------
+    session : Session
+    *watched : str
+        Parameters of the state that `refresh` is called for.
+
+    Attributes
+    ----------
+    downloads : dict of str to callable
+        What each download button saves, by what the button says it shows.
+    is_on_screen, is_dark : bool
+    """
+
+    def __init__(self, session: Session, *watched: str) -> None:
+        self.session = session
+        self.downloads: dict[str, Callable[[], Shown]] = {}
+        self.is_on_screen = self.is_dark = False
+        self._painted: list[Paintable] = []
+        self._jobs = session.tasks.latest()
+        if watched:
+            session.state.param.watch(lambda *_: self.refresh(), list(watched))
+
+    @cached_property
+    def view(self) -> View:
+        """The section, for the navigation."""
+        main, sidebar = self.layout()
+        return View(main, sidebar, self.show, self.follow, self.paint)
+
+    def layout(self) -> tuple[Any, Any]:
+        """Return the content, and the section's part of the sidebar."""
+        raise NotImplementedError
+
+    def show(self, is_on_screen: bool) -> None:
+        """Come on screen, or leave it."""
+        self.is_on_screen = is_on_screen
+        self.refresh()
+
+    def follow(self, answer: Answer) -> None:
+        """Show another estimate of the session."""
+        self.refresh()
+
+    def paint(self, dark: bool) -> None:
+        """Change between light and dark mode."""
+        self.is_dark = dark
+        for each in self._painted:
+            each.paint(palette(dark))
+
+    def refresh(self) -> None:
+        """Update what is shown, if it is on screen."""
+
+    # Background work
+
+    def submit(
+        self,
+        work: Callable[[], Result],
+        draw: Callable[[Result], None],
+        failed: Callable[[Exception], None] | None = None,
+    ) -> None:
+        """Run `work` in the background and draw its result, unless it is outdated by then."""
+        session, answer = self.session, self.session.answer
+
+        def arrived(result: Result) -> None:
+            session.failures.resolve(self)
+            if self.is_on_screen and answer is session.answer:
+                with session.tasks.hold():
+                    draw(result)
+
+        self._jobs.submit(work, arrived, failed or self.report_error)
+
+    def report_error(self, error: Exception) -> None:
+        """Show an error until this section works again."""
+        self.session.failures.report(error, part=self)
+
+    # Downloads
+
+    def about(self) -> Subject:
+        """Return what the section's files are about."""
+        return explored(self.session)
+
+    def saved(self, what: str, csv: Write) -> Shown:
+        """Return a plot or a table as it is saved."""
+        return Shown(self.about(), what, {"csv": csv})
+
+    def offer(
+        self,
+        holder: pn.Column,
+        button: str,
+        show: Callable[[], Shown],
+        formats: Iterable[str] = PLOT,
+    ) -> pn.Column:
+        """Add a download button to a card."""
+        self.downloads[button] = show
+        return downloadable(holder, self.session, button, show, formats)
+
+    def offer_gate_plot(self, holder: pn.Column, button: str, figure: Any, what: str) -> pn.Column:
+        """Add a download button to the card of a plot over the gate."""
+
+        def show() -> Shown:
+            return self.saved(what, plot_file(figure, self.session.answer.capture.acquisition))
+
+        return self.offer(holder, button, show)
+
+    def offer_facts(self, facts: Facts, what: Callable[[], str]) -> pn.Column:
+        """Return a list of facts with a download button."""
+
+        def show() -> Shown:
+            return self.saved(what(), facts_file(facts.facts))
+
+        self.downloads["numbers"] = show
+        return downloadable_facts(facts, self.session, show)
+
+    def offer_table(self, table: Table, what: str) -> pn.Column:
+        """Return a table with a download button."""
+
+        def show() -> Shown:
+            return self.saved(what, shown_table_file(table.columns, table.rows))
+
+        return self.offer(below(table), "table", show, TABLE)
+
+
+class SettingsSection(Section, Generic[Settings]):
+    """A section with settings of its own.
+
+    Parameters
+    ----------
+    session : Session
+    settings : Checked
+        Initial settings.
+    explanation : str
+        Text above the controls.
+
+    Attributes
+    ----------
+    settings : Checked
+        The present settings.
+    panel : SettingsPanel
+    """
+
+    def __init__(self, session: Session, settings: Settings, explanation: str = "") -> None:
+        super().__init__(session)
+        self.settings = settings
+        self.panel = SettingsPanel(settings, self.change)
+        self._explanation = explanation
+
+    def change(self, settings: Settings) -> None:
+        """Take other settings."""
+        self.settings = settings
+
+    def controls(self, *more: Any) -> pn.Column:
+        """Return the explanation and the settings, with further controls below."""
+        return aside(self._explanation, self.panel.layout, *more)
+
+
+class StudySection(SettingsSection[Settings]):
+    """A section whose content is a study in steps, started when it first comes on screen.
+
+    Parameters
+    ----------
+    session : Session
+    settings : Checked
+        Initial settings.
+    explanation : str
+        Text above the controls.
+    noun : str
+        Name of the steps.
+    """
+
+    def __init__(self, session: Session, settings: Settings, explanation: str, noun: str) -> None:
+        super().__init__(session, settings, explanation)
+        self.study = Study(session, self.steps, noun)
+
+    def steps(self) -> list[Step[Any]]:
+        """Return the steps of the study, from the present settings."""
+        raise NotImplementedError
+
+    def show(self, is_on_screen: bool) -> None:
+        """Come on screen, or leave it."""
+        self.study.show(is_on_screen)

@@ -1,0 +1,110 @@
+"""The study of the acquisition: which pulses, flux and gate reach a restoration degree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import panel as pn
+
+from app.pages.session import Session
+from app.pages.shared.downloads import Subject, looked_at
+from app.pages.shared.outputs import CurveCard, TableCard
+from app.pages.shared.section import Repetitions, SettingsSection
+from app.pages.shared.studies import OnePiece
+from app.pages.tradeoff import text
+from app.pages.tradeoff.speed import affordable, source_of
+from app.tasks.scheduler import Work
+from app.widgets.cards import part
+from app.widgets.controls import Sentence
+from core.studies.tradeoff import (
+    Cancelled,
+    Simulation,
+    acquisition_items,
+    acquisition_sweeps,
+    surrogate_of,
+)
+
+CURVES = """
+:host { display: grid !important; gap: 8px; flex: none !important; height: 668px !important;
+  grid-template: repeat(2, 330px) / repeat(2, minmax(0, 1fr)); }
+@media (max-width: 900px) {
+  :host { grid-template: repeat(3, 330px) / minmax(0, 1fr); height: 1006px !important; }
+}
+"""
+
+
+class AcquisitionSection(SettingsSection[Repetitions]):
+    """Restoration degree against number of pulses, flux and length of the gate.
+
+    Parameters
+    ----------
+    session : Session
+        The session whose scene, or a simulation like whose capture, is acquired.
+
+    Attributes
+    ----------
+    cards : list of CurveCard
+    study : OnePiece
+    subject : Sentence
+        What was simulated.
+    """
+
+    def __init__(self, session: Session) -> None:
+        super().__init__(session, Repetitions(), text.ACQUISITION)
+        self.study = OnePiece(session, self.work, self.draw, "captures")
+        self.subject = Sentence(
+            text=text.NOT_SIMULATED, live=True, sizing_mode="stretch_width", margin=(4, 8)
+        )
+        self.cards = [CurveCard() for _ in range(3)]
+        self._painted = [*self.cards]
+        self._required = TableCard(waiting="")
+        self._simulated = session.answer.request
+        for each in self.cards:
+            each.offer(session, self.about)
+        self._required.offer(session, self.about)
+
+    def layout(self) -> tuple[Any, Any]:
+        """Return the curves and the table, and their controls."""
+        curves = pn.Column(
+            *(each.card for each in self.cards),
+            sizing_mode="stretch_width",
+            stylesheets=[CURVES],
+            margin=0,
+        )
+        controls = self.controls(*self.study.controls)
+        return [self.subject, curves, self._required.layout], part("Simulation", controls)
+
+    def about(self) -> Subject:
+        """Return what the section's files are about."""
+        return looked_at(self.session, self._simulated)
+
+    def work(self) -> Work[tuple[str, list[Any]]]:
+        """Return the simulation of the present scene or capture."""
+        source, repetitions = source_of(self.session.answer), self.settings.repetitions
+        self._simulated = self.session.answer.request
+
+        def work(
+            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
+        ) -> tuple[str, list[Any]]:
+            def report(done: int, of: int) -> None:
+                if cancelled():
+                    raise Cancelled
+                progress(done, of)
+
+            affordable(source, ())
+            simulation = (
+                source if isinstance(source, Simulation) else surrogate_of(source, source.source)
+            )
+            found = acquisition_sweeps([simulation], range(repetitions), progress=report)
+            return simulation.note, list(acquisition_items(found))
+
+        return work
+
+    def draw(self, found: tuple[str, list[Any]]) -> None:
+        """Show a note on the simulation, the curves and the table."""
+        self.subject.text, (*curves, required) = found
+        with self.session.tasks.hold():
+            for each, curve in zip(self.cards, curves, strict=True):
+                each.show(curve)
+            self._required.show(required)

@@ -1,0 +1,104 @@
+"""Fields that both layouts of this project share, `core.io.readers.npz` and `labelled`.
+
+They are the arrays of an archive, or the attributes of an array of counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from core.acquisition import SHORTEST_PULSE_S, Acquisition, Pulse, require_time
+from core.checks import require
+from core.io.readers.dense import Description
+from core.io.readers.options import ReadOptions
+from core.io.readers.times import time_text
+
+PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
+"""Fields that define a pulse together."""
+
+_MOST_SAMPLES = 2**20
+_MOST_SAMPLES_BEYOND_GATE = 2**16
+
+
+def fields_of(description: Description) -> dict[str, Any]:
+    """Return the fields that a file keeps; what is unknown is left out."""
+    acquisition, pulse = description.acquisition, description.pulse
+    known = {
+        "bin_width_s": acquisition.bin_width_s,
+        "gate_delay_s": acquisition.gate_delay_s,
+        "n_pulses": acquisition.n_pulses,
+        "pixel_angle_rad": acquisition.pixel_angle_rad,
+        "pulse_shape": pulse.shape,
+        "pulse_tau_s": pulse.tau_s,
+        "pulse_samples": list(pulse.samples) or None,
+        "detection": description.detection,
+        "source": description.source or None,
+    }
+    return {name: value for name, value in known.items() if value is not None}
+
+
+def completed(request: ReadOptions, known: Mapping[str, Any]) -> ReadOptions:
+    """Return a request with the fields of a file where the user specifies nothing.
+
+    Raises
+    ------
+    ValueError
+        If a field is invalid.
+    """
+    values: dict[str, Any] = {}
+    for name in ("bin_width_s", "gate_delay_s", "pixel_angle_rad", "n_pulses", "detection"):
+        if getattr(request, name) is None and name in known:
+            values[name] = known[name] if name == "detection" else number(known, name)
+    if "n_pulses" in values:
+        n_pulses = values["n_pulses"]
+        whole = n_pulses.is_integer() and n_pulses >= 0
+        require("n_pulses", n_pulses, whole, "a whole number, 0 if not known")
+        values["n_pulses"] = int(n_pulses) or None
+    if request.pulse is None and any(name in known for name in PULSE):
+        values["pulse"] = _pulse(known)
+    return replace(request, **values)
+
+
+def number(known: Mapping[Any, Any], name: str) -> float | None:
+    """Return a field that must be one number; None where it is absent."""
+    if name not in known:
+        return None
+    value = np.asarray(known[name])
+    real = value.size == 1 and value.dtype.kind in "iuf"
+    require(name, known[name], real, "one number")
+    return float(value.item())
+
+
+def _pulse(known: Mapping[str, Any]) -> Pulse:
+    tau_s = number(known, "pulse_tau_s")
+    if tau_s is None:
+        raise ValueError("pulse_tau_s = None is not accepted: give a time with the shape.")
+    require_time("pulse_tau_s", tau_s, SHORTEST_PULSE_S)
+    samples = np.asarray(known.get("pulse_samples", ()))
+    real = samples.dtype.kind in "biuf"
+    require("pulse_samples", known.get("pulse_samples"), real, "real numbers")
+    fits = samples.size <= _MOST_SAMPLES
+    require("pulse_samples", f"{samples.size:,} of them", fits, f"up to {_MOST_SAMPLES:,}")
+    shape: Any = str(known.get("pulse_shape", "gamma"))
+    return Pulse(tau_s, shape=shape, samples=tuple(samples.astype(float).ravel().tolist()))
+
+
+def require_pulse_in_gate(pulse: Pulse, acquisition: Acquisition) -> None:
+    """Raise ``ValueError`` if a file's pulse has many samples and lasts longer than the gate."""
+    n_samples = len(pulse.samples)
+    length_s, gate_s = n_samples * pulse.tau_s, acquisition.n_bins * acquisition.bin_width_s
+    require(
+        "pulse_samples",
+        f"{n_samples:,} of them, {time_text(length_s)}",
+        n_samples <= _MOST_SAMPLES_BEYOND_GATE or length_s <= gate_s,
+        f"up to {_MOST_SAMPLES_BEYOND_GATE:,}, or no more than last {time_text(gate_s)}, the gate",
+    )
+
+
+def require_image(name: str, found: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    """Raise ``ValueError`` unless an image has the cube's rows and columns."""
+    require(name, f"shape {found}", found == shape, f"shape {shape}, that of the cube")

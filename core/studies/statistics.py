@@ -1,0 +1,45 @@
+"""95 % intervals of medians and means."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.special import bdtr, stdtrit
+
+from core.acquisition import Floats
+from core.checks import require
+from core.metrics import Interval
+
+MIN_REPEATS = 6
+"""With fewer values even the range from smallest to largest covers the median in less than 95 %."""
+
+
+def median_interval(values: Floats) -> Interval:
+    """Return the median with its 95 % interval from order statistics, for any distribution.
+
+    The interval from the j-th smallest to the j-th largest of n values misses the median only where
+    fewer than j of them lie on one side of it: twice a binomial tail.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than `MIN_REPEATS` values.
+    """
+    n = len(values)
+    require("repeats", n, n >= MIN_REPEATS, f"at least {MIN_REPEATS}")
+    tail = 2 * bdtr(np.arange(n // 2), n, 0.5)  # of 0, 1, ... values on one side
+    outermost = int(np.count_nonzero(tail <= 0.05))
+    ordered = np.sort(values)
+    low, high = ordered[outermost - 1], ordered[n - outermost]
+    return Interval(float(np.median(ordered)), float(low), float(high))
+
+
+def mean_interval(values: Floats) -> Interval:
+    """Return the mean with Student's 95 % interval, NaN where there are fewer than two values."""
+    n = len(values)
+    if n < 2:
+        return Interval(math.nan, math.nan, math.nan)
+    mean = float(np.mean(values))
+    half = float(stdtrit(n - 1, 0.975) * np.std(values, ddof=1) / math.sqrt(n))
+    return Interval(mean, mean - half, mean + half)
