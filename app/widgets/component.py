@@ -1,4 +1,4 @@
-"""Base class of the app's own components."""
+"""Base class of the app's own components, and the lifetime of callbacks that run in the browser."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from contextlib import nullcontext
 from functools import cache
 from typing import Any
 
+import panel as pn
 import param
 from panel.custom import Child, JSComponent
 from panel.io import hold
+from panel.links import Callback
 
 
 class Component(JSComponent):
@@ -51,3 +53,13 @@ def _plain(kind: Any) -> frozenset[str]:
     """Return the names of a component's own values, without children and events."""
     own = set(kind.param) - set(JSComponent.param)
     return frozenset(n for n in own if not isinstance(kind.param[n], Child | param.Event))
+
+
+def until_session_ends(callback: Callback) -> None:
+    """Remove a JavaScript callback when its session ends.
+
+    Panel registers callbacks globally, by their source. Their arguments lead back to the source, so
+    that neither they nor anything else of the page would ever be freed.
+    """
+    if pn.state.curdoc is not None:
+        pn.state.on_session_destroyed(lambda _: callback.unwatch())

@@ -10,6 +10,7 @@ import panel as pn
 import panel_material_ui as pmui
 
 from app.widgets.cards import button
+from app.widgets.component import until_session_ends
 from app.widgets.controls import Sentence
 
 SCRIPT_FILE = "firstphoton.py"
@@ -91,7 +92,7 @@ class Share:
             width_option="md",
             sizing_mode="stretch_width",
         )
-        dialog.jscallback(open=RETURN_FOCUS, args={"opener": self._open})
+        until_session_ends(dialog.jscallback(open=RETURN_FOCUS, args={"opener": self._open}))
         return dialog
 
 
@@ -100,5 +101,6 @@ def _copy_button(
 ) -> tuple[pmui.Button, Sentence]:
     """Return a button that copies a JavaScript expression, and the status line that confirms it."""
     made, status = button(label, help, lambda: None), Sentence(live=True)
-    made.js_on_click(args | {"status": status}, COPY.format(text=text, what=what))
+    copy = COPY.format(text=text, what=what)
+    until_session_ends(made.js_on_click(args | {"status": status}, copy))
     return made, status

@@ -25,6 +25,7 @@ from app.pages.shared.downloads import CORNER_PX, IMAGE, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
 from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part
+from app.widgets.component import until_session_ends
 from app.widgets.controls import Chips, PixelKeys, Sentence
 from core.checks import require
 
@@ -125,7 +126,8 @@ class Inspect(Section):
         self.keys.param.watch(lambda _: self._pin_pixel(), "pressed")
         drags = {"toolbar": self.navigator.figure.toolbar, "drags": self.navigator.drags}
         # In the browser, since a drag may begin before the server has heard of the choice.
-        self._mode.jscallback(value="toolbar.active_drag = drags[source.value]", args=drags)
+        choose = "toolbar.active_drag = drags[source.value]"
+        until_session_ends(self._mode.jscallback(value=choose, args=drags))
         for axis, field in enumerate(self.place):
             field.param.watch(lambda event, axis=axis: self._go_to(axis, event.new), "value")
         self.chips.param.watch(lambda event: session.choose_pixel(*event.new[0]), "chosen")
