@@ -168,10 +168,14 @@ def stage(page: Page) -> Locator:
 
 
 def parts(page: Page) -> dict[str, Locator]:
-    """Return all pictures of Explore."""
-    plots = page.locator(".bk-Figure").filter(has_text="answer").filter(visible=True).all()
+    """Return all pictures of Explore, once they are visible."""
+    plots = page.locator(".bk-Figure").filter(has_text="answer").filter(visible=True)
+    expect(plots).to_have_count(3)
+    found = [image(page), stage(page), *plots.all()]
+    for each in found:
+        expect(each).to_be_visible()
     names = ("image", "cloud", "histogram", "residual", "enhanced")
-    return dict(zip(names, [image(page), stage(page), *plots], strict=True))
+    return dict(zip(names, found, strict=True))
 
 
 def choose(page: Page, name: str, option: str) -> None:

@@ -22,7 +22,7 @@ from app.pages.inspect import text
 from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
 from core.tests.captures import real_capture_path
-from tests.browser import VIEWS, chosen, enter, eventually, fact, serving, slider
+from tests.browser import VIEWS, chosen, enter, eventually, fact, field, serving, slider
 from tests.browser import image as picture
 from tests.test_downloads import columns_of, download
 from tests.test_lasting import here as address_of
@@ -170,14 +170,24 @@ def choose_map(page: Page, name: str) -> None:
     expect(page.locator(".MuiMenu-root")).to_have_count(0)  # it takes all clicks until it has faded
 
 
+TOOLS = {"Rectangle": "BoxSelectTool", "Lasso": "LassoSelectTool", "Zoom": "BoxZoomTool"}
+"""What a drag on the map does, and Bokeh's tool that does it."""
+
+
+def choose_drag(page: Page, mode: str) -> None:
+    button(page, mode).click()
+    eventually(lambda: of_picture(page, "found.toolbar.active_drag.type") == TOOLS[mode])
+
+
 def drag(page: Page, mode: str, *places: tuple[float, float]) -> None:
     """Drag on the map from one place to the others, in shares of its width and height."""
-    button(page, mode).click()
+    choose_drag(page, mode)
     first, *others = (within(page, *each) for each in places)
     page.mouse.move(*first)
     page.mouse.down()
     for each in others:
         page.mouse.move(*each, steps=5)
+        page.evaluate("new Promise(requestAnimationFrame)")  # moves within a frame are joined
     page.mouse.up()
     button(page, "Zoom").click()
 
@@ -246,6 +256,7 @@ def test_keys_taps_and_fields_move_the_pixel(here):
     (down, across), tapped = place_at(page, 0.5, 0.4), within(page, 0.5, 0.4)
     page.mouse.click(*tapped)
     expect(fact(page, "Pixel")).to_have_text(f"{down:.0f}, {across:.0f}")
+    expect(field(page, "Row")).to_have_value(f"{down:.0f}")  # late, it would replace an entry
     rows, _ = here.capture.shape
     enter(page, "Row", str(rows))
     refused = page.get_by_role("alert").filter(has_text=f"0 to {rows - 1}")
@@ -343,10 +354,8 @@ def test_what_a_drag_does_is_chosen_in_the_browser(here):
     page.evaluate("""() => {
       WebSocket.prototype.send = () => {};
     }""")
-    tools = {"Rectangle": "BoxSelectTool", "Lasso": "LassoSelectTool", "Zoom": "BoxZoomTool"}
-    for mode, tool in tools.items():
-        button(page, mode).click()
-        eventually(lambda t=tool: of_picture(page, "found.toolbar.active_drag.type") == t)
+    for mode in TOOLS:
+        choose_drag(page, mode)
 
 
 # -- regions and pins ------------------------------------------------------------------------------
