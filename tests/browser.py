@@ -169,7 +169,8 @@ def stage(page: Page) -> Locator:
 
 def parts(page: Page) -> dict[str, Locator]:
     """Return all pictures of Explore."""
-    plots = page.locator(".bk-Figure").filter(has_text="answer").filter(visible=True).all()
+    figures = page.locator(".bk-Figure").filter(visible=True)
+    plots = figures.filter(has_text=re.compile("estimate")).all()
     names = ("image", "cloud", "histogram", "residual", "enhanced")
     return dict(zip(names, [image(page), stage(page), *plots], strict=True))
 

@@ -154,9 +154,9 @@ def test_a_plots_table_holds_its_curves(explore, session):
     acquisition = session.answer.capture.acquisition
     np.testing.assert_allclose(found["Range (m)"], acquisition.bin_to_range_m(found["Bin"]))
     np.testing.assert_allclose(found["Time (ns)"], 280 + found["Bin"])
-    (answer,) = np.flatnonzero(found["answer"] == 1)
+    (estimate,) = np.flatnonzero(found["estimate"] == 1)
     at = session.answer.run.image.bin[session.state.pixel]
-    np.testing.assert_allclose(found["Bin"][answer], at, rtol=1e-6)
+    np.testing.assert_allclose(found["Bin"][estimate], at, rtol=1e-6)
 
 
 def test_a_plots_table_omits_what_is_hidden_or_out_of_view(explore):

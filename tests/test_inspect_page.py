@@ -414,7 +414,7 @@ def test_accuracy_against_pulses_is_drawn_step_by_step(building):
     assert "truth" in section.accuracy.figure.yaxis.axis_label
     section.pulses.value = 0.25
     building.tasks.run_until(lambda: building.answer.capture.acquisition.n_pulses == 250)
-    np.testing.assert_allclose(section.accuracy.source("answer").data["x"], 250)
+    np.testing.assert_allclose(section.accuracy.source("present").data["x"], 250)
     section.show(False)
 
 

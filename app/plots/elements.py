@@ -35,9 +35,9 @@ hv.renderer("bokeh").webgl = False
 BIN = hv.Dimension("bin", label="Bin")
 
 # Layers of each plot, by their colours' names in the palette, in drawing order.
-HISTOGRAM_LAYERS = ("raw", "expected", "small", "large", "truth", "answer")
-RESIDUAL_LAYERS = ("raw", "residual", "truth", "answer")
-ENHANCED_LAYERS = ("weight", "enhanced", "truth", "answer")
+HISTOGRAM_LAYERS = ("raw", "expected", "small", "large", "truth", "estimate")
+RESIDUAL_LAYERS = ("raw", "residual", "truth", "estimate")
+ENHANCED_LAYERS = ("weight", "enhanced", "truth", "estimate")
 
 
 def marker_line(position_bin: float, top: float, bottom: float = 0.0) -> tuple[Array, Array]:
@@ -120,7 +120,7 @@ def _truth(unit: hv.Dimension, colors: Palette) -> hv.Curve:
 
 def _markers(unit: hv.Dimension, colors: Palette) -> list[hv.Curve]:
     line = marker_line(np.nan, 1.0)
-    return [_truth(unit, colors), _curve(*line, unit, "answer", colors.answer, 1.5, "solid")]
+    return [_truth(unit, colors), _curve(*line, unit, "estimate", colors.estimate, 1.5, "solid")]
 
 
 def _panel(layers: list[Any], title: str) -> hv.Overlay:
@@ -229,8 +229,8 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "limit: probability of the right bin": ("text", [2, 4]),
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
-    "estimate, lag included": ("answer", []),
-    "the echo above": ("answer", []),
+    "estimate, lag included": ("estimate", []),
+    "the echo above": ("estimate", []),
 }
 METHOD_PLACES = {method.name: n for n, method in enumerate(paper.COMPARED)}
 BARS = "histogram"
@@ -402,7 +402,7 @@ def show_goals(drawing: Any, milliseconds: float, degree: float) -> None:
 
 def paint_tradeoff(drawing: Any, colors: Palette) -> None:
     """Set the colours of lines; the points have their own."""
-    for name, color in (("front", colors.text), ("chosen", colors.answer)):
+    for name, color in (("front", colors.text), ("chosen", colors.estimate)):
         drawing.select_one({"name": name}).glyph.line_color = color
     for name in _GOALS:
         drawing.select_one({"name": name}).line_color = colors.muted

@@ -138,7 +138,7 @@ def accuracy() -> Any:
         )
     )
     drawing.xaxis.formatter = PrintfTickFormatter(format="%.3g")
-    _vertical(drawing, empty("x", "y"), "answer", "present number")
+    _vertical(drawing, empty("x", "y"), "present", "present number")
     return _with_legend(drawing, "bottom_right")
 
 
@@ -205,7 +205,7 @@ def _vertical(
 def _marked(drawing: Any, marks: Mapping[str, ColumnDataSource], with_ranks: bool = False) -> Any:
     """Add truth, estimate and candidates, from sources that figures share."""
     _vertical(drawing, marks["truth"], "truth", "truth", 2.5, line_dash="4 2")
-    _vertical(drawing, marks["answer"], "answer", "answer", 1.5)
+    _vertical(drawing, marks["estimate"], "estimate", "estimate", 1.5)
     places = {"source": marks["candidates"], "y_range_name": MARKS}
     drawing.scatter("x", "y", marker="triangle", size=8, **places, name="candidates")
     if with_ranks:

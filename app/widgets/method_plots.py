@@ -50,11 +50,11 @@ class CurvePlot:
     """Score of each bin of one pixel, by method."""
 
     def __init__(self) -> None:
-        self._plot = Plot(plots.score_curves(LIGHT), ("lines", "truth", "answers"))
+        self._plot = Plot(plots.score_curves(LIGHT), ("lines", "truth", "estimates"))
         self._lines = Lines(self._plot)
-        self._answers = self._plot.source("answers")
-        self._answers.data = {"bin": [], "score": [], "color": []}
-        self._plot.layers["answers"]["glyph"].fill_color = {"field": "color"}
+        self._estimates = self._plot.source("estimates")
+        self._estimates.data = {"bin": [], "score": [], "color": []}
+        self._plot.layers["estimates"]["glyph"].fill_color = {"field": "color"}
         drawing = self._plot.figure
         drawing.x_range, drawing.y_range = Range1d(0, 1), Range1d(0, 1)
         drawing.min_border_left, drawing.min_border_right = 46, 14
@@ -69,7 +69,7 @@ class CurvePlot:
     def update(
         self,
         curves: Mapping[str, Array],
-        answers: Mapping[str, float],
+        estimates: Mapping[str, float],
         truth_bin: float,
         acquisition: Acquisition,
         styles: Mapping[str, Style],
@@ -85,16 +85,16 @@ class CurvePlot:
         lowest = min((float(curve.min()) for curve in curves.values()), default=0.0)
         low = 1.05 * max(lowest, LOWEST_SCORE) - 0.02
         # One above the other, so that equal estimates remain visible.
-        height = {method: 1.06 + 0.07 * place for place, method in enumerate(answers)}
-        top = 1.1 + 0.07 * len(answers)
+        height = {method: 1.06 + 0.07 * place for place, method in enumerate(estimates)}
+        top = 1.1 + 0.07 * len(estimates)
         vertical = plot.figure.y_range
         if (low, top) != (vertical.start, vertical.end):
             vertical.update(start=low, end=top, reset_start=low, reset_end=top)
-        answered = [method for method, at in answers.items() if np.isfinite(at)]
-        self._answers.data = {
-            "bin": np.array([answers[method] for method in answered], np.float32),
-            "score": np.array([height[method] for method in answered], np.float32),
-            "color": [styles[method][0] for method in answered],
+        estimated = [method for method, at in estimates.items() if np.isfinite(at)]
+        self._estimates.data = {
+            "bin": np.array([estimates[method] for method in estimated], np.float32),
+            "score": np.array([height[method] for method in estimated], np.float32),
+            "color": [styles[method][0] for method in estimated],
         }
         x, y = plots.marker_line(truth_bin, top)
         plot.write("truth", bin=x, score=y)

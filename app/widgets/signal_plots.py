@@ -123,7 +123,7 @@ class SignalPlots:
         if (start, end) != (vertical.start, vertical.end):
             vertical.update(start=start, end=end, reset_start=start, reset_end=end)
         (column,) = (name for name in plot.source("truth").data if name != "bin")
-        for layer, position in (("truth", pixel.truth_bin), ("answer", pixel.answer_bin)):
+        for layer, position in (("truth", pixel.truth_bin), ("estimate", pixel.answer_bin)):
             x, y = plots.marker_line(position, end)
             plot.write(layer, **{"bin": x, column: y})
             plot.show(layer, bool(np.isfinite(position)))

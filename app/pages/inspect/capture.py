@@ -185,7 +185,7 @@ class CaptureSection(Section):
 
     def _mark_present(self) -> None:
         """Mark the number of pulses that is used at present."""
-        self.accuracy.mark("answer", self.session.answer.request.less.pulses * self._all_pulses)
+        self.accuracy.mark("present", self.session.answer.request.less.pulses * self._all_pulses)
 
     # Report
 

@@ -135,7 +135,8 @@ PALETTE_NAMES = {
     "candidates": "text",
     "ranks": "text",
     "window": "residual",
-    "t_n": "answer",
+    "t_n": "estimate",
+    "present": "estimate",
     "suggested": "residual",
     "line": "small",
     "points": "small",
@@ -240,7 +241,7 @@ class PixelPlots:
         self.candidates = inspect_plots.empty("x", "y", "rank")
         marks = {
             "truth": ColumnDataSource({"x": nowhere, "y": upright}),
-            "answer": ColumnDataSource({"x": nowhere, "y": upright}),
+            "estimate": ColumnDataSource({"x": nowhere, "y": upright}),
             "candidates": self.candidates,
         }
         self.bins = Range1d(0, 1)
@@ -283,7 +284,7 @@ class PixelPlots:
         self.stages.show_curves(residual=signals.residual, enhanced=signals.enhanced)
         self.stages.frame(signals.residual)
         self.stages.frame(signals.enhanced, axis="enhanced")
-        for name, position in (("truth", pixel.truth_bin), ("answer", pixel.answer_bin)):
+        for name, position in (("truth", pixel.truth_bin), ("estimate", pixel.answer_bin)):
             self.counts.write(name, x=np.full(2, position))
             for plot in self._plots:
                 plot.show(name, bool(np.isfinite(position)))
