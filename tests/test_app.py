@@ -331,7 +331,7 @@ def test_provenance_states_size_and_gate(car):
 
 def test_every_plot_has_a_title_a_legend_and_labels_with_units():
     signals, image = SignalPlots(), ImageView(lambda row, col: None)
-    figures = [pane.object for pane in signals.panes]
+    figures = [plot.figure for plot in signals.plots]
     assert [figure.yaxis.axis_label for figure in figures] == [
         "Counts",
         "Counts",
@@ -395,9 +395,8 @@ def test_axes_follow_another_gate(car, small_file):
     views.update(inspect(car, 32, 30), car.capture.acquisition, with_difference=False)
     answer = compute(ask(file_source(small_file)), None)
     views.update(inspect(answer, 1, 2), answer.capture.acquisition, with_difference=False)
-    for pane in views.panes:
-        assert (pane.object.x_range.start, pane.object.x_range.end) == (0, 37)
-    for plot in (views.histogram, views.residual, views.enhanced):
+    for plot in views.plots:
+        assert (plot.figure.x_range.start, plot.figure.x_range.end) == (0, 37)
         for layer in plot.layers:
             lengths = {len(column) for column in columns(plot, layer).values()}
             assert lengths == ({2} if layer in ("truth", "estimate") else {37}), layer
