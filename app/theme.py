@@ -33,7 +33,7 @@ class Palette:
     enhanced: str
     weight: str
     truth: str
-    answer: str
+    estimate: str
     methods: tuple[str, ...]
     """Colours of methods, none of them that of the truth; `method_style` adds dashes."""
 
@@ -51,7 +51,7 @@ LIGHT = Palette(
     enhanced="#8e4585",
     weight="#7a8696",
     truth="#009e73",
-    answer="#c2185b",
+    estimate="#c2185b",
     methods=("#0072b2", "#d55e00", "#8e4585", "#a67c00", "#1c2430", "#3f9fd8"),
 )
 DARK = Palette(
@@ -67,7 +67,7 @@ DARK = Palette(
     enhanced="#e39bd0",
     weight="#8996a6",
     truth="#2fd6a5",
-    answer="#ff6fa3",
+    estimate="#ff6fa3",
     methods=("#56b4e9", "#ff9e4a", "#e39bd0", "#e3c34a", "#e8edf3", "#7f8cff"),
 )
 

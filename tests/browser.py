@@ -169,7 +169,8 @@ def stage(page: Page) -> Locator:
 
 def parts(page: Page) -> dict[str, Locator]:
     """Return all pictures of Explore, once they are visible."""
-    plots = page.locator(".bk-Figure").filter(has_text="answer").filter(visible=True)
+    figures = page.locator(".bk-Figure").filter(visible=True)
+    plots = figures.filter(has_text=re.compile("estimate"))
     expect(plots).to_have_count(3)
     found = [image(page), stage(page), *plots.all()]
     for each in found:

@@ -331,7 +331,7 @@ def test_provenance_states_size_and_gate(car):
 
 def test_every_plot_has_a_title_a_legend_and_labels_with_units():
     signals, image = SignalPlots(), ImageView(lambda row, col: None)
-    figures = [pane.object for pane in signals.panes]
+    figures = [plot.figure for plot in signals.plots]
     assert [figure.yaxis.axis_label for figure in figures] == [
         "Counts",
         "Counts",
@@ -385,7 +385,7 @@ def test_a_pixels_stages_stand_in_its_plots(car):
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6, err_msg=name)
     for plot in (views.histogram, views.residual, views.enhanced):
         np.testing.assert_allclose(columns(plot, "truth")["bin"], pixel.truth_bin, rtol=1e-6)
-        np.testing.assert_allclose(columns(plot, "answer")["bin"], pixel.answer_bin, rtol=1e-6)
+        np.testing.assert_allclose(columns(plot, "estimate")["bin"], pixel.answer_bin, rtol=1e-6)
         shown = [curve.max() for curve in (signals.raw, signals.large)]
         assert plot is not views.histogram or plot.figure.y_range.end >= max(shown)
 
@@ -395,12 +395,11 @@ def test_axes_follow_another_gate(car, small_file):
     views.update(inspect(car, 32, 30), car.capture.acquisition, with_difference=False)
     answer = compute(ask(file_source(small_file)), None)
     views.update(inspect(answer, 1, 2), answer.capture.acquisition, with_difference=False)
-    for pane in views.panes:
-        assert (pane.object.x_range.start, pane.object.x_range.end) == (0, 37)
-    for plot in (views.histogram, views.residual, views.enhanced):
+    for plot in views.plots:
+        assert (plot.figure.x_range.start, plot.figure.x_range.end) == (0, 37)
         for layer in plot.layers:
             lengths = {len(column) for column in columns(plot, layer).values()}
-            assert lengths == ({2} if layer in ("truth", "answer") else {37}), layer
+            assert lengths == ({2} if layer in ("truth", "estimate") else {37}), layer
     start_m, step_m = 149.896229, 0.299792458
     metres = views.histogram.figure.above[0].formatter.args
     assert (metres["origin"], metres["step"]) == pytest.approx((start_m, step_m))
@@ -418,7 +417,7 @@ def test_lines_without_a_position_are_not_drawn(car, sample):
         for plot in (views.histogram, views.residual, views.enhanced):
             assert plot.layers["truth"]["glyph_renderer"].visible == has_truth
             assert legend(plot)["truth"] == has_truth
-            assert legend(plot)["answer"]
+            assert legend(plot)["estimate"]
         assert legend(views.histogram)["expected"] == has_truth
         assert not legend(views.residual)["first difference of the raw histogram"]
 

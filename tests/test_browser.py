@@ -95,9 +95,9 @@ def test_every_part_of_the_page_is_drawn(start_page):
     eventually(lambda: n_ranges(look(start_page)["image"]) > 50)
     shown = look(start_page)
     for plot, lines in (
-        ("histogram", ("raw", "small", "large", "truth", "answer")),
-        ("residual", ("residual", "truth", "answer")),
-        ("enhanced", ("enhanced", "truth", "answer")),
+        ("histogram", ("raw", "small", "large", "truth", "estimate")),
+        ("residual", ("residual", "truth", "estimate")),
+        ("enhanced", ("enhanced", "truth", "estimate")),
     ):
         # A line in the legend alone has some sixty pixels.
         assert [x for x in lines if count_near(shown[plot], getattr(LIGHT, x)) < 100] == []

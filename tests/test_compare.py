@@ -22,6 +22,7 @@ from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
 from core.io import ReadOptions
 from tests.browser import eventually, fact
+from tests.test_downloads import columns_of, written
 from tests.threads import HeldTasks
 
 # -- what is computed ------------------------------------------------------------------------------
@@ -200,6 +201,26 @@ def test_pictures_share_one_view(shown):
     assert len(figures) == 5
     assert len({(id(figure.x_range), id(figure.y_range)) for figure in figures}) == 1
     assert len(figures[0].x_range.renderers) == 5
+
+
+def test_plots_are_saved_with_every_digit(shown):
+    page, pixel = shown.page, shown.session.state.pixel
+    assert page.view.main
+    scores, reliability = (
+        columns_of(written(page.downloads[each]().files["csv"]))
+        for each in ("scores", "reliability")
+    )
+    curves = ranking.score_curves(shown.session.answer.capture, page.tasks, *pixel)
+    n_bins = shown.session.answer.capture.acquisition.n_bins
+    for method, answer in page.answers.items():
+        title, accuracy = ESTIMATORS[method].title, page.results[page.tasks[method]].accuracy
+        np.testing.assert_array_equal(scores[f"{title} (score, scaled)"][:n_bins], curves[method])
+        mark = scores[f"{title}, estimate, own lag removed"] == 1
+        assert scores["Bin"][mark] == answer.run.image.bin[pixel]
+        right = reliability[f"{title} (share right within 3 bins)"]
+        known = ~np.isnan(right)
+        np.testing.assert_array_equal(reliability["Confidence"][known], accuracy.confidence)
+        np.testing.assert_array_equal(right[known], accuracy.correct)
 
 
 def test_only_what_is_missing_is_computed(shown, monkeypatch):

@@ -6,6 +6,8 @@ import errno
 import io
 import math
 import re
+import subprocess
+import sys
 import tempfile
 from base64 import b64encode
 from csv import DictReader
@@ -18,12 +20,21 @@ import psutil
 import pytest
 import tifffile
 import trimesh
+from bokeh.models import Range1d
 from PIL import Image
 from playwright.sync_api import expect
 
 import core
 from app.model.colors import image_of, map_of, shown
-from app.model.exports import drawn, facts_file, image_files, shown_table_file, table_file
+from app.model.exports import (
+    Curve,
+    band,
+    facts_file,
+    image_files,
+    plot_file,
+    shown_table_file,
+    table_file,
+)
 from app.model.state import MAPS, Illumination, ReductionSettings
 from app.model.store import built_in_sources, inspect
 from app.pages.layout import Layout
@@ -137,26 +148,65 @@ def test_names_of_image_and_cloud_follow_the_view(explore, session, changed, suf
 # -- contents --------------------------------------------------------------------------------------
 
 
+def test_files_are_written_without_the_library_that_draws():
+    code = "import sys, app.model.exports; sys.exit('bokeh' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_a_plots_table_holds_its_curves(explore, session):
-    signals = inspect(session.answer, *session.state.pixel).signals
-    shown_plot = downloads.pixel_plot(session, explore.signals.histogram.figure, "histogram")
+    pixel = inspect(session.answer, *session.state.pixel)
+    signals = pixel.signals
+    shown_plot = downloads.pixel_plot(session, explore.signals.histogram, "histogram")
     found, n_bins = columns_of(written(shown_plot.files["csv"])), signals.raw.size
     np.testing.assert_array_equal(found["Bin"][:n_bins], np.arange(n_bins) + 0.5)
     for column, values in (
         ("raw histogram (counts)", signals.raw),
         ("small scale (counts)", signals.small),
         ("large scale (counts)", signals.large),
+        ("expected (counts)", pixel.expected),
     ):
-        np.testing.assert_array_equal(
-            found[column][:n_bins], values.astype(np.float32).astype(str).astype(float)
-        )
+        np.testing.assert_array_equal(found[column][:n_bins], values)
         assert np.isnan(found[column][n_bins:]).all()
     acquisition = session.answer.capture.acquisition
     np.testing.assert_allclose(found["Range (m)"], acquisition.bin_to_range_m(found["Bin"]))
     np.testing.assert_allclose(found["Time (ns)"], 280 + found["Bin"])
-    (answer,) = np.flatnonzero(found["answer"] == 1)
+    (estimate,) = np.flatnonzero(found["estimate"] == 1)
     at = session.answer.run.image.bin[session.state.pixel]
-    np.testing.assert_allclose(found["Bin"][answer], at, rtol=1e-6)
+    assert found["Bin"][estimate] == at
+
+
+def test_stages_of_a_pixel_are_saved_with_every_digit_and_the_weight_not_scaled(explore, session):
+    signals, n_bins = inspect(session.answer, *session.state.pixel).signals, 100
+    residual, enhanced = (
+        columns_of(written(downloads.pixel_plot(session, plot, "p").files["csv"]))
+        for plot in (explore.signals.residual, explore.signals.enhanced)
+    )
+    assert "first difference of the raw histogram (counts)" not in residual  # switched off
+    for found, column, values in (
+        (residual, "residual (counts)", signals.residual),
+        (enhanced, "enhanced (counts × weight)", signals.enhanced),
+        (enhanced, "weight", signals.weight),
+    ):
+        np.testing.assert_array_equal(found[column][:n_bins], values)
+
+
+def test_a_table_has_rows_for_each_set_of_positions_in_view():
+    x = [1.0, 2.0, 3.0]
+    curves = [
+        Curve("a", "a", x, [0.1, 0.2, 1 / 3], "m"),
+        *band("b", "b", x, [4, 5, 6], [7, 8, np.nan], ""),
+        Curve("c", "c", [2.0, 9.0]),
+        Curve("d", "d", np.nan),
+    ]
+    content = written(plot_file(curves, "Pulses", Range1d(1.5, 3)))
+    assert content.decode().splitlines() == [
+        'Pulses,a (m),"b, lowest","b, highest",c,d',
+        "2.0,0.2,5.0,8.0,,",
+        f"3.0,{1 / 3!r},6.0,,,",
+        "2.0,,,,1.0,",
+    ]
+    with pytest.raises(ValueError, match="nothing is drawn here yet"):
+        plot_file(curves, "Pulses", Range1d(20, 30))
 
 
 def test_a_plots_table_omits_what_is_hidden_or_out_of_view(explore):
@@ -164,7 +214,7 @@ def test_a_plots_table_omits_what_is_hidden_or_out_of_view(explore):
     plot.show("small", False)
     plot.figure.x_range.update(start=20.2, end=30.9)
     try:
-        found = drawn(plot.figure)
+        found = columns_of(written(plot.csv()))
     finally:
         plot.show("small", True)
         plot.figure.x_range.update(start=0, end=100)

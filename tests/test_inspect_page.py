@@ -230,6 +230,21 @@ def test_everything_about_a_pixel_is_cores(building):
         np.testing.assert_allclose(plot.curve(name), expected, rtol=1e-5, atol=1e-6, err_msg=name)
     image = building.answer.run.image
     report = inspection.pixel_report(capture, image, 40, 30, "tracking", tracking)
+    n_bins = capture.acquisition.n_bins
+    for button, column, expected in (
+        ("counts", "counts", signals.raw),
+        ("counts", "small scale (counts)", signals.small),
+        ("rate", f"rate ({report.rate_unit})", report.rate),
+        ("residual and enhanced", "residual (counts)", signals.residual),
+        ("residual and enhanced", "enhanced (counts × weight)", signals.enhanced),
+    ):
+        np.testing.assert_array_equal(table_of(section, button)[column][:n_bins], expected)
+    rate = table_of(section, "rate")
+    for column, expected in (
+        ("estimate", image.bin[40, 30]),
+        ("candidates", [each.bin for each in report.candidates]),
+    ):
+        assert set(rate["Bin"][rate[column] == 1]) == set(np.atleast_1d(expected))
     marks = section.plots.candidates.data["x"]
     np.testing.assert_allclose(marks, [each.bin for each in report.candidates], rtol=1e-6)
     facts = values(section.facts)
@@ -411,10 +426,19 @@ def test_accuracy_against_pulses_is_drawn_step_by_step(building):
     drawn = section.accuracy.source("points").data
     assert drawn["pulses"] == [each.share * 1000 for each in section.accuracies]
     assert drawn["value"] == [each.within.value for each in section.accuracies]
+    assert section.view.main
+    saved = table_of(section, "accuracy")
+    for column, name in (
+        ("within 3 bins", "value"),
+        ("95 % interval, lowest (within 3 bins)", "low"),
+    ):
+        expected = [getattr(each.within, name) for each in section.accuracies]
+        np.testing.assert_array_equal(saved[column][: len(expected)], expected)
+    assert saved["Pulses"][saved["present number"] == 1] == 1000
     assert "truth" in section.accuracy.figure.yaxis.axis_label
     section.pulses.value = 0.25
     building.tasks.run_until(lambda: building.answer.capture.acquisition.n_pulses == 250)
-    np.testing.assert_allclose(section.accuracy.source("answer").data["x"], 250)
+    np.testing.assert_allclose(section.accuracy.source("present").data["x"], 250)
     section.show(False)
 
 

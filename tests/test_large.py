@@ -297,7 +297,7 @@ def test_a_window_keeps_the_pixel_and_shows_its_place_in_the_file(app):
     name = downloads.explored(session).file_name("range image", "csv")
     assert "_rows30-69_cols20-79_" in name
     at = "row{} col{}".format(*place)
-    assert downloads.pixel_plot(session, explore.signals.histogram.figure, "h").what == f"h {at}"
+    assert downloads.pixel_plot(session, explore.signals.histogram, "h").what == f"h {at}"
     control(app, "Show all").clicks += 1
     app.tasks.run_until(lambda: session.answer.cutout.is_preview)
     assert session.state.window is None

@@ -25,7 +25,7 @@ from app.pages.paper.page import (
     two_scales,
 )
 from app.pages.session import Session
-from app.pages.shared.outputs import CurveCard, Gallery, table_of
+from app.pages.shared.outputs import CurveCard, Gallery, curves_of, table_of
 from app.plots import elements as plots
 from app.theme import DARK, LIGHT
 from core import PRESETS, Flux
@@ -79,6 +79,20 @@ def test_new_curves_change_values_and_nothing_else():
     assert set(renderer(card, "echo's onset").data_source.data["x"]) == {60.0}
     assert figure.title.text == moved.title
     assert figure.y_range.end > max(curve.max() for curve in moved.curves.values())
+
+
+def test_curves_of_a_study_are_stated_with_bands_and_marks_as_they_are():
+    x, y = np.array([0.1, 0.2]), np.array([1 / 3, 2 / 3])
+    bands = {"log_peak": (y - 0.1, y + 0.1)}
+    item = outputs.Plot("", "", "SBR", "Share", x, {"log_peak": y}, {"truth": 1 / 7}, bands=bands)
+    low, high, curve, mark = curves_of(item)
+    assert low.heading == "log peak, lowest (Share)"
+    assert high.heading == "log peak, highest (Share)"
+    assert (curve.heading, mark.heading, mark.x) == ("log peak (Share)", "truth", 1 / 7)
+    for each, values in ((low, y - 0.1), (high, y + 0.1), (curve, y)):
+        np.testing.assert_array_equal(each.y, values)
+    layers = {each.name for each in plots.curves(item, LIGHT).renderers}
+    assert {each.layer for each in (low, high, curve, mark)} == layers
 
 
 @pytest.mark.parametrize("is_painted_first", [True, False])

@@ -7,15 +7,13 @@ Numbers come from arrays and from `app.units.Quantity`, never from text.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, BinaryIO
 
 import numpy as np
-from bokeh.models import Axis, GlyphRenderer
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from app.model.colors import ColorScale, cloud_of, map_of, shown
 from app.model.download_text import NO_POINTS, NOTHING_DRAWN
@@ -30,6 +28,7 @@ from core.io import WRITERS, Plane, Product, write_columns
 from core.studies import Table, as_csv
 
 Array = NDArray[Any]
+Floats = NDArray[np.float64]
 
 Write = Callable[[BinaryIO], None]
 """Writes a file; runs on a thread."""
@@ -38,114 +37,91 @@ Write = Callable[[BinaryIO], None]
 # Plots
 
 
-def plot_file(figure: Any, acquisition: Acquisition | None = None) -> Write:
-    """Return the curves of a Bokeh figure as CSV; see `drawn`."""
-    return partial(write_columns, drawn(figure, acquisition))
-
-
-def drawn(figure: Any, acquisition: Acquisition | None = None) -> dict[str, Array]:
-    """Return the curves of a Bokeh figure as columns, as far as they are in view.
-
-    The first column is the horizontal axis. Curves over the same positions share rows; others have
-    rows of their own, NaN in all other columns. A mark, such as a vertical line, is a 1 at its
-    position. Curves that are hidden by the legend are left out.
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A curve or marks of a plot, as the values that the plot was made from.
 
     Parameters
     ----------
-    figure : bokeh.plotting.figure
-    acquisition : Acquisition, optional
-        For a figure over bins, whose first columns are then bins, nanoseconds and metres.
+    layer : str
+        Layer of the plot that draws it.
+    name : str
+    x : array_like, shape (n,)
+        Positions on the horizontal axis; along a gate, in bins.
+    y : array_like, shape (n,), optional
+        Omitted for marks, which are positions only.
+    unit : str
+        Unit or quantity of `y`; may be empty or equal to the name.
+    """
+
+    layer: str
+    name: str
+    x: ArrayLike
+    y: ArrayLike | None = None
+    unit: str = ""
+
+    @property
+    def heading(self) -> str:
+        """Name and unit."""
+        return self.name if self.unit in ("", self.name) else f"{self.name} ({self.unit})"
+
+    def within(self, low: float, high: float) -> tuple[Floats, Floats]:
+        """Return x and y, (n,) each, between two positions; the y of a mark is 1."""
+        x = np.atleast_1d(np.asarray(self.x, float))
+        y = np.ones(x.size) if self.y is None else np.asarray(self.y, float)
+        inside = (x >= low) & (x <= high)
+        return x[inside], y[inside]
+
+
+def band(
+    layer: str, name: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, unit: str
+) -> list[Curve]:
+    """Return the limits (n,) of a curve as two curves."""
+    limits = (("lowest", low), ("highest", high))
+    return [Curve(layer, f"{name}, {end}", x, y, unit) for end, y in limits]
+
+
+def plot_file(curves: Sequence[Curve], along: Acquisition | str, x_range: Any) -> Write:
+    """Return curves as CSV, as far as they are in view.
+
+    The first column is the horizontal axis. Curves over the same positions share rows; others have
+    rows of their own, NaN in all other columns.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+    along : Acquisition or str
+        Label of the horizontal axis, or for curves over bins their gate: the first columns are then
+        bins, nanoseconds and metres.
+    x_range : bokeh.models.Range1d
+        The horizontal axis as it is zoomed.
 
     Raises
     ------
     ValueError
-        If no curve is drawn.
+        If no curve is in view.
     """
-    groups: dict[bytes, tuple[Array, dict[str, Array]]] = {}
-    low, high = _view(figure.x_range)
-    for name, x, y in _curves(figure):
-        inside = (x >= low) & (x <= high)
-        _, curves = groups.setdefault(x[inside].tobytes(), (x[inside], {}))
-        curves[name] = y[inside]
+    groups: dict[bytes, tuple[Floats, dict[str, Floats]]] = {}
+    view = _view(x_range)
+    for curve in curves:
+        x, y = curve.within(*view)
+        groups.setdefault(x.tobytes(), (x, {}))[1][curve.heading] = y
     if not any(x.size for x, _ in groups.values()):
         raise ValueError(NOTHING_DRAWN)
-    places = np.concatenate([x for x, _ in groups.values()])
-    if acquisition is None:
-        columns = {_label(figure.below): places}
-    else:
-        along = {unit: scale(unit, acquisition) for unit in UNITS}
-        columns = {
-            AXIS_TITLES[unit]: each.origin + each.step * places.astype(float)
-            for unit, each in along.items()
-        }
-    for name in dict.fromkeys(name for _, curves in groups.values() for name in curves):
-        pieces = [
-            curves.get(name, np.full(x.size, np.nan, np.float32)) for x, curves in groups.values()
-        ]
-        columns[name] = np.concatenate(pieces)
-    return columns
+    columns = _axis(np.concatenate([x for x, _ in groups.values()]), along)
+    for name in dict.fromkeys(curve.heading for curve in curves):
+        columns[name] = np.concatenate(
+            [values.get(name, np.full(x.size, np.nan)) for x, values in groups.values()]
+        )
+    return partial(write_columns, columns)
 
 
-def _curves(figure: Any) -> Iterator[tuple[str, Array, Array]]:
-    """Yield name with unit, x and y of each curve that a figure draws and names."""
-    labels = {
-        renderer.id: item.label
-        for legend in figure.legend
-        for item in legend.items
-        for renderer in item.renderers
-    }
-    for renderer in figure.renderers:
-        if not isinstance(renderer, GlyphRenderer) or not renderer.visible:
-            continue
-        glyph, kind = renderer.glyph, type(renderer.glyph).__name__
-        columns = renderer.data_source.data
-        label = labels.get(renderer.id)
-        unit = _unit(_label([*figure.left, *figure.right], renderer.y_range_name))
-        if kind == "MultiLine":
-            names = columns[getattr(label, "field", "title")]
-            lines = zip(names, columns["xs"], columns["ys"], strict=True)
-            found = [(name, np.asarray(x), np.asarray(y)) for name, x, y in lines]
-        else:
-            # Bands and points need no legend; lines without one only connect points.
-            name = renderer.name if kind in ("VArea", "Scatter") else ""
-            data = {name: np.asarray(x) for name, x in columns.items()}
-            found = _shape(kind, getattr(label, "value", name), glyph, data)
-        for name, x, y in found:
-            is_upright = kind == "Line" and x.size == 2 and x[0] == x[1]
-            if name and (is_upright or not unit):  # its height has no meaning
-                yield name, np.unique(x), np.ones(np.unique(x).size, np.float32)
-            elif name:
-                yield name if name == unit else f"{name} ({unit})", x, y
-
-
-def _shape(
-    kind: str, name: str, glyph: Any, data: Mapping[str, Array]
-) -> list[tuple[str, Array, Array]]:
-    """Return name, x and y of the curves of a glyph."""
-    if kind == "Quad" and glyph.top in data:
-        return [(name, (data["left"] + data["right"]) / 2, data[glyph.top])]
-    if kind == "Quad":
-        return [(name, np.concatenate([data["left"], data["right"]]), np.empty(0))]
-    if kind in ("VArea", "Segment"):
-        x = data[glyph.x if kind == "VArea" else glyph.x0]
-        ends = (glyph.y1, glyph.y2) if kind == "VArea" else (glyph.y0, glyph.y1)
-        low, high = (data[column] for column in ends)
-        return [(f"{name}, lowest", x, low), (f"{name}, highest", x, high)]
-    if kind in ("VBar", "Line", "Step", "Scatter"):
-        return [(name, data[glyph.x], data[glyph.top if kind == "VBar" else glyph.y])]
-    return []
-
-
-def _label(axes: Sequence[Any], range_name: str = "default") -> str:
-    """Return the label of the first axis of a vertical range, or an empty string."""
-    own = (each for each in axes if isinstance(each, Axis) and each.y_range_name == range_name)
-    return next((each.axis_label or "" for each in own), "")
-
-
-def _unit(label: str) -> str:
-    """Return the unit of an axis: the part of its label in brackets, or the whole label."""
-    in_brackets = re.search(r"\((.*)\)$", label)
-    return in_brackets[1] if in_brackets else label[:1].lower() + label[1:]
+def _axis(x: Floats, along: Acquisition | str) -> dict[str, Floats]:
+    """Return the columns of the horizontal axis."""
+    if isinstance(along, str):
+        return {along: x}
+    scales = {AXIS_TITLES[unit]: scale(unit, along) for unit in UNITS}
+    return {title: each.origin + each.step * x for title, each in scales.items()}
 
 
 def _view(axis_range: Any) -> tuple[float, float]:

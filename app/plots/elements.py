@@ -6,6 +6,7 @@ building a plot again would take ten times as long as drawing it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import holoviews as hv
@@ -20,8 +21,9 @@ from bokeh.models import (
     Span,
 )
 from bokeh.plotting import figure
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from app.model.exports import Curve
 from app.theme import OUTSIDE_COLOR, RANGE_COLORS, Palette, method_style
 from core.studies import outputs as items
 from core.studies.paper import figures as paper
@@ -35,9 +37,27 @@ hv.renderer("bokeh").webgl = False
 BIN = hv.Dimension("bin", label="Bin")
 
 # Layers of each plot, by their colours' names in the palette, in drawing order.
-HISTOGRAM_LAYERS = ("raw", "expected", "small", "large", "truth", "answer")
-RESIDUAL_LAYERS = ("raw", "residual", "truth", "answer")
-ENHANCED_LAYERS = ("weight", "enhanced", "truth", "answer")
+HISTOGRAM_LAYERS = ("raw", "expected", "small", "large", "truth", "estimate")
+RESIDUAL_LAYERS = ("raw", "residual", "truth", "estimate")
+ENHANCED_LAYERS = ("weight", "enhanced", "truth", "estimate")
+
+# Names on screen of the layers that have another one.
+HISTOGRAM_NAMES = {"raw": "raw histogram", "small": "small scale", "large": "large scale"}
+RESIDUAL_NAMES = {"raw": "first difference of the raw histogram"}
+ESTIMATES_NAME = "estimate, own lag removed"
+
+
+def bin_curves(names: Mapping[str, str], unit: str, **values: Array) -> list[Curve]:
+    """State curves (bin,) for a download, by layer; `names` are those that differ from it."""
+    return [
+        Curve(layer, names.get(layer, layer), centres(y.size), y, unit)
+        for layer, y in values.items()
+    ]
+
+
+def marks(names: Mapping[str, str], **positions: ArrayLike) -> list[Curve]:
+    """State marks for a download, by layer; `names` are those that differ from it."""
+    return [Curve(layer, names.get(layer, layer), x) for layer, x in positions.items()]
 
 
 def marker_line(position_bin: float, top: float, bottom: float = 0.0) -> tuple[Array, Array]:
@@ -67,12 +87,13 @@ def histogram(
     """
     unit = hv.Dimension("counts", label="Counts")
     data = edges(counts.size), counts
-    bars = hv.Histogram(data, kdims=BIN, vdims=unit, label="raw histogram")
+    names = HISTOGRAM_NAMES
+    bars = hv.Histogram(data, kdims=BIN, vdims=unit, label=names["raw"])
     layers = [
         bars.opts(color=colors.raw, line_width=0),
         _signal(expected, unit, "expected", colors.expected, 1.5, "dotted"),
-        _signal(small, unit, "small scale", colors.small),
-        _signal(large, unit, "large scale", colors.large),
+        _signal(small, unit, names["small"], colors.small),
+        _signal(large, unit, names["large"], colors.large),
         *_markers(unit, colors),
     ]
     return _panel(layers, "Histogram of the pixel, and the two scales that follow it")
@@ -82,7 +103,7 @@ def residual(values: Array, difference: Array, colors: Palette) -> hv.Overlay:
     """Plot the positive difference of the scales, and the first difference of the histogram."""
     unit = hv.Dimension("residual", label="Counts")
     layers = [
-        _signal(difference, unit, "first difference of the raw histogram", colors.raw, 1.2),
+        _signal(difference, unit, RESIDUAL_NAMES["raw"], colors.raw, 1.2),
         _signal(values, unit, "residual", colors.residual),
         *_markers(unit, colors),
     ]
@@ -120,7 +141,7 @@ def _truth(unit: hv.Dimension, colors: Palette) -> hv.Curve:
 
 def _markers(unit: hv.Dimension, colors: Palette) -> list[hv.Curve]:
     line = marker_line(np.nan, 1.0)
-    return [_truth(unit, colors), _curve(*line, unit, "answer", colors.answer, 1.5, "solid")]
+    return [_truth(unit, colors), _curve(*line, unit, "estimate", colors.estimate, 1.5, "solid")]
 
 
 def _panel(layers: list[Any], title: str) -> hv.Overlay:
@@ -191,7 +212,7 @@ def score_curves(colors: Palette) -> hv.Overlay:
     layers = [
         hv.Path([np.full((1, 2), np.nan)], [BIN, unit]).opts(line_width=1.8),
         _truth(unit, colors),
-        hv.Scatter((nothing, nothing), BIN, unit, label="estimate, own lag removed").opts(
+        hv.Scatter((nothing, nothing), BIN, unit, label=ESTIMATES_NAME).opts(
             marker="inverted_triangle", size=9, line_width=0
         ),
     ]
@@ -229,8 +250,8 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "limit: probability of the right bin": ("text", [2, 4]),
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
-    "estimate, lag included": ("answer", []),
-    "the echo above": ("answer", []),
+    "estimate, lag included": ("estimate", []),
+    "the echo above": ("estimate", []),
 }
 METHOD_PLACES = {method.name: n for n, method in enumerate(paper.COMPARED)}
 BARS = "histogram"
@@ -402,7 +423,7 @@ def show_goals(drawing: Any, milliseconds: float, degree: float) -> None:
 
 def paint_tradeoff(drawing: Any, colors: Palette) -> None:
     """Set the colours of lines; the points have their own."""
-    for name, color in (("front", colors.text), ("chosen", colors.answer)):
+    for name, color in (("front", colors.text), ("chosen", colors.estimate)):
         drawing.select_one({"name": name}).glyph.line_color = color
     for name in _GOALS:
         drawing.select_one({"name": name}).line_color = colors.muted

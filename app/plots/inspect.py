@@ -27,6 +27,19 @@ RATE_TITLES = {
 CANDIDATE_HEIGHT = 0.05
 """Height of the candidates' marks: near the bottom, where no legend hides them."""
 
+NAMES = {
+    "raw": "counts",
+    "small": "small scale",
+    "large": "large scale",
+    "window": "suggested gate",
+    "t_n": "T_n",
+    "suggested": "suggested T_n",
+    "interval": "95 % interval",
+    "points": "within 3 bins",
+    "present": "present number",
+}
+"""Names on screen of the layers that have another one."""
+
 
 def empty(*columns: str) -> ColumnDataSource:
     """Return an empty source."""
@@ -37,10 +50,10 @@ def counts(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     """Plot the counts of each bin as bars, with both scales and the expected counts."""
     drawing = _over_the_gate("Counts, and the two scales that follow them", "Counts", bins)
     source = empty("bin", "raw", "expected", "small", "large")
-    _bars(drawing, source, "raw", "counts")
-    _line(drawing, source, "expected", "expected", 1.5, line_dash="dotted")
-    _line(drawing, source, "small", "small scale")
-    _line(drawing, source, "large", "large scale")
+    _bars(drawing, source, "raw")
+    _line(drawing, source, "expected", 1.5, line_dash="dotted")
+    _line(drawing, source, "small")
+    _line(drawing, source, "large")
     return _marked(drawing, marks, with_ranks=True)
 
 
@@ -48,7 +61,7 @@ def rate(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     """Plot the detection rate of each bin, corrected for pile-up."""
     drawing = _over_the_gate("", "", bins)
     source = empty("bin", "rate")
-    _bars(drawing, source, "rate", "rate")
+    _bars(drawing, source, "rate")
     return _marked(drawing, marks)
 
 
@@ -59,8 +72,8 @@ def stages(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     drawing.extra_y_ranges["enhanced"] = Range1d(0, 1)
     axis = LinearAxis(y_range_name="enhanced", axis_label="Counts × weight")
     drawing.add_layout(axis, "right")
-    _line(drawing, source, "residual", "residual")
-    _line(drawing, source, "enhanced", "enhanced", y_range_name="enhanced", line_dash=[6, 3])
+    _line(drawing, source, "residual")
+    _line(drawing, source, "enhanced", y_range_name="enhanced", line_dash=[6, 3])
     return _marked(drawing, marks)
 
 
@@ -83,7 +96,7 @@ def aggregate(bins: Range1d) -> Any:
     """Plot the summed counts of all pixels, the suggested gate, and T_n."""
     drawing = _over_the_gate("Counts of all pixels along the gate", "Counts", bins)
     drawing.yaxis.formatter = NumeralTickFormatter(format="0,0")  # also for millions
-    _bars(drawing, empty("bin", "raw"), "raw", "counts")
+    _bars(drawing, empty("bin", "raw"), "raw")
     drawing.quad(
         "left",
         "right",
@@ -94,10 +107,10 @@ def aggregate(bins: Range1d) -> Any:
         fill_alpha=0.12,
         line_width=0,
         name="window",
-        legend_label="suggested gate",
+        legend_label=NAMES["window"],
     )
-    for name, label, dash in (("t_n", "T_n", "solid"), ("suggested", "suggested T_n", "dashed")):
-        _vertical(drawing, empty("x", "y"), name, label, line_dash=dash)
+    for name, dash in (("t_n", "solid"), ("suggested", "dashed")):
+        _vertical(drawing, empty("x", "y"), name, line_dash=dash)
     return _with_legend(drawing)
 
 
@@ -121,11 +134,11 @@ def accuracy() -> Any:
         line_width=5,
         line_alpha=0.4,
         name="interval",
-        legend_label="95 % interval",
+        legend_label=NAMES["interval"],
     )
     drawing.line("pulses", "value", source=source, line_width=1.5, name="line")
     points = drawing.scatter(
-        "pulses", "value", source=source, size=6, name="points", legend_label="within 3 bins"
+        "pulses", "value", source=source, size=6, name="points", legend_label=NAMES["points"]
     )
     drawing.add_tools(
         HoverTool(
@@ -138,7 +151,7 @@ def accuracy() -> Any:
         )
     )
     drawing.xaxis.formatter = PrintfTickFormatter(format="%.3g")
-    _vertical(drawing, empty("x", "y"), "answer", "present number")
+    _vertical(drawing, empty("x", "y"), "present")
     return _with_legend(drawing, "bottom_right")
 
 
@@ -168,15 +181,17 @@ def _with_marks(**options: Any) -> Any:
     return drawing
 
 
-def _bars(drawing: Any, source: ColumnDataSource, column: str, label: str) -> None:
+def _bars(drawing: Any, source: ColumnDataSource, column: str) -> None:
+    label = NAMES.get(column, column)
     drawing.vbar(
         x="bin", top=column, width=1.0, source=source, line_width=0, name=column, legend_label=label
     )
 
 
 def _line(
-    drawing: Any, source: ColumnDataSource, column: str, label: str, width: float = 2, **style: Any
+    drawing: Any, source: ColumnDataSource, column: str, width: float = 2, **style: Any
 ) -> None:
+    label = NAMES.get(column, column)
     drawing.line(
         "bin", column, source=source, line_width=width, name=column, legend_label=label, **style
     )
@@ -186,7 +201,6 @@ def _vertical(
     drawing: Any,
     source: ColumnDataSource,
     name: str,
-    label: str,
     width: float = 1.8,
     **style: Any,
 ) -> None:
@@ -197,15 +211,15 @@ def _vertical(
         y_range_name=MARKS,
         line_width=width,
         name=name,
-        legend_label=label,
+        legend_label=NAMES.get(name, name),
         **style,
     )
 
 
 def _marked(drawing: Any, marks: Mapping[str, ColumnDataSource], with_ranks: bool = False) -> Any:
     """Add truth, estimate and candidates, from sources that figures share."""
-    _vertical(drawing, marks["truth"], "truth", "truth", 2.5, line_dash="4 2")
-    _vertical(drawing, marks["answer"], "answer", "answer", 1.5)
+    _vertical(drawing, marks["truth"], "truth", 2.5, line_dash="4 2")
+    _vertical(drawing, marks["estimate"], "estimate", 1.5)
     places = {"source": marks["candidates"], "y_range_name": MARKS}
     drawing.scatter("x", "y", marker="triangle", size=8, **places, name="candidates")
     if with_ranks:

@@ -14,7 +14,9 @@ from bokeh.events import DoubleTap
 from bokeh.models import ColorBar, CustomJS, Range1d
 from numpy.typing import ArrayLike
 
+from app.model.exports import Curve, Write, plot_file
 from app.theme import STYLES, Palette
+from core import Acquisition
 
 
 class Layers:
@@ -30,6 +32,8 @@ class Layers:
     def __init__(self, figure: Any, layers: Mapping[str, Mapping[str, Any]]) -> None:
         self.figure = figure
         self.layers = layers
+        self._along: Acquisition | str = ""
+        self._curves: Sequence[Curve] = ()
         reset = CustomJS(args={"figure": self.figure}, code="figure.reset.emit()")
         self.figure.js_on_event(DoubleTap, reset)
 
@@ -44,6 +48,17 @@ class Layers:
         new = {n: v for n, v in new.items() if not np.array_equal(data[n], v, equal_nan=True)}
         if new:
             data.update(new)
+
+    def keep(self, along: Acquisition | str, curves: Sequence[Curve]) -> None:
+        """Keep what the layers show for a download; `along` is the gate or the axis label."""
+        self._along, self._curves = along, curves
+
+    def csv(self) -> Write:
+        """Return the kept curves as CSV; those that are hidden or out of view are left out."""
+        visible = [
+            each for each in self._curves if self.layers[each.layer]["glyph_renderer"].visible
+        ]
+        return plot_file(visible, self._along, self.figure.x_range)
 
     def show(self, layer: str, visible: bool) -> None:
         """Show or hide a layer and its line in the legend."""

@@ -9,6 +9,7 @@ import numpy as np
 from bokeh.models import BasicTicker, LegendItem, Range1d
 from numpy.typing import NDArray
 
+from app.model.exports import Curve
 from app.model.methods import METHOD_TITLES
 from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes
@@ -46,20 +47,31 @@ class Lines:
         }
 
 
+def curves_of(lines: Mapping[str, tuple[Array, Array]], unit: str) -> list[Curve]:
+    """Return the lines of a plot, by method, for a download."""
+    return [Curve("lines", METHOD_TITLES[method], *line, unit) for method, line in lines.items()]
+
+
 class CurvePlot:
-    """Score of each bin of one pixel, by method."""
+    """Score of each bin of one pixel, by method.
+
+    Attributes
+    ----------
+    plot : Plot
+    pane : pn.pane.Bokeh
+    """
 
     def __init__(self) -> None:
-        self._plot = Plot(plots.score_curves(LIGHT), ("lines", "truth", "answers"))
-        self._lines = Lines(self._plot)
-        self._answers = self._plot.source("answers")
-        self._answers.data = {"bin": [], "score": [], "color": []}
-        self._plot.layers["answers"]["glyph"].fill_color = {"field": "color"}
-        drawing = self._plot.figure
+        self.plot = Plot(plots.score_curves(LIGHT), ("lines", "truth", "estimates"))
+        self._lines = Lines(self.plot)
+        self._estimates = self.plot.source("estimates")
+        self._estimates.data = {"bin": [], "score": [], "color": []}
+        self.plot.layers["estimates"]["glyph"].fill_color = {"field": "color"}
+        drawing = self.plot.figure
         drawing.x_range, drawing.y_range = Range1d(0, 1), Range1d(0, 1)
         drawing.min_border_left, drawing.min_border_right = 46, 14
         self._axes = GateAxes(drawing)
-        renderer = self._plot.layers["lines"]["glyph_renderer"]
+        renderer = self.plot.layers["lines"]["glyph_renderer"]
         drawing.legend[0].items.insert(
             0, LegendItem(label={"field": "title"}, renderers=[renderer])
         )
@@ -69,53 +81,66 @@ class CurvePlot:
     def update(
         self,
         curves: Mapping[str, Array],
-        answers: Mapping[str, float],
+        estimates: Mapping[str, float],
         truth_bin: float,
         acquisition: Acquisition,
         styles: Mapping[str, Style],
         unit: str,
     ) -> None:
         """Show a pixel: curves (bin,), estimates in bins and styles of lines, by method."""
-        plot, bins = self._plot, self._plot.figure.x_range
+        plot, bins = self.plot, self.plot.figure.x_range
         if bins.end != acquisition.n_bins:
             bins.update(end=acquisition.n_bins, reset_end=acquisition.n_bins)
         self._axes.follow(unit, acquisition)
         centres = plots.centres(acquisition.n_bins)
-        self._lines.update({method: (centres, curve) for method, curve in curves.items()}, styles)
+        lines = {method: (centres, curve) for method, curve in curves.items()}
+        self._lines.update(lines, styles)
         lowest = min((float(curve.min()) for curve in curves.values()), default=0.0)
         low = 1.05 * max(lowest, LOWEST_SCORE) - 0.02
         # One above the other, so that equal estimates remain visible.
-        height = {method: 1.06 + 0.07 * place for place, method in enumerate(answers)}
-        top = 1.1 + 0.07 * len(answers)
+        height = {method: 1.06 + 0.07 * place for place, method in enumerate(estimates)}
+        top = 1.1 + 0.07 * len(estimates)
         vertical = plot.figure.y_range
         if (low, top) != (vertical.start, vertical.end):
             vertical.update(start=low, end=top, reset_start=low, reset_end=top)
-        answered = [method for method, at in answers.items() if np.isfinite(at)]
-        self._answers.data = {
-            "bin": np.array([answers[method] for method in answered], np.float32),
-            "score": np.array([height[method] for method in answered], np.float32),
-            "color": [styles[method][0] for method in answered],
+        estimated = [method for method, at in estimates.items() if np.isfinite(at)]
+        self._estimates.data = {
+            "bin": np.array([estimates[method] for method in estimated], np.float32),
+            "score": np.array([height[method] for method in estimated], np.float32),
+            "color": [styles[method][0] for method in estimated],
         }
         x, y = plots.marker_line(truth_bin, top)
         plot.write("truth", bin=x, score=y)
         plot.show("truth", bool(np.isfinite(truth_bin)))
+        marks = [
+            Curve("estimates", f"{METHOD_TITLES[each]}, {plots.ESTIMATES_NAME}", estimates[each])
+            for each in estimated
+        ]
+        truth = Curve("truth", "truth", truth_bin)
+        plot.keep(acquisition, [*curves_of(lines, "score, scaled"), truth, *marks])
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme; those of the lines come with `update`."""
-        paint_frame(self._plot.figure, colors)
-        self._plot.layers["truth"]["glyph"].line_color = colors.truth
+        paint_frame(self.plot.figure, colors)
+        self.plot.layers["truth"]["glyph"].line_color = colors.truth
 
 
 class ReliabilityPlot:
-    """Share of right estimates against their confidence, by method."""
+    """Share of right estimates against their confidence, by method.
+
+    Attributes
+    ----------
+    plot : Plot
+    pane : pn.pane.Bokeh
+    """
 
     def __init__(self) -> None:
-        self._plot = Plot(plots.reliability(LIGHT), ("honest", "lines", "dots"))
-        self._lines = Lines(self._plot)
-        self._dots = self._plot.source("dots")
+        self.plot = Plot(plots.reliability(LIGHT), ("honest", "lines", "dots"))
+        self._lines = Lines(self.plot)
+        self._dots = self.plot.source("dots")
         self._dots.data = {"confidence": [], "right": [], "color": []}
-        self._plot.layers["dots"]["glyph"].fill_color = {"field": "color"}
-        drawing = self._plot.figure
+        self.plot.layers["dots"]["glyph"].fill_color = {"field": "color"}
+        drawing = self.plot.figure
         drawing.x_range, drawing.y_range = Range1d(0, 1.02), Range1d(0, 1.04)
         drawing.xaxis.ticker = drawing.yaxis.ticker = BasicTicker(desired_num_ticks=5)
         self.pane = pane_of(drawing)
@@ -123,6 +148,7 @@ class ReliabilityPlot:
     def update(self, lines: Mapping[str, tuple[Array, Array]], styles: Mapping[str, Style]) -> None:
         """Show confidence and share of right estimates, by method."""
         self._lines.update(lines, styles)
+        self.plot.keep("Confidence", curves_of(lines, "share right within 3 bins"))
         confidence, right = ([each[axis] for each in lines.values()] for axis in (0, 1))
         colors = [[styles[method][0]] * each[0].size for method, each in lines.items()]
         self._dots.data = {
@@ -133,5 +159,5 @@ class ReliabilityPlot:
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme; those of the lines come with `update`."""
-        paint_frame(self._plot.figure, colors)
-        self._plot.layers["honest"]["glyph"].line_color = colors.muted
+        paint_frame(self.plot.figure, colors)
+        self.plot.layers["honest"]["glyph"].line_color = colors.muted

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import panel as pn
 from bokeh.models import BasicTicker, Range1d
 from numpy.typing import NDArray
 
@@ -13,7 +12,7 @@ from app.model.store import Pixel
 from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.theme import LIGHT, Palette
-from app.widgets.figures import Plot, cover, pane_of, round_up
+from app.widgets.figures import Plot, cover, round_up
 from core import Acquisition
 
 Array = NDArray[Any]
@@ -28,14 +27,14 @@ class SignalPlots:
         self.residual = Plot(plots.residual(one, one, LIGHT), plots.RESIDUAL_LAYERS)
         self.enhanced = Plot(plots.enhanced(one, one, LIGHT), plots.ENHANCED_LAYERS)
         self._bins = Range1d(0, 1)
-        for plot in self._plots:
+        for plot in self.plots:
             figure = plot.figure
             figure.x_range, figure.y_range = self._bins, Range1d(0, 1)
             figure.min_border_left, figure.min_border_right = 46, 14
             figure.min_border_top = figure.min_border_bottom = 4
             figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
         # The second axis appears once: the plots are stacked.
-        self._axes = [GateAxes(plot.figure, plot is self.histogram) for plot in self._plots]
+        self._axes = [GateAxes(plot.figure, plot is self.histogram) for plot in self.plots]
         raw = ("Counts", self.histogram.source("raw"), "top")
         small, large = (
             (f"{name} scale".capitalize(), self.histogram.source(name), "counts")
@@ -55,17 +54,13 @@ class SignalPlots:
         ]
 
     @property
-    def panes(self) -> list[pn.pane.Bokeh]:
+    def plots(self) -> tuple[Plot, Plot, Plot]:
         """The three plots, from top to bottom."""
-        return [pane_of(plot.figure) for plot in self._plots]
-
-    @property
-    def _plots(self) -> tuple[Plot, Plot, Plot]:
         return self.histogram, self.residual, self.enhanced
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme."""
-        for plot in self._plots:
+        for plot in self.plots:
             plot.paint(colors)
 
     def update(
@@ -80,10 +75,10 @@ class SignalPlots:
             self._lay_out(acquisition.n_bins)
         signals, nothing = pixel.signals, np.full(acquisition.n_bins, np.nan)
         expected = nothing if pixel.expected is None else pixel.expected
+        lines = {"expected": expected, "small": signals.small, "large": signals.large}
         self.histogram.write("raw", top=signals.raw)
-        self.histogram.write("expected", counts=expected)
-        self.histogram.write("small", counts=signals.small)
-        self.histogram.write("large", counts=signals.large)
+        for layer, counts in lines.items():
+            self.histogram.write(layer, counts=counts)
         self.histogram.show("expected", pixel.expected is not None)
         self._frame(self.histogram, pixel, 0.0, signals.raw, signals.large, expected)
 
@@ -99,6 +94,20 @@ class SignalPlots:
         self.enhanced.write("enhanced", enhanced=signals.enhanced)
         self.enhanced.write("weight", enhanced=weight)
         self._frame(self.enhanced, pixel, 0.0, signals.enhanced, weight)
+        self._keep(pixel, acquisition, lines, difference)
+
+    def _keep(
+        self, pixel: Pixel, acquisition: Acquisition, lines: dict[str, Array], difference: Array
+    ) -> None:
+        """Keep values (bin,) for downloads, the weight as it is; on screen it is scaled."""
+        signals, curves, names = pixel.signals, plots.bin_curves, plots.RESIDUAL_NAMES
+        histogram = curves(plots.HISTOGRAM_NAMES, "counts", raw=signals.raw, **lines)
+        residual = curves(names, "counts", raw=difference, residual=signals.residual)
+        weight = curves({}, "", weight=signals.weight)
+        enhanced = curves({}, "counts × weight", enhanced=signals.enhanced)
+        marks = plots.marks({}, truth=pixel.truth_bin, estimate=pixel.answer_bin)
+        for plot, own in zip(self.plots, (histogram, residual, weight + enhanced), strict=True):
+            plot.keep(acquisition, own + marks)
 
     def _lay_out(self, n_bins: int) -> None:
         """Prepare the plots for another number of bins."""
@@ -123,7 +132,7 @@ class SignalPlots:
         if (start, end) != (vertical.start, vertical.end):
             vertical.update(start=start, end=end, reset_start=start, reset_end=end)
         (column,) = (name for name in plot.source("truth").data if name != "bin")
-        for layer, position in (("truth", pixel.truth_bin), ("answer", pixel.answer_bin)):
+        for layer, position in (("truth", pixel.truth_bin), ("estimate", pixel.answer_bin)):
             x, y = plots.marker_line(position, end)
             plot.write(layer, **{"bin": x, column: y})
             plot.show(layer, bool(np.isfinite(position)))

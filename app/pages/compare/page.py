@@ -14,7 +14,7 @@ import panel_material_ui as pmui
 
 from app.model.colors import cloud_of, image_of
 from app.model.download_text import NOTHING_DRAWN
-from app.model.exports import cloud_files, image_files, plot_file
+from app.model.exports import cloud_files, image_files
 from app.model.mesh import view_bounds
 from app.model.methods import method_title
 from app.model.state import CLOUDS, KINDS, Comparison, Viewing
@@ -205,7 +205,7 @@ class Compare(Section):
         reliability = card(self._reliability.pane, self._no_reliability)
         plots = pn.Column(
             self.offer(card(self._curves.pane), "scores", self._curves_shown),
-            self.offer(reliability, "reliability", self._reliability_shown),
+            self.offer_plot(reliability, "reliability", self._reliability.plot, "reliability"),
             stylesheets=[PLOTS],
             sizing_mode="stretch_width",
             height=290,
@@ -415,11 +415,7 @@ class Compare(Section):
         return Shown(subject, what.lower(), files, method_title(method), look)
 
     def _curves_shown(self) -> Shown:
-        csv = plot_file(self._curves.pane.object, self._capture.acquisition)
-        return self.saved(f"scores {pixel_on_show(self.session)}", csv)
-
-    def _reliability_shown(self) -> Shown:
-        return self.saved("reliability", plot_file(self._reliability.pane.object))
+        return self.saved(f"scores {pixel_on_show(self.session)}", self._curves.plot.csv())
 
     # Drawing
 

@@ -34,6 +34,7 @@ from app.theme import WRONG_COLOR
 from app.widgets.cards import BREAK_PX, board, card, choice, column, part
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import FACTS_PX, HEADLINE_PX, Facts, PixelKeys, SettingsPanel
+from app.widgets.figures import pane_of
 from app.widgets.image_view import ImageView
 from app.widgets.signal_plots import SignalPlots
 
@@ -105,9 +106,11 @@ class Explore(Section):
         right = (
             downloadable_facts(self.numbers, session, self.numbers_shown),
             *(
-                self.offer(card(pane), what, partial(pixel_plot, session, pane.object, what))
-                for pane, what in zip(
-                    self.signals.panes, ("histogram", "residual", "enhanced"), strict=True
+                self.offer(
+                    card(pane_of(plot.figure)), what, partial(pixel_plot, session, plot, what)
+                )
+                for plot, what in zip(
+                    self.signals.plots, ("histogram", "residual", "enhanced"), strict=True
                 )
             ),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any, cast
@@ -11,7 +12,7 @@ import panel as pn
 from bokeh.models import FixedTicker, Range1d
 
 from app.model.download_text import NOTHING_DRAWN
-from app.model.exports import plot_file
+from app.model.exports import Curve, band
 from app.model.state import ReductionSettings
 from app.model.store import Answer
 from app.model.text import COMPUTING
@@ -20,9 +21,9 @@ from app.pages.inspect.pixel import FACTS, framed, stage
 from app.pages.inspect.results import SHARES, accuracy_steps, inspect_capture, with_gate
 from app.pages.inspect.views import GatePlot, NamedLayers
 from app.pages.session import Session
-from app.pages.shared.downloads import Shown
 from app.pages.shared.section import Section
 from app.pages.shared.studies import Study
+from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
 from app.tasks.scheduler import Step
 from app.units import scale
@@ -63,6 +64,7 @@ class CaptureSection(Section):
         self.report: CaptureReport | None = None
         self._reported: Answer | None = None
         self.accuracies: list[Accuracy] = []
+        self._points: list[Curve] = []
         self._studied: Any = None
         self._count_jobs = session.tasks.latest()
         self._bins = Range1d(0, 1)
@@ -93,14 +95,11 @@ class CaptureSection(Section):
             self.offer_facts(self.facts, self._facts_name),
             self.flux,
             *advice,
-            self.offer_gate_plot(counts, "counts", self.counts.figure, "counts of all pixels"),
-            self.offer(accuracy, "accuracy", self._accuracy_shown),
+            self.offer_plot(counts, "counts", self.counts, "counts of all pixels"),
+            self.offer_plot(accuracy, "accuracy", self.accuracy, "accuracy against pulses"),
         )
         below = pn.Column(self.pulses, *self.study.controls, sizing_mode="stretch_width", margin=0)
         return main, below
-
-    def _accuracy_shown(self) -> Shown:
-        return self.saved("accuracy against pulses", plot_file(self.accuracy.figure))
 
     def _facts_name(self) -> str:
         if self._reported is not self.session.answer:
@@ -172,31 +171,43 @@ class CaptureSection(Section):
 
     def _add(self, found: Accuracy) -> None:
         known = [(n, within) for n in (*self.accuracies, found) if (within := n.within) is not None]
+        points = {
+            "pulses": [each.share * self._all_pulses for each, _ in known],
+            "value": [within.value for _, within in known],
+            "low": [within.low for _, within in known],
+            "high": [within.high for _, within in known],
+            "rmse_m": [each.rmse_m.value if each.rmse_m else np.nan for each, _ in known],
+        }
+        names, pulses = inspect_plots.NAMES, points["pulses"]
+        interval, share = names["interval"], names["points"]
+        self._points = [
+            *band("interval", interval, pulses, points["low"], points["high"], share),
+            Curve("points", share, pulses, points["value"]),
+        ]
         with self.session.tasks.hold():
-            self.accuracy.source("points").data = {
-                "pulses": [each.share * self._all_pulses for each, _ in known],
-                "value": [within.value for _, within in known],
-                "low": [within.low for _, within in known],
-                "high": [within.high for _, within in known],
-                "rmse_m": [each.rmse_m.value if each.rmse_m else np.nan for each, _ in known],
-            }
+            self.accuracy.source("points").data = points
             self._mark_present()
         self.accuracies.append(found)
 
     def _mark_present(self) -> None:
         """Mark the number of pulses that is used at present."""
-        self.accuracy.mark("answer", self.session.answer.request.less.pulses * self._all_pulses)
+        present = self.session.answer.request.less.pulses * self._all_pulses
+        self.accuracy.mark("present", present)
+        marks = plots.marks(inspect_plots.NAMES, present=present)
+        self.accuracy.keep(self.accuracy.figure.xaxis.axis_label, self._points + marks)
 
     # Report
 
-    def _draw_counts(self, answer: Answer, counts: Any) -> None:
+    def _draw_counts(self, answer: Answer, counts: Any, marks: Sequence[Curve] = ()) -> None:
+        """Draw the sum of all pixels (bin,); `marks` are kept for a download."""
         if answer is not self.session.answer:
             return  # outdated
         acquisition = answer.capture.acquisition
         with self.session.tasks.hold():
             cover(self._bins, acquisition.n_bins)
             self.counts.follow(self.session.state.unit, acquisition)
-            self.counts.show_curves(raw=counts)
+            curves = plots.bin_curves(inspect_plots.NAMES, "counts", raw=counts)
+            self.counts.draw(acquisition, [*curves, *marks])
             self.counts.frame(counts)
 
     def _arrived(self, answer: Answer, report: CaptureReport) -> None:
@@ -221,12 +232,14 @@ class CaptureSection(Section):
         if not self.is_on_screen or answer is not self.session.answer or report is None:
             return
         acquisition, suggestion = answer.capture.acquisition, report.suggestion
+        positions = {"t_n": answer.request.tracking.t_n, "suggested": suggestion.t_n}
+        first, end = suggestion.gate
+        marks = plots.marks(inspect_plots.NAMES, window=suggestion.gate, **positions)
         with self.session.tasks.hold():
-            self._draw_counts(answer, report.histogram)
-            first, end = suggestion.gate
+            self._draw_counts(answer, report.histogram, marks)
             self.counts.source("window").data = {"left": [first], "right": [end]}
-            self.counts.mark("t_n", answer.request.tracking.t_n)
-            self.counts.mark("suggested", suggestion.t_n)
+            for layer, position in positions.items():
+                self.counts.mark(layer, position)
             self.facts.facts = text.capture_facts(answer, report)
             self.flux.text = text.flux_sentence(report)
             along = scale(self.session.state.unit, acquisition)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from bokeh.models import Range1d
 
+from app.model.exports import Curve
 from app.model.state import MOST_PINS
 from app.pages.inspect import text
 from app.pages.inspect.pixel import NARROW, framed, stage
@@ -52,7 +53,7 @@ class PinsSection(Section):
     def layout(self) -> tuple[Any, Any]:
         """Return the plots, and the table that stands below the map."""
         cards = [
-            self.offer_gate_plot(framed(pane_of(plot.figure)), what, plot.figure, f"pins {what}")
+            self.offer_plot(framed(pane_of(plot.figure)), what, plot, f"pins {what}")
             for plot, what in ((self.counts, "counts"), (self.enhanced, "enhanced"))
         ]
         return stage(self._note, *cards), self.offer_table(self.table, "pins")
@@ -75,13 +76,16 @@ class PinsSection(Section):
         names = [text.pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
         scales = text.both_scales(unit, answer)
         cover(self._bins, acquisition.n_bins)
-        for plot, curves in (
-            (self.counts, [each.pixel.signals.raw for each in found]),
-            (self.enhanced, [each.pixel.signals.enhanced for each in found]),
+        bins = plots.centres(acquisition.n_bins)
+        for plot, quantity, curves in (
+            (self.counts, "counts", [each.pixel.signals.raw for each in found]),
+            (self.enhanced, "counts × weight", [each.pixel.signals.enhanced for each in found]),
         ):
             plot.follow(unit, acquisition)
+            named = zip(names, curves, strict=True)
+            plot.keep(acquisition, [Curve("lines", n, bins, y, quantity) for n, y in named])
             plot.source("lines").data = {
-                "xs": [plots.centres(acquisition.n_bins).astype(np.float32)] * len(found),
+                "xs": [bins.astype(np.float32)] * len(found),
                 "ys": [np.asarray(curve, np.float32) for curve in curves],
                 "color": list(colors),
                 "label": names,

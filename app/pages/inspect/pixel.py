@@ -24,6 +24,7 @@ from app.pages.shared.downloads import Shown, pixel_on_show, region_on_show
 from app.pages.shared.section import Section
 from app.widgets.cards import card, column, unrolled
 from app.widgets.controls import FACTS_PX, LINE_PX, Facts, Sentence, Table
+from app.widgets.figures import pane_of
 
 BREAK_PX = 1100
 """Width below which the parts of this page follow each other."""
@@ -91,9 +92,9 @@ class PixelSection(Section):
         self.plots = PixelPlots()
         self._painted = [self.plots]
         self.cards = [
-            self.offer_gate_plot(framed(pane), what, pane.object, what)
-            for pane, what in zip(
-                self.plots.panes, ("counts", "rate", "residual and enhanced"), strict=True
+            self.offer_plot(framed(pane_of(plot.figure)), what, plot, what)
+            for plot, what in zip(
+                self.plots.plots, ("counts", "rate", "residual and enhanced"), strict=True
             )
         ]
         self.facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")

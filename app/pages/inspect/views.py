@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
-import panel as pn
 from bokeh.events import SelectionGeometry
 from bokeh.models import (
     BasicTicker,
@@ -19,13 +19,14 @@ from bokeh.models import (
 )
 from numpy.typing import NDArray
 
+from app.model.exports import Curve
 from app.pages.inspect.results import Corners, Inspected
 from app.pages.shared.outputs import layers_of
 from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.theme import Palette
-from app.widgets.figures import Layers, cover, paint_frame, pane_of, round_up
+from app.widgets.figures import Layers, cover, paint_frame, round_up
 from app.widgets.image_view import ImageView
 from core import Acquisition
 
@@ -135,7 +136,8 @@ PALETTE_NAMES = {
     "candidates": "text",
     "ranks": "text",
     "window": "residual",
-    "t_n": "answer",
+    "t_n": "estimate",
+    "present": "estimate",
     "suggested": "residual",
     "line": "small",
     "points": "small",
@@ -185,18 +187,18 @@ class GatePlot(NamedLayers):
     ) -> None:
         super().__init__(figure)
         self._axes = GateAxes(figure, has_top)
-        self._curves = next(iter(self.layers))
+        self._curve_layer = next(iter(self.layers))
         self._read_out = None
         if read_out:
-            source = self.source(self._curves)
-            renderer = self.layers[self._curves]["glyph_renderer"]
+            source = self.source(self._curve_layer)
+            renderer = self.layers[self._curve_layer]["glyph_renderer"]
             rows = [(name, source, column) for name, column in read_out.items()]
             self._read_out = GateReadOut(figure, renderer, rows)
         figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
 
     def curve(self, name: str) -> Array:
-        """Return a curve (bin,) as it is drawn."""
-        return np.asarray(self.source(self._curves).data[name])
+        """Return a curve (bin,) as it is drawn, in 32 bits."""
+        return np.asarray(self.source(self._curve_layer).data[name])
 
     def follow(self, unit: str, acquisition: Acquisition) -> None:
         """Change the unit or the gate of the axes."""
@@ -204,16 +206,18 @@ class GatePlot(NamedLayers):
         if self._read_out is not None:
             self._read_out.follow(acquisition)
 
-    def show_curves(self, **curves: Array) -> None:
-        """Draw curves (bin,)."""
-        bins = plots.centres(next(iter(curves.values())).size)
+    def draw(self, acquisition: Acquisition, curves: Sequence[Curve]) -> None:
+        """Draw curves (bin,), and keep them for a download; marks are only kept."""
+        self.keep(acquisition, curves)
+        columns = {each.layer: each.y for each in curves if each.y is not None}
+        bins = plots.centres(acquisition.n_bins)
         if len(self.curve("bin")) != bins.size:
-            columns = {"bin": bins, **curves}
-            self.source(self._curves).data = {
+            columns["bin"] = bins
+            self.source(self._curve_layer).data = {
                 name: np.asarray(values, np.float32) for name, values in columns.items()
             }
         else:
-            self.write(self._curves, **curves)
+            self.write(self._curve_layer, **columns)
 
     def frame(self, *curves: Array, axis: str = "") -> None:
         """Fit the vertical axis to these curves."""
@@ -231,6 +235,8 @@ class PixelPlots:
     bins : Range1d
         The common axis along the gate.
     counts, rate, stages : GatePlot
+    plots : tuple of GatePlot
+        All three, from top to bottom.
     candidates : ColumnDataSource
         Marks of the candidates.
     """
@@ -240,7 +246,7 @@ class PixelPlots:
         self.candidates = inspect_plots.empty("x", "y", "rank")
         marks = {
             "truth": ColumnDataSource({"x": nowhere, "y": upright}),
-            "answer": ColumnDataSource({"x": nowhere, "y": upright}),
+            "estimate": ColumnDataSource({"x": nowhere, "y": upright}),
             "candidates": self.candidates,
         }
         self.bins = Range1d(0, 1)
@@ -249,16 +255,11 @@ class PixelPlots:
         self.counts = GatePlot(inspect_plots.counts(self.bins, marks), counts, has_top=True)
         self.rate = GatePlot(inspect_plots.rate(self.bins, marks), {"Rate": "rate"})
         self.stages = GatePlot(inspect_plots.stages(self.bins, marks), stages)
-        self._plots = self.counts, self.rate, self.stages
-
-    @property
-    def panes(self) -> list[pn.pane.Bokeh]:
-        """The plots, from top to bottom."""
-        return [pane_of(plot.figure) for plot in self._plots]
+        self.plots = self.counts, self.rate, self.stages
 
     def paint(self, colors: Palette) -> None:
         """Take on the colours of a mode."""
-        for plot in self._plots:
+        for plot in self.plots:
             plot.paint(colors)
 
     def update(self, found: Inspected, unit: str) -> None:
@@ -266,30 +267,36 @@ class PixelPlots:
         pixel, report, signals = found.pixel, found.report, found.pixel.signals
         acquisition = found.answer.capture.acquisition
         cover(self.bins, acquisition.n_bins)
-        for plot in self._plots:
+        for plot in self.plots:
             plot.follow(unit, acquisition)
         has_model = pixel.expected is not None
         expected = pixel.expected if has_model else np.full(acquisition.n_bins, np.nan)
         assert expected is not None
-        self.counts.show_curves(
-            raw=signals.raw, expected=expected, small=signals.small, large=signals.large
+        curves = partial(plots.bin_curves, inspect_plots.NAMES)
+        counts = curves(
+            "counts", raw=signals.raw, expected=expected, small=signals.small, large=signals.large
         )
+        residual = curves("counts", residual=signals.residual)
+        enhanced = curves("counts × weight", enhanced=signals.enhanced)
+        positions = {"truth": pixel.truth_bin, "estimate": pixel.answer_bin}
+        candidates = [each.bin for each in report.candidates]
+        marks = plots.marks(inspect_plots.NAMES, **positions, candidates=candidates)
+        self.counts.draw(acquisition, counts + marks)
         self.counts.show("expected", has_model)
         self.counts.frame(signals.raw, signals.large, expected)
-        self.rate.show_curves(rate=report.rate)
+        self.rate.draw(acquisition, curves(report.rate_unit, rate=report.rate) + marks)
         self.rate.frame(report.rate)
         self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
         self.rate.figure.title.text = inspect_plots.RATE_TITLES[report.rate_unit]
-        self.stages.show_curves(residual=signals.residual, enhanced=signals.enhanced)
+        self.stages.draw(acquisition, residual + enhanced + marks)
         self.stages.frame(signals.residual)
         self.stages.frame(signals.enhanced, axis="enhanced")
-        for name, position in (("truth", pixel.truth_bin), ("answer", pixel.answer_bin)):
+        for name, position in positions.items():
             self.counts.write(name, x=np.full(2, position))
-            for plot in self._plots:
+            for plot in self.plots:
                 plot.show(name, bool(np.isfinite(position)))
-        places = np.array([each.bin for each in report.candidates], np.float32)
         self.candidates.data = {
-            "x": places,
-            "y": np.full(places.size, inspect_plots.CANDIDATE_HEIGHT, np.float32),
-            "rank": [str(n + 1) for n in range(places.size)],
+            "x": np.array(candidates, np.float32),
+            "y": np.full(len(candidates), inspect_plots.CANDIDATE_HEIGHT, np.float32),
+            "rank": [str(n + 1) for n in range(len(candidates))],
         }

@@ -26,12 +26,13 @@ import param
 
 from app.model import download_text
 from app.model.colors import ColorScale
-from app.model.exports import Write, image_files, plot_file
+from app.model.exports import Write, image_files
 from app.model.state import Viewing
 from app.model.store import Answer, Request
 from app.pages.session import Session
 from app.tasks.scheduler import FILES
 from app.widgets.component import Component
+from app.widgets.figures import Layers
 from core import inspection
 from core.parameters import spec_of
 
@@ -334,15 +335,9 @@ def viewed(session: Session, subject: Subject, viewing: Viewing) -> Subject:
     return replace(subject, settings=(*subject.settings, viewing))
 
 
-def over_the_gate(session: Session, figure: Any, what: str) -> Shown:
-    """Return the content of a plot over the gate."""
-    table = plot_file(figure, session.answer.capture.acquisition)
-    return Shown(explored(session), what, {"csv": table})
-
-
-def pixel_plot(session: Session, figure: Any, what: str) -> Shown:
+def pixel_plot(session: Session, plot: Layers, what: str) -> Shown:
     """Return the content of a plot of the session's pixel."""
-    return over_the_gate(session, figure, f"{what} {pixel_on_show(session)}")
+    return Shown(explored(session), f"{what} {pixel_on_show(session)}", {"csv": plot.csv()})
 
 
 def pixel_on_show(session: Session) -> str:

@@ -15,7 +15,7 @@ from bokeh.models import Range1d
 
 from app.model.colors import ColorScale
 from app.model.download_text import NOTHING_DRAWN
-from app.model.exports import image_file, plot_file, table_file
+from app.model.exports import Curve, band, image_file, table_file
 from app.model.large import Grid
 from app.model.methods import METHOD_TITLES
 from app.model.text import NOT_COMPUTED, number
@@ -37,7 +37,7 @@ from app.widgets.method_picture import ScaleBar
 from core.parameters import Number
 from core.studies import outputs as items
 
-Item = TypeVar("Item", items.Plot, items.Table, items.Pictures)
+Item = TypeVar("Item")
 
 GRID = """
 :host { display: grid !important; gap: 8px; width: 100%;
@@ -78,8 +78,8 @@ class CurveCard:
         """Add a download button."""
 
         def show() -> Shown:
-            item = _required(self._item)
-            return Shown(subject(), item.key, {"csv": plot_file(self.figure)})
+            item, plot = _required(self._item), _required(self._plot)
+            return Shown(subject(), item.key, {"csv": plot.csv()})
 
         downloadable(self.card, session, "curves", show, PLOT)
 
@@ -88,6 +88,7 @@ class CurveCard:
         if self._plot is None or self._item is None or _names(item) != _names(self._item):
             self._plot = self._built(item)
         self._item = item
+        self._plot.keep(item.x_label, curves_of(item))
         figure = self._plot.figure
         low, high = (
             round_up(1.1 * max(float(np.nanmax(sign * curve, initial=0.0)) for curve in curves))
@@ -138,6 +139,20 @@ class CurveCard:
 def _names(item: items.Plot) -> list[str]:
     """Return the names of a plot's layers."""
     return [*item.curves, *item.marks]
+
+
+def curves_of(item: items.Plot) -> list[Curve]:
+    """Return bands, curves and marks of a study's plot, for a download."""
+    bands = [
+        limit
+        for name, limits in item.bands.items()
+        for limit in band(f"{name} band", spelled(name), item.x, *limits, item.y_label)
+    ]
+    curves = [
+        Curve(name, spelled(name), item.x, values, item.y_label)
+        for name, values in item.curves.items()
+    ]
+    return bands + curves + [Curve(name, spelled(name), at) for name, at in item.marks.items()]
 
 
 class TableCard:

@@ -9,7 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import panel as pn
 
-from app.model.exports import Write, facts_file, plot_file, shown_table_file
+from app.model.exports import Write, facts_file, shown_table_file
 from app.model.store import Answer
 from app.pages.navigation import View
 from app.pages.session import Session
@@ -27,6 +27,7 @@ from app.pages.shared.studies import Study, aside
 from app.tasks.scheduler import Step
 from app.theme import Palette, palette
 from app.widgets.controls import Facts, SettingsPanel, Table
+from app.widgets.figures import Layers
 from core.parameters import Number, check_fields, parameter
 
 Result = TypeVar("Result")
@@ -159,13 +160,9 @@ class Section:
         self.downloads[button] = show
         return downloadable(holder, self.session, button, show, formats)
 
-    def offer_gate_plot(self, holder: pn.Column, button: str, figure: Any, what: str) -> pn.Column:
-        """Add a download button to the card of a plot over the gate."""
-
-        def show() -> Shown:
-            return self.saved(what, plot_file(figure, self.session.answer.capture.acquisition))
-
-        return self.offer(holder, button, show)
+    def offer_plot(self, holder: pn.Column, button: str, plot: Layers, what: str) -> pn.Column:
+        """Add a download button to the card of a plot."""
+        return self.offer(holder, button, lambda: self.saved(what, plot.csv()))
 
     def offer_facts(self, facts: Facts, what: Callable[[], str]) -> pn.Column:
         """Return a list of facts with a download button."""
