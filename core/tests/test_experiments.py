@@ -39,8 +39,7 @@ from core.studies.report import write
 from core.studies.trials import Condition, Method, Results, Score, summary
 from core.tracking import PRESETS, TrackingParameters
 
-# Shared fixtures are computed once.
-pytestmark = [pytest.mark.compiled, pytest.mark.xdist_group("experiments")]
+pytestmark = pytest.mark.compiled
 
 CAR = Condition("car", 0.06)
 SIZE = 24  # rows and columns of images with one echo position
