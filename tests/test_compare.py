@@ -329,13 +329,13 @@ def test_every_source_can_be_shown_in_every_way(shown, key):
 
 
 @pytest.fixture
-def here(start_page):
+def here(page, address):
     """The Compare page with five methods of the car."""
-    start_page.get_by_role("button", name="Compare", exact=True).click()
-    expect(start_page.get_by_text("5 methods compared")).to_be_visible()
-    expect(start_page.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
-    start_page.wait_for_function("Bokeh.documents[0].is_idle")
-    return start_page
+    opened = page(f"{address}?page=Compare", ready="tbody")
+    expect(opened.get_by_text("5 methods compared")).to_be_visible()
+    expect(opened.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
+    opened.wait_for_function("Bokeh.documents[0].is_idle")
+    return opened
 
 
 def press(page, name):
@@ -362,20 +362,26 @@ def first_row(page):
 
 
 @pytest.mark.browser
-def test_five_methods_stand_side_by_side(here):
+def test_methods_stand_side_by_side_and_are_sorted_by_click_and_by_keyboard(here):
     expect(here.locator("tbody").first.locator("tr")).to_have_count(5)
     eventually(lambda: len(colors_of(pictures(here)) & set(RANGE_COLORS)) > 50)
+    header = here.get_by_role("button", name="Within 3 bins")
+    header.click()
+    expect(here.locator("th[aria-sort=descending]")).to_have_text("Within 3 bins")
+    expect(first_row(here)).not_to_contain_text("Peak of the histogram")
+    expect(header).to_be_focused()
+    here.keyboard.press("Enter")
+    expect(here.locator("th[aria-sort=ascending]")).to_have_text("Within 3 bins")
+    expect(first_row(here)).to_contain_text("Peak of the histogram")
+    expect(here.locator("tbody").last).to_contain_text("Physical limit")
     another = here.get_by_role("checkbox", name="Matched filter", exact=True)
     another.check()
     expect(here.get_by_text("6 methods compared")).to_be_visible()
     expect(here.locator("tbody").first.locator("tr")).to_have_count(6)
-    # Explore is as it was.
-    press(here, "Explore")
-    expect(fact(here, "RMSE")).to_be_visible()
 
 
 @pytest.mark.browser
-def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all(here):
+def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all_in_dark_colors_too(here):
     before = fact(here, "Pixel").inner_text()
     box = pictures(here).locator(".bk-Figure").first.bounding_box()
     here.mouse.click(box["x"] + 0.4 * box["width"], box["y"] + 0.5 * box["height"])
@@ -387,23 +393,12 @@ def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all(here):
     curves = here.locator(".bk-Figure").filter(has_text="estimate, own lag removed")
     hues = {method_style(place, LIGHT)[0] for place in range(5)}
     eventually(lambda: hues <= colors_of(curves))
+    press(here, "Toggle theme")
+    eventually(lambda: {method_style(0, DARK)[0], DARK.paper} <= colors_of(curves))
 
 
 @pytest.mark.browser
-def test_the_table_is_sorted_by_click_and_by_keyboard(here):
-    header = here.get_by_role("button", name="Within 3 bins")
-    header.click()
-    expect(here.locator("th[aria-sort=descending]")).to_have_text("Within 3 bins")
-    expect(first_row(here)).not_to_contain_text("Peak of the histogram")
-    expect(header).to_be_focused()
-    here.keyboard.press("Enter")
-    expect(here.locator("th[aria-sort=ascending]")).to_have_text("Within 3 bins")
-    expect(first_row(here)).to_contain_text("Peak of the histogram")
-    expect(here.locator("tbody").last).to_contain_text("Physical limit")
-
-
-@pytest.mark.browser
-def test_clouds_turn_together(here):
+def test_clouds_turn_together_and_explore_is_as_it_was(here):
     press(here, "3D clouds")
     stages = here.locator(".stage").filter(visible=True)
     expect(stages).to_have_count(5)
@@ -414,13 +409,8 @@ def test_clouds_turn_together(here):
     here.keyboard.press("ArrowLeft")
     expect(stages.last).not_to_have_attribute("data-camera", before)
     eventually(lambda: len({each.get_attribute("data-camera") for each in stages.all()}) == 1)
-
-
-@pytest.mark.browser
-def test_it_follows_the_page_into_the_dark(here):
-    press(here, "Toggle theme")
-    curves = here.locator(".bk-Figure").filter(has_text="estimate, own lag removed")
-    eventually(lambda: {method_style(0, DARK)[0], DARK.paper} <= colors_of(curves))
+    press(here, "Explore")
+    expect(fact(here, "RMSE")).to_be_visible()
 
 
 @pytest.mark.browser

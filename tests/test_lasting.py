@@ -173,6 +173,7 @@ def test_an_uploaded_capture_survives_reload_and_lost_connection(browser, addres
     expect(read).to_be_visible()
     page.get_by_role("button", name="Explore", exact=True).click()
     eventually(lambda: "page=" not in here(page))
+    expect(fact(page, "Estimate")).to_have_text(re.compile("^6[6-9]"))  # of the capture, 21 km away
     page.get_by_label("Range image. Arrow keys move").press("Shift+ArrowDown")
     rests(page, "source=", "pixel=[")
     estimate, place = fact(page, "Estimate").inner_text(), pixel_on_show(page)

@@ -303,15 +303,15 @@ def titles(page: Page) -> dict[str, str]:
 
 
 @pytest.fixture
-def paper_page(start_page):
+def paper_page(page, address):
     """The Paper page with its first figures."""
-    start_page.get_by_role("button", name="Paper", exact=True).click()
-    expect(figure(start_page, "background alone")).to_be_visible()
-    return start_page
+    opened = page(f"{address}?page=Paper", ready=".bk-Figure")
+    expect(figure(opened, "background alone")).to_be_visible()
+    return opened
 
 
 @pytest.mark.browser
-def test_the_slider_of_figure_5_moves_the_curves(paper_page):
+def test_the_slider_of_figure_5_moves_the_curves_and_the_page_is_dark_where_the_app_is(paper_page):
     go(paper_page, "Figures 4, 5")
     pixel, curve = figure(paper_page, "small scale"), figure(paper_page, "the echo above")
     for each in (pixel, curve):
@@ -323,10 +323,17 @@ def test_the_slider_of_figure_5_moves_the_curves(paper_page):
         paper_page.keyboard.press("ArrowRight")
     eventually(lambda: "Both scales, echo at bin 70, SBR 0.08" in titles(paper_page))
     eventually(lambda: pixel.screenshot() != before[0] and curve.screenshot() != before[1])
+    paper_page.get_by_role("button", name="Toggle theme").click()
+    go(paper_page, "Figure 6")
+    expect(figure(paper_page, "weight cubic")).to_be_visible()
+    figures = ("Figure 1", "Figure 2", "Figure 6")
+    eventually(lambda: sum(text.startswith(figures) for text in titles(paper_page)) == 3)
+    colors = {color for text, color in titles(paper_page).items() if text.startswith(figures)}
+    assert colors == {DARK.text}
 
 
 @pytest.mark.browser
-def test_what_a_part_shows_is_below_each_other(paper_page):
+def test_what_a_part_shows_is_below_each_other_and_pictures_are_compared_at_a_pixel(paper_page):
     go(paper_page, "Figures 8, 9, 12")
     go(paper_page, "What the paper does not report")
     limit, *others = (
@@ -344,6 +351,12 @@ def test_what_a_part_shows_is_below_each_other(paper_page):
     for each in pictures:
         assert bottom(each) <= scale.bounding_box()["y"]
     assert bottom(scale) <= note.bounding_box()["y"]
+    expect(paper_page.get_by_text("Done: 1 figure.")).to_be_visible(timeout=60_000)
+    expect(paper_page.get_by_role("button", name=re.compile("^Cancel"))).to_be_disabled()
+    row = paper_page.get_by_role("textbox", name="Row", exact=True)
+    row.fill("0")
+    row.press("Enter")
+    eventually(lambda: "SBR 0.03: no target" in titles(paper_page))
 
 
 @pytest.mark.browser
@@ -364,25 +377,3 @@ def test_table_3_runs_at_the_chosen_sbr_and_can_be_cancelled(paper_page):
     stopped = paper_page.get_by_text(re.compile("^Stopped after .* of 100 repetitions"))
     expect(stopped).to_be_visible()
     expect(cancel).to_be_disabled()
-
-
-@pytest.mark.browser
-def test_the_page_is_dark_where_the_app_is(paper_page):
-    paper_page.get_by_role("button", name="Toggle theme").click()
-    go(paper_page, "Figure 6")
-    expect(figure(paper_page, "weight cubic")).to_be_visible()
-    figures = ("Figure 1", "Figure 2", "Figure 6")
-    eventually(lambda: sum(text.startswith(figures) for text in titles(paper_page)) == 3)
-    colors = {color for text, color in titles(paper_page).items() if text.startswith(figures)}
-    assert colors == {DARK.text}
-
-
-@pytest.mark.browser
-def test_range_images_are_compared_at_a_pixel(paper_page):
-    go(paper_page, "Figures 8, 9, 12")
-    expect(paper_page.get_by_text("Done: 1 figure.")).to_be_visible(timeout=60_000)
-    expect(paper_page.get_by_role("button", name=re.compile("^Cancel"))).to_be_disabled()
-    row = paper_page.get_by_role("textbox", name="Row", exact=True)
-    row.fill("0")
-    row.press("Enter")
-    eventually(lambda: "SBR 0.03: no target" in titles(paper_page))
