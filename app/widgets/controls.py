@@ -32,6 +32,9 @@ class Knob(Component):
 
     Unreliable values are marked on the slider; while one of them is set, a sentence says why. Only
     values between `low` and `high` can be set; the field refuses others with a sentence.
+
+    The `EditableFloatSlider` of panel-material-ui 0.16 follows a drag as fast, but it has no
+    logarithmic track, and its marks are points, not zones.
     """
 
     value = param.Number(default=0.0)
