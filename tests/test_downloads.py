@@ -457,6 +457,7 @@ def button(page, what):
 
 def download(page, what, suffix):
     """Download a file; return its name and content."""
+    page.wait_for_function("Bokeh.documents[0].is_idle")  # a card being filled closes its menu
     button(page, what).click()
     with page.expect_download(timeout=60_000) as asked:
         page.get_by_role("menuitem", name=suffix.upper()).filter(visible=True).click()
@@ -639,4 +640,6 @@ def test_every_page_saves_what_it_shows(start_page):
     assert name == "car_methods.csv"
     assert b"Physical limit" in table
     go("Paper")
+    first = start_page.locator(".bk-Figure").filter(has_text="background alone")
+    expect(first).to_be_visible()
     assert download(start_page, "curves", "csv")[0] == "paper_figure_1.csv"

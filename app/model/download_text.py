@@ -25,7 +25,8 @@ NO_POINTS = (
 
 _GOES_ON = "The page works as before."
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# If the disk is full before the first temporary file, Python finds no folder for it (ENOENT).
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOENT)
 
 
 def not_saved(error: Exception) -> str:
