@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -174,7 +175,15 @@ def test_an_uploaded_capture_survives_reload_and_lost_connection(browser, addres
     page.get_by_role("button", name="Explore", exact=True).click()
     eventually(lambda: "page=" not in here(page))
     expect(fact(page, "Estimate")).to_have_text(re.compile("^6[6-9]"))  # of the capture, 21 km away
-    page.get_by_label("Range image. Arrow keys move").press("Shift+ArrowDown")
+    picture = page.get_by_label("Range image. Arrow keys move")
+
+    def is_moved() -> bool:
+        picture.press("Shift+ArrowDown")
+        with suppress(AssertionError):  # the key met the arrival of the capture's own pixel
+            eventually(lambda: "pixel=[" in here(page), 10)
+        return "pixel=[" in here(page)
+
+    eventually(is_moved)
     rests(page, "source=", "pixel=[")
     estimate, place = fact(page, "Estimate").inner_text(), pixel_on_show(page)
 
