@@ -6,6 +6,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from io import BytesIO
 from itertools import cycle
 
@@ -47,8 +48,8 @@ pytestmark = pytest.mark.browser
 
 def colors(picture: np.ndarray) -> Counter[str]:
     """Return the number of pixels of each colour, by its #rrggbb."""
-    values, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
-    names = ("#{:02x}{:02x}{:02x}".format(*value) for value in values.tolist())
+    values, counts = np.unique(picture @ [1 << 16, 1 << 8, 1], return_counts=True)
+    names = (f"#{value:06x}" for value in values.tolist())
     return Counter(dict(zip(names, counts.tolist(), strict=True)))
 
 
@@ -76,6 +77,7 @@ def changed(page: Page, before: dict[str, np.ndarray], *names: str) -> Callable[
 # -- expected values, computed by core alone -------------------------------------------------------
 
 
+@cache
 def car(light: Illumination | None = None, tracking: TrackingParameters | None = None) -> core.Run:
     light, scene = light or Illumination(), core.scenes["car"]()
     acquisition = light.acquisition(scene.acquisition)
