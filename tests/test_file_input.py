@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from playwright.sync_api import expect
 
 from app.model.uploads import MAX_UPLOAD_BYTES
 from app.widgets.file_input import PART_BYTES, FileInput
@@ -76,17 +75,3 @@ def test_unfinished_files_are_not_kept(given, complaints):
         send(given, name=f"{n}.npz")
     assert "one file at a time" in complaints[0]
     assert len(complaints) == 25  # every second one is refused, with the one before it
-
-
-@pytest.mark.browser
-def test_a_file_that_is_too_large_is_refused_by_its_limit(page, tmp_path, troubles):
-    large = tmp_path / "large.npz"
-    with large.open("wb") as file:
-        file.truncate(MAX_UPLOAD_BYTES + 1)
-    opened = page()
-    opened.locator("input[type=file]").set_input_files(large)
-    alert = opened.get_by_role("alert").filter(has_text="large.npz")
-    expect(alert).to_contain_text("The limit is 100 MiB")
-    (trouble,) = troubles
-    assert "exceeds maximum file size" in trouble  # the widget's own line in the console
-    troubles.clear()

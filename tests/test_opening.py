@@ -98,16 +98,3 @@ def test_a_busy_server_does_not_delay_a_page_for_ever(monkeypatch):
     monkeypatch.setattr(opening.asyncio, "sleep", busy)
     asyncio.run(when_quiet())
     assert len(waits) == MOST_WAITS
-
-
-@pytest.mark.browser
-def test_the_widgets_module_is_fetched_once_and_early(page):
-    new = page()
-    started_ms = new.evaluate("""performance.getEntriesByType("resource")
-      .filter(({ name }) => name.includes("panel-material-ui.bundle.js"))
-      .map(({ startTime }) => startTime)""")
-    loaded_ms = new.evaluate(
-        "performance.timing.domContentLoadedEventStart - performance.timeOrigin"
-    )
-    assert len(started_ms) == 1
-    assert started_ms[0] < loaded_ms
