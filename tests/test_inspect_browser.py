@@ -1,4 +1,4 @@
-"""The Inspect page in a browser, on the 21 km capture and on the simulated building.
+"""The Inspect page in a browser, on the simulated building and on the 21 km capture.
 
 Expected numbers are computed by `core`.
 """
@@ -6,10 +6,10 @@ Expected numbers are computed by `core`.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
 from csv import DictReader
 from dataclasses import dataclass
 from io import StringIO
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,7 @@ from app.model.state import Illumination
 from app.pages.inspect import text
 from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
-from core.tests.captures import real_capture_path
-from tests.browser import VIEWS, chosen, enter, eventually, fact, field, serving, slider
+from tests.browser import VIEWS, chosen, enter, eventually, fact, field, slider, upload
 from tests.browser import image as picture
 from tests.test_downloads import columns_of, download
 from tests.test_lasting import here as address_of
@@ -30,12 +29,10 @@ from tests.test_lasting import rests
 
 pytestmark = pytest.mark.browser
 
-CAPTURE = "21km_K11_night.mat"
-
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A capture, and the address at which the app shows it."""
+    """A capture, and the address of a page that shows it or to which it is uploaded."""
 
     address: str
     capture: Capture
@@ -45,21 +42,15 @@ class Subject:
     pixel: tuple[int, int]
     """A pixel with a surface, which continues to its right."""
 
+    @property
+    def visible_m(self) -> np.ndarray:
+        """Ranges with enough confidence to be shown."""
+        confident = self.image.valid & (self.image.confidence >= 0.9)
+        return np.where(confident, self.image.range_m, np.nan)
 
-@dataclass(frozen=True, eq=False)
-class Inspected(Subject):
-    """A subject on a page of its own."""
 
-    page: Page
-
-
-@pytest.fixture(scope="module")
-def at_21_km() -> Iterator[Subject]:
-    """The real capture, opened as ``make app CAPTURE=path`` does."""
-    path = real_capture_path(CAPTURE)
-    capture = core.read_capture(path)
-    with serving(path) as address:
-        yield Subject(address, capture, ranged(capture), path.stem, (100, 190))
+def ranged(capture: Capture) -> RangeImage:
+    return core.run(capture, "tracking", core.TrackingParameters()).image
 
 
 @pytest.fixture(scope="module")
@@ -68,25 +59,8 @@ def facade(address: str) -> Subject:
     scene, illumination = core.scenes["building"](), Illumination()
     acquisition = illumination.acquisition(scene.acquisition)
     capture = core.simulate(scene, acquisition, illumination.flux, seed=illumination.seed)
-    address = f"{address}?source=building&page=Inspect"
+    address = f"{address}?source=building&page=Inspect&pixel=[30,20]"
     return Subject(address, capture, ranged(capture), "building", (30, 20))
-
-
-def ranged(capture: Capture) -> RangeImage:
-    return core.run(capture, "tracking", core.TrackingParameters()).image
-
-
-BOTH = pytest.mark.parametrize("here", ["at_21_km", "facade"], indirect=True)
-"""Run on the real capture as well; other tests use the building only."""
-
-
-@pytest.fixture
-def here(request: pytest.FixtureRequest, page: Callable[..., Page]) -> Inspected:
-    """The Inspect page on a capture, just opened."""
-    subject = request.getfixturevalue(getattr(request, "param", "facade"))
-    shown = page(subject.address)
-    expect(button(shown, "Inspect")).to_have_attribute("aria-pressed", "true")
-    return Inspected(**vars(subject), page=shown)
 
 
 # -- parts of the page -----------------------------------------------------------------------------
@@ -156,14 +130,6 @@ COUNTS, RATE, STAGES = "Counts, and the two scales", "Rate", "Residual, and enha
 # -- actions of a user -----------------------------------------------------------------------------
 
 
-def go_to(page: Page, row: int, col: int) -> None:
-    """Choose a pixel, and focus the map."""
-    enter(page, "Row", str(row))
-    enter(page, "Column", str(col))
-    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
-    picture(page).focus()
-
-
 def choose_map(page: Page, name: str) -> None:
     chosen(page, "Map").click()
     page.get_by_role("menuitem", name=name, exact=True).click()
@@ -205,35 +171,34 @@ def region_in(page: Page) -> tuple[tuple[float, float], ...]:
     return tuple(zip(map(float, numbers[::2]), map(float, numbers[1::2]), strict=True))
 
 
-# -- the pixel -------------------------------------------------------------------------------------
+# -- everything is as core computes it -------------------------------------------------------------
 
 
-@BOTH
-def test_everything_about_a_pixel_is_shown(here):
-    page, (row, col) = here.page, here.pixel
-    expect(button(page, "Inspect")).to_have_attribute("aria-pressed", "true")
-    go_to(page, row, col)
-    tracking = core.TrackingParameters()
-    report = inspection.pixel_report(here.capture, here.image, row, col, "tracking", tracking)
+def expect_pixel(page: Page, subject: Subject) -> None:
+    """Expect all about a pixel: numbers, on screen and saved, candidates and curves."""
+    row, col = subject.pixel
+    enter(page, "Row", str(row))
+    enter(page, "Column", str(col))
+    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
+    capture, tracking = subject.capture, core.TrackingParameters()
+    report = inspection.pixel_report(capture, subject.image, row, col, "tracking", tracking)
     for name, found in zip(("Signal S", "Background B", "SBR"), report.flux, strict=True):
         expect(fact(page, name)).to_have_text(text.interval(found))
     name, table = download(page, "numbers", "csv")
-    assert name == f"{here.name}_tracking_numbers-row{row}-col{col}.csv"
+    assert name == f"{subject.name}_tracking_numbers-row{row}-col{col}.csv"
     saved = {row["quantity"]: row for row in DictReader(StringIO(table.decode()))}["SBR"]
     sbr = report.flux.sbr
     ends = [float(saved[end]) for end in ("value", "low", "high")]
     assert ends == pytest.approx([sbr.value, sbr.low, sbr.high])
-    shown = fact(page, "Detections")
-    expect(shown).to_have_text(re.compile(rf"^{here.capture.counts[row, col]:,}( \(.* %\))?$"))
+    counts = re.compile(rf"^{capture.counts[row, col]:,}( \(.* %\))?$")
+    expect(fact(page, "Detections")).to_have_text(counts)
     verdict = f"Verdict: {report.verdict.health}. {report.verdict.why}"
     expect(page.get_by_text(verdict)).to_be_visible()
     for title in ("Rank", "Bin", "Score", "Probability"):
         expect(page.get_by_role("columnheader", name=title).filter(visible=True)).to_be_visible()
     ranks = page.get_by_role("rowheader").filter(visible=True)
     expect(ranks).to_have_text([str(n + 1) for n in range(len(report.candidates))])
-    signals = core.tracking_signals(
-        here.capture.cube[row, col], tracking, here.capture.gated_pulses
-    )
+    signals = core.tracking_signals(capture.cube[row, col], tracking, capture.gated_pulses)
     for title, layer, column, expected in (
         (COUNTS, "raw", "raw", signals.raw),
         (COUNTS, "raw", "small", signals.small),
@@ -247,28 +212,96 @@ def test_everything_about_a_pixel_is_shown(here):
         np.testing.assert_allclose(seen, expected, rtol=1e-6, err_msg=column)  # as 32-bit floats
 
 
-def test_keys_taps_and_fields_move_the_pixel(here):
-    page, (row, col) = here.page, here.pixel
-    go_to(page, row, col)
-    page.keyboard.press("ArrowRight")
-    page.keyboard.press("Shift+ArrowDown")
-    expect(fact(page, "Pixel")).to_have_text(f"{row + 8}, {col + 1}")
-    (down, across), tapped = place_at(page, 0.5, 0.4), within(page, 0.5, 0.4)
-    page.mouse.click(*tapped)
-    expect(fact(page, "Pixel")).to_have_text(f"{down:.0f}, {across:.0f}")
-    expect(field(page, "Row")).to_have_value(f"{down:.0f}")  # late, it would replace an entry
-    rows, _ = here.capture.shape
-    enter(page, "Row", str(rows))
-    refused = page.get_by_role("alert").filter(has_text=f"0 to {rows - 1}")
-    expect(refused).to_be_visible()
-    enter(page, "Row", str(row))
-    expect(fact(page, "Pixel")).to_have_text(re.compile(f"^{row}, "))
-    expect(refused).to_be_hidden()
+EACH = 17
+"""Only every so many-th pixel of a map is compared, since all take the browser a second."""
 
 
-def test_a_move_paints_each_plot_once_and_then_writes_the_numbers(here):
-    page, (row, col) = here.page, here.pixel
-    go_to(page, row, col)
+def is_mapped(page: Page, values: np.ndarray) -> bool:
+    """Return whether the map shows these values of pixels."""
+    seen = of_picture(
+        page,
+        "[...found.renderers.find((r) => r.glyph.type === 'Image')"
+        f".data_source.get_array('image')[0]].filter((_, at) => at % {EACH} === 0)",
+    )
+    shown, expected = np.array(seen, float), values.flat[::EACH]
+    return shown.shape == expected.shape and np.allclose(
+        shown, expected, rtol=1e-5, atol=1e-6, equal_nan=True
+    )
+
+
+def expect_maps(page: Page, subject: Subject) -> None:
+    capture, image = subject.capture, subject.image
+    expected = {
+        "Counts": capture.counts,
+        "Confidence": np.where(image.valid, image.confidence, np.nan),
+        **{name: find(capture) for name, find in inspection.maps.items()},
+        "Estimate": subject.visible_m,
+    }
+    if capture.truth_range_m is not None:
+        error_m = subject.visible_m - capture.truth_range_m
+        expected = {"Truth": capture.truth_range_m, "Error": error_m, **expected}
+    for name, values in expected.items():
+        choose_map(page, name)
+        eventually(lambda values=values: is_mapped(page, values))
+    _, content = download(page, "map", "csv")
+    *_, range_m = columns_of(content).values()
+    np.testing.assert_allclose(range_m, expected["Estimate"].ravel())
+
+
+def expect_report(page: Page, capture: Capture) -> None:
+    """Expect the capture's flux, how it was found, and the sum of all histograms."""
+    report = inspection.capture_report(capture)
+    for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.flux, strict=True):
+        expect(fact(page, name)).to_have_text(text.interval(found))
+    method = f"Signal, background and SBR: {report.flux_method}"
+    expect(page.get_by_text(method)).to_be_visible()
+    counts = drawn(page, "Counts of all pixels", "raw", "raw")
+    np.testing.assert_array_equal(counts, report.histogram)
+
+
+def expect_fewer_pulses(page: Page, capture: Capture) -> None:
+    """Reduce the pulses by the slider, and expect the sum of the histograms that are left."""
+    slide = slider(page, "Pulses used (of all)").filter(visible=True)
+    for _ in range(3):
+        slide.press("PageDown")
+    share = float(slide.get_attribute("aria-valuetext").split()[0])
+    assert 0.001 < share < 0.9
+    fewer = core.reductions.share_of_pulses(capture, share)
+    expect(fact(page, "Detections")).to_have_text(f"{fewer.counts.mean():.4g}")
+    counts = inspection.capture_report(fewer).histogram
+    eventually(lambda: np.array_equal(drawn(page, "Counts of all pixels", "raw", "raw"), counts))
+
+
+def expect_all(page: Page, subject: Subject) -> None:
+    expect(button(page, "Inspect")).to_have_attribute("aria-pressed", "true")
+    expect_pixel(page, subject)
+    expect_maps(page, subject)
+    button(page, "Capture").click()
+    expect_report(page, subject.capture)
+    expect_fewer_pulses(page, subject.capture)
+
+
+def test_a_scene_is_shown_as_core_computes_it(page, facade):
+    expect_all(page(facade.address), facade)
+
+
+def test_an_uploaded_capture_without_truth_is_shown_as_core_computes_it(
+    page, address, real_capture
+):
+    path = real_capture("21km_K11_night.mat")
+    capture = core.read_capture(path)
+    page = page(f"{address}?page=Inspect")
+    upload(page, path.name, path.read_bytes())
+    for name in ("Row", "Column"):  # the middle; written late, it would replace an entry
+        expect(field(page, name)).to_have_value(re.compile(r"^1\d\d$"))
+    expect_all(page, Subject(address, capture, ranged(capture), path.stem, (100, 190)))
+
+
+# -- the pixel -------------------------------------------------------------------------------------
+
+
+def note_paints(page: Page) -> None:
+    """Note in ``seen`` which plots are painted and when the numbers are written."""
     page.evaluate("""() => {
       const plot = Bokeh.Models.get("Figure").prototype.default_view.prototype;
       const paint = plot._actual_paint;
@@ -281,57 +314,33 @@ def test_a_move_paints_each_plot_once_and_then_writes_the_numbers(here):
     fact(page, "Pixel").locator("xpath=ancestor::dl").evaluate(
         "l => new MutationObserver(() => seen.push('numbers')).observe(l, { childList: true })"
     )
+
+
+def test_keys_taps_and_fields_move_the_pixel_and_the_zoom_stays(page, facade):
+    page, (row, col) = page(facade.address), facade.pixel
+    eventually(lambda: is_mapped(page, facade.visible_m))  # else its paint would count
+    picture(page).press("Shift+ArrowDown")
+    expect(fact(page, "Pixel")).to_have_text(f"{row + 8}, {col}")
+    note_paints(page)
     page.keyboard.press("ArrowRight")
-    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 1}")
+    expect(fact(page, "Pixel")).to_have_text(f"{row + 8}, {col + 1}")
     *painted, last = page.evaluate("seen")
     assert last == "numbers"
     assert len(painted) == len(set(painted)) == 4  # the picture, and three plots
+    (down, across), middle = place_at(page, 0.5, 0.4), within(page, 0.5, 0.4)
+    page.mouse.click(*middle)
+    expect(fact(page, "Pixel")).to_have_text(f"{down:.0f}, {across:.0f}")
+    expect(field(page, "Row")).to_have_value(f"{down:.0f}")  # late, it would replace an entry
+    rows, _ = facade.capture.shape
+    enter(page, "Row", str(rows))
+    refused = page.get_by_role("alert").filter(has_text=f"0 to {rows - 1}")
+    expect(refused).to_be_visible()
+    enter(page, "Row", str(row))
+    expect(fact(page, "Pixel")).to_have_text(re.compile(f"^{row}, "))
+    expect(refused).to_be_hidden()
 
-
-# -- the map ---------------------------------------------------------------------------------------
-
-
-EACH = 17
-"""Only every so many-th pixel of a map is compared, since all take the browser a second."""
-
-
-@BOTH
-def test_every_map_is_shown(here):
-    page, capture, image = here.page, here.capture, here.image
-    visible = image.valid & (image.confidence >= 0.9)
-    expected = {
-        "Counts": capture.counts,
-        "Confidence": np.where(image.valid, image.confidence, np.nan),
-        **{name: find(capture) for name, find in inspection.maps.items()},
-        "Estimate": np.where(visible, image.range_m, np.nan),
-    }
-    if capture.truth_range_m is not None:
-        error_m = np.where(visible, image.range_m - capture.truth_range_m, np.nan)
-        expected = {"Truth": capture.truth_range_m, "Error": error_m, **expected}
-    for name, values in expected.items():
-        choose_map(page, name)
-
-        def is_shown(values: np.ndarray = values) -> bool:
-            seen = of_picture(
-                page,
-                "[...found.renderers.find((r) => r.glyph.type === 'Image')"
-                f".data_source.get_array('image')[0]].filter((_, at) => at % {EACH} === 0)",
-            )
-            shown = np.array(seen, float)
-            return np.allclose(shown, values.flat[::EACH], rtol=1e-5, atol=1e-6, equal_nan=True)
-
-        eventually(is_shown)
-    _, content = download(page, "map", "csv")
-    *_, range_m = columns_of(content).values()
-    np.testing.assert_allclose(range_m, expected["Estimate"].ravel())
-
-
-def test_zoom_stays_when_map_and_pixel_change(here):
-    page, (row, col) = here.page, here.pixel
-    go_to(page, row, col)
     spans = "[found.x_range, found.y_range].flatMap(({start, end}) => [start, end])"
-    whole, middle = of_picture(page, spans), within(page, 0.5, 0.4)
-    page.mouse.move(*middle)
+    whole = of_picture(page, spans)
     page.mouse.wheel(0, -200)
     eventually(lambda: of_picture(page, spans) != whole)
     zoomed = of_picture(page, spans)
@@ -340,22 +349,12 @@ def test_zoom_stays_when_map_and_pixel_change(here):
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 7}")
     np.testing.assert_allclose(of_picture(page, spans), zoomed)
     page.mouse.dblclick(*middle)
-    last = here.capture.shape[0] - 0.5
 
     def shows_all() -> bool:
         left, right, top, bottom = of_picture(page, spans)
-        return min(left, bottom, top) <= -0.5 and min(right, max(top, bottom)) >= last
+        return min(left, bottom, top) <= -0.5 and min(right, max(top, bottom)) >= rows - 0.5
 
     eventually(shows_all)
-
-
-def test_what_a_drag_does_is_chosen_in_the_browser(here):
-    page = here.page
-    page.evaluate("""() => {
-      WebSocket.prototype.send = () => {};
-    }""")
-    for mode in TOOLS:
-        choose_drag(page, mode)
 
 
 # -- regions and pins ------------------------------------------------------------------------------
@@ -367,21 +366,21 @@ DRAGS = {
 }
 
 
-@pytest.mark.parametrize("mode", DRAGS)
-def test_a_region_is_dragged_outlined_and_its_sum_shown(here, mode):
-    page, capture = here.page, here.capture
+def expect_sum_of_dragged(page: Page, subject: Subject, mode: str) -> None:
+    """Drag a region in place of the present one; expect its outline and its summed histogram."""
+    before, capture = region_in(page), subject.capture
     dragged = [place_at(page, *each) for each in DRAGS[mode]]
     drag(page, mode, *DRAGS[mode])
     expect(button(page, "Region")).to_have_attribute("aria-pressed", "true")
-    rests(page, "region=[")
+    eventually(lambda: region_in(page) not in ((), before))
     region = region_in(page)
     inside = inspection.pixels_in(region, capture.shape)
     assert (len(region) == 4) == (mode == "Rectangle")
     for end in (np.min, np.max):  # a pixel of the screen is up to one of the picture
         np.testing.assert_allclose(end(region, axis=0), end(dragged, axis=0), atol=1)
-    expect(fact(page, "Pixels")).to_have_text(f"{inside.sum():,}")
     sum_of_all = capture.cube[inside].sum(axis=0)
-    np.testing.assert_array_equal(drawn(page, COUNTS, "raw", "raw"), sum_of_all)
+    eventually(lambda: np.array_equal(drawn(page, COUNTS, "raw", "raw"), sum_of_all))
+    expect(fact(page, "Pixels")).to_have_text(f"{inside.sum():,}")
     gated_pulses = capture.gated_pulses and capture.gated_pulses * int(inside.sum())
     signals = core.tracking_signals(sum_of_all, core.TrackingParameters(), gated_pulses)
     residual = drawn(page, STAGES, "residual", "residual")
@@ -395,27 +394,39 @@ def test_a_region_is_dragged_outlined_and_its_sum_shown(here, mode):
     name, content = download(page, "counts", "csv")
     rows, cols = np.nonzero(inside)
     place = f"rows{rows.min()}-{rows.max()}_cols{cols.min()}-{cols.max()}"
-    assert name == f"{here.name}_{place}_tracking_counts-region.csv"
+    assert name == f"{subject.name}_{place}_tracking_counts-region.csv"
     np.testing.assert_array_equal(columns_of(content)["counts"][: sum_of_all.size], sum_of_all)
+
+
+def test_regions_are_dragged_outlined_and_summed(page, facade):
+    page = page(facade.address)
+    for mode in DRAGS:
+        expect_sum_of_dragged(page, facade, mode)
     clear_region(page)
+    page.evaluate("() => { WebSocket.prototype.send = () => {}; }")
+    for mode in TOOLS:  # without the server
+        choose_drag(page, mode)
 
 
-def test_region_and_pins_outlast_a_reload(here):
-    page, (row, col) = here.page, here.pixel
-    go_to(page, row, col)
-    page.keyboard.press("p")
-    drag(page, "Lasso", *DRAGS["Lasso"])
-    n_pixels = fact(page, "Pixels").inner_text()
-    rests(page, "region=[", f"pins=[[{row},{col}]]", "subject=Region")
-    page.reload()
-    expect(fact(page, "Pixels")).to_have_text(n_pixels)
-    button(page, f"Remove {row}, {col}").press("Enter")
-    clear_region(page)
+def expect_every_unit(page: Page) -> None:
+    """Choose each unit; expect it at the axes of the pixel's plots and above its table."""
+    axes = "[...figure.below, ...figure.above].map((each) => each.axis_label)"
+    for unit, title, other in (
+        ("ns", "Time (ns)", "Range (m)"),
+        ("m", "Range (m)", "Bin"),
+        ("bins", "Bin", "Range (m)"),
+    ):
+        button(page, unit).click()
+        header = page.get_by_role("columnheader", name=title).filter(visible=True)
+        expect(header).to_be_visible()
+        assert in_figure(page, COUNTS, axes) == [title, other]
+        for each in (RATE, STAGES):
+            assert in_figure(page, each, axes) == [title]
 
 
-def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
-    page, (row, col) = here.page, here.pixel
-    go_to(page, row, col)
+def test_pixels_are_pinned_and_compared_shown_in_every_unit_and_read_out(page, facade):
+    page, (row, col) = page(facade.address), facade.pixel
+    picture(page).focus()
     pins = [(row, col + n) for n in range(4)]
     names = [f"{row}, {col}" for row, col in pins]
     for name in names:
@@ -428,73 +439,55 @@ def test_four_pixels_are_pinned_compared_and_a_fifth_is_refused(here):
     button(page, "Pins").click()
     headers = page.get_by_role("rowheader").filter(visible=True)
     expect(headers).to_have_text(names)
-    np.testing.assert_array_equal(
-        drawn(page, "Counts of the pinned", "lines", "ys"), [here.capture.cube[pin] for pin in pins]
-    )
+    counts = drawn(page, "Counts of the pinned", "lines", "ys")
+    np.testing.assert_array_equal(counts, [facade.capture.cube[pin] for pin in pins])
+    listed = ",".join(f"[{row},{col}]" for row, col in pins)
+    rests(page, f"pins=[{listed}]", "subject=Pins")
     while names:
         button(page, f"Remove {names.pop()}").press("Enter")
         expect(headers).to_have_text(names)
     expect(page.get_by_text(text.NO_PINS)).to_be_visible()
 
-
-def test_units_change_axes_and_table_and_the_pointer_reads_out_all(here):
-    page = here.page
-    for unit, title, other in (
-        ("ns", "Time (ns)", "Range (m)"),
-        ("m", "Range (m)", "Bin"),
-        ("bins", "Bin", "Range (m)"),
-    ):
-        button(page, unit).click()
-        header = page.get_by_role("columnheader", name=title).filter(visible=True)
-        expect(header).to_be_visible()
-        axes = "[...figure.below, ...figure.above].map((each) => each.axis_label)"
-        assert in_figure(page, COUNTS, axes) == [title, other]
-        for each in (RATE, STAGES):
-            assert in_figure(page, each, axes) == [title]
+    button(page, "Pixel").click()
+    expect_every_unit(page)
     page.mouse.move(*within(page, 0.5, 0.6, figure=1))
     tip = page.locator(".bk-Tooltip").filter(visible=True)
-    expect(tip).to_contain_text("Large scale")
-    expect(tip).to_contain_text(re.compile(r"\d ns"))
-    expect(tip).to_contain_text(re.compile(r"\d m"))
+    for each in ("Large scale", re.compile(r"\d ns"), re.compile(r"\d m")):
+        expect(tip).to_contain_text(each)
 
 
-def test_a_phone_shows_all_parts_below_each_other(page, facade):
-    page = page(facade.address, width=390, height=844)
-    shown = page.get_by_text("64 × 64 pixels, 334 bins")
-    for subject, n_plots in (("Capture", 3), ("Region", 1), ("Pins", 3), ("Pixel", 4)):
-        button(page, subject).click()
+def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other(page, facade):
+    region = "[[20,20],[20,40],[40,40],[40,20]]"
+    link = f"{facade.address}&subject=Region&region={region}&pins=[[30,20],[30,21]]"
+    page = page(link, width=390, height=844)
+    expect(fact(page, "Pixels")).to_have_text("441")
+    expect(page.get_by_text("Computing")).to_have_count(0)
+
+    def are_below_each_other(n_plots: int) -> bool:
         plots = page.locator(".bk-Figure").filter(visible=True)
-        expect(plots).to_have_count(n_plots)
-        bottom = 0.0
-        for box in [*(plot.bounding_box() for plot in plots.all()), shown.bounding_box()]:
-            assert 0 <= box["x"] < box["x"] + box["width"] <= 390
-            assert box["y"] >= bottom
-            bottom = box["y"] + box["height"]
+        size = page.get_by_text("64 × 64 pixels, 334 bins")
+        boxes = plots.or_(size).evaluate_all("all => all.map((e) => e.getBoundingClientRect())")
+        return (
+            len(boxes) == n_plots + 1
+            and all(0 <= box["left"] < box["right"] <= 390 for box in boxes)
+            and all(box["bottom"] <= below["top"] for box, below in pairwise(boxes))
+        )
+
+    for subject, n_plots in (("Region", 4), ("Capture", 3), ("Pixel", 4), ("Pins", 3)):
+        button(page, subject).click()
+        eventually(lambda n_plots=n_plots: are_below_each_other(n_plots))
+    expect(page.get_by_role("rowheader").filter(visible=True)).to_have_text(["30, 20", "30, 21"])
+    button(page, "Remove 30, 20").press("Enter")
+    button(page, "Region").click()
+    clear_region(page)
+    rests(page, "pins=[[30,21]]")
 
 
 # -- the capture as a whole ------------------------------------------------------------------------
 
 
-@pytest.fixture
-def whole(here) -> Inspected:
-    """The page with its section on the capture."""
-    button(here.page, "Capture").click()
-    return here
-
-
-@BOTH
-def test_the_capture_is_reported(whole):
-    report = inspection.capture_report(whole.capture)
-    for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.flux, strict=True):
-        expect(fact(whole.page, name)).to_have_text(text.interval(found))
-    shown = whole.page.get_by_text(f"Signal, background and SBR: {report.flux_method}")
-    expect(shown).to_be_visible()
-    counts = drawn(whole.page, "Counts of all pixels", "raw", "raw")
-    np.testing.assert_array_equal(counts, report.histogram)
-
-
-def test_accuracy_is_studied_and_a_bar_shows_the_progress(whole):
-    page = whole.page
+def test_accuracy_is_studied_with_a_progress_bar_and_suggestions_are_applied(page, facade):
+    page, capture = page(f"{facade.address}&subject=Capture"), facade.capture
     done = page.get_by_text(re.compile("^Done: 8"))
     expect(done).to_be_visible()
     *_, bar = page.get_by_role("progressbar").filter(visible=True).all()
@@ -512,27 +505,12 @@ def test_accuracy_is_studied_and_a_bar_shows_the_progress(whole):
     title = "Accuracy against number"
     near, taken = (drawn(page, title, "points", column) for column in ("value", "pulses"))
     expected = inspection.accuracy_over_pulses(
-        whole.capture, (SHARES[4], 1.0), "tracking", core.TrackingParameters()
+        capture, (SHARES[4], 1.0), "tracking", core.TrackingParameters()
     )
     np.testing.assert_allclose(near[[4, 7]], [each.within.value for each in expected])
-    np.testing.assert_allclose(taken, np.multiply(SHARES, whole.capture.acquisition.n_pulses or 1))
+    np.testing.assert_allclose(taken, np.multiply(SHARES, capture.acquisition.n_pulses or 1))
 
-
-@BOTH
-def test_fewer_pulses_are_taken_live(whole):
-    page, slide = whole.page, slider(whole.page, "Pulses used (of all)").filter(visible=True)
-    for _ in range(3):
-        slide.press("PageDown")
-    share = float(slide.get_attribute("aria-valuetext").split()[0])
-    assert 0.001 < share < 0.9
-    fewer = core.reductions.share_of_pulses(whole.capture, share)
-    expect(fact(page, "Detections")).to_have_text(f"{fewer.counts.mean():.4g}")
-    counts = inspection.capture_report(fewer).histogram
-    eventually(lambda: np.array_equal(drawn(page, "Counts of all pixels", "raw", "raw"), counts))
-
-
-def test_suggestions_are_shown_with_reasons_and_applied(whole):
-    page, suggested = whole.page, inspection.capture_report(whole.capture).suggestion
+    suggested = inspection.capture_report(capture).suggestion
     first, end = suggested.gate
     for shown in (
         f"Suggested gate, in bins: {first} to {end}. {suggested.why_gate}",
@@ -549,7 +527,7 @@ def test_suggestions_are_shown_with_reasons_and_applied(whole):
     expect(t_n).to_have_attribute("aria-valuetext", f"{suggested.t_n} bins")
     expect(apply_t_n).to_be_disabled()
     apply_gate.click()
-    rows, cols = whole.capture.shape
+    rows, cols = capture.shape
     expect(page.get_by_text(f"{rows} × {cols} pixels, {end - first} bins")).to_be_visible()
-    within_gate = core.reductions.cut_gate(whole.capture, first, end)
+    within_gate = core.reductions.cut_gate(capture, first, end)
     expect(fact(page, "Detections")).to_have_text(f"{within_gate.counts.mean():.4g}")
