@@ -21,8 +21,8 @@ from app.pages.session import Session
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
 from core.io import ReadOptions
-from tests.browser import eventually, fact
-from tests.test_downloads import columns_of, written
+from tests.browser import choose, eventually, fact
+from tests.test_downloads import columns_of, download, written
 from tests.threads import HeldTasks
 
 # -- what is computed ------------------------------------------------------------------------------
@@ -328,23 +328,8 @@ def test_every_source_can_be_shown_in_every_way(shown, key):
 # -- in a browser ----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def here(page, address):
-    """The Compare page with five methods of the car."""
-    opened = page(f"{address}?page=Compare", ready="tbody")
-    expect(opened.get_by_text("5 methods compared")).to_be_visible()
-    expect(opened.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
-    opened.wait_for_function("Bokeh.documents[0].is_idle")
-    return opened
-
-
 def press(page, name):
     page.get_by_role("button", name=name, exact=True).click()
-
-
-def open_source(page, title):
-    page.get_by_role("combobox", name=re.compile("^Scene or capture")).click()
-    page.get_by_role("menuitem", name=title, exact=True).click()
 
 
 def pictures(page):
@@ -361,29 +346,27 @@ def first_row(page):
     return page.locator("tbody tr").first.locator("th")
 
 
-@pytest.mark.browser
-def test_methods_stand_side_by_side_and_are_sorted_by_click_and_by_keyboard(here):
-    expect(here.locator("tbody").first.locator("tr")).to_have_count(5)
-    eventually(lambda: len(colors_of(pictures(here)) & set(RANGE_COLORS)) > 50)
-    header = here.get_by_role("button", name="Within 3 bins")
-    header.click()
-    expect(here.locator("th[aria-sort=descending]")).to_have_text("Within 3 bins")
-    expect(first_row(here)).not_to_contain_text("Peak of the histogram")
-    expect(header).to_be_focused()
-    here.keyboard.press("Enter")
-    expect(here.locator("th[aria-sort=ascending]")).to_have_text("Within 3 bins")
-    expect(first_row(here)).to_contain_text("Peak of the histogram")
-    expect(here.locator("tbody").last).to_contain_text("Physical limit")
-    another = here.get_by_role("checkbox", name="Matched filter", exact=True)
-    another.check()
-    expect(here.get_by_text("6 methods compared")).to_be_visible()
-    expect(here.locator("tbody").first.locator("tr")).to_have_count(6)
+def save_pictures_and_table(here):
+    expect(here.get_by_text(re.compile(r", confidence \d+ %")).nth(1)).to_be_visible()
+    name, png = download(here, "Peak of the histogram", "png")
+    assert name == "car_peak_least-confidence0_range-image.png"
+    assert Image.open(BytesIO(png)).height > 216  # with heading and colour scale
+    name, arrays = download(here, "Peak of the histogram", "npz")
+    assert name == "car_peak_least-confidence0_range-image.npz"
+    light, scene = Illumination(), core.scenes["car"]()
+    capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
+    peak = core.estimate(capture, "peak")
+    np.testing.assert_array_equal(np.load(BytesIO(arrays))["range_m"], peak.range_m)
+    name, table = download(here, "table", "csv")
+    assert name == "car_methods.csv"
+    assert b"Physical limit" in table
 
 
-@pytest.mark.browser
-def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all_in_dark_colors_too(here):
-    before = fact(here, "Pixel").inner_text()
-    box = pictures(here).locator(".bk-Figure").first.bounding_box()
+def choose_the_pixel_of_all(here):
+    """Choose the pixel by a tap and by a key; its curves have the colours of light and dark."""
+    before, first = fact(here, "Pixel").inner_text(), pictures(here).locator(".bk-Figure").first
+    first.scroll_into_view_if_needed()
+    box = first.bounding_box()
     here.mouse.click(box["x"] + 0.4 * box["width"], box["y"] + 0.5 * box["height"])
     expect(fact(here, "Pixel")).not_to_have_text(before)
     row, col = map(int, re.findall(r"\d+", fact(here, "Pixel").inner_text()))
@@ -397,8 +380,7 @@ def test_a_tap_and_the_arrow_keys_choose_the_pixel_of_all_in_dark_colors_too(her
     eventually(lambda: {method_style(0, DARK)[0], DARK.paper} <= colors_of(curves))
 
 
-@pytest.mark.browser
-def test_clouds_turn_together_and_explore_is_as_it_was(here):
+def turn_all_clouds(here):
     press(here, "3D clouds")
     stages = here.locator(".stage").filter(visible=True)
     expect(stages).to_have_count(5)
@@ -409,35 +391,39 @@ def test_clouds_turn_together_and_explore_is_as_it_was(here):
     here.keyboard.press("ArrowLeft")
     expect(stages.last).not_to_have_attribute("data-camera", before)
     eventually(lambda: len({each.get_attribute("data-camera") for each in stages.all()}) == 1)
-    press(here, "Explore")
-    expect(fact(here, "RMSE")).to_be_visible()
+
+
+def sort_by_click_and_by_key(here):
+    header = here.get_by_role("button", name="Within 3 bins")
+    header.click()
+    expect(here.locator("th[aria-sort=descending]")).to_have_text("Within 3 bins")
+    expect(first_row(here)).not_to_contain_text("Peak of the histogram")
+    expect(header).to_be_focused()
+    here.keyboard.press("Enter")
+    expect(here.locator("th[aria-sort=ascending]")).to_have_text("Within 3 bins")
+    expect(first_row(here)).to_contain_text("Peak of the histogram")
+    expect(here.locator("tbody").last).to_contain_text("Physical limit")
 
 
 @pytest.mark.browser
-def test_a_file_without_truth_says_what_is_not_known(here):
-    open_source(here, "Sample capture (file)")
+def test_methods_stand_side_by_side(page, address):
+    here = page(f"{address}?page=Compare", ready="tbody")
+    expect(here.get_by_text("5 methods compared")).to_be_visible()
+    expect(here.locator("tbody").first.locator("tr")).to_have_count(5)
+    expect(here.get_by_role("checkbox")).to_have_count(len(ESTIMATORS))
+    eventually(lambda: len(colors_of(pictures(here)) & set(RANGE_COLORS)) > 50)
+    save_pictures_and_table(here)
+    choose_the_pixel_of_all(here)
+    turn_all_clouds(here)
+    press(here, "Explore")  # is as it was
+    expect(fact(here, "RMSE")).to_be_visible()
+    press(here, "Compare")
+    sort_by_click_and_by_key(here)
+    here.get_by_role("checkbox", name="Matched filter", exact=True).check()
+    expect(here.get_by_text("6 methods compared")).to_be_visible()
+    expect(here.locator("tbody").first.locator("tr")).to_have_count(6)
+    choose(here, "Scene or capture", "Sample capture (file)")
     expect(here.get_by_text(text.AGREEMENT_ONLY)).to_be_visible()
     expect(here.get_by_role("button", name="Error", exact=True)).to_have_count(0)
     expect(here.get_by_text(re.compile("^Not possible here: .*true signal"))).to_be_visible()
     expect(here.get_by_text(text.LIMIT_UNKNOWN)).to_be_visible()
-
-
-@pytest.mark.browser
-def test_pages_fit_a_phone(page):
-    here = page(width=390, height=844)
-    expect(here.get_by_role("button", name="Toggle theme")).to_be_in_viewport(ratio=1)
-    here.get_by_role("button", name="Compare", exact=True).click()
-    expect(here.get_by_text(re.compile(r"^\d+ methods compared$"))).to_be_visible()
-    for picture in pictures(here).locator(".bk-Figure").all():
-        box = picture.bounding_box()
-        assert box["x"] >= 0
-        assert box["x"] + box["width"] <= 390
-    here.get_by_role("button", name="Paper", exact=True).click()
-    figure = here.locator(".bk-Figure").filter(has_text="background alone")
-    expect(figure).to_be_visible()
-    last = here.get_by_role("slider", name="SBR", exact=True).bounding_box()
-    assert figure.bounding_box()["y"] >= last["y"] + last["height"]
-    here.get_by_role("button", name="Explore", exact=True).click()
-    expect(here.get_by_text(re.compile("^simulated, seed 0"))).to_be_visible()
-    eventually(lambda: here.evaluate("Bokeh.documents[0].is_idle"))
-    expect(here.get_by_role("button", name="Open drawer")).to_be_visible()  # it is not open

@@ -24,7 +24,6 @@ from bokeh.models import Range1d
 from PIL import Image
 from playwright.sync_api import expect
 
-import core
 from app.model.colors import image_of, map_of, shown
 from app.model.exports import (
     Curve,
@@ -492,17 +491,13 @@ def as_seen(browser, content):
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)
 
 
-@pytest.mark.browser
-@pytest.mark.parametrize(
-    ("what", "title"), [("histogram", "Histogram of the pixel"), ("image", "Estimated range")]
-)
-def test_pictures_of_a_plot_show_what_is_on_screen(start_page, browser, what, title):
-    name, png = download(start_page, what, "png")
+def save_a_plot_as_a_picture(here, browser, what, title):
+    name, png = download(here, what, "png")
     assert name.startswith("car_tracking_")
     picture = Image.open(io.BytesIO(png))
-    assert list(picture.size) == size_of(start_page, what)
+    assert list(picture.size) == size_of(here, what)
     assert "simulated, seed 0" in picture.text["Description"]
-    svg_name, svg = download(start_page, what, "svg")
+    svg_name, svg = download(here, what, "svg")
     assert svg_name == name.replace(".png", ".svg")
     root = ElementTree.fromstring(svg)
     texts = {each.text for each in root.iter("{http://www.w3.org/2000/svg}text")}
@@ -527,21 +522,19 @@ LOOK_AT = """([start, end]) => {
 """Zoom the histogram and hide a curve by its legend."""
 
 
-@pytest.mark.browser
-def test_a_plots_table_follows_zoom_and_legend(start_page):
-    start_page.evaluate(LOOK_AT, [20.2, 30.9])
-    _, content = download(start_page, "histogram", "csv")
+def save_the_visible_part_of_a_plot(here):
+    here.evaluate(LOOK_AT, [20.2, 30.9])
+    _, content = download(here, "histogram", "csv")
     found = columns_of(content)
     assert (found["Bin"].min(), found["Bin"].max()) == (20.5, 30.5)
     assert "large scale (counts)" in found
     assert "small scale (counts)" not in found
 
 
-@pytest.mark.browser
-def test_a_cloud_is_saved_as_a_picture_and_as_points(start_page):
-    shown_points = int(start_page.locator(".stage").first.get_attribute("data-points"))
-    box = start_page.locator(".stage").first.bounding_box()
-    name, png = download(start_page, "3D cloud", "png")
+def save_a_cloud_as_picture_and_points(here):
+    stage = here.locator(".stage").first
+    shown_points, box = int(stage.get_attribute("data-points")), stage.bounding_box()
+    name, png = download(here, "3D cloud", "png")
     assert name == "car_tracking_cloud.png"
     picture = Image.open(io.BytesIO(png)).convert("RGB")
     assert picture.width == round(box["width"])
@@ -553,70 +546,44 @@ def test_a_cloud_is_saved_as_a_picture_and_as_points(start_page):
         ("las", lambda content: len(laspy.read(io.BytesIO(content)).x)),
         ("csv", lambda content: len(columns_of(content)["x_m"])),
     ):
-        name, content = download(start_page, "3D cloud", suffix)
+        name, content = download(here, "3D cloud", suffix)
         assert name == f"car_tracking_cloud.{suffix}"
         assert count_points(content) == shown_points
 
 
-@pytest.mark.browser
-def test_the_menu_works_by_keyboard_alone(start_page):
-    opener = button(start_page, "residual")
+def save_by_keyboard_alone(here):
+    opener = button(here, "residual")
     opener.focus()
-    start_page.keyboard.press("Enter")
-    items = start_page.get_by_role("menuitem").filter(visible=True)
+    here.keyboard.press("Enter")
+    items = here.get_by_role("menuitem").filter(visible=True)
     expect(items).to_have_count(3)
     expect(items.first).to_be_focused()
     expect(opener).to_have_attribute("aria-expanded", "true")
-    start_page.keyboard.press("Escape")
+    here.keyboard.press("Escape")
     expect(items).to_have_count(0)
     expect(opener).to_be_focused()
-    start_page.keyboard.press("ArrowDown")
+    here.keyboard.press("ArrowDown")
     expect(items.first).to_be_focused()
-    start_page.keyboard.press("ArrowUp")
+    here.keyboard.press("ArrowUp")
     expect(items.last).to_be_focused()
-    with start_page.expect_download() as asked:
-        start_page.keyboard.press("Enter")
+    with here.expect_download() as asked:
+        here.keyboard.press("Enter")
     assert asked.value.suggested_filename.endswith(".csv")
 
 
-@pytest.mark.browser
-def test_a_failure_is_reported_and_the_page_continues(start_page, troubles):
-    alert = start_page.get_by_role("alert").filter(has_text="Nothing was saved")
-    server = server_process(start_page.url)
-    _, hard = server.rlimit(psutil.RLIMIT_FSIZE)
-    server.rlimit(psutil.RLIMIT_FSIZE, (0, hard))  # as if the disk were full
-    try:
-        button(start_page, "image").click()
-        start_page.get_by_role("menuitem", name="NPZ").filter(visible=True).click()
-        expect(alert).to_contain_text("temporary files is full. Make room there")
-    finally:
-        server.rlimit(psutil.RLIMIT_FSIZE, (hard, hard))
-    start_page.evaluate("""() => {
-      const canvas = HTMLCanvasElement.prototype;
-      [window.kept, canvas.toBlob] = [canvas.toBlob, (done) => done(null)];
-    }""")
-    button(start_page, "residual").click()
-    start_page.get_by_role("menuitem", name="PNG").filter(visible=True).click()
-    expect(alert).to_contain_text("the picture could not be made (it is too large)")
-    start_page.evaluate("() => { HTMLCanvasElement.prototype.toBlob = window.kept; }")
-    assert download(start_page, "residual", "png")[1].startswith(b"\x89PNG")
-    assert np.load(io.BytesIO(download(start_page, "image", "npz")[1]))["range_m"].shape == (64, 64)
-
-
-@pytest.mark.browser
-def test_every_page_saves_what_it_shows(start_page):
-    def go(name):
-        start_page.get_by_role("button", name=name, exact=True).click()
-
-    name, table = download(start_page, "numbers", "csv")
+def save_numbers_as_shown(here):
+    name, table = download(here, "numbers", "csv")
     assert name == "car_tracking_numbers-row32-col32.csv"
     lines = {line["quantity"]: line for line in DictReader(io.StringIO(table.decode()))}
     for each in ("RMSE", "Confidence"):
-        value, unit = fact(start_page, each).inner_text().split()
+        value, unit = fact(here, each).inner_text().split()
         assert float(lines[each]["value"]) == pytest.approx(float(value), rel=1e-3)
         assert lines[each]["unit"] == unit
-    go("Inspect")
-    expect(start_page.get_by_role("rowheader", name="1", exact=True)).to_be_visible()
+
+
+def save_all_of_inspect(here):
+    here.get_by_role("button", name="Inspect", exact=True).click()
+    expect(here.get_by_role("rowheader", name="1", exact=True)).to_be_visible()
     for what, suffix, name in (
         ("map", "tif", "car_tracking_map-Estimate.tif"),
         ("numbers", "csv", "car_tracking_numbers-row32-col32.csv"),
@@ -624,22 +591,39 @@ def test_every_page_saves_what_it_shows(start_page):
         ("rate", "svg", "car_tracking_rate-row32-col32.svg"),
         ("table", "csv", "car_tracking_candidates-row32-col32.csv"),
     ):
-        assert download(start_page, what, suffix)[0] == name
-    go("Compare")
-    expect(start_page.get_by_text(re.compile(r", confidence \d+ %")).nth(1)).to_be_visible()
-    name, png = download(start_page, "Peak of the histogram", "png")
-    assert name == "car_peak_least-confidence0_range-image.png"
-    assert Image.open(io.BytesIO(png)).height > 216  # with heading and colour scale
-    name, arrays = download(start_page, "Peak of the histogram", "npz")
-    assert name == "car_peak_least-confidence0_range-image.npz"
-    light, scene = Illumination(), core.scenes["car"]()
-    capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
-    peak = core.estimate(capture, "peak")
-    np.testing.assert_array_equal(np.load(io.BytesIO(arrays))["range_m"], peak.range_m)
-    name, table = download(start_page, "table", "csv")
-    assert name == "car_methods.csv"
-    assert b"Physical limit" in table
-    go("Paper")
-    first = start_page.locator(".bk-Figure").filter(has_text="background alone")
-    expect(first).to_be_visible()
-    assert download(start_page, "curves", "csv")[0] == "paper_figure_1.csv"
+        assert download(here, what, suffix)[0] == name
+
+
+def fail_and_continue(here):
+    alert = here.get_by_role("alert").filter(has_text="Nothing was saved")
+    server = server_process(here.url)
+    _, hard = server.rlimit(psutil.RLIMIT_FSIZE)
+    server.rlimit(psutil.RLIMIT_FSIZE, (0, hard))  # as if the disk were full
+    try:
+        button(here, "image").click()
+        here.get_by_role("menuitem", name="NPZ").filter(visible=True).click()
+        expect(alert).to_contain_text("temporary files is full. Make room there")
+    finally:
+        server.rlimit(psutil.RLIMIT_FSIZE, (hard, hard))
+    here.evaluate("""() => {
+      const canvas = HTMLCanvasElement.prototype;
+      [window.kept, canvas.toBlob] = [canvas.toBlob, (done) => done(null)];
+    }""")
+    button(here, "residual").click()
+    here.get_by_role("menuitem", name="PNG").filter(visible=True).click()
+    expect(alert).to_contain_text("the picture could not be made (it is too large)")
+    here.evaluate("() => { HTMLCanvasElement.prototype.toBlob = window.kept; }")
+    assert download(here, "residual", "png")[1].startswith(b"\x89PNG")
+    assert np.load(io.BytesIO(download(here, "image", "npz")[1]))["range_m"].shape == (64, 64)
+
+
+@pytest.mark.browser
+def test_what_is_on_screen_is_saved(start_page, browser):
+    for what, title in (("histogram", "Histogram of the pixel"), ("image", "Estimated range")):
+        save_a_plot_as_a_picture(start_page, browser, what, title)
+    save_the_visible_part_of_a_plot(start_page)
+    save_a_cloud_as_picture_and_points(start_page)
+    save_by_keyboard_alone(start_page)
+    save_numbers_as_shown(start_page)
+    fail_and_continue(start_page)
+    save_all_of_inspect(start_page)

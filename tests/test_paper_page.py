@@ -32,7 +32,8 @@ from core import PRESETS, Flux
 from core.studies import outputs
 from core.studies.paper import figures as paper
 from core.studies.trials import Condition, trials
-from tests.browser import eventually
+from tests.browser import enter, eventually, slider
+from tests.test_downloads import download
 from tests.threads import HeldTasks
 
 # -- plots, pictures, tables -----------------------------------------------------------------------
@@ -275,10 +276,6 @@ def test_range_images_come_on_the_first_visit(session):
 # -- in a browser ----------------------------------------------------------------------------------
 
 
-def slider(page: Page, name: str) -> Locator:
-    return page.get_by_role("slider", name=name, exact=True)
-
-
 def go(page: Page, part: str) -> None:
     page.get_by_role("button", name=re.compile(f"^{part}")).click()
 
@@ -302,78 +299,93 @@ def titles(page: Page) -> dict[str, str]:
     )
 
 
-@pytest.fixture
-def paper_page(page, address):
-    """The Paper page with its first figures."""
-    opened = page(f"{address}?page=Paper", ready=".bk-Figure")
-    expect(figure(opened, "background alone")).to_be_visible()
-    return opened
-
-
-@pytest.mark.browser
-def test_the_slider_of_figure_5_moves_the_curves_and_the_page_is_dark_where_the_app_is(paper_page):
-    go(paper_page, "Figures 4, 5")
-    pixel, curve = figure(paper_page, "small scale"), figure(paper_page, "the echo above")
+def move_the_slider_of_figure_5(here: Page) -> None:
+    go(here, "Figures 4, 5")
+    pixel, curve = figure(here, "small scale"), figure(here, "the echo above")
     for each in (pixel, curve):
         expect(each).to_be_visible()
-    assert "Both scales, echo at bin 50, SBR 0.08" in titles(paper_page)
+    assert "Both scales, echo at bin 50, SBR 0.08" in titles(here)
     before = pixel.screenshot(), curve.screenshot()
-    slider(paper_page, "Echo's bin").focus()
+    slider(here, "Echo's bin").focus()
     for _ in range(20):
-        paper_page.keyboard.press("ArrowRight")
-    eventually(lambda: "Both scales, echo at bin 70, SBR 0.08" in titles(paper_page))
+        here.keyboard.press("ArrowRight")
+    eventually(lambda: "Both scales, echo at bin 70, SBR 0.08" in titles(here))
     eventually(lambda: pixel.screenshot() != before[0] and curve.screenshot() != before[1])
-    paper_page.get_by_role("button", name="Toggle theme").click()
-    go(paper_page, "Figure 6")
-    expect(figure(paper_page, "weight cubic")).to_be_visible()
+
+
+def change_to_dark(here: Page) -> None:
+    """Expect dark plots, those that are built later, too."""
+    here.get_by_role("button", name="Toggle theme").click()
+    go(here, "Figure 6")
+    expect(figure(here, "weight cubic")).to_be_visible()
     figures = ("Figure 1", "Figure 2", "Figure 6")
-    eventually(lambda: sum(text.startswith(figures) for text in titles(paper_page)) == 3)
-    colors = {color for text, color in titles(paper_page).items() if text.startswith(figures)}
+    eventually(lambda: sum(text.startswith(figures) for text in titles(here)) == 3)
+    colors = {color for text, color in titles(here).items() if text.startswith(figures)}
     assert colors == {DARK.text}
 
 
-@pytest.mark.browser
-def test_what_a_part_shows_is_below_each_other_and_pictures_are_compared_at_a_pixel(paper_page):
-    go(paper_page, "Figures 8, 9, 12")
-    go(paper_page, "What the paper does not report")
-    limit, *others = (
-        paper_page.locator("table").filter(has_text=text) for text in ("Cramér-Rao", "statement")
-    )
-    chart = figure(paper_page, "limit: probability")
+def cancel_table_3_at_another_sbr(here: Page) -> None:
+    go(here, "Table 3")
+    rows = here.locator("tbody tr").filter(visible=True)
+    expect(rows).to_have_count(len(paper.COMPARED))
+    peak = rows.filter(has_text="Peak of the histogram")
+    expect(peak).to_contain_text("0.2615")
+    for name, typed in (("SBR", "0.05"), ("Repetitions", "100")):
+        enter(here, name, typed)
+    here.get_by_role("button", name=re.compile("^Compute")).press("Enter")
+    expect(peak).not_to_contain_text("0.2615")
+    cancel = here.get_by_role("button", name=re.compile("^Cancel"))
+    cancel.press("Enter")
+    stopped = here.get_by_text(re.compile("^Stopped after .* of 100 repetitions"))
+    expect(stopped).to_be_visible()
+    expect(cancel).to_be_disabled()
+
+
+def expect_limits_below_each_other(here: Page) -> None:
+    go(here, "What the paper does not report")
+    limit, *others = (here.locator("table").filter(has_text=x) for x in ("Cramér-Rao", "statement"))
+    chart = figure(here, "limit: probability")
     for above, below in pairwise((chart, limit, *others)):
         eventually(lambda above=above, below=below: bottom(above) < below.bounding_box()["y"])
-    go(paper_page, "Figures 8, 9, 12")
-    note = paper_page.get_by_text(text.OUTSIDE_NOTE)
+
+
+def compare_pictures_at_a_pixel(here: Page) -> None:
+    go(here, "Figures 8, 9, 12")
+    note = here.get_by_text(text.OUTSIDE_NOTE)
     expect(note).to_be_visible()
-    drawn = paper_page.locator(".bk-Figure:visible")
+    drawn = here.locator(".bk-Figure:visible")
     eventually(lambda: drawn.count() == len(paper.NEAR) + 2)  # truth and scale, too
     *pictures, scale = sorted(drawn.all(), key=lambda each: each.bounding_box()["y"])
     for each in pictures:
         assert bottom(each) <= scale.bounding_box()["y"]
     assert bottom(scale) <= note.bounding_box()["y"]
-    expect(paper_page.get_by_text("Done: 1 figure.")).to_be_visible(timeout=60_000)
-    expect(paper_page.get_by_role("button", name=re.compile("^Cancel"))).to_be_disabled()
-    row = paper_page.get_by_role("textbox", name="Row", exact=True)
-    row.fill("0")
-    row.press("Enter")
-    eventually(lambda: "SBR 0.03: no target" in titles(paper_page))
+    expect(here.get_by_text("Done: 1 figure.")).to_be_visible()
+    expect(here.get_by_role("button", name=re.compile("^Cancel"))).to_be_disabled()
+    enter(here, "Row", "0")
+    eventually(lambda: "SBR 0.03: no target" in titles(here))
+
+
+def expect_a_phone_to_show_figure_and_sliders(here: Page) -> None:
+    here.set_viewport_size({"width": 390, "height": 844})
+    here.reload()
+    above, below = slider(here, "SBR"), figure(here, "background alone")
+    expect(below).to_be_visible()
+    eventually(lambda: bottom(above) <= below.bounding_box()["y"])
+    here.get_by_role("button", name="Explore", exact=True).click()
+    expect(here.get_by_text(re.compile("^simulated, seed 0"))).to_be_visible()
+    here.wait_for_function("Bokeh.documents[0].is_idle")
+    expect(here.get_by_role("button", name="Open drawer")).to_be_visible()  # it is not open
 
 
 @pytest.mark.browser
-def test_table_3_runs_at_the_chosen_sbr_and_can_be_cancelled(paper_page):
-    go(paper_page, "Table 3")
-    rows = paper_page.locator("tbody tr")
-    expect(rows).to_have_count(len(paper.COMPARED))
-    peak = rows.filter(has_text="Peak of the histogram")
-    expect(peak).to_contain_text("0.2615")
-    for name, typed in (("SBR", "0.05"), ("Repetitions", "100")):
-        field = paper_page.get_by_role("textbox", name=name, exact=True)
-        field.fill(typed)
-        field.press("Enter")
-    paper_page.get_by_role("button", name=re.compile("^Compute")).press("Enter")
-    expect(peak).not_to_contain_text("0.2615")
-    cancel = paper_page.get_by_role("button", name=re.compile("^Cancel"))
-    cancel.press("Enter")
-    stopped = paper_page.get_by_text(re.compile("^Stopped after .* of 100 repetitions"))
-    expect(stopped).to_be_visible()
-    expect(cancel).to_be_disabled()
+def test_what_the_paper_reports_is_computed_and_shown_part_by_part(page, address):
+    here = page(f"{address}?page=Paper", ready=".bk-Figure")
+    expect(figure(here, "background alone")).to_be_visible()
+    assert download(here, "curves", "csv")[0] == "paper_figure_1.csv"
+    move_the_slider_of_figure_5(here)
+    change_to_dark(here)
+    cancel_table_3_at_another_sbr(here)
+    go(here, "Figures 8, 9, 12")  # left before it is done
+    expect_limits_below_each_other(here)
+    compare_pictures_at_a_pixel(here)
+    expect_a_phone_to_show_figure_and_sliders(here)

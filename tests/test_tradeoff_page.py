@@ -27,7 +27,7 @@ from core import ESTIMATORS
 from core.scene import parts_of
 from core.studies.sensitivity import numbers
 from core.studies.tradeoff import Cancelled, best_within, cheapest_reaching, pareto_front
-from tests.browser import eventually
+from tests.browser import enter, eventually, field
 from tests.threads import HeldTasks, control
 
 
@@ -304,18 +304,16 @@ def test_every_setting_of_a_method_is_swept(session):
 
 
 @pytest.mark.browser
-def test_a_recommended_configuration_is_opened_by_a_click(start_page):
-    start_page.get_by_role("button", name="Trade-off", exact=True).click()
+def test_a_recommended_configuration_is_opened_by_a_click(page, address):
+    here = page(f"{address}?page=Trade-off", ready=".bk-Figure")
     for name, value in (("Repetitions", "2"), ("Timing rounds", "6")):
-        field = start_page.get_by_role("textbox", name=name, exact=True)
-        field.fill(value)
-        field.press("Enter")
-    start_page.get_by_role("button", name=re.compile("^Compute")).press("Enter")
-    done = start_page.get_by_text(re.compile("^Done: "))
+        enter(here, name, value)
+    here.get_by_role("button", name=re.compile("^Compute")).press("Enter")
+    done = here.get_by_text(re.compile("^Done: "))
     expect(done).to_be_visible(timeout=300_000)  # 360 images, on a machine that may be busy
-    expect(start_page.get_by_text(re.compile("^Most accurate within 10 ms: "))).to_be_visible()
-    expect(start_page.locator("tbody tr")).to_have_count(3 * len(ESTIMATORS))
+    expect(here.get_by_text(re.compile("^Most accurate within 10 ms: "))).to_be_visible()
+    expect(here.locator("tbody tr")).to_have_count(3 * len(ESTIMATORS))
     open_merged = f"Open: {ESTIMATORS['tracking'].title}, 2 bins merged"
-    start_page.get_by_role("button", name=open_merged, exact=True).press("Enter")
-    expect(start_page.get_by_text("50 bins of 2 ns")).to_be_visible()
-    expect(start_page.get_by_role("textbox", name="T_n", exact=True)).to_have_value("10")
+    here.get_by_role("button", name=open_merged, exact=True).press("Enter")
+    expect(here.get_by_text("50 bins of 2 ns")).to_be_visible()
+    expect(field(here, "T_n")).to_have_value("10")
