@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from concurrent.futures import ThreadPoolExecutor
+from http.client import HTTPConnection
 from types import SimpleNamespace
 
 import pytest
@@ -15,8 +16,8 @@ from tornado.httpclient import HTTPClientError
 from app.server.sessions import CHECK_S, RETRY_S, Bounds, Sessions
 from tests.browser import eventually, server_process, serving
 from tests.crowded import BOUNDS
-from tests.test_serving import Site
-from tests.wire import Wire, connected
+from tests.test_serving import UPGRADE, Site
+from tests.wire import Wire, connected, token_in
 
 
 class Kept:
@@ -183,8 +184,26 @@ def test_a_socket_opens_no_session(crowded):
     eventually(lambda: has_room(crowded))
 
 
+def open_pages(site, count):
+    """Connect sessions without a browser, as soon as there is room; return their connections."""
+    links = []
+
+    def all_entered():
+        status, _, text = site.ask()
+        if status == 200:
+            links.append(HTTPConnection("127.0.0.1", site.port, timeout=120))
+            headers = UPGRADE | {"Sec_WebSocket_Protocol": f"bokeh, {token_in(text)}"}
+            named = {name.replace("_", "-"): value for name, value in headers.items()}
+            links[-1].request("GET", "/ws", headers=named)
+            assert links[-1].getresponse().status == 101
+        return len(links) == count
+
+    eventually(all_entered)
+    return links
+
+
 @pytest.mark.browser
-def test_a_page_that_connects_too_late_is_reloaded(browser, crowded):
+def test_a_browser_that_finds_the_server_full_or_connects_too_late_gets_in_later(browser, crowded):
     page = browser.contexts[0].new_page()
     delays_s = iter([BOUNDS.unconnected_s + 3 * CHECK_S])
 
@@ -192,28 +211,14 @@ def test_a_page_that_connects_too_late_is_reloaded(browser, crowded):
         time.sleep(next(delays_s, 0.0))
         route.continue_()
 
-    eventually(lambda: has_room(crowded))
+    others = open_pages(crowded, BOUNDS.sessions)
     page.route("**/bokeh.min.js*", late)
     page.goto(crowded.address)
+    expect(page.get_by_role("status")).to_contain_text("no room for another session")
+    with page.expect_request("**/bokeh.min.js*", timeout=60_000):  # it has got in
+        others.pop().close()
     expect(page.locator(".stage[data-camera]").first).to_be_attached()
     assert next(delays_s, None) is None
     page.close()
-
-
-@pytest.mark.browser
-def test_a_browser_that_finds_the_server_full_gets_in_later(browser, crowded):
-
-    def opened():
-        page = browser.contexts[0].new_page()
-        page.goto(crowded.address)
-        return page
-
-    pages = [opened() for _ in range(BOUNDS.sessions)]
-    for page in pages:
-        expect(page.locator(".stage[data-camera]").first).to_be_attached()
-    late = opened()
-    expect(late.get_by_role("status")).to_contain_text("no room for another session")
-    pages[0].close()
-    expect(late.locator(".stage[data-camera]").first).to_be_attached()
-    for page in [*pages[1:], late]:
-        page.close()
+    for each in others:
+        each.close()
