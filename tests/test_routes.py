@@ -199,8 +199,9 @@ def test_a_foreign_page_can_neither_load_from_here_nor_connect(browser, marked):
     eventually(lambda: page.title() == "refused")
     eventually(lambda: log.read_text().count(f"403 GET {path}") == before + 3)
     assert not mark.exists()
-    page.click("#here")  # a link is welcome
-    page.locator(".stage[data-camera]").first.wait_for(state="attached")
+    with page.expect_navigation(wait_until="commit") as welcome:
+        page.click("#here")
+    assert welcome.value.status == 200
     page.close()
     foreign.shutdown()
     foreign.server_close()
