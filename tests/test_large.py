@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
 
 import core
 from app.__main__ import main
@@ -29,7 +23,7 @@ from core.inference.flux import flux_prior_of
 from core.io import ReadOptions
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
-from tests.browser import ROOT, fact, serving
+from tests.browser import ROOT
 from tests.test_app import alert_of, ask, values_of
 from tests.test_downloads import columns_of, written
 from tests.threads import HeldLayout, control
@@ -338,108 +332,3 @@ def test_a_damaged_part_is_reported_and_the_page_continues(app, path):
     control(app, "l").value = 0.01
     app.tasks.run_until(lambda: session.answer is not before)
     assert session.answer.request.tracking.l == 0.01
-
-
-# -- in a browser ----------------------------------------------------------------------------------
-
-SIDE = 512
-"""Rows and columns of a capture that is just too large for a preview of every pixel."""
-
-
-@pytest.fixture(scope="module")
-def served(tmp_path_factory):
-    """Path of a large capture, address of the app, and the capture."""
-    scene = core.scenes["car"]()
-    car = core.simulate(scene, scene.acquisition, core.Flux(sbr=1.0), seed=1)
-    times = SIDE // car.shape[0]
-    tiled = core.Capture(np.tile(car.cube, (times, times, 1)), car.acquisition, car.pulse)
-    path = write(tiled, tmp_path_factory.mktemp("served") / "cars.zarr", 128)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(LIMIT, str(2**20))
-        with serving(path) as address:
-            yield path, address, tiled
-
-
-def bounds(page: Page, rows: str, cols: str) -> None:
-    for name, text in (("Rows shown", rows), ("Columns shown", cols)):
-        page.get_by_label(name, exact=True).fill(text)
-        page.get_by_label(name, exact=True).press("Tab")
-
-
-def shows(page: Page, rows: str, cols: str) -> None:
-    for name, text in (("Rows shown", rows), ("Columns shown", cols)):
-        expect(page.get_by_label(name, exact=True)).to_have_value(text)
-
-
-def zoom(page: Page) -> None:
-    """Drag a box on the image."""
-    box = page.locator("[data-part=image]").bounding_box()
-    left, top = box["x"] + 0.4 * box["width"], box["y"] + 0.4 * box["height"]
-    page.mouse.move(left, top)
-    page.mouse.down()
-    page.mouse.move(left + 40, top + 40, steps=4)
-    page.mouse.up()
-    for name in ("Rows shown", "Columns shown"):
-        expect(page.get_by_label(name, exact=True)).to_have_value(re.compile("^[1-9]"))
-
-
-@contextmanager
-def endless(chunk: Path) -> Iterator[None]:
-    """Replace a chunk by one that takes for ever to be read."""
-    kept = chunk.read_bytes()
-    chunk.unlink()
-    os.mkfifo(chunk)
-    try:
-        yield
-    finally:
-        chunk.open("wb").close()  # readers see the end of the file
-        chunk.unlink()
-        chunk.write_bytes(kept)
-
-
-@pytest.mark.browser
-def test_a_large_capture_is_previewed_and_looked_at_closer(page, served):
-    path, address, capture = served
-    opened = page(address)
-    closer = opened.get_by_role("button", name="Read window")
-    cancel = opened.get_by_role("button", name="Cancel").filter(visible=True)
-    preview = opened.get_by_text(f"Preview of {SIDE} × {SIDE} pixels, 1 of each 2 × 2")
-    expect(preview).to_be_visible()
-    expect(cancel).to_be_disabled()  # all of the preview has been read
-    shows(opened, "0 to 511", "0 to 511")
-    zoom(opened)
-    closer.click()
-    line = opened.get_by_text(re.compile("^Shown: rows"))
-    expect(line).to_be_visible()
-    seen = re.fullmatch(r"Shown: rows (.*), columns (.*), of 512 × 512 pixels\.", line.inner_text())
-    shows(opened, *seen.groups())
-    first, last = map(int, seen[1].split(" to "))
-    assert 0 < first < last < SIDE - 1
-    # While something is read, the page can be used; and the reading can be cancelled.
-    chunk = path / "counts" / "c" / "0" / "0" / "0"
-    with endless(chunk):
-        bounds(opened, "0 to 63", "0 to 63")
-        closer.click()
-        expect(cancel).to_be_enabled()
-        before = fact(opened, "Pixel").inner_text()
-        opened.locator("[data-part=image]").focus()
-        opened.keyboard.press("ArrowLeft")
-        expect(fact(opened, "Pixel")).not_to_have_text(before)
-        row, col = map(int, re.findall(r"\d+", fact(opened, "Pixel").inner_text()))
-        expect(fact(opened, "Detections")).to_have_text(
-            re.compile(f"^{capture.counts[row, col]:,} ")
-        )
-        cancel.click()
-        expect(cancel).to_be_disabled()
-        expect(line).to_have_text(seen[0])
-    kept = chunk.read_bytes()
-    chunk.write_bytes(kept[:-9])
-    closer.click()
-    expect(opened.get_by_role("alert").filter(has_text="is damaged")).to_be_visible()
-    expect(line).to_have_text(seen[0])
-    chunk.write_bytes(kept)
-    closer.click()
-    expect(line).to_have_text("Shown: rows 0 to 63, columns 0 to 63, of 512 × 512 pixels.")
-    opened.get_by_role("button", name="Show all").click()
-    expect(preview).to_be_visible()
-    shows(opened, "0 to 511", "0 to 511")

@@ -12,7 +12,6 @@ from urllib.parse import urlencode
 
 import numpy as np
 import pytest
-from playwright.sync_api import expect
 
 from app.server.access import TOKEN_VARIABLE, Access
 from app.widgets.connection import serving_options
@@ -296,22 +295,3 @@ def test_sigterm_stops_at_any_time_and_cancels_long_work():
         rest = server.communicate(timeout=60)[0]
     assert {"begun", "now", "ended"} <= set(rest.split())
     assert server.returncode == 0
-
-
-# -- in a browser ----------------------------------------------------------------------------------
-
-
-@pytest.mark.browser
-def test_the_token_form_in_a_browser(browser):
-    with serving("--origin", "localhost", **{TOKEN_VARIABLE: TOKEN}) as running_at:
-        context = browser.new_context()
-        page = context.new_page()
-        page.goto(f"{running_at}?unit=ns")
-        page.get_by_label("Token").fill("something else")
-        page.get_by_role("button", name="Enter").click()
-        expect(page.get_by_role("alert")).to_contain_text("Wrong token")
-        page.get_by_label("Token").fill(TOKEN)
-        page.get_by_role("button", name="Enter").click()
-        page.locator(".stage[data-camera]").wait_for()
-        assert page.url == f"{running_at}?unit=ns"
-        context.close()

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import expect
 
 from app.model.state import Illumination
 from app.model.uploads import Bounds, Uploads, safe_name
 from core import Acquisition, Capture, save_capture
 from core.io import ReadOptions
-from tests.browser import serving
 
 
 class Session:
@@ -134,46 +132,3 @@ def test_a_full_disk_leaves_nothing_behind(folder, content, monkeypatch):
 )
 def test_a_stored_name_has_harmless_characters_only(name, kept):
     assert safe_name(name) == kept
-
-
-# -- in a browser ----------------------------------------------------------------------------------
-
-GIVEN = """<img src=x onerror=window.broken=1>"'.. &lt;b&gt;*.npz"""
-UPLOADED = """..<svg onload=window.broken=1>"'.npz"""
-DESCRIPTION = "<img src=x onerror=window.broken=1>*_made_*"
-
-
-def check_harmless(page):
-    assert page.evaluate("window.broken") is None
-    assert page.locator("img[src=x], [onload], [onerror]").count() == 0
-    assert page.title() == "firstphoton"
-
-
-@pytest.mark.browser
-def test_file_names_are_shown_as_text_on_every_page(page, tmp_path):
-    path = saved(tmp_path / GIVEN, source=DESCRIPTION)
-    with serving(path) as address:
-        new = page(address)
-        source = new.get_by_role("combobox", name=re.compile("^Scene or capture"))
-        for shown in ("Explore", "Compare", "Trade-off", "Paper", "Inspect"):
-            button = new.get_by_role("button", name=shown, exact=True)
-            button.click()
-            expect(button).to_have_attribute("aria-pressed", "true")
-            new.wait_for_function("Bokeh.documents[0].is_idle")
-            check_harmless(new)
-        expect(source).to_have_text(GIVEN)
-        expect(new.get_by_text("4 × 6 pixels, 37 bins")).to_contain_text(DESCRIPTION)
-        source.click()
-        expect(new.get_by_role("menuitem", name=GIVEN, exact=True)).to_be_visible()
-        check_harmless(new)
-        new.keyboard.press("Escape")
-        for content, names in (
-            (path.read_bytes(), source),
-            (b"no capture", new.get_by_role("alert")),
-        ):
-            file = {"name": UPLOADED, "mimeType": "application/octet-stream", "buffer": content}
-            new.locator("input[type=file]").set_input_files(file)
-            expect(new.get_by_role("button", name=UPLOADED, exact=True)).to_be_visible()
-            expect(names.filter(has_text=safe_name(UPLOADED))).to_be_visible()
-            check_harmless(new)
-        new.close()  # before its server stops
