@@ -280,6 +280,19 @@ def test_a_file_that_the_machine_cannot_read_is_no_bad_input(
     assert code == 1 and "counts.npy" in err and "Input/output error" in err
 
 
+EACH = """
+import sys
+from core.__main__ import main
+for command in sys.argv[1:]:
+    try:
+        code = main(command.split("\\n"))
+    except SystemExit as refusal:
+        code = refusal.code
+    print(end=f"\\0{code}\\0", flush=True)
+"""
+"""Run one command after the other, and print its exit code between NUL characters."""
+
+
 @pytest.mark.parametrize(
     ("locale", "name"), [("C", "gr\u00f6\u00dfe".encode()), ("C.UTF-8", b"n\xff")]
 )
@@ -290,26 +303,24 @@ def test_names_that_the_terminal_cannot_show(locale: str, name: bytes, frames: P
     path, out = (os.path.join(folder, name + suffix) for suffix in (b".npy", b"_out.tif"))
     os.rename(frames, path)
 
-    def ran(*arguments: bytes | str) -> subprocess.CompletedProcess[bytes]:
-        command = [sys.executable, "-m", "core", *arguments]
-        return subprocess.run(command, cwd=ROOT, env=plain, capture_output=True, check=False)
-
-    for arguments in (
-        ("info", path),
-        ("info", path, "--json"),
-        ("estimate", "peak", "--capture", path, "--out", out),
-        ("export", path, os.path.join(folder, name + b".nc")),
-    ):
-        done = ran(*arguments)
-        assert done.returncode == 0, done.stderr
-        if "--json" in arguments:
-            assert json.loads(done.stdout)["source"].endswith("all photons of a pulse")
-    again = ran("estimate", "peak", "--capture", path, "--out", out)
-    assert again.returncode == 2 and b"exists" in again.stderr
-    absent = ran("info", path + b".npz")
-    assert absent.returncode == 2 and b"an existing file" in absent.stderr
-    assert b"Traceback" not in again.stderr + absent.stderr
-    assert os.path.exists(out)
+    nc, absent = os.path.join(folder, name + b".nc"), path + b".npz"
+    commands = [
+        (b"info", path),
+        (b"info", path, b"--json"),
+        (b"estimate", b"peak", b"--capture", path, b"--out", out),
+        (b"export", path, nc),
+        (b"estimate", b"peak", b"--capture", path, b"--out", out),
+        (b"info", absent),
+    ]
+    joined = [b"\n".join(each) for each in commands]
+    command = [sys.executable, "-c", EACH, *joined]
+    done = subprocess.run(command, cwd=ROOT, env=plain, capture_output=True, check=True)
+    assert b"Traceback" not in done.stderr
+    assert b"exists" in done.stderr and b"an existing file" in done.stderr
+    shown = done.stdout.split(b"\x00")
+    assert [int(each) for each in shown[1::2]] == [0, 0, 0, 0, 2, 2]
+    assert json.loads(shown[2])["source"].endswith("all photons of a pulse")
+    assert os.path.exists(out) and os.path.exists(nc)
 
 
 def test_names_that_are_too_long(
