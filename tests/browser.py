@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory, TemporaryFile
 from typing import IO
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
@@ -59,17 +59,23 @@ READY = ".stage[data-camera], [aria-label='Pinned pixels']"
 @contextmanager
 def chromium() -> Iterator[Browser]:
     """Start a browser without a window; raise where there is none."""
-    with sync_playwright() as playwright:
-        browser = launch(playwright.chromium)
+    with sync_playwright() as playwright, launched(playwright.chromium) as browser:
         yield browser
-        browser.close()
 
 
-def launch(kind: BrowserType) -> Browser:
-    """Start a browser whose first context is that of `open_page`."""
-    browser = kind.launch(executable_path=browser_path(), args=ARGUMENTS)
-    browser.new_context()
-    return browser
+@contextmanager
+def launched(kind: BrowserType) -> Iterator[Browser]:
+    """Start a browser whose first context is that of `open_page`.
+
+    It has a folder of its own: in private contexts, each page would compile all scripts again.
+    """
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        context = kind.launch_persistent_context(
+            folder, executable_path=browser_path(), args=ARGUMENTS
+        )
+        assert context.browser is not None
+        yield context.browser
+        context.close()
 
 
 @contextmanager
@@ -110,7 +116,7 @@ def open_page(
 
     `prepare` is a script to run first; `watch` is called with the page before it loads anything.
     """
-    page = browser.contexts[0].new_page()  # of one context: scripts are cached
+    page = browser.contexts[0].new_page()
     page.set_viewport_size({"width": width, "height": height})
     watch(page)
     page.add_init_script(prepare)

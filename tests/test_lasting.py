@@ -8,7 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
-from playwright.sync_api import Locator, Page, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 
 import core
 from app.model.script import script_of
@@ -17,7 +17,7 @@ from tests.browser import (
     enter,
     eventually,
     fact,
-    launch,
+    launched,
     look,
     open_page,
     pixel_on_show,
@@ -197,12 +197,11 @@ def reconnect(page: Page, text: str) -> None:
     expect(page.get_by_role("alertdialog")).to_have_count(0)
 
 
-def test_a_page_recovers_from_the_loss_of_graphics_and_of_the_connection(browser, address):
-    own = launch(browser.browser_type)
-    page = open_page(own, address, prepare=CANVASES + CUT)
+def recover(browser: Browser, page: Page) -> None:
+    """Take the graphics from a page, then the connection, and expect both to return."""
     eventually(lambda: share_changed(page, look(page)) == 0)
     before = look(page)
-    own.new_browser_cdp_session().send("Browser.crashGpuProcess")
+    browser.new_browser_cdp_session().send("Browser.crashGpuProcess")
     page.wait_for_function("restored")
     # The symbols of legends are smoothed another way: 24 of 142,000 pixels of a plot.
     eventually(lambda: share_changed(page, before) < 0.001)
@@ -223,7 +222,11 @@ def test_a_page_recovers_from_the_loss_of_graphics_and_of_the_connection(browser
     eventually(lambda: share_changed(page, before, "cloud") == 0)
     slider(page, "Seed").press("ArrowRight")
     rests(page, "light.seed=1")
-    own.close()
+
+
+def test_a_page_recovers_from_the_loss_of_graphics_and_of_the_connection(browser, address):
+    with launched(browser.browser_type) as own:
+        recover(own, open_page(own, address, prepare=CANVASES + CUT))
 
 
 def test_an_expired_session_is_replaced_and_its_file_removed(
