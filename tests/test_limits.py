@@ -18,7 +18,7 @@ FORM = {"Content-Type": "application/x-www-form-urlencoded", "Host": NAME}
 HEAD = f"POST / HTTP/1.1\r\nHost: {NAME}\r\nContent-Type: application/x-www-form-urlencoded\r\n"
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def away():
     """A server that requires a token."""
     options = ("--address", "0.0.0.0", "--origin", NAME)
