@@ -10,6 +10,9 @@ BIN := $(VENV)/bin
 KERNELS := blocks capture detection estimators inspection matlab more_estimators posterior \
 	reductions simulate spatial speed tracking
 
+# Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform calibration results field large fuzz attack wheel clean
 
 help: ## list the commands
@@ -24,7 +27,7 @@ test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/mypy
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -n auto $(KERNELS:%=core/tests/test_%.py) --cov --cov-report=
 	$(BIN)/python -m pytest -n auto --dist loadfile core/tests --cov --cov-append --cov-fail-under=95
-	$(BIN)/python -m pytest -n 4 --dist loadfile tests -m "not browser"
+	$(BIN)/python -m pytest -n 3 --dist loadfile tests -m "not browser"
 	$(BIN)/python -m pytest -n auto --dist loadfile tests -m browser
 
 bench: $(VENV)/.test ## slider to changed pixels, through a real browser

@@ -10,8 +10,9 @@ import pytest
 
 from app.__main__ import main
 from app.server.access import TOKEN_VARIABLE
-from app.server.limits import HTTP_LIMITS, MOST_CONNECTIONS, WrongTokens
+from app.server.limits import MOST_CONNECTIONS, WrongTokens
 from tests.browser import eventually, server_process, serving
+from tests.crowded import TIMES_S
 from tests.test_serving import NAME, TOKEN, Site
 
 FORM = {"Content-Type": "application/x-www-form-urlencoded", "Host": NAME}
@@ -20,9 +21,10 @@ HEAD = f"POST / HTTP/1.1\r\nHost: {NAME}\r\nContent-Type: application/x-www-form
 
 @pytest.fixture(scope="module")
 def away():
-    """A server that requires a token."""
+    """A server that requires a token and waits for a short time only."""
     options = ("--address", "0.0.0.0", "--origin", NAME)
-    with serving(*options, **{TOKEN_VARIABLE: TOKEN}) as running_at:
+    given = {TOKEN_VARIABLE: TOKEN}
+    with serving(*options, module="tests.crowded", **given) as running_at:
         yield Site(running_at)
 
 
@@ -75,8 +77,7 @@ def test_incomplete_requests_end_and_block_no_client(away):
         for n in range(MOST_CONNECTIONS + 50)
     ]
     assert away.ask("/", Host=NAME)[0] == 403
-    late_s = HTTP_LIMITS["idle_connection_timeout"] + HTTP_LIMITS["body_timeout"]
-    time.sleep(late_s)
+    time.sleep(sum(TIMES_S.values()))
     eventually(lambda: all(map(is_ended, halves)))
     for half in halves:
         half.close()

@@ -13,7 +13,7 @@ from bokeh.util.token import generate_jwt_token, generate_session_id
 from playwright.sync_api import expect
 from tornado.httpclient import HTTPClientError
 
-from app.server.sessions import CHECK_S, RETRY_S, Bounds, Sessions
+from app.server.sessions import Bounds, Sessions
 from tests.browser import eventually, server_process, serving
 from tests.crowded import BOUNDS
 from tests.test_serving import UPGRADE, Site
@@ -50,7 +50,7 @@ def test_only_a_session_without_a_browser_ends():
     clock = Clock()
     sessions = kept_by(late, early, served, clock=clock)
     sessions.connected(served)
-    clock.s += CHECK_S
+    clock.s += Bounds.check_s
     sessions.check()
     assert (late.is_ended, early.is_ended, served.is_ended) == (True, False, False)
 
@@ -61,7 +61,7 @@ def test_a_busy_server_accepts_connections_before_it_ends_a_session():
     clock.s += 30
     sessions.check()
     assert not late.is_ended
-    clock.s += CHECK_S
+    clock.s += Bounds.check_s
     sessions.check()
     assert late.is_ended
 
@@ -110,8 +110,8 @@ def crowded():
 def has_room(site):
     status, headers, text = site.ask()
     if status == 503:
-        assert headers["Retry-After"] == str(RETRY_S)
-        assert "no room" in text and f'content="{RETRY_S}"' in text
+        assert headers["Retry-After"] == str(BOUNDS.retry_s)
+        assert "no room" in text and f'content="{BOUNDS.retry_s}"' in text
     return status == 200
 
 
@@ -205,7 +205,7 @@ def open_pages(site, count):
 @pytest.mark.browser
 def test_a_browser_that_finds_the_server_full_or_connects_too_late_gets_in_later(browser, crowded):
     page = browser.contexts[0].new_page()
-    delays_s = iter([BOUNDS.unconnected_s + 3 * CHECK_S])
+    delays_s = iter([BOUNDS.unconnected_s + 3 * BOUNDS.check_s])
 
     def late(route):
         time.sleep(next(delays_s, 0.0))

@@ -10,7 +10,7 @@ from panel.io.server import DocHandler
 from tornado.web import HTTPError, OutputTransform
 
 from app.server.messages import full_page
-from app.server.sessions import RETRY_S, Sessions
+from app.server.sessions import Sessions
 
 QUIET_S = 0.1
 """Time without requests after which a browser has the files of the head. They come from the thread
@@ -52,10 +52,11 @@ class PageHandler(DocHandler):
             if has_room:
                 await super().get(*arguments, **options)
                 return
+        retry_s = self._sessions.bounds.retry_s
         self.set_status(503)
-        self.set_header("Retry-After", str(RETRY_S))
+        self.set_header("Retry-After", str(retry_s))
         self.set_header("Cache-Control", "no-store")
-        self.finish(full_page(RETRY_S))
+        self.finish(full_page(retry_s))
 
     def on_connection_close(self) -> None:
         """Record that the browser has left."""

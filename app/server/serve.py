@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import panel as pn
@@ -23,6 +23,7 @@ def server_of(
     port: int,
     linger_s: float = LINGER_S,
     bounds: Bounds | None = None,
+    http_limits: Mapping[str, Any] = HTTP_LIMITS,
 ) -> Server:
     """Return a server that has not been started.
 
@@ -38,6 +39,8 @@ def server_of(
         Seconds for which a session is kept after its page was closed or disconnected.
     bounds : Bounds, optional
         Limits on all sessions together.
+    http_limits : mapping
+        Options of the HTTP server.
 
     Raises
     ------
@@ -52,7 +55,7 @@ def server_of(
         address=address,
         websocket_origin=sorted(access.hosts),
         websocket_max_message_size=MOST_MESSAGE_BYTES,
-        http_server_kwargs=dict(HTTP_LIMITS),
+        http_server_kwargs=dict(http_limits),
         transforms=[Headers, ResponseCount],
         title="firstphoton",
         verbose=False,

@@ -19,17 +19,11 @@ from bokeh.server.contexts import ApplicationContext
 from bokeh.server.session import ServerSession
 from tornado.ioloop import PeriodicCallback
 
-CHECK_S = 2.0
-"""Interval at which unconnected sessions are checked."""
-
 POLL_S = 0.1
 """Interval at which a waiting page checks whether it can be built."""
 
 PAUSE = 0.5
 """Pause after a page was built, as a share of the time that took; open pages respond in it."""
-
-RETRY_S = 10
-"""Time after which a browser that found the server full asks again."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +38,10 @@ class Bounds:
         Most sessions without a browser; the next page waits until one is connected or has ended.
     unconnected_s : float
         Seconds after which a session without a browser ends.
+    check_s : float
+        Seconds between two searches for such sessions.
+    retry_s : int
+        Seconds after which a browser that found the server full asks again.
     queued : int
         Most pages that wait to be built.
     memory_bytes : int
@@ -54,6 +52,8 @@ class Bounds:
     sessions: int = 100
     unconnected: int = 6
     unconnected_s: float = 20.0
+    check_s: float = 2.0
+    retry_s: int = 10
     queued: int = 30
     memory_bytes: int = field(default_factory=lambda: psutil.virtual_memory().total // 2)
 
@@ -85,13 +85,13 @@ class Sessions:
         clock: Callable[[], float] = monotonic,
     ) -> None:
         self._context = context
-        self._bounds = bounds or Bounds()
+        self.bounds = bounds or Bounds()
         self._memory, self._clock = memory, clock
         self._connected: WeakSet[ServerSession] = WeakSet()
         self._n_opening = 0
         self._building, self._next_build_s = asyncio.Lock(), clock()
         self._checked_s = clock()
-        self._checks = PeriodicCallback(self.check, 1000 * CHECK_S)
+        self._checks = PeriodicCallback(self.check, 1000 * self.bounds.check_s)
 
     def start(self) -> None:
         """Start to end sessions without a browser."""
@@ -126,7 +126,7 @@ class Sessions:
         """Build pages one at a time, with pauses in between."""
         async with self._building:
             await asyncio.sleep(max(0.0, self._next_build_s - self._clock()))
-            while len(self._unconnected()) >= self._bounds.unconnected:
+            while len(self._unconnected()) >= self.bounds.unconnected:
                 await asyncio.sleep(POLL_S)
             begun_s = self._clock()
             try:
@@ -138,12 +138,12 @@ class Sessions:
     def check(self) -> None:
         """End the sessions that have waited too long for their browser."""
         now_s = self._clock()
-        is_late = now_s - self._checked_s > 2 * CHECK_S
+        is_late = now_s - self._checked_s > 2 * self.bounds.check_s
         self._checked_s = now_s
         if is_late:  # the server was busy, and connections may not be accepted yet
             return
         for session in self._unconnected():
-            if session.milliseconds_since_last_unsubscribe > 1000 * self._bounds.unconnected_s:
+            if session.milliseconds_since_last_unsubscribe > 1000 * self.bounds.unconnected_s:
                 session.request_expiration()
 
     def _unconnected(self) -> list[ServerSession]:
@@ -151,7 +151,7 @@ class Sessions:
 
     def _has_room(self) -> bool:
         """Whether one more session fits, after ending sessions whose page was closed."""
-        bounds = self._bounds
+        bounds = self.bounds
         closed = [
             each
             for each in self._context.sessions
