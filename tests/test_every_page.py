@@ -8,7 +8,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from app.pages.catalog import PAGES
-from tests.browser import VIEWS, eventually
+from tests.browser import VIEWS, eventually, slider, stage
 
 pytestmark = pytest.mark.browser
 
@@ -52,3 +52,7 @@ def test_every_page_opens_first_with_plots_that_can_be_read(page, address):
         expect(opened).to_have_url(re.compile(f"page={name}"))
         opened.reload()
         expect_readable(opened, name)
+    opened.get_by_role("button", name=first, exact=True).click()  # the window has become narrow
+    expect(stage(opened)).to_be_visible()
+    expect(opened.get_by_role("button", name="Open drawer")).to_be_visible()
+    expect(slider(opened, "SBR")).not_to_be_in_viewport()

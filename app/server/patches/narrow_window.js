@@ -1,6 +1,6 @@
-// Open a page in a narrow window with the sidebar closed.
+// Keep the sidebar closed in a narrow window.
 //
-// Panel's template opens its sidebar on top of the page, which it covers until everything is drawn.
+// Panel's template opens its sidebar on top of the page, which it covers.
 // Upstream: none found. Fixes: the page is covered on a phone.
 {
   // Width below which the sidebar covers the page.
@@ -10,8 +10,11 @@
   const { initialize } = view;
   view.initialize = function () {
     const { data } = this.model;
-    if ("is_narrow" in data.attributes && window.innerWidth < NARROW_PX)
-      data.setv({ sidebar_open: false, is_narrow: true });
+    if ("is_narrow" in data.attributes) {
+      const narrow = matchMedia(`(width < ${NARROW_PX}px)`);
+      if (narrow.matches) data.setv({ sidebar_open: false, is_narrow: true });
+      narrow.addEventListener("change", ({ matches }) => data.setv({ is_narrow: matches }));
+    }
     initialize.call(this);
   };
 }
