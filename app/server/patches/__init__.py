@@ -66,7 +66,6 @@ PATCHES = (
     Patch("latest_value", _BOKEH),
     Patch("legend_items", _BOKEH),
     Patch("lost_graphics", _BOKEH),
-    Patch("missing_layout", _BOKEH),
     Patch("narrow_window", _PANEL),
     Patch("server_wins", _PANEL),
     Patch("session_ended", _BOKEH),
