@@ -21,6 +21,7 @@ help: ## list the commands
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
 
+# Tests of the app's server often wait, so a third worker has something to do on two cores.
 test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

@@ -16,6 +16,7 @@ import sys
 import webbrowser
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import panel as pn
@@ -102,6 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
     tune()
     apply_patches()
     garbage.freeze_all()
+    gettempdir()  # is chosen by writing to it: on a full disk, Python would find no folder at all
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
     if chosen.show:

@@ -12,9 +12,9 @@ from app.server.sessions import Bounds
 
 BOUNDS = Bounds(sessions=4, unconnected=2, unconnected_s=4.0, check_s=0.5, retry_s=2, queued=3)
 
-TIMES_S = {"body_timeout": 2.0, "idle_connection_timeout": 3.0}
-"""Times of the HTTP server."""
+HTTP = {name: n / 5 if name.endswith("timeout") else n for name, n in HTTP_LIMITS.items()}
+"""Limits of the HTTP server, with a fifth of its times."""
 
 if __name__ == "__main__":
-    started.server_of = partial(server_of, bounds=BOUNDS, http_limits=HTTP_LIMITS | TIMES_S)
+    started.server_of = partial(server_of, bounds=BOUNDS, http_limits=HTTP)
     sys.exit(started.main())

@@ -24,6 +24,7 @@ from core import PRESETS, TrackingParameters
 from core.io.readers.npz import FORMAT
 from core.parameters import spec_of
 from tests.browser import (
+    VIEWS,
     choose,
     chosen,
     enter,
@@ -517,9 +518,10 @@ def move_at_once(page: Page) -> None:
     assert page.evaluate("values") in (1, 2)
 
 
-CHANGE_QUICKLY = """async () => {
-  const models = [...Bokeh.documents[0]._all_models.values()];
-  const all = models.map(({ data }) => data);
+CHANGE_QUICKLY = (
+    f"async () => {{ {VIEWS}"
+    + """
+  const all = views.map(({ model }) => model.data);
   const themed = all.filter((data) => data?.attributes?.dark_theme === false);
   const wait = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
   let reverted = 0;
@@ -533,6 +535,7 @@ CHANGE_QUICKLY = """async () => {
   }
   return { components: themed.length, reverted };
 }"""
+)
 
 
 def test_fast_moves_are_followed_at_little_cost_and_the_last_value_stays(start_page):

@@ -510,15 +510,17 @@ def save_a_plot_as_a_picture(here, browser, what, title):
     assert np.abs(one - other).mean() < 6  # letters may be of another font
 
 
-LOOK_AT = """([start, end]) => {
-  const models = [...Bokeh.documents[0]._all_models.values()];
-  const figure = models.find(
-    ({type, title}) => type === "Figure" && title?.text?.startsWith("Histogram of the pixel"));
+LOOK_AT = (
+    f"([start, end]) => {{ {VIEWS}"
+    + """
+  const { model: figure } = views.find(({ model: { type, title } }) =>
+    type === "Figure" && title?.text?.startsWith("Histogram of the pixel"));
   figure.x_range.setv({start, end});
   const legend = figure.center.find(({type}) => type === "Legend");
   const item = legend.items.find(({label}) => label.value === "small scale");
   item.renderers[0].visible = false;
 }"""
+)
 """Zoom the histogram and hide a curve by its legend."""
 
 
@@ -619,11 +621,11 @@ def fail_and_continue(here):
 
 @pytest.mark.browser
 def test_what_is_on_screen_is_saved(start_page, browser):
+    fail_and_continue(start_page)  # on a disk that is full from the beginning
     for what, title in (("histogram", "Histogram of the pixel"), ("image", "Estimated range")):
         save_a_plot_as_a_picture(start_page, browser, what, title)
     save_the_visible_part_of_a_plot(start_page)
     save_a_cloud_as_picture_and_points(start_page)
     save_by_keyboard_alone(start_page)
     save_numbers_as_shown(start_page)
-    fail_and_continue(start_page)
     save_all_of_inspect(start_page)

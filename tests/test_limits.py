@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import time
 from urllib.parse import urlencode
 
 import pytest
@@ -12,7 +11,6 @@ from app.__main__ import main
 from app.server.access import TOKEN_VARIABLE
 from app.server.limits import MOST_CONNECTIONS, WrongTokens
 from tests.browser import eventually, server_process, serving
-from tests.crowded import TIMES_S
 from tests.test_serving import NAME, TOKEN, Site
 
 FORM = {"Content-Type": "application/x-www-form-urlencoded", "Host": NAME}
@@ -23,8 +21,8 @@ HEAD = f"POST / HTTP/1.1\r\nHost: {NAME}\r\nContent-Type: application/x-www-form
 def away():
     """A server that requires a token and waits for a short time only."""
     options = ("--address", "0.0.0.0", "--origin", NAME)
-    given = {TOKEN_VARIABLE: TOKEN}
-    with serving(*options, module="tests.crowded", **given) as running_at:
+    chosen = {TOKEN_VARIABLE: TOKEN}
+    with serving(*options, module="tests.crowded", **chosen) as running_at:
         yield Site(running_at)
 
 
@@ -77,7 +75,6 @@ def test_incomplete_requests_end_and_block_no_client(away):
         for n in range(MOST_CONNECTIONS + 50)
     ]
     assert away.ask("/", Host=NAME)[0] == 403
-    time.sleep(sum(TIMES_S.values()))
     eventually(lambda: all(map(is_ended, halves)))
     for half in halves:
         half.close()

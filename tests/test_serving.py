@@ -6,7 +6,7 @@ import re
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from http.client import HTTPConnection
 from urllib.parse import urlencode
 
@@ -37,20 +37,30 @@ class Site:
         self.address = address
         self.port = int(address.rstrip("/").rpartition(":")[2])
 
-    def ask(self, path="/", method="GET", body=None, **headers):
-        """Return status, headers and text of a response."""
+    def send(self, path="/", method="GET", body=None, **headers):
+        """Send a request, and return its connection."""
         headers = {name.replace("_", "-"): value for name, value in headers.items()}
         link = HTTPConnection("127.0.0.1", self.port, timeout=120)
-        try:
-            link.request(method, path, body, headers)
+        link.request(method, path, body, headers)
+        return link
+
+    def ask(self, *request, **headers):
+        """Return status, headers and text of the response to a request."""
+        with closing(self.send(*request, **headers)) as link:
             answer = link.getresponse()
             return answer.status, answer.headers, answer.read().decode(errors="replace")
-        finally:
-            link.close()
+
+    def connect(self, token, **headers):
+        """Request a session's socket; return the connection, and 101 if it was accepted."""
+        protocol = f"bokeh, {token}"
+        link = self.send("/ws", **UPGRADE, Sec_WebSocket_Protocol=protocol, **headers)
+        return link, link.getresponse().status
 
     def socket(self, token, **headers):
-        """Return the status of a request for a session's socket: 101 if it is accepted."""
-        return self.ask("/ws", **UPGRADE, Sec_WebSocket_Protocol=f"bokeh, {token}", **headers)[0]
+        """Return the status of a request for a session's socket, and close it."""
+        link, status = self.connect(token, **headers)
+        link.close()
+        return status
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import time
 from concurrent.futures import ThreadPoolExecutor
-from http.client import HTTPConnection
 from types import SimpleNamespace
 
 import pytest
@@ -16,7 +15,7 @@ from tornado.httpclient import HTTPClientError
 from app.server.sessions import Bounds, Sessions
 from tests.browser import eventually, server_process, serving
 from tests.crowded import BOUNDS
-from tests.test_serving import UPGRADE, Site
+from tests.test_serving import Site
 from tests.wire import Wire, connected, token_in
 
 
@@ -191,11 +190,9 @@ def open_pages(site, count):
     def all_entered():
         status, _, text = site.ask()
         if status == 200:
-            links.append(HTTPConnection("127.0.0.1", site.port, timeout=120))
-            headers = UPGRADE | {"Sec_WebSocket_Protocol": f"bokeh, {token_in(text)}"}
-            named = {name.replace("_", "-"): value for name, value in headers.items()}
-            links[-1].request("GET", "/ws", headers=named)
-            assert links[-1].getresponse().status == 101
+            link, status = site.connect(token_in(text))
+            assert status == 101
+            links.append(link)
         return len(links) == count
 
     eventually(all_entered)

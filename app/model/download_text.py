@@ -25,8 +25,7 @@ NO_POINTS = (
 
 _GOES_ON = "The page works as before."
 
-# If the disk is full before the first temporary file, Python finds no folder for it (ENOENT).
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOENT)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def not_saved(error: Exception) -> str:
