@@ -39,6 +39,11 @@ Detection = Literal["first", "all"]
 class CaptureError(ValueError):
     """A file that cannot be read as a capture; names file, field, value and remedy."""
 
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of the arrays of which ``variable`` must choose one; empty for other errors."""
+        return tuple(getattr(self.__cause__, "variables", ()))
+
 
 @dataclass(frozen=True, eq=False)
 class Capture:

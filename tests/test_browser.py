@@ -644,7 +644,7 @@ def test_a_real_capture_is_ranged_and_its_reading_can_be_changed(page, real_capt
     new.get_by_role("button", name="Explore", exact=True).click()
     expect_the_building_at_21_km(new)
     new.get_by_role("button", name="Reading options").click()
-    bin_width = new.get_by_role("textbox", name="Bin width (s)")  # its help is part of the name
+    bin_width = new.get_by_role("textbox", name="Bin width")  # its help is part of the name
     bin_width.fill("2e-9")
     new.get_by_role("button", name="Read again").click()
     expect(new.get_by_text("256 × 256 pixels, 100 bins of 2 ns")).to_be_visible()

@@ -355,7 +355,7 @@ def test_a_refused_reading_option_is_reported_and_the_next_reading_works():
     layout = Layout({"sample": built_in_sources()["sample"]})
     opened(layout, "Reading options")
     width, alert, again = (
-        control(layout, "Bin width (s)"),
+        control(layout, "Bin width"),
         layout.alert,
         control(layout, "Read again"),
     )

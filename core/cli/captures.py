@@ -19,6 +19,7 @@ from core.cli.options import (
     FLUX_OPTIONS,
     add_flux,
     add_reading,
+    angle,
     flux_of,
     reading,
     require_none,
@@ -266,12 +267,12 @@ def _add_simulate(commands: Any) -> None:
         "--pulses", type=whole_from_to(1, 2**32 - 1), help="by default the scene's own"
     )
     group = command.add_argument_group("view of a scene file; what is not given is assumed")
-    for flag, name, help in (
-        ("--unit", "unit_m", "of the file, in metres"),
-        ("--distance", "distance_m", "to the nearest point of a mesh, in metres"),
-        ("--pixel-angle", "pixel_angle_rad", "between neighbouring pixels, in radians"),
+    for flag, name, kind, help in (
+        ("--unit", "unit_m", float, "of the file, in metres"),
+        ("--distance", "distance_m", float, "to the nearest point of a mesh, in metres"),
+        ("--pixel-angle", "pixel_angle_rad", angle, "between neighbouring pixels, such as 1mrad"),
     ):
-        group.add_argument(flag, dest=name, type=float, help=help)
+        group.add_argument(flag, dest=name, type=kind, help=help)
     add_flux(command)
     _add_out(command, "the capture", CAPTURE_SUFFIXES, required=True)
     _add_json(command)

@@ -16,6 +16,7 @@ import numpy as np
 from core.acquisition import Flux
 from core.checks import require
 from core.io import ReadOptions, reading_options
+from core.io.readers.quantities import EXAMPLE_OF_ANGLE, parsed_angle
 
 
 def whole_from_to(least: int, most: int) -> Callable[[str], int]:
@@ -29,6 +30,15 @@ def whole_from_to(least: int, most: int) -> Callable[[str], int]:
     return whole
 
 
+def angle(text: str) -> float:
+    """Parse an angle for an option."""
+    try:
+        return parsed_angle(text)
+    except ValueError:
+        message = f"{text} is not accepted: give {EXAMPLE_OF_ANGLE}."
+        raise argparse.ArgumentTypeError(message) from None
+
+
 def add_reading(command: Any) -> None:
     """Add the options for reading a file, one for each field of `core.io.ReadOptions`."""
     group = command.add_argument_group("reading the file; what is not given is guessed")
@@ -36,7 +46,8 @@ def add_reading(command: Any) -> None:
         parts = option.kind.metavars
         # One string for each option: `reading` parses them as the app's form does.
         several = {"nargs": len(parts), "metavar": parts} if parts else {}
-        group.add_argument(f"--{option.flag}", dest=name, help=option.help, **several)
+        given = {"choices": option.kind.choices or None, "help": option.help}
+        group.add_argument(f"--{option.flag}", dest=name, **given, **several)
 
 
 def add_processes(command: Any) -> None:

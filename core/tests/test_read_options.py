@@ -6,12 +6,15 @@ import argparse
 import inspect
 from dataclasses import fields
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import core
 from core.cli.options import add_reading, reading
 from core.io import ReadOptions, reading_options
-from core.io.readers.times import parsed_time
+from core.io.readers.quantities import angle_as_typed, parsed_angle, parsed_time, time_as_typed
 from core.tests.read_options import EXAMPLES
 
 NAMES = [each.name for each in fields(ReadOptions)]
@@ -72,6 +75,46 @@ def test_unknown_options_are_refused() -> None:
 )
 def test_times_carry_units(text: str, expected_s: float) -> None:
     assert parsed_time(text) == pytest.approx(expected_s, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected_rad"),
+    [
+        ("20urad", 2e-5),
+        ("20 µrad", 2e-5),
+        ("20 μrad", 2e-5),  # the Greek letter, as keyboards have it
+        ("1.5 mrad", 1.5e-3),
+        ("2e-5", 2e-5),
+        ("0.01 deg", np.radians(0.01)),
+        ("0.01°", np.radians(0.01)),
+        ("0.5rad", 0.5),
+    ],
+)
+def test_angles_carry_units(text: str, expected_rad: float) -> None:
+    assert parsed_angle(text) == pytest.approx(expected_rad, rel=1e-12)
+
+
+@pytest.mark.parametrize("text", ["", "urad", "20 ps", "20 Urad", "1 rad rad", "one rad"])
+def test_text_that_is_no_angle_is_refused(text: str) -> None:
+    with pytest.raises(ValueError):
+        parsed_angle(text)
+
+
+@given(st.floats(1e-13, 0.5))
+def test_quantities_are_written_as_text_that_means_the_same(value: float) -> None:
+    assert parsed_time(time_as_typed(value)) == value
+    assert parsed_time(time_as_typed(-value)) == -value
+    assert parsed_angle(angle_as_typed(value)) == value
+
+
+def test_quantities_are_written_with_a_suitable_unit() -> None:
+    assert [time_as_typed(t) for t in (64e-12, 1e-9, 2.8e-7, -1e-9)] == [
+        "64 ps",
+        "1 ns",
+        "280 ns",
+        "-1 ns",
+    ]
+    assert [angle_as_typed(a) for a in (2e-5, 1.5e-3)] == ["20 µrad", "1.5 mrad"]
 
 
 @pytest.mark.parametrize("text", ["", "ps", "64 pc", "1e-9 s s", "one ns", "64Ps", "64", "1\n2"])

@@ -84,7 +84,7 @@ def test_sdt_has_a_bin_width_and_all_photons(kind: int, write: Write) -> None:
 
 def test_sdt_blocks_are_chosen_by_name(write: Write) -> None:
     path = write("a.sdt", sdt_bytes(CUBE, 2 * CUBE))
-    with pytest.raises(CaptureError, match=r"variable = 'block 0, block 1'.*block 1 \(an image\)"):
+    with pytest.raises(CaptureError, match=r"give block 0 or block 1, each.*block 1 \(an image\)"):
         read_capture(path)
     np.testing.assert_array_equal(read_capture(path, variable="block 1").cube, 2 * CUBE)
 

@@ -38,7 +38,7 @@ from core.checks import require
 from core.io.readers.dense import capture_of, count_dtype, description_of
 from core.io.readers.guards import require_fits
 from core.io.readers.options import ReadOptions
-from core.io.readers.times import time_text
+from core.io.readers.quantities import time_text
 
 NATIVE_BIN_S = 8e-12
 PICOSECONDS_ABOVE = 100_000

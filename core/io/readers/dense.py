@@ -20,7 +20,7 @@ from core.checks import printable, require
 from core.io.readers.guards import require_fits
 from core.io.readers.options import ReadOptions
 from core.io.readers.pulse_guess import guessed_pulse
-from core.io.readers.times import time_text
+from core.io.readers.quantities import time_text
 
 AXES = ("row", "col", "bin")
 LARGEST_COUNT = 2**32 - 1

@@ -45,9 +45,9 @@ from core.io.readers.layout import (
     require_pulse_in_gate,
 )
 from core.io.readers.options import ReadOptions
+from core.io.readers.quantities import UNITS_S as TIME_UNITS_S
 from core.io.readers.sample import sample_of
 from core.io.readers.stored import CLASSIC_SIGNATURES, HDF5_SIGNATURE, Stored, arrays, choose
-from core.io.readers.times import UNITS_S as TIME_UNITS_S
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -15,7 +15,7 @@ from core.acquisition import SHORTEST_PULSE_S, Acquisition, Pulse, require_time
 from core.checks import require
 from core.io.readers.dense import Description
 from core.io.readers.options import ReadOptions
-from core.io.readers.times import time_text
+from core.io.readers.quantities import time_text
 
 PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 """Fields that define a pulse together."""

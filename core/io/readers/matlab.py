@@ -6,8 +6,9 @@ captures are stored. The file may have other variables if only one fits; a numbe
 ``bin_width`` or ``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
 
 The pixels of a sparse matrix follow each other column by column, as MATLAB's ``reshape`` lists
-them, or row by row with ``axes="row col"``. Rows and columns come from ``shape``; without it the
-image is guessed to be square.
+them, or row by row with ``axes="row col"``. Rows and columns come from ``shape``; without it they
+are guessed to be those of another array with as many elements along its first two axes, or the
+image to be square.
 
 SciPy and h5py read the variables in an isolated process (`core.io.readers.isolation`). In version
 7.3 the axes are reversed, a cell array is an array of references, and a sparse matrix a group of
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from math import isqrt
+from math import isqrt, prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,13 +33,15 @@ from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
 from core.io.readers.dense import LARGEST_COUNT, count_dtype, cube_capture, dense_capture
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import ReadOptions, only_one
 from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
 
 _USER_BLOCK = 512  # before the HDF5 of version 7.3
 _VERSIONS_5 = (b"\x00\x01IM", b"\x01\x00MI")
 
 NUMERIC = ("double", "single", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)))
+
+_FRACTIONS = ("double", "single")
 
 _WIDTH_NAMES = {"binwidth", "binsize", "binresolution", "timeresolution", "resolution"}
 _SHORTEST_S, _LONGEST_S = 1e-13, 1e-6
@@ -183,7 +186,8 @@ def read(path: Path, request: ReadOptions) -> Capture:
     )
     if variable.kind == "sparse":
         parts = file.sparse(variable)
-        return _sparse_capture(parts, variable.shape, name, origin, request, width_s)
+        shaped, guessed = _with_shape(request, variable, file.variables)
+        return _sparse_capture(parts, variable.shape, name, origin, shaped, guessed, width_s)
     return cube_capture(file.array(variable), name, origin, request, bin_width_s=width_s)
 
 
@@ -191,16 +195,14 @@ def _choose(variables: Sequence[Variable], name: str | None) -> Variable:
     """Return the requested variable, else the only one that fits."""
     fitting = {variable.name: variable for variable in variables if variable.fits}
     listed = ", ".join(map(str, variables)) or "nothing"
-    remedy = (
-        "a cell (row, col) of arrival times, a cube (row, col, bin), or a sparse matrix "
-        f"(pixel, bin); the file has {listed}"
-    )
-    if name is not None:
-        require("variable", name, name in fitting, f"the name of {remedy}")
-        return fitting[name]
-    found = ", ".join(fitting) or None
-    require("variable", found, len(fitting) == 1, f"as variable the name of {remedy}")
-    return next(iter(fitting.values()))
+    accepted = "a cell (row, col) of arrival times, a cube (row, col, bin), or a sparse matrix "
+    accepted += "(pixel, bin)"
+    if name is None:
+        # Photons are counted in whole numbers; fractions may be rates.
+        likely = sorted(fitting, key=lambda each: fitting[each].kind in _FRACTIONS)
+        return fitting[only_one(likely, accepted, listed)]
+    require("variable", name, name in fitting, f"the name of {accepted}; the file has {listed}")
+    return fitting[name]
 
 
 def _bin_width(values: Iterable[float]) -> float | None:
@@ -209,12 +211,38 @@ def _bin_width(values: Iterable[float]) -> float | None:
     return found.pop() if len(found) == 1 else None
 
 
+def _with_shape(
+    request: ReadOptions, pixels: Variable, variables: Iterable[Variable]
+) -> tuple[ReadOptions, list[str]]:
+    """Return a request with rows and columns for a list of pixels; and what was guessed of them.
+
+    An array with as many elements along its first two axes gives the shape; otherwise the image
+    is square.
+    """
+    n_pixels = pixels.shape[0]
+    if request.shape is not None:
+        return request, []
+    likely: dict[tuple[int, ...], str] = {}
+    for each in variables:
+        size = each.shape[:2]
+        if each.kind in NUMERIC and len(size) == 2 and min(size) > 1 and prod(size) == n_pixels:
+            likely.setdefault(size, each.name)
+    if len(likely) == 1:
+        ((rows, cols), name), *_ = likely.items()
+        return replace(request, shape=(rows, cols)), [f"shape {rows} x {cols}, that of {name}"]
+    side = isqrt(n_pixels)
+    if side**2 != n_pixels:
+        return request, []
+    return replace(request, shape=(side, side)), [f"shape {side} x {side}"]
+
+
 def _sparse_capture(
     parts: list[NDArray[Any]],
     shape: tuple[int, ...],
     name: str,
     origin: str,
     request: ReadOptions,
+    guessed: list[str],
     bin_width_s: float | None,
 ) -> Capture:
     """Return a capture from a sparse matrix (pixel, bin) of counts.
@@ -224,12 +252,10 @@ def _sparse_capture(
     """
     n_pixels, n_bins = shape
     by_row = request.order(("row", "col")) == (0, 1)
-    side = isqrt(n_pixels)
-    rows, cols = request.shape or (side, side)
+    rows, cols = request.shape or (0, 0)
     accepted = f"rows and columns of {n_pixels} pixels in all"
     require("shape", request.shape, rows * cols == n_pixels, accepted)
-    guessed = [] if request.shape else [f"shape {rows} x {cols}"]
-    guessed += [] if request.axes else ["pixels column by column"]
+    guessed = [*guessed, *([] if request.axes else ["pixels column by column"])]
     pixel, bins, counts = _entries(parts, n_pixels, n_bins, name)
     if not by_row:
         col, row = np.divmod(pixel, rows)

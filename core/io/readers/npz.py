@@ -32,6 +32,7 @@ accompany them. Frames that are stored without compression may be larger than me
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
@@ -53,7 +54,7 @@ from core.io.readers.layout import (
     require_pulse_in_gate,
 )
 from core.io.readers.npy import frames_in, read_array, read_header
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import ReadOptions, only_one
 
 FORMAT = "firstphoton-capture-1"
 
@@ -127,9 +128,10 @@ def read(path: Path, request: ReadOptions) -> Capture:
 def _choose(archive: ZipFile, names: list[str], request: ReadOptions) -> str:
     """Return the requested array, else ``cube``, ``frames``, or the only one with three axes."""
     listed, variable = ", ".join(names) or "none", request.variable
-    remedy = f"the name of a (row, col, bin) array; the file has {listed}"
+    accepted = "a (row, col, bin) array"
     if variable is not None:
-        require("variable", variable, variable in names, remedy)
+        what = f"the name of {accepted}; the file has {listed}"
+        require("variable", variable, variable in names, what)
         return variable
     for name in ("cube", "frames") if request.no_trigger is None else ("frames",):
         if name in names:
@@ -137,9 +139,12 @@ def _choose(archive: ZipFile, names: list[str], request: ReadOptions) -> str:
     cubes = []
     for name in names:
         with _opened(archive, name) as file:
-            cubes += [name] if len(read_header(file, name).shape) == 3 else []
-    require("variable", ", ".join(cubes) or None, len(cubes) == 1, f"as variable {remedy}")
-    return cubes[0]
+            header = read_header(file, name)
+        if len(header.shape) == 3:
+            cubes.append((header.dtype.kind not in "iu", name))
+    # Photons are counted in whole numbers; fractions may be rates.
+    likely = [name for _, name in sorted(cubes, key=itemgetter(0))]
+    return only_one(likely, accepted, listed)
 
 
 def _field(archive: ZipFile, name: str) -> Any:

@@ -7,7 +7,7 @@ and scripts are made from the fields of `ReadOptions` and their `Option`.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, get_args
 
@@ -16,7 +16,14 @@ import numpy as np
 from core.acquisition import LONGEST_S, MOST_BINS, MOST_PULSES, SHORTEST_BIN_S, Pulse, require_time
 from core.capture import Detection
 from core.checks import require, require_whole
-from core.io.readers.times import EXAMPLE, parsed_time, time_as_typed
+from core.io.readers.quantities import (
+    EXAMPLE,
+    EXAMPLE_OF_ANGLE,
+    angle_as_typed,
+    parsed_angle,
+    parsed_time,
+    time_as_typed,
+)
 
 Check = Callable[[str, Any], None]
 """Called with the name of a field and its value; raises ``ValueError``."""
@@ -36,6 +43,8 @@ class Kind:
     """As text from which `parse` returns the same value."""
     metavars: tuple[str, ...] = ()
     """Names of the parts of a value that takes several arguments of the command line."""
+    choices: tuple[str, ...] = ()
+    """All texts that are accepted, where they are few."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +100,10 @@ _DETECTIONS = get_args(Detection)
 _NAMES = Kind("str", str, "names", _required("text", lambda value: isinstance(value, str)))
 _ANGLE = Kind(
     "float",
-    float,
-    "a number such as 1e-3",
+    parsed_angle,
+    EXAMPLE_OF_ANGLE,
     _required("between 0 and 1 radian", lambda value: 0 < value < 1),
-    repr,
+    angle_as_typed,
 )
 _WHOLE = Kind("int", int, "a whole number", _required("a whole number", _is_whole))
 _DETECTION = Kind(
@@ -102,6 +111,7 @@ _DETECTION = Kind(
     str,
     "first or all",
     _required(" or ".join(map(repr, _DETECTIONS)), lambda value: value in _DETECTIONS),
+    choices=_DETECTIONS,
 )
 _SHAPE = Kind(
     "tuple of int",
@@ -131,16 +141,16 @@ class ReadOptions:
     """
 
     time_unit_s: float | None = _option(
-        "Time unit (s)",
+        "Time unit",
         "time-unit",
         _time(SHORTEST_BIN_S),
         "Unit of the arrival times, such as 8ps; only for a file that holds such.",
     )
     bin_width_s: float | None = _option(
-        "Bin width (s)", "bin-width", _time(SHORTEST_BIN_S), "Width of a bin, such as 64ps."
+        "Bin width", "bin-width", _time(SHORTEST_BIN_S), "Width of a bin, such as 64ps."
     )
     gate_delay_s: float | None = _option(
-        "Gate opens after (s)",
+        "Gate opens after",
         "gate-delay",
         _time(-LONGEST_S),
         "Time from the pulse to the first bin, such as 280ns; earlier photons are dropped.",
@@ -158,16 +168,16 @@ class ReadOptions:
         "Variable", "variable", _NAMES, "Name of the array, where the file holds several."
     )
     pulse: Pulse | None = _option(
-        "Echo's standard deviation (s)",
+        "Echo's standard deviation",
         "pulse-sigma",
         _PULSE,
         "Shape of an echo; as text, the standard deviation of a Gaussian, such as 150ps.",
     )
     pixel_angle_rad: float | None = _option(
-        "Pixel angle (rad)", "pixel-angle", _ANGLE, "Angle between neighbouring pixels in radians."
+        "Pixel angle", "pixel-angle", _ANGLE, "Angle between neighbouring pixels, such as 20urad."
     )
     detection: Detection | None = _option(
-        "Photons of a pulse (first, all)",
+        "Photons of a pulse",
         "detection",
         _DETECTION,
         "Photons of a pulse that are recorded, first or all; guessed to be first photons where the "
@@ -187,7 +197,7 @@ class ReadOptions:
         "Rows and columns of a file that lists its pixels one after the other.",
     )
     stop_s: float | None = _option(
-        "Common stop after (s)",
+        "Common stop after",
         "stop",
         _time(-LONGEST_S),
         "For common-stop instruments: times count backwards from this time after the pulse, often "
@@ -266,6 +276,41 @@ class ReadOptions:
         """Raise ``ValueError`` if a field is specified that does not apply to the file."""
         for name in names:
             require(name, getattr(self, name), getattr(self, name) is None, f"None: {why}")
+
+
+class AmbiguousError(ValueError):
+    """Several arrays of a file could be the capture.
+
+    Attributes
+    ----------
+    variables : tuple of str
+        Their names, the most likely first.
+    """
+
+    def __init__(self, variables: Sequence[str], listed: str) -> None:
+        self.variables = tuple(variables)
+        names = " or ".join((", ".join(variables[:-1]), variables[-1]))
+        super().__init__(
+            f"variable = None is not accepted: give {names}, each of which could be the capture; "
+            f"the file has {listed}."
+        )
+
+
+def only_one(fitting: Sequence[str], accepted: str, listed: str) -> str:
+    """Return the name of the only array that fits; `accepted` says which would.
+
+    Raises
+    ------
+    AmbiguousError
+        If several fit.
+    ValueError
+        If none fits.
+    """
+    if len(fitting) > 1:
+        raise AmbiguousError(fitting, listed)
+    what = f"as variable the name of {accepted}; the file has {listed}"
+    require("variable", None, len(fitting) == 1, what)
+    return fitting[0]
 
 
 def reading_options() -> dict[str, Option]:

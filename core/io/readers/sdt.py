@@ -23,7 +23,7 @@ from core.checks import require
 from core.io.readers.dense import AXES, cube_capture
 from core.io.readers.guards import require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import ReadOptions, only_one
 
 _HISTOGRAMS = {0x00: "decay curves", 0x10: "pages", 0x60: "an image"}
 _CONTENT = 0xF0
@@ -60,13 +60,12 @@ def _choose(types: list[int], variable: str | None) -> int:
     kinds = [_HISTOGRAMS.get(kind & _CONTENT) for kind in types]
     fitting = {f"block {number}": number for number, kind in enumerate(kinds) if kind}
     listed = ", ".join(f"{name} ({kinds[number]})" for name, number in fitting.items()) or "none"
-    remedy = f"the name of a block with histograms; the file has {listed}"
-    if variable is not None:
-        require("variable", variable, variable in fitting, remedy)
-        return fitting[variable]
-    found = ", ".join(fitting) or None
-    require("variable", found, len(fitting) == 1, f"as variable {remedy}")
-    return next(iter(fitting.values()))
+    accepted = "a block with histograms"
+    if variable is None:
+        variable = only_one(list(fitting), accepted, listed)
+    what = f"the name of {accepted}; the file has {listed}"
+    require("variable", variable, variable in fitting, what)
+    return fitting[variable]
 
 
 def _image(data: NDArray[Any], name: str) -> NDArray[Any]:

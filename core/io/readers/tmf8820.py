@@ -45,7 +45,7 @@ from core.io.readers.dense import AXES, dense_capture, whole_counts
 from core.io.readers.isolation import isolated
 from core.io.readers.layout import require_pulse_in_gate
 from core.io.readers.options import ReadOptions
-from core.io.readers.times import time_text
+from core.io.readers.quantities import time_text
 
 BIN_WIDTH_S = 91e-12
 PEAK_AT_0_M_S = 1.1e-9
