@@ -645,9 +645,11 @@ def test_a_real_capture_is_ranged_and_its_reading_can_be_changed(page, real_capt
     expect_the_building_at_21_km(new)
     new.get_by_role("button", name="Reading options").click()
     bin_width = new.get_by_role("textbox", name="Bin width")  # its help is part of the name
-    bin_width.fill("2e-9")
-    new.get_by_role("button", name="Read again").click()
+    expect(bin_width).to_have_value("1 ns")  # a guess
+    bin_width.fill("2000 ps")
+    bin_width.press("Enter")
     expect(new.get_by_text("256 × 256 pixels, 100 bins of 2 ns")).to_be_visible()
+    expect(bin_width).to_have_value("2 ns")
     bin_width.fill("wide")
     new.get_by_role("button", name="Read again").click()
     expect(new.get_by_role("alert").filter(has_text="bin_width_s = 'wide'")).to_be_visible()
@@ -659,6 +661,22 @@ def test_a_real_capture_is_ranged_and_its_reading_can_be_changed(page, real_capt
     choose(new, "Scene or capture", "Car at 50 m")
     expect_rmse(new, car())
     expect(slider(new, "SBR")).to_be_visible()
+    answer_which_array_to_read(new)
+
+
+def answer_which_array_to_read(page: Page) -> None:
+    counts = np.random.default_rng(3).poisson(0.2, (5, 7, 40)).astype(np.uint8)
+    upload(page, "two.npz", saved_arrays(rates=counts / 7, spad=counts))
+    expect(page.get_by_text("Several arrays of two.npz could be the capture.")).to_be_visible()
+    first, second = (page.get_by_role("button", name=name) for name in ("spad", "rates"))
+    assert first.bounding_box()["x"] < second.bounding_box()["x"]
+    expect(page.get_by_role("textbox", name="Variable")).to_have_value("")
+    first.click()
+    expect(page.get_by_text("5 × 7 pixels, 40 bins of 1 ns")).to_be_visible()
+    expect(first).to_be_hidden()
+    expect(page.get_by_role("textbox", name="Variable")).to_have_value("spad")
+    inspect = page.get_by_role("button", name="Inspect", exact=True)
+    expect(inspect).to_have_attribute("aria-pressed", "true")
 
 
 def saved_arrays(**arrays: np.ndarray | str) -> bytes:

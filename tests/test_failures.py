@@ -11,6 +11,7 @@ from dataclasses import replace
 from itertools import cycle
 from pkgutil import resolve_name
 
+import numpy as np
 import panel as pn
 import pytest
 
@@ -19,7 +20,7 @@ from app.model import download_text
 from app.model import text as model_text
 from app.model.address import Link
 from app.model.state import Illumination
-from app.model.store import built_in_sources, scene_source
+from app.model.store import built_in_sources, file_source, scene_source
 from app.model.uploads import Uploads
 from app.pages.compare import text as compare_text
 from app.pages.compare.page import Compare
@@ -39,6 +40,7 @@ from app.pages.tradeoff.acquisition import AcquisitionSection
 from app.pages.tradeoff.sensitivity import SensitivitySection, Swept
 from app.pages.tradeoff.speed import Effort, SpeedSection
 from core import ESTIMATORS, CaptureError
+from core.io import ReadOptions
 from core.studies.paper import figures as paper
 from core.studies.trials import Condition
 from tests.broken import AT_SEED, WHEN_DRAWN, WHEN_INSPECTED, WHEN_TAPPED
@@ -370,6 +372,39 @@ def test_a_refused_reading_option_is_reported_and_the_next_reading_works():
     again.clicks += 1
     eventually(lambda: alert.text == "")
     assert layout.session.answer.capture.acquisition.bin_width_s == 2e-9
+
+
+def test_the_form_stays_open_for_a_file_that_is_refused(tmp_path):
+    np.savez(
+        tmp_path / "two.npz", day=np.ones((4, 5, 30), int), night=np.eye(30)[:20].reshape(4, 5, 30)
+    )
+    sources = built_in_sources()
+    kept = {"sample": sources["sample"], "two": file_source(tmp_path / "two.npz")}
+    layout = Layout(kept | {"car": sources["car"]})
+    session, form = layout.session, opened(layout, "Reading options")
+    for first in ("sample", "car"):
+        session.state.source = first
+        eventually(lambda first=first: form.visible == (first == "sample"))
+        eventually(lambda: layout.alert.text == "")
+        session.state.source = "two"
+        eventually(lambda: "give day or night" in layout.alert.text)
+        assert session.state.source == first
+        assert form.visible and not form.collapsed
+        assert control(layout, "Bin width").value == ""
+    control(layout, "Variable").value = "night"
+    control(layout, "Bin width").value = "64 ps"
+    control(layout, "Read again").clicks += 1
+    eventually(lambda: layout.alert.text == "")
+    assert session.state.source == "two"
+    assert session.answer.capture.acquisition.bin_width_s == 64e-12
+    # What is on screen is a guess until it is changed.
+    shown = {name: control(layout, name).value for name in ("Variable", "Bins", "Gate opens after")}
+    assert shown == {"Variable": "night", "Bins": "30", "Gate opens after": "0 s"}
+    assert session.state.reading == ReadOptions(variable="night", bin_width_s=64e-12)
+    control(layout, "Variable").value = "day"
+    control(layout, "Read again").clicks += 1
+    eventually(lambda: session.answer.request.reading.variable == "day")
+    assert session.state.reading == ReadOptions(variable="day", bin_width_s=64e-12)
 
 
 def test_a_link_to_an_unreadable_file_shows_no_folder(monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,6 +15,7 @@ from panel_material_ui.template.base import Meta
 
 from app.model import text
 from app.model.address import Link
+from app.model.reading import options_in_use
 from app.model.restore import parameters_of
 from app.model.script import script_of
 from app.model.state import ReductionSettings
@@ -22,6 +24,7 @@ from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
 from app.pages.catalog import PAGES
 from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
+from app.pages.shared.reading import ReadingForm
 from app.tasks.page import PageTasks
 from app.theme import DARK, LIGHT, STYLES
 from app.widgets.address_bar import AddressBar
@@ -31,7 +34,7 @@ from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import FileInput
 from app.widgets.share import Share
 from core import PRESETS, TrackingParameters
-from core.io import SUFFIXES, ReadOptions, reading_options
+from core.io import SUFFIXES, ReadOptions
 
 CUSTOM = "custom"
 
@@ -216,23 +219,12 @@ class Layout:
             _preset_of(state.tracking),
             "recommended: best on random depths. as printed: the paper's settings, literally.",
         )
-        self._reading = {
-            name: pmui.TextInput(
-                label=option.label,
-                description=option.help,
-                placeholder="guess",
-                size="small",
-                sizing_mode="stretch_width",
-                margin=(6, 8, 2, 8),
-            )
-            for name, option in reading_options().items()
-        }
+        self._reading = ReadingForm(self._read, session.failures.show)
         unit = choice(text.UNIT_HELP, state.param.unit)
         unit.param.update(
             label="Gate axes in", sx=UNIT_BUTTONS, sizing_mode="stretch_width", margin=(4, 8)
         )
         self._make_parts(unit)
-        self._shown_source: Source | None = None
         self._uploaded = ""
         self._link = AddressBar()
         session_id = session.page.session_context.id if session.tasks.is_served else ""
@@ -240,16 +232,9 @@ class Layout:
 
     def _make_parts(self, unit: Any) -> None:
         """Make the parts of the sidebar that pages share; `_show_answer` shows one of the first."""
-        read_again = pmui.Button(label="Read again", size="small", margin=(6, 8))
-        read_again.on_click(lambda _: self._read_again())
         self._light_part = part("Simulation", self._panels["light"].layout, is_shown=False)
-        self._reading_part = part(
-            "Reading options",
-            *self._reading.values(),
-            read_again,
-            is_open=self.session.answer.request.reading != ReadOptions(),
-            is_shown=False,
-        )
+        if self.session.answer.request.reading != ReadOptions():
+            self._reading.part.collapsed = False
         tracking = self._panels["tracking"]
         self._shared = {
             Shared.UNIT: unit,
@@ -263,6 +248,7 @@ class Layout:
             self._connection,
             self._busy,
             self.alert,
+            self._reading.question,
             sizing_mode="stretch_width",
             margin=(4, 12, 0, 12),
         )
@@ -286,7 +272,7 @@ class Layout:
             self._shared[Shared.UNIT],
             *(aside for name, aside in asides.items() if not self._pages[name].sidebar_last),
             self._light_part,
-            self._reading_part,
+            self._reading.part,
             self._shared[Shared.TRACKING],
             self._shared[Shared.REDUCTION],
             part("Share", share.layout),
@@ -332,17 +318,22 @@ class Layout:
         if self.session.state.source == self._uploaded:  # it could be read
             self._uploaded, self.session.state.page = "", "Inspect"
         self._source.value = self.session.state.source
-        if answer.request.source is not self._shown_source:
-            self._shown_source = answer.request.source
-            for name, field in self._reading.items():
-                field.value = answer.request.reading.as_text(name)
-        self._light_part.visible, self._reading_part.visible = is_scene, not is_scene
+        self._light_part.visible, self._reading.part.visible = is_scene, not is_scene
+        self._show_reading(answer)
         self._provenance.text = text.provenance(answer)[:2000]
         self._show_settings()
         self._panels["tracking"].controls["t_n"].high = max(
             answer.capture.acquisition.n_bins - 1, 1
         )
         self.pages.follow(answer)
+
+    def _show_reading(self, answer: Answer) -> None:
+        refused = self.session.estimate.refused
+        if refused is not None:
+            is_new = refused.request.source is not answer.request.source
+            self._reading.show_refused(refused.request, refused.variables, is_new)
+        elif not answer.request.source.is_scene:
+            self._reading.show(answer.request.reading, options_in_use(answer))
 
     def _show_settings(self, *names: str) -> None:
         """Show settings that were changed by a page, a preset or an estimate; all by default."""
@@ -382,13 +373,12 @@ class Layout:
         self._source.options = self._titles()
         self._uploaded = self._source.value = key
 
-    def _read_again(self) -> None:
-        try:
-            self.session.state.reading = ReadOptions.from_text(
-                {name: field.value for name, field in self._reading.items()}
-            )
-        except ValueError as error:
-            self.session.failures.show(str(error))
+    def _read(self, options: ReadOptions) -> None:
+        """Read the file that the form is for: the one on screen, or the one that was refused."""
+        session, refused = self.session, self.session.estimate.refused
+        request = session.answer.request if refused is None else refused.request
+        again = parameters_of(replace(request, reading=options), session.sources)
+        session.state.param.update(again)
 
     def _close(self) -> None:
         """Release what would outlive a closed page."""

@@ -14,7 +14,7 @@ EXAMPLES: dict[str, Any] = {
     "n_pulses": 9,
     "variable": "a b&c",
     "pulse": Pulse.gaussian(3e-10),
-    "pixel_angle_rad": 0.001,
+    "pixel_angle_rad": 0.002,
     "detection": "all",
     "axes": "bin, row col",
     "shape": (3, 5),

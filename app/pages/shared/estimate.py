@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
 
@@ -12,7 +12,7 @@ import param
 from app.model.capture_defaults import enter, own_field_of_view_deg
 from app.model.restore import parameters_of, request_of
 from app.model.state import State
-from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute, same_view
+from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute, same_subject, same_view
 from app.model.text import no_estimates
 from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
@@ -28,6 +28,15 @@ FEW_COUNTS = 2**20
 
 FEW_S = 0.25
 """Predicted time up to which an estimate may run on the page's thread."""
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A file that could not be read."""
+
+    request: Request
+    variables: tuple[str, ...]
+    """Names of its arrays of which the user must choose one; empty for other errors."""
 
 
 class CurrentEstimate:
@@ -48,6 +57,8 @@ class CurrentEstimate:
         The latest estimate that could be computed.
     changed : Signal of Answer
         Emitted with each new estimate, and with the old one again where a request failed.
+    refused : Refused or None
+        The file that was requested last, as long as it could not be read.
     own_field_of_view_deg : float
         The field of view that suits the present capture.
     busy : Signal of bool
@@ -63,6 +74,7 @@ class CurrentEstimate:
         first: Answer,
     ) -> None:
         self.answer = first
+        self.refused: Refused | None = None
         self.changed: Signal[Answer] = Signal()
         self.busy: Signal[bool] = Signal()
         self._state, self._sources = state, sources
@@ -92,7 +104,7 @@ class CurrentEstimate:
         )
 
     def _accept(self, answer: Answer) -> None:
-        previous, self.answer = self.answer, answer
+        previous, self.answer, self.refused = self.answer, answer, None
         self._take_reduction(answer)
         if not same_view(answer.request, previous.request):
             self.own_field_of_view_deg = own_field_of_view_deg(answer)
@@ -115,6 +127,8 @@ class CurrentEstimate:
             shown = replace(self.answer.request, light=request.light, tracking=request.tracking)
             with param.discard_events(self._state):
                 self._state.param.update(parameters_of(shown, self._sources))
+            if not (request.source.is_scene or same_subject(request, self.answer.request)):
+                self.refused = Refused(request, getattr(error, "variables", ()))
         self._end()
         self.changed.emit(self.answer)
         self._failures.report(error)

@@ -63,6 +63,8 @@ def time_as_typed(time_s: float) -> str:
     >>> time_as_typed(6.4e-11)
     '64 ps'
     """
+    if time_s == 0:
+        return "0 s"
     if parsed_time(text := time_text(time_s)) == time_s:
         return text
     return repr(float(time_s)) if abs(time_s) <= MOST_WITHOUT_UNIT_S else f"{float(time_s)!r} s"

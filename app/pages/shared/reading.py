@@ -1,0 +1,116 @@
+"""The form of options for reading a file, and the question of which of its arrays to read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+
+from app.model.reading import changed_options
+from app.model.store import Request
+from app.widgets.cards import button, part, select
+from app.widgets.controls import Sentence
+from core.io import ReadOptions, reading_options
+
+QUESTION = "Several arrays of {file} could be the capture. Which one?"
+
+
+class ReadingForm:
+    """Fields with the options in use, guesses included; one left as it is stays a guess.
+
+    Parameters
+    ----------
+    read : callable
+        Called with the options that the user chose.
+    complain : callable
+        Called with a sentence where a text cannot be parsed.
+
+    Attributes
+    ----------
+    part : Part
+        The form as a part of the sidebar.
+    question : Column
+        A button for each array of a file that could be the capture.
+    """
+
+    def __init__(
+        self, read: Callable[[ReadOptions], None], complain: Callable[[str], None]
+    ) -> None:
+        self._read, self._complain = read, complain
+        self._fields = {name: _field(name) for name in reading_options()}
+        self._reading, self._shown = ReadOptions(), dict.fromkeys(self._fields, "")
+        for field in self._fields.values():
+            if isinstance(field, pmui.TextInput):
+                field.param.watch(lambda _: self._apply(), "enter_pressed")
+        again = pmui.Button(label="Read again", size="small", margin=(6, 8))
+        again.on_click(lambda _: self._apply())
+        self._about = Sentence(sizing_mode="stretch_width", margin=(4, 8), visible=False)
+        self.part = part(
+            "Reading options",
+            self._about,
+            *self._fields.values(),
+            again,
+            is_open=False,
+            is_shown=False,
+        )
+        self.question = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+
+    def show(self, reading: ReadOptions, used: Mapping[str, str]) -> None:
+        """Show the options of the file on screen; keep what was typed if they are the same."""
+        self.question.visible = self._about.visible = False
+        self._fill(reading, used)
+
+    def show_refused(self, request: Request, variables: Sequence[str], is_new: bool) -> None:
+        """Open for a file that was refused, and ask for the array if several could be meant."""
+        name = request.source.title
+        if is_new:
+            self._fill(request.reading, {})
+        self._about.param.update(text=f"For {name}, which could not be read.", visible=is_new)
+        self.part.param.update(visible=True, collapsed=False)
+        self.question.visible = bool(variables)
+        self.question[:] = [
+            Sentence(text=QUESTION.format(file=name), sizing_mode="stretch_width", margin=(4, 0)),
+            pn.FlexBox(*map(self._choice, variables)),
+        ]
+
+    def _choice(self, variable: str) -> pmui.Button:
+        help = f"Read the array {variable}."
+        return button(variable, help, partial(self._apply, {"variable": variable}), (2, 8, 6, 0))
+
+    def _fill(self, reading: ReadOptions, used: Mapping[str, str]) -> None:
+        shown = {name: reading.as_text(name) or used.get(name, "") for name in self._fields}
+        if (reading, shown) == (self._reading, self._shown):
+            return
+        self._reading, self._shown = reading, shown
+        for name, field in self._fields.items():
+            field.value = shown[name]
+
+    def _apply(self, chosen: Mapping[str, str] | None = None) -> None:
+        typed = {name: _text(field) for name, field in self._fields.items()} | dict(chosen or {})
+        try:
+            self._read(changed_options(self._reading, self._shown, typed))
+        except ValueError as error:
+            self._complain(str(error))
+
+
+def _text(field: Any) -> str:
+    """Return the text of a field; Enter arrives before the value that it completes."""
+    return str(field.value_input if isinstance(field, pmui.TextInput) else field.value)
+
+
+def _field(name: str) -> Any:
+    option = reading_options()[name]
+    if option.kind.choices:
+        choices = {"as guessed": ""} | {each: each for each in option.kind.choices}
+        return select(option.label, choices, "", option.help)
+    return pmui.TextInput(
+        label=option.label,
+        description=option.help,
+        placeholder="guess",
+        size="small",
+        sizing_mode="stretch_width",
+        margin=(6, 8, 2, 8),
+    )
