@@ -14,7 +14,7 @@ import os
 import signal
 import sys
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any
@@ -24,7 +24,7 @@ import panel as pn
 import core
 from app.model import text
 from app.model.state import Illumination
-from app.model.store import Source, built_in_sources, file_source
+from app.model.store import NO_OPTIONS, Source, built_in_sources, file_source
 from app.model.uploads import Uploads
 from app.pages.layout import build_page
 from app.server import garbage
@@ -36,7 +36,7 @@ from app.server.tuning import tune
 from app.tasks.scheduler import STUDIES
 from app.widgets.connection import LINGER_S
 from app.widgets.controls import Sentence
-from core.io import SUFFIXES, ReadOptions
+from core.io import SUFFIXES, ReadOptions, add_read_options, read_options_from, with_flags
 
 log = logging.getLogger(__name__)
 
@@ -71,14 +71,13 @@ def main(arguments: list[str] | None = None) -> int:
         metavar="SECONDS",
         help="time for which a closed or disconnected page is kept (default: %(default)s)",
     )
+    add_read_options(parser)
     chosen = parser.parse_args(arguments)
+    try:
+        files = readable(chosen.captures, read_options_from(chosen))
+    except ValueError as error:
+        parser.error(with_flags(str(error)))
     # Files come first: the page opens on the first source.
-    files = {f"path {n}": file_source(p, shared=True) for n, p in enumerate(chosen.captures)}
-    for source in files.values():
-        try:
-            print(source.load(Illumination(), ReadOptions(), ()).source, flush=True)
-        except ValueError as error:  # unreadable or too large
-            parser.error(str(error))
     sources, uploads = files | built_in_sources(), Uploads()
     pn.extension("vtk")
     try:
@@ -114,6 +113,29 @@ def main(arguments: list[str] | None = None) -> int:
     server.stop()
     STUDIES.is_closed = True
     return 0
+
+
+def readable(paths: Sequence[Path], options: ReadOptions) -> dict[str, Source]:
+    """Return the files that can be read, by their key, and report the others.
+
+    Raises
+    ------
+    ValueError
+        If none can be read.
+    """
+    found, refused = {}, []
+    for number, path in enumerate(paths):
+        source = file_source(path, given=options, shared=True)
+        try:
+            print(source.load(Illumination(), NO_OPTIONS, ()).source, flush=True)
+            found[f"path {number}"] = source
+        except ValueError as error:  # unreadable or too large
+            refused.append(error)
+    if refused and not found:
+        raise ValueError("\n".join(map(str, refused)))
+    for why in refused:
+        print(f"Not opened: {with_flags(str(why))}", file=sys.stderr, flush=True)
+    return found
 
 
 def page_for(sources: Mapping[str, Source], uploads: Uploads) -> Any:

@@ -98,7 +98,7 @@ def _file(answer: Answer) -> Lines:
     yield "# Read the capture. Add the folder to the path if necessary."
     yield f"path = {literal(request.source.name)}"
     window = request.window if cutout is None else cutout.window
-    options = changed_fields(request.reading)
+    options = changed_fields(request.reading.completed_by(request.source.given))
     if window is None:
         yield _assign("capture", "core.read_capture", "path", **options)
     else:

@@ -39,6 +39,7 @@ from core.cost import Cost, predicted
 from core.inference import has_posterior, posterior_of
 from core.io import ReadOptions
 
+NO_OPTIONS = ReadOptions()
 ASSETS = Path(str(resources.files("assets")))
 
 
@@ -57,6 +58,8 @@ class Source:
     """Name of the scene in `core.scenes`, or of the file."""
     arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Arguments of the scene."""
+    given: ReadOptions = NO_OPTIONS
+    """Options for reading that hold unless a request has others."""
 
     @property
     def is_scene(self) -> bool:
@@ -83,11 +86,17 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
     return Source(title, load, build, name=name, arguments=arguments)
 
 
-def file_source(path: Path, title: str | None = None, *, shared: bool = False) -> Source:
+def file_source(
+    path: Path,
+    title: str | None = None,
+    *,
+    given: ReadOptions = NO_OPTIONS,
+    shared: bool = False,
+) -> Source:
     """Return a capture file as a source; with `shared`, its capture is kept for all sessions."""
 
     def read(reading: ReadOptions) -> Capture:
-        capture = read_capture(path, **vars(reading))
+        capture = read_capture(path, **vars(reading.completed_by(given)))
         require_small(path, capture.cube.nbytes)
         return capture
 
@@ -97,10 +106,10 @@ def file_source(path: Path, title: str | None = None, *, shared: bool = False) -
 
     @lru_cache(maxsize=1)
     def opened(reading: ReadOptions) -> LargeFile | None:
-        return open_large(path, vars(reading))
+        return open_large(path, vars(reading.completed_by(given)))
 
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, load, large=opened, name=path.name)
+    return Source(title or path.name, load, large=opened, name=path.name, given=given)
 
 
 def built_in_sources() -> dict[str, Source]:

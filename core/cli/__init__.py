@@ -10,8 +10,8 @@ from pathlib import Path
 
 import core
 from core.cli import ablation, captures, studies, tradeoff
-from core.cli.options import as_options
 from core.cli.results import CheckFailed
+from core.io import with_flags
 
 ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done; the machine (such as a full disk) or a check failed; bad input; Ctrl-C."""
@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
         chosen.work(chosen)
         sys.stdout.flush()
     except (ValueError, FileExistsError) as error:
-        return _report(FAILED if _is_of_machine(error) else REFUSED, as_options(str(error)))
+        return _report(FAILED if _is_of_machine(error) else REFUSED, with_flags(str(error)))
     except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED

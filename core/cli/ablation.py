@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 from core.acquisition import Pulse
 from core.cli.options import (
     FLUX_OPTIONS,
+    add_capture,
     add_flux,
-    add_reading,
     flux_of,
     reading,
     require_none,
@@ -23,6 +22,7 @@ from core.cli.options import (
 from core.cli.results import add_results, publish
 from core.estimators import ESTIMATORS
 from core.io.readers import read_capture
+from core.io.readers.options import add_read_options
 from core.scene import scenes
 from core.studies.ablation import plain
 from core.studies.ablation.criterion import Requirement
@@ -39,7 +39,7 @@ def add(commands: Any) -> None:
         "requires", help="judge which parts and corrections a scene or a capture needs"
     )
     subject = command.add_mutually_exclusive_group()
-    subject.add_argument("--capture", type=Path, help="a file that `info` can read")
+    add_capture(subject)
     subject.add_argument("--scene", choices=scenes, default="car", help="built in (car)")
     add_flux(command)
     command.add_argument("--method", choices=ESTIMATORS, default="likelihood", help="(likelihood)")
@@ -48,7 +48,7 @@ def add(commands: Any) -> None:
     )
     command.add_argument("--json", action="store_true", help="one JSON object instead of tables")
     add_results(command, folder="")
-    add_reading(command)
+    add_read_options(command)
     command.set_defaults(work=_requires)
 
 

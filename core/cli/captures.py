@@ -17,8 +17,8 @@ from core.capture import Capture, CaptureInfo
 from core.checks import printable, require, shown
 from core.cli.options import (
     FLUX_OPTIONS,
+    add_capture,
     add_flux,
-    add_reading,
     angle,
     flux_of,
     reading,
@@ -31,7 +31,7 @@ from core.inspection import capture_report, pixel_report
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import ReadOptions, add_read_options
 from core.io.scene_files import read_scene
 from core.io.writers import (
     CAPTURE_SUFFIXES,
@@ -70,7 +70,7 @@ def _add_info(commands: Any) -> None:
     command.add_argument("capture", type=Path, help=f"a file: {', '.join(SUFFIXES)}")
     _add_pixel(command, "report on one pixel, ranged by tracking with default settings")
     _add_json(command)
-    add_reading(command)
+    add_read_options(command)
     command.set_defaults(work=_info)
 
 
@@ -161,7 +161,7 @@ def _add_estimate(commands: Any) -> None:
     for name, estimator in ESTIMATORS.items():
         method = methods.add_parser(name, help=estimator.title, description=estimator.title)
         subject = method.add_mutually_exclusive_group()
-        subject.add_argument("--capture", type=Path, help="a file that `info` can read")
+        add_capture(subject)
         subject.add_argument("--scene", choices=scenes, default="car", help="to simulate (car)")
         add_flux(method)
         method.add_argument(
@@ -187,7 +187,7 @@ def _add_estimate(commands: Any) -> None:
                 metavar=each.name.upper(),
                 help=f"{each.metadata['help']} ({each.default})".replace("%", "%%"),
             )
-        add_reading(method)
+        add_read_options(method)
         method.set_defaults(work=_estimate)
 
 
@@ -316,7 +316,7 @@ def _add_export(commands: Any) -> None:
     )
     command.add_argument("--overwrite", action="store_true", help="replace files")
     _add_json(command)
-    add_reading(command)
+    add_read_options(command)
     command.set_defaults(work=_export, suffixes=(*CAPTURE_SUFFIXES, ".csv"))
 
 

@@ -6,16 +6,16 @@ import argparse
 import json
 import math
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from core.acquisition import Flux
 from core.checks import require
-from core.io import ReadOptions, reading_options
+from core.io import read_options_from
 from core.io.readers.quantities import EXAMPLE_OF_ANGLE, parsed_angle
 
 
@@ -39,15 +39,25 @@ def angle(text: str) -> float:
         raise argparse.ArgumentTypeError(message) from None
 
 
-def add_reading(command: Any) -> None:
-    """Add the options for reading a file, one for each field of `core.io.ReadOptions`."""
-    group = command.add_argument_group("reading the file; what is not given is guessed")
-    for name, option in reading_options().items():
-        parts = option.kind.metavars
-        # One string for each option: `reading` parses them as the app's form does.
-        several = {"nargs": len(parts), "metavar": parts} if parts else {}
-        given = {"choices": option.kind.choices or None, "help": option.help}
-        group.add_argument(f"--{option.flag}", dest=name, **given, **several)
+class _Once(argparse.Action):
+    """Refuse an option that is given twice, of which only the last value would count."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        if (before := getattr(namespace, self.dest)) is not None:
+            parser.error(f"{option_string} is given twice, {before} and {values}: give one.")
+        setattr(namespace, self.dest, values)
+
+
+def add_capture(command: Any) -> None:
+    """Add the option for a file to read."""
+    help = "a file that `info` can read"
+    command.add_argument("--capture", type=Path, action=_Once, help=help)
 
 
 def add_processes(command: Any) -> None:
@@ -59,11 +69,7 @@ def add_processes(command: Any) -> None:
 
 def reading(chosen: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of `core.read_capture`."""
-    given = {name: getattr(chosen, name) or "" for name in reading_options()}
-    joined = {
-        name: each if isinstance(each, str) else " ".join(each) for name, each in given.items()
-    }
-    return vars(ReadOptions.from_text(joined))
+    return vars(read_options_from(chosen))
 
 
 FLUX_OPTIONS = ("sbr", "ppp", "seed")
@@ -88,14 +94,6 @@ def require_none(options: Mapping[str, Any], names: Sequence[str], reason: str) 
     """Refuse options that contradict others."""
     for name in names:
         require(name, options[name], options[name] is None, f"None: {reason}")
-
-
-def as_options(message: str) -> str:
-    """Return a message of `core` with the names of the command line's options."""
-    for name, option in reading_options().items():
-        if "_" in name:
-            message = re.sub(rf"\b{name}\b", f"--{option.flag}", message)
-    return message
 
 
 def show_progress(done: int, of: int, what: str = "pieces") -> None:

@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from core.acquisition import Flux
 from core.capture import Capture
 from core.checks import require
 from core.cli.options import (
+    add_capture,
     add_processes,
-    add_reading,
     reading,
     require_none,
     show_progress,
@@ -24,6 +23,7 @@ from core.cli.options import (
 )
 from core.cli.results import add_results, publish
 from core.io.readers import read_capture
+from core.io.readers.options import add_read_options
 from core.scene import scenes
 from core.studies.statistics import MIN_REPEATS
 from core.studies.tradeoff import page
@@ -43,7 +43,7 @@ def add(commands: Any) -> None:
         "tradeoff", help="measure speed against accuracy of every method; recommend configurations"
     )
     subject = command.add_mutually_exclusive_group()
-    subject.add_argument("--capture", type=Path, help="a file that `info` can read")
+    add_capture(subject)
     subject.add_argument(
         "--scene", nargs="+", choices=scenes, help=f"to simulate ({' '.join(SCENES)})"
     )
@@ -83,7 +83,7 @@ def add(commands: Any) -> None:
     command.add_argument("--short", action="store_true", help="one scene, one SBR: a minute")
     add_processes(command)
     add_results(command, folder="tradeoff")
-    add_reading(command)
+    add_read_options(command)
     command.set_defaults(work=_tradeoff)
 
 

@@ -225,6 +225,7 @@ def test_a_pixel_or_a_capture_is_exported(frames: Path, capsys: pytest.CaptureFi
             "--first-detections",
         ),
         (("info", "{frames}", "--bin-width", "64"), 2, "give a time such as 64ps"),
+        (("info", "{frames}", "--pixel-angle", "20 km"), 2, "give an angle such as 20urad"),
         (("field", "nowhere"), 2, "data_face.mat"),
     ],
 )
@@ -337,3 +338,9 @@ def test_a_pipe_that_closes_early_is_no_error(frames: Path) -> None:
     command = f"{sys.executable} -m core info {frames} | head -c 1"
     done = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stderr == ""
+
+
+def test_a_second_capture_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["estimate", "peak", "--capture", "a.npz", "--capture", "b.npz"])
+    assert "--capture is given twice, a.npz and b.npz" in capsys.readouterr().err

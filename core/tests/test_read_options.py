@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import core
-from core.cli.options import add_reading, reading
-from core.io import ReadOptions, reading_options
+from core.io import ReadOptions, add_read_options, read_options_from, reading_options
 from core.io.readers.quantities import angle_as_typed, parsed_angle, parsed_time, time_as_typed
 from core.tests.read_options import EXAMPLES
 
@@ -46,7 +45,7 @@ def test_functions_document_each_field(function: object) -> None:
 
 def test_the_command_line_has_an_option_for_each_field() -> None:
     parser, all_of_them = argparse.ArgumentParser(), ReadOptions(**EXAMPLES)
-    add_reading(parser)
+    add_read_options(parser)
     arguments = []
     for name, option in reading_options().items():
         text = all_of_them.as_text(name)
@@ -54,8 +53,8 @@ def test_the_command_line_has_an_option_for_each_field() -> None:
         arguments += (
             [f"--{option.flag}={text}"] if len(parts) == 1 else [f"--{option.flag}", *parts]
         )
-    assert reading(parser.parse_args(arguments)) == EXAMPLES
-    assert reading(parser.parse_args([])) == dict.fromkeys(NAMES)
+    assert read_options_from(parser.parse_args(arguments)) == all_of_them
+    assert read_options_from(parser.parse_args([])) == ReadOptions()
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("variable", "axes")])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, get_args
 
 import numpy as np
@@ -242,6 +242,11 @@ class ReadOptions:
                 require(name, text, False, f"{kind.accepts}, or nothing to let the reader guess")
         return cls(**values)
 
+    def completed_by(self, others: ReadOptions) -> ReadOptions:
+        """Return these options, and those of `others` where they are None."""
+        own = {name: value for name, value in vars(self).items() if value is not None}
+        return replace(others, **own)
+
     def as_text(self, name: str) -> str:
         """Return a field as it would be typed."""
         value = getattr(self, name)
@@ -316,3 +321,36 @@ def only_one(fitting: Sequence[str], accepted: str, listed: str) -> str:
 def reading_options() -> dict[str, Option]:
     """Return the option of each field of `ReadOptions`."""
     return {each.name: each.metadata["option"] for each in fields(ReadOptions)}
+
+
+def add_read_options(parser: Any) -> None:
+    """Add an option for each field of `ReadOptions` to a parser of `argparse`."""
+    group = parser.add_argument_group("reading the file; what is not given is guessed")
+    for name, option in reading_options().items():
+        parts = option.kind.metavars
+        # One string for each option: `read_options_from` parses them as a form does.
+        several = {"nargs": len(parts), "metavar": parts} if parts else {}
+        given = {"choices": option.kind.choices or None, "help": option.help}
+        group.add_argument(f"--{option.flag}", dest=name, **given, **several)
+
+
+def read_options_from(chosen: Any) -> ReadOptions:
+    """Return the options that `argparse` has parsed.
+
+    Raises
+    ------
+    ValueError
+        If a text cannot be parsed, or a value is out of its range.
+    """
+    given = {name: getattr(chosen, name) or "" for name in reading_options()}
+    return ReadOptions.from_text(
+        {name: each if isinstance(each, str) else " ".join(each) for name, each in given.items()}
+    )
+
+
+def with_flags(message: str) -> str:
+    """Return a message with the options of the command line instead of the fields' names."""
+    for name, option in reading_options().items():
+        if "_" in name:
+            message = re.sub(rf"\b{name}\b", f"--{option.flag}", message)
+    return message

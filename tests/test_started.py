@@ -1,0 +1,53 @@
+"""Files and reading options with which the app is started."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.__main__ import main, readable
+from app.model.reading import options_in_use
+from app.model.script import script_of
+from app.model.store import built_in_sources
+from app.pages.session import Session
+from core.io import ReadOptions
+from tests.browser import eventually
+
+CUBE = np.random.default_rng(2).poisson(0.3, (4, 6, 40))
+
+
+@pytest.fixture
+def paths(tmp_path):
+    """A file that is no capture, one that does not exist, and a capture."""
+    (tmp_path / "broken.npz").write_bytes(b"no capture")
+    np.savez(tmp_path / "day.npz", day=CUBE, night=CUBE)
+    return [tmp_path / name for name in ("broken.npz", "absent.mat", "day.npz")]
+
+
+def test_files_that_cannot_be_read_are_reported_and_the_others_are_served(paths, capsys):
+    files = readable(paths, ReadOptions(variable="day", bin_width_s=64e-12))
+    assert [source.title for source in files.values()] == ["day.npz"]
+    said = capsys.readouterr()
+    assert "variable day" in said.out
+    assert [line.partition(": ")[0] for line in said.err.splitlines()] == ["Not opened"] * 2
+    assert "broken.npz" in said.err and "absent.mat" in said.err
+
+
+def test_options_hold_until_others_are_chosen(paths):
+    files = readable(paths, ReadOptions(variable="day", bin_width_s=64e-12))
+    session = Session(files | {"car": built_in_sources()["car"]})
+    assert session.answer.capture.acquisition.bin_width_s == 64e-12
+    assert session.state.reading == ReadOptions()
+    assert options_in_use(session.answer)["bin_width_s"] == "64 ps"
+    assert 'variable="day")' in script_of(session.answer, session.state)
+    session.state.reading = ReadOptions(bin_width_s=1e-9)
+    eventually(lambda: session.answer.capture.acquisition.bin_width_s == 1e-9)
+    assert "variable day" in session.answer.capture.source
+
+
+def test_without_a_readable_file_each_is_reported_and_nothing_is_served(paths, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main([*map(str, paths), "--bins", "41", "--variable", "day"])
+    said = capsys.readouterr().err
+    assert all(path.name in said for path in paths)
+    assert "--bins = 41" in said
