@@ -50,6 +50,23 @@ def test_any_order_of_axes_in_any_stretch(
     np.testing.assert_array_equal(capture.cube, expected)
 
 
+@pytest.mark.parametrize(("no_trigger", "dtype"), [(-1, "i2"), (65535, "u2"), (-1, "f4")])
+@pytest.mark.parametrize("name", ["f.npy", "f.npz"])
+def test_frames_are_no_cube(no_trigger: int, dtype: str, name: str, write: Write) -> None:
+    stack = np.where(FRAMES < 0, no_trigger, FRAMES).astype(dtype)[:40]
+    content = npy_bytes(stack) if name.endswith("npy") else npz_bytes(data=stack)
+    path = write(name, content)
+    with pytest.raises(CaptureError, match=f"no_trigger = None .* give {no_trigger}.* raw frames"):
+        read_capture(path)
+    assert read_capture(path, no_trigger=no_trigger).acquisition.n_pulses == 40
+
+
+def test_a_cube_may_hold_any_counts(write: Write) -> None:
+    for cube in (np.full((2, 3, 9), 255), np.tile([0, 0, 0, 60000], (2, 3, 5)), CUBE):
+        found = read_capture(write("c.npy", npy_bytes(cube.astype(np.uint16))))
+        np.testing.assert_array_equal(found.cube, cube)
+
+
 def test_frames_are_first_photons(write: Write) -> None:
     capture = read_capture(write("f.npy", npy_bytes(FRAMES)), no_trigger=-1)
     assert capture.detection == "first"
@@ -89,6 +106,7 @@ def test_only_the_cube_must_fit(write: Write, monkeypatch: pytest.MonkeyPatch) -
         path = write(name, content)
         assert path.stat().st_size > 0.8 * limit
         options = {"no_trigger": -1} if name == "s.npy" else {}
+        read_capture(path, **options)  # imports what it needs
         tracemalloc.start()
         try:
             capture = read_capture(path, **options)

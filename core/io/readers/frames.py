@@ -28,6 +28,7 @@ from core.io.readers.options import ReadOptions
 AXES = ("pulse", "row", "col")
 STRETCH = 2**20
 MOST_GUESSED_BINS = 2**16
+_LARGEST_USUAL_COUNT = 255
 
 Stretch = tuple[tuple[int, int, int], NDArray[Any]]
 """Pulse, row and column of the first of some frames, and the frames (pulse, row, col)."""
@@ -121,6 +122,26 @@ def frames_capture(
     detection = request.detection or "first"
     known = replace(request, n_pulses=n_pulses, no_trigger=None, detection=detection)
     return dense_capture(cube, origin, known, guessed=guessed, bin_width_s=bin_width_s)
+
+
+def require_counts(array: NDArray[Any], name: str) -> None:
+    """Refuse an array of which more than half is one value that hardly is a count.
+
+    Raises
+    ------
+    ValueError
+        If its least value is negative, or its largest above 255, and as frequent as that: such a
+        value probably marks the pulses without a trigger in raw frames.
+    """
+    if array.ndim != 3 or not array.size or array.dtype.kind not in "iuf":
+        return
+    least, largest = array.min().item(), array.max().item()
+    for value in (least, largest):
+        is_count = 0 <= value <= _LARGEST_USUAL_COUNT
+        if not is_count and np.count_nonzero(array == value) > array.size / 2:
+            frames = f"raw frames ({', '.join(AXES)})"
+            what = f"{value} if {name} holds {frames}: more than half of its values are {value}"
+            require("no_trigger", None, False, what)
 
 
 def _count_triggers(

@@ -1,7 +1,7 @@
 """NumPy ``.npy``: one histogram cube (row, col, bin) of non-negative whole numbers.
 
 If ``no_trigger`` is given, the array holds raw frames (pulse, row, col), see
-`core.io.readers.frames`.
+`core.io.readers.frames`. An array that looks like such is refused without it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import cube_capture
-from core.io.readers.frames import Header, frames_from
+from core.io.readers.frames import Header, frames_from, require_counts
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.options import ReadOptions
 
@@ -34,6 +34,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
         if request.no_trigger is not None:
             return frames_in(file, size, "the array", path.name, request)
         cube = read_array(file, size, "the array")
+    require_counts(cube, "the array")
     return cube_capture(cube, "the array", path.name, request)
 
 

@@ -44,6 +44,7 @@ from core.acquisition import Floats, Pulse
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import AXES, Description, cube_capture, dense_capture, stored_counts
+from core.io.readers.frames import require_counts
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.layout import (
     PULSE,
@@ -93,7 +94,9 @@ def read(path: Path, request: ReadOptions) -> Capture:
         origin = f"{path.name}, variable {name}"
         is_frames = name == "frames" or (request.no_trigger is not None and name != "cube")
         if name != "cube" and not is_frames:
-            return cube_capture(_array(archive, name), name, origin, request)
+            counts = _array(archive, name)
+            require_counts(counts, name)
+            return cube_capture(counts, name, origin, request)
         known = {field: _field(archive, field) for field in names if field in _FIELDS}
         version = known.get("format", FORMAT)
         require("format", version, str(version) == FORMAT, FORMAT)
