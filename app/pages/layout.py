@@ -248,7 +248,6 @@ class Layout:
             self._connection,
             self._busy,
             self.alert,
-            self._reading.question,
             sizing_mode="stretch_width",
             margin=(4, 12, 0, 12),
         )
@@ -269,6 +268,7 @@ class Layout:
         return [
             self._source,
             self._file,
+            self._reading.question,
             self._shared[Shared.UNIT],
             *(aside for name, aside in asides.items() if not self._pages[name].sidebar_last),
             self._light_part,

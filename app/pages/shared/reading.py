@@ -72,13 +72,13 @@ class ReadingForm:
         self.part.param.update(visible=True, collapsed=False)
         self.question.visible = bool(variables)
         self.question[:] = [
-            Sentence(text=QUESTION.format(file=name), sizing_mode="stretch_width", margin=(4, 0)),
+            Sentence(text=QUESTION.format(file=name), sizing_mode="stretch_width", margin=(4, 8)),
             pn.FlexBox(*map(self._choice, variables)),
         ]
 
     def _choice(self, variable: str) -> pmui.Button:
         help = f"Read the array {variable}."
-        return button(variable, help, partial(self._apply, {"variable": variable}), (2, 8, 6, 0))
+        return button(variable, help, partial(self._apply, {"variable": variable}), (2, 0, 6, 8))
 
     def _fill(self, reading: ReadOptions, used: Mapping[str, str]) -> None:
         shown = {name: reading.as_text(name) or used.get(name, "") for name in self._fields}
