@@ -22,8 +22,7 @@ def options_in_use(answer: Answer) -> dict[str, str]:
         pixel_angle_rad=acquisition.pixel_angle_rad if answer.cutout is None else None,
         shape=capture.shape if answer.cutout is None else None,
     )
-    texts = {name: used.as_text(name) for name in vars(used)}
-    return {name: text for name, text in texts.items() if text}
+    return {name: used.as_text(name) for name in vars(used)}
 
 
 def changed_options(

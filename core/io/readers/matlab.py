@@ -33,7 +33,7 @@ from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
 from core.io.readers.dense import LARGEST_COUNT, count_dtype, cube_capture, dense_capture
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.options import ReadOptions, only_one
+from core.io.readers.options import ReadOptions, choose_variable
 from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
 
 _USER_BLOCK = 512  # before the HDF5 of version 7.3
@@ -197,12 +197,8 @@ def _choose(variables: Sequence[Variable], name: str | None) -> Variable:
     listed = ", ".join(map(str, variables)) or "nothing"
     accepted = "a cell (row, col) of arrival times, a cube (row, col, bin), or a sparse matrix "
     accepted += "(pixel, bin)"
-    if name is None:
-        # Photons are counted in whole numbers; fractions may be rates.
-        likely = sorted(fitting, key=lambda each: fitting[each].kind in _FRACTIONS)
-        return fitting[only_one(likely, accepted, listed)]
-    require("variable", name, name in fitting, f"the name of {accepted}; the file has {listed}")
-    return fitting[name]
+    whole = {each: variable.kind not in _FRACTIONS for each, variable in fitting.items()}
+    return fitting[choose_variable(name, fitting, whole, accepted, listed)]
 
 
 def _bin_width(values: Iterable[float]) -> float | None:

@@ -32,7 +32,6 @@ accompany them. Frames that are stored without compression may be larger than me
 from __future__ import annotations
 
 from dataclasses import replace
-from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
@@ -55,7 +54,7 @@ from core.io.readers.layout import (
     require_pulse_in_gate,
 )
 from core.io.readers.npy import frames_in, read_array, read_header
-from core.io.readers.options import ReadOptions, only_one
+from core.io.readers.options import ReadOptions, choose_variable
 
 FORMAT = "firstphoton-capture-1"
 
@@ -131,23 +130,16 @@ def read(path: Path, request: ReadOptions) -> Capture:
 def _choose(archive: ZipFile, names: list[str], request: ReadOptions) -> str:
     """Return the requested array, else ``cube``, ``frames``, or the only one with three axes."""
     listed, variable = ", ".join(names) or "none", request.variable
-    accepted = "a (row, col, bin) array"
-    if variable is not None:
-        what = f"the name of {accepted}; the file has {listed}"
-        require("variable", variable, variable in names, what)
-        return variable
     for name in ("cube", "frames") if request.no_trigger is None else ("frames",):
-        if name in names:
+        if variable is None and name in names:
             return name
-    cubes = []
-    for name in names:
+    cubes = {}
+    for name in names if variable is None else ():
         with _opened(archive, name) as file:
             header = read_header(file, name)
         if len(header.shape) == 3:
-            cubes.append((header.dtype.kind not in "iu", name))
-    # Photons are counted in whole numbers; fractions may be rates.
-    likely = [name for _, name in sorted(cubes, key=itemgetter(0))]
-    return only_one(likely, accepted, listed)
+            cubes[name] = header.dtype.kind in "iu"
+    return choose_variable(variable, names, cubes, "a (row, col, bin) array", listed)
 
 
 def _field(archive: ZipFile, name: str) -> Any:

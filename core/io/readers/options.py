@@ -7,7 +7,7 @@ and scripts are made from the fields of `ReadOptions` and their `Option`.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, get_args
 
@@ -301,21 +301,41 @@ class AmbiguousError(ValueError):
         )
 
 
-def only_one(fitting: Sequence[str], accepted: str, listed: str) -> str:
-    """Return the name of the only array that fits; `accepted` says which would.
+def choose_variable(
+    requested: str | None,
+    names: Container[str],
+    fitting: Mapping[str, bool],
+    accepted: str,
+    listed: str,
+) -> str:
+    """Return the requested name, else that of the only array that fits.
+
+    Parameters
+    ----------
+    requested : str or None
+    names : container of str
+        Those that may be requested.
+    fitting : mapping of str to bool
+        Names of the arrays that fit, and whether they hold whole numbers. Photons are counted in
+        such; fractions may be rates.
+    accepted, listed : str
+        What an array must be, and the arrays of the file, for messages.
 
     Raises
     ------
     AmbiguousError
         If several fit.
     ValueError
-        If none fits.
+        If the requested one is unknown, or none fits.
     """
+    what = f"the name of {accepted}; the file has {listed}"
+    if requested is not None:
+        require("variable", requested, requested in names, what)
+        return requested
     if len(fitting) > 1:
-        raise AmbiguousError(fitting, listed)
-    what = f"as variable the name of {accepted}; the file has {listed}"
-    require("variable", None, len(fitting) == 1, what)
-    return fitting[0]
+        raise AmbiguousError(sorted(fitting, key=lambda name: not fitting[name]), listed)
+    require("variable", None, len(fitting) == 1, f"as variable {what}")
+    return next(iter(fitting))
 
 
 def reading_options() -> dict[str, Option]:

@@ -23,7 +23,7 @@ from core.checks import require
 from core.io.readers.dense import AXES, cube_capture
 from core.io.readers.guards import require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.options import ReadOptions, only_one
+from core.io.readers.options import ReadOptions, choose_variable
 
 _HISTOGRAMS = {0x00: "decay curves", 0x10: "pages", 0x60: "an image"}
 _CONTENT = 0xF0
@@ -60,12 +60,8 @@ def _choose(types: list[int], variable: str | None) -> int:
     kinds = [_HISTOGRAMS.get(kind & _CONTENT) for kind in types]
     fitting = {f"block {number}": number for number, kind in enumerate(kinds) if kind}
     listed = ", ".join(f"{name} ({kinds[number]})" for name, number in fitting.items()) or "none"
-    accepted = "a block with histograms"
-    if variable is None:
-        variable = only_one(list(fitting), accepted, listed)
-    what = f"the name of {accepted}; the file has {listed}"
-    require("variable", variable, variable in fitting, what)
-    return fitting[variable]
+    whole = dict.fromkeys(fitting, True)
+    return fitting[choose_variable(variable, fitting, whole, "a block with histograms", listed)]
 
 
 def _image(data: NDArray[Any], name: str) -> NDArray[Any]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from core.checks import require
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.options import ReadOptions, only_one
+from core.io.readers.options import ReadOptions, choose_variable
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 CLASSIC_SIGNATURES = (b"CDF\x01", b"CDF\x02")
@@ -161,16 +161,11 @@ def choose(arrays: Sequence[Stored], request: ReadOptions) -> Stored:
     """
     named = {array.name: array for array in arrays}
     listed = ", ".join(map(str, arrays[:20])) + ", ..." * (len(arrays) > 20) or "nothing"
-    accepted, name = "a (row, col, bin) array", request.variable
-    if name is None and "counts" in named:
-        name = "counts"
-    if name is None:
-        cubes = [array for array in arrays if len(array.shape) == 3]
-        # Photons are counted in whole numbers; fractions may be rates.
-        cubes.sort(key=lambda array: array.dtype.kind not in "iu")
-        name = only_one([array.name for array in cubes], accepted, listed)
-    what = f"as variable the name of {accepted}; the file has {listed}"
-    require("variable", name, name in named, what)
+    requested = request.variable
+    if requested is None and "counts" in named:
+        requested = "counts"
+    cubes = {array.name: array.dtype.kind in "iu" for array in arrays if len(array.shape) == 3}
+    name = choose_variable(requested, named, cubes, "a (row, col, bin) array", listed)
     chosen = named[name]
     within = "an array of whole or real numbers in the file itself"
     require(f"variable {name}", chosen.refused, not chosen.refused, within)
