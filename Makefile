@@ -21,13 +21,13 @@ help: ## list the commands
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
 
-# Tests of the app's server often wait, so a third worker has something to do on two cores.
+# Tests that wait leave room for a third worker on two cores.
 test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -n auto $(KERNELS:%=core/tests/test_%.py) --cov --cov-report=
-	$(BIN)/python -m pytest -n auto --dist loadfile core/tests --cov --cov-append --cov-fail-under=95
+	$(BIN)/python -m pytest -n 3 --dist loadfile core/tests --cov --cov-append --cov-fail-under=95
 	$(BIN)/python -m pytest -n 3 --dist loadfile tests -m "not browser"
 	$(BIN)/python -m pytest -n auto --dist loadfile tests -m browser
 
@@ -94,6 +94,7 @@ $(VENV)/.app: pyproject.toml constraints.txt
 $(VENV)/.test: $(VENV)/.app
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[app,test]'
 	sh tests/install_browser.sh $(BIN)/python
+	$(BIN)/python -c "import core; core.warm_up()"
 	touch $@
 
 clean: ## remove what the other commands made

@@ -9,24 +9,28 @@ encrypted: use a trusted network, or ssh -L.
 from __future__ import annotations
 
 import argparse
+import gc
 import logging
 import os
 import signal
 import sys
 import webbrowser
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any
 
 import panel as pn
+from tornado.ioloop import IOLoop, PeriodicCallback
 
 import core
+from app import THRESHOLD
 from app.model import text
-from app.model.state import Illumination
-from app.model.store import NO_OPTIONS, Source, built_in_sources, file_source
+from app.model.store import Source, built_in_sources, content_key, file_source
 from app.model.uploads import Uploads
-from app.pages.layout import build_page
+from app.model.watched import LOOK_MS, WatchedFolder
+from app.pages.layout import Arrivals, build_page
 from app.server import garbage
 from app.server.access import TOKEN_VARIABLE, Access
 from app.server.patches import apply_patches, scripts
@@ -34,6 +38,7 @@ from app.server.ports import free_port, port_number
 from app.server.serve import server_of
 from app.server.tuning import tune
 from app.tasks.scheduler import STUDIES
+from app.tasks.signals import Signal
 from app.widgets.connection import LINGER_S
 from app.widgets.controls import Sentence
 from core.io import SUFFIXES, ReadOptions, add_read_options, read_options_from, with_flags
@@ -43,6 +48,64 @@ log = logging.getLogger(__name__)
 
 def main(arguments: list[str] | None = None) -> int:
     """Serve until interrupted; return the exit code."""
+    parser = parser_of_arguments()
+    chosen = parser.parse_args(arguments)
+    try:
+        options = read_options_from(chosen)
+        files = readable(chosen.captures, options)
+        watched = None if chosen.watch is None else WatchedFolder(chosen.watch, options)
+    except ValueError as error:
+        parser.error(with_flags(str(error)))
+    newest = None if watched is None else watched.look()
+    # Files come first: the page opens on the first source.
+    sources = {**(newest.found if newest else {}), **files, **built_in_sources()}
+    uploads = Uploads()
+    arrivals: Arrivals | None = None if watched is None else Signal()
+    pn.extension("vtk")
+    try:
+        port = chosen.port or free_port(chosen.address)
+        scripts()  # raises for unknown names of patches
+        token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
+        access = Access.of(chosen.address, port, chosen.origin, token)
+        server = server_of(
+            lambda: page_for(sources, uploads, arrivals),  # Panel would draw a partial as an object
+            access,
+            chosen.address,
+            port,
+            chosen.linger,
+        )
+    except ValueError as error:
+        parser.error(str(error))
+    except OSError as error:
+        print(f"Cannot serve at {chosen.address}, port {chosen.port}: {error.strerror}.")
+        print("Choose another --port, or --port 0 for a free one.")
+        return 1
+    # An exception raised at an arbitrary place can be lost: handle SIGTERM like Ctrl+C, for which
+    # Panel stops the loop below.
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    print("Compiling kernels that are not cached ...", flush=True)
+    core.warm_up()
+    tune()
+    apply_patches()
+    garbage.freeze_all()
+    gc.set_threshold(*THRESHOLD)
+    gettempdir()  # is chosen by writing to it: on a full disk, Python would find no folder at all
+    link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
+    print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
+    if chosen.show:
+        server.io_loop.add_callback(webbrowser.open, link)
+    server.start()
+    if watched is not None and arrivals is not None:
+        PeriodicCallback(partial(look, watched, sources, arrivals), LOOK_MS).start()
+    server.io_loop.start()  # until Ctrl+C
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl+C exits at once
+    server.stop()
+    STUDIES.is_closed = True
+    return 0
+
+
+def parser_of_arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog="firstphoton" if Path(sys.argv[0]).stem == "firstphoton" else "python -m app",
         description=__doc__,
@@ -71,48 +134,14 @@ def main(arguments: list[str] | None = None) -> int:
         metavar="SECONDS",
         help="time for which a closed or disconnected page is kept (default: %(default)s)",
     )
+    parser.add_argument(
+        "--watch",
+        type=Path,
+        metavar="FOLDER",
+        help="open each capture that is written to this folder, beginning with the newest there",
+    )
     add_read_options(parser)
-    chosen = parser.parse_args(arguments)
-    try:
-        files = readable(chosen.captures, read_options_from(chosen))
-    except ValueError as error:
-        parser.error(with_flags(str(error)))
-    # Files come first: the page opens on the first source.
-    sources, uploads = files | built_in_sources(), Uploads()
-    pn.extension("vtk")
-    try:
-        port = chosen.port or free_port(chosen.address)
-        scripts()  # raises for unknown names of patches
-        token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
-        access = Access.of(chosen.address, port, chosen.origin, token)
-        server = server_of(
-            lambda: page_for(sources, uploads), access, chosen.address, port, chosen.linger
-        )
-    except ValueError as error:
-        parser.error(str(error))
-    except OSError as error:
-        print(f"Cannot serve at {chosen.address}, port {chosen.port}: {error.strerror}.")
-        print("Choose another --port, or --port 0 for a free one.")
-        return 1
-    # An exception raised at an arbitrary place can be lost: handle SIGTERM like Ctrl+C, for which
-    # Panel stops the loop below.
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
-    print("Compiling kernels that are not cached ...", flush=True)
-    core.warm_up()
-    tune()
-    apply_patches()
-    garbage.freeze_all()
-    gettempdir()  # is chosen by writing to it: on a full disk, Python would find no folder at all
-    link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
-    print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
-    if chosen.show:
-        server.io_loop.add_callback(webbrowser.open, link)
-    server.start()
-    server.io_loop.start()  # until Ctrl+C
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl+C exits at once
-    server.stop()
-    STUDIES.is_closed = True
-    return 0
+    return parser
 
 
 def readable(paths: Sequence[Path], options: ReadOptions) -> dict[str, Source]:
@@ -124,11 +153,11 @@ def readable(paths: Sequence[Path], options: ReadOptions) -> dict[str, Source]:
         If none can be read.
     """
     found, refused = {}, []
-    for number, path in enumerate(paths):
+    for path in paths:
         source = file_source(path, given=options, shared=True)
         try:
-            print(source.load(Illumination(), NO_OPTIONS, ()).source, flush=True)
-            found[f"path {number}"] = source
+            print(source.read().source, flush=True)
+            found[content_key(path)] = source
         except ValueError as error:  # unreadable or too large
             refused.append(error)
     if refused and not found:
@@ -138,13 +167,23 @@ def readable(paths: Sequence[Path], options: ReadOptions) -> dict[str, Source]:
     return found
 
 
-def page_for(sources: Mapping[str, Source], uploads: Uploads) -> Any:
+async def look(watched: WatchedFolder, sources: dict[str, Source], arrivals: Arrivals) -> None:
+    """Offer captures that have just been written to all pages, open ones and later ones."""
+    arrival = await IOLoop.current().run_in_executor(None, watched.look)
+    if arrival is not None:
+        arrival.update(sources)
+        arrivals.emit(arrival)
+
+
+def page_for(
+    sources: Mapping[str, Source], uploads: Uploads, arrivals: Arrivals | None = None
+) -> Any:
     """Return the page of a new session, or a sentence if it cannot be built."""
     if pn.state.curdoc is not None:
         pn.state.curdoc.template_variables["scripts"] = scripts()
         pn.state.onload(garbage.freeze_all)
     try:
-        return build_page(sources, uploads)
+        return build_page(sources, uploads, arrivals)
     except Exception:
         log.exception("could not build a page")
         return Sentence(text=text.NO_PAGE, warning=True)

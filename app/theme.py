@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import colorcet
 
+from core.io import RangeColors, colors_of
+
 FONT = "Roboto, system-ui, sans-serif"
 
-# Perceptually uniform, without its white end, which would vanish on the page.
-RANGE_COLORS: list[str] = colorcet.palette["bgyw"][:-12]
+RANGE_COLORS = colors_of(RangeColors().color_map)
 ERROR_COLORS: list[str] = colorcet.palette["diverging_bwr_20_95_c54"]
 COUNT_COLORS: list[str] = colorcet.palette["fire"][30:-20]
 WRONG_COLOR = "#e8206a"
-OUTSIDE_COLOR = "#8d949c"
-"""Colour of values beyond the ends of a range image's scale."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,9 @@ OPPOSITE_UNIT = {"bins": "m", "ns": "m", "m": "bins"}
 AXIS_TITLES = {"bins": "Bin", "ns": "Time (ns)", "m": "Range (m)"}
 
 
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 class Quantity(str):
     """Text of a number that keeps the number, which tables and downloads use.
 
@@ -53,11 +56,41 @@ class Quantity(str):
         return quantity
 
 
-def number(value: float, unit: str, sign: bool = False) -> Quantity:
-    """Format a number with its unit; a dash if it is not finite."""
+def number(value: float, unit: str, sign: bool = False, decimals: int | None = None) -> Quantity:
+    """Format a number with its unit, by default with four digits; a dash if it is not finite."""
     value = value if math.isfinite(value) else math.nan
-    text = f"{value:+.4g}" if sign else f"{value:.4g}" if abs(value) < 1000 else f"{value:,.2f}"
+    plus = "+" if sign else ""
+    if decimals is not None:
+        text = f"{value:{plus},.{decimals}f}"
+    elif sign or abs(value) < 1000:
+        text = f"{value:{plus}.4g}"
+    else:
+        text = f"{value:,.2f}"
     return Quantity(f"{text} {unit}".strip(), value, unit)
+
+
+def supported_decimals(low: float, high: float) -> int | None:
+    """Return the decimals that give half the width of an interval two digits; None without one."""
+    half = (high - low) / 2
+    return max(0, 1 - math.floor(math.log10(half))) if half > 0 else None
+
+
+def plus_minus(low: float, high: float, unit: str) -> Quantity:
+    """Format an interval as its middle and half its width; a dash for NaN."""
+    middle, half, decimals = (low + high) / 2, (high - low) / 2, supported_decimals(low, high)
+    if decimals is None:
+        return Quantity("", math.nan, unit)
+    text = f"{middle:,.{decimals}f} ± {half:.{decimals}f} {unit}"
+    return Quantity(text, middle, unit, low, high)
+
+
+def between(low: float, high: float, unit: str) -> Quantity:
+    """Format the ends of an interval; a dash for NaN."""
+    decimals = supported_decimals(low, high)
+    if decimals is None:
+        return Quantity("", math.nan, unit)
+    text = f"{low:,.{decimals}f}–{high:,.{decimals}f} {unit}"
+    return Quantity(text, (low + high) / 2, unit, low, high)
 
 
 def count(value: int, note: str = "") -> Quantity:
@@ -79,18 +112,24 @@ def milliseconds(seconds: float) -> Quantity:
 
 def three_digits(value: float) -> str:
     """Format a number with three digits; a dash for NaN."""
-    return "–" if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.3g}"
+    if not math.isfinite(value):
+        return "–" if math.isnan(value) else "∞"
+    if 0 < abs(value) < 1e-3:
+        digits, power = f"{value:.2e}".split("e")
+        return f"{digits}×10{str(int(power)).translate(_RAISED)}"
+    return f"{float(f'{value:.3g}'):,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def bounds(low: float, high: float) -> str:
     """Format the ends of an interval; empty for NaN."""
-    return "" if math.isnan(low) else f"[{three_digits(low)}, {three_digits(high)}]"
+    return "" if math.isnan(low) else f"[{three_digits(low)}–{three_digits(high)}]"
 
 
 def interval(value: float, low: float, high: float) -> Quantity:
-    """Format a number with the ends of its interval."""
-    text = f"{three_digits(value)} {bounds(low, high)}".strip()
-    return Quantity(text, value, low=low, high=high)
+    """Format a number with the ends of its interval, or with the lower one if it has no other."""
+    is_open = math.isinf(value) and math.isfinite(low)
+    text = f"> {three_digits(low)}" if is_open else f"{three_digits(value)} {bounds(low, high)}"
+    return Quantity(text.strip(), value, low=low, high=high)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,35 @@
 
 The names exported here are what most scripts need. `PUBLIC_MODULES` export more; any other module
 may change without notice.
+
+Examples
+--------
+Counts of any origin become a capture: unsigned numbers of shape (row, col, bin), and what is known
+of the recording. Here they are simulated.
+
+>>> import core
+>>> scene = core.scenes["staircase"](16)
+>>> counts = core.simulate(scene, core.Acquisition(), core.Flux(signal=0.3, sbr=1.0), seed=1).cube
+>>> acquisition = core.Acquisition(n_bins=counts.shape[2], bin_width_s=1e-9, n_pulses=1000)
+>>> capture = core.Capture(counts, acquisition, truth_range_m=scene.range_m, source="staircase")
+
+Estimate its ranges, and compare them with the truth.
+
+>>> image = core.estimate(capture, "likelihood", false_alarm=0.01)
+>>> image.range_m.shape
+(16, 16)
+>>> core.metrics.coverage(image.range_m, capture.truth_range_m)
+1.0
+>>> core.metrics.rmse_m(image.range_m, capture.truth_range_m) < capture.acquisition.bin_length_m
+True
+
+Continue with labelled arrays, or save a file for other software.
+
+>>> image.to_xarray().range_m.attrs["units"]
+'m'
+>>> dict(capture.to_xarray().counts.sizes)
+{'row': 16, 'col': 16, 'bin': 100}
+>>> core.save_image(capture, image, "ranges.nc")
 """
 
 from core import inspection, metrics, reductions
@@ -9,18 +38,20 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError
 from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
-from core.inference import limits
+from core.inference import RangeInterval, limits, pixel_range_intervals, range_interval
 from core.io import (
     SceneError,
     open_capture,
     read_capture,
     read_scene,
+    read_truth,
     save_capture,
     save_image,
     save_pixel,
 )
 from core.out_of_core import Window, as_image, estimate_large, read_window, sampled_flux_prior
 from core.pipeline import Run, run
+from core.report import save_report
 from core.scene import PARTS, Scene, parts_of, scenes, without
 from core.simulation import first_photons, simulate
 from core.tracking import PRESETS, Signals, TrackingParameters, tracking_signals
@@ -31,6 +62,7 @@ from core.trigger import (
     rate_per_bin,
     trigger_probability,
 )
+from core.version import __version__ as __version__
 from core.warmup import warm_up
 
 PUBLIC_MODULES = (
@@ -46,6 +78,8 @@ PUBLIC_MODULES = (
     "core.out_of_core",
     "core.parameters",
     "core.reductions",
+    "core.report",
+    "core.scripts",
     "core.studies",
     "core.studies.ablation",
     "core.studies.paper",
@@ -56,8 +90,6 @@ PUBLIC_MODULES = (
 """Modules whose ``__all__`` is public, too."""
 
 light_of_whole = sampled_flux_prior  # deprecated name, to be removed after the next release
-
-__version__ = "0.1.0"
 
 __all__ = [
     "CORRECTIONS",
@@ -71,6 +103,7 @@ __all__ = [
     "Flux",
     "Pulse",
     "RangeImage",
+    "RangeInterval",
     "Run",
     "Scene",
     "SceneError",
@@ -90,9 +123,12 @@ __all__ = [
     "no_trigger_probability",
     "open_capture",
     "parts_of",
+    "pixel_range_intervals",
+    "range_interval",
     "rate_per_bin",
     "read_capture",
     "read_scene",
+    "read_truth",
     "read_window",
     "reductions",
     "run",
@@ -100,6 +136,7 @@ __all__ = [
     "save_capture",
     "save_image",
     "save_pixel",
+    "save_report",
     "scenes",
     "simulate",
     "tracking_signals",

@@ -26,11 +26,18 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.checks import require
 from core.deprecation import renamed
 from core.kernels.blocks import Blocks, to_blocks
+from core.labels import dataset
+from core.notebook import html_table
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from core.inference.flux_model import FluxPrior
 
 COUNT_TYPES = (np.uint8, np.uint16, np.uint32)
+
+IMAGES = ("truth_range_m", "reported_range_m", "signal")
+"""Fields of a `Capture` that hold an image (row, col), or None."""
 
 Detection = Literal["first", "all"]
 """``"first"``: at most one detection per pulse (Geiger mode); ``"all"``: every photon (TCSPC)."""
@@ -72,6 +79,12 @@ class Capture:
         Flux parameters of the image that these pixels belong to; estimated from these pixels if
         None. ``dataclasses.replace`` keeps it: pass ``flux_prior=None`` together with counts of
         another image, gate or number of pulses.
+    reported_range_m : ndarray, shape (row, col), optional
+        Range in metres that the instrument itself reported, NaN where it found no target: a second
+        estimate to compare with, not truth.
+    n_records : int, optional
+        Records in time of the file that the capture was read from, all of them or some added up;
+        None for a file without a sequence.
 
     Raises
     ------
@@ -88,6 +101,8 @@ class Capture:
     source: str = ""
     detection: Detection = "first"
     flux_prior: FluxPrior | None = field(default=None, repr=False)
+    reported_range_m: Floats | None = None
+    n_records: int | None = None
 
     def __post_init__(self) -> None:
         cube = self.cube
@@ -103,7 +118,7 @@ class Capture:
             self.acquisition.n_bins == cube.shape[2],
             f"{cube.shape[2]}, the cube's last axis",
         )
-        for name in ("truth_range_m", "signal"):
+        for name in IMAGES:
             image = getattr(self, name)
             if image is not None:
                 fits = image.shape == self.shape
@@ -149,6 +164,45 @@ class Capture:
         """Whole bins that hold the middle 80 % of an echo, at least 1."""
         begin_s, end_s = self.pulse.span_s
         return max(1, math.ceil((end_s - begin_s) / self.acquisition.bin_width_s))
+
+    def images(self, change: Callable[[Floats], Any]) -> dict[str, Any]:
+        """Return each of `IMAGES` after a change, by its field; what is None remains None."""
+        images = {name: getattr(self, name) for name in IMAGES}
+        return {name: image if image is None else change(image) for name, image in images.items()}
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return the capture as labelled arrays, as `core.save_capture` writes them.
+
+        Returns
+        -------
+        xarray.Dataset
+            ``counts`` over ``row``, ``col`` and ``bin`` with the coordinates ``time_s`` (when a bin
+            opens, after the pulse) and ``range_m``; its attributes describe acquisition, pulse,
+            detection and source. Where known, ``truth_range_m``, ``reported_range_m`` and
+            ``signal`` over ``row`` and ``col``.
+        """
+        return dataset(self)
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """Size, gate, pulses, photons, kind of detection, truth and source as text, by name."""
+        (rows, cols), acquisition = self.shape, self.acquisition
+        photons, n_pulses = int(self.counts.sum()), acquisition.n_pulses
+        begin_m, end_m = acquisition.bin_to_range_m([0, acquisition.n_bins]).tolist()
+        return {
+            "shape": f"{rows} × {cols} pixels",
+            "bins": f"{acquisition.n_bins} of {acquisition.bin_width_s * 1e9:.6g} ns, "
+            f"{begin_m:.6g} to {end_m:.6g} m",
+            "pulses": "not known" if n_pulses is None else f"{n_pulses:,}",
+            "photons": f"{photons:,}, {photons / self.counts.size:.4g} per pixel",
+            "detection": "first photons" if self.detection == "first" else "all photons",
+            "truth": "not known" if self.truth_range_m is None else "known",
+            "source": self.source,
+        }
+
+    def _repr_html_(self) -> str:
+        """Return a table for notebooks."""
+        return html_table("Capture", self.facts)
 
 
 class CaptureInfo(Protocol):

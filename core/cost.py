@@ -84,7 +84,7 @@ class _Rates:
 
 _USUAL = _Rates(25e-9)
 _RATES = {
-    "tracking": _Rates(5e-9),
+    "tracking": _Rates(5e-9, 0.5e-6, 40.0),
     "peak": _Rates(2e-9),
     "shi": _Rates(40e-9),
     "chi": _Rates(60e-9, 1e-6, 170.0, 40e6),

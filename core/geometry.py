@@ -12,11 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.acquisition import Floats
+from core.acquisition import Acquisition, Floats
 from core.checks import require
 
 __all__ = [
     "Points",
+    "distance_m",
+    "guessed_field_of_view_deg",
+    "pixel_angle_of",
     "points_m",
     "sight_lines",
 ]
@@ -90,3 +93,59 @@ def points_m(range_m: ArrayLike, pixel_angle_rad: float) -> Points:
     lines = sight_lines(ranges.shape, pixel_angle_rad)
     xyz_m = ranges[row, col, np.newaxis] * lines[row, col]
     return Points(xyz_m, row.astype(np.int32), col.astype(np.int32))
+
+
+def distance_m(
+    lines: ArrayLike, range_m: ArrayLike, half_width_m: ArrayLike
+) -> tuple[float, float]:
+    """Return the distance of two points, and half the width of its interval.
+
+    The intervals of both ranges are propagated to first order, as independent errors.
+
+    Parameters
+    ----------
+    lines : array_like, shape (2, 3)
+        Lines of sight as unit vectors, as of `sight_lines`.
+    range_m, half_width_m : array_like, shape (2,)
+        Range of each point, and half the width of its interval, in metres.
+    """
+    towards, ranges = np.asarray(lines, float), np.asarray(range_m, float)
+    between = ranges[1] * towards[1] - ranges[0] * towards[0]
+    length_m = float(np.linalg.norm(between))
+    # Change of the distance with each range; any change of one of two equal points is a distance.
+    slopes = towards @ between / length_m if length_m else np.ones(2)
+    return length_m, float(np.linalg.norm(slopes * np.asarray(half_width_m, float)))
+
+
+def pixel_angle_of(field_of_view_deg: float, cols: int) -> float:
+    """Return the angle in radians between neighbouring pixels at the centre of an image.
+
+    Parameters
+    ----------
+    field_of_view_deg : float
+        Horizontal angle that all columns span, in degrees.
+    cols : int
+        Columns of the image.
+    """
+    return float(np.arctan(2 * np.tan(np.radians(field_of_view_deg) / 2) / cols))
+
+
+def guessed_field_of_view_deg(
+    range_m: Floats, confidence: Floats, acquisition: Acquisition
+) -> float:
+    """Guess a horizontal field of view in degrees that makes a scene about as wide as it is deep.
+
+    For a capture whose angle between pixels is not known; three digits, 0.001 to 120 degrees.
+
+    Parameters
+    ----------
+    range_m, confidence : ndarray, shape (row, col)
+        Estimates; the depth is that of the middle 90 % of those of confidence 0.9 or more.
+    acquisition : Acquisition
+        Its first bin is the depth if there are none.
+    """
+    sure = range_m[confidence >= 0.9]
+    sure = sure if sure.size else acquisition.bin_to_range_m([0.0, 1.0])
+    low, high = np.percentile(sure, [5, 95])
+    width_deg = np.clip(np.degrees((high - low) / max(high, 1e-3)), 0.001, 120.0)
+    return float(f"{width_deg:.3g}")

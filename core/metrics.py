@@ -191,6 +191,18 @@ class Interval:
     low: float
     high: float
 
+    def scaled(self, factor: float) -> Interval:
+        """Return the interval of the estimate multiplied by a positive `factor`."""
+        return Interval(self.value * factor, self.low * factor, self.high * factor)
+
+    def joined(self, other: Interval) -> Interval:
+        """Return the estimate with an interval that includes another one."""
+        return Interval(self.value, min(self.low, other.low), max(self.high, other.high))
+
+    def overlaps(self, other: Interval) -> bool:
+        """Return whether both have a value in common."""
+        return self.low <= other.high and other.low <= self.high
+
 
 def wilson(hits: int, trials: int, level: float = 0.95) -> Interval:
     """Wilson score interval of a share (Wilson 1927).

@@ -64,6 +64,8 @@ class Number:
         Smallest and largest accepted value.
     open_below : bool
         Whether `least` itself is refused.
+    optional : bool
+        Whether None, which leaves the choice to the program, is accepted.
     doubtful : tuple of Zone
         Accepted values that make estimates unreliable.
     """
@@ -79,6 +81,7 @@ class Number:
     least: float = -math.inf
     most: float = math.inf
     open_below: bool = False
+    optional: bool = False
     doubtful: tuple[Zone, ...] = ()
 
     def check(self, name: str, value: object) -> None:
@@ -86,10 +89,14 @@ class Number:
         noun = "an integer" if self.whole else "a number"
         relation = "above" if self.open_below else "from"
         bounds = f"{noun} {relation} {self.least:g} to {self.most:g}"
+        if self.optional:
+            bounds += ", or None"
         require(name, value, self.takes(value), bounds)
 
     def takes(self, value: Any) -> bool:
         """Return whether `value` is acceptable."""
+        if value is None:
+            return self.optional
         if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
             return False
         above: Any = value

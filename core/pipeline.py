@@ -7,10 +7,11 @@ from time import perf_counter
 from typing import Any
 
 from core import metrics
+from core.acquisition import Floats
 from core.capture import Capture
 from core.cost import require_memory
 from core.deprecation import renamed
-from core.estimators import RangeImage, estimate, settings_of
+from core.estimators import RangeImage, estimate, require_capture, settings_of
 from core.inference.posterior import posterior_of
 
 
@@ -59,6 +60,7 @@ def run(
     ValueError
         As `core.estimate`.
     """
+    require_capture(capture)
     settings = settings_of(method, settings)
     require_memory(capture, method, settings, false_alarm)
     started = perf_counter()
@@ -66,13 +68,22 @@ def run(
     flux_done = perf_counter()
     image = estimate(capture, method, settings, false_alarm=false_alarm)
     done = perf_counter()
-    return Run(capture, image, _figures(capture, image), flux_done - started, done - flux_done)
+    truth_m, bin_m = capture.truth_range_m, capture.acquisition.bin_length_m
+    figures = {} if truth_m is None else figures_of(image.range_m, truth_m, bin_m)
+    return Run(capture, image, figures, flux_done - started, done - flux_done)
 
 
-def _figures(capture: Capture, image: RangeImage) -> dict[str, float]:
-    if capture.truth_range_m is None:
-        return {}
-    ranges, bin_m = (image.range_m, capture.truth_range_m), capture.acquisition.bin_length_m
+def figures_of(range_m: Floats, truth_m: Floats, bin_m: float) -> dict[str, float]:
+    """Return the error figures of a `Run`.
+
+    Parameters
+    ----------
+    range_m, truth_m : ndarray, shape (row, col)
+        As `core.metrics` takes them.
+    bin_m : float
+        Range covered by one bin, in metres.
+    """
+    ranges = range_m, truth_m
     return {
         "rmse_m": metrics.rmse_m(*ranges),
         "mae_m": metrics.mae_m(*ranges),

@@ -111,8 +111,7 @@ def skip_pixels(capture: Capture, step: int) -> Capture:
         capture,
         cube=capture.cube[kept],
         acquisition=coarser(capture.acquisition, step),
-        truth_range_m=None if capture.truth_range_m is None else capture.truth_range_m[kept],
-        signal=None if capture.signal is None else capture.signal[kept],
+        **capture.images(lambda image: image[kept]),
         source=f"{capture.source}; 1 pixel of each {step} x {step}",
         flux_prior=None,
     )
@@ -122,18 +121,20 @@ def pool_pixels(capture: Capture, side: int) -> Capture:
     """Add the histograms of each `side` x `side` neighbouring pixels.
 
     The sum is that of one pixel with as many times the pulses: exact if the pixels see the same,
-    otherwise it holds several surfaces. Its truth is the median of theirs, its signal their mean.
-    Remaining rows and columns are dropped. `side` is from 1 to the smaller side of the image.
+    otherwise it holds several surfaces. Its truth and its reported range are the medians of theirs,
+    its signal their mean. Remaining rows and columns are dropped. `side` is from 1 to the smaller
+    side of the image.
     """
     require_whole("side", side, min(capture.shape))
     acquisition, n_pulses = coarser(capture.acquisition, side), capture.acquisition.n_pulses
-    truth_m, signal = capture.truth_range_m, capture.signal
+    images = capture.images(lambda image: _median(_each_of_tile(image, side)))
+    if capture.signal is not None:
+        images["signal"] = np.mean(_each_of_tile(capture.signal, side), axis=0)
     return replace(
         capture,
         cube=_sum(_each_of_tile(capture.cube, side)),
         acquisition=replace(acquisition, n_pulses=n_pulses and n_pulses * side * side),
-        truth_range_m=None if truth_m is None else _median(_each_of_tile(truth_m, side)),
-        signal=None if signal is None else np.mean(_each_of_tile(signal, side), axis=0),
+        **images,
         source=f"{capture.source}; {side} x {side} pixels added",
         flux_prior=None,
     )

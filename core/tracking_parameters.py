@@ -10,6 +10,7 @@ from core.parameters import Choice, Number, Settings, Zone, parameter
 Weight = Literal["cubic", "exponential", "survival", "none"]
 Start = Literal["zero", "mean"]
 SigmaFrom = Literal["gate", "before T_n"]
+Refine = Literal["none", "likelihood"]
 
 
 # Limits of reliable settings, measured by ``python -m core stability``.
@@ -128,6 +129,12 @@ class TrackingParameters(Settings):
         Choice("σ from", ("gate", "before T_n")),
         "Bins whose standard deviation is σ: the whole gate (Eq. 6) or those before T_n "
         "(Algorithm 1). The paper prints both.",
+    )
+    refine: Refine = parameter(
+        "none",
+        Choice("Refine", ("none", "likelihood")),
+        "Range below a bin: none, the bin of the maximum minus the lag as printed, or the largest "
+        "likelihood within one pulse of it, which takes three times as long.",
     )
 
     def joint_doubts(self) -> list[str]:

@@ -186,9 +186,16 @@ def parts(page: Page) -> dict[str, Locator]:
 
 
 def choose(page: Page, name: str, option: str) -> None:
+    """Choose an option from a list.
+
+    While the list opens, its options move: a button pressed on one and released on another chooses
+    nothing. Until it has faded, the list takes all clicks.
+    """
     chosen(page, name).click()
+    expect(page.locator(".MuiMenu-paper")).to_have_css("transform", "none")
     page.get_by_role("menuitem", name=option, exact=True).click()
     expect(chosen(page, name)).to_have_text(option)
+    expect(page.locator(".MuiMenu-root")).to_have_count(0)
 
 
 def enter(page: Page, name: str, text: str) -> None:

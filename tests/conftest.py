@@ -11,6 +11,7 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
 from core.tests.captures import real_capture_path
+from core.tests.garbage import pytest_collection, pytest_collection_finish  # noqa: F401 - hooks
 from tests.browser import chromium, open_page, serving
 
 # Pages are drawn in software, some with five clouds, on few cores.

@@ -90,7 +90,7 @@ class Hand:
         self._numbers = next(
             key
             for key, each in wire.models.items()
-            if each["name"].startswith("Facts") and each["attributes"]["facts"][0][0] == "Pixel"
+            if each["name"].startswith("Facts") and "Pixel" in _named(each["attributes"]["facts"])
         )
         knob = partial(wire.find, "Knob")
         pixels = [[row, col] for row in (20, 40) for col in range(12, 52)]
@@ -193,11 +193,16 @@ class Hand:
 
     def _shown_pixel(self) -> list[int]:
         facts = self._wire.values[self._numbers, "facts"]
-        return [int(number) for number in re.findall(r"\d+", facts[0][1])]
+        return [int(number) for number in re.findall(r"\d+", _named(facts)["Pixel"])]
 
     def _shown_image(self) -> str:
         title = self._wire.values[self._title, "text"].split()[0]
         return next(kind for kind, begins in TITLES.items() if begins == title)
+
+
+def _named(facts: list[Any]) -> dict[str, str]:
+    """Return the values of named facts."""
+    return {name: value for name, value, _ in facts}
 
 
 def _source(figure: Any, layer: int) -> str:

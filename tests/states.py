@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from core.parameters import Choice
 from core.tests.read_options import EXAMPLES
 
 OTHERWISE: dict[str, list[Any]] = {
+    "method": ["likelihood", "peak"],
     "source": ["building", "a b&c=d/é?#", "17"],
     "window": [Window((0, 8), (3, 9)), Window((2, 30), (0, 40), step=3)],
     "absent": [frozenset({"jitter"}), frozenset({"pile_up", "signal_levels", "motion"})],
@@ -24,6 +25,7 @@ OTHERWISE: dict[str, list[Any]] = {
     "page": ["Inspect", "Compare", "Trade-off", "Paper"],
     "pins": [((1, 2),), ((1, 2), (3, 4), (0, 0), (9, 9))],
     "region": [((1, 2), (1, 9), (7, 5)), ((0.5, 1.25), (-3.0, 9.0), (7.0, 5.1))],
+    "kept": ["source=car&method=coates", "tracking.l=0.006&light.sbr=2.0"],
     "reading": [ReadOptions(**{name: value}) for name, value in EXAMPLES.items()],
 }
 """Other values of parameters whose kind does not tell which there are."""
@@ -51,10 +53,10 @@ def otherwise(settings: Any) -> Iterator[Any]:
         yield replace(settings, kind="Error")
         for viewing in otherwise(settings.viewing):
             yield replace(settings, viewing=viewing, kind=CLOUDS)
-        for method, own in settings.settings.items():
-            for changed in otherwise(own):
-                own_settings = {**settings.settings, method: changed}
-                yield replace(settings, settings=own_settings, methods=(method,))
+        return
+    if isinstance(settings, Mapping):
+        for name, own in settings.items():
+            yield from ({**settings, name: changed} for changed in otherwise(own))
         return
     for each in fields(settings):
         yield replace(settings, **{each.name: other_value(each, getattr(settings, each.name))})
@@ -78,6 +80,8 @@ def random_state(rng: np.random.Generator) -> State:
 def random_value(name: str, rng: np.random.Generator) -> Any:
     """Some value of a parameter, with about half of its fields changed."""
     default = State.param[name].default
+    if isinstance(default, Mapping):
+        return {each: _random(own, rng) for each, own in default.items()}
     if not is_dataclass(default) or name in OTHERWISE:
         values = list(another(name))
         return values[rng.integers(len(values))]
@@ -89,7 +93,6 @@ def _random(settings: Any, rng: np.random.Generator) -> Any:
         return Comparison(
             tuple(method for method in ESTIMATORS if rng.random() < 0.5),
             float(rng.uniform(0.01, 1)),
-            {method: _random(own, rng) for method, own in settings.settings.items()},
             "Confidence",
             _random(settings.viewing, rng),
         )
@@ -98,4 +101,7 @@ def _random(settings: Any, rng: np.random.Generator) -> Any:
         for each in fields(settings)
         if rng.random() < 0.5
     }
+    if {"color_from_m", "color_to_m"} <= changed.keys():
+        low, high = sorted((changed["color_from_m"], changed["color_to_m"]))
+        changed |= {"color_from_m": low, "color_to_m": high + 1.0}
     return replace(settings, **changed)

@@ -16,6 +16,7 @@ from app.pages.session import Session
 from core import TrackingParameters
 from core.io import ReadOptions
 from tests.states import OTHERWISE, another, random_state
+from tests.threads import HeldLayout, control
 
 
 def restored(query: str, **own) -> tuple[dict, list[str]]:
@@ -92,7 +93,7 @@ def test_defaults_are_left_out_those_of_the_capture_included():
         ("comparison.methods=[%22magic%22]", "methods = ('magic',)"),
         ("comparison.methods=[[%22peak%22]]", "methods"),
         ("comparison.false_alarm=0", "false_alarm = 0"),
-        ("comparison.settings.kde.bandwidth_bins=-1", "bandwidth_bins"),
+        ("settings.kde.bandwidth_bins=-1", "bandwidth_bins"),
     ],
 )
 def test_a_bad_entry_is_refused_and_the_others_are_used(query, named):
@@ -151,3 +152,45 @@ def test_a_session_names_what_it_could_not_restore_and_keeps_the_rest(query, nam
     assert named in text.not_restored(session.refused)
     assert bool(named) == bool(session.refused)
     assert dict(parse_qsl(session.query())) == dict(parse_qsl(kept))
+
+
+# -- the history of a session ----------------------------------------------------------------------
+
+
+def test_a_session_returns_to_what_it_has_shown():
+    layout = HeldLayout(built_in_sources())
+    session, state = layout.session, layout.session.state
+    visited = []
+
+    def note() -> None:
+        layout.tasks.run_until(session.is_settled)
+        visited.append((session.query(), chosen(state)))
+
+    note()
+    state.param.update(light=Illumination(sbr=0.5), pixel=(3, 5))
+    note()
+    state.param.update(image="Error", viewing=replace(state.viewing, least_confidence=0.3))
+    note()
+    control(layout, "Scene or capture").value = "sample"  # without truth, with its own pixel
+    note()
+    state.param.update(page="Compare", method="coates", pins=((1, 2), (3, 4)))
+    state.comparison = replace(state.comparison, methods=("peak", "coates"), kind="Confidence")
+    note()
+    for query, values in (*reversed(visited), *visited):
+        session.recall(query)
+        layout.tasks.run_until(session.is_settled)
+        assert (session.query(), chosen(state)) == (query, values)
+        assert control(layout, "Scene or capture").value == state.source
+        assert control(layout, "SBR").value == state.light.sbr
+        compared = control(layout, "Methods to compare").value
+        assert compared == list(state.comparison.methods) or state.page != "Compare"
+    assert compared == ["peak", "coates"]
+    layout.settle()
+    assert {*layout.heard} == {""}
+    before = chosen(state)
+    session.recall("source=nowhere&light.sbr=2")
+    assert layout.heard[-1] == text.source_is_gone("nowhere")
+    assert chosen(state) == before
+    with pytest.raises(KeyError, match="Nowhere"):
+        session.recall("page=Nowhere")
+    layout.tasks.run_until(session.is_settled)

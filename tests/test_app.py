@@ -13,8 +13,9 @@ import core
 from app.model import colors as looks
 from app.model import text as model_text
 from app.model.address import Link, query_of
+from app.model.capture_defaults import enter
 from app.model.script import script_of
-from app.model.state import Illumination, ReductionSettings, Viewing
+from app.model.state import Illumination, ReductionSettings, State, Viewing
 from app.model.store import (
     Request,
     built_in_sources,
@@ -29,13 +30,13 @@ from app.pages.layout import CUSTOM, Layout
 from app.pages.shared.estimate import lane_of
 from app.plots import elements as plots
 from app.tasks.scheduler import GENERAL, PAGE, SHORT
-from app.theme import LIGHT, OUTSIDE_COLOR
+from app.theme import LIGHT
 from app.widgets.controls import Knob, SettingsPanel
 from app.widgets.figures import Plot
 from app.widgets.image_view import ImageView
 from app.widgets.signal_plots import SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
-from core.io import ReadOptions, reading_options
+from core.io import OUTSIDE_COLOR, ColorScale, ReadOptions, reading_options
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
 from core.tests.read_options import EXAMPLES
@@ -99,7 +100,10 @@ def rng():
         (Illumination(), {"n_pulses": 1.5}),
         (Illumination(), {"seed": -1}),
         (Viewing(), {"least_confidence": -0.1}),
+        (Viewing(), {"least_confidence": 1.01}),
         (Viewing(), {"field_of_view_deg": 0.0}),
+        (Viewing(color_from_m=50.0), {"color_to_m": 50.0}),
+        (Viewing(), {"color_map": "jet"}),
     ],
 )
 def test_impossible_settings_are_refused_by_name(settings, changes):
@@ -179,7 +183,7 @@ def test_a_pixel_shows_the_stages_of_its_own_estimate(car, preset):
     expected = tracking_signals(histogram, PRESETS[preset], 1000)
     for stage, values in expected._asdict().items():
         np.testing.assert_array_equal(getattr(pixel.signals, stage), values)
-    np.testing.assert_array_equal(pixel.signals.raw, histogram)
+    np.testing.assert_array_equal(pixel.histogram, histogram)
     np.testing.assert_array_equal(pixel.difference, core.first_difference(histogram))
     acquisition = answer.capture.acquisition
     assert pixel.range_m == answer.run.image.range_m[32, 30]
@@ -218,8 +222,8 @@ def test_every_built_in_source_can_be_estimated(key):
 
 
 def test_truth_and_estimate_share_one_scale(car):
-    truth, of_truth = looks.image_of(car, "Truth", 0.9)
-    estimate, of_estimate = looks.image_of(car, "Estimate", 0.9)
+    truth, of_truth = looks.image_of(car, "Truth", Viewing(0.9))
+    estimate, of_estimate = looks.image_of(car, "Estimate", Viewing(0.9))
     assert (of_truth.low, of_truth.high) == (of_estimate.low, of_estimate.high)
     assert of_truth.colors == of_estimate.colors
     assert of_truth.low < np.nanmin(truth) < np.nanmax(truth) < of_truth.high
@@ -228,11 +232,53 @@ def test_truth_and_estimate_share_one_scale(car):
     np.testing.assert_array_equal(estimate[known], car.run.image.range_m[known])
 
 
+def test_what_an_image_hides_is_said(car):
+    image, n_pixels = car.run.image, car.run.image.valid.sum()
+    for least in (0.0, 0.9):
+        values, look = looks.image_of(car, "Estimate", Viewing(least))
+        said = looks.legend(car, "Estimate", Viewing(least), values, look)
+        n_hidden = (image.valid & (image.confidence < least)).sum()
+        assert (f"{n_hidden:,} of {n_pixels:,} hidden" in said) == (n_hidden > 0)
+        n_outside = ((values < look.low) | (values > look.high)).sum()
+        assert (f"Grey: {n_outside:,} beyond" in said) == (n_outside > 0)
+    nothing = np.full_like(values, np.nan)
+    assert "Lower" in looks.legend(car, "Estimate", Viewing(1.0), nothing, look)
+    values, look = looks.image_of(car, "Counts", Viewing(0.9))
+    assert looks.legend(car, "Counts", Viewing(), values, look) == ""
+
+
+def test_image_and_cloud_take_the_chosen_limits_and_colours(car):
+    viewing = Viewing(color_from_m=48.5, color_to_m=50.0, color_map="inferno")
+    values, look = looks.image_of(car, "Estimate", viewing)
+    assert (look.low, look.high) == (48.5, 50.0)
+    outside = (values < 48.5) | (values > 50.0)
+    said = looks.legend(car, "Estimate", viewing, values, look)
+    assert f"Grey: {outside.sum():,} beyond the scale." in said
+    _, rgb, _ = looks.cloud_of(car, "Range", viewing)
+    known = np.isfinite(values)
+    np.testing.assert_array_equal(rgb, look.rgb(values[known]))
+    grey = tuple(bytes.fromhex(OUTSIDE_COLOR[1:]))
+    np.testing.assert_array_equal((rgb == grey).all(axis=1), outside[known])
+    assert looks.image_of(car, "Truth", viewing)[1].colors == look.colors
+    for one_end in ({"color_from_m": 1e4}, {"color_to_m": 1.0}):  # far from all estimates
+        _, look = looks.image_of(car, "Estimate", Viewing(**one_end))
+        assert look.low < look.high
+        assert next(iter(one_end.values())) in (look.low, look.high)
+
+
+def test_limits_of_colours_are_kept_with_the_scene_and_dropped_with_another(car, sample):
+    chosen = Viewing(color_from_m=48.0, color_map="plasma")
+    for answer, kept in ((car, 48.0), (sample, None)):
+        state = State(viewing=chosen)
+        enter(state, answer, car)
+        assert (state.viewing.color_from_m, state.viewing.color_map) == (kept, "plasma")
+
+
 @pytest.mark.parametrize("kind", ["Estimate", "Error"])
 def test_estimates_below_the_confidence_are_blank(car, kind):
     confidence = car.run.image.confidence
     for least in (0.0, 0.5, 0.99):
-        image, _ = looks.image_of(car, kind, least)
+        image, _ = looks.image_of(car, kind, Viewing(least))
         blank = confidence < least
         if kind == "Error":
             blank |= np.isnan(car.capture.truth_range_m)
@@ -240,7 +286,7 @@ def test_estimates_below_the_confidence_are_blank(car, kind):
 
 
 def test_error_is_estimate_minus_truth_around_zero(car):
-    error, look = looks.image_of(car, "Error", 0.0)
+    error, look = looks.image_of(car, "Error", Viewing(0.0))
     expected = car.run.image.range_m - car.capture.truth_range_m
     np.testing.assert_array_equal(error, expected)
     assert look.low == -look.high < 0
@@ -248,20 +294,20 @@ def test_error_is_estimate_minus_truth_around_zero(car):
 
 
 def test_counts_are_those_of_the_capture(car):
-    counts, look = looks.image_of(car, "Counts", 1.0)
+    counts, look = looks.image_of(car, "Counts", Viewing(1.0))
     np.testing.assert_array_equal(counts, car.capture.counts)
     assert (look.low, look.high, look.unit) == (counts.min(), counts.max(), "counts")
 
 
 def test_without_truth_the_scale_fits_confident_estimates(sample):
-    image, look = looks.image_of(sample, "Truth", 0.9)
+    image, look = looks.image_of(sample, "Truth", Viewing(0.9))
     assert look.title == "Estimated range"
     inside = (image > look.low) & (image < look.high)
     assert inside.sum() >= 0.95 * np.isfinite(image).sum()
 
 
 def test_a_colour_for_every_value():
-    look = looks.ColorScale("", "", 0.0, 1.0, ["#000000", "#808080", "#ffffff"], OUTSIDE_COLOR)
+    look = ColorScale("", "", 0.0, 1.0, ["#000000", "#808080", "#ffffff"], OUTSIDE_COLOR)
     grey = [int(OUTSIDE_COLOR[at : at + 2], 16) for at in (1, 3, 5)]
     rgb = look.rgb(np.array([-0.01, 0.0, 0.5, 1.0, 1.01]))
     np.testing.assert_array_equal(rgb, [grey, [0] * 3, [128] * 3, [255] * 3, grey])
@@ -285,8 +331,15 @@ def test_figures_and_numbers_are_cores(car):
     numbers = {name: value for name, value, _ in pixel}
     image, sigma, settings = car.run.image, car.capture.cube[32, 30].std(), TrackingParameters()
     assert numbers["Pixel"] == "row 32, col 30"
-    assert numbers["Estimate"] == f"{image.range_m[32, 30]:.4g} m"
-    assert numbers["Truth"] == f"{car.capture.truth_range_m[32, 30]:.4g} m"
+    report = core.inspection.pixel_report(car.capture, image, 32, 30)
+    inner, outer = report.interval_68_m, report.interval_95_m
+    middle_m, half_m = (inner.low + inner.high) / 2, (inner.high - inner.low) / 2
+    assert 0.01 <= half_m < 0.1, "two digits are three decimals"
+    assert numbers["Range (68 %)"] == f"{middle_m:.3f} ± {half_m:.3f} m"
+    assert numbers["Range (95 %)"] == f"{outer.low:.2f}–{outer.high:.2f} m"
+    assert (numbers["Range (95 %)"].low, numbers["Range (95 %)"].high) == (outer.low, outer.high)
+    assert numbers["Estimate"] == f"{image.range_m[32, 30]:.3f} m"
+    assert numbers["Truth"] == f"{car.capture.truth_range_m[32, 30]:.3f} m"
     assert numbers["σ"] == f"{sigma:.4g} counts"
     assert numbers["r small"] == f"{settings.l * sigma:.4g}"
     assert numbers["r large"] == f"{settings.n * settings.l * sigma:.4g}"
@@ -336,6 +389,7 @@ def test_every_plot_has_a_title_a_legend_and_labels_with_units():
         "Counts",
         "Counts",
         "Counts × weight",
+        "Score",
     ]
     for figure in figures:
         assert figure.title.text
@@ -425,7 +479,7 @@ def test_lines_without_a_position_are_not_drawn(car, sample):
 def test_an_image_is_shown_with_its_scale_and_its_frame(car):
     view = ImageView(lambda row, col: None)
     view.enter(64, 64, car.grid)
-    image, look = looks.image_of(car, "Estimate", 0.9)
+    image, look = looks.image_of(car, "Estimate", Viewing(0.9))
     view.update(image, look)
     view.mark(3, 5)
     (picture,) = (r for r in view.figure.renderers if "image" in r.data_source.data)
@@ -458,10 +512,22 @@ def test_every_field_has_a_control_made_from_its_metadata(settings):
             assert (control.low, control.high) == (spec.low, spec.high)
             assert (control.log, control.whole) == (spec.log, spec.whole)
             assert (control.unit, control.help) == (spec.unit, each.metadata["help"])
-            assert control.low <= control.initial <= control.high
+            assert control.optional == spec.optional
+            assert control.optional or control.low <= control.initial <= control.high
         else:
             assert tuple(control.options) == spec.options
             assert control.description == each.metadata["help"]
+
+
+def test_values_that_exclude_each_other_are_refused_in_words_of_the_form():
+    reported = []
+    panel = SettingsPanel(Viewing(color_from_m=40.0), reported.append)
+    panel.controls["color_to_m"].value = 30.0
+    assert reported == []
+    assert panel.doubts.text.startswith("Colours to = 30.0 is not accepted")
+    panel.controls["color_from_m"].value = None
+    assert reported == [Viewing(color_to_m=30.0)]
+    assert panel.doubts.text == ""
 
 
 def test_a_change_by_the_user_is_reported_as_new_settings_and_one_by_the_page_is_not():
@@ -516,7 +582,7 @@ def test_a_page_is_complete(layout, explore):
     assert f"{shown:,} of 4,096" in explore.cloud.caption
     model = layout.page.get_root()
     kinds = [type(part).__name__ for part in model.references()]
-    assert kinds.count("figure") == 4
+    assert kinds.count("figure") == 5  # one of them is hidden
     assert sum(kind.startswith("PointCloud") for kind in kinds) == 1
 
 

@@ -15,6 +15,7 @@ from playwright.sync_api import Page, expect
 
 import core
 from app.model.large import LIMIT
+from app.model.store import content_key
 from app.model.uploads import safe_name
 from app.server.access import TOKEN_VARIABLE
 from tests.browser import fact, serving, upload
@@ -71,7 +72,8 @@ def check_harmless(page):
 
 def test_file_names_are_shown_as_text_on_every_page(page, served):
     path, address, _ = served
-    new = page(f"{address}?{urlencode({'token': TOKEN, 'source': 'path 1'})}")
+    second = content_key(path.parent / GIVEN)
+    new = page(f"{address}?{urlencode({'token': TOKEN, 'source': second})}")
     source = new.get_by_role("combobox", name=re.compile("^Scene or capture"))
     for shown in ("Explore", "Compare", "Trade-off", "Paper", "Inspect"):
         button = new.get_by_role("button", name=shown, exact=True)

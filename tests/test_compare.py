@@ -29,6 +29,10 @@ from tests.threads import HeldTasks
 
 
 def answer_to(source):
+    return compute(request_for(source), None)
+
+
+def request_for(source, **chosen):
     request = Request(
         built_in_sources()[source],
         Illumination(),
@@ -36,7 +40,7 @@ def answer_to(source):
         TrackingParameters(),
         ReductionSettings(),
     )
-    return compute(request, None)
+    return replace(request, **chosen)
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +70,9 @@ def test_the_explored_estimate_is_not_computed_again(car):
     assert ranking.run_task(Task("tracking", car.request.tracking), car).answer is car
     other = Task("tracking", car.request.tracking, false_alarm=0.1)
     assert ranking.run_task(other, car).answer.run.image.valid.mean() < 0.7
+    by_peak = compute(request_for("sample", method="peak"), None)
+    assert ranking.run_task(task_of("peak"), by_peak).answer is by_peak
+    assert ranking.run_task(task_of("tracking"), by_peak).answer is not by_peak
 
 
 def test_accuracy_is_that_of_the_metrics(car):
@@ -235,6 +242,7 @@ def test_only_what_is_missing_is_computed(shown, monkeypatch):
     shown.settle()
     assert ran == ["matched_filter"]
     page.panels["likelihood"].controls["depths"].value = "learned"
+    shown.tasks.run_until(lambda: len(ran) == 2)
     shown.settle()
     assert ran == ["matched_filter", "likelihood"]
     page.show(False)
@@ -310,11 +318,12 @@ def test_without_a_method_the_page_asks_for_one(stage):
 
 
 @pytest.mark.parametrize("key", built_in_sources())
-def test_every_source_can_be_shown_in_every_way(shown, key):
-    page = shown.page
+def test_every_source_can_be_shown_in_every_way(stage, key):
+    page = stage.page
     if key != "car":
-        shown.change(source=key)
-    shown.settle()
+        stage.change(source=key)
+    page.show(True)
+    stage.settle()
     for kind in page.kind.options:
         page.kind.value = kind
     assert page.kind.value == CLOUDS

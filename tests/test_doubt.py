@@ -36,6 +36,18 @@ def test_a_doubtful_combination_is_explained_while_it_is_set():
     assert panel.doubts.text == ""
 
 
+def test_doubts_that_do_not_hold_for_the_data_are_not_shown():
+    panel = SettingsPanel(replace(TrackingParameters(), alpha=5.0), lambda new: None)
+    zones, doubts = panel.controls["l"].doubtful, panel.doubts.text
+    assert zones and doubts
+    panel.mark_doubts(False)
+    panel.controls["l"].value = 0.7
+    assert (panel.controls["l"].doubtful, panel.doubts.text) == ([], "")
+    panel.controls["l"].value = TrackingParameters().l
+    panel.mark_doubts(True)
+    assert (panel.controls["l"].doubtful, panel.doubts.text) == (zones, doubts)
+
+
 def test_a_panel_explains_its_initial_settings():
     settings = replace(TrackingParameters(), alpha=5.0)
     panel = SettingsPanel(settings, lambda new: None)

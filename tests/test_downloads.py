@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import html
 import io
+import json
 import math
 import re
 import subprocess
@@ -11,7 +13,7 @@ import sys
 import tempfile
 from base64 import b64encode
 from csv import DictReader
-from dataclasses import replace
+from dataclasses import asdict, replace
 from xml.etree import ElementTree
 
 import laspy
@@ -24,17 +26,20 @@ from bokeh.models import Range1d
 from PIL import Image
 from playwright.sync_api import expect
 
+import core
 from app.model.colors import image_of, map_of, shown
 from app.model.exports import (
     Curve,
     band,
+    cloud_files,
     facts_file,
     image_files,
     plot_file,
     shown_table_file,
     table_file,
 )
-from app.model.state import MAPS, Illumination, ReductionSettings
+from app.model.script import script_of
+from app.model.state import MAPS, Illumination, ReductionSettings, Viewing
 from app.model.store import built_in_sources, inspect
 from app.pages.layout import Layout
 from app.pages.shared import downloads
@@ -42,7 +47,10 @@ from app.pages.shared.downloads import Download, Shown, Subject
 from app.theme import RANGE_COLORS
 from app.units import count, interval, number, share
 from core import TrackingParameters
+from core.cli import main
+from core.io import MOST_LETTERS
 from core.studies.outputs import Table
+from core.tests.test_export import drawn_pixels
 from tests.browser import VIEWS, eventually, fact, server_process
 
 
@@ -54,7 +62,7 @@ def layout():
 @pytest.fixture
 def session(layout):
     """The session, whose viewing settings are restored afterwards."""
-    names = ("image", "cloud_color", "viewing")
+    names = ("image", "cloud_color", "pixel", "viewing")
     before = {name: getattr(layout.session.state, name) for name in names}
     yield layout.session
     layout.session.state.param.update(before)
@@ -72,10 +80,16 @@ def written(write):
     return file.getvalue()
 
 
+def rows_of(content):
+    """Return the rows of a CSV file, without the lines that describe it."""
+    lines = content.decode().splitlines()
+    return list(DictReader(line for line in lines if not line.startswith("# ")))
+
+
 def columns_of(content):
     """Return the columns of a CSV file by name; an empty field is NaN."""
-    lines = list(DictReader(io.StringIO(content.decode())))
-    return {name: np.array([float(line[name] or "nan") for line in lines]) for name in lines[0]}
+    rows = rows_of(content)
+    return {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
 
 
 # -- names -----------------------------------------------------------------------------------------
@@ -124,7 +138,7 @@ def test_a_name_is_safe_for_every_system_whatever_the_capture_is_called(capture)
     name = subject.file_name("enhanced row1000 col1000", "csv")
     assert re.fullmatch(r"[\w+][\w.+-]+", name, re.ASCII)
     assert ".." not in name
-    assert len(name) <= downloads.MOST_LETTERS
+    assert len(name) <= MOST_LETTERS
     assert name.endswith("_enhanced-row1000-col1000.csv")
 
 
@@ -134,6 +148,7 @@ def test_a_name_is_safe_for_every_system_whatever_the_capture_is_called(capture)
         ({}, ""),
         ({"least_confidence": 0.5}, "_least-confidence0.5"),
         ({"field_of_view_deg": 7.0}, "_field-of-view-deg7"),
+        ({"color_to_m": 51.5}, "_color-to-m51.5"),
     ],
 )
 def test_names_of_image_and_cloud_follow_the_view(explore, session, changed, suffix):
@@ -226,22 +241,47 @@ def test_a_plots_table_omits_what_is_hidden_or_out_of_view(explore):
 def test_an_images_table_holds_its_pixels(explore, session, kind):
     session.state.image = kind
     found = columns_of(written(explore.image_shown().files["csv"]))
-    values, look = image_of(session.answer, kind, session.state.viewing.least_confidence)
+    values, look = image_of(session.answer, kind, session.state.viewing)
     np.testing.assert_array_equal(found["row"] * 64 + found["col"], np.arange(64 * 64))
     np.testing.assert_array_equal(found[look.legend], values.ravel())
 
 
-def test_an_images_table_holds_the_pixels_in_view(explore):
+def test_an_images_table_and_picture_hold_the_pixels_in_view(explore):
     figure = explore.image.figure
     figure.x_range.update(start=9.7, end=20.2)
     figure.y_range.update(start=30.4, end=5.6)
     try:
-        found = columns_of(written(explore.image_shown().files["csv"]))
+        files = explore.image_shown().files
+        found = columns_of(written(files["csv"]))
+        picture = written(files["svg"])
     finally:
         for each in (figure.x_range, figure.y_range):
             each.update(start=np.nan, end=np.nan)
     assert (found["col"].min(), found["col"].max()) == (10, 20)
     assert (found["row"].min(), found["row"].max()) == (6, 30)
+    assert drawn_pixels(io.BytesIO(picture), (25, 11)).shape == (25, 11, 4)
+
+
+@pytest.mark.parametrize("kind", ["Estimate", "Counts"])
+def test_a_picture_of_an_image_is_that_of_the_command_line(explore, session, kind, tmp_path):
+    colors = {"color_from_m": 48.0, "color_to_m": 50.5, "color_map": "viridis"}
+    viewing = replace(session.state.viewing, **colors)
+    session.state.param.update(image=kind, viewing=viewing)
+    files = explore.image_shown().files
+    picture = Image.open(io.BytesIO(written(files["png"])))
+    assert picture.width >= 1200
+    values, look = image_of(session.answer, kind, viewing)
+    known = np.isfinite(values)
+    drawn = drawn_pixels(io.BytesIO(written(files["svg"])), values.shape)
+    np.testing.assert_array_equal(drawn[known][:, :3], look.rgb(values[known]))
+    assert (drawn[~known] == 255).all()
+    if kind == "Estimate":
+        path = tmp_path / "picture.png"
+        options = "--scene car --least-confidence 0.9 --color-from 48 --color-to 50.5"
+        assert not main(
+            ["estimate", "tracking", *options.split(), "--color-map=viridis", "--out", str(path)]
+        )
+        np.testing.assert_array_equal(np.asarray(picture), np.asarray(Image.open(path)))
 
 
 def test_arrays_of_the_estimate_omit_hidden_pixels(explore, session):
@@ -252,12 +292,32 @@ def test_arrays_of_the_estimate_omit_hidden_pixels(explore, session):
     np.testing.assert_array_equal(arrays["range_m"], range_m)
     np.testing.assert_array_equal(arrays["valid"], visible)
     assert str(arrays["source"]) == session.answer.capture.source
+    assert (str(arrays["method"]), float(arrays["least_confidence"])) == ("tracking", 0.9)
+    assert json.loads(str(arrays["settings"])) == asdict(session.answer.request.tracking)
+
+
+def test_a_report_shows_the_pixel_and_the_script_on_screen(explore, session):
+    session.choose_pixel(20, 30)
+    source = written(explore.image_shown().files["html"]).decode()
+    assert "<h1>Car at 50 m</h1>" in source
+    assert "<h2>Pixel in row 20, column 30</h2>" in source
+    script = re.search("<code>(.*)</code>", source, re.DOTALL)[1]
+    assert html.unescape(script) == script_of(session.answer, session.state)
+
+
+def test_descriptions_state_version_method_all_settings_and_source(explore, session):
+    found = explore.image_shown()
+    version, method, *settings, source = found.subject.lines(found.what)
+    assert version == f"firstphoton {core.__version__}: range image"
+    assert (method, source) == ("method: tracking", f"source: {session.answer.capture.source}")
+    assert f"settings: {session.answer.request.tracking}" in settings
+    assert f"settings: {session.state.viewing}" in settings
 
 
 @pytest.mark.parametrize("kind", MAPS)
 def test_arrays_and_pages_hold_the_map_that_is_shown(explore, session, kind):
-    values, look = map_of(session.answer, kind, 0.9)
-    files = image_files(session.answer, kind, 0.9, explore.image.figure)
+    values, look = map_of(session.answer, kind, Viewing())
+    files = image_files(session.answer, kind, Viewing(), explore.image.figure)
     name = "range_m" if kind == "Estimate" else kind.lower()
     np.testing.assert_array_equal(np.load(io.BytesIO(written(files["npz"])))[name], values)
     with tifffile.TiffFile(io.BytesIO(written(files["tif"]))) as tif:
@@ -293,6 +353,16 @@ def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(explore, sess
         np.testing.assert_allclose(points, xyz_m, atol=2e-4)
         np.testing.assert_array_equal(colors, rgb)
     np.testing.assert_array_equal(ply.vertices.astype(np.float32), xyz_m)
+
+
+@pytest.mark.parametrize("angle_rad", [None, 1e-3])
+def test_a_cloud_states_that_its_field_of_view_is_a_guess(session, angle_rad):
+    run = session.answer.run
+    acquisition = replace(run.capture.acquisition, pixel_angle_rad=angle_rad)
+    run = replace(run, capture=replace(run.capture, acquisition=acquisition))
+    files = cloud_files(replace(session.answer, run=run), "Range", session.state.viewing)
+    header = written(files["ply"]).partition(b"end_header")[0].decode()
+    assert ("rests on a guess: a field of view of" in header) == (angle_rad is None)
 
 
 @pytest.mark.parametrize("kind", ["Range", "Confidence", "3D clouds"])
@@ -394,7 +464,8 @@ def test_a_file_is_sent_in_pieces_and_then_deleted(session, monkeypatch, tmp_pat
         message = button.ask(**{"from": len(received)})
         assert len(message["piece"]) <= 1000
         received += message["piece"]
-    assert received == content
+    assert received.startswith(f"# firstphoton {core.__version__}: test\r\n".encode())
+    assert received.endswith(content)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -419,7 +490,7 @@ def test_a_file_that_cannot_be_written_is_reported_and_the_next_one_is_sent(layo
     assert words in layout.alert.text
     assert "secret" not in layout.alert.text
     good = Receiver(layout.session, offering(lambda file: file.write(b"all")))
-    assert good.ask(suffix="csv")["piece"] == b"all"
+    assert good.ask(suffix="csv")["piece"].endswith(b"\r\nall")
 
 
 def test_a_cloud_without_points_is_reported(explore, layout):
@@ -443,7 +514,7 @@ def test_malformed_messages_do_no_harm(session, message):
     button._handle_msg(message)
     assert all(set(each) == {"failed"} for each in button.messages)
     button.messages.clear()
-    assert button.ask(suffix="csv")["piece"] == b"all"
+    assert button.ask(suffix="csv")["piece"].endswith(b"\r\nall")
 
 
 # -- in a browser ----------------------------------------------------------------------------------
@@ -495,15 +566,21 @@ def save_a_plot_as_a_picture(here, browser, what, title):
     name, png = download(here, what, "png")
     assert name.startswith("car_tracking_")
     picture = Image.open(io.BytesIO(png))
-    assert list(picture.size) == size_of(here, what)
     assert "simulated, seed 0" in picture.text["Description"]
     svg_name, svg = download(here, what, "svg")
     assert svg_name == name.replace(".png", ".svg")
     root = ElementTree.fromstring(svg)
     texts = {each.text for each in root.iter("{http://www.w3.org/2000/svg}text")}
     assert any(text.startswith(title) for text in texts)
-    axes = {"histogram": {"Bin", "Counts", "Range (m)", "truth"}, "image": {"Column", "Row", "m"}}
+    axes = {
+        "histogram": {"Bin", "Counts", "Range (m)", "truth"},
+        "image": {"Column (px)", "Row (px)", "Estimated range (m)"},
+    }
     assert axes[what] <= texts
+    if what == "image":  # drawn by the server, as the command line does
+        assert picture.width >= 1200
+        return
+    assert list(picture.size) == size_of(here, what)
     one, other = as_seen(browser, png), as_seen(browser, svg)
     assert one.shape == other.shape
     assert np.ptp(one) > 200  # something is drawn
@@ -576,7 +653,7 @@ def save_by_keyboard_alone(here):
 def save_numbers_as_shown(here):
     name, table = download(here, "numbers", "csv")
     assert name == "car_tracking_numbers-row32-col32.csv"
-    lines = {line["quantity"]: line for line in DictReader(io.StringIO(table.decode()))}
+    lines = {line["quantity"]: line for line in rows_of(table)}
     for each in ("RMSE", "Confidence"):
         value, unit = fact(here, each).inner_text().split()
         assert float(lines[each]["value"]) == pytest.approx(float(value), rel=1e-3)
@@ -594,6 +671,51 @@ def save_all_of_inspect(here):
         ("table", "csv", "car_tracking_candidates-row32-col32.csv"),
     ):
         assert download(here, what, suffix)[0] == name
+
+
+IS_DRAWN = """canvas =>
+  canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some(Boolean)"""
+
+
+def save_a_report_and_turn_its_cloud(here, browser):
+    name, content = download(here, "map", "html")
+    assert name == "car_tracking_report.html"
+    report, problems = browser.new_page(viewport={"width": 390, "height": 844}), []
+    report.on("pageerror", lambda error: problems.append(error.message))
+    report.on("console", lambda found: problems.append(found.text))  # what the policy refuses
+    report.route("**/*", lambda route: problems.append(route.request.url))
+    report.set_content(content.decode())
+    assert report.evaluate("document.documentElement.scrollWidth") == 390
+    cloud = report.locator("canvas")
+    cloud.scroll_into_view_if_needed()
+    eventually(lambda: cloud.evaluate(IS_DRAWN))
+
+    def picture():
+        return cloud.evaluate("canvas => canvas.toDataURL()")
+
+    first, box = picture(), cloud.bounding_box()
+    report.mouse.move(box["x"] + 100, box["y"] + 100)
+    report.mouse.down()
+    report.mouse.move(box["x"] + 200, box["y"] + 120)
+    report.mouse.up()
+    eventually(lambda: picture() != first)
+    cloud.press("0")
+    eventually(lambda: picture() == first)
+    report.close()
+    assert problems == []
+
+
+def colour_the_map_between_chosen_limits(here):
+    here.get_by_role("button", name="View", exact=True).filter(visible=True).click()
+    low = here.get_by_role("textbox", name="Colours from").filter(visible=True)
+    expect(low).to_have_attribute("placeholder", "automatic")
+    low.fill("50")
+    low.press("Enter")
+    expect(here).to_have_url(re.compile(r"viewing\.color_from_m=50\b"))
+    assert download(here, "map", "png")[0] == "car_tracking_color-from-m50_map-Estimate.png"
+    low.fill("")
+    low.press("Enter")
+    expect(here).not_to_have_url(re.compile(r"color_from_m"))
 
 
 def fail_and_continue(here):
@@ -629,3 +751,5 @@ def test_what_is_on_screen_is_saved(start_page, browser):
     save_by_keyboard_alone(start_page)
     save_numbers_as_shown(start_page)
     save_all_of_inspect(start_page)
+    save_a_report_and_turn_its_cloud(start_page, browser)
+    colour_the_map_between_chosen_limits(start_page)

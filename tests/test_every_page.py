@@ -42,9 +42,30 @@ def expect_readable(page: Page, name: str) -> None:
     expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
 
 
+def expect_a_print_of_the_content(page: Page) -> None:
+    page.emulate_media(media="print")
+    expect(page.get_by_role("button", name="Toggle theme")).to_be_hidden()
+    expect(slider(page, "SBR")).to_be_hidden()
+    content = page.locator(".main-content")
+    expect(stage(page)).to_be_visible()
+    assert content.evaluate("(each) => each.scrollHeight <= each.clientHeight")  # all of it
+    page.emulate_media(media="screen")
+
+
+def expect_the_sidebar_to_be_skipped(page: Page) -> None:
+    page.locator("body").focus()
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="Skip to the content")).to_be_focused()
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("main").locator(":focus").first).to_be_attached()
+
+
 def test_every_page_opens_first_with_plots_that_can_be_read(page, address):
     first, *others = [each.name for each in PAGES]
     opened = page(f"{address}?page={first}")
+    expect_the_sidebar_to_be_skipped(opened)
+    expect_a_print_of_the_content(opened)
     expect_readable(opened, first)
     for name in others:
         opened.set_viewport_size({"width": 1440, "height": 900})

@@ -29,7 +29,7 @@ from app.pages.inspect.page import Inspect
 from app.pages.inspect.pins import PinsSection
 from app.pages.inspect.pixel import PixelSection
 from app.pages.inspect.views import rectangle
-from app.pages.layout import Layout, Template
+from app.pages.layout import Template
 from app.pages.navigation import Pages, View
 from app.pages.paper.page import Jump, LiveFigures, RangeImages, RepeatedTable, jump
 from app.pages.session import Session
@@ -44,10 +44,10 @@ from core.io import ReadOptions
 from core.studies.paper import figures as paper
 from core.studies.trials import Condition
 from tests.broken import AT_SEED, WHEN_DRAWN, WHEN_INSPECTED, WHEN_TAPPED
-from tests.browser import ROOT, eventually, serving
+from tests.browser import ROOT, serving
 from tests.load import opened as opened_wire
 from tests.test_app import opened
-from tests.threads import control
+from tests.threads import HeldLayout, HeldTasks, control
 
 
 @pytest.fixture(scope="module")
@@ -234,7 +234,8 @@ def few_pixels():
 
 @pytest.fixture
 def session():
-    return Session(few_pixels())
+    """A session whose page's thread is that of the test."""
+    return Session(few_pixels(), tasks=HeldTasks())
 
 
 @pytest.fixture
@@ -256,14 +257,14 @@ def test_work_of_a_section_that_fails_is_reported_and_the_next_works(
     for error in errors:
         raised[:], before = [error], len(shown)
         act()
-        eventually(lambda before=before: len(shown) > before and shown[-1])
+        session.tasks.run_until(lambda before=before: len(shown) > before and shown[-1])
         check_sentence(shown[-1], error)
         assert "Compute" in shown[-1] or "still shows" in shown[-1]
         assert not has_succeeded()
     raised.clear()
     act()
-    eventually(has_succeeded)
-    eventually(lambda: shown[-1] == "")
+    session.tasks.run_until(has_succeeded)
+    session.tasks.run_until(lambda: shown[-1] == "")
 
 
 def test_a_failure_is_shown_until_its_own_part_works_again():
@@ -290,9 +291,11 @@ def test_another_pixel_does_not_hide_that_a_map_failed(monkeypatch, session, sho
     section.show(True)
     change_map, _ = maps(session)
     change_map()
-    eventually(lambda: shown)
+    session.tasks.run_until(lambda: shown)
     session.choose_pixel(1, 1)
-    eventually(lambda: section.facts.facts[0][1] == "1, 1")
+    session.tasks.run_until(
+        lambda: dict(each[:2] for each in section.facts.facts)["Pixel"] == "1, 1"
+    )
     assert shown[-1]
 
 
@@ -310,19 +313,21 @@ def messages(page):
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
-def test_a_method_that_fails_is_reported_and_runs_when_selected_again(error, monkeypatch, compare):
+def test_a_method_that_fails_is_reported_and_runs_when_selected_again(
+    error, monkeypatch, session, compare
+):
     raised, name = (
         breaking(monkeypatch, "app.pages.compare.page.run_task"),
         ESTIMATORS["peak"].title,
     )
     raised[:] = [error]
     compare.show(True)
-    eventually(lambda: messages(compare)[name] != model_text.NOT_COMPUTED)
+    session.tasks.run_until(lambda: messages(compare)[name] != model_text.NOT_COMPUTED)
     check_sentence(messages(compare)[name], error)
     raised.clear()
     compare.picks.value = []
     compare.picks.value = ["peak"]
-    eventually(lambda: messages(compare)[name] == "")
+    session.tasks.run_until(lambda: messages(compare)[name] == "")
 
 
 def test_a_limit_that_fails_is_reported_and_not_called_unknown(monkeypatch, session, compare):
@@ -330,11 +335,11 @@ def test_a_limit_that_fails_is_reported_and_not_called_unknown(monkeypatch, sess
     raised[:] = ERRORS[2:]
     compare.show(True)
     limit = "Physical limit"
-    eventually(lambda: messages(compare)[limit] not in ("", model_text.NOT_COMPUTED))
+    session.tasks.run_until(lambda: messages(compare)[limit] not in ("", model_text.NOT_COMPUTED))
     check_sentence(messages(compare)[limit], raised[0])
     raised.clear()
     session.state.light = Illumination(seed=1)
-    eventually(lambda: messages(compare)[limit] == "")
+    session.tasks.run_until(lambda: messages(compare)[limit] == "")
 
 
 def test_scores_that_fail_are_reported_and_those_of_the_next_pixel_are_drawn(
@@ -342,19 +347,19 @@ def test_scores_that_fail_are_reported_and_those_of_the_next_pixel_are_drawn(
 ):
     raised = breaking(monkeypatch, "app.pages.compare.page.score_curves")
     compare.show(True)
-    eventually(lambda: compare.is_complete)
+    session.tasks.run_until(lambda: compare.is_complete)
     for error in ERRORS:
         raised[:], before = [error], len(shown)
         compare.request_curves()
-        eventually(lambda before=before: len(shown) > before and shown[-1])
+        session.tasks.run_until(lambda before=before: len(shown) > before and shown[-1])
         check_sentence(shown[-1], error)
     raised.clear()
     session.choose_pixel(1, 2)
-    eventually(lambda: shown[-1] == "")
+    session.tasks.run_until(lambda: shown[-1] == "")
 
 
 def test_a_refused_reading_option_is_reported_and_the_next_reading_works():
-    layout = Layout({"sample": built_in_sources()["sample"]})
+    layout = HeldLayout({"sample": built_in_sources()["sample"]})
     opened(layout, "Reading options")
     width, alert, again = (
         control(layout, "Bin width"),
@@ -367,10 +372,10 @@ def test_a_refused_reading_option_is_reported_and_the_next_reading_works():
     ):
         width.value = typed
         again.clicks += 1
-        eventually(lambda sentence=sentence: sentence in alert.text)
+        layout.tasks.run_until(lambda sentence=sentence: sentence in alert.text)
     width.value = "2e-9"
     again.clicks += 1
-    eventually(lambda: alert.text == "")
+    layout.tasks.run_until(lambda: alert.text == "")
     assert layout.session.answer.capture.acquisition.bin_width_s == 2e-9
 
 
@@ -380,21 +385,21 @@ def test_the_form_stays_open_for_a_file_that_is_refused(tmp_path):
     )
     sources = built_in_sources()
     kept = {"sample": sources["sample"], "two": file_source(tmp_path / "two.npz")}
-    layout = Layout(kept | {"car": sources["car"]})
+    layout = HeldLayout(kept | {"car": sources["car"]})
     session, form = layout.session, opened(layout, "Reading options")
     for first in ("sample", "car"):
         session.state.source = first
-        eventually(lambda first=first: form.visible == (first == "sample"))
-        eventually(lambda: layout.alert.text == "")
+        layout.tasks.run_until(lambda first=first: form.visible == (first == "sample"))
+        layout.tasks.run_until(lambda: layout.alert.text == "")
         session.state.source = "two"
-        eventually(lambda: "give day or night" in layout.alert.text)
+        layout.tasks.run_until(lambda: "give day or night" in layout.alert.text)
         assert session.state.source == first
         assert form.visible and not form.collapsed
         assert control(layout, "Bin width").value == ""
     control(layout, "Variable").value = "night"
     control(layout, "Bin width").value = "64 ps"
     control(layout, "Read again").clicks += 1
-    eventually(lambda: layout.alert.text == "")
+    layout.tasks.run_until(lambda: layout.alert.text == "")
     assert session.state.source == "two"
     assert session.answer.capture.acquisition.bin_width_s == 64e-12
     # What is on screen is a guess until it is changed.
@@ -403,7 +408,7 @@ def test_the_form_stays_open_for_a_file_that_is_refused(tmp_path):
     assert session.state.reading == ReadOptions(variable="night", bin_width_s=64e-12)
     control(layout, "Variable").value = "day"
     control(layout, "Read again").clicks += 1
-    eventually(lambda: session.answer.request.reading.variable == "day")
+    layout.tasks.run_until(lambda: session.answer.request.reading.variable == "day")
     assert session.state.reading == ReadOptions(variable="day", bin_width_s=64e-12)
 
 
@@ -483,8 +488,8 @@ def test_a_killed_process_is_reported_and_the_next_works(monkeypatch, session, s
     with monkeypatch.context() as patched:
         patched.setattr("core.studies.tradeoff.measure.held_bytes", killed)
         start()
-        eventually(lambda: shown and "BrokenProcessPool" in shown[-1])
+        session.tasks.run_until(lambda: shown and "BrokenProcessPool" in shown[-1])
     assert "Press Compute" in shown[-1]
     start()
-    eventually(lambda: has_succeeded() and has_succeeded()[0] == "Done")
+    session.tasks.run_until(lambda: has_succeeded() and has_succeeded()[0] == "Done")
     assert shown[-1] == ""

@@ -6,9 +6,7 @@ Expected numbers are computed by `core`.
 from __future__ import annotations
 
 import re
-from csv import DictReader
 from dataclasses import dataclass
-from io import StringIO
 from itertools import pairwise
 from typing import Any
 
@@ -21,9 +19,9 @@ from app.model.state import Illumination
 from app.pages.inspect import text
 from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
-from tests.browser import VIEWS, chosen, enter, eventually, fact, field, slider, upload
+from tests.browser import VIEWS, choose, enter, eventually, fact, field, slider, upload
 from tests.browser import image as picture
-from tests.test_downloads import columns_of, download
+from tests.test_downloads import columns_of, download, rows_of
 from tests.test_lasting import here as address_of
 from tests.test_lasting import rests
 
@@ -130,12 +128,6 @@ COUNTS, RATE, STAGES = "Counts, and the two scales", "Rate", "Residual, and enha
 # -- actions of a user -----------------------------------------------------------------------------
 
 
-def choose_map(page: Page, name: str) -> None:
-    chosen(page, "Map").click()
-    page.get_by_role("menuitem", name=name, exact=True).click()
-    expect(page.locator(".MuiMenu-root")).to_have_count(0)  # it takes all clicks until it has faded
-
-
 TOOLS = {"Rectangle": "BoxSelectTool", "Lasso": "LassoSelectTool", "Zoom": "BoxZoomTool"}
 """What a drag on the map does, and Bokeh's tool that does it."""
 
@@ -186,7 +178,7 @@ def expect_pixel(page: Page, subject: Subject) -> None:
         expect(fact(page, name)).to_have_text(text.interval(found))
     name, table = download(page, "numbers", "csv")
     assert name == f"{subject.name}_tracking_numbers-row{row}-col{col}.csv"
-    saved = {row["quantity"]: row for row in DictReader(StringIO(table.decode()))}["SBR"]
+    saved = {row["quantity"]: row for row in rows_of(table)}["SBR"]
     sbr = report.flux.sbr
     ends = [float(saved[end]) for end in ("value", "low", "high")]
     assert ends == pytest.approx([sbr.value, sbr.low, sbr.high])
@@ -241,7 +233,7 @@ def expect_maps(page: Page, subject: Subject) -> None:
         error_m = subject.visible_m - capture.truth_range_m
         expected = {"Truth": capture.truth_range_m, "Error": error_m, **expected}
     for name, values in expected.items():
-        choose_map(page, name)
+        choose(page, "Map", name)
         eventually(lambda values=values: is_mapped(page, values))
     _, content = download(page, "map", "csv")
     *_, range_m = columns_of(content).values()
@@ -251,7 +243,9 @@ def expect_maps(page: Page, subject: Subject) -> None:
 def expect_report(page: Page, capture: Capture) -> None:
     """Expect the capture's flux, how it was found, and the sum of all histograms."""
     report = inspection.capture_report(capture)
-    for name, found in zip(("Signal (PPP)", "Background", "SBR"), report.flux, strict=True):
+    for name, found in zip(
+        ("PPP, all pixels", "Background", "SBR, all pixels"), report.flux, strict=True
+    ):
         expect(fact(page, name)).to_have_text(text.interval(found))
     method = f"Signal, background and SBR: {report.flux_method}"
     expect(page.get_by_text(method)).to_be_visible()
@@ -292,6 +286,8 @@ def test_an_uploaded_capture_without_truth_is_shown_as_core_computes_it(
     capture = core.read_capture(path)
     page = page(f"{address}?page=Inspect")
     upload(page, path.name, path.read_bytes())
+    expect(page.get_by_text("Matched filter: the capture holds all photons")).to_be_visible()
+    choose(page, "Method", "Dual-scale tracking differentiator")
     for name in ("Row", "Column"):  # the middle; written late, it would replace an entry
         expect(field(page, name)).to_have_value(re.compile(r"^1\d\d$"))
     expect_all(page, Subject(address, capture, ranged(capture), path.stem, (100, 190)))
@@ -344,7 +340,7 @@ def test_keys_taps_and_fields_move_the_pixel_and_the_zoom_stays(page, facade):
     page.mouse.wheel(0, -200)
     eventually(lambda: of_picture(page, spans) != whole)
     zoomed = of_picture(page, spans)
-    choose_map(page, "Confidence")
+    choose(page, "Map", "Confidence")
     enter(page, "Column", str(col + 7))
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 7}")
     np.testing.assert_allclose(of_picture(page, spans), zoomed)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 
+from app.model.address import Link
 from app.model.colors import map_of
-from app.model.state import MAPS, NEED_TRUTH, ReductionSettings
+from app.model.state import MAPS, NEED_TRUTH, Illumination, ReductionSettings, Viewing
 from app.model.store import built_in_sources, file_source
 from app.pages.inspect import text
 from app.pages.inspect.capture import CaptureSection
 from app.pages.inspect.page import Inspect
+from app.pages.inspect.pair import PairSection
 from app.pages.inspect.pins import PinsSection
 from app.pages.inspect.pixel import PixelSection
 from app.pages.inspect.results import accuracy_steps, inspect_region, with_gate
@@ -20,7 +24,7 @@ from app.pages.inspect.views import MAX_DRAWN_CORNERS, corners_of, rectangle
 from app.pages.session import Session
 from app.theme import DARK
 from app.units import scale
-from core import Acquisition, coates_rate, inspection, tracking_signals
+from core import Acquisition, TrackingParameters, coates_rate, inspection, tracking_signals
 from core.tests.captures import real_capture_path
 from tests.test_downloads import columns_of, written
 from tests.threads import HeldTasks
@@ -132,7 +136,7 @@ def test_every_map_is_offered_where_possible_and_drawn(name, request):
     offered = session.state.param.map.objects
     has_truth = capture.truth_range_m is not None
     assert offered == [each for each in MAPS if has_truth or each not in NEED_TRUTH]
-    maps = {kind: map_of(session.answer, kind, 0.9) for kind in offered}
+    maps = {kind: map_of(session.answer, kind, Viewing()) for kind in offered}
     for image, look in maps.values():
         assert image.shape == capture.shape
         assert look.title and look.low < look.high
@@ -212,10 +216,55 @@ def test_pixel_pins_and_region_are_kept_while_the_capture_keeps_its_pixels(far):
 # -- pixel and region ------------------------------------------------------------------------------
 
 
+def test_confidence_below_which_estimates_are_hidden_is_set_beside_the_map(building):
+    page = Inspect(building)
+    page.show(True)
+    building.tasks.run_until(lambda: page.legend.text)
+    confidence = building.answer.run.image.confidence
+    for least in (0.5, 0.99):
+        page.least_confidence.value = least
+        said = f"{(confidence < least).sum():,} of {confidence.size:,} hidden"
+        building.tasks.run_until(lambda said=said: said in page.legend.text)
+        assert building.state.viewing.least_confidence == least
+    building.state.viewing = replace(building.state.viewing, least_confidence=0.9)
+    building.tasks.run_until(lambda: page.least_confidence.value == 0.9)
+
+
+def test_hot_and_dead_pixels_are_listed_marked_and_shown_by_a_press():
+    session = Session({"worn": built_in_sources()["worn"]}, tasks=HeldTasks())
+    page = Inspect(session)
+    page.show(True)
+    session.tasks.run_until(lambda: page.n_faulty.text)
+    faulty = inspection.faulty_pixels(session.answer.capture)
+    n_hot = sum(each.health == "hot" for each in faulty)
+    assert f"{n_hot} hot" in page.n_faulty.text
+    assert f"{len(faulty) - n_hot} dead" in page.n_faulty.text
+    n_listed = min(n_hot, text.MOST_LISTED) + min(len(faulty) - n_hot, text.MOST_LISTED)
+    assert len(page.faulty.rows) == n_listed < len(faulty)
+    assert f"{len(faulty) - n_listed} more" in page.n_faulty.text
+    (marks,) = (
+        each.data_source.data
+        for each in page.navigator.figure.renderers
+        if each.name == "faulty mark"
+    )
+    places = {(each.row, each.col): each.health for each in faulty}
+    shapes = {"circle": "hot", "x": "dead"}
+    assert places == {
+        (row, col): shapes[shape]
+        for row, col, shape in zip(marks["y"], marks["x"], marks["marker"], strict=True)
+    }
+    session.state.subject = "Capture"
+    row = page.faulty.rows[-1]
+    page.faulty.acted = [row["key"], 0]
+    assert list(session.state.pixel) == row["key"]
+    assert session.state.subject == "Pixel"
+    assert places[session.state.pixel] == row["cells"][0][0] == "dead"
+
+
 def test_everything_about_a_pixel_is_cores(building):
     section = on_screen(PixelSection(building, "pixel"))
     building.choose_pixel(40, 30)
-    building.tasks.run_until(lambda: section.facts.facts[0][1] == "40, 30")
+    building.tasks.run_until(lambda: values(section.facts).get("Pixel") == "40, 30")
     capture, tracking = building.answer.capture, building.answer.request.tracking
     signals = tracking_signals(capture.cube[40, 30], tracking, capture.gated_pulses)
     counts, rate, stages = section.plots.counts, section.plots.rate, section.plots.stages
@@ -251,6 +300,8 @@ def test_everything_about_a_pixel_is_cores(building):
     for name, found in zip(("Signal S", "Background B", "SBR"), report.flux, strict=True):
         assert facts[name] == text.interval(found)
     assert facts.keys() >= {"Truth", "Error", "Confidence"}
+    range_m = facts["Range (95 %)"]
+    assert (range_m.low, range_m.high) == (report.interval_95_m.low, report.interval_95_m.high)
     assert section.remark.text == f"Verdict: {report.verdict.health}. {report.verdict.why}"
     scores = [row["cells"][1][1] for row in section.table.rows]
     assert scores == sorted((each.score for each in report.candidates), reverse=True)
@@ -301,12 +352,60 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
     lines = section.counts.source("lines").data["ys"]
     np.testing.assert_allclose(lines, [far.answer.capture.cube[pin] for pin in pins])
     assert [row["name"] for row in section.table.rows] == [f"100, {130 + n}" for n in range(4)]
+    assert re.match(r"From 100, 130: [\d.]+ ± [\d.]+ m to 100, 131, ", section.note.text)
+    assert section.note.text.endswith(text.WIDTH_GUESSED)
     page.chips.removed = [[100, 131], 1]
     assert (100, 131) not in far.state.pins
     assert page.refusal.text == ""
     page.chips.chosen = [[100, 132], 1]
     assert far.state.pixel == (100, 132)
     far.tasks.run_until(lambda: len(section.table.rows) == 3)
+
+
+# -- A and B ---------------------------------------------------------------------------------------
+
+
+def test_an_estimate_is_kept_and_subtracted_from_another(building):
+    section, sources = PairSection(building), building.sources
+    section.show(True)
+    assert section.note.text == text.NO_A
+    building.state.param.update(light=Illumination(sbr=0.3), tracking=TrackingParameters(l=0.006))
+    building.tasks.run_until(building.is_settled)
+    a = building.answer
+    press(button(section, "Keep as A"))
+    change(building, method="coates")
+    section.refresh()
+    building.tasks.run_until(lambda: section.pair and section.pair.b is building.answer)
+    image_a, image_b = a.run.image, building.answer.run.image
+    shown = [each.valid & (each.confidence >= 0.9) for each in (image_a, image_b)]
+    difference_m = np.where(shown[0] & shown[1], image_b.range_m - image_a.range_m, np.nan)
+    assert section.pair.a is a
+    np.testing.assert_array_equal(section.pair.difference_m, difference_m)
+    numbers = values(section.facts)
+    assert numbers["In both"] == f"{np.isfinite(difference_m).sum():,}"
+    assert numbers["Only in A"] == f"{(shown[0] & ~shown[1]).sum():,}"
+    assert "SBR0.3" in section.a.title.text and "Coates" in section.b.title.text
+    # Another session has only the link, and computes A again.
+    link = Link(dict(parse_qsl(building.query())))
+    again = PairSection(Session(sources, link, tasks=HeldTasks()))
+    again.show(True)
+    again.session.tasks.run_until(lambda: again.pair)
+    np.testing.assert_array_equal(again.pair.a.run.image.range_m, image_a.range_m)
+    np.testing.assert_array_equal(again.pair.difference_m, difference_m)
+    press(button(section, "Forget A"))
+    assert section.note.text == text.NO_A and building.state.kept == ""
+
+
+def test_estimates_of_other_sizes_are_not_subtracted(building):
+    section = PairSection(building)
+    section.show(True)
+    press(button(section, "Keep as A"))
+    change(building, less=ReductionSettings(pool=2))
+    section.refresh()
+    building.tasks.run_until(lambda: "their sizes must be equal" in section.note.text)
+    assert section.pair is None
+    building.state.kept = "source=gone"
+    assert "There is no scene or capture 'gone'" in section.note.text
 
 
 # -- downloads -------------------------------------------------------------------------------------
@@ -325,10 +424,12 @@ def test_region_pins_and_capture_are_saved_as_shown(name, request):
     cube, n_bins = session.answer.capture.cube, session.answer.capture.acquisition.n_bins
 
     section = on_screen(PixelSection(session, "region"))
-    saved = {button: show() for button, show in section.downloads.items()}
-    assert saved.keys() == {"counts", "rate", "residual and enhanced"}
     assert section.view.main
-    saved = {button: show() for button, show in section.downloads.items()}
+    is_tracking = session.answer.method == "tracking"
+    hidden, shown = ("score", "residual and enhanced")[:: 1 if is_tracking else -1]
+    visible = section.downloads.keys() - {hidden}
+    assert visible >= {"rate", shown}
+    saved = {button: section.downloads[button]() for button in visible}
     assert saved.keys() >= {"counts", "numbers", "table"}
     assert {each.subject.part for each in saved.values()} == {"rows40-44_cols30-33"}
     summed = cube[40:45, 30:34].sum(axis=(0, 1))
@@ -375,9 +476,12 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
     report, before = capture.report, building.answer.capture
     np.testing.assert_allclose(capture.counts.curve("raw"), before.cube.sum(axis=(0, 1)))
     facts = values(capture.facts)
-    assert facts["SBR"] == text.interval(report.flux.sbr)
+    for pixels, flux in (("all", report.flux), ("target", report.target_flux)):
+        assert facts[f"SBR, {pixels} pixels"] == text.interval(flux.sbr)
+        assert facts[f"PPP, {pixels} pixels"] == text.interval(flux.signal)
     assert facts["Hot pixels"] == str(report.n_hot)
     assert report.flux_method in capture.flux.text
+    assert report.flux_remark in capture.flux.text
     assert report.suggestion.why_gate in capture.advice[0].text
     assert report.suggestion.why_t_n in capture.advice[1].text
 

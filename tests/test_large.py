@@ -14,7 +14,7 @@ from app.model import large
 from app.model.address import Link
 from app.model.colors import image_of
 from app.model.large import LIMIT, Grid, most_whole_bytes
-from app.model.state import Illumination, ReductionSettings
+from app.model.state import Illumination, ReductionSettings, Viewing
 from app.model.store import built_in_sources, compute, file_source
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
@@ -133,7 +133,7 @@ def large_share(pieces):
 def test_unread_pixels_are_blank(path, slow):
     answer = compute(ask(file_source(path)), None)
     for kind in ("Counts", "Estimate", "Confidence"):
-        image, _ = image_of(answer, kind, 0.0)
+        image, _ = image_of(answer, kind, Viewing(0.0))
         assert np.isnan(image).mean() >= 1 - large_share(4)
 
 
@@ -241,7 +241,7 @@ def saved_window(app):
     table = app.contents["Explore"].image_shown().files["csv"]
     rows, cols, shown = columns_of(written(table)).values()
     session = app.session
-    values, _ = image_of(session.answer, "Estimate", session.state.viewing.least_confidence)
+    values, _ = image_of(session.answer, "Estimate", session.state.viewing)
     at = [session.answer.grid.pixel(*each) for each in zip(rows, cols, strict=True)]
     np.testing.assert_array_equal(shown, [values[each] for each in at])
     return (rows.min(), rows.max()), (cols.min(), cols.max()), rows.size

@@ -19,8 +19,8 @@ from app.model.address import Link, defaults, query_of
 from app.model.colors import image_of
 from app.model.large import LIMIT
 from app.model.script import COMMANDS, script_of
-from app.model.state import State
-from app.model.store import ASSETS, Answer, Request, built_in_sources, file_source, inspect
+from app.model.state import Comparison, State
+from app.model.store import ASSETS, Answer, Pixel, Request, built_in_sources, file_source, inspect
 from app.pages.catalog import PAGES
 from app.pages.compare.ranking import run_task, tasks_of
 from app.pages.session import Session
@@ -30,8 +30,8 @@ from tests.states import another, random_state
 
 PAGE_NAMES = [page.name for page in PAGES]
 
-NOT_CODE = {"cloud_color", "unit"}
-"""Parameters without an effect on arrays: colours, and units on axes."""
+NOT_CODE = {"cloud_color", "unit", "kept"}
+"""Parameters without an effect on arrays: colours, units on axes, and the estimate kept as A."""
 
 RUN_EACH = """
 import os, runpy, sys
@@ -44,8 +44,12 @@ for folder in sys.argv[1:]:
     kept = {"picture": found.get("picture", 0)}
     for name, image in answers.items():
         kept |= {f"{name} {each}": value for each, value in vars(image).items()}
+        kept[f"{name} made_by"] = str(image.made_by)
     for name, signals in ({"signals": found.get("signals")} | found.get("pinned", {})).items():
-        kept |= {f"{name} {n}": each for n, each in (signals._asdict() if signals else {}).items()}
+        if isinstance(signals, np.ndarray):
+            kept[f"{name} score"] = signals
+        elif signals is not None:
+            kept |= {f"{name} {n}": each for n, each in signals._asdict().items()}
     if "region" in found:
         kept["region"] = found["region"].summed.cube
     if "pictures" in found:
@@ -93,7 +97,18 @@ def same(found: dict, name: str, expected) -> None:
     """Compare all arrays of a range image, or of signals, bit for bit."""
     whole = expected._asdict() if hasattr(expected, "_asdict") else vars(expected)
     for each, value in whole.items():
+        if each == "made_by":
+            assert str(found[f"{name} made_by"]) == str(value)
+            continue
         assert np.array_equal(found[f"{name} {each}"], np.asarray(value), equal_nan=True), each
+
+
+def same_pixel(found: dict, name: str, pixel: Pixel) -> None:
+    """Compare the stages of a pixel, or its score, bit for bit."""
+    if pixel.signals is None:
+        assert np.array_equal(found[f"{name} score"], pixel.score)
+    else:
+        same(found, name, pixel.signals)
 
 
 # -- results ---------------------------------------------------------------------------------------
@@ -103,10 +118,13 @@ STATES = {
     "changed": "source=worn&light.sbr=0.3&light.n_pulses=500&light.seed=4&less.merge=2&less.pool=2"
     "&less.gate_from=0.1&less.pulses=0.7&absent=[%22jitter%22,%22pile_up%22]&tracking.l=0.01"
     "&tracking.n=500&tracking.m=1.5&tracking.alpha=0.3&tracking.t_n=10&tracking.weight=cubic"
-    "&tracking.start=zero&image=Error&viewing.least_confidence=0.4&difference=true&pixel=[3,17]",
+    "&tracking.start=zero&image=Error&viewing.least_confidence=0.4"
+    "&viewing.color_from_m=48&viewing.color_map=viridis&difference=true&pixel=[3,17]",
     "larger": "source=car_256&less.skip=3&image=Counts&absent=[%22signal_levels%22]",
     "inspected": "source=building&page=Inspect&map=SBR&pins=[[1,2],[30,41]]&pixel=[12,13]"
     "&region=[[1,2],[1,12],[14,9.5]]&absent=[%22pulse_shape%22,%22reflectivity%22]",
+    "another method": "source=sample&page=Inspect&method=likelihood&pins=[[3,4]]"
+    "&region=[[1,2],[1,9],[7,5]]&settings.likelihood.steps_per_bin=4",
     "file": "source=sample&reading.bin_width_s=1.5e-9&image=Counts",
 }
 
@@ -117,15 +135,15 @@ def test_scripts_reproduce_the_screen(tmp_path):
     for name, session in sessions.items():
         answer, state = session.answer, session.state
         same(found[name], "image", answer.run.image)
-        same(found[name], "signals", inspect(answer, *state.pixel).signals)
+        same_pixel(found[name], "signals", inspect(answer, *state.pixel))
         for file in ("range.png", "cloud.ply", "pixel.csv"):
             assert (tmp_path / name / file).stat().st_size > 0
-        if name != "inspected":
-            picture, _ = image_of(answer, state.image, state.viewing.least_confidence)
+        if state.page != "Inspect":
+            picture, _ = image_of(answer, state.image, state.viewing)
             assert np.array_equal(found[name]["picture"], picture, equal_nan=True)
     answer, more = sessions["inspected"].answer, found["inspected"]
     for pixel in ((1, 2), (30, 41)):
-        same(more, str(pixel), inspect(answer, *pixel).signals)
+        same_pixel(more, str(pixel), inspect(answer, *pixel))
     mask = core.inspection.pixels_in(sessions["inspected"].state.region, answer.capture.shape)
     assert np.array_equal(more["region"].ravel(), answer.capture.cube[mask].sum(axis=0))
     sbr = core.inspection.maps["SBR"](answer.capture)
@@ -143,7 +161,7 @@ def test_scripts_of_random_states_run(tmp_path):
         sessions[str(seed)] = session
     for name, found in run(tmp_path, sessions).items():
         same(found, "image", sessions[name].answer.run.image)
-        same(found, "signals", inspect(sessions[name].answer, 5, 6).signals)
+        same_pixel(found, "signals", inspect(sessions[name].answer, 5, 6))
 
 
 def test_a_script_reproduces_a_real_capture(tmp_path, real_capture):
@@ -152,7 +170,7 @@ def test_a_script_reproduces_a_real_capture(tmp_path, real_capture):
     session = opened(query, it=path)
     found = run(tmp_path, {"it": session}, path)["it"]
     same(found, "image", session.answer.run.image)
-    same(found, "signals", inspect(session.answer, 60, 70).signals)
+    same_pixel(found, "signals", inspect(session.answer, 60, 70))
     assert str(path.parent) not in script_of(session.answer, session.state)
 
 
@@ -167,7 +185,7 @@ def test_a_script_reproduces_a_window_of_a_large_capture(tmp_path, monkeypatch):
     session = opened(f"{query}&window.rows=[8,40]&window.cols=[20,60]", it=path)
     found = run(tmp_path, {"it": session}, path)["it"]
     same(found, "image", session.answer.run.image)
-    same(found, "signals", inspect(session.answer, 3, 4).signals)
+    same_pixel(found, "signals", inspect(session.answer, 3, 4))
     assert session.answer.capture.shape == (32, 40)
     alone = core.estimate(replace(session.answer.capture, flux_prior=None), "tracking")
     assert not np.array_equal(alone.confidence, found["image confidence"])
@@ -176,7 +194,7 @@ def test_a_script_reproduces_a_window_of_a_large_capture(tmp_path, monkeypatch):
 def test_a_script_reproduces_the_comparison(tmp_path):
     query = (
         "page=Compare&comparison.methods=[%22peak%22,%22kde%22,%22tracking%22,%22oracle%22]"
-        "&comparison.false_alarm=0.1&comparison.settings.kde.bandwidth_bins=0.7&tracking.l=0.01"
+        "&comparison.false_alarm=0.1&settings.kde.bandwidth_bins=0.7&tracking.l=0.01"
     )
     sessions = {
         "car": opened(query + "&comparison.kind=Error&comparison.viewing.least_confidence=0.5"),
@@ -185,14 +203,14 @@ def test_a_script_reproduces_the_comparison(tmp_path):
     found = run(tmp_path, sessions, ASSETS / "sample_capture.npz")
     for name, session in sessions.items():
         answer, chosen = session.answer, session.state.comparison
-        for method, task in tasks_of(chosen, answer.request.tracking).items():
+        for method, task in tasks_of(chosen, answer.request).items():
             if name == "file" and method == "oracle":
                 assert "oracle range_m" not in found[name]
                 continue
             compared = run_task(task, answer).answer
             same(found[name], method, compared.run.image)
             kind = "Error" if name == "car" else "Estimate"
-            picture, _ = image_of(compared, kind, chosen.viewing.least_confidence)
+            picture, _ = image_of(compared, kind, chosen.viewing)
             assert np.array_equal(found[name][f"{method} picture"], picture, equal_nan=True)
 
 
@@ -216,6 +234,8 @@ def test_the_title_names_the_command_of_a_page(page, command, car):
 def test_every_parameter_is_in_the_script_of_some_page(name, car):
     """Fails for a new parameter or field that scripts ignore."""
     first = {"source": "sample" if name in ("reading", "window") else "worn"}
+    if name == "settings":
+        first["comparison"] = Comparison(methods=tuple(core.ESTIMATORS))
     for value in ["building"] if name == "source" else another(name):
         seen = [{"page": page, **first} for page in PAGE_NAMES]
         assert any(

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+from urllib.parse import parse_qsl
+
 import numpy as np
 import pytest
 
 from app.__main__ import main, readable
+from app.model.address import Link
 from app.model.reading import options_in_use
 from app.model.script import script_of
 from app.model.store import built_in_sources
@@ -51,3 +56,20 @@ def test_without_a_readable_file_each_is_reported_and_nothing_is_served(paths, c
     said = capsys.readouterr().err
     assert all(path.name in said for path in paths)
     assert "--bins = 41" in said
+
+
+def test_a_link_opens_the_same_file_or_none(paths, tmp_path):
+    options = ReadOptions(variable="day")
+    linked = Session(readable(paths[2:], options) | built_in_sources()).query()
+    assert linked.startswith("source=day.npz")
+    (tmp_path / "moved").mkdir()
+    np.savez(tmp_path / "moved" / "first.npz", day=CUBE[:2])
+    same = shutil.copy(paths[2], tmp_path / "moved")
+    files = readable([tmp_path / "moved" / "first.npz", Path(same)], options) | built_in_sources()
+    again = Session(files, Link(dict(parse_qsl(linked))))
+    assert again.refused == []
+    assert again.answer.request.source.title == "day.npz"
+    np.savez(same, day=CUBE + 1)
+    files = readable([Path(same)], options) | built_in_sources()
+    (refused,) = Session(files, Link(dict(parse_qsl(linked)))).refused
+    assert "day.npz" in refused and "its content is another" in refused

@@ -156,12 +156,8 @@ def test_every_row_and_point_opens_its_configuration(section, measured, session)
         candidate = measured[row["key"]].candidate
         assert text.name_of(candidate) == row["name"]
         assert len(row["cells"]) == len(text.COLUMNS) - 1
-        method = candidate.method.estimator
-        if method == "tracking":
-            assert session.state.page == "Explore"
-        else:
-            assert session.state.page == "Compare"
-            assert method in session.state.comparison.methods
+        assert session.state.page == "Explore"
+        assert session.state.method == candidate.method.estimator
     session.state.page = "Trade-off"
     section.plot.source("points").selected.indices = [3]
     assert session.state.page != "Trade-off"
@@ -202,18 +198,18 @@ def test_opening_the_papers_method_sets_the_sliders(measured):
     assert control(layout, "T_n").value == merged.settings.t_n == 10
 
 
-def test_opening_another_method_adds_it_to_compare(measured):
+def test_any_method_is_shown_on_explore(measured):
     layout = Layout(built_in_sources())
     (point,) = (p for p in measured if p.candidate.method.estimator == "cfar")
     settings = replace(point.candidate.settings, guard_bins=9)
     method = replace(point.candidate.method, settings=settings)
     another = replace(point, candidate=replace(point.candidate, method=method))
     show_point(layout.session, another, layout.session.answer.request)
-    assert layout.pages.choice.value == "Compare"
-    compare = layout.contents["Compare"]
-    assert "cfar" in compare.picks.value
-    assert compare.tasks["cfar"].settings == settings
-    assert compare.panels["cfar"].controls["guard_bins"].value == 9
+    assert layout.pages.choice.value == "Explore"
+    answer = layout.session.answer
+    assert (answer.method, answer.settings) == ("cfar", settings)
+    assert control(layout, "Method").value == "cfar"
+    assert control(layout, "Guard").value == 9
 
 
 # -- acquisition -----------------------------------------------------------------------------------

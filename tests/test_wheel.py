@@ -35,6 +35,7 @@ def wheel(tmp_path_factory):
 def test_the_wheel_has_types_and_data_and_no_tests(wheel):
     names = ZipFile(wheel).namelist()
     assert {"core/py.typed", "app/py.typed", "assets/car.npz"} <= set(names)
+    assert {"core/report/cloud.js", "core/report/page.css"} <= set(names)
     assert not [name for name in names if "tests" in name or name.endswith((".png", ".md"))]
 
 

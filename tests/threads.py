@@ -8,7 +8,8 @@ from typing import Any
 
 from app.model.address import Link
 from app.model.store import Answer, Source
-from app.pages.layout import Layout
+from app.model.uploads import Uploads
+from app.pages.layout import Arrivals, Layout
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import Act
 
@@ -51,9 +52,15 @@ class HeldLayout(Layout):
         Every sentence on failures, the latest last; empty ones where all works.
     """
 
-    def __init__(self, sources: Mapping[str, Source], wanted: Link | None = None) -> None:
+    def __init__(
+        self,
+        sources: Mapping[str, Source],
+        wanted: Link | None = None,
+        uploads: Uploads | None = None,
+        arrivals: Arrivals | None = None,
+    ) -> None:
         self.tasks = HeldTasks()
-        super().__init__(sources, wanted, tasks=self.tasks)
+        super().__init__(sources, wanted, uploads, self.tasks, arrivals)
         self.heard = [""]
         self.session.failures.shown.subscribe(self.heard.append)
         self._answers: list[Answer] = []

@@ -15,13 +15,16 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
-from urllib.parse import urlencode
+from urllib.parse import parse_qsl, urlencode
 
 import param
 
 from app.model.state import State
 from core.checks import require
 from core.io import ReadOptions
+
+OLD_SETTINGS, SETTINGS = "comparison.settings.", "settings."
+"""Beginning of the settings' names in links of the last release, and the present one."""
 
 Result = TypeVar("Result")
 
@@ -92,7 +95,9 @@ class Link:
     """
 
     def __init__(self, entries: Mapping[str, str]) -> None:
-        self._entries = entries
+        self._entries = {
+            name.replace(OLD_SETTINGS, SETTINGS, 1): text for name, text in entries.items()
+        }
         self._known: set[str] = set()
         self.refused: list[str] = []
 
@@ -100,6 +105,11 @@ class Link:
     def source(self) -> str:
         """Key of the scene or capture that the link names, or an empty string."""
         return self._entries.get("source", "")
+
+    @property
+    def kept_source(self) -> str:
+        """Key of the scene or capture of the estimate that was kept as A, or an empty string."""
+        return dict(parse_qsl(self._entries.get("kept", ""))).get("source", "")
 
     def of(self, bases: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters that the link changes, by name.
@@ -143,9 +153,12 @@ class Link:
         changed = {each: part for each, part in changed.items() if part is not parts[each]}
         if isinstance(base, Mapping):
             return {**base, **changed} if changed else base
-        for each, part in changed.items():  # one by one, so that a bad one leaves the others
-            base = self._attempt(replace, base, **{each: part}) or base
-        return base
+        try:
+            return replace(base, **changed) if changed else base
+        except (ValueError, TypeError):
+            for each, part in changed.items():  # one by one, so that a bad one leaves the others
+                base = self._attempt(replace, base, **{each: part}) or base
+            return base
 
     def _created(self, name: str, kind: Any) -> Any:
         """Return an object made from its entries; None where there are none."""
@@ -173,7 +186,8 @@ class Link:
         try:
             return _like(base, json.loads(text))
         except (ValueError, TypeError, RecursionError):
-            expected = "a finite number" if isinstance(base, float) else f"a value such as {base}"
+            is_number = base is None or isinstance(base, float)
+            expected = "a finite number" if is_number else f"a value such as {base}"
             self.refused.append(f"{name} = {text[:80]!r} is not accepted: give {expected}.")
             return base
 

@@ -10,10 +10,24 @@ import numpy as np
 
 from app.model.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State, Viewing
 from app.model.store import Answer, same_pixels
+from core.geometry import guessed_field_of_view_deg
 from core.inspection import pixels_in
+from core.report import telling_pixel
 
-FROM_CAPTURE = ("pixel", "pins", "region", "viewing", "comparison")
-"""Parameters of the state whose default depends on the capture."""
+KINDS = {"image": IMAGES, "map": MAPS, "cloud_color": CLOUD_COLORS}
+"""Parameters of which some values require a truth, with all values."""
+
+FROM_CAPTURE = ("pixel", "pins", "region", "viewing", "comparison", *KINDS)
+"""Parameters of the state whose default or possible values depend on the capture."""
+
+
+def possible_kinds(answer: Answer) -> dict[str, list[str]]:
+    """Return the possible values of the parameters `KINDS`; the first is the default."""
+    has_truth = answer.capture.truth_range_m is not None
+    return {
+        name: [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
+        for name, kinds in KINDS.items()
+    }
 
 
 def defaults_of(answer: Answer) -> dict[str, Any]:
@@ -22,7 +36,7 @@ def defaults_of(answer: Answer) -> dict[str, Any]:
     comparison = Comparison()
     compared = replace(comparison.viewing, field_of_view_deg=field_of_view_deg)
     return {
-        "pixel": _first_pixel(answer),
+        "pixel": telling_pixel(answer.capture, answer.run.image),
         "viewing": Viewing(field_of_view_deg=field_of_view_deg),
         "comparison": replace(comparison, viewing=compared),
     }
@@ -30,19 +44,19 @@ def defaults_of(answer: Answer) -> dict[str, Any]:
 
 def enter(state: State, answer: Answer, previous: Answer | None) -> None:
     """Adapt the state to another capture; keep the pixel, pins and region that lie in it."""
-    has_truth = answer.capture.truth_range_m is not None
-    for name, kinds in (("image", IMAGES), ("map", MAPS), ("cloud_color", CLOUD_COLORS)):
-        possible = [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
+    for name, possible in possible_kinds(answer).items():
         state.param[name].objects = possible
         if getattr(state, name) not in possible:
             setattr(state, name, possible[0])
     own = defaults_of(answer)
-    as_wide = {"field_of_view_deg": own["viewing"].field_of_view_deg}
-    compared = replace(state.comparison.viewing, **as_wide)
+    changed: dict[str, Any] = {"field_of_view_deg": own["viewing"].field_of_view_deg}
+    if previous is not None and previous.request.source is not answer.request.source:
+        changed |= {"color_from_m": None, "color_to_m": None}  # limits of another scene
+    compared = replace(state.comparison.viewing, **changed)
     here = {"pixel": state.pixel, "pins": state.pins, "region": state.region}
     kept = {} if previous is None else carried(here, previous, answer)
     state.param.update(
-        viewing=replace(state.viewing, **as_wide),
+        viewing=replace(state.viewing, **changed),
         comparison=replace(state.comparison, viewing=compared),
         **{"pixel": own["pixel"], "pins": (), "region": ()} | kept,
     )
@@ -73,29 +87,13 @@ def carried(here: Mapping[str, Any], before: Answer, answer: Answer) -> dict[str
     }
 
 
-def _first_pixel(answer: Answer) -> tuple[int, int]:
-    """Return the pixel nearest to the centre that has a target, or else a confident estimate."""
-    truth_m = answer.capture.truth_range_m
-    image = answer.run.image
-    good = image.confidence >= 0.9 if truth_m is None else np.isfinite(truth_m)
-    rows, cols = answer.capture.shape
-    row, col = np.nonzero(good) if good.any() else np.nonzero(np.ones((rows, cols), bool))
-    nearest = np.argmin((row - rows / 2) ** 2 + (col - cols / 2) ** 2)
-    return int(row[nearest]), int(col[nearest])
-
-
 def own_field_of_view_deg(answer: Answer) -> float:
     """Return the image's width as the capture states it; else about as wide as the scene is deep.
 
     Rounded to three digits, for links.
     """
-    cols = answer.capture.shape[1]
-    angle_rad = answer.capture.acquisition.pixel_angle_rad
-    if angle_rad is not None:
-        return float(f"{np.degrees(2 * np.arctan(cols / 2 * np.tan(angle_rad))):.3g}")
-    image = answer.run.image
-    range_m = image.range_m[image.confidence >= 0.9]
-    range_m = range_m if range_m.size else answer.capture.acquisition.bin_to_range_m([0.0, 1.0])
-    low, high = np.percentile(range_m, [5, 95])
-    width_deg = np.clip(np.degrees((high - low) / max(high, 1e-3)), 0.001, 120.0)
-    return float(f"{width_deg:.3g}")
+    acquisition, image = answer.capture.acquisition, answer.run.image
+    if acquisition.pixel_angle_rad is None:
+        return guessed_field_of_view_deg(image.range_m, image.confidence, acquisition)
+    half_width = answer.capture.shape[1] / 2 * np.tan(acquisition.pixel_angle_rad)
+    return float(f"{np.degrees(2 * np.arctan(half_width)):.3g}")

@@ -7,11 +7,12 @@ import errno
 from app.model.text import cause
 
 FORMATS = {
-    "png": "picture, as on screen",
-    "svg": "picture, as on screen, to enlarge and edit",
+    "png": "picture",
+    "svg": "picture, to enlarge and edit",
     "csv": "the numbers on screen, as text",
     "npz": "image and arrays of the estimate, for NumPy",
     "tif": "image, range, confidence and counts, for GIS",
+    "html": "report: maps, cloud, numbers and script on one page",
     "ply": "the points on screen, with colours",
     "las": "the points on screen, for survey software",
 }

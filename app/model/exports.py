@@ -8,24 +8,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.model.colors import ColorScale, cloud_of, map_of, shown
+from app.model.colors import cloud_of, map_of, shown
 from app.model.download_text import NO_POINTS, NOTHING_DRAWN
 from app.model.large import Grid
-from app.model.state import UNITS, Viewing
+from app.model.script import script_of
+from app.model.state import UNITS, State, Viewing
 from app.model.store import Answer
 from app.model.text import Fact
 from app.theme import WRONG_COLOR
 from app.units import AXIS_TITLES, Quantity, scale
 from core import Acquisition
-from core.io import WRITERS, Plane, Product, write_columns
-from core.studies import Table, as_csv
+from core.geometry import pixel_angle_of
+from core.io import (
+    WRITERS,
+    ColorScale,
+    Picture,
+    Plane,
+    Product,
+    guessed_angle,
+    write_columns,
+)
+from core.report import write_report
+from core.studies import Table, as_csv, without_nan
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -136,26 +147,65 @@ def _view(axis_range: Any) -> tuple[float, float]:
 
 
 def image_files(
-    answer: Answer, kind: str, least_confidence: float, figure: Any
+    answer: Answer,
+    kind: str,
+    viewing: Viewing,
+    figure: Any,
+    look: ColorScale | None = None,
+    title: str = "",
 ) -> dict[str, Write]:
     """Return an image (row, col) as shown, with the estimate that it belongs to.
+
+    Pictures are those that `core.save_image` makes of the pixels in view, in the light mode.
 
     Parameters
     ----------
     answer : Answer
     kind : str
         As for `app.model.colors.map_of`.
-    least_confidence : float
-        Estimates below it are left out.
+    viewing : Viewing
+        Estimates below its confidence are left out.
     figure : bokeh.plotting.figure
-        Plot of the image; a CSV file holds the pixels in view.
+        Plot of the image; pictures and a CSV file hold the pixels in view.
+    look : ColorScale, optional
+        Colours, by default those of the image.
+    title : str
+        Title of a picture, by default that of its colours.
     """
-    values, look = map_of(answer, kind, least_confidence)
+    values, own = map_of(answer, kind, viewing)
+    look = look or own
     name = "range_m" if kind == "Estimate" else kind.lower()
     plane = Plane(values, look.unit if look.unit == "m" else "1", look.legend)
-    product = _product(answer, least_confidence, shown={name: plane})
-    files = {suffix: partial(WRITERS[f".{suffix}"], product) for suffix in ("npz", "tif")}
-    return {"csv": image_file(values, look, figure, answer.grid), **files}
+    product = _product(answer, viewing.least_confidence, shown={name: plane})
+    rows, cols = in_view(figure, answer.grid, values.shape)
+    picture = Picture(
+        values[rows, cols],
+        look,
+        title,
+        product.lines,
+        viewing.least_confidence if kind in ("Estimate", "Error") else None,
+        first=answer.grid.place(rows.start, cols.start),
+        step=answer.grid.step,
+    )
+    return {
+        "csv": image_file(values, look, figure, answer.grid),
+        **{suffix: partial(WRITERS[f".{suffix}"], product) for suffix in ("npz", "tif")},
+        **{suffix: partial(picture.write, suffix=suffix) for suffix in ("png", "svg")},
+    }
+
+
+def in_view(figure: Any, grid: Grid, shape: tuple[int, int]) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that are at least partly in view of its plot."""
+    found = []
+    for ends, place in zip(
+        (figure.y_range, figure.x_range), grid.place(*map(np.arange, shape)), strict=True
+    ):
+        seen = np.flatnonzero(_in_view(ends, place, grid.step / 2))
+        if not seen.size:
+            raise ValueError(NOTHING_DRAWN)
+        found.append(slice(int(seen[0]), int(seen[-1]) + 1))
+    rows, cols = found
+    return rows, cols
 
 
 def image_file(values: Array, look: ColorScale, figure: Any, grid: Grid) -> Write:
@@ -163,16 +213,12 @@ def image_file(values: Array, look: ColorScale, figure: Any, grid: Grid) -> Writ
 
     Rows and columns are those of the file, as on the axes.
     """
-    places = grid.place(*map(np.arange, values.shape))
-    in_view = [
-        _in_view(ends, place, grid.step / 2)
-        for ends, place in zip((figure.y_range, figure.x_range), places, strict=True)
-    ]
+    rows, cols = in_view(figure, grid, values.shape)
 
     def write(file: BinaryIO) -> None:
-        seen = (place[each] for place, each in zip(places, in_view, strict=True))
-        row, col = np.meshgrid(*seen, indexing="ij")
-        write_columns({"row": row, "col": col, look.legend: values[np.ix_(*in_view)]}, file)
+        place = grid.place(*(np.arange(each.start, each.stop) for each in (rows, cols)))
+        row, col = np.meshgrid(*place, indexing="ij")
+        write_columns({"row": row, "col": col, look.legend: values[rows, cols]}, file)
 
     return write
 
@@ -185,10 +231,39 @@ def _in_view(axis_range: Any, place: Array, half: float) -> NDArray[np.bool_]:
 
 def _product(answer: Answer, least_confidence: float, **more: Any) -> Product:
     """Return the pixels on show of an estimate, for `core.io.writers`."""
-    visible, image = shown(answer, least_confidence), answer.run.image
-    range_m = np.where(visible, image.range_m, np.nan)
     more.setdefault("pixel_angle_rad", answer.capture.acquisition.pixel_angle_rad)
-    return Product(answer.capture, replace(image, range_m=range_m, valid=visible), **more)
+    return Product(answer.capture, answer.run.image.confident(least_confidence), **more)
+
+
+# Reports
+
+
+def report_file(answer: Answer, state: State, title: str, own_field_of_view_deg: float) -> Write:
+    """Return the report on the capture, the estimate and the pixel on screen, as HTML.
+
+    Parameters
+    ----------
+    answer : Answer
+    state : State
+        How it is shown.
+    title : str
+        Of the report.
+    own_field_of_view_deg : float
+        The capture's own; where it is shown, `core` states whether it is a guess.
+    """
+    viewing = state.viewing
+    is_own = viewing.field_of_view_deg == own_field_of_view_deg
+    angle_rad = pixel_angle_of(viewing.field_of_view_deg, answer.capture.shape[1])
+    return partial(
+        write_report,
+        answer.capture,
+        answer.run.image,
+        pixel=state.pixel,
+        least_confidence=viewing.least_confidence,
+        pixel_angle_rad=None if is_own else angle_rad,
+        title=title,
+        script=script_of(answer, state),
+    )
 
 
 # Clouds
@@ -228,7 +303,14 @@ def _cloud(answer: Answer, kind: str, viewing: Viewing) -> Product:
     image = np.zeros((*answer.capture.shape, 3), np.uint8)
     image[shown(answer, viewing.least_confidence)] = rgb
     angle_rad = float(cloud.field_data["pixel_angle_rad"][0])
-    return _product(answer, viewing.least_confidence, pixel_angle_rad=angle_rad, rgb=image)
+    unknown = answer.capture.acquisition.pixel_angle_rad is None
+    return _product(
+        answer,
+        viewing.least_confidence,
+        pixel_angle_rad=angle_rad,
+        rgb=image,
+        remark=guessed_angle(viewing.field_of_view_deg) if unknown else "",
+    )
 
 
 # Tables
@@ -282,15 +364,8 @@ def _value(text: str) -> Any:
 def _csv(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Write:
     if not rows:
         raise ValueError(NOTHING_DRAWN)
-    plain = [
-        [
-            "" if cell is None or (isinstance(cell, float) and math.isnan(cell)) else cell
-            for cell in row
-        ]
-        for row in rows
-    ]
 
     def write(file: BinaryIO) -> None:
-        file.write(as_csv(columns, plain).encode())
+        file.write(as_csv(columns, without_nan(rows)).encode())
 
     return write

@@ -1,8 +1,14 @@
-"""Titles of the estimators on screen."""
+"""The estimators on screen: titles, settings, and the one to begin with."""
 
 from __future__ import annotations
 
-from core import ESTIMATORS
+from collections.abc import Mapping
+from typing import Any
+
+from core import ESTIMATORS, Capture
+
+OTHERS = tuple(name for name in ESTIMATORS if name != "tracking")
+"""All estimators but the tracking differentiator, whose settings the state holds by themselves."""
 
 METHOD_TITLES = {name: estimator.title for name, estimator in ESTIMATORS.items()}
 
@@ -10,3 +16,24 @@ METHOD_TITLES = {name: estimator.title for name, estimator in ESTIMATORS.items()
 def method_title(name: str) -> str:
     """Return the title of an estimator; a reconstruction is marked as such."""
     return METHOD_TITLES[name] + (" (reconstruction)" if ESTIMATORS[name].reconstructed else "")
+
+
+def default_settings() -> Mapping[str, Any]:
+    """Return the default settings of each of `OTHERS`."""
+    return {name: ESTIMATORS[name].parameters() for name in OTHERS}
+
+
+def suitable_method(capture: Capture) -> str:
+    """Return the estimator to begin with: the paper's, unless all photons were counted.
+
+    Then a matched filter finds more surfaces; the likelihood needs a better guess of the pulse.
+    """
+    return "matched_filter" if capture.detection == "all" else "tracking"
+
+
+def doubts_hold(capture: Capture) -> bool:
+    """Return whether doubtful settings are those of this kind of data.
+
+    They were measured on simulated first photons (`python -m core stability`).
+    """
+    return capture.detection == "first"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from typing import Any
+from urllib.parse import parse_qsl
 
 from app.model import text
 from app.model.address import Link, defaults
-from app.model.capture_defaults import FROM_CAPTURE, defaults_of, enter
+from app.model.capture_defaults import FROM_CAPTURE, defaults_of, enter, possible_kinds
 from app.model.state import State
 from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute
 
@@ -32,25 +33,39 @@ def restore(
     """
     answer = _first_answer(state, sources, link, own)
     enter(state, answer, None)
-    rows, cols = answer.capture.shape
-    before = defaults() | defaults_of(answer)
-    changed = link.of({name: before[name] for name in FROM_CAPTURE})
-    pins, (row, col) = changed.get("pins", ()), changed.get("pixel", state.pixel)
-    changed["pins"] = tuple(pin for pin in pins if pin[0] < rows and pin[1] < cols)
-    if changed["pins"] != pins:
-        link.refused.append(text.pins_outside(rows, cols))
-    changed["pixel"] = min(row, rows - 1), min(col, cols - 1)
-    state.param.update(changed)
+    state.param.update(places(link, answer))
     link.refuse_others()
     return answer
+
+
+def places(link: Link, answer: Answer) -> dict[str, Any]:
+    """Return the parameters `FROM_CAPTURE` that a link describes, for its estimate."""
+    rows, cols = answer.capture.shape
+    before = defaults() | defaults_of(answer)
+    found = {name: before[name] for name in FROM_CAPTURE}
+    found |= link.of(found)
+    pins, (row, col) = found["pins"], found["pixel"]
+    found["pins"] = tuple(pin for pin in pins if pin[0] < rows and pin[1] < cols)
+    if found["pins"] != pins:
+        link.refused.append(text.pins_outside(rows, cols))
+    found["pixel"] = min(row, rows - 1), min(col, cols - 1)
+    for name, possible in possible_kinds(answer).items():
+        found[name] = found[name] if found[name] in possible else possible[0]
+    return found
+
+
+def choices(link: Link, own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all parameters that a link describes, except those of `places`."""
+    before = {**defaults(), **own}
+    base = {name: before[name] for name in before if name not in FROM_CAPTURE}
+    return base | link.of(base)
 
 
 def _first_answer(
     state: State, sources: Mapping[str, Source], link: Link, own: Mapping[str, Any]
 ) -> Answer:
-    before = {**defaults(), **own}
-    changed = link.of({name: before[name] for name in before if name not in FROM_CAPTURE})
-    if changed.get("source", own["source"]) not in sources:
+    before, changed = {**defaults(), **own}, choices(link, own)
+    if changed["source"] not in sources:
         link.refused.append(text.source_is_gone(changed["source"]))
         of_source = ("source", "reading", "window", "less")
         changed = {name: value for name, value in changed.items() if name not in of_source}
@@ -64,6 +79,23 @@ def _first_answer(
             log.warning("could not restore the link", exc_info=error)
             link.refused.append(text.reason(error))
     return compute(request_of(state, sources), None)
+
+
+def parsed(
+    query: str, sources: Mapping[str, Source], own: Mapping[str, Any]
+) -> tuple[Link, dict[str, Any]]:
+    """Return a query as a link, and its `choices`.
+
+    Raises
+    ------
+    ValueError
+        If its scene or capture is not among the sources.
+    """
+    link = Link(dict(parse_qsl(query)))
+    chosen = choices(link, own)
+    if chosen["source"] not in sources:
+        raise ValueError(text.source_is_gone(chosen["source"]))
+    return link, chosen
 
 
 def request_of(state: State, sources: Mapping[str, Source]) -> Request:

@@ -1,22 +1,20 @@
 """The view of a page as a short Python script that computes the same arrays with `core` alone.
 
-Settings are written as the ``repr`` of their dataclasses without fields at their default, so that a
-new field needs no line here. Text from outside can only become a string literal.
+`core.scripts` writes settings, so that a new field needs no line here.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from textwrap import indent
-from typing import Any
 
 from app.model.state import CLOUDS, State, Viewing
 from app.model.store import Answer
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
-
-LINE_LENGTH = 88
-"""Characters of a line; a longer call has one argument per line, as formatters write it."""
+from core.io import RangeColors
+from core.scripts import assign, call, changed_fields, literal
 
 IMAGES = {
     "Estimate": "shown.range_m",
@@ -45,15 +43,24 @@ def script_of(answer: Answer, state: State) -> str:
         How it is shown.
     """
     compares = state.page == "Compare"
-    imports = "from dataclasses import replace\n\nimport numpy as np\n\nimport core\n"
-    if not compares or state.comparison.kind == CLOUDS:
-        imports = f"import math\n{imports}"
     title = "View of firstphoton"
     if state.page in COMMANDS:
         title = f"Explore view of firstphoton ({state.page}: {COMMANDS[state.page]})"
-    body = _comparison if compares else _single_estimate
-    lines = [f'"""{title}."""\n', imports, *_capture(answer), *body(answer, state)]
-    return "\n".join(lines) + "\n"
+    estimate = _comparison if compares else _single_estimate
+    body = "\n".join([*_capture(answer), *estimate(answer, state)])
+    return f'"""{title}."""\n\n{_imports(body)}\n{body}\n'
+
+
+def _imports(body: str) -> str:
+    """Return the imports that some code needs, in the order of linters."""
+    known = {
+        "replace(": "from dataclasses import replace\n",
+        "np.": "import numpy as np\n",
+        "core.": "import core\n",
+    }
+    return "\n".join(
+        line for use, line in known.items() if re.search(rf"(?<![\w.]){re.escape(use)}", body)
+    )
 
 
 # The capture
@@ -65,13 +72,13 @@ def _capture(answer: Answer) -> Lines:
     reduction = request.less.reduction(answer.whole.acquisition.n_bins)
     if changed := changed_fields(reduction):
         yield "\n# Reduce the capture."
-        yield _assign("reduction", "core.reductions.Reduction", **changed)
+        yield assign("reduction", "core.reductions.Reduction", **changed)
         yield "capture = reduction.of(capture)"
     off = [name for name in CORRECTIONS if name in request.absent]
     if off:
         yield "\n# Switch corrections off."
     for name in off:
-        yield _assign("capture", "core.without_correction", "capture", literal(name))
+        yield assign("capture", "core.without_correction", "capture", literal(name))
 
 
 def _simulation(answer: Answer) -> Lines:
@@ -80,17 +87,17 @@ def _simulation(answer: Answer) -> Lines:
     assert source.scene is not None
     yield "# Simulate a capture of the scene."
     arguments = {name: literal(value) for name, value in source.arguments.items()}
-    yield _assign("scene", f"core.scenes[{literal(source.name)}]", **arguments)
+    yield assign("scene", f"core.scenes[{literal(source.name)}]", **arguments)
     for part in PARTS:
         if part in request.absent:
-            yield _assign("scene", "core.without", "scene", literal(part))
+            yield assign("scene", "core.without", "scene", literal(part))
     own, acquisition = source.scene().acquisition, "scene.acquisition"
     if light.acquisition(own) != own:
         pulses = literal(light.n_pulses)
-        yield _assign("acquisition", "replace", acquisition, n_pulses=pulses)
+        yield assign("acquisition", "replace", acquisition, n_pulses=pulses)
         acquisition = "acquisition"
     seed = {"seed": literal(light.seed)} if light.seed else {}
-    yield _assign("capture", "core.simulate", "scene", acquisition, literal(light.flux), **seed)
+    yield assign("capture", "core.simulate", "scene", acquisition, literal(light.flux), **seed)
 
 
 def _file(answer: Answer) -> Lines:
@@ -100,86 +107,99 @@ def _file(answer: Answer) -> Lines:
     window = request.window if cutout is None else cutout.window
     options = changed_fields(request.reading.completed_by(request.source.given))
     if window is None:
-        yield _assign("capture", "core.read_capture", "path", **options)
+        yield assign("capture", "core.read_capture", "path", **options)
+        if (truth := request.source.truth) is not None:
+            named = {name: literal(value) for name, value in truth.options.items()}
+            yield assign("capture", "core.read_truth", literal(truth.name), "capture", **named)
     else:
-        yield _assign("counts", "core.open_capture", "path", **options)
-        yield _assign("window", "core.Window", **changed_fields(window))
-        yield _assign("capture", "core.read_window", "counts", "window")
+        yield assign("counts", "core.open_capture", "path", **options)
+        yield assign("window", "core.Window", **changed_fields(window))
+        yield assign("capture", "core.read_window", "counts", "window")
 
 
-# Pages that show the tracking differentiator
+# Pages that show one method
 
 
 def _single_estimate(answer: Answer, state: State) -> Lines:
     is_inspect = state.page == "Inspect"
     kind = state.map if is_inspect else state.image
-    settings = changed_fields(answer.request.tracking)
+    method, settings = literal(answer.method), changed_fields(answer.settings)
     yield "\n# Estimate the ranges. `shown` has only pixels of sufficient confidence."
-    yield _assign("settings", "core.TrackingParameters", **settings)
-    yield _assign("image", "core.estimate", "capture", '"tracking"', "settings")
+    yield assign("settings", f"core.ESTIMATORS[{method}].parameters", **settings)
+    yield assign("image", "core.estimate", "capture", method, "settings")
     yield from _shown(state.viewing.least_confidence)
     yield f"picture = {IMAGES[kind]}"
     yield "\n# Signals of one pixel."
     yield f"row, col = {state.pixel[0]}, {state.pixel[1]}"
-    yield _signals("signals", "row, col")
+    yield _signals(answer.method, "signals", "row, col")
     if is_inspect:
-        yield from _reports(state)
+        yield from _reports(answer, state)
     elif state.difference:
         yield "difference = core.first_difference(capture.cube[row, col])"
     yield "\n# Save image, point cloud and pixel."
-    yield _saved('"range.png"')
+    yield _saved('"range.png"', **_colors(state.viewing))
     yield from _angle(state.viewing)
     yield from _saved_cloud('"cloud.ply"')
     pixel = ("capture", "row", "col", "settings", '"pixel.csv"')
-    yield _assign("", "core.save_pixel", *pixel, overwrite="True")
+    chosen = {} if answer.method == "tracking" else {"method": method}
+    yield assign("", "core.save_pixel", *pixel, **chosen, overwrite="True")
     if kind != "Estimate":
         yield 'np.savetxt("picture.csv", picture, delimiter=",")'
 
 
-def _reports(state: State) -> Lines:
-    method = ('"tracking"', "settings")
+def _reports(answer: Answer, state: State) -> Lines:
+    method = (literal(answer.method), "settings")
     if state.subject == "Pixel":
         pixel = ("capture", "image", "row", "col", *method)
-        yield _assign("report", "core.inspection.pixel_report", *pixel)
+        yield assign("report", "core.inspection.pixel_report", *pixel)
     if state.subject == "Capture":
         yield "\n# Report on the capture."
-        yield _assign("report", "core.inspection.capture_report", "capture")
+        yield assign("report", "core.inspection.capture_report", "capture")
     if state.pins:
         yield "\n# Signals of the pinned pixels."
         yield "pinned = {}"
         for row, col in state.pins:
-            yield _signals(f"pinned[{row}, {col}]", f"{row}, {col}")
+            yield _signals(answer.method, f"pinned[{row}, {col}]", f"{row}, {col}")
     if state.region:
         yield "\n# Report on the region."
-        yield _assign("corners", "", *map(literal, state.region))
-        yield _assign("mask", "core.inspection.pixels_in", "corners", "capture.shape")
+        yield assign("corners", "", *map(literal, state.region))
+        yield assign("mask", "core.inspection.pixels_in", "corners", "capture.shape")
         region = ("capture", "image", "mask", *method)
-        yield _assign("region", "core.inspection.region_report", *region)
+        yield assign("region", "core.inspection.region_report", *region)
 
 
-def _signals(name: str, pixel: str) -> str:
+def _signals(method: str, name: str, pixel: str) -> str:
+    """Return the stages of the tracking differentiator, or the score of another method."""
+    if method != "tracking":
+        score = f"core.ESTIMATORS[{literal(method)}].curves"
+        return assign(name, score, "capture", pixel, "settings")
     arguments = (f"capture.cube[{pixel}]", "settings", "capture.gated_pulses")
-    return _assign(name, "core.tracking_signals", *arguments)
+    return assign(name, "core.tracking_signals", *arguments)
 
 
 def _shown(least_confidence: float) -> Lines:
-    yield f"confident = image.valid & (image.confidence >= {literal(least_confidence)})"
-    range_m = "np.where(confident, image.range_m, np.nan)"
-    yield _assign("shown", "replace", "image", range_m=range_m, valid="confident")
+    yield assign("shown", "image.confident", literal(least_confidence))
 
 
 def _angle(viewing: Viewing) -> Lines:
-    yield f"half_rad = math.radians({literal(viewing.field_of_view_deg)}) / 2"
-    yield "angle_rad = math.atan(2 * math.tan(half_rad) / capture.shape[1])"
+    arguments = literal(viewing.field_of_view_deg), "capture.shape[1]"
+    yield assign("angle_rad", "core.geometry.pixel_angle_of", *arguments)
+
+
+def _colors(viewing: Viewing) -> dict[str, str]:
+    """Return the argument for the colours of a picture, unless they are the default."""
+    chosen = RangeColors(**{each.name: getattr(viewing, each.name) for each in fields(RangeColors)})
+    changed = changed_fields(chosen)
+    return {"colors": call("core.io.RangeColors", **changed)} if changed else {}
 
 
 def _saved(path: str, **options: str) -> str:
-    return _assign("", "core.save_image", "capture", "shown", path, **options, overwrite="True")
+    return assign("", "core.save_image", "capture", "shown", path, **options, overwrite="True")
 
 
 def _saved_cloud(path: str) -> Lines:
     yield f"cloud = {path}"
-    yield "if confident.any():  # a point cloud needs points"
+    yield "if shown.valid.any():  # a point cloud needs points"
     yield indent(_saved("cloud", pixel_angle_rad="angle_rad"), "    ")
 
 
@@ -188,7 +208,6 @@ def _saved_cloud(path: str) -> Lines:
 
 def _comparison(answer: Answer, state: State) -> Lines:
     chosen = state.comparison
-    settings = {**chosen.settings, "tracking": answer.request.tracking}
     false_alarm = {} if chosen.false_alarm == 1 else {"false_alarm": literal(chosen.false_alarm)}
     yield "\n# Estimate the ranges with each method."
     yield "images = {}"
@@ -199,8 +218,8 @@ def _comparison(answer: Answer, state: State) -> Lines:
         except ValueError:
             yield f"# {method} is left out: it needs the true signal and background."
         else:
-            options = changed_fields(settings[method]) | false_alarm
-            yield _assign(f"images[{name}]", "core.estimate", "capture", name, **options)
+            options = changed_fields(answer.request.settings_of(method)) | false_alarm
+            yield assign(f"images[{name}]", "core.estimate", "capture", name, **options)
     has_clouds = chosen.kind == CLOUDS
     yield "\n# Save the images. `shown` has only pixels of sufficient confidence."
     if has_clouds:
@@ -211,49 +230,10 @@ def _comparison(answer: Answer, state: State) -> Lines:
     of_each = [
         *_shown(chosen.viewing.least_confidence),
         f"pictures[method] = {IMAGES[kind]}",
-        *(_saved_cloud('f"{method}.ply"') if has_clouds else [_saved('f"{method}.png"')]),
+        *(
+            _saved_cloud('f"{method}.ply"')
+            if has_clouds
+            else [_saved('f"{method}.png"', **_colors(chosen.viewing))]
+        ),
     ]
     yield indent("\n".join(of_each), "    ")
-
-
-# Code
-
-
-def changed_fields(settings: Any) -> dict[str, str]:
-    """Return the fields of a dataclass object that differ from their default, as code."""
-    values = {each: getattr(settings, each.name) for each in fields(settings)}
-    return {each.name: literal(value) for each, value in values.items() if value != each.default}
-
-
-def literal(value: Any) -> str:
-    """Return the code of a value: a literal, or the call that makes a dataclass of `core`."""
-    if is_dataclass(value):
-        return _call(f"core.{type(value).__name__}", **changed_fields(value))
-    if isinstance(value, tuple):
-        items = [literal(each) for each in value]
-        return f"({', '.join(items)}{',' if len(items) == 1 else ''})"
-    if isinstance(value, str):
-        code = repr(value)
-        # Formatters prefer double quotes where the text has none.
-        return f'"{code[1:-1]}"' if code[0] == "'" and '"' not in code else code
-    if isinstance(value, bool | int | float):
-        return repr(value)
-    raise TypeError(f"no code for {type(value).__name__}")
-
-
-def _call(function: str, *positional: str, **named: str) -> str:
-    return f"{function}({', '.join(_arguments(*positional, **named))})"
-
-
-def _assign(name: str, function: str, *positional: str, **named: str) -> str:
-    """Return a call whose result is assigned to a name, on as many lines as it needs."""
-    start = f"{name} = " if name else ""
-    line = start + _call(function, *positional, **named)
-    if len(line) <= LINE_LENGTH:
-        return line
-    arguments = "".join(f"    {each},\n" for each in _arguments(*positional, **named))
-    return f"{start}{function}(\n{arguments})"
-
-
-def _arguments(*positional: str, **named: str) -> list[str]:
-    return [*positional, *(f"{name}={value}" for name, value in named.items())]

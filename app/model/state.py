@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Any
 
 import param
 
+from app.model.methods import OTHERS, default_settings
 from core import ESTIMATORS, Acquisition, Flux, TrackingParameters, Window
 from core.checks import require
 from core.estimators import FALSE_ALARM
-from core.io import ReadOptions
+from core.io import RangeColors, ReadOptions
 from core.parameters import Number, check_fields, parameter
 from core.reductions import Reduction
 from core.studies.ablation import TITLES
@@ -57,12 +58,12 @@ class Illumination:
 
 
 @dataclass(frozen=True)
-class Viewing:
-    """Display of the estimate; does not affect it."""
+class Visibility:
+    """Estimates that are shown, and the width of the cloud."""
 
     least_confidence: float = parameter(
         0.9,
-        Number("Show from confidence", 0.0, 1.0, least=0.0),
+        Number("Show from confidence", 0.0, 1.0, least=0.0, most=1.0),
         "Estimates with less confidence are hidden in image and cloud, but count in the figures. "
         "0 also shows estimates from noise alone.",
     )
@@ -72,8 +73,10 @@ class Viewing:
         "Horizontal field of view of the sensor; determines the width of the cloud in metres.",
     )
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+
+@dataclass(frozen=True)
+class Viewing(RangeColors, Visibility):
+    """Display of the estimate; does not affect it."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +151,9 @@ class ReductionSettings:
         )
 
 
+AUTOMATIC = "automatic"
+"""Stands for the method that suits the capture."""
+
 FIRST_METHODS = ("peak", "coates", "likelihood", "tracking", "oracle")
 
 CLOUDS = "3D clouds"
@@ -158,18 +164,10 @@ KINDS = ("Range", "Error", "Confidence", CLOUDS)
 
 @dataclass(frozen=True)
 class Comparison:
-    """The methods that are compared, their settings, and the kind of their pictures.
-
-    The tracking differentiator has the same settings as on other pages.
-    """
+    """The methods that are compared, and the kind of their pictures."""
 
     methods: tuple[str, ...] = tuple(each for each in ESTIMATORS if each in FIRST_METHODS)
     false_alarm: float = 1.0
-    settings: Mapping[str, Any] = field(
-        default_factory=lambda: {
-            name: each.parameters() for name, each in ESTIMATORS.items() if name != "tracking"
-        }
-    )
     kind: str = KINDS[0]
     viewing: Viewing = Viewing(0.0)
 
@@ -179,17 +177,11 @@ class Comparison:
         FALSE_ALARM.check("false_alarm", self.false_alarm)
         require("kind", self.kind, self.kind in KINDS, " or ".join(map(repr, KINDS)))
 
-    def including(self, method: str, settings: Any) -> Comparison:
-        """Return the comparison with one more method, or with other settings of it."""
-        methods = tuple(each for each in ESTIMATORS if each in (*self.methods, method))
-        own = {method: settings} if method in self.settings and settings is not None else {}
-        return replace(self, methods=methods, settings={**self.settings, **own})
-
 
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
 UNITS = ("bins", "ns", "m")
-SUBJECTS = ("Pixel", "Region", "Pins", "Capture")
+SUBJECTS = ("Pixel", "Region", "Pins", "A/B", "Capture")
 CLOUD_COLORS = ("Range", "Error", "Counts")
 NEED_TRUTH = ("Truth", "Error")
 
@@ -236,6 +228,12 @@ def _check_region(name: str, value: Any) -> None:
     require(name, value, fit, f"rows and columns of 3 to {MOST_CORNERS} corners, or nothing")
 
 
+def _check_settings(name: str, value: Any) -> None:
+    known = isinstance(value, Mapping) and tuple(value) == OTHERS
+    fit = known and all(isinstance(value[each], ESTIMATORS[each].parameters) for each in OTHERS)
+    require(name, value, fit, f"settings of {', '.join(OTHERS)}")
+
+
 def _is_pair(value: Any, kind: type, least: int) -> bool:
     numbers = isinstance(value, tuple) and all(isinstance(each, kind) for each in value)
     return numbers and len(value) == 2 and all(least <= each < 2**31 for each in value)
@@ -265,7 +263,15 @@ class State(param.Parameterized):
     absent: Any = Checked(
         frozenset(), _check_absent, doc="Parts and corrections that are switched off."
     )
+    method = param.Selector(
+        default=AUTOMATIC,
+        objects=[AUTOMATIC, *ESTIMATORS],
+        doc="Key of the estimator that pages show, or `AUTOMATIC`.",
+    )
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
+    settings: Any = Checked(
+        default_settings(), _check_settings, doc="Settings of each other estimator."
+    )
     pixel: Any = Checked((31, 24), _check_pixel, doc="Selected row and column.")
     image = param.Selector(default="Estimate", objects=list(IMAGES))
     cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
@@ -283,4 +289,5 @@ class State(param.Parameterized):
         _check_region,
         doc="Corners (row, col) of a polygon of pixels whose counts are added.",
     )
+    kept = param.String(default="", doc="Query of the estimate that was kept as A.")
     comparison = param.ClassSelector(class_=Comparison, default=Comparison())

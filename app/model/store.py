@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, lru_cache, partial
+from hashlib import sha256
 from importlib import resources
 from pathlib import Path
 from time import perf_counter
@@ -14,9 +15,11 @@ import numpy as np
 
 from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
-from app.model.state import Illumination, ReductionSettings
+from app.model.methods import default_settings, suitable_method
+from app.model.state import AUTOMATIC, Illumination, ReductionSettings
 from core import (
     CORRECTIONS,
+    ESTIMATORS,
     PARTS,
     Capture,
     Run,
@@ -36,10 +39,13 @@ from core import (
     without_correction,
 )
 from core.cost import Cost, predicted
-from core.inference import has_posterior, posterior_of
+from core.inference import has_posterior, pixel_range_intervals, posterior_of
+from core.inspection import PixelReport
 from core.io import ReadOptions
+from core.metrics import Interval
 
 NO_OPTIONS = ReadOptions()
+_END_BYTES, _FILES_READ = 2**16, 16
 ASSETS = Path(str(resources.files("assets")))
 
 
@@ -60,11 +66,39 @@ class Source:
     """Arguments of the scene."""
     given: ReadOptions = NO_OPTIONS
     """Options for reading that hold unless a request has others."""
+    truth: AddedTruth | None = None
 
     @property
     def is_scene(self) -> bool:
         """Whether captures are simulated."""
         return self.scene is not None
+
+    def read(self) -> Capture:
+        """Return the capture of a file, read with the options that are given.
+
+        Raises
+        ------
+        ValueError
+            If it cannot be read or is too large.
+        """
+        return self.load(Illumination(), NO_OPTIONS, ())
+
+    @property
+    def without_truth(self) -> Source:
+        """The capture without a truth that was added to it."""
+        return self if self.truth is None else self.truth.to
+
+
+@dataclass(frozen=True)
+class AddedTruth:
+    """True ranges from another file than the capture's."""
+
+    to: Source
+    """The capture."""
+    name: str
+    """Name of the file."""
+    options: Mapping[str, str] = field(hash=False)
+    """Options of `core.read_truth`."""
 
 
 def bare(scene: Scene, absent: Collection[str]) -> Scene:
@@ -112,6 +146,25 @@ def file_source(
     return Source(title or path.name, load, large=opened, name=path.name, given=given)
 
 
+def content_key(path: Path) -> str:
+    """Return a key for links that names a file and tells it from others of the same name.
+
+    It depends on the sizes of all files of a capture, and on both ends of the first ones.
+    """
+    digest = sha256()
+    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
+    for number, each in enumerate(files):
+        size = each.stat().st_size
+        digest.update(f"{each.relative_to(path.parent)} {size}\n".encode())
+        if number >= _FILES_READ:
+            continue
+        with each.open("rb") as file:
+            digest.update(file.read(_END_BYTES))
+            file.seek(max(size - _END_BYTES, 0))
+            digest.update(file.read(_END_BYTES))
+    return f"{path.name}~{digest.hexdigest()[:8]}"
+
+
 def built_in_sources() -> dict[str, Source]:
     """Return the scenes and the sample that every session offers."""
     return {
@@ -137,10 +190,28 @@ class Request:
     reading: ReadOptions
     tracking: TrackingParameters
     less: ReductionSettings
+    method: str = AUTOMATIC
+    """Key of `core.ESTIMATORS`, or `AUTOMATIC`."""
+    settings: Mapping[str, Any] = field(default_factory=default_settings, hash=False)
+    """Settings of the other estimators by their keys."""
     absent: frozenset[str] = frozenset()
     """Parts of the scene and corrections of the estimators that are switched off."""
     window: Window | None = None
     """Part of a capture larger than memory; None for its preview."""
+
+    def method_for(self, capture: Capture) -> str:
+        """Return the key of the estimator for a capture."""
+        return suitable_method(capture) if self.method == AUTOMATIC else self.method
+
+    def settings_of(self, method: str) -> Any:
+        """Return the settings of an estimator."""
+        return self.tracking if method == "tracking" else self.settings[method]
+
+    def with_settings(self, settings: Any) -> Request:
+        """Return the request with other settings of its estimator, which must be named."""
+        if self.method == "tracking":
+            return replace(self, tracking=settings)
+        return replace(self, settings={**self.settings, self.method: settings})
 
 
 COMPUTED_FROM = tuple(each.name for each in fields(Request))
@@ -167,6 +238,16 @@ class Answer:
     def capture(self) -> Capture:
         """The capture after its reduction."""
         return self.run.capture
+
+    @property
+    def method(self) -> str:
+        """Key of the estimator."""
+        return self.request.method_for(self.capture)
+
+    @property
+    def settings(self) -> Any:
+        """Settings of the estimator."""
+        return self.request.settings_of(self.method)
 
     @property
     def grid(self) -> Grid:
@@ -208,19 +289,34 @@ def compute(request: Request, previous: Answer | None) -> Answer:
     ):
         capture, capture_s = previous.capture, previous.capture_s
     else:
-        require_fitting(_reduced_shape(whole, request), "tracking", _cost(whole, request))
+        shape = _reduced_shape(whole, request)
+        require_fitting(shape, request.method_for(whole), _cost(whole, request))
         capture = reduced(whole, request)
         if request.less != requested:
             source = f"{capture.source}; reduced to fit the limits of this server"
             capture = replace(capture, source=source)
         capture_s = perf_counter() - started
-    with ranging(capture, "tracking", request.tracking):
-        started = perf_counter()
+    estimated, flux_s = _estimate(capture, request, previous)
+    return Answer(request, estimated, capture_s + flux_s, whole, cutout, requested)
+
+
+def _estimate(capture: Capture, request: Request, previous: Answer | None) -> tuple[Run, float]:
+    """Return an estimate, that of `previous` if it is the same, and the seconds for the fluxes."""
+    method = request.method_for(capture)
+    settings = request.settings_of(method)
+    if (
+        previous is not None
+        and capture is previous.capture
+        and (method, settings) == (previous.method, previous.settings)
+    ):
+        return previous.run, 0.0
+    with ranging(capture, method, settings):
+        flux_s = 0.0
         if not has_posterior(capture):
+            started = perf_counter()
             posterior_of(capture)  # every confidence is computed from it, whatever the method
-            capture_s += perf_counter() - started
-        estimated = run(capture, "tracking", request.tracking)
-    return Answer(request, estimated, capture_s, whole, cutout, requested)
+            flux_s = perf_counter() - started
+        return run(capture, method, settings), flux_s
 
 
 def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:
@@ -231,7 +327,8 @@ def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:
 
 
 def _cost(whole: Capture, request: Request) -> Cost:
-    return predicted(_reduced_shape(whole, request), "tracking", request.tracking)
+    method = request.method_for(whole)
+    return predicted(_reduced_shape(whole, request), method, request.settings_of(method))
 
 
 def _fitting(whole: Capture, request: Request) -> ReductionSettings:
@@ -239,7 +336,8 @@ def _fitting(whole: Capture, request: Request) -> ReductionSettings:
     if fits(_cost(whole, request)):
         return request.less
     rows, cols, n_bins = whole.cube.shape
-    found = fitting((rows, cols, n_bins), "tracking", request.less.reduction(n_bins))
+    least = request.less.reduction(n_bins)
+    found = fitting((rows, cols, n_bins), request.method_for(whole), least)
     return request.less if found is None else replace(request.less, merge=found[0], skip=found[1])
 
 
@@ -281,7 +379,7 @@ def same_view(one: Request, other: Request) -> bool:
 def same_pixels(one: Answer, other: Answer) -> bool:
     """Whether a row and a column mean the same in two estimates."""
     same = one.capture.shape == other.capture.shape and one.grid == other.grid
-    return same and one.request.source is other.request.source
+    return same and one.request.source.without_truth is other.request.source.without_truth
 
 
 def _agree(one: Request, other: Request, *names: str) -> bool:
@@ -294,32 +392,62 @@ class Pixel:
 
     row: int
     col: int
-    signals: Signals
+    histogram: np.ndarray[Any, Any]
+    """Detections in each bin, shape (bin,)."""
+    signals: Signals | None
+    """Stages of the tracking differentiator; None for another estimator."""
+    score: np.ndarray[Any, Any]
+    """Score of each bin, shape (bin,); of the tracking differentiator, the enhanced signal."""
     expected: np.ndarray[Any, Any] | None
     """Expected counts of the model; None where the truth is unknown."""
     difference: np.ndarray[Any, Any]
     truth_bin: float
     answer_bin: float
     range_m: float
+    interval_68_m: Interval
+    """The estimate with the 68 % interval of the range of the surface (`core.range_interval`)."""
+    interval_95_m: Interval
     truth_m: float
     confidence: float
     counts: int
 
+    @property
+    def lines(self) -> dict[str, np.ndarray[Any, Any] | None]:
+        """Curves (bin,) over the histogram by their layers; None where they are not known."""
+        signals = self.signals
+        scales = (None, None) if signals is None else (signals.small, signals.large)
+        return dict(zip(("expected", "small", "large"), (self.expected, *scales), strict=True))
 
-def inspect(answer: Answer, row: int, col: int) -> Pixel:
-    """Return every stage of the tracking differentiator for one pixel."""
+
+def inspect(answer: Answer, row: int, col: int, report: PixelReport | None = None) -> Pixel:
+    """Return the counts of one pixel and what the estimator makes of them.
+
+    A report on the pixel, if there is one, has the score and the intervals already.
+    """
     capture, image = answer.capture, answer.run.image
     acquisition, histogram = capture.acquisition, capture.cube[row, col]
     truth_m = np.nan if capture.truth_range_m is None else float(capture.truth_range_m[row, col])
+    signals = None
+    if answer.method == "tracking":
+        signals = tracking_signals(histogram, answer.settings, capture.gated_pulses)
+    if report is not None:
+        score, inner, outer = report.curve, report.interval_68_m, report.interval_95_m
+    else:
+        score = ESTIMATORS[answer.method].curves(capture, row, col, answer.settings)
+        inner, outer = pixel_range_intervals(capture, image, row, col)
     return Pixel(
         row,
         col,
-        tracking_signals(histogram, answer.request.tracking, capture.gated_pulses),
+        histogram.astype(float),
+        signals,
+        score,
         _expected_counts(capture, row, col),
         first_difference(histogram),
         float(acquisition.range_m_to_bin(truth_m)),
         float(image.bin[row, col]),
         float(image.range_m[row, col]),
+        inner,
+        outer,
         truth_m,
         float(image.confidence[row, col]),
         int(capture.counts[row, col]),

@@ -7,8 +7,10 @@ import re
 from collections.abc import Iterable
 from concurrent.futures import BrokenExecutor
 
+from app.model.methods import METHOD_TITLES
+from app.model.state import AUTOMATIC
 from app.model.store import Answer, Pixel
-from app.units import Scale
+from app.units import Scale, between, plus_minus, supported_decimals
 from app.units import milliseconds as milliseconds  # noqa: PLC0414
 from app.units import number as number  # noqa: PLC0414
 from app.units import share as share  # noqa: PLC0414
@@ -29,7 +31,16 @@ ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-backgrou
 
 CONFIDENCE_HELP = "Probability of a surface within 3 bins of the estimate."
 
+RANGE_HELP = (
+    "Range of the surface from the photons of this pixel, if there is one within 3 bins of the "
+    "estimate: {} of such intervals contain it."
+)
+
 TRUTH_HELP = "True range of the surface."
+
+AUTOMATIC_TITLE = "Automatic, by the capture"
+
+METHOD_HELP = "Estimator of the image, the cloud, the plots of a pixel, and everything saved."
 
 COMPUTING = "Computing …"
 
@@ -59,11 +70,26 @@ def provenance(answer: Answer) -> str:
     )
 
 
+def why_method(answer: Answer) -> str:
+    """Return which estimator suits the capture, and why; empty where the user has chosen one."""
+    if answer.request.method != AUTOMATIC:
+        return ""
+    title = METHOD_TITLES[answer.method]
+    if answer.method == "tracking":
+        return f"{title}: the paper's method, for first photons."
+    return (
+        f"{title}: the capture holds all photons, not only the first of each pulse, so there is no "
+        "pile-up, for which the tracking differentiator is made."
+    )
+
+
 def no_estimates(answer: Answer) -> str:
     """Return why no pixel has an estimate, and what to do; empty if any has one."""
     if answer.run.image.valid.any():
         return ""
-    n_bins, t_n = answer.capture.acquisition.n_bins, answer.request.tracking.t_n
+    if answer.method != "tracking":
+        return "No pixel has an estimate: no photon was detected."
+    n_bins, t_n = answer.capture.acquisition.n_bins, answer.settings.t_n
     if t_n >= n_bins:
         return f"T_n = {t_n} excludes all {n_bins} bins: reduce it."
     return (
@@ -135,22 +161,27 @@ def interval_cell(found: Interval, form: str) -> Cell:
 
 def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
     """Return name, value and help of a pixel's estimate, compared with the truth if it is known."""
-    help = "Range of the surface, lag removed."
-    facts: list[Fact] = [("Estimate", number(pixel.range_m, "m"), help)]
+    inner, outer = pixel.interval_68_m, pixel.interval_95_m
+    decimals = supported_decimals(inner.low, inner.high)
+    facts: list[Fact] = [
+        ("Range (68 %)", plus_minus(inner.low, inner.high, "m"), RANGE_HELP.format("68 %")),
+        ("Range (95 %)", between(outer.low, outer.high, "m"), RANGE_HELP.format("95 %")),
+        ("Estimate", number(pixel.range_m, "m", decimals=decimals), "Of the method, lag removed."),
+    ]
     if along.name != "m":
         facts.append(("Position", along.place(pixel.answer_bin), "The estimate along the gate."))
     if has_truth:
-        error = number(pixel.range_m - pixel.truth_m, "m", sign=True)
+        error = number(pixel.range_m - pixel.truth_m, "m", sign=True, decimals=decimals)
         facts += [
-            ("Truth", target(pixel.truth_m), TRUTH_HELP),
+            ("Truth", target(pixel.truth_m, decimals), TRUTH_HELP),
             ("Error", error, "Estimate minus truth."),
         ]
     return [*facts, ("Confidence", share(pixel.confidence), CONFIDENCE_HELP)]
 
 
-def target(truth_m: float) -> str:
+def target(truth_m: float, decimals: int | None = None) -> str:
     """Format the true range of a pixel, which may have no target."""
-    return "no target" if math.isnan(truth_m) else number(truth_m, "m")
+    return "no target" if math.isnan(truth_m) else number(truth_m, "m", decimals=decimals)
 
 
 def progress(done: int, of: int, noun: str, is_running: bool) -> str:
@@ -167,8 +198,8 @@ def progress(done: int, of: int, noun: str, is_running: bool) -> str:
 def source_is_gone(key: str) -> str:
     """Return the message about a missing scene or capture of a link."""
     return (
-        f"There is no scene or capture {key[:40]!r}. Uploaded files are removed when no page uses "
-        "them: upload the file again."
+        f"There is no scene or capture {key[:40]!r} here, or its content is another. Uploaded "
+        "files are removed when no page uses them: upload the file again."
     )
 
 

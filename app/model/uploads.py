@@ -50,13 +50,13 @@ class _Upload:
         folder = mkdtemp(prefix="firstphoton-")
         self.remove = finalize(self, rmtree, folder, ignore_errors=True)
         self.n_bytes, self.users = len(content), WeakSet([user])
-        path = Path(folder) / safe_name(name)
+        self.path = Path(folder) / safe_name(name)
         try:
-            path.write_bytes(content)
+            self.path.write_bytes(content)
         except OSError:
             self.remove()
             raise
-        source = file_source(path)
+        source = file_source(self.path)
         self.source = replace(source, load=cached_while_used(source.load))
 
 
@@ -95,13 +95,21 @@ class Uploads:
             return key
 
     def use(self, key: str, user: object) -> Source | None:
-        """Return the file of a key and keep it for another user; None if there is none."""
+        """Return the capture of a key and keep it for another user; None if there is none."""
+        upload = self._used(key, user)
+        return None if upload is None else upload.source
+
+    def path(self, key: str, user: object) -> Path | None:
+        """Return the path of a file and keep it for another user; None if there is none."""
+        upload = self._used(key, user)
+        return None if upload is None else upload.path
+
+    def _used(self, key: str, user: object) -> _Upload | None:
         with self._lock:
             upload = self._uploads.get(key)
-            if upload is None:
-                return None
-            upload.users.add(user)
-            return upload.source
+            if upload is not None:
+                upload.users.add(user)
+            return upload
 
     def leave(self, user: object) -> None:
         """Remove a user, and the files that no other user has."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import panel as pn
@@ -15,23 +16,29 @@ from panel_material_ui.template.base import Meta
 
 from app.model import text
 from app.model.address import Link
+from app.model.methods import doubts_hold
 from app.model.reading import options_in_use
 from app.model.restore import parameters_of
 from app.model.script import script_of
 from app.model.state import ReductionSettings
 from app.model.store import Answer, Request, Source
+from app.model.truth import Truth, parts_of, with_truth
 from app.model.uploads import MAX_UPLOAD_BYTES, Uploads
+from app.model.watched import Arrival
 from app.pages.catalog import PAGES
 from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
+from app.pages.shared.method import MethodChoice
 from app.pages.shared.reading import ReadingForm
+from app.pages.shared.truth import TruthForm
 from app.tasks.page import PageTasks
+from app.tasks.signals import Signal
 from app.theme import DARK, LIGHT, STYLES
 from app.widgets.address_bar import AddressBar
 from app.widgets.cards import choice, part, select
 from app.widgets.connection import Connection
 from app.widgets.controls import Sentence, SettingsPanel
-from app.widgets.file_input import FileInput
+from app.widgets.file_input import file_button
 from app.widgets.share import Share
 from core import PRESETS, TrackingParameters
 from core.io import SUFFIXES, ReadOptions
@@ -79,8 +86,23 @@ PAGE_BUTTONS = {
 }
 
 
+PRINT = """
+@media print {
+  header, nav, .MuiToolbar-root { display: none !important; }
+  .page > div > div, main, main > div, .main-content {
+    display: block !important; height: auto !important; overflow: visible !important; }
+  /* The content of a wide window fits on a sheet. */
+  main { zoom: 0.7; margin: 0 !important; width: auto !important; }
+}
+"""
+"""Style of the printed page: the content alone, with all that is out of view on screen."""
+
+SKIP_LINK = (Path(__file__).parent.parent / "widgets" / "skip_link.js").read_text("utf-8")
+
 TEMPLATE = (
-    '{% extends "base.html" %}{% block postamble %}{{ super() }}<script>{{ scripts | safe }}'
+    '{% extends "base.html" %}{% block postamble %}{{ super() }}'
+    "<style>@page { size: landscape; margin: 8mm; }</style><script>{{ scripts | safe }}"
+    + SKIP_LINK
     # Load the widgets' module now, not only when the page has loaded.
     + f'importShim("{pmui.Button._render_esm(server=True)}");'
     + "</script>{% endblock %}"
@@ -116,12 +138,18 @@ class Template(pmui.Page):
         return root
 
 
-def build_page(sources: Mapping[str, Source], uploads: Uploads) -> pmui.Page:
+Arrivals = Signal[Arrival]
+"""Notification of captures that have just been written."""
+
+
+def build_page(
+    sources: Mapping[str, Source], uploads: Uploads, arrivals: Arrivals | None = None
+) -> pmui.Page:
     """Return a new page with a session of its own, restored from its address."""
     query = {
         name: texts[-1].decode(errors="replace") for name, texts in pn.state.session_args.items()
     }
-    return Layout(sources, Link(query), uploads).page
+    return Layout(sources, Link(query), uploads, arrivals=arrivals).page
 
 
 class Layout:
@@ -140,6 +168,8 @@ class Layout:
         Where uploaded files are stored.
     tasks : PageTasks, optional
         The page's thread; by default that of the page being built.
+    arrivals : Signal, optional
+        Captures to follow.
 
     Attributes
     ----------
@@ -157,9 +187,13 @@ class Layout:
         link: Link | None = None,
         uploads: Uploads | None = None,
         tasks: PageTasks | None = None,
+        arrivals: Arrivals | None = None,
     ) -> None:
+        self._arrivals = arrivals
         link, self._uploads = link or Link({}), uploads or Uploads()
-        session = self.session = Session(self._with_upload(sources, link.source), link, tasks)
+        known = self._with_uploads(sources, link.source)
+        known = self._with_uploads(known, link.kept_source)
+        session = self.session = Session(known, link, tasks)
         state = session.state
         self._pages = {each.name: each for each in PAGES}
         if state.page not in self._pages:
@@ -199,15 +233,17 @@ class Layout:
             state.source,
             "A built-in scene to simulate, or a capture from a file.",
         )
-        self._file = FileInput(
+        self._file = file_button(
+            "Open a capture file",
+            SUFFIXES,
+            self._upload,
             lambda reason: session.failures.show(text.not_uploaded(reason, MAX_UPLOAD_BYTES)),
-            label="Open a capture file",
-            accept=",".join(SUFFIXES),
-            max_file_size=MAX_UPLOAD_BYTES,
-            variant="outlined",
+        )
+        self._follow = pmui.Switch(
+            label="Follow new captures",
+            value=True,
             size="small",
-            sizing_mode="stretch_width",
-            margin=(4, 8),
+            margin=(0, 8),
         )
         self._panels: dict[str, SettingsPanel[Any]] = {
             name: SettingsPanel(type(getattr(state, name))(), partial(setattr, state, name))
@@ -219,7 +255,9 @@ class Layout:
             _preset_of(state.tracking),
             "recommended: best on random depths. as printed: the paper's settings, literally.",
         )
+        self._method = MethodChoice(session)
         self._reading = ReadingForm(self._read, session.failures.show)
+        self._truth = TruthForm(session, self._uploads, self, self._add_truth)
         unit = choice(text.UNIT_HELP, state.param.unit)
         unit.param.update(
             label="Gate axes in", sx=UNIT_BUTTONS, sizing_mode="stretch_width", margin=(4, 8)
@@ -238,6 +276,7 @@ class Layout:
         tracking = self._panels["tracking"]
         self._shared = {
             Shared.UNIT: unit,
+            Shared.METHOD: self._method.part,
             Shared.TRACKING: part("Tracking differentiator", self._preset, tracking.layout),
             Shared.REDUCTION: part("Data reduction", self._panels["less"].layout, is_open=False),
         }
@@ -258,6 +297,7 @@ class Layout:
             header=[self.pages.choice],  # not in `main`: plots keep the height
             main=[head, *self.pages.mains.values(), self._provenance],
             sidebar_width=330,
+            stylesheets=[PRINT],
             theme_config=THEME,
             meta=Meta(title="firstphoton", description=text.ONE_LINE),
         )
@@ -268,11 +308,15 @@ class Layout:
         return [
             self._source,
             self._file,
+            *([] if self._arrivals is None else [self._follow]),
             self._reading.question,
+            self._reading.records,
             self._shared[Shared.UNIT],
             *(aside for name, aside in asides.items() if not self._pages[name].sidebar_last),
             self._light_part,
             self._reading.part,
+            self._truth.part,
+            self._shared[Shared.METHOD],
             self._shared[Shared.TRACKING],
             self._shared[Shared.REDUCTION],
             part("Share", share.layout),
@@ -283,12 +327,13 @@ class Layout:
 
     def _listen(self) -> None:
         session, state, tasks = self.session, self.session.state, self.session.tasks
-        self._link.follow(state, session.query, tasks.call_later, tasks.run_next)
+        later, at_once = tasks.call_later, tasks.run_next
+        self._link.follow(state, session.query, session.is_settled, later, at_once)
+        self._link.param.watch(lambda event: session.recall(event.new[0]), "visited")
         session.estimate.changed.subscribe(self._show_answer)
         session.estimate.busy.subscribe(partial(setattr, self._busy, "visible"))
         session.failures.shown.subscribe(self._show_failure)
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
-        self._file.param.watch(lambda event: self._upload(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
         state.param.watch(
             lambda *_: self._show_settings("light", "tracking"), ["light", "tracking"]
@@ -297,6 +342,8 @@ class Layout:
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
         self._fit_sidebar()
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
+        if self._arrivals is not None:
+            self._arrivals.subscribe(self._hear_of)
         if tasks.is_served:
             pn.state.on_session_destroyed(lambda _: self._close())
             pn.config.exception_handler = session.failures.report  # for this session only
@@ -304,8 +351,10 @@ class Layout:
     def _fit_sidebar(self) -> None:
         """Show the controls that affect the open page."""
         page = self._pages[self.pages.choice.value]
+        shows_other = Shared.METHOD in page.shared and self.session.answer.method != "tracking"
         for each, content in self._shared.items():
-            content.visible = each in page.shared
+            is_other = each is Shared.TRACKING and shows_other
+            content.visible = each in page.shared and not is_other
         if page.is_standalone == self._provenance.visible:
             self._provenance.visible = not page.is_standalone
             self.page.sidebar_open = not (page.is_standalone or self.page.is_narrow)
@@ -318,9 +367,13 @@ class Layout:
         if self.session.state.source == self._uploaded:  # it could be read
             self._uploaded, self.session.state.page = "", "Inspect"
         self._source.value = self.session.state.source
-        self._light_part.visible, self._reading.part.visible = is_scene, not is_scene
+        self._light_part.visible = is_scene
+        self._reading.part.visible = self._truth.part.visible = not is_scene
         self._show_reading(answer)
         self._provenance.text = text.provenance(answer)[:2000]
+        self._method.show(answer)
+        self._panels["tracking"].mark_doubts(doubts_hold(answer.capture))
+        self._fit_sidebar()
         self._show_settings()
         self._panels["tracking"].controls["t_n"].high = max(
             answer.capture.acquisition.n_bins - 1, 1
@@ -332,8 +385,11 @@ class Layout:
         if refused is not None:
             is_new = refused.request.source is not answer.request.source
             self._reading.show_refused(refused.request, refused.variables, is_new)
-        elif not answer.request.source.is_scene:
-            self._reading.show(answer.request.reading, options_in_use(answer))
+        elif answer.request.source.is_scene:
+            self._reading.records.visible = False
+        else:
+            n_records = answer.whole.n_records
+            self._reading.show(answer.request.reading, options_in_use(answer), n_records)
 
     def _show_settings(self, *names: str) -> None:
         """Show settings that were changed by a page, a preset or an estimate; all by default."""
@@ -353,6 +409,8 @@ class Layout:
                 ReadOptions(),
                 state.tracking,
                 ReductionSettings(),
+                state.method,
+                state.settings,
             )
             state.param.update(parameters_of(request, session.sources))
 
@@ -360,16 +418,13 @@ class Layout:
         if name in PRESETS:
             self.session.state.tracking = PRESETS[name]
 
-    def _upload(self, content: bytes | None) -> None:
-        if not content:
-            return
-        name, self._file.value = self._file.filename, None  # the same file can be chosen again
+    def _upload(self, name: str, content: bytes) -> None:
         try:
             key = self._uploads.add(name, content, self)
         except (ValueError, OSError) as error:
             self.session.failures.show(text.not_kept(error))
             return
-        self.session.sources.update(self._with_upload({}, key))
+        self.session.sources.update(self._with_uploads({}, key))
         self._source.options = self._titles()
         self._uploaded = self._source.value = key
 
@@ -380,8 +435,30 @@ class Layout:
         again = parameters_of(replace(request, reading=options), session.sources)
         session.state.param.update(again)
 
+    def _add_truth(self, truth: Truth) -> None:
+        """Show the capture on screen with a truth, in place of one that was added before."""
+        session, request = self.session, self.session.answer.request
+        capture, _ = parts_of(session.key(request.source))
+        key = truth.key_with(capture)
+        session.sources.update(self._with_uploads(session.sources, key))
+        self._source.options = self._titles()
+        session.state.param.update(parameters_of(request, session.sources) | {"source": key})
+
+    def _hear_of(self, arrival: Arrival) -> None:
+        self.session.tasks.queue(partial(self._receive, arrival))
+
+    def _receive(self, arrival: Arrival) -> None:
+        """Offer captures that have just been written, and show the last one if it is wanted."""
+        session = self.session
+        arrival.update(session.sources, kept=session.state.source)
+        self._source.options = self._titles()
+        if self._follow.value:
+            session.go_on_with(arrival.newest)
+
     def _close(self) -> None:
         """Release what would outlive a closed page."""
+        if self._arrivals is not None:
+            self._arrivals.unsubscribe(self._hear_of)
         pn.config._session_config.pop(self.session.page, None)
         self._uploads.leave(self)
 
@@ -391,15 +468,23 @@ class Layout:
         """Return the key of each source by its title; files of the same name are numbered."""
         titles: dict[str, str] = {}
         for key, source in self.session.sources.items():
-            number = 1 + sum(title.startswith(source.title) for title in titles)
-            is_new = source.title not in titles
-            titles[source.title if is_new else f"{source.title} ({number})"] = key
+            title, number = source.title, 1
+            while title in titles:
+                number += 1
+                title = f"{source.title} ({number})"
+            titles[title] = key
         return titles
 
-    def _with_upload(self, sources: Mapping[str, Source], key: str) -> dict[str, Source]:
-        """Add the upload of a key to the sources, if there is one."""
-        upload = self._uploads.use(key, self)
-        return {**sources, key: upload} if upload is not None else dict(sources)
+    def _with_uploads(self, sources: Mapping[str, Source], key: str) -> dict[str, Source]:
+        """Add the upload of a key to the sources, if there is one, and a truth added to it."""
+        capture, truth = parts_of(key)
+        found, upload = dict(sources), self._uploads.use(capture, self)
+        if upload is not None:
+            found[capture] = upload
+        path = None if truth is None else self._uploads.path(truth.key, self)
+        if truth is not None and path is not None and capture in found:
+            found[key] = with_truth(found[capture], truth, path)
+        return found
 
 
 def _preset_of(settings: TrackingParameters) -> str:

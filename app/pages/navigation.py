@@ -28,8 +28,10 @@ class Shared(Enum):
 
     UNIT = auto()
     """Unit of the axes along the gate."""
+    METHOD = auto()
+    """Choice of the estimator, with its settings."""
     TRACKING = auto()
-    """Settings of the tracking differentiator."""
+    """Settings of the tracking differentiator, unless the page shows another estimator."""
     REDUCTION = auto()
     """Reduction of the capture."""
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
+from urllib.parse import parse_qsl, urlencode
 
 from app.model.address import Link, query_of
 from app.model.capture_defaults import defaults_of
-from app.model.restore import restore
+from app.model.restore import parameters_of, parsed, places, restore
 from app.model.state import State
-from app.model.store import Answer, Source
+from app.model.store import COMPUTED_FROM, Answer, Request, Source
 from app.pages.shared.estimate import CurrentEstimate
 from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
@@ -62,6 +64,8 @@ class Session:
         self.estimate = CurrentEstimate(
             self.state, self.sources, self.tasks, self.failures, first_answer
         )
+        self._recalled: Link | None = None
+        self.estimate.changed.subscribe(lambda _: self._find_places())
 
     @property
     def answer(self) -> Answer:
@@ -80,7 +84,60 @@ class Session:
 
     def query(self) -> str:
         """Return the query of a link to what the page shows."""
-        return query_of(self.state, self._own | defaults_of(self.answer))
+        own = self._own | defaults_of(self.answer)
+        if not self.answer.request.source.is_scene:
+            own["source"] = ""  # always in the link: another server may have another file
+        return query_of(self.state, own)
+
+    def request_query(self) -> str:
+        """Return the part of the link from which the estimate on screen is computed."""
+        # The source is always named: an empty query means that nothing was kept.
+        return query_of(State(**parameters_of(self.answer.request, self.sources)), {"source": ""})
+
+    def described(self, query: str) -> Request:
+        """Return the request that a query of `request_query` describes.
+
+        Raises
+        ------
+        ValueError
+            If its scene or capture is not here.
+        """
+        _, chosen = parsed(query, self.sources, self._own)
+        values = {name: chosen[name] for name in COMPUTED_FROM}
+        return Request(**values | {"source": self.sources[chosen["source"]]})
+
+    def is_settled(self) -> bool:
+        """Return whether all that was requested is on screen."""
+        return self._recalled is None and self.estimate.is_settled
+
+    def recall(self, query: str) -> None:
+        """Return to what the page showed when `query` was its link."""
+        try:
+            link, chosen = parsed(query, self.sources, self._own)
+        except ValueError as error:
+            self.failures.show(str(error))
+            return
+        self._recalled = link
+        try:
+            self.state.param.update(chosen)
+        except Exception:
+            self._recalled = None
+            raise
+        if not self.is_settled() and self.estimate.is_settled:  # nothing has to be computed
+            self.estimate.changed.emit(self.answer)
+
+    def go_on_with(self, key: str) -> None:
+        """Show another capture with the present settings, pixel and views."""
+        entries = dict(parse_qsl(self.query()))
+        entries |= {"source": key, "pixel": json.dumps(self.state.pixel)}
+        self.recall(urlencode(entries))
+
+    def _find_places(self) -> None:
+        """Return to the recalled pixel, pins, region and views, once their estimate is there."""
+        link = self._recalled
+        if link is not None and self.estimate.is_settled:
+            self._recalled = None
+            self.state.param.update(places(link, self.answer))
 
     def key(self, source: Source) -> str:
         """Return the key of a source in the catalogue."""

@@ -24,7 +24,8 @@ from bokeh.plotting import figure
 from numpy.typing import ArrayLike, NDArray
 
 from app.model.exports import Curve
-from app.theme import OUTSIDE_COLOR, RANGE_COLORS, Palette, method_style
+from app.theme import RANGE_COLORS, Palette, method_style
+from core.io import OUTSIDE_COLOR
 from core.studies import outputs as items
 from core.studies.paper import figures as paper
 
@@ -40,10 +41,18 @@ BIN = hv.Dimension("bin", label="Bin")
 HISTOGRAM_LAYERS = ("raw", "expected", "small", "large", "truth", "estimate")
 RESIDUAL_LAYERS = ("raw", "residual", "truth", "estimate")
 ENHANCED_LAYERS = ("weight", "enhanced", "truth", "estimate")
+SCORE_LAYERS = ("enhanced", "truth", "estimate")
 
 # Names on screen of the layers that have another one.
 HISTOGRAM_NAMES = {"raw": "raw histogram", "small": "small scale", "large": "large scale"}
 RESIDUAL_NAMES = {"raw": "first difference of the raw histogram"}
+SCORE_NAMES = {"enhanced": "score"}
+HISTOGRAM_TITLES = {
+    True: "Histogram of the pixel, and the two scales that follow it",
+    False: "Histogram of the pixel",
+}
+"""Titles with and without the scales."""
+SCORE_TITLE = "Score of each bin; its largest value is the echo"
 ESTIMATES_NAME = "estimate, own lag removed"
 
 
@@ -58,6 +67,14 @@ def bin_curves(names: Mapping[str, str], unit: str, **values: Array) -> list[Cur
 def marks(names: Mapping[str, str], **positions: ArrayLike) -> list[Curve]:
     """State marks for a download, by layer; `names` are those that differ from it."""
     return [Curve(layer, names.get(layer, layer), x) for layer, x in positions.items()]
+
+
+def drawn(lines: Mapping[str, Array | None], n_bins: int) -> dict[str, Array]:
+    """Return curves (bin,) with NaN, which is not drawn, for those that are not known."""
+    return {
+        layer: np.full(n_bins, np.nan) if counts is None else counts
+        for layer, counts in lines.items()
+    }
 
 
 def marker_line(position_bin: float, top: float, bottom: float = 0.0) -> tuple[Array, Array]:
@@ -96,7 +113,7 @@ def histogram(
         _signal(large, unit, names["large"], colors.large),
         *_markers(unit, colors),
     ]
-    return _panel(layers, "Histogram of the pixel, and the two scales that follow it")
+    return _panel(layers, HISTOGRAM_TITLES[True])
 
 
 def residual(values: Array, difference: Array, colors: Palette) -> hv.Overlay:
@@ -119,6 +136,24 @@ def enhanced(values: Array, weight: Array, colors: Palette) -> hv.Overlay:
         *_markers(unit, colors),
     ]
     return _panel(layers, "Enhanced: residual × weight; its largest value is the echo")
+
+
+def score(values: Array, colors: Palette) -> hv.Overlay:
+    """Plot the score of a method in each bin."""
+    unit = hv.Dimension("score", label="Score")
+    layers = [_signal(values, unit, "score", colors.enhanced), *_markers(unit, colors)]
+    return _panel(layers, SCORE_TITLE)
+
+
+def score_ends(values: Array) -> tuple[float, float]:
+    """Return the ends of a vertical axis for scores (bin,).
+
+    Scores below the median are shown as far as those above it.
+    """
+    high, middle = float(values.max()), float(np.median(values))
+    above = high - middle or 1.0
+    low = max(float(values.min()), middle - above)
+    return low - 0.05 * above, high + 0.15 * above
 
 
 def _signal(

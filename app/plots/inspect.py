@@ -19,11 +19,15 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
+from app.plots.elements import SCORE_TITLE
+
 MARKS = "marks"
 RATE_TITLES = {
     "photons per pulse": "Rate, pile-up corrected (Coates)",
     "photons": "Rate as counted (no pile-up to correct)",
 }
+COUNTS_TITLES = {True: "Counts, and the two scales that follow them", False: "Counts"}
+"""Titles with and without the scales."""
 CANDIDATE_HEIGHT = 0.05
 """Height of the candidates' marks: near the bottom, where no legend hides them."""
 
@@ -48,7 +52,7 @@ def empty(*columns: str) -> ColumnDataSource:
 
 def counts(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     """Plot the counts of each bin as bars, with both scales and the expected counts."""
-    drawing = _over_the_gate("Counts, and the two scales that follow them", "Counts", bins)
+    drawing = _over_the_gate(COUNTS_TITLES[True], "Counts", bins)
     source = empty("bin", "raw", "expected", "small", "large")
     _bars(drawing, source, "raw")
     _line(drawing, source, "expected", 1.5, line_dash="dotted")
@@ -74,6 +78,13 @@ def stages(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     drawing.add_layout(axis, "right")
     _line(drawing, source, "residual")
     _line(drawing, source, "enhanced", y_range_name="enhanced", line_dash=[6, 3])
+    return _marked(drawing, marks)
+
+
+def score(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
+    """Plot the score of a method in each bin."""
+    drawing = _over_the_gate(SCORE_TITLE, "Score", bins)
+    _line(drawing, empty("bin", "score"), "score")
     return _marked(drawing, marks)
 
 

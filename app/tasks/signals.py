@@ -18,6 +18,10 @@ class Signal(Generic[Value]):
         """Call a function with each further value."""
         self._subscribers.append(call)
 
+    def unsubscribe(self, call: Callable[[Value], None]) -> None:
+        """Call a function no more."""
+        self._subscribers.remove(call)
+
     def emit(self, value: Value) -> None:
         """Send a value."""
         for call in self._subscribers:

@@ -17,22 +17,54 @@ REST_MS = 250
 
 
 class AddressBar(Component):
-    """Replace the query of the page's address without loading the page.
+    """Write the state into the page's address, and follow the browser's history.
 
-    `panel.state.location` adds an entry to the browser's history with each change (its script calls
-    ``pushState``), so that the Back button would undo slider moves one by one.
+    Each address is an entry of the history: Back and Forward, or Ctrl+Z and Ctrl+Y outside of text
+    fields, return to it without loading the page. `panel.state.location` cannot do this: its script
+    adds an entry with each change, so that the Back button would undo slider moves one by one, and
+    ignores Back.
     """
 
     query = param.String(default="", doc="Part of the address after the question mark.")
+    visited = param.List(default=[], doc="Query of the entry that was returned to, and when.")
 
     _esm = """
     export function render({ model }) {
+      const step = () => history.state?.step ?? 0;
+      let isNew = false;  // whether the next address is an entry of its own
       const show = () => {
         const query = model.query ? `?${model.query}` : "";
-        history.replaceState(history.state, "", location.pathname + query + location.hash);
+        const address = new URL(location.pathname + query + location.hash, location.href);
+        if (address.href !== location.href) {
+          if (isNew) history.pushState({ step: step() + 1 }, "", address);
+          else history.replaceState(history.state, "", address);
+        }
+        isNew = true;
       };
       model.on("query", show);
       show();
+
+      const visit = () => {
+        isNew = false;  // the state is written once more when it is restored
+        model.visited = [location.search.slice(1), Date.now()];
+      };
+      const TEXT = "input[type=text], input:not([type]), textarea";
+      const press = (event) => {
+        const isText = event.composedPath()[0].matches?.(TEXT);
+        if (isText || event.altKey || !(event.ctrlKey || event.metaKey)) return;
+        const key = event.key.toLowerCase();
+        const isRedo = key === "y" || (key === "z" && event.shiftKey);
+        if (!isRedo && key !== "z") return;
+        event.preventDefault();
+        if (isRedo) history.forward();
+        else if (step() > 0) history.back();  // never leaves the page
+      };
+      addEventListener("popstate", visit);
+      addEventListener("keydown", press);
+      model.on("remove", () => {
+        removeEventListener("popstate", visit);
+        removeEventListener("keydown", press);
+      });
       return document.createElement("span");
     }
     """
@@ -41,6 +73,7 @@ class AddressBar(Component):
         self,
         state: State,
         query: Callable[[], str],
+        is_settled: Callable[[], bool],
         wait: Callable[[int, Callable[[], None]], None],
         run_on_page: Callable[[Callable[[], None]], None],
     ) -> None:
@@ -51,6 +84,8 @@ class AddressBar(Component):
         state : State
         query : callable
             Returns the query of the present state.
+        is_settled : callable
+            Returns whether the estimate is that of the state: until then, the address waits.
         wait, run_on_page : callable
             ``call_later`` and ``run_next`` of `app.tasks.page.PageTasks`.
         """
@@ -66,7 +101,10 @@ class AddressBar(Component):
 
         def check(seen: int) -> None:
             if seen == changes:
-                run_on_page(write)
+                if is_settled():
+                    run_on_page(write)
+                else:
+                    wait(REST_MS, partial(check, seen))
 
         write()
         state.param.watch(changed, list(defaults()))

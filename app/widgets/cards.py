@@ -16,7 +16,7 @@ BREAK_PX = 900
 def unrolled(break_px: int, height: str = "auto") -> str:
     """Return the style of a part that keeps its own height where parts are stacked."""
     kept = f"height: {height} !important; max-height: none !important; flex: none !important;"
-    return f"@media (max-width: {break_px}px) {{ :host {{ {kept} }} }}"
+    return f"@media screen and (max-width: {break_px}px) {{ :host {{ {kept} }} }}"
 
 
 def board(least_px: int, rest_px: int, break_px: int) -> str:
@@ -25,7 +25,7 @@ def board(least_px: int, rest_px: int, break_px: int) -> str:
 :host {{ display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
   gap: 10px; flex: none !important; height: max({least_px}px, calc(100vh - {rest_px}px)) !important;
 }}
-@media (max-width: {break_px}px) {{
+@media screen and (max-width: {break_px}px) {{
   :host {{ display: flex !important; flex-direction: column; height: auto !important;
     max-height: none !important; }}
 }}

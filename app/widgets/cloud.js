@@ -365,6 +365,8 @@ class CloudView {
     this.resizing.observe(stage)
     this.onCamera = ({detail}) => this.follow(detail)
     window.addEventListener(CAMERA_EVENT, this.onCamera)
+    this.onPrint = () => this.draw() // a canvas keeps what was drawn within the present task
+    window.addEventListener("beforeprint", this.onPrint)
   }
 
   mark(...what) {
@@ -623,6 +625,7 @@ class CloudView {
     this.dead = true
     this.resizing.disconnect()
     window.removeEventListener(CAMERA_EVENT, this.onCamera)
+    window.removeEventListener("beforeprint", this.onPrint)
     cancelAnimationFrame(this.frame)
     this.release()
   }

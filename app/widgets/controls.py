@@ -11,6 +11,7 @@ Our own components where panel-material-ui 0.16 and Panel 1.9 are worse for a pe
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import Field, fields, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ import panel as pn
 import param
 from panel.custom import Child
 
-from app.widgets.cards import select
+from app.widgets.cards import BREAK_PX, select
 from app.widgets.component import Component
 from core.parameters import Number, joint_doubts, spec_of
 
@@ -31,18 +32,20 @@ class Knob(Component):
     """A number with a slider, a text field, its unit, help and a reset.
 
     Unreliable values are marked on the slider; while one of them is set, a sentence says why. Only
-    values between `low` and `high` can be set; the field refuses others with a sentence.
+    values between `low` and `high` can be set; the field refuses others with a sentence. An
+    optional number has no slider; an empty field stands for None.
 
     The `EditableFloatSlider` of panel-material-ui 0.16 follows a drag as fast, but it has no
     logarithmic track, and its marks are points, not zones.
     """
 
-    value = param.Number(default=0.0)
-    initial = param.Number(default=0.0, doc="Value set by the reset button.")
+    value = param.Number(default=None)  # Panel does not send None to a new model
+    initial = param.Number(default=None, doc="Value set by the reset button.")
     low = param.Number(default=0.0)
     high = param.Number(default=1.0)
     log = param.Boolean(default=False)
     whole = param.Boolean(default=False)
+    optional = param.Boolean(default=False, doc="Whether the field may be empty.")
     label = param.String(default="")
     unit = param.String(default="")
     help = param.String(default="")
@@ -55,7 +58,7 @@ class Knob(Component):
     _stylesheets: ClassVar = [Path(__file__).with_name("knob.css")]
 
     @classmethod
-    def of(cls, spec: Number, value: float, help: str) -> Knob:
+    def of(cls, spec: Number, value: float | None, help: str) -> Knob:
         """Return the knob of a field."""
         return cls(
             value=value,
@@ -64,13 +67,22 @@ class Knob(Component):
             high=spec.high,
             log=spec.log,
             whole=spec.whole,
+            optional=spec.optional,
             label=spec.symbol,
             unit=spec.unit,
             help=help,
-            doubtful=[[zone.low, zone.high, zone.why] for zone in spec.doubtful],
+            doubtful=_zones(spec),
             sizing_mode="stretch_width",
             margin=(0, 8, 2, 8),
         )
+
+    @classmethod
+    def of_field(cls, settings: Any, name: str) -> Knob:
+        """Return the knob of a numeric field of a settings object."""
+        (field,) = (each for each in fields(settings) if each.name == name)
+        spec = spec_of(field)
+        assert isinstance(spec, Number)
+        return cls.of(spec, getattr(settings, name), field.metadata["help"])
 
 
 # As in knob.css.
@@ -94,6 +106,7 @@ class SettingsPanel(Generic[Settings]):
         self._settings = settings
         self._changed = changed
         self._silent = False
+        self._doubts_hold = True
         # About combinations of settings; each knob reports its own unreliable values.
         self.doubts = Sentence(
             live=True, stylesheets=[DOUBT], sizing_mode="stretch_width", margin=(0, 8, 4, 8)
@@ -124,6 +137,17 @@ class SettingsPanel(Generic[Settings]):
             self._silent = False
         self._accept(settings)
 
+    def mark_doubts(self, hold: bool) -> None:
+        """Mark unreliable values, and explain them, if the zones hold for the data on screen."""
+        if hold == self._doubts_hold:
+            return
+        self._doubts_hold = hold
+        for field in fields(self._settings):  # type: ignore[arg-type]
+            spec = spec_of(field)
+            if isinstance(spec, Number):
+                self.controls[field.name].doubtful = _zones(spec) if hold else []
+        self._accept(self._settings)
+
     def _collect(self, _event: param.parameterized.Event) -> None:
         if self._silent:
             return
@@ -131,12 +155,24 @@ class SettingsPanel(Generic[Settings]):
             name: round(control.value) if getattr(control, "whole", False) else control.value
             for name, control in self.controls.items()
         }
-        self._accept(replace(self._settings, **values))  # type: ignore[type-var]
-        self._changed(self._settings)
+        try:
+            settings = replace(self._settings, **values)  # type: ignore[type-var]
+        except ValueError as error:  # values that exclude each other
+            text = str(error)
+            for name, control in self.controls.items():
+                text = re.sub(rf"\b{name}\b", control.label, text)
+            self.doubts.text = text
+            return
+        self._accept(settings)
+        self._changed(settings)
 
     def _accept(self, settings: Settings) -> None:
         self._settings = settings
-        self.doubts.text = " ".join(joint_doubts(settings))
+        self.doubts.text = " ".join(joint_doubts(settings)) if self._doubts_hold else ""
+
+
+def _zones(spec: Number) -> list[list[Any]]:
+    return [[zone.low, zone.high, zone.why] for zone in spec.doubtful]
 
 
 def _control(field: Field[Any], value: Any) -> Any:
@@ -154,6 +190,7 @@ class Facts(Component):
     """A list of named values; an update does not make the browser lay out the page again."""
 
     facts = param.List(default=[], doc="Name, value and one line of help, each a string.")
+    leading = param.Boolean(default=False, doc="Whether the first value is written large.")
     timed = param.Boolean(default=False, doc="Whether to add the times that drawing took.")
 
     _esm = Path(__file__).with_name("facts.js")
@@ -211,6 +248,16 @@ class Sentence(Component):
         }
         """
     ]
+
+
+def legend_line() -> Sentence:
+    """Return the line below an image that says what is hidden in it."""
+    # On one line where the image would shrink for a second one.
+    line = "white-space: nowrap; overflow: hidden; text-overflow: ellipsis"
+    style = f"@media (min-width: {BREAK_PX + 1}px) {{ .note {{ {line} }} }}"
+    return Sentence(
+        stylesheets=[style], min_height=LINE_PX, sizing_mode="stretch_width", margin=(0, 8, 4, 8)
+    )
 
 
 class Chips(Component):

@@ -2,7 +2,9 @@
 
 export function render({ model }) {
   const root = document.createElement("dl");
-  root.className = model.timed ? "fact-list timed" : "fact-list";
+  root.className = "fact-list";
+  if (model.timed) root.classList.add("timed");
+  if (model.leading) root.classList.add("leading");
 
   const entry = ([name, value, help]) => {
     const item = document.createElement("div");

@@ -136,6 +136,13 @@ def cover(bins: Range1d, n_bins: int) -> bool:
     return True
 
 
+def fit(figure: Any, low: float, high: float) -> None:
+    """Set the ends of the vertical axis, and those that a reset restores."""
+    vertical = figure.y_range
+    if (low, high) != (vertical.start, vertical.end):
+        vertical.update(start=low, end=high, reset_start=low, reset_end=high)
+
+
 def round_up(value: float) -> float:
     """Round up to a few steps per decade, so that an axis seldom changes."""
     if value <= 0.0:

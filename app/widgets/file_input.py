@@ -1,19 +1,58 @@
-"""A file input whose uploads are checked on the server, too."""
+"""A button that opens a file, whose uploads are checked on the server, too."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import panel_material_ui as pmui
 
+from app.model.uploads import MAX_UPLOAD_BYTES
 from core.checks import require
 
 PART_BYTES = 4 * 2**20
 """Size of the parts in which a file arrives, each in its own message."""
 
 _LONGEST_NAME = 1024
+
+
+def file_button(
+    label: str,
+    suffixes: Iterable[str],
+    receive: Callable[[str, bytes], None],
+    complain: Callable[[str], None],
+) -> FileInput:
+    """Return a button that opens a file.
+
+    Parameters
+    ----------
+    label : str
+    suffixes : iterable of str
+        For the dialog that it opens.
+    receive : callable
+        Called with the name and the content of each file.
+    complain : callable
+        Called with the reason where a file is refused.
+    """
+    made = FileInput(
+        complain,
+        label=label,
+        accept=",".join(suffixes),
+        max_file_size=MAX_UPLOAD_BYTES,
+        variant="outlined",
+        size="small",
+        sizing_mode="stretch_width",
+        margin=(4, 8),
+    )
+
+    def take(content: bytes | None) -> None:
+        if content:
+            made.value = None  # the same file can be chosen again
+            receive(made.filename, content)
+
+    made.param.watch(lambda event: take(event.new), "value")
+    return made
 
 
 class FileInput(pmui.FileInput):

@@ -7,16 +7,23 @@ from typing import Any
 
 import numpy as np
 from bokeh.events import Tap
-from bokeh.models import BoxZoomTool, CustomJS, DataRange1d
+from bokeh.models import BoxZoomTool, CustomJS, CustomJSHover, DataRange1d, HoverTool
 from numpy.typing import NDArray
 
-from app.model.colors import ColorScale
 from app.model.large import Grid
 from app.plots import elements as plots
 from app.theme import Palette
 from app.widgets.figures import Plot, color_bars, paint_frame, pane_of
+from core.io import ColorScale
 
 Array = NDArray[Any]
+
+# Column or value of the pixel under the pointer. Bokeh would write NaN without asking.
+READ_OUT = """
+if (format === "column") return String(Math.round(value));
+const found = source.data.image[0][special_vars.image_index.flat_index];
+return Number.isFinite(found) ? `${Number(found.toPrecision(5))} ${unit}` : "none shown";
+"""
 
 
 class ImageView:
@@ -50,6 +57,15 @@ class ImageView:
         zoom.match_aspect = True
         # Else Bokeh activates the first of the tools that HoloViews adds.
         self.figure.toolbar.active_drag = zoom
+
+        self._read_out = CustomJSHover(code=READ_OUT)
+        self.figure.add_tools(
+            HoverTool(
+                renderers=[picture["glyph_renderer"]],
+                tooltips=[("Row", "$y{0}"), ("Column", "$x{column}"), ("Value", "$x{value}")],
+                formatters={"$x": self._read_out},
+            )
+        )
 
         def tap(event: Tap) -> None:
             row, col = self._grid.pixel(event.y, event.x)
@@ -103,6 +119,7 @@ class ImageView:
             high_color=look.outside,
         )
         self._bar.title = look.unit
+        self._read_out.args = {"source": self._plot.source("picture"), "unit": look.unit}
         self.figure.title.text = look.title
 
     @property

@@ -34,6 +34,7 @@ export function render({ model }) {
     return Math.round(Math.min(1, Math.max(0, share)) * Number(track.max));
   };
   const text = (value) => {
+    if (value === null) return "";
     const size = Math.abs(value);
     return size !== 0 && (size < 1e-3 || size >= 1e6) ? value.toExponential() : String(value);
   };
@@ -53,6 +54,8 @@ export function render({ model }) {
   };
   const show = () => {
     const { value, low, high, initial, whole, log, doubtful } = model;
+    track.parentElement.hidden = model.optional;
+    field.placeholder = model.optional ? "automatic" : "";
     track.max = whole && !log ? high - low : STEPS;
     track.value = toPosition(value);
     track.style.setProperty("--filled", `${(100 * track.value) / track.max}%`);
@@ -76,8 +79,9 @@ export function render({ model }) {
     ask.title = help.textContent;
     ask.setAttribute("aria-label", `Help on ${model.label}`);
     track.title = model.help;
-    reset.title = `Reset to ${text(initial)}`;
-    reset.setAttribute("aria-label", `Reset ${model.label} to ${text(initial)}`);
+    const initially = text(initial) || "automatic";
+    reset.title = `Reset to ${initially}`;
+    reset.setAttribute("aria-label", `Reset ${model.label} to ${initially}`);
     reset.style.visibility = value === initial ? "hidden" : "visible";
     complain("");
   };
@@ -96,7 +100,9 @@ export function render({ model }) {
     const { low, high, whole } = model;
     const typed = field.value.trim();
     const value = Number(typed.replace(",", "."));
-    if (typed !== "" && value >= low && value <= high && !(whole && value % 1)) {
+    if (typed === "" && model.optional) {
+      set(null);
+    } else if (typed !== "" && value >= low && value <= high && !(whole && value % 1)) {
       set(value);
     } else {
       const kind = whole ? "a whole number" : "a number";

@@ -11,12 +11,12 @@ from bokeh.models import ColorBar, LinearColorMapper, Range1d
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from app.model.colors import ColorScale
 from app.theme import WRONG_COLOR, Palette
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import Sentence
 from app.widgets.figures import paint_frame, pane_of
 from app.widgets.image_view import ImageView
+from core.io import ColorScale
 
 Array = NDArray[Any]
 

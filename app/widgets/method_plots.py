@@ -14,7 +14,7 @@ from app.model.methods import METHOD_TITLES
 from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes
 from app.theme import LIGHT, Palette
-from app.widgets.figures import Plot, paint_frame, pane_of
+from app.widgets.figures import Plot, fit, paint_frame, pane_of
 from core import Acquisition
 
 Array = NDArray[Any]
@@ -100,9 +100,7 @@ class CurvePlot:
         # One above the other, so that equal estimates remain visible.
         height = {method: 1.06 + 0.07 * place for place, method in enumerate(estimates)}
         top = 1.1 + 0.07 * len(estimates)
-        vertical = plot.figure.y_range
-        if (low, top) != (vertical.start, vertical.end):
-            vertical.update(start=low, end=top, reset_start=low, reset_end=top)
+        fit(plot.figure, low, top)
         estimated = [method for method, at in estimates.items() if np.isfinite(at)]
         self._estimates.data = {
             "bin": np.array([estimates[method] for method in estimated], np.float32),

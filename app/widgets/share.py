@@ -17,6 +17,8 @@ SCRIPT_FILE = "firstphoton.py"
 
 TITLE = "Python script of this view"
 
+UNDO = "The browser's Back and Forward, or Ctrl+Z and Ctrl+Y, undo and redo changes."
+
 # Browsers refuse the clipboard to pages that came over plain HTTP from another machine.
 COPY = """
 navigator.clipboard.writeText({text}).then(
@@ -56,9 +58,9 @@ class Share:
         link, status = _copy_button(
             "Copy link", "Copy link: it restores this view.", "location.href", "Link"
         )
-        self.layout = pn.Column(
-            pn.Row(self._open, link, margin=0, styles={"gap": "8px"}), status, margin=8
-        )
+        buttons = pn.Row(self._open, link, margin=0, styles={"gap": "8px"})
+        undo = Sentence(text=UNDO, margin=(6, 0, 0, 0))
+        self.layout = pn.Column(buttons, status, undo, margin=8)
 
     def _show(self) -> None:
         self._code.text = self._script()

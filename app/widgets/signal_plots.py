@@ -1,4 +1,4 @@
-"""The three plots of a pixel: histogram, residual and enhanced signal."""
+"""The plots of a pixel: histogram, residual and enhanced signal, or the score of a method."""
 
 from __future__ import annotations
 
@@ -8,24 +8,35 @@ import numpy as np
 from bokeh.models import BasicTicker, Range1d
 from numpy.typing import NDArray
 
+from app.model.exports import Curve
 from app.model.store import Pixel
 from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.theme import LIGHT, Palette
-from app.widgets.figures import Plot, cover, round_up
-from core import Acquisition
+from app.widgets.figures import Plot, cover, fit, round_up
+from core import Acquisition, Signals
 
 Array = NDArray[Any]
 
 
 class SignalPlots:
-    """The pixel's three plots, linked along the gate."""
+    """The pixel's plots, linked along the gate.
+
+    Attributes
+    ----------
+    histogram : Plot
+    residual, enhanced : Plot
+        Stages of the tracking differentiator.
+    score : Plot
+        Score of another method, in place of these.
+    """
 
     def __init__(self) -> None:
         one = np.zeros(1)
         self.histogram = Plot(plots.histogram(one, one, one, one, LIGHT), plots.HISTOGRAM_LAYERS)
         self.residual = Plot(plots.residual(one, one, LIGHT), plots.RESIDUAL_LAYERS)
         self.enhanced = Plot(plots.enhanced(one, one, LIGHT), plots.ENHANCED_LAYERS)
+        self.score = Plot(plots.score(one, LIGHT), plots.SCORE_LAYERS)
         self._bins = Range1d(0, 1)
         for plot in self.plots:
             figure = plot.figure
@@ -50,13 +61,14 @@ class SignalPlots:
                 (self.histogram, "raw", (raw, small, large)),
                 (self.residual, "residual", rest),
                 (self.enhanced, "enhanced", rest),
+                (self.score, "enhanced", [("Score", self.score.source("enhanced"), "score")]),
             )
         ]
 
     @property
-    def plots(self) -> tuple[Plot, Plot, Plot]:
-        """The three plots, from top to bottom."""
-        return self.histogram, self.residual, self.enhanced
+    def plots(self) -> tuple[Plot, ...]:
+        """All plots, from top to bottom."""
+        return self.histogram, self.residual, self.enhanced, self.score
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme."""
@@ -73,15 +85,36 @@ class SignalPlots:
             read_out.follow(acquisition)
         if cover(self._bins, acquisition.n_bins):
             self._lay_out(acquisition.n_bins)
-        signals, nothing = pixel.signals, np.full(acquisition.n_bins, np.nan)
-        expected = nothing if pixel.expected is None else pixel.expected
-        lines = {"expected": expected, "small": signals.small, "large": signals.large}
-        self.histogram.write("raw", top=signals.raw)
-        for layer, counts in lines.items():
-            self.histogram.write(layer, counts=counts)
-        self.histogram.show("expected", pixel.expected is not None)
-        self._frame(self.histogram, pixel, 0.0, signals.raw, signals.large, expected)
+        self._draw_histogram(pixel, acquisition)
+        if pixel.signals is None:
+            self._draw_score(pixel, acquisition)
+        else:
+            self._draw_stages(pixel, pixel.signals, acquisition, with_difference)
 
+    def _draw_histogram(self, pixel: Pixel, acquisition: Acquisition) -> None:
+        plot, lines = self.histogram, plots.drawn(pixel.lines, acquisition.n_bins)
+        plot.figure.title.text = plots.HISTOGRAM_TITLES[pixel.signals is not None]
+        plot.write("raw", top=pixel.histogram)
+        for layer, counts in lines.items():
+            plot.write(layer, counts=counts)
+            plot.show(layer, pixel.lines[layer] is not None)
+        self._frame(plot, pixel, 0.0, pixel.histogram, *lines.values())
+        curves = plots.bin_curves(plots.HISTOGRAM_NAMES, "counts", raw=pixel.histogram, **lines)
+        plot.keep(acquisition, curves + _marks(pixel))
+
+    def _draw_score(self, pixel: Pixel, acquisition: Acquisition) -> None:
+        plot, score = self.score, pixel.score
+        plot.write("enhanced", score=score)
+        low, high = plots.score_ends(score)
+        fit(plot.figure, low, high)
+        self._mark(plot, pixel, low, high)
+        curves = plots.bin_curves(plots.SCORE_NAMES, "", enhanced=score)
+        plot.keep(acquisition, curves + _marks(pixel))
+
+    def _draw_stages(
+        self, pixel: Pixel, signals: Signals, acquisition: Acquisition, with_difference: bool
+    ) -> None:
+        nothing = np.full(acquisition.n_bins, np.nan)
         difference = pixel.difference if with_difference else nothing
         self.residual.write("residual", residual=signals.residual)
         self.residual.write("raw", residual=difference)
@@ -94,20 +127,15 @@ class SignalPlots:
         self.enhanced.write("enhanced", enhanced=signals.enhanced)
         self.enhanced.write("weight", enhanced=weight)
         self._frame(self.enhanced, pixel, 0.0, signals.enhanced, weight)
-        self._keep(pixel, acquisition, lines, difference)
 
-    def _keep(
-        self, pixel: Pixel, acquisition: Acquisition, lines: dict[str, Array], difference: Array
-    ) -> None:
-        """Keep values (bin,) for downloads, the weight as it is; on screen it is scaled."""
-        signals, curves, names = pixel.signals, plots.bin_curves, plots.RESIDUAL_NAMES
-        histogram = curves(plots.HISTOGRAM_NAMES, "counts", raw=signals.raw, **lines)
+        curves, names = plots.bin_curves, plots.RESIDUAL_NAMES
         residual = curves(names, "counts", raw=difference, residual=signals.residual)
-        weight = curves({}, "", weight=signals.weight)
-        enhanced = curves({}, "counts × weight", enhanced=signals.enhanced)
-        marks = plots.marks({}, truth=pixel.truth_bin, estimate=pixel.answer_bin)
-        for plot, own in zip(self.plots, (histogram, residual, weight + enhanced), strict=True):
-            plot.keep(acquisition, own + marks)
+        enhanced = [
+            *curves({}, "", weight=signals.weight),  # as it is; on screen it is scaled
+            *curves({}, "counts × weight", enhanced=signals.enhanced),
+        ]
+        self.residual.keep(acquisition, residual + _marks(pixel))
+        self.enhanced.keep(acquisition, enhanced + _marks(pixel))
 
     def _lay_out(self, n_bins: int) -> None:
         """Prepare the plots for another number of bins."""
@@ -119,20 +147,28 @@ class SignalPlots:
             (self.histogram, "counts", ("expected", "small", "large")),
             (self.residual, "residual", ("raw", "residual")),
             (self.enhanced, "enhanced", ("weight", "enhanced")),
+            (self.score, "score", ("enhanced",)),
         ):
             for layer in layers:
                 plot.source(layer).data = {"bin": centres, column: empty}
 
-    @staticmethod
-    def _frame(plot: Plot, pixel: Pixel, low: float, *curves: Array) -> None:
+    def _frame(self, plot: Plot, pixel: Pixel, low: float, *curves: Array) -> None:
         """Fit the vertical axis, and draw the lines of truth and estimate."""
         highest = max(float(np.nanmax(curve, initial=0.0)) for curve in curves)
-        vertical = plot.figure.y_range
-        end, start = round_up(highest * 1.15), -round_up(-low * 1.05)
-        if (start, end) != (vertical.start, vertical.end):
-            vertical.update(start=start, end=end, reset_start=start, reset_end=end)
+        end = round_up(highest * 1.15)
+        fit(plot.figure, -round_up(-low * 1.05), end)
+        self._mark(plot, pixel, 0.0, end)
+
+    @staticmethod
+    def _mark(plot: Plot, pixel: Pixel, low: float, high: float) -> None:
+        """Draw the lines of truth and estimate."""
         (column,) = (name for name in plot.source("truth").data if name != "bin")
         for layer, position in (("truth", pixel.truth_bin), ("estimate", pixel.answer_bin)):
-            x, y = plots.marker_line(position, end)
+            x, y = plots.marker_line(position, high, low)
             plot.write(layer, **{"bin": x, column: y})
             plot.show(layer, bool(np.isfinite(position)))
+
+
+def _marks(pixel: Pixel) -> list[Curve]:
+    """State the lines of truth and estimate for a download."""
+    return plots.marks({}, truth=pixel.truth_bin, estimate=pixel.answer_bin)

@@ -9,12 +9,14 @@ import sys
 from pathlib import Path
 
 import core
-from core.cli import ablation, captures, studies, tradeoff
-from core.cli.results import CheckFailed
+from core.cli import ablation, batch, captures, report, studies, tradeoff
+from core.cli.options import TRUTH_OPTIONS
+from core.cli.results import CheckFailed, Incomplete
 from core.io import with_flags
 
 ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
-"""Exit codes: done; the machine (such as a full disk) or a check failed; bad input; Ctrl-C."""
+"""Exit codes: done; the machine (such as a full disk), a check or a part failed; bad input; Ctrl-C.
+"""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"firstphoton {core.__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
-    for room in (captures, studies, tradeoff, ablation):
+    for room in (captures, report, batch, studies, tradeoff, ablation):
         room.add(commands)
     chosen = parser.parse_args(arguments)
     chosen.arguments = sys.argv[1:] if arguments is None else arguments
@@ -38,11 +40,12 @@ def main(arguments: list[str] | None = None) -> int:
         chosen.work(chosen)
         sys.stdout.flush()
     except (ValueError, FileExistsError) as error:
-        return _report(FAILED if _is_of_machine(error) else REFUSED, with_flags(str(error)))
+        message = with_flags(str(error), *TRUTH_OPTIONS)
+        return _report(FAILED if _is_of_machine(error) else REFUSED, message)
     except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except (OSError, CheckFailed) as error:
+    except (OSError, CheckFailed, Incomplete) as error:
         return _report(FAILED, error)
     except MemoryError as error:
         return _report(FAILED, f"not enough memory: {error}")

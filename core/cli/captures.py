@@ -5,33 +5,51 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from core.acquisition import Acquisition
+from core.acquisition import Floats
 from core.capture import Capture, CaptureInfo
-from core.checks import printable, require, shown
+from core.checks import printable, require
 from core.cli.options import (
     FLUX_OPTIONS,
+    TRUTH_OPTIONS,
     add_capture,
+    add_colors,
+    add_filters,
     add_flux,
+    add_pixel,
+    add_settings,
+    add_truth,
     angle,
+    colors_given,
     flux_of,
     reading,
     require_none,
+    settings_given,
     show,
+    truth_options,
     whole_from_to,
 )
-from core.estimators import ESTIMATORS, FALSE_ALARM, RangeImage, estimate
-from core.inspection import capture_report, pixel_report
+from core.cli.saving import (
+    Refused,
+    refused_outputs,
+    require_all,
+    save_each,
+    save_ranges,
+)
+from core.estimators import ESTIMATORS, RangeImage, estimate
+from core.inspection import PixelReport, capture_report, faulty_pixels, pixel_report
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
 from core.io.readers.options import ReadOptions, add_read_options
+from core.io.readers.truth import read_truth, truth_of
 from core.io.scene_files import read_scene
 from core.io.writers import (
     CAPTURE_SUFFIXES,
@@ -39,18 +57,19 @@ from core.io.writers import (
     FOLDER_WRITERS,
     WRITERS,
     save_capture,
-    save_image,
     save_pixel,
 )
-from core.io.writers.whole import writing
-from core.parameters import Number, doubts, spec_of
-from core.pipeline import run
+from core.io.writers.product import guessed_view
+from core.metrics import Interval
+from core.parameters import doubts
+from core.pipeline import figures_of, run
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.tracking import PRESETS
 
 _CONFIDENT = 0.9
 _MAX_REPORTED = 2**27  # counts; a report on more takes minutes
+_CLOUD_HELP = "; a cloud of a file without a pixel angle gets about as wide as it is deep"
 _VIEW = ("unit_m", "distance_m", "pixel_angle_rad")
 
 
@@ -68,7 +87,7 @@ def _add_info(commands: Any) -> None:
         "info", help="show what a capture file contains and what is assumed about it"
     )
     command.add_argument("capture", type=Path, help=f"a file: {', '.join(SUFFIXES)}")
-    _add_pixel(command, "report on one pixel, ranged by tracking with default settings")
+    add_pixel(command, "report on one pixel, ranged by tracking with default settings")
     _add_json(command)
     add_read_options(command)
     command.set_defaults(work=_info)
@@ -114,11 +133,23 @@ def _info(chosen: argparse.Namespace) -> None:
 
 def _capture_facts(capture: Capture) -> dict[str, Any]:
     report = capture_report(capture)
-    suggestion = report.suggestion
+    suggestion, faulty = report.suggestion, faulty_pixels(capture)
+    free, target = report.echo_free_background, report.target_flux
+    hot, dead = (
+        [each._asdict() for each in faulty if each.health == health] for health in ("hot", "dead")
+    )
     return {
+        "flux_mean_over": "all pixels, empty ones included",
         **_flux_facts(report),
+        "target_flux_mean_over": "target pixels, those with an echo",
+        **_interval("target_signal", target.signal),
+        **_interval("target_sbr", target.sbr),
+        **({} if free is None else _interval("echo_free_background", free)),
+        "flux_remark": report.flux_remark,
         "hot_pixels": report.n_hot,
+        "hot_pixels_at": hot,
         "dead_pixels": report.n_dead,
+        "dead_pixels_at": dead,
         "suggested_gate_first_bin": suggestion.gate[0],
         "suggested_gate_end_bin": suggestion.gate[1],
         "why_gate": suggestion.why_gate,
@@ -136,6 +167,8 @@ def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
         "photons": int(report.counts.sum()),
         "range_m": report.answer_m,
         "confidence": report.confidence,
+        "interval": report.interval_text,
+        **_interval_facts(report),
         **_flux_facts(report),
         "verdict": report.verdict.health,
         "why_verdict": report.verdict.why,
@@ -145,11 +178,22 @@ def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
     return facts
 
 
+def _interval_facts(report: PixelReport) -> dict[str, float]:
+    facts: dict[str, float] = {}
+    for name, each in (("68_", report.interval_68_m), ("", report.interval_95_m)):
+        facts |= {f"range_low_{name}m": each.low, f"range_high_{name}m": each.high}
+    return facts
+
+
 def _flux_facts(report: Any) -> dict[str, Any]:
     facts: dict[str, Any] = {"flux_unit": report.flux_unit}
-    for name, interval in report.flux._asdict().items():
-        facts |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    for name, found in report.flux._asdict().items():
+        facts |= _interval(name, found)
     return facts | {"flux_method": report.flux_method}
+
+
+def _interval(name: str, found: Interval) -> dict[str, float]:
+    return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
 
 
 # -- estimate --------------------------------------------------------------------------------------
@@ -163,42 +207,43 @@ def _add_estimate(commands: Any) -> None:
         subject = method.add_mutually_exclusive_group()
         add_capture(subject)
         subject.add_argument("--scene", choices=scenes, default="car", help="to simulate (car)")
+        add_truth(method)
         add_flux(method)
+        add_filters(method)
+        add_colors(method)
+        _add_out(method, "the range image", (*WRITERS, *FOLDER_WRITERS), more=_CLOUD_HELP)
         method.add_argument(
-            "--false-alarm",
-            type=float,
-            help="accepted share of echo-free pixels with an estimate, "
-            f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one",
+            "--intervals",
+            action="store_true",
+            help="write the 95 %% interval of each range, too: in NPZ, netCDF, HDF5, Zarr and CSV",
         )
-        _add_out(method, "the range image", (*WRITERS, *FOLDER_WRITERS))
         method.add_argument(
             "--scheduler", help="address of a Dask cluster to use, such as tcp://host:8786"
         )
         _add_json(method)
-        group = method.add_argument_group("settings of the method")
-        for each in fields(estimator.parameters):
-            spec = spec_of(each)
-            kind = (int if spec.whole else float) if isinstance(spec, Number) else str
-            group.add_argument(
-                f"--{each.name.replace('_', '-')}",
-                dest=f"setting_{each.name}",
-                type=kind,
-                default=each.default,
-                metavar=each.name.upper(),
-                help=f"{each.metadata['help']} ({each.default})".replace("%", "%%"),
-            )
+        add_settings(method, estimator.parameters)
         add_read_options(method)
         method.set_defaults(work=_estimate)
 
 
 def _estimate(chosen: argparse.Namespace) -> None:
-    _require_writable(chosen)
-    kind = ESTIMATORS[chosen.method].parameters
-    settings = kind(**{f.name: getattr(chosen, f"setting_{f.name}") for f in fields(kind)})
+    refused = _refused(chosen)
+    if chosen.capture is None:
+        require_none(vars(chosen), TRUTH_OPTIONS, "a scene has its own truth")
+    elif chosen.truth is None:
+        require_none(vars(chosen), TRUTH_OPTIONS, "there is no --truth")
+    settings = settings_given(chosen, ESTIMATORS[chosen.method].parameters)
+    colors = colors_given(chosen)
     in_tiles = chosen.scheduler or _exceeds_memory(chosen)
+    accepted = "False for a capture that is ranged in tiles"
+    require("intervals", chosen.intervals, not (chosen.intervals and in_tiles), accepted)
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
-    for path in chosen.out:
-        save_image(described, image, path, overwrite=chosen.overwrite)
+    save = save_ranges(
+        described, image, chosen.least_confidence, chosen.overwrite, colors, chosen.intervals
+    )
+    written, refused = save_each(chosen.out, refused, save)
+    has_cloud = any(path.suffix.lower() in CLOUD_SUFFIXES for path in written)
+    view = guessed_view(described, image) if has_cloud else {}
     known = {
         "source": described.source,
         "remark": facts.pop("remark"),
@@ -209,9 +254,11 @@ def _estimate(chosen: argparse.Namespace) -> None:
         f"pixels_at_confidence_{_CONFIDENT}": int((image.confidence >= _CONFIDENT).sum()),
         "median_range_m": float(np.median(image.range_m[image.valid])) if image.valid.any() else "",
         **facts,
-        "written": _names(chosen.out),
+        "cloud": view.get("remark", ""),
+        "written": _names(written),
     }
     show({name: value for name, value in known.items() if value != ""}, chosen.json)
+    require_all(chosen.out, refused)
 
 
 def _exceeds_memory(chosen: argparse.Namespace) -> bool:
@@ -223,8 +270,9 @@ def _range_at_once(
     chosen: argparse.Namespace, settings: Any
 ) -> tuple[CaptureInfo, RangeImage, dict[str, Any]]:
     capture = _capture(chosen)
+    if chosen.truth is not None:
+        capture = read_truth(chosen.truth, capture, **truth_options(chosen))
     print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
-    _require_angle(chosen, capture.acquisition)
     found = run(capture, chosen.method, settings, chosen.false_alarm)
     facts: dict[str, Any] = found.figures | {
         "remark": ESTIMATORS[chosen.method].remark(capture),
@@ -232,7 +280,7 @@ def _range_at_once(
         "estimate_s": found.estimate_s,
     }
     if capture.truth_range_m is not None:
-        facts["pixels_with_a_target"] = int(np.isfinite(capture.truth_range_m).sum())
+        facts |= _targets(capture.truth_range_m)
     return capture, found.image, facts
 
 
@@ -245,12 +293,24 @@ def _range_in_tiles(
         raise ValueError("scheduler needs a --capture: a scene is simulated and ranged here.")
     counts = open_capture(chosen.capture, **reading(chosen))
     print(counts.attrs.get("source", ""), file=sys.stderr)
-    _require_angle(chosen, describe(counts, ReadOptions()).acquisition)
+    acquisition = describe(counts, ReadOptions()).acquisition
+    truth_m, origin = None, ""
+    if chosen.truth is not None:
+        options = truth_options(chosen)
+        truth_m, origin = truth_of(chosen.truth, counts.shape[:2], acquisition, **options)
+        print(origin, file=sys.stderr)
     started = perf_counter()
     parts = tiles.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)
     described, image = tiles.as_image(tiles.computed(parts, chosen.scheduler))
     facts = {"remark": parts.attrs["remark"], "seconds": perf_counter() - started}
+    if truth_m is not None:
+        facts |= figures_of(image.range_m, truth_m, acquisition.bin_length_m) | _targets(truth_m)
+        described = replace(described, source="; ".join(filter(None, (described.source, origin))))
     return described, image, facts
+
+
+def _targets(truth_m: Floats) -> dict[str, int]:
+    return {"pixels_with_a_target": int(np.isfinite(truth_m).sum())}
 
 
 # -- simulate and export ---------------------------------------------------------------------------
@@ -280,7 +340,7 @@ def _add_simulate(commands: Any) -> None:
 
 
 def _simulate(chosen: argparse.Namespace) -> None:
-    _require_writable(chosen)
+    refused = _refused(chosen)
     scene = _scene(chosen)
     acquisition = scene.acquisition
     if chosen.pulses is not None:
@@ -289,7 +349,7 @@ def _simulate(chosen: argparse.Namespace) -> None:
     given = {"unit": chosen.unit_m, "distance": chosen.distance_m, "SBR": chosen.sbr}
     options = [f"{name} {value:g}" for name, value in given.items() if value is not None]
     source = ", ".join((printable(chosen.scene), capture.source, *options))
-    _save_captures(replace(capture, source=source), chosen)
+    _save_captures(replace(capture, source=source), chosen, refused)
 
 
 def _scene(chosen: argparse.Namespace) -> Scene:
@@ -310,7 +370,7 @@ def _add_export(commands: Any) -> None:
     command.add_argument("capture", type=Path, help="a file that `info` can read")
     suffixes = ", ".join(CAPTURE_SUFFIXES)
     command.add_argument("out", type=Path, nargs="+", help=f"{suffixes}; .csv with --pixel")
-    _add_pixel(command, "write the signals of this pixel")
+    add_pixel(command, "write the signals of this pixel")
     command.add_argument(
         "--preset", choices=PRESETS, default="recommended", help="of these signals (recommended)"
     )
@@ -321,24 +381,26 @@ def _add_export(commands: Any) -> None:
 
 
 def _export(chosen: argparse.Namespace) -> None:
-    _require_writable(chosen)
+    refused = _refused(chosen)
     capture = read_capture(chosen.capture, **reading(chosen))
     if chosen.pixel is None:
-        _save_captures(capture, chosen)
+        _save_captures(capture, chosen, refused)
         return
+    settings = PRESETS[chosen.preset]
     row, col = chosen.pixel
-    for path in chosen.out:
-        settings = PRESETS[chosen.preset]
-        save_pixel(capture, row, col, settings, path, overwrite=chosen.overwrite)
-    show({"source": capture.source, "written": _names(chosen.out)}, chosen.json)
+    save = partial(save_pixel, capture, row, col, settings, overwrite=chosen.overwrite)
+    written, refused = save_each(chosen.out, refused, save)
+    show({"source": capture.source, "written": _names(written)}, chosen.json)
+    require_all(chosen.out, refused)
 
 
-def _save_captures(capture: Capture, chosen: argparse.Namespace) -> None:
-    for path in chosen.out:
-        save_capture(capture, path, overwrite=chosen.overwrite)
+def _save_captures(capture: Capture, chosen: argparse.Namespace, refused: Refused) -> None:
+    save = partial(save_capture, capture, overwrite=chosen.overwrite)
+    written, refused = save_each(chosen.out, refused, save)
     photons = int(capture.counts.sum())
-    facts = {"source": capture.source, "photons": photons, "written": _names(chosen.out)}
+    facts = {"source": capture.source, "photons": photons, "written": _names(written)}
     show(facts, chosen.json)
+    require_all(chosen.out, refused)
 
 
 # -- Shared ----------------------------------------------------------------------------------------
@@ -348,18 +410,17 @@ def _names(paths: Sequence[Path]) -> str:
     return ", ".join(map(str, paths))
 
 
-def _add_pixel(command: Any, help: str) -> None:
-    command.add_argument("--pixel", type=int, nargs=2, metavar=("ROW", "COL"), help=help)
-
-
-def _add_out(command: Any, what: str, suffixes: Sequence[str], required: bool = False) -> None:
+def _add_out(
+    command: Any, what: str, suffixes: Sequence[str], required: bool = False, more: str = ""
+) -> None:
     command.add_argument(
         "--out",
         type=Path,
         action="append",
         default=[],
         required=required,
-        help=f"a file for {what} in the format of its suffix: {', '.join(suffixes)}; repeatable",
+        help=f"a file for {what} in the format of its suffix: {', '.join(suffixes)}; "
+        f"repeatable{more}",
     )
     command.add_argument("--overwrite", action="store_true", help="replace files")
     command.set_defaults(suffixes=suffixes)
@@ -369,23 +430,9 @@ def _add_json(command: Any) -> None:
     command.add_argument("--json", action="store_true", help="one JSON object instead of lines")
 
 
-def _require_angle(chosen: argparse.Namespace, acquisition: Acquisition) -> None:
-    """Refuse a point cloud with unknown directions before anything is ranged."""
-    clouds = [str(path) for path in chosen.out if path.suffix.lower() in CLOUD_SUFFIXES]
-    known = acquisition.pixel_angle_rad is not None
-    require("pixel_angle_rad", None, known or not clouds, f"it, which {', '.join(clouds)} needs")
-
-
-def _require_writable(chosen: argparse.Namespace) -> None:
-    """Refuse what cannot be written before anything is computed."""
-    for path in chosen.out:
-        known = path.suffix.lower() in chosen.suffixes
-        require("suffix", path.suffix, known, "one of " + ", ".join(chosen.suffixes))
-        with writing(path):
-            if path.exists() and not chosen.overwrite:
-                raise FileExistsError(f"{path} exists: give another name, or --overwrite.")
-        if not path.absolute().parent.is_dir():
-            raise FileNotFoundError(f"{shown(path.parent)} is not a folder: create it first.")
+def _refused(chosen: argparse.Namespace) -> Refused:
+    """Return outputs that cannot be written before anything is computed."""
+    return refused_outputs(chosen.out, chosen.suffixes, chosen.overwrite)
 
 
 def _capture(chosen: argparse.Namespace) -> Capture:

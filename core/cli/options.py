@@ -8,6 +8,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,12 @@ import numpy as np
 
 from core.acquisition import Flux
 from core.checks import require
+from core.estimators import FALSE_ALARM
 from core.io import read_options_from
 from core.io.readers.quantities import EXAMPLE_OF_ANGLE, parsed_angle
+from core.io.readers.truth import TRUTH_UNITS
+from core.io.writers import RangeColors
+from core.parameters import Choice, Number, spec_of
 
 
 def whole_from_to(least: int, most: int) -> Callable[[str], int]:
@@ -37,6 +42,16 @@ def angle(text: str) -> float:
     except ValueError:
         message = f"{text} is not accepted: give {EXAMPLE_OF_ANGLE}."
         raise argparse.ArgumentTypeError(message) from None
+
+
+def probability(text: str) -> float:
+    """Parse a probability for an option."""
+    try:
+        if 0 <= (value := float(text)) <= 1:
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text} is not accepted: give 0 to 1.")
 
 
 class _Once(argparse.Action):
@@ -65,6 +80,97 @@ def add_processes(command: Any) -> None:
     cores = os.cpu_count() or 1
     help = f"that share the work ({cores})"
     command.add_argument("--processes", type=whole_from_to(1, 256), default=cores, help=help)
+
+
+TRUTH_OPTIONS = ("truth", "truth_unit", "truth_variable")
+
+
+def add_truth(command: Any) -> None:
+    """Add the options for the true ranges of a capture."""
+    group = command.add_argument_group("truth of a capture, to compare the estimates with")
+    group.add_argument(
+        "--truth",
+        type=Path,
+        metavar="FILE",
+        help="true ranges as an image of the capture's shape: .npy, .npz, .mat, .tif, .nc, .h5 or "
+        ".zarr, such as a result of `estimate` or a simulated capture",
+    )
+    group.add_argument(
+        "--truth-unit",
+        choices=TRUTH_UNITS,
+        help="of these: metres, bins after the opening of the gate, or nanoseconds after the "
+        "pulse; by default the unit that the file states",
+    )
+    group.add_argument("--truth-variable", metavar="NAME", help="of the array or page")
+
+
+def truth_options(chosen: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of `core.read_truth`."""
+    return {"truth_unit": chosen.truth_unit, "truth_variable": chosen.truth_variable}
+
+
+def add_pixel(command: Any, help: str) -> None:
+    """Add the option for one pixel."""
+    command.add_argument("--pixel", type=int, nargs=2, metavar=("ROW", "COL"), help=help)
+
+
+def add_false_alarm(command: Any) -> None:
+    """Add the option for the accepted rate of false alarms."""
+    command.add_argument(
+        "--false-alarm",
+        type=float,
+        help="accepted share of echo-free pixels with an estimate, "
+        f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one",
+    )
+
+
+def add_filters(command: Any) -> None:
+    """Add the options for the accepted rate of false alarms and the confidence of what is saved."""
+    add_false_alarm(command)
+    command.add_argument(
+        "--least-confidence",
+        type=probability,
+        help="leave estimates of less confidence out of the files, as the app does below 0.9; they "
+        "still count in the figures; by default all are written",
+    )
+
+
+def add_colors(command: Any) -> None:
+    """Add the options for the colours of pictures."""
+    group = command.add_argument_group("colours of pictures, .png and .svg; those of the app")
+    for each in fields(RangeColors):
+        spec, help = spec_of(each), f"{each.metadata['help']}".replace("%", "%%")
+        name = each.name.removesuffix("_m").replace("_", "-")
+        kind: dict[str, Any] = {"type": float, "metavar": "METRES"}
+        if isinstance(spec, Choice):
+            kind = {"choices": spec.options, "default": each.default}
+        group.add_argument(f"--{name}", dest=each.name, help=help, **kind)
+
+
+def colors_given(chosen: argparse.Namespace) -> RangeColors:
+    """Return the colours that the options of `add_colors` give."""
+    return RangeColors(**{each.name: getattr(chosen, each.name) for each in fields(RangeColors)})
+
+
+def add_settings(command: Any, kind: type[Any]) -> None:
+    """Add an option for each setting of a method."""
+    group = command.add_argument_group("settings of the method")
+    for each in fields(kind):
+        spec = spec_of(each)
+        parse = (int if spec.whole else float) if isinstance(spec, Number) else str
+        group.add_argument(
+            f"--{each.name.replace('_', '-')}",
+            dest=f"setting_{each.name}",
+            type=parse,
+            default=each.default,
+            metavar=each.name.upper(),
+            help=f"{each.metadata['help']} ({each.default})".replace("%", "%%"),
+        )
+
+
+def settings_given(chosen: argparse.Namespace, kind: type[Any]) -> Any:
+    """Return the settings that the options of `add_settings` give."""
+    return kind(**{each.name: getattr(chosen, f"setting_{each.name}") for each in fields(kind)})
 
 
 def reading(chosen: argparse.Namespace) -> dict[str, Any]:
@@ -102,6 +208,10 @@ def show_progress(done: int, of: int, what: str = "pieces") -> None:
     print(f"\r[{bar:<40}] {done} of {of} {what}", end="", file=sys.stderr, flush=True)
 
 
+MOST_LISTED = 10
+"""Items of a list that are printed as lines."""
+
+
 def show(facts: Mapping[str, Any], as_json: bool) -> None:
     """Print facts, one per line or as one JSON object, where NaN and infinity are null."""
     if as_json:
@@ -109,13 +219,26 @@ def show(facts: Mapping[str, Any], as_json: bool) -> None:
         return
     width = max(map(len, facts))
     for name, value in facts.items():
-        text = f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
-        print(f"{name:<{width}}  {text}")
+        for n, line in enumerate(_lines(value)):
+            print(f"{name if n == 0 else '':<{width}}  {line}")
+
+
+def _lines(value: Any) -> list[str]:
+    """Return a value as text, a list as one line for each item."""
+    if isinstance(value, list):
+        lines = [line for each in value[:MOST_LISTED] for line in _lines(each)]
+        n_more = len(value) - MOST_LISTED
+        return [*lines, f"and {n_more} more: --json has all"] if n_more > 0 else lines
+    if isinstance(value, Mapping):
+        return [", ".join(f"{name} {each}" for name, each in value.items())]
+    return [f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)]
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

@@ -18,6 +18,10 @@ class CheckFailed(Exception):
     """A measurement contradicts what it is checked against."""
 
 
+class Incomplete(Exception):
+    """A part of the work failed, and the rest is done; the message says which."""
+
+
 def add_results(command: Any, folder: str | None = None) -> None:
     """Add ``--results`` and, where `folder` is given, ``--folder`` with that default ("": none)."""
     command.add_argument(

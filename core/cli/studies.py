@@ -40,7 +40,9 @@ def add(commands: Any) -> None:
     _add_count(command, "--seeds", 2, MAX_SEEDS, 24)
     add_processes(command)
 
-    command = _added(commands, "calibration", "compare confidence with accuracy", _calibration)
+    command = _added(
+        commands, "calibration", "compare confidences and intervals with errors", _calibration
+    )
     _add_count(command, "--seeds", 1, MAX_SEEDS, 5)
 
     command = _added(commands, "field", "compare methods on published captures", _field)
@@ -111,7 +113,18 @@ def _uniform(chosen: argparse.Namespace) -> None:
 
 
 def _calibration(chosen: argparse.Namespace) -> None:
-    publish([calibration.calibration_table(range(chosen.seeds))], chosen)
+    seeds = range(chosen.seeds)
+    publish(
+        (
+            each(seeds)
+            for each in (
+                calibration.calibration_table,
+                calibration.coverage_table,
+                calibration.flux_table,
+            )
+        ),
+        chosen,
+    )
 
 
 def _field(chosen: argparse.Namespace) -> None:

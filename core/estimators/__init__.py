@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from core.capture import Capture
@@ -21,9 +22,18 @@ from core.estimators import (
     tracking,
     unmixing,
 )
-from core.estimators.base import FALSE_ALARM, Estimator, RangeImage
+from core.estimators.base import FALSE_ALARM, Estimator, Provenance, RangeImage
 
-__all__ = ["ESTIMATORS", "FALSE_ALARM", "Estimator", "RangeImage", "estimate", "settings_of"]
+__all__ = [
+    "ESTIMATORS",
+    "FALSE_ALARM",
+    "Estimator",
+    "Provenance",
+    "RangeImage",
+    "estimate",
+    "require_capture",
+    "settings_of",
+]
 
 ESTIMATORS: dict[str, Estimator] = {
     "tracking": tracking.ESTIMATOR,
@@ -71,12 +81,31 @@ def estimate(
     Raises
     ------
     ValueError
-        If the method or a parameter is unknown, a parameter is out of its bounds, the capture lacks
-        data that the method needs, or memory is not sufficient (`core.cost`).
+        If there is no capture, the method or a parameter is unknown, a parameter is out of its
+        bounds, the capture lacks data that the method needs, or memory is not sufficient
+        (`core.cost`).
     """
+    require_capture(capture)
     settings = settings_of(method, settings, **parameters)
     require_memory(capture, method, settings, false_alarm)
-    return ESTIMATORS[method](capture, settings, false_alarm)
+    estimator = ESTIMATORS[method]
+    made_by = Provenance(method, settings, false_alarm, estimator.remark(capture))
+    return replace(estimator(capture, settings, false_alarm), made_by=made_by)
+
+
+def require_capture(capture: object) -> None:
+    """Raise ``ValueError`` unless an object is a capture; say how to make one."""
+    if isinstance(capture, Capture):
+        return
+    kind, shape = type(capture), getattr(capture, "shape", None)
+    name = f"{kind.__module__}.{kind.__qualname__}".removeprefix("builtins.")
+    n_bins = shape[-1] if isinstance(shape, tuple) and len(shape) == 3 else "..."
+    given = name if shape is None else f"{name} of shape {shape}"
+    example = f"core.Capture(counts, core.Acquisition(n_bins={n_bins}, bin_width_s=1e-9))"
+    accepted = (
+        f"a core.Capture: core.read_capture(path) for a file, or {example} for unsigned counts"
+    )
+    require("capture", given, False, f"{accepted} of shape (row, col, bin)")
 
 
 def settings_of(method: str, settings: Any = None, **parameters: Any) -> Any:

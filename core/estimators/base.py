@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
+from core.checks import require
 from core.deprecation import renamed
 from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
 from core.inference.neighbours import patches, pooled_at, pooled_in
 from core.inference.posterior import tolerance_probability
+from core.labels import Plane, images_dataset, software
+from core.notebook import html_table
 from core.parameters import Number
 from core.trigger import draw_counts, rate_per_bin, trigger_probability
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 @dataclass(frozen=True)
@@ -27,9 +34,41 @@ class NoParameters:
     """Settings of a method that has none."""
 
 
+@dataclass(frozen=True)
+class Provenance:
+    """How the estimates of a range image were made.
+
+    Parameters
+    ----------
+    method : str
+        Key of `core.ESTIMATORS`.
+    settings : dataclass
+        Settings of the method.
+    false_alarm : float, optional
+        As for `core.estimate`.
+    remark : str
+        What the method left out of its model, see `Estimator.remark`.
+    least_confidence : float, optional
+        Estimates of less confidence have been removed, see `RangeImage.confident`.
+    """
+
+    method: str
+    settings: Any
+    false_alarm: float | None = None
+    remark: str = ""
+    least_confidence: float | None = None
+
+    @property
+    def facts(self) -> dict[str, str | float]:
+        """Facts for a file: all settings as JSON; what was not given is left out."""
+        settings = json.dumps(asdict(self.settings), ensure_ascii=False)
+        known = vars(self) | {"settings": settings, "remark": self.remark or None}
+        return {name: value for name, value in known.items() if value is not None}
+
+
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """Estimate of a capture; every field has shape (row, col).
+    """Estimate of a capture; every array has shape (row, col).
 
     Parameters
     ----------
@@ -47,6 +86,8 @@ class RangeImage:
         confidence 0.9, nine in ten are right. 0 where `valid` is False.
     valid : ndarray of bool
         Whether the pixel has an estimate.
+    made_by : Provenance, optional
+        Method and settings; None where they are not known.
     """
 
     range_m: Floats
@@ -54,6 +95,64 @@ class RangeImage:
     score: Floats
     confidence: Floats
     valid: NDArray[np.bool_]
+    made_by: Provenance | None = field(default=None, repr=False)
+
+    @property
+    def planes(self) -> dict[str, Plane]:
+        """Images with unit and meaning, by name."""
+        return {
+            "range_m": Plane(self.range_m, "m", "range of the surface, NaN without an estimate"),
+            "confidence": Plane(
+                self.confidence, "1", "probability that the estimate is right within 3 bins"
+            ),
+            "bin": Plane(self.bin, "1", "delay of the echo in bins, from the opening of the gate"),
+            "score": Plane(self.score, "1", "score of the estimate, of the estimator's own scale"),
+            "valid": Plane(self.valid, "1", "whether there is an estimate"),
+        }
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return the image as labelled arrays, as `core.save_image` writes them.
+
+        Returns
+        -------
+        xarray.Dataset
+            Variables ``range_m``, ``confidence``, ``bin``, ``score`` and ``valid`` (1 or 0) over
+            the coordinates ``row`` and ``col``, with units; method, settings (JSON) and version
+            are attributes.
+        """
+        about = {} if self.made_by is None else self.made_by.facts
+        return images_dataset(self.planes, {**about, "software": software()})
+
+    def _repr_html_(self) -> str:
+        """Return a table for notebooks."""
+        (rows, cols), n_valid = self.valid.shape, int(self.valid.sum())
+        facts = {
+            "shape": f"{rows} × {cols} pixels",
+            "estimates": f"{n_valid:,} of {self.valid.size:,} pixels",
+        }
+        if n_valid:
+            low, middle, high = np.percentile(self.range_m[self.valid], [0, 50, 100])
+            facts["ranges"] = f"{low:.6g} to {high:.6g} m, median {middle:.6g} m"
+            facts["confidence"] = f"{self.confidence[self.valid].mean():.3g} on average"
+        if self.made_by is not None:
+            facts |= {name: str(fact) for name, fact in self.made_by.facts.items()}
+        return html_table("Range image", facts)
+
+    def confident(self, least: float) -> RangeImage:
+        """Return the image without estimates of a confidence below `least`, 0 to 1.
+
+        Their scores and confidences are kept.
+
+        Raises
+        ------
+        ValueError
+            If `least` is not a probability.
+        """
+        require("least_confidence", least, 0 <= least <= 1, "a probability, 0 to 1")
+        kept = self.valid & (self.confidence >= least)
+        range_m, bins = (np.where(kept, each, np.nan) for each in (self.range_m, self.bin))
+        made_by = self.made_by and replace(self.made_by, least_confidence=least)
+        return replace(self, range_m=range_m, bin=bins, valid=kept, made_by=made_by)
 
 
 FALSE_ALARM = Number("False alarms", 1e-3, 1.0, log=True, least=1e-3, most=1.0)
@@ -109,6 +208,9 @@ class Estimator:
     whole_image : bool
         Whether the estimate of a pixel depends on pixels outside its window, so that no part of an
         image can be estimated alone.
+    refine : callable, optional
+        ``(capture, flux_model, delay_bin, parameters) -> delay_bin``, each of shape (row, col): a
+        finer search in the neighbourhood of a delay that is corrected for the lag.
     """
 
     title: str
@@ -124,6 +226,7 @@ class Estimator:
     undoes_pile_up: bool = False
     omits: Callable[[Capture], str] = lambda _: ""
     whole_image: bool = False
+    refine: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
 
     light = renamed("flux_model")
     reach = renamed("window_size")
@@ -190,10 +293,13 @@ class Estimator:
     def _delays(
         self, capture: Capture, parameters: Any, calibration: Calibration
     ) -> tuple[Floats, Floats]:
-        position, score = self.positions(capture, self.flux_model(capture), parameters)
+        flux = self.flux_model(capture)
+        position, score = self.positions(capture, flux, parameters)
         if calibration.least_score is not None:
             position = np.where(score > calibration.least_score, position, np.nan)
         delay = np.clip(position - calibration.lag_bins, 0.0, capture.acquisition.n_bins)
+        if self.refine is not None:
+            delay = self.refine(capture, flux, delay, parameters)
         return delay, score
 
     def curves(self, capture: Capture, row: int, col: int, parameters: Any) -> Floats:

@@ -1,4 +1,8 @@
-"""The paper's estimator, the dual-scale tracking differentiator of `core.tracking`."""
+"""The paper's estimator, the dual-scale tracking differentiator of `core.tracking`.
+
+It finds the bin of the echo. If `TrackingParameters.refine` is "likelihood", the range below a bin
+is that of the largest likelihood in the neighbourhood.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ from core.capture import Capture
 from core.estimators.base import Estimator
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
+from core.inference.refinement import refined
 from core.tracking import TrackingParameters, track, tracking_signals
 
 
@@ -21,10 +26,17 @@ def _curve(histogram: Floats, conditions: Conditions, parameters: TrackingParame
     return tracking_signals(histogram, parameters, conditions.n_pulses).enhanced
 
 
+def _refine(
+    capture: Capture, flux: FluxModel, delay_bin: Floats, parameters: TrackingParameters
+) -> Floats:
+    return refined(capture, flux, delay_bin) if parameters.refine == "likelihood" else delay_bin
+
+
 ESTIMATOR = Estimator(
     "Dual-scale tracking differentiator",
     TrackingParameters,
     _curve,
     _locate,
     first_bin=lambda parameters: parameters.t_n,
+    refine=_refine,
 )

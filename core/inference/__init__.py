@@ -2,6 +2,7 @@
 
 from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_prior_of
 from core.inference.flux_model import FluxModel, FluxPrior
+from core.inference.intervals import RangeInterval, pixel_range_intervals, range_interval
 from core.inference.likelihood import Conditions, log_likelihood_ratio, rate_and_n_armed
 from core.inference.posterior import (
     TOLERANCE_BINS,
@@ -18,13 +19,16 @@ __all__ = [
     "FluxModel",
     "FluxPrior",
     "Posterior",
+    "RangeInterval",
     "detailed_flux_prior_of",
     "flux_model_of",
     "flux_prior_of",
     "has_posterior",
     "log_likelihood_ratio",
     "most_likely",
+    "pixel_range_intervals",
     "posterior_of",
+    "range_interval",
     "rate_and_n_armed",
     "tolerance_probability",
 ]

@@ -62,6 +62,13 @@ def outlier_pixels(capture: Capture) -> OutlierPixels | None:
     return OutlierPixels(hot, dead, most, least)
 
 
+def ordinary_pixels(capture: Capture) -> NDArray[np.bool_]:
+    """Find the pixels that are neither hot nor dead, shape (row, col); all if there are none."""
+    faulty = outlier_pixels(capture)
+    ordinary = np.ones(capture.shape, bool) if faulty is None else ~(faulty.hot | faulty.dead)
+    return ordinary if ordinary.any() else np.ones(capture.shape, bool)
+
+
 def neighbour_median(capture: Capture) -> NDArray[np.int64]:
     """Median counts of each pixel's neighbours, shape (row, col)."""
     found = scipy.ndimage.median_filter(capture.counts, footprint=_AROUND, mode="mirror")

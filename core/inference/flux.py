@@ -135,7 +135,9 @@ def level_likelihoods(
         Without terms that depend only on the counts.
     """
     some, n_bins, n_pulses = pixels[np.newaxis], capture.cube.shape[2], capture.gated_pulses
-    flux = flux_prior.model(_totals(capture)[0].ravel()[some], _least_background(capture))
+    # A mean background below half a count is known from many pixels.
+    least = min(_least_background(capture), float(flux_prior.background))
+    flux = flux_prior.model(_totals(capture)[0].ravel()[some], least)
     cube = capture.cube.reshape(-1, n_bins)[some]
     prepared = prepare(capture, cube, flux, steps_per_bin)
     evidence = level_evidence(prepared, prepared.depth[:, np.newaxis])

@@ -23,6 +23,11 @@ TOLERANCE_BINS = 3
 """Tolerance within which an estimate is right; it reproduces the paper's tables."""
 
 
+def same_echo_bins(capture: Capture) -> int:
+    """Distance below which delays belong to one echo: one pulse, and the tolerance at least."""
+    return max(TOLERANCE_BINS, capture.echo_bins)
+
+
 class Posterior(NamedTuple):
     """Posterior of the delay of each pixel."""
 
@@ -74,19 +79,33 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
         Delays in fractional bins, from 0 to n_bins; NaN gives 0.
     """
     table, found = posterior_of(capture).tolerance_probability, np.empty(bins.size)
-    last = table.shape[2] - 1
     for begin in range(0, bins.size, _AT_ONCE):
         some = slice(begin, begin + _AT_ONCE)
         delay = bins.ravel()[some]
-        at = np.clip(np.nan_to_num(delay), 0, last)
-        below = np.minimum(at.astype(np.intp), max(last - 1, 0))
-        above = np.minimum(below + 1, last)
-        # Flat indices: `numpy.take_along_axis` takes longer than everything else.
-        first = np.arange(begin, begin + at.size) * table.shape[2]
-        low, high = table.take(first + below), table.take(first + above)
-        between = low + (at - below) * (high - low)
-        found[some] = np.where(np.isnan(delay), 0.0, np.clip(between, 0.0, 1.0))
+        found[some] = _interpolated(table, np.arange(begin, begin + delay.size), delay)
     return found.reshape(bins.shape)
+
+
+def tolerance_probability_at(capture: Capture, row: int, col: int, bins: Floats) -> Floats:
+    """Return `tolerance_probability` of one pixel at several delays (n,), shape (n,)."""
+    pixel = row * capture.shape[1] + col
+    table = posterior_of(capture).tolerance_probability
+    return _interpolated(table, np.full(bins.size, pixel), bins)
+
+
+def _interpolated(
+    table: NDArray[np.float32], pixels: NDArray[np.intp], delay_bin: Floats
+) -> Floats:
+    """Interpolate a table (row, col, bin) at the delays (n,) of pixels given as flat indices."""
+    last = table.shape[2] - 1
+    at = np.clip(np.nan_to_num(delay_bin), 0, last)
+    below = np.minimum(at.astype(np.intp), max(last - 1, 0))
+    above = np.minimum(below + 1, last)
+    # Flat indices: `numpy.take_along_axis` takes longer than everything else.
+    first = pixels * table.shape[2]
+    low, high = table.take(first + below), table.take(first + above)
+    between = low + (at - below) * (high - low)
+    return np.where(np.isnan(delay_bin), 0.0, np.clip(between, 0.0, 1.0))
 
 
 def most_likely(capture: Capture, flux: FluxModel, steps_per_bin: int) -> tuple[Floats, Floats]:

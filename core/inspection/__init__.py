@@ -1,9 +1,10 @@
 """Reports on a pixel, a region and a capture, with uncertainties."""
 
 from core.inspection.capture import CaptureReport, Suggestion, capture_report
+from core.inspection.faulty import FaultyPixel, faulty_pixels
 from core.inspection.flux import estimate_flux
 from core.inspection.maps import maps
-from core.inspection.mean_flux import estimate_mean_flux
+from core.inspection.mean_flux import estimate_mean_flux, estimate_target_flux
 from core.inspection.pixel import PixelReport, RangeCandidate, pixel_report
 from core.inspection.profile import LEVEL, FluxEstimate
 from core.inspection.pulses import Accuracy, accuracy_over_pulses
@@ -18,6 +19,7 @@ __all__ = [
     "Accuracy",
     "Candidate",
     "CaptureReport",
+    "FaultyPixel",
     "FluxEstimate",
     "LightFound",
     "PixelReport",
@@ -28,6 +30,8 @@ __all__ = [
     "capture_report",
     "estimate_flux",
     "estimate_mean_flux",
+    "estimate_target_flux",
+    "faulty_pixels",
     "light_found",
     "maps",
     "mean_light",

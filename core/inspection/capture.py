@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +11,11 @@ from numpy.typing import NDArray
 from core.capture import Capture, cached_per_capture
 from core.inference.faults import outlier_pixels
 from core.inference.posterior import TOLERANCE_BINS
-from core.inspection.maps import likeliest
-from core.inspection.mean_flux import METHOD, estimate_mean_flux
+from core.inspection.echoes import FEWEST, echoes_of
+from core.inspection.mean_flux import METHOD, MeanFlux, mean_flux_of
 from core.inspection.pixel import flux_unit, lag_bins
 from core.inspection.profile import FluxEstimate, OldFluxNames
+from core.metrics import Interval
 from core.tracking import START_BINS, TrackingParameters
 
 
@@ -39,7 +39,16 @@ class CaptureReport(OldFluxNames):
     histogram: NDArray[np.int64]
     """Counts of all pixels together, shape (bin,)."""
     flux: FluxEstimate
-    """Mean signal (PPP) and background of all pixels, and their ratio, with 95 % intervals."""
+    """Mean signal (PPP) and background of all pixels, and their ratio, with 95 % intervals. Pixels
+    without an echo count as having no signal."""
+    target_flux: FluxEstimate
+    """Likewise of a target pixel, one with an echo: the PPP and SBR that a simulation is given."""
+    echo_free_background: Interval | None
+    """Background in the bins before and after all echoes, likewise over the whole gate; None if
+    there are too few such bins. Where it contradicts the fluxes, their intervals include it."""
+    flux_remark: str
+    """Whether the background is confirmed by bins without echoes, and how long the echoes are
+    where they differ from the pulse."""
     flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
@@ -53,10 +62,13 @@ class CaptureReport(OldFluxNames):
 
 def capture_report(capture: Capture) -> CaptureReport:
     """Report on a capture as a whole; the first call takes as long as an estimate."""
-    faulty = outlier_pixels(capture)
+    faulty, found = outlier_pixels(capture), mean_flux_of(capture)
     return CaptureReport(
         histogram=aggregate(capture),
-        flux=estimate_mean_flux(capture),
+        flux=found.image,
+        target_flux=found.target,
+        echo_free_background=found.free and found.free.background,
+        flux_remark=_flux_remark(capture, found),
         flux_unit=flux_unit(capture),
         flux_method=METHOD,
         n_hot=None if faulty is None else int(np.count_nonzero(faulty.hot)),
@@ -65,47 +77,48 @@ def capture_report(capture: Capture) -> CaptureReport:
     )
 
 
+def _flux_remark(capture: Capture, found: MeanFlux) -> str:
+    """Return how far the fluxes can be trusted, in sentences."""
+    begin_s, end_s = capture.pulse.span_s
+    fitted_begin_s, fitted_end_s = found.pulse.span_s
+    unit, wide = flux_unit(capture), (fitted_end_s - fitted_begin_s) / (end_s - begin_s)
+    if found.free is None:
+        remark = "Too few bins are known to be free of echoes to check the background."
+    else:
+        remark = (
+            f"Bins without echoes give a background of {_text(found.free.background)} {unit}, the "
+            f"likelihood of all bins {_text(found.model.background)}: "
+        )
+        remark += (
+            "they disagree, and the intervals include both. The background may vary along the "
+            "gate, or echoes have another shape than the pulse."
+            if found.is_contradicted
+            else "they agree."
+        )
+    if found.pulse != capture.pulse:
+        remark += f" The echoes are {wide:.2g} times as long as the pulse, which does not fit."
+    return remark
+
+
+def _text(found: Interval) -> str:
+    return f"{found.value:.3g} [{found.low:.3g}, {found.high:.3g}]"
+
+
 @cached_per_capture
 def aggregate(capture: Capture) -> NDArray[np.int64]:
     """Counts of all pixels together, shape (bin,)."""
     return np.asarray(capture.cube.sum(axis=(0, 1), dtype=np.int64))
 
 
-_CONFIDENT = 0.9
-_FEWEST = 10  # confident estimates
 _MARGIN_BINS = 3 * START_BINS
-
-
-class _Echoes(NamedTuple):
-    """Delays of confident estimates, in bins."""
-
-    first: float
-    last: float
-    n_found: int
-
-
-@cached_per_capture
-def _echoes(capture: Capture) -> _Echoes | None:
-    """Find the first and last delay; None if there are too few confident estimates.
-
-    Leaves out as many estimates as are expected to be wrong, half of them at each end.
-    """
-    delay, probability = likeliest(capture)
-    sure = probability >= _CONFIDENT
-    count = int(np.count_nonzero(sure))
-    if count < _FEWEST:
-        return None
-    found = np.sort(delay[sure])
-    wrong = math.ceil(float((1 - probability[sure]).sum()) / 2)
-    return _Echoes(float(found[wrong]), float(found[-1 - wrong]), count)
 
 
 @cached_per_capture
 def suggestion(capture: Capture) -> Suggestion:
     """Suggest gate and T_n, with a reason in a sentence each."""
-    n_bins, echoes = capture.acquisition.n_bins, _echoes(capture)
+    n_bins, echoes = capture.acquisition.n_bins, echoes_of(capture)
     if echoes is None:
-        why = f"Fewer than {_FEWEST} estimates are confident: the delays of echoes are unknown."
+        why = f"Fewer than {FEWEST} estimates are confident: the delays of echoes are unknown."
         t_n = min(_MARGIN_BINS, n_bins - 1)
         return Suggestion((0, n_bins), why, t_n, f"{why} The differentiators need {t_n} bins.")
     lag = lag_bins(capture, "tracking", TrackingParameters())

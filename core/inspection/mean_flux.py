@@ -7,6 +7,9 @@ shape, and profile likelihood intervals as for a single pixel (`core.inspection.
 
 The maximum-likelihood gamma distribution has the mean of the observed signals, whatever their
 true distribution, so that the model need not be exact where signals are clear.
+
+Target pixels are those with an echo: the same likelihood, as a function of their mean signal
+instead of that of all pixels.
 """
 
 from __future__ import annotations
@@ -14,33 +17,75 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
 
-from core.acquisition import Floats
+from core.acquisition import Floats, Pulse
 from core.capture import Capture, cached_per_capture
-from core.inference.faults import outlier_pixels
+from core.inference.faults import ordinary_pixels
 from core.inference.flux import detailed_flux_prior_of, level_likelihoods, total_rates
+from core.inference.flux_model import FluxPrior
+from core.inspection.echoes import echo_free_flux, total_flux
 from core.inspection.flux import estimate_flux
-from core.inspection.profile import LEVEL, Box, FluxEstimate, spans, zoomed
+from core.inspection.profile import LEVEL, Box, FluxEstimate, difference_of, ratio_of, spans, zoomed
+from core.inspection.pulse_fit import fit_pulse
+from core.kernels.posterior import learn_shares
 from core.metrics import Interval
-from core.reductions import share_of_pulses
+from core.reductions import merge_bins, share_of_pulses
 
 METHOD = (
     "95 % profile likelihood intervals; signals of pixels with an echo are modelled as gamma "
-    "distributed"
+    "distributed, and the pulse is fitted to the echoes"
 )
 
 _SAMPLE = 512  # pixels
 _FEW = 24  # pixels, too few to estimate the scatter of the signals
 _DARK = 30  # photons in all, too few to separate signal and background
 _BRIGHT = 400  # photons of the brightest echo, enough for the mean
-_COARSE, _FINE = (5, 9), (7, 15)
+_ECHO_BINS = 3  # bins of an echo, enough to locate it
+# Values of background and signal that are tried; the background is known when the target is found.
+_COARSE, _FINE = ((5, 9), (3, 9)), ((7, 15), (4, 15))
 
 
-@cached_per_capture
+class MeanFlux(NamedTuple):
+    """Fluxes of the pixels of a capture, in the units of `estimate_mean_flux`."""
+
+    image: FluxEstimate
+    """Mean over all pixels; those without an echo have no signal."""
+    target: FluxEstimate
+    """Mean over the target pixels, those with an echo; its background is that of the image."""
+    model: FluxEstimate
+    """The image's by the likelihood alone."""
+    free: FluxEstimate | None
+    """The image's by the bins without echoes alone (`core.inspection.echoes.echo_free_flux`)."""
+    pulse: Pulse
+    """The capture's, or the one that fits the echoes clearly better
+    (`core.inspection.pulse_fit`)."""
+
+    @classmethod
+    def alike(cls, found: FluxEstimate, pulse: Pulse) -> MeanFlux:
+        """Return the same fluxes for every pixel."""
+        return cls(found, found, found, None, pulse)
+
+    def in_longer_gate(self, factor: float) -> MeanFlux:
+        """Return the fluxes of a gate `factor` times as long, with as much background per time."""
+        return MeanFlux(
+            self.image.in_longer_gate(factor),
+            self.target.in_longer_gate(factor),
+            self.model.in_longer_gate(factor),
+            self.free and self.free.in_longer_gate(factor),
+            self.pulse,
+        )
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether bins without echoes give another background than the likelihood."""
+        return self.free is not None and not self.free.background.overlaps(self.model.background)
+
+
 def estimate_mean_flux(capture: Capture) -> FluxEstimate:
     """Estimate mean signal and background of all pixels, and their ratio, with 95 % intervals.
 
@@ -48,48 +93,105 @@ def estimate_mean_flux(capture: Capture) -> FluxEstimate:
     echo count as having no signal; hot and dead ones are left out. Fewer than 24 pixels are assumed
     to have the same fluxes.
     """
-    capture = _ordinary(capture)
-    n_pixels, acquisition, pulse = capture.shape[1], capture.acquisition, capture.pulse
+    return mean_flux_of(capture).image
+
+
+def estimate_target_flux(capture: Capture) -> FluxEstimate:
+    """Estimate the fluxes as `estimate_mean_flux` does, of a mean pixel with an echo."""
+    return mean_flux_of(capture).target
+
+
+@cached_per_capture
+def mean_flux_of(capture: Capture) -> MeanFlux:
+    """Estimate the fluxes of the image and of its target pixels."""
+    coarse = _coarse(capture)
+    lengths_s = [
+        each.n_bins * each.bin_width_s for each in (capture.acquisition, coarse.acquisition)
+    ]
+    return _mean_flux(coarse).in_longer_gate(lengths_s[0] / lengths_s[1])
+
+
+def _mean_flux(capture: Capture) -> MeanFlux:
+    ordinary = selected_pixels(capture, ordinary_pixels(capture))
+    n_pixels, acquisition, pulse = ordinary.shape[1], ordinary.acquisition, ordinary.pulse
     if n_pixels < _FEW:
-        found = estimate_flux(
-            capture.cube[0].astype(float), acquisition, pulse, capture.gated_pulses
-        )
-        return found.of(capture)
-    if 2 * capture.echo_bins >= acquisition.n_bins or capture.counts.sum() < _DARK:
-        return _unresolved(capture).of(capture)
-    some, share = _dimmer(capture)
-    surface = _Mixture(some)
-    box = zoomed(surface.box, surface, _COARSE)
-    # The tail of an echo beyond its taps is not background.
-    echo, _ = pulse.taps(acquisition.n_bins, acquisition.bin_width_s)
-    missed = max(1 - float(echo.sum()), 0.0)
-
-    def flux_at(log_background: Floats, root_signal: Floats) -> tuple[Floats, Floats]:
-        background, signal = np.meshgrid(np.exp(log_background), root_signal**2, indexing="ij")
-        background = np.maximum(background - missed * signal, 0.0)
-        if box.low[0] == box.least[0]:
-            background[0] = 0.0
-        if box.high[0] == box.most[0]:
-            background[-1] = np.inf
-        return signal, background
-
-    found = spans(box, surface(*box.grid(_FINE)), flux_at).of(some)
-    return found if acquisition.n_pulses else found.scaled(1 / share)
+        counts = ordinary.cube[0].astype(float)
+        found = estimate_flux(counts, acquisition, pulse, ordinary.gated_pulses)
+        return MeanFlux.alike(found.of(ordinary), pulse)
+    if 2 * ordinary.echo_bins >= acquisition.n_bins or ordinary.counts.sum() < _DARK:
+        return MeanFlux.alike(_unresolved(ordinary).of(ordinary), pulse)
+    some, share = _dimmer(ordinary)
+    mixture, scale = _Mixture(some), 1.0 if acquisition.n_pulses else 1 / share
+    model, target = (each.of(some).scaled(scale) for each in (mixture.image, mixture.target))
+    whole = _with_total(model, total_flux(ordinary))
+    signal = _at_same_share(target.signal, model.signal, whole.signal)
+    if signal != target.signal:
+        sbr = ratio_of(signal, whole.background)
+        target = FluxEstimate(signal, whole.background, sbr)
+    return _combined(MeanFlux(whole, target, whole, echo_free_flux(capture), mixture.pulse))
 
 
-def _ordinary(capture: Capture) -> Capture:
-    """Return the pixels that are neither hot nor dead, in one row; all if there are none."""
-    faulty = outlier_pixels(capture)
-    kept = np.ones(capture.shape, bool) if faulty is None else ~(faulty.hot | faulty.dead)
-    if not kept.any():
-        kept[:] = True
-    return selected_pixels(capture, kept)
+def _with_total(model: FluxEstimate, total: Interval | None) -> FluxEstimate:
+    """Return the signal of all pixels above the background, if that is known better.
+
+    The likelihood is that of a sample of the pixels, in which more or fewer may have an echo.
+    """
+    if total is None or math.isinf(model.background.high):
+        return model
+    signal = difference_of(total, model.background)
+    if signal.high - signal.low > model.signal.high - model.signal.low:
+        return model
+    ratio = ratio_of(total, model.background)
+    sbr = Interval(*(max(each - 1, 0.0) for each in (ratio.value, ratio.low, ratio.high)))
+    return FluxEstimate(signal, model.background, sbr)
+
+
+def _at_same_share(target: Interval, sample: Interval, image: Interval) -> Interval:
+    """Return the signal of target pixels if as large a share of the image has an echo as sampled.
+
+    Unless the signal of the image is known worse than that of the target pixels.
+    """
+    if not (image.high - image.low) * target.value < (target.high - target.low) * image.value:
+        return target
+    return target.scaled(image.value / sample.value) if sample.value > 0 else target
+
+
+def _combined(found: MeanFlux) -> MeanFlux:
+    """Prefer the narrower of both estimates; include both where they disagree."""
+    free, model, target = found.free, found.model, found.target
+    if free is None:
+        return found
+    if not found.is_contradicted:
+        if free.signal.high - free.signal.low > model.signal.high - model.signal.low:
+            return found
+        signal = _at_same_share(target.signal, model.signal, free.signal)
+        sbr = ratio_of(signal, free.background)
+        return found._replace(image=free, target=FluxEstimate(signal, free.background, sbr))
+    image = FluxEstimate(*(one.joined(other) for one, other in zip(free, model, strict=True)))
+    # The same share of the pixels has an echo.
+    factor = free.signal.value / model.signal.value if model.signal.value > 0 else 1.0
+    signal = target.signal.scaled(factor)
+    sbr = ratio_of(signal, free.background).joined(target.sbr)
+    joined = FluxEstimate(signal.joined(target.signal), image.background, sbr)
+    return found._replace(image=image, target=joined)
 
 
 def selected_pixels(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
     """Return the pixels of a mask (row, col) in one row, without truth and flux prior."""
-    cube = capture.cube[mask][np.newaxis]
-    return replace(capture, cube=cube, truth_range_m=None, signal=None, flux_prior=None)
+    return _of_counts(capture, capture.cube[mask])
+
+
+def _of_counts(capture: Capture, counts: NDArray[Any]) -> Capture:
+    """Return a capture of a row of pixels (col, bin), without truth and flux prior."""
+    cube, images = counts[np.newaxis], capture.images(lambda _: None)
+    return replace(capture, cube=cube, **images, flux_prior=None)
+
+
+def _coarse(capture: Capture) -> Capture:
+    """Merge bins of which an echo covers many: they hold no more information on fluxes."""
+    factor = capture.echo_bins // _ECHO_BINS
+    fits = factor > 1 and 2 * capture.echo_bins < capture.acquisition.n_bins
+    return merge_bins(capture, factor) if fits else capture
 
 
 def _unresolved(capture: Capture) -> FluxEstimate:
@@ -120,70 +222,151 @@ def _dimmer(capture: Capture) -> tuple[Capture, float]:
 
 
 class _Mixture:
-    """Likelihood of mean background and mean signal, from a sample of the pixels."""
+    """Likelihood of mean background and signal, from a sample of the pixels.
+
+    With the pulse that fits their echoes best (`core.inspection.pulse_fit`).
+    """
 
     def __init__(self, capture: Capture) -> None:
         known = detailed_flux_prior_of(capture)
         total, n_pulses = total_rates(capture), capture.gated_pulses or 1
-        self._capture, self._known, acquisition = capture, known, capture.acquisition
-        self._pixels = np.random.default_rng(0).permutation(total.size)[:_SAMPLE]
+        pixels = np.random.default_rng(0).permutation(total.size)[:_SAMPLE]
+        self._sample = _of_counts(capture, capture.cube[0, pixels])
         top = 2 * float(known.levels[-1])
         count = int(np.clip(math.ceil(2 * math.sqrt(top * n_pulses)), 12, 40))
         self._levels = np.linspace(0.0, math.sqrt(top), count + 1) ** 2
-        signal = max(float(known.share @ known.levels), top / 1e3)
-        background = max(float(total.mean()) - signal, 0.5 / n_pulses)
-        chance = math.sqrt(float(total.mean()) / n_pulses / self._pixels.size)
-        half = min(4 * chance / background, 1.0)
-        self.box = Box(
-            low=(math.log(background) - half, 0.6 * math.sqrt(signal)),
-            high=(math.log(background) + half, 1.3 * math.sqrt(signal)),
-            least=(math.log(1e-4 / n_pulses / self._pixels.size), 0.0),  # beyond: no bound
-            most=(math.log(1000 * (background + top + acquisition.n_bins)), math.sqrt(top)),
+        self._known = known._replace(
+            levels=self._levels,
+            share=np.full(self._levels.size, 1 / self._levels.size),
+            # Without pile-up, the likelihood averaged over uniform delays is the same wherever
+            # the echoes lie; a distribution learned from few photons would bias it.
+            depth=known.depth if capture.gated_pulses else np.ones_like(known.depth),
+            own_weight=_own_weight(capture, known),
         )
-        self._tabulate(self.box.low[0], self.box.high[0])
+        mean = max(float(known.share @ known.levels), top / 1e3)
+        bright = max(mean / float(known.share[1:].sum()), mean)
+        background = max(float(total.mean()) - mean, 0.5 / n_pulses)
+        chance = math.sqrt(float(total.mean()) / n_pulses / pixels.size)
+        half = min(4 * chance / background, 1.0)
+        fit = fit_pulse(
+            lambda pulse, at: self._score(pulse, math.log(background) + at * half),
+            capture.pulse,
+            _BACKGROUNDS,
+            capture.acquisition.bin_width_s / _SAMPLES_PER_BIN,
+        )
+        self.pulse, centre = fit.pulse, math.log(background) + fit.background * half
+        box = Box(
+            low=(centre - half, 0.6 * math.sqrt(mean)),
+            high=(centre + half, 1.3 * math.sqrt(mean)),
+            least=(math.log(1e-4 / n_pulses / pixels.size), 0.0),  # beyond: no bound
+            most=(
+                math.log(1000 * (background + top + capture.acquisition.n_bins)),
+                math.sqrt(top),
+            ),
+        )
+        self._tabulate(box.low[0], box.high[0])
+        box, self.image = self._estimated(box, of_target=False)
+        bright = min(math.sqrt(bright), box.most[1] / 2)
+        box = box._replace(low=(box.low[0], 0.8 * bright), high=(box.high[0], 1.2 * bright))
+        self.target = self._estimated(box, of_target=True)[1]
+
+    def _estimated(self, box: Box, of_target: bool) -> tuple[Box, FluxEstimate]:
+        """Estimate the fluxes of the mean pixel, or of the mean target pixel, from a box."""
+        acquisition = self._sample.acquisition
+
+        def surface(log_background: Floats, root_signal: Floats) -> Floats:
+            return self._log_likelihood(log_background, root_signal**2, of_target)
+
+        box = zoomed(box, surface, _COARSE[of_target])
+        # The tail of an echo beyond its taps is not background.
+        echo, _ = self.pulse.taps(acquisition.n_bins, acquisition.bin_width_s)
+        missed = max(1 - float(echo.sum()), 0.0)
+
+        def flux_at(log_background: Floats, root_signal: Floats) -> tuple[Floats, Floats]:
+            background, signal = np.meshgrid(np.exp(log_background), root_signal**2, indexing="ij")
+            background = np.maximum(background - missed * signal, 0.0)
+            if box.low[0] == box.least[0]:
+                background[0] = 0.0
+            if box.high[0] == box.most[0]:
+                background[-1] = np.inf
+            return signal, background
+
+        return box, spans(box, surface(*box.grid(_FINE[of_target])), flux_at)
+
+    def _score(self, pulse: Pulse, log_background: float) -> float:
+        """Log likelihood of pulse and background, maximised over the shares of the levels."""
+        log = self._level_likelihoods(pulse, log_background, _TRIAL_SAMPLE, _TRIAL_STEPS)
+        top = log.max(axis=1, keepdims=True)
+        likelihood, share = np.exp(log - top), self._known.share.copy()
+        learn_shares(likelihood, share)
+        return float(np.log(likelihood @ share).sum() + top.sum())
 
     def _tabulate(self, low: float, high: float) -> None:
         """Tabulate log likelihoods of the levels between two backgrounds (as logarithms)."""
         self._nodes = np.linspace(low, high, _NODES)
-        self._logs = np.stack([self._log_likelihoods(math.exp(each)) for each in self._nodes])
-
-    def _log_likelihoods(self, background: float) -> Floats:
-        """Log likelihood of each level, shape (pixel, level)."""
-        flux_prior = self._known._replace(
-            levels=self._levels,
-            share=np.full(self._levels.size, 1 / self._levels.size),
-            background=np.asarray(background),
+        self._logs = np.stack(
+            [self._level_likelihoods(self.pulse, each, _SAMPLE, _STEPS) for each in self._nodes]
         )
-        return level_likelihoods(self._capture, self._pixels, flux_prior, _STEPS)
 
-    def __call__(self, log_background: Floats, root_signal: Floats) -> Floats:
+    def _level_likelihoods(
+        self, pulse: Pulse, log_background: float, n_pixels: int, delays_per_echo: float
+    ) -> Floats:
+        """Log likelihood of each level in the first pixels, shape (pixel, level)."""
+        sample, pixels = replace(self._sample, pulse=pulse), np.arange(self._sample.shape[1])
+        begin_s, end_s = pulse.span_s
+        steps = math.ceil(
+            delays_per_echo * self._sample.acquisition.bin_width_s / (end_s - begin_s)
+        )
+        steps = min(steps, _MOST_STEPS)
+        prior = self._known._replace(background=np.asarray(math.exp(log_background)))
+        return level_likelihoods(sample, pixels[:n_pixels], prior, steps)
+
+    def _log_likelihood(self, log_background: Floats, signal: Floats, of_target: bool) -> Floats:
         """Log likelihood, shape (background, signal)."""
         if log_background[0] < self._nodes[0] or log_background[-1] > self._nodes[-1]:
             self._tabulate(log_background[0], log_background[-1])
-        return np.stack([self._of_signals(each, root_signal**2) for each in log_background])
+        return np.stack([self._of_signals(each, signal, of_target) for each in log_background])
 
-    def _of_signals(self, log_background: float, signal: Floats) -> Floats:
+    def _of_signals(self, log_background: float, signal: Floats, of_target: bool) -> Floats:
         log = np.tensordot(_lagrange(self._nodes, log_background), self._logs, axes=1)
         top = log.max(axis=1, keepdims=True)
         # A few pixels at a time: larger products start threads, which take longer.
         parts = np.array_split(np.exp(log - top), math.ceil(len(log) / _PIXELS_AT_ONCE))
 
         def fit(share: Floats, shape: Floats) -> Floats:
-            weights = _gamma_weights(self._levels, signal, share, shape)
+            bright = signal[:, np.newaxis, np.newaxis] / (1.0 if of_target else share)
+            weights = _gamma_weights(self._levels, bright, share, shape)
             tried = np.swapaxes(weights.reshape(signal.size, -1, self._levels.size), 1, 2)
             found = sum(np.log(np.maximum(part @ tried, 1e-300)).sum(axis=1) for part in parts)
             return np.asarray(found).reshape(weights.shape[:-1])
 
-        least_share = np.clip(signal / self._levels[-1], _LEAST_SHARE, 1.0)
-        return np.asarray(_largest(fit, least_share) + top.sum())
+        least = np.zeros(signal.size) if of_target else signal / self._levels[-1]
+        return np.asarray(_largest(fit, np.clip(least, _LEAST_SHARE, 1.0)) + top.sum())
 
 
+_BACKGROUNDS = np.array([-5.0, -2.5, -1.0, 0.0, 1.0, 2.5])  # from the first guess
+_SAMPLES_PER_BIN = 4
+_TRIAL_SAMPLE = 256  # pixels to which a pulse is fitted
 _NODES = 4
 _PIXELS_AT_ONCE = 128
 _LEAST_SHARE = 1e-6  # of pixels with an echo
-_STEPS = 2  # delays per bin
+_STEPS, _TRIAL_STEPS = 6.0, 3.0  # delays per width of an echo, which is its middle 80 %
+_MOST_STEPS = 8  # delays per bin
 _SHAPES = (0.3, 3000.0)  # of gamma distributions, from mostly faint pixels to equal ones
 _TRIED, _ZOOMS = 5, 7
+
+
+def _own_weight(capture: Capture, known: FluxPrior) -> float:
+    """Weight of a pixel's own background; for photons, 0 unless it is significant.
+
+    Few photons say little of the background of their pixel. The variance of the signals is that of
+    a sample, and only what it leaves of the variance of the totals is due to backgrounds.
+    """
+    if capture.gated_pulses is not None:
+        return known.own_weight
+    squares = (capture.counts - capture.counts.mean()) ** 2
+    chance = math.sqrt(float(squares.var()) / min(squares.size, _SAMPLE))
+    return known.own_weight if known.own_weight * float(squares.mean()) > 3 * chance else 0.0
 
 
 def _lagrange(nodes: Floats, x: float) -> Floats:
@@ -215,13 +398,12 @@ def _largest(fit: Callable[[Floats, Floats], Floats], least_share: Floats) -> Fl
     return best
 
 
-def _gamma_weights(levels: Floats, mean: Floats, share: Floats, shape: Floats) -> Floats:
-    """Share of the pixels at each level, (signal, share, shape, level), with given means.
+def _gamma_weights(levels: Floats, bright: Floats, share: Floats, shape: Floats) -> Floats:
+    """Share of the pixels at each level, (signal, share, shape, level).
 
-    A share of gamma distributed signals, each split between its two adjacent levels so that the
-    mean is preserved; the rest has no signal.
+    A share of gamma distributed signals of mean `bright`, each split between its two adjacent
+    levels so that the mean is preserved; the rest has no signal.
     """
-    bright = mean[:, np.newaxis, np.newaxis] / share  # mean of pixels with an echo
     x = levels * (shape / np.maximum(bright, 1e-12 * levels[-1]))[..., np.newaxis]
     k = np.broadcast_to(shape[..., np.newaxis], x.shape)
     below = scipy.special.gammainc(k, x)  # share of the signals below each level
@@ -229,7 +411,7 @@ def _gamma_weights(levels: Floats, mean: Floats, share: Floats, shape: Floats) -
     moment = (below - at_level) * bright[..., np.newaxis]
     mass = np.diff(below)
     upper = (np.diff(moment) - mass * levels[:-1]) / np.diff(levels)
-    weights = np.zeros_like(x)
+    weights = np.zeros(np.broadcast_shapes(x.shape, (*share.shape, 1)))
     weights[..., 1:] += upper
     weights[..., :-1] += mass - upper
     weights[..., -1] += 1 - below[..., -1]

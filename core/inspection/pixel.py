@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,26 +17,33 @@ from core.checks import require
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.inference.faults import PixelVerdict, pixel_verdict
+from core.inference.intervals import pixel_range_intervals
 from core.inference.likelihood import rate_and_n_armed
-from core.inference.posterior import posterior_of
+from core.inference.posterior import same_echo_bins, tolerance_probability_at
 from core.inspection.flux import METHOD, estimate_flux
 from core.inspection.profile import FluxEstimate, OldFluxNames
+from core.metrics import Interval
 
 MOST_CANDIDATES = 5
 
 
 @dataclass(frozen=True)
 class RangeCandidate:
-    """A possible delay of the surface: a peak of an estimator's score."""
+    """A possible delay of the surface: a peak of an estimator's score.
+
+    Peaks within one pulse, or 3 bins, of each other or of the estimate are one candidate, that of
+    the highest score.
+    """
 
     bin: float
-    """Delay in fractional bins, corrected for the lag of the estimator."""
+    """Delay in fractional bins, corrected for the lag of the estimator; that of the estimate for
+    the candidate that is the estimate."""
     range_m: float
     score: float
     relative: float
     """Score over that of the best candidate; 1 for that one."""
     probability: float
-    """Probability of a surface within 3 bins (`core.inference.posterior`)."""
+    """Probability of a surface within 3 bins, which for the estimate is its confidence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +70,10 @@ class PixelReport(OldFluxNames):
     answer_m: float
     """Range in the range image, likewise."""
     confidence: float
+    interval_68_m: Interval
+    """Estimate with the 68 % interval of the range of the surface (`core.range_interval`)."""
+    interval_95_m: Interval
+    """Estimate with the 95 % interval, likewise."""
     candidates: tuple[RangeCandidate, ...]
     """Highest peaks of the score, in descending order; empty without detections."""
     find_flux: Callable[[], FluxEstimate] = field(repr=False)
@@ -82,6 +94,23 @@ class PixelReport(OldFluxNames):
         In photons per pulse if the number of pulses is known, otherwise in photons.
         """
         return self.find_flux()
+
+    @property
+    def interval_text(self) -> str:
+        """Range of the surface with its intervals, as text; a dash without an estimate.
+
+        Such as ``12.341 m ± 0.053 m (68 %), 12.236 to 12.448 m (95 %)``: the middle of the 68 %
+        interval and half its width, which has two significant digits.
+        """
+        inner, outer = self.interval_68_m, self.interval_95_m
+        half_m, middle_m = (inner.high - inner.low) / 2, (inner.high + inner.low) / 2
+        if not half_m > 0:
+            return "–"
+        digits = max(0, 1 - math.floor(math.log10(half_m)))
+        return (
+            f"{middle_m:.{digits}f} m ± {half_m:.{digits}f} m (68 %), "
+            f"{outer.low:.{digits}f} to {outer.high:.{digits}f} m (95 %)"
+        )
 
 
 def pixel_report(
@@ -115,6 +144,7 @@ def pixel_report(
     counts = capture.cube[row, col].astype(float)
     curve = ESTIMATORS[method].curves(capture, row, col, settings)
     lag = lag_bins(capture, method, settings)
+    interval_68_m, interval_95_m = pixel_range_intervals(capture, image, row, col, (0.68, 0.95))
 
     def find_flux() -> FluxEstimate:
         found = estimate_flux(counts, capture.acquisition, capture.pulse, capture.gated_pulses)
@@ -132,7 +162,9 @@ def pixel_report(
         answer_bin=float(image.bin[row, col]),
         answer_m=float(image.range_m[row, col]),
         confidence=float(image.confidence[row, col]),
-        candidates=_candidates(capture, row, col, curve, lag),
+        interval_68_m=interval_68_m,
+        interval_95_m=interval_95_m,
+        candidates=_candidates(capture, row, col, curve, lag, float(image.bin[row, col])),
         find_flux=find_flux,
         flux_unit=flux_unit(capture),
         flux_method=METHOD,
@@ -153,19 +185,34 @@ def lag_bins(capture: Capture, method: str, settings: Any) -> float:
 
 
 def _candidates(
-    capture: Capture, row: int, col: int, curve: Floats, lag_bins: float
+    capture: Capture, row: int, col: int, curve: Floats, lag_bins: float, estimate_bin: float
 ) -> tuple[RangeCandidate, ...]:
     if not capture.counts[row, col]:
         return ()
     peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
     peaks = peaks[curve[peaks] > 0]
-    peaks = peaks[np.argsort(-curve[peaks], kind="stable")][:MOST_CANDIDATES]
+    peaks = peaks[np.argsort(-curve[peaks], kind="stable")]
     if not peaks.size:
         return ()
     bins = np.clip(peaks - lag_bins, 0.0, capture.acquisition.n_bins)
-    table = posterior_of(capture).tolerance_probability[row, col]
-    probability = np.clip(np.interp(bins, np.arange(table.size), table), 0.0, 1.0)
+    width_bins = same_echo_bins(capture)
+    is_estimate = np.abs(bins - estimate_bin) < width_bins
+    if is_estimate.any():
+        bins[is_estimate.argmax()] = estimate_bin
+    kept = _apart(bins, width_bins)
+    bins, score = bins[kept], curve[peaks[kept]]
     range_m = capture.acquisition.bin_to_range_m(bins)
-    score = curve[peaks]
+    probability = tolerance_probability_at(capture, row, col, bins)
     columns = (bins, range_m, score, score / score[0], probability)
     return tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
+
+
+def _apart(bins: Floats, width_bins: float) -> list[int]:
+    """Return the indices of the first delays that are at least a width from all before them."""
+    kept: list[int] = []
+    for i, delay in enumerate(bins):
+        if np.all(np.abs(bins[kept] - delay) >= width_bins):
+            kept.append(i)
+        if len(kept) == MOST_CANDIDATES:
+            break
+    return kept

@@ -7,6 +7,7 @@ freedom (Wilks 1938).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -49,11 +50,14 @@ class FluxEstimate(NamedTuple):
 
     def scaled(self, factor: float) -> FluxEstimate:
         """Return the fluxes multiplied by `factor`."""
-        signal, background = (
-            Interval(x.value * factor, x.low * factor, x.high * factor)
-            for x in (self.signal, self.background)
-        )
+        signal, background = (each.scaled(factor) for each in (self.signal, self.background))
         return self._replace(signal=signal, background=background)
+
+    def in_longer_gate(self, factor: float) -> FluxEstimate:
+        """Return the fluxes of a gate `factor` times as long, with as much background per time."""
+        return self._replace(
+            background=self.background.scaled(factor), sbr=self.sbr.scaled(1 / factor)
+        )
 
     def of(self, capture: Capture) -> FluxEstimate:
         """Convert photons of all pulses to photons per pulse if the number of pulses is known."""
@@ -61,6 +65,34 @@ class FluxEstimate(NamedTuple):
         if capture.gated_pulses is not None or n_pulses is None:
             return self
         return self.scaled(1 / n_pulses)
+
+
+def difference_of(one: Interval, other: Interval) -> Interval:
+    """Interval of the difference of independent, non-negative estimates, at least 0.
+
+    From their own intervals (Zou & Donner 2008, "Construction of confidence limits about effect
+    measures").
+    """
+    value = one.value - other.value
+    low = value - math.hypot(one.value - one.low, other.high - other.value)
+    high = value + math.hypot(one.high - one.value, other.value - other.low)
+    return Interval(*(max(each, 0.0) for each in (value, low, high)))
+
+
+def ratio_of(one: Interval, other: Interval) -> Interval:
+    """Interval of the ratio of independent, non-negative estimates: `difference_of` logarithms."""
+    if one.value == 0 or other.value == 0:
+        low = one.low / other.high if other.high > 0 else 0.0
+        high = one.high / other.low if other.low > 0 else math.inf
+        return Interval(math.inf if one.value > 0 else low, low, high)
+    value = one.value / other.value
+    smaller = math.hypot(_log(one.value, one.low), _log(other.high, other.value))
+    larger = math.hypot(_log(one.high, one.value), _log(other.value, other.low))
+    return Interval(value, value * math.exp(-smaller), value * math.exp(larger))
+
+
+def _log(above: float, below: float) -> float:
+    return math.log(above / below) if below > 0 else math.inf
 
 
 class Box(NamedTuple):

@@ -132,8 +132,7 @@ def _summed(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
         capture,
         cube=total.astype(np.uint32)[np.newaxis, np.newaxis],
         acquisition=replace(capture.acquisition, n_pulses=n_pulses and n_pulses * n_pixels),
-        truth_range_m=None,
-        signal=None,
+        **capture.images(lambda _: None),
         source=f"{capture.source}; {n_pixels} pixels added",
         flux_prior=None,
     )

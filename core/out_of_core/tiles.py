@@ -8,10 +8,11 @@ the tiling nor on the worker that processes a tile.
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from time import monotonic
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from core.acquisition import Acquisition, Floats
 from core.capture import Capture, Detection
 from core.checks import require
 from core.estimators import ESTIMATORS, RangeImage, settings_of
-from core.estimators.base import Calibration
+from core.estimators.base import Calibration, Provenance
 from core.inference.flux import flux_prior_of
 from core.inference.flux_model import FluxPrior
 from core.io.readers.dense import AXES, Description, capture_of, whole_counts
@@ -110,7 +111,8 @@ def estimate_large(
         meta=np.empty((0, 0, 0)),
     )
     images = da.overlap.trim_internal(ranged, around, boundary="none")
-    return _dataset(images, description, remark)
+    made_by = Provenance(method, settings, false_alarm, remark)
+    return _dataset(images, description, made_by)
 
 
 def learned(
@@ -142,11 +144,12 @@ def captured(cube: NDArray[Any], description: Description) -> Capture:
     return capture_of(whole_counts(cube, "counts"), description)
 
 
-def _dataset(images: Any, description: Description, remark: str) -> xr.Dataset:
+def _dataset(images: Any, description: Description, made_by: Provenance) -> xr.Dataset:
     import xarray as xr  # noqa: PLC0415
 
     acquisition, _, detection, source = description
-    about = {**vars(acquisition), "detection": detection, "source": source, "remark": remark}
+    about = {**vars(acquisition), "detection": detection, "source": source}
+    about |= {"remark": made_by.remark, **made_by.facts}
     return xr.Dataset(
         {
             name: (AXES[:2], images[..., k], {"long_name": meaning, "units": unit})
@@ -260,4 +263,13 @@ def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:
     overview = Overview(
         counts, Acquisition(**known), ranged.attrs["detection"], ranged.attrs["source"]
     )
-    return overview, RangeImage(**images, valid=np.isfinite(images["range_m"]))
+    made_by = _made_by(ranged.attrs)
+    return overview, RangeImage(**images, valid=np.isfinite(images["range_m"]), made_by=made_by)
+
+
+def _made_by(known: Mapping[Any, Any]) -> Provenance | None:
+    """Return the provenance that the attributes of a dataset state; None if they do not."""
+    if "method" not in known:
+        return None
+    settings = settings_of(known["method"], **json.loads(known["settings"]))
+    return Provenance(known["method"], settings, known.get("false_alarm"), known["remark"])

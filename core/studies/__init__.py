@@ -1,10 +1,11 @@
 """Studies that anyone can run again: settings as data, rows as records, tables as Markdown."""
 
 from core.studies import outputs
-from core.studies.outputs import Table, as_csv
+from core.studies.outputs import Table, as_csv, without_nan
 
 __all__ = [
     "Table",
     "as_csv",
     "outputs",
+    "without_nan",
 ]

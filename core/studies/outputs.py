@@ -125,6 +125,14 @@ def as_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
+def without_nan(rows: Iterable[Sequence[Any]]) -> list[list[Any]]:
+    """Return the rows of a table for `as_csv` with empty cells in place of NaN."""
+    return [
+        [None if isinstance(cell, float) and math.isnan(cell) else cell for cell in row]
+        for row in rows
+    ]
+
+
 def _ends(value: Any) -> Sequence[Any]:
     return astuple(value) if isinstance(value, Interval) else (value, "", "")
 

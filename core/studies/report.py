@@ -13,11 +13,12 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from core.io import OUTSIDE_COLOR, RangeColors, colors_of
 from core.studies.outputs import (
     Item,
     Pictures,
@@ -190,9 +191,13 @@ def _draw_pictures(pictures: Pictures) -> Figure:
     grid = figure.subplots(down, across, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
-    colors = Normalize(pictures.low, pictures.high)
+    scale = Normalize(pictures.low, pictures.high)
+    colors = ListedColormap(colors_of(RangeColors().color_map)).with_extremes(
+        under=OUTSIDE_COLOR, over=OUTSIDE_COLOR
+    )
     for axes, (name, image) in zip(grid.flat, pictures.images.items(), strict=False):
-        axes.imshow(image, norm=colors, cmap="viridis", interpolation="nearest")
+        axes.imshow(image, norm=scale, cmap=colors, interpolation="nearest")
         axes.set_title(name, fontsize=10)
-    figure.colorbar(ScalarMappable(colors, "viridis"), ax=grid, label=pictures.label, shrink=0.7)
+    mappable = ScalarMappable(scale, colors)
+    figure.colorbar(mappable, ax=grid, label=pictures.label, shrink=0.7, extend="both")
     return figure

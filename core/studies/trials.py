@@ -240,20 +240,24 @@ def mapped(
     if processes == 1 and not in_new_process:
         yield from ((piece, work(piece)) for piece in pieces)
         return
-    # A forked process would inherit the state of kernel threads without the threads.
-    pool = ProcessPoolExecutor(
-        processes,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=numba.set_num_threads,
-        initargs=(1,),
-    )
-    with pool:
+    with process_pool(processes) as pool:
         futures = {pool.submit(work, piece): piece for piece in pieces}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def process_pool(processes: int) -> ProcessPoolExecutor:
+    """Return a pool of new processes, each of which runs kernels on one thread."""
+    # A forked process would inherit the state of kernel threads without the threads.
+    return ProcessPoolExecutor(
+        processes,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=numba.set_num_threads,
+        initargs=(1,),
+    )
 
 
 def _score_piece(piece: _Piece) -> _Scores:

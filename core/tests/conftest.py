@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import numba
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import settings
 
 from core.tests.captures import real_capture_path
+from core.tests.garbage import pytest_collection, pytest_collection_finish  # noqa: F401 - hooks
 
 # The same examples on every run; a kernel's first call compiles it, so no example has a deadline.
 settings.register_profile("core", derandomize=True, deadline=None)
@@ -37,6 +39,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         left_out = [item for item in items if any(map(item.get_closest_marker, marks))]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Count no lines in tests marked so; pytest-cov's own mark has no effect in its workers."""
+    tracer = sys.gettrace()
+    if item.get_closest_marker("uncounted"):
+        sys.settrace(None)
+    try:
+        return (yield)
+    finally:
+        sys.settrace(tracer)
 
 
 @pytest.fixture

@@ -27,6 +27,7 @@ from core.tests.instruments import (
     sdt_bytes,
     split,
     tmf8820_bytes,
+    tmf8829_bytes,
 )
 from core.tests.labelled_files import Matlab73, hdf5_bytes, netcdf_bytes, zarr_files
 from core.tests.samples import (
@@ -53,16 +54,20 @@ CUBES_REFUSE = (
     {"no_trigger": 0},
     {"shape": (3, 4)},
     {"first_detections": 7},
+    {"records": 0},
 )
 ARRAYS_REFUSE = tuple(each for each in CUBES_REFUSE if "no_trigger" not in each)
+SEQUENCES_REFUSE = tuple(each for each in CUBES_REFUSE if "records" not in each)
 FRAMES_REFUSE = (
     {"n_bins": 50},
     {"n_pulses": 499},
     {"time_unit_s": 1e-12},
     {"shape": (3, 4)},
     {"first_detections": 7},
+    {"records": 500},
+    {"records": (3, 500)},
 )
-TIMES_REFUSE = ({"no_trigger": 0}, {"shape": (3, 4)})
+TIMES_REFUSE = ({"no_trigger": 0}, {"shape": (3, 4)}, {"records": 0})
 
 
 @dataclass(frozen=True)
@@ -181,12 +186,14 @@ FORMATS: dict[str, Format] = {
     "mat cube of doubles": Format("c.mat", lambda: mat_bytes(True, counts=CUBE * 1.0)),
 }
 
-# Files of instruments give the bin width, except those of the TMF8820, always 91 ps.
+# Files of instruments give the bin width, except those of the TMF8820 and TMF8829.
 GATE = {"guesses": ("gate 0-100 ns", "pulse Gaussian of 1 ns")}
+ONE_FRAME = {"refuses": (*SEQUENCES_REFUSE, {"records": 1}, {"records": (0, 1)})}
+TWO_FRAMES = {"refuses": (*SEQUENCES_REFUSE, {"records": 2}, {"records": (0, 2)})}
 FORMATS |= {
-    "ptu": Format("c.ptu", lambda: ptu_bytes(CUBE), **GATE),
+    "ptu": Format("c.ptu", lambda: ptu_bytes(CUBE), **GATE, **ONE_FRAME),
     "ptu of frames and channels": Format(
-        "c.ptu", lambda: ptu_bytes(split(CUBE)), guesses=("gate 0-100 ns",)
+        "c.ptu", lambda: ptu_bytes(split(CUBE)), guesses=("gate 0-100 ns",), **TWO_FRAMES
     ),
     "sdt": Format("c.sdt", lambda: sdt_bytes(CUBE), **GATE),
     "sdt, compressed": Format(
@@ -197,6 +204,14 @@ FORMATS |= {
         lambda: tmf8820_bytes(CUBE),
         acquisition=replace(ACQUISITION, bin_width_s=91e-12),
         guesses=("bin width 91 ps", "zero range 1.1 ns after the first bin"),
+        refuses=(*SEQUENCES_REFUSE, {"records": 3}, {"records": (0, 3)}),
+    ),
+    "tmf8829": Format(
+        "c.json",
+        lambda: tmf8829_bytes(CUBE),
+        acquisition=replace(ACQUISITION, bin_width_s=820e-12),
+        guesses=("bin width 820 ps", "zero range 2.87 ns after the first bin"),
+        refuses=(*SEQUENCES_REFUSE, {"records": 3}, {"records": (0, 3)}),
     ),
 }
 
@@ -243,6 +258,7 @@ SPARSE: dict[str, Any] = {
         {"no_trigger": 0},
         {"shape": (4, 4)},
         {"first_detections": 7},
+        {"records": 0},
     ),
 }
 OWN: dict[str, Any] = {"guesses": ()}

@@ -122,3 +122,18 @@ def tmf8820_records(cube: NDArray[Any]) -> list[dict[str, Any]]:
 def tmf8820_bytes(cube: NDArray[Any]) -> bytes:
     """Histograms (record, zone, bin), without a reference."""
     return json.dumps(tmf8820_records(cube)).encode()
+
+
+def tmf8829_log(cubes: NDArray[Any], **of_records: Any) -> dict[str, Any]:
+    """A log of histograms (record, row, col, bin), without reference, results or configuration."""
+    records = [
+        {"info": {}, "mp_histo": [[{"bin": bins} for bins in row] for row in cube], **of_records}
+        for cube in cubes.tolist()
+    ]
+    return {"Result_Set": records, "info": []}
+
+
+def tmf8829_bytes(cube: NDArray[Any], n_records: int = 3) -> bytes:
+    """A log of which the records add up to counts (row, col, bin)."""
+    shares = np.random.default_rng(5).multinomial(cube, np.full(n_records, 1 / n_records))
+    return json.dumps(tmf8829_log(np.moveaxis(shares, -1, 0))).encode()

@@ -21,4 +21,5 @@ EXAMPLES: dict[str, Any] = {
     "stop_s": 0.5,
     "no_trigger": -1,
     "first_detections": 3,
+    "records": (3, 7),
 }

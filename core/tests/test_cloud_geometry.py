@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from core.geometry import points_m, sight_lines
+from core.geometry import distance_m, points_m, sight_lines
 
 ANGLE = 2e-3
 
@@ -80,3 +80,23 @@ def test_an_impossible_angle_is_refused(angle: float) -> None:
 def test_ranges_of_another_shape_are_refused() -> None:
     with pytest.raises(ValueError, match=r"range_m = 'shape \(3,\)'.*image \(row, col\)"):
         points_m([1.0, 2.0, 3.0], ANGLE)
+
+
+def test_a_distance_follows_the_law_of_cosines_and_its_margin_the_scatter() -> None:
+    rng, sigma_m = np.random.default_rng(0), np.array([0.02, 0.05])
+    lines = sight_lines((9, 9), 0.1)[[2, 7], [1, 6]]
+    range_m, angle_rad = np.array([5.0, 6.5]), float(angle_between(*lines))
+    length_m, margin_m = distance_m(lines, range_m, sigma_m)
+    near, far = range_m
+    assert length_m == pytest.approx(
+        np.sqrt(near**2 + far**2 - 2 * near * far * np.cos(angle_rad)), rel=1e-12
+    )
+    drawn_m = range_m + sigma_m * rng.standard_normal((4000, 2))
+    points = drawn_m[..., np.newaxis] * lines
+    scatter_m = np.linalg.norm(points[:, 1] - points[:, 0], axis=1).std()
+    assert margin_m == pytest.approx(scatter_m, rel=5 / np.sqrt(2 * 4000))
+
+
+def test_one_point_is_as_far_from_itself_as_its_range_is_uncertain() -> None:
+    line = sight_lines((3, 3), ANGLE)[1, 1]
+    assert distance_m([line, line], [7.0, 7.0], [0.3, 0.4]) == (0.0, pytest.approx(0.5))

@@ -17,9 +17,11 @@ from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.cli import main
 from core.estimators import estimate
+from core.geometry import guessed_field_of_view_deg, pixel_angle_of
+from core.inference import range_interval
 from core.io import readers
 from core.io.readers import Reader, read_capture
-from core.io.writers import CAPTURE_SUFFIXES, save_capture
+from core.io.writers import CAPTURE_SUFFIXES, WRITERS, save_capture
 from core.out_of_core.tiles import IMAGES
 from core.scene import scenes
 from core.simulation import simulate
@@ -70,6 +72,31 @@ def test_info_shows_contents_and_assumptions(
     assert "axes (row, col, bin), bin width 1 ns" in out
 
 
+def test_info_lists_hot_and_dead_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    counts = np.full((9, 15, 10), 20, np.uint16)
+    counts[1::3, 1:14:2] = 90  # no two beside each other
+    counts[4, 4] = 0
+    path = tmp_path / "worn.npz"
+    save_capture(Capture(counts, Acquisition(10, n_pulses=2000)), path)
+    found = facts(capsys, "info", path)
+    assert found["hot_pixels"] == len(found["hot_pixels_at"]) == 21
+    assert found["dead_pixels_at"] == [
+        {
+            "row": 4,
+            "col": 4,
+            "health": "dead",
+            "counts": 0,
+            "neighbours_least": 200,
+            "neighbours_most": 900,
+        }
+    ]
+    _, out, _ = ran(capsys, "info", path)
+    lines = [line.strip() for line in out.splitlines()]
+    assert sum("health hot, counts 900" in line for line in lines) == 10
+    assert "and 11 more: --json has all" in lines
+    assert any(line.startswith("dead_pixels_at") and "row 4, col 4" in line for line in lines)
+
+
 def test_info_reports_on_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = scenes["staircase"](8)
     capture = simulate(scene, Acquisition(n_pulses=200), Flux(0.3, sbr=1.0), seed=3)
@@ -78,11 +105,18 @@ def test_info_reports_on_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[st
     found = facts(capsys, "info", path)
     assert found["signal_low"] < 0.3 < found["signal_high"]
     assert found["sbr_low"] <= found["sbr"] <= found["sbr_high"]
+    for name in ("target_signal", "target_sbr"):
+        assert found[f"{name}_low"] <= found[name] <= found[f"{name}_high"]
+    assert "empty" in found["flux_mean_over"] and "target" in found["target_flux_mean_over"]
+    assert "background" in found["flux_remark"]
     assert found["hot_pixels"] == found["dead_pixels"] == 0
     assert found["suggested_gate_first_bin"] < found["suggested_gate_end_bin"] <= 100
     pixel = facts(capsys, "info", path, "--pixel", 2, 3)
     assert pixel["photons"] == capture.counts[2, 3]
     assert pixel["candidate_1_range_m"] == pixel["range_m"]
+    assert pixel["candidate_1_probability"] == pixel["confidence"]
+    assert pixel["range_low_m"] < pixel["range_low_68_m"] < pixel["range_high_68_m"]
+    assert pixel["interval"].endswith(f"{pixel['range_high_m']:.3f} m (95 %)")
     assert pixel["verdict"] == "ordinary"
     code, _, err = ran(capsys, "info", path, "--pixel", 8, 0)
     assert code == 2 and "row, col = (8, 0)" in err
@@ -124,8 +158,10 @@ def test_estimate_writes_what_it_reports(
     car: Capture, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, tif, las = tmp_path / "car.npz", tmp_path / "car.tif", tmp_path / "car.las"
+    npz = tmp_path / "image.npz"
     save_capture(car, path)
-    arguments = ("--capture", path, "--false-alarm", 0.01, "--out", tif, "--out", las)
+    outputs = ("--out", tif, "--out", las, "--out", npz, "--intervals")
+    arguments = ("--capture", path, "--false-alarm", 0.01, *outputs)
     found = facts(capsys, "estimate", "cfar", *arguments, "--guard-bins", 4)
     image = estimate(car, "cfar", false_alarm=0.01, guard_bins=4)
     assert found["pixels_estimated"] == image.valid.sum()
@@ -133,6 +169,15 @@ def test_estimate_writes_what_it_reports(
     assert "guard_bins=4" in found["settings"]
     np.testing.assert_allclose(tifffile.imread(tif)[0], image.range_m, rtol=1e-6)
     assert las.stat().st_size > 20 * image.valid.sum()
+    with np.load(npz) as archive:
+        np.testing.assert_array_equal(archive["range_low_m"], range_interval(car, image).low_m)
+    sure, given = tmp_path / "sure.npz", ("--least-confidence", 0.99, "--overwrite")
+    more = facts(capsys, "estimate", "peak", *arguments[:2], *given, "--out", sure)
+    peak = estimate(car, "peak")
+    assert more["pixels_estimated"] == peak.valid.sum()
+    with np.load(sure) as archive:
+        np.testing.assert_array_equal(archive["valid"], peak.confident(0.99).valid)
+        assert (archive["method"], archive["settings"]) == ("peak", "{}")
     arguments = ("--t-n", 30, "--weight", "none", "--sbr", 0.2, "--seed", 1)
     found = facts(capsys, "estimate", "tracking", *arguments)
     image = estimate(car, "tracking", t_n=30, weight="none")
@@ -184,7 +229,12 @@ def test_a_pixel_or_a_capture_is_exported(frames: Path, capsys: pytest.CaptureFi
     counts = np.load(frames)
     out, *captures = (frames.with_name(name) for name in ("pixel.csv", "a.nc", "a.npz"))
     assert ran(capsys, "export", frames, out, "--pixel", 1, 2, *READING)[0] == 0
-    lines = out.read_text().splitlines()
+    comments, lines = (
+        [line for line in out.read_text().splitlines() if line.startswith("#") == marked]
+        for marked in (True, False)
+    )
+    assert comments[0] == "# method: tracking"
+    assert comments[-1].startswith("# source: counts.npy")
     assert lines[0].split(",")[:4] == ["bin", "time_s", "range_m", "counts"]
     assert [int(line.split(",")[3]) for line in lines[1:]] == counts[:, 1, 2].tolist()
     code, _, err = ran(capsys, "export", frames, captures[1], "--pixel", 1, 2, *READING)
@@ -203,6 +253,7 @@ def test_a_pixel_or_a_capture_is_exported(frames: Path, capsys: pytest.CaptureFi
         (("estimate", "peak", "--out", "nowhere/a.npz"), 1, "nowhere is not a folder"),
         (("estimate", "cfar", "--guard-bins", "-1"), 2, "guard_bins = -1"),
         (("estimate", "peak", "--scheduler", "tcp://a:1"), 2, "needs a --capture"),
+        (("estimate", "peak", "--scheduler", "a", "--intervals"), 2, "intervals = True"),
         (("export", "{frames}", "{frames}"), 2, "suffix = '.npy'"),
         (("simulate", "--scene", "absent.stl", "--out", "a.npz"), 2, "absent.stl"),
         (("simulate", "--sbr", "0", "--out", "a.npz"), 2, "sbr = 0"),
@@ -213,11 +264,6 @@ def test_a_pixel_or_a_capture_is_exported(frames: Path, capsys: pytest.CaptureFi
             ("estimate", "peak", "--capture", "{frames}", "--sbr", "1"),
             2,
             "a capture has its own flux",
-        ),
-        (
-            ("estimate", "peak", "--capture", "{frames}", "--out", "a.las"),
-            2,
-            "--pixel-angle = None",
         ),
         (
             ("info", "{frames}", "--gate-delay=5ns", "--first-detections", "3"),
@@ -268,6 +314,71 @@ def test_failures_of_the_machine_and_interrupts_have_their_own_codes(
     monkeypatch.setattr("core.cli.captures.save_capture", fail)
     found, _, err = ran(capsys, "export", frames, frames.with_name("a.npz"))
     assert (found, message in err) == (code, True)
+
+
+@pytest.mark.parametrize("command", ["estimate", "export", "simulate"])
+def test_outputs_that_can_be_written_are_written(
+    command: str, frames: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(frames.parent)
+    frames.with_name("there.nc").write_bytes(b"older")
+    names = ("a.npz", "there.nc", "c.xyz", "nowhere/a.nc", "d.h5")
+    arguments = {
+        "estimate": ("estimate", "peak", "--capture", frames, *READING),
+        "simulate": ("simulate", "--scene", "staircase", "--size", 8),
+        "export": ("export", frames, *READING),
+    }[command]
+    flag = ["--out"] if command != "export" else []
+    outputs = [each for name in names for each in (*flag, name)]
+    code, out, err = ran(capsys, *arguments, *outputs)
+    assert code == 1
+    assert out.splitlines()[-1].split() == ["written", "a.npz,", "d.h5"]
+    reasons = err.strip().splitlines()[-4:]
+    assert reasons[0] == "Not written, unlike the other files:"
+    assert [each.partition(": ")[0] for each in reasons[1:]] == list(names[1:4])
+    for reason, words in zip(reasons[1:], ("exists", "suffix = '.xyz'", "no"), strict=True):
+        assert words in reason
+    assert frames.with_name("there.nc").read_bytes() == b"older"
+    with np.load("a.npz") as archive:
+        assert "source" in archive
+
+
+def test_a_cloud_states_that_its_width_is_guessed(
+    frames: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(frames.parent)
+    given = ("estimate", "peak", "--capture", frames, *READING, "--out", "a.ply", "--out", "a.npz")
+    found = facts(capsys, *given)
+    capture = read_capture(frames, axes="bin row col")
+    image = estimate(capture, "peak")
+    width_deg = guessed_field_of_view_deg(image.range_m, image.confidence, capture.acquisition)
+    text = f"a field of view of {width_deg:g} degrees, which the capture does not state"
+    assert found["cloud"].endswith(text)
+    header = Path("a.ply").read_bytes().partition(b"end_header")[0].decode()
+    assert text in header
+    assert f"pixel_angle_rad: {pixel_angle_of(width_deg, 5)!r}" in header
+    with np.load("a.npz") as archive:
+        assert "pixel_angle_rad" not in archive  # only clouds need the guess
+    found = facts(capsys, *given, "--overwrite", "--pixel-angle", "1mrad")
+    assert "cloud" not in found
+    header = Path("a.ply").read_bytes().partition(b"end_header")[0].decode()
+    assert "pixel_angle_rad: 0.001\n" in header and "guess:" not in header
+
+
+def test_a_full_disk_costs_one_output_and_not_the_others(
+    frames: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.chdir(frames.parent)
+    monkeypatch.setitem(WRITERS, ".tif", full)
+    given = ("estimate", "peak", "--capture", frames, *READING)
+    code, out, err = ran(capsys, *given, "--out", "a.tif", "--out", "b.npz")
+    assert code == 1
+    assert out.splitlines()[-1].split() == ["written", "b.npz"]
+    assert "a.tif: a.tif cannot be written (No space left on device)" in err
+    assert sorted(path.name for path in frames.parent.iterdir()) == ["b.npz", frames.name]
 
 
 def test_a_file_that_the_machine_cannot_read_is_no_bad_input(

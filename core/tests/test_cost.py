@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,17 +17,36 @@ from core.cost import predicted
 MB = 10**6
 
 MEASURE = """
-import sys
+import os, sys
 from core.studies.performance.costs import measured
-rows, cols, n_bins = map(int, sys.argv[2:])
-print(measured((rows, cols, n_bins), sys.argv[1]).working_bytes)
+for line in sys.stdin:
+    method, *shape = line.split()
+    if os.fork() == 0:
+        print(measured(tuple(map(int, shape)), method).working_bytes, flush=True)
+        os._exit(0)
+    if os.wait()[1]:
+        print("failed", flush=True)
 """
 
 
-def working_bytes(method: str, *shape: int) -> int:
-    """Peak of an estimate beyond what a fresh process held before."""
-    command = [sys.executable, "-c", MEASURE, method, *map(str, shape)]
-    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+@pytest.fixture(scope="module")
+def working_bytes() -> Iterator[Callable[..., int]]:
+    """Function that measures the peak of an estimate beyond what a fresh process held before.
+
+    Each is measured in a process of its own, all forked from one that has the libraries loaded.
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", MEASURE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as forking:
+        assert forking.stdin is not None and forking.stdout is not None
+        asked, answers = forking.stdin, forking.stdout
+
+        def measured(method: str, *shape: int) -> int:
+            print(method, *shape, file=asked, flush=True)
+            return int(answers.readline())
+
+        yield measured
+        asked.close()
 
 
 def empty(*shape: int) -> Capture:
@@ -34,7 +54,9 @@ def empty(*shape: int) -> Capture:
 
 
 @pytest.mark.parametrize("method", ["tracking", "likelihood", "chi", "unmixing"])
-def test_memory_of_a_long_gate_depends_on_its_pixels(method: str) -> None:
+def test_memory_of_a_long_gate_depends_on_its_pixels(
+    method: str, working_bytes: Callable[..., int]
+) -> None:
     # A block of 64 lanes would take 3.3 kB a bin, for a single pixel: 660 MB.
     assert working_bytes(method, 1, 1, 200_000) < 150 * MB
 
@@ -49,7 +71,9 @@ def test_memory_of_a_long_gate_depends_on_its_pixels(method: str) -> None:
         ("likelihood", (128, 128, 512)),
     ],
 )
-def test_predicted_memory_is_measured(method: str, shape: tuple[int, int, int]) -> None:
+def test_predicted_memory_is_measured(
+    method: str, shape: tuple[int, int, int], working_bytes: Callable[..., int]
+) -> None:
     expected = predicted(shape, method).working_bytes
     assert expected / 3 < working_bytes(method, *shape) < 1.3 * expected
 

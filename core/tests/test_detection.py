@@ -18,6 +18,8 @@ from core.io.readers.dense import guess_detection
 from core.scene import Scene
 from core.simulation import simulate
 
+pytestmark = pytest.mark.uncounted
+
 # Milliseconds a pixel where the kernels are plain Python.
 SIZE = 8 if numba.config.DISABLE_JIT else 40  # rows and columns of captures
 NULL_SIDE = 8 if numba.config.DISABLE_JIT else 64  # of the images on which thresholds are found

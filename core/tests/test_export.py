@@ -6,12 +6,13 @@ import base64
 import csv
 import errno
 import io
+import json
 import os
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 from xml.etree import ElementTree
@@ -27,10 +28,22 @@ from PIL import Image
 import core
 from core.acquisition import Acquisition
 from core.capture import Capture
-from core.estimators import RangeImage
+from core.estimators import Provenance, RangeImage
+from core.estimators.base import NoParameters
 from core.geometry import sight_lines
 from core.io.readers.labelled import dataset
-from core.io.writers import CAPTURE_SUFFIXES, WRITERS, save_capture, save_image, save_pixel
+from core.io.writers import (
+    CAPTURE_SUFFIXES,
+    COLOR_MAPS,
+    FOLDER_WRITERS,
+    OUTSIDE_COLOR,
+    WRITERS,
+    RangeColors,
+    range_scale,
+    save_capture,
+    save_image,
+    save_pixel,
+)
 from core.io.writers.product import Plane, Product
 from core.tracking import TrackingParameters, tracking_signals
 
@@ -91,10 +104,15 @@ def read_npz(path: Path) -> Images:
         return {name: archive[name] for name in archive if archive[name].ndim == 2}
 
 
+def without_comments(lines: Iterable[str]) -> Iterator[str]:
+    return (line for line in lines if not line.startswith("# "))
+
+
 def read_csv(path: Path) -> Images:
-    assert path.read_bytes().count(b"\r\n") == path.read_bytes().count(b"\n") == 1 + ROWS * COLS
+    content = path.read_bytes()
+    assert content.count(b"\r\n") == content.count(b"\n")
     with path.open(newline="", encoding="utf-8") as file:
-        table = list(csv.DictReader(file, strict=True))
+        table = list(csv.DictReader(without_comments(file), strict=True))
     assert list(table[0]) == ["row", "col", "range_m", "confidence", "counts", "valid"]
     pixels = [(int(line["row"]), int(line["col"])) for line in table]
     assert pixels == list(np.ndindex(ROWS, COLS))
@@ -151,7 +169,7 @@ def read_png(path: Path) -> Images:
     with Image.open(path) as picture:
         picture.verify()
         assert picture.format == "PNG"
-        assert min(picture.size) > 200
+        assert picture.width >= 1200
     return {}
 
 
@@ -214,6 +232,23 @@ def test_every_image_is_read_back(tmp_path: Path, suffix: str, image: RangeImage
     if suffix not in {".tif", ".tiff"} | PICTURES:
         np.testing.assert_array_equal(found["range_m"], image.range_m)
     assert os.listdir(tmp_path) == [f"wall{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".nc", ".h5", ".csv"])
+def test_formats_that_list_pixels_hold_intervals(tmp_path: Path, suffix: str) -> None:
+    interval = core.range_interval(CAPTURE, IMAGE)
+    path = saved(tmp_path, suffix, interval=interval)
+    if suffix == ".csv":
+        lines = list(without_comments(path.read_text(encoding="utf-8").splitlines()))
+        table = np.genfromtxt(lines, delimiter=",", names=True)
+        assert table.dtype.names[:5] == ("row", "col", "range_m", "range_low_m", "range_high_m")
+        found = {name: table[name].reshape(ROWS, COLS) for name in table.dtype.names}
+    else:
+        found = READERS[suffix](path)
+    for name in ("low_m", "high_m"):
+        np.testing.assert_array_equal(found[f"range_{name}"], getattr(interval, name))
+    with pytest.raises(ValueError, match=r"range_low_m = 'shape \(9, 7\)'"):
+        saved(tmp_path, suffix, interval=core.RangeInterval(interval.low_m.T, interval.high_m))
 
 
 @every_cloud
@@ -457,6 +492,7 @@ FACTS = {
     "n_pulses": 900,
     "detection": "first",
     "pixel_angle_rad": ANGLE,
+    "software": f"firstphoton {core.__version__}",
     "source": PLAIN_SOURCE,
 }
 
@@ -473,6 +509,108 @@ def test_npz_holds_the_acquisition(tmp_path: Path) -> None:
     with np.load(tmp_path / "unknown.npz", allow_pickle=False) as archive:
         assert archive["n_pulses"] == 0
         assert "pixel_angle_rad" not in archive
+
+
+def lines_of(text: str) -> dict[str, str]:
+    """Facts of lines ``name: value``."""
+    return dict(line.split(": ", 1) for line in text.splitlines() if ": " in line)
+
+
+def commented(path: Path, mark: str) -> dict[str, str]:
+    """Facts of lines that begin with a mark."""
+    lines = path.read_bytes().splitlines()
+    marked = (line.decode() for line in lines if line.startswith(mark.encode()))
+    return lines_of("\n".join(line.removeprefix(mark) for line in marked))
+
+
+def npz_facts(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name].item() for name in archive if archive[name].ndim == 0}
+
+
+def hdf5_facts(path: Path) -> dict[str, Any]:
+    with h5py.File(path) as file:
+        return {name: np.asarray(fact).item() for name, fact in file.attrs.items()}
+
+
+def tiff_facts(path: Path) -> dict[str, Any]:
+    with tifffile.TiffFile(path) as file:
+        items = ElementTree.fromstring(file.pages[0].tags["GDAL_METADATA"].value)
+    return {item.attrib["name"]: item.text for item in items}
+
+
+def las_facts(path: Path) -> dict[str, Any]:
+    (record,) = laspy.read(path).header.vlrs.get_by_id("firstphoton")
+    return lines_of(record.record_data.decode())
+
+
+def png_facts(path: Path) -> dict[str, Any]:
+    with Image.open(path) as picture:
+        return lines_of(picture.text["Description"])
+
+
+def svg_facts(path: Path) -> dict[str, Any]:
+    name = "{http://purl.org/dc/elements/1.1/}description"
+    return lines_of(next(ElementTree.parse(path).iter(name)).text or "")
+
+
+FACTS_OF: dict[str, Callable[[Path], dict[str, Any]]] = {
+    ".npz": npz_facts,
+    ".csv": lambda path: commented(path, "# "),
+    ".tif": tiff_facts,
+    ".tiff": tiff_facts,
+    ".nc": hdf5_facts,
+    ".h5": hdf5_facts,
+    ".zarr": lambda path: json.loads((path / "zarr.json").read_bytes())["attributes"],
+    ".ply": lambda path: commented(path, "comment "),
+    ".las": las_facts,
+    ".laz": las_facts,
+    ".pcd": lambda path: commented(path, "# "),
+    ".png": png_facts,
+    ".svg": svg_facts,
+}
+
+
+@pytest.mark.parametrize("suffix", [*WRITERS, *FOLDER_WRITERS])
+def test_every_file_states_method_settings_version_and_source(tmp_path: Path, suffix: str) -> None:
+    made_by = Provenance("tracking", TrackingParameters(l=0.02), 0.05, "no pile-up is undone")
+    image = replace(IMAGE, made_by=made_by).confident(0.7)
+    found = FACTS_OF[suffix](saved(tmp_path, suffix, image))
+    settings = json.loads(found["settings"])
+    assert settings == asdict(made_by.settings)
+    assert (found["method"], found["remark"]) == ("tracking", "no pile-up is undone")
+    assert float(found["false_alarm"]) == 0.05
+    assert float(found["least_confidence"]) == 0.7
+    assert found["software"] == f"firstphoton {core.__version__}"
+    source = PLAIN_SOURCE
+    if suffix in {".ply", ".pcd"}:  # ASCII
+        source = source.encode("ascii", "backslashreplace").decode()
+    assert found["source"] == source
+    assert float(found["bin_width_s"]) == 1e-9
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".las", ".pcd", ".png"])
+def test_a_source_of_any_length_fits(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"wall{suffix}"
+    save_image(replace(CAPTURE, source="µ " * 50_000), IMAGE, path)
+    READERS[suffix](path)
+    assert FACTS_OF[suffix](path)["software"] == f"firstphoton {core.__version__}"
+    if suffix == ".ply":
+        header, _, _ = path.read_bytes().partition(b"end_header")
+        assert max(map(len, header.splitlines())) < 600
+
+
+def test_estimates_state_how_they_were_made() -> None:
+    image = core.estimate(CAPTURE, "coates", false_alarm=0.5)
+    remark = core.ESTIMATORS["coates"].remark(CAPTURE)
+    assert image.made_by == Provenance("coates", NoParameters(), 0.5, remark)
+    sure = image.confident(0.5)
+    assert sure.made_by == Provenance("coates", NoParameters(), 0.5, remark, 0.5)
+    np.testing.assert_array_equal(sure.valid, image.valid & (image.confidence >= 0.5))
+    np.testing.assert_array_equal(np.isfinite(sure.bin), sure.valid)
+    np.testing.assert_array_equal(sure.range_m[sure.valid], image.range_m[sure.valid])
+    with pytest.raises(ValueError, match="least_confidence = 90"):
+        image.confident(90)
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".h5"])
@@ -596,14 +734,14 @@ def test_intensity_ends_at_16_bits(tmp_path: Path) -> None:
 # -- pictures --------------------------------------------------------------------------------------
 
 
-def drawn_pixels(path: Path) -> np.ndarray:
-    """The range image within an SVG, RGBA of shape (row, col, 4), right way up."""
+def drawn_pixels(path: Path | BinaryIO, shape: tuple[int, int] = (ROWS, COLS)) -> np.ndarray:
+    """The range image of this shape within an SVG, RGBA of shape (row, col, 4), right way up."""
     link = "{http://www.w3.org/1999/xlink}href"
     for element in ElementTree.parse(path).iter("{http://www.w3.org/2000/svg}image"):
         data = base64.b64decode(element.attrib[link].partition("base64,")[2])
         with Image.open(io.BytesIO(data)) as picture:
             pixels = np.asarray(picture.convert("RGBA"))
-        if pixels.shape[:2] == (ROWS, COLS):
+        if pixels.shape[:2] == shape:
             return pixels if "scale(1 -1)" not in element.attrib["transform"] else pixels[::-1]
     raise AssertionError("no range image")
 
@@ -613,7 +751,7 @@ def test_colours_grow_brighter_with_range(tmp_path: Path) -> None:
     pixels = drawn_pixels(saved(tmp_path, ".svg", sure))
     assert {tuple(color) for color in pixels[~VALID]} == {(255, 255, 255, 255)}
     colors = pixels[VALID].astype(int)
-    # Viridis grows brighter with range, which here grows along the rows.
+    # Every colour map grows brighter with range, which here grows along the rows.
     brightness = colors[:, :3] @ [299, 587, 114]
     assert np.all(np.diff(brightness) > 0)
 
@@ -630,6 +768,35 @@ def test_ranges_beyond_the_confident_ones_are_grey(tmp_path: Path) -> None:
     assert np.argwhere(grey).tolist() == [[1, 1], [5, 5]]
 
 
+@pytest.mark.parametrize("color_map", COLOR_MAPS)
+def test_a_picture_takes_chosen_limits_and_colours(tmp_path: Path, color_map: str) -> None:
+    low_m, high_m = (float(np.nanquantile(IMAGE.range_m, share)) for share in (0.2, 0.8))
+    colors = RangeColors(low_m, high_m, color_map)
+    path = saved(tmp_path, ".svg", colors=colors)
+    pixels, scale = drawn_pixels(path)[VALID], range_scale(CAPTURE, IMAGE, colors)
+    range_m = IMAGE.range_m[VALID]
+    outside = (range_m < low_m) | (range_m > high_m)
+    grey = tuple(bytes.fromhex(OUTSIDE_COLOR[1:]))
+    np.testing.assert_array_equal((pixels[:, :3] == grey).all(axis=1), outside)
+    np.testing.assert_array_equal(pixels[:, :3], scale.rgb(range_m))
+    text = " ".join(ElementTree.parse(path).getroot().itertext())
+    assert f"grey: beyond the colours ({outside.sum()})" in text
+    assert f"({(~VALID).sum()} of {VALID.size} pixels)" in text
+
+
+@pytest.mark.parametrize(
+    ("refused", "message"),
+    [
+        ({"color_from_m": 2.0, "color_to_m": 1.0}, "color_to_m = 1.0 .* above color_from_m = 2"),
+        ({"color_from_m": float("inf")}, "color_from_m = inf .* or None"),
+        ({"color_map": "jet"}, "color_map = 'jet' .*'bgyw' or 'viridis'"),
+    ],
+)
+def test_impossible_colours_are_refused(refused: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RangeColors(**refused)
+
+
 def test_png_and_svg_show_the_same_colours(tmp_path: Path) -> None:
     with Image.open(saved(tmp_path, ".png")) as picture:
         colors = {color for _, color in picture.convert("RGBA").getcolors(2**24)}
@@ -642,7 +809,7 @@ def test_the_same_image_gives_the_same_picture(tmp_path: Path, suffix: str) -> N
     first = path.read_bytes()
     assert saved(tmp_path, suffix, title=TITLE, overwrite=True).read_bytes() == first
     text = " ".join(ElementTree.parse(path).getroot().itertext()) if suffix == ".svg" else ""
-    for label in ("Column (px)", "Row (px)", "Range (m)", TITLE) if text else ():
+    for label in ("Column (px)", "Row (px)", "Estimated range (m)", TITLE) if text else ():
         assert label in text
 
 
@@ -654,7 +821,7 @@ def test_a_pixels_signals_are_read(tmp_path: Path) -> None:
     settings_ = TrackingParameters(l=0.01, weight="survival")
     save_pixel(CAPTURE, 2, 5, settings_, path)
     with path.open(newline="", encoding="utf-8") as file:
-        table = list(csv.DictReader(file, strict=True))
+        table = list(csv.DictReader(without_comments(file), strict=True))
     stages = ("raw", "small", "large", "residual", "enhanced")
     assert list(table[0]) == ["bin", "time_s", "range_m", "counts", *stages]
     columns = {name: np.array([float(line[name]) for line in table]) for name in table[0]}
@@ -695,7 +862,7 @@ def test_a_pixel_that_cannot_be_saved_is_refused(
 
 
 def test_the_libraries_of_the_formats_are_imported_when_needed() -> None:
-    heavy = {"laspy", "matplotlib", "trimesh", "pypcd4", "tifffile", "xarray"}
+    heavy = {"colorcet", "laspy", "matplotlib", "trimesh", "pypcd4", "tifffile", "xarray"}
     command = [sys.executable, "-c", "import sys, core.io.writers; print(*sys.modules)"]
     folder = Path(core.__file__).parent.parent
     loaded = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout

@@ -11,9 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from core.capture import CaptureError
 from core.io.readers import frames, guards, read_capture
+from core.io.readers.frame_guess import resembles_frames
+from core.tests.captures import real_capture_path
 from core.tests.samples import CAMERA_CUBE, CUBE, frames_of, gmapd_bytes, npy_bytes, npz_bytes
 
 pytestmark = pytest.mark.files
@@ -61,6 +64,68 @@ def test_frames_are_no_cube(no_trigger: int, dtype: str, name: str, write: Write
     assert read_capture(path, no_trigger=no_trigger).acquisition.n_pulses == 40
 
 
+def camera_frames(share: float, n_pulses: int) -> NDArray[np.uint8]:
+    """Frames of 32 x 32 pixels, each with a target of its own, in which 0 marks no trigger."""
+    rng = np.random.default_rng(0)
+    shape = (n_pulses, 32, 32)
+    fired = rng.random(shape) < share * rng.uniform(0.3, 1.0, shape[1:])
+    echo = np.broadcast_to(rng.integers(20, 150, shape[1:]), shape)
+    bins = np.where(rng.random(shape) < 0.5, echo, rng.integers(1, 154, shape))
+    return np.asarray(fired * bins, np.uint8)
+
+
+@pytest.mark.parametrize(("share", "n_pulses"), [(0.05, 200), (0.5, 60)])
+@pytest.mark.parametrize("name", ["f.npy", "f.npz"])
+def test_frames_in_which_0_is_no_trigger_are_no_cube(
+    share: float, n_pulses: int, name: str, write: Write
+) -> None:
+    stack = camera_frames(share, n_pulses)
+    path = write(name, npy_bytes(stack) if name.endswith("npy") else npz_bytes(data=stack))
+    with pytest.raises(CaptureError, match=r"no_trigger = None .* give 0 if .* raw frames .* axes"):
+        read_capture(path)
+    capture = read_capture(path, no_trigger=0)
+    assert capture.acquisition.n_pulses == n_pulses
+    assert capture.counts.sum() == np.count_nonzero(stack)
+    np.testing.assert_array_equal(read_capture(path, axes="row col bin").cube, stack)
+
+
+def surfaces(kind: str) -> NDArray[np.int64]:
+    """Bins (row, col) at which echoes of a wall, a slope or random depths begin."""
+    row, col = np.indices((64, 48))
+    depths = np.random.default_rng(1).integers(0, 100, row.shape)
+    return {"wall": 30 + 0 * col, "slope": row, "random": depths}[kind]
+
+
+@pytest.mark.parametrize("kind", ["wall", "slope", "random"])
+@pytest.mark.parametrize("background", [0.0, 0.07, 3.0])
+@pytest.mark.parametrize(("echo", "width"), [(5, 1), (100, 8), (100, 50), (1000, 1)])
+@pytest.mark.parametrize("filled", [1.0, 0.3])
+def test_counts_are_not_taken_for_frames(
+    kind: str, background: float, echo: float, width: int, filled: float
+) -> None:
+    rng = np.random.default_rng(2)
+    later = (np.arange(100) - surfaces(kind)[:, :, np.newaxis]) % 100
+    counts = rng.poisson(background + echo * (later < width))
+    counts[rng.random(counts.shape[:2]) > filled] = 0
+    assert not resembles_frames(counts)
+    assert not resembles_frames(counts.transpose(1, 0, 2))
+
+
+@pytest.mark.parametrize("flux", [0.5, 3.0, 8.0, 20.0, 160.0])
+@pytest.mark.parametrize("n_pulses", [300, 10**5])
+def test_pile_up_is_not_taken_for_frames(flux: float, n_pulses: int) -> None:
+    triggers = -np.diff(np.exp(-flux * np.linspace(0, 1, 101)))
+    counts = np.random.default_rng(3).poisson(n_pulses * triggers, (64, 48, 100))
+    assert not resembles_frames(counts)
+
+
+def test_real_counts_are_not_taken_for_frames() -> None:
+    for name in ("21km_K11_night.mat", "tmf8820_distance_data.json"):
+        cube = read_capture(real_capture_path(name)).cube
+        for axes in itertools.permutations(range(3)):
+            assert not resembles_frames(cube.transpose(axes))
+
+
 def test_a_cube_may_hold_any_counts(write: Write) -> None:
     for cube in (np.full((2, 3, 9), 255), np.tile([0, 0, 0, 60000], (2, 3, 5)), CUBE):
         found = read_capture(write("c.npy", npy_bytes(cube.astype(np.uint16))))
@@ -84,6 +149,35 @@ def test_frames_are_first_photons(write: Write) -> None:
     np.testing.assert_array_equal(
         read_capture(write("o.npz", content), no_trigger=-1).cube, capture.cube
     )
+
+
+@pytest.mark.parametrize("stretch", [7, 10**6])
+@pytest.mark.parametrize("axes", ["pulse row col", "row col pulse"])
+def test_frames_are_records(
+    axes: str, stretch: int, write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frames, "STRETCH", stretch)
+    stack = FRAMES[:30].transpose([frames.AXES.index(name) for name in axes.split()])
+    content = npz_bytes(frames=stack, no_trigger=-1, n_pulses=30)
+    path = write("f.npz", content)
+    whole = read_capture(path, axes=axes)
+    parts = [read_capture(path, axes=axes, records=span) for span in (0, (1, 28), 29)]
+    assert {part.n_records for part in (whole, *parts)} == {30}
+    assert [part.acquisition.n_pulses for part in parts] == [1, 28, 1]
+    np.testing.assert_array_equal(sum(part.cube for part in parts), whole.cube)  # in one gate
+    np.testing.assert_array_equal(parts[2].counts, FRAMES[29] >= 0)
+    assert [part.source.split("; ")[0] for part in parts] == [
+        "f.npz, variable frames, frame 0 of 30",
+        "f.npz, variable frames, frames 1 to 28 of 30 added",
+        "f.npz, variable frames, frame 29 of 30",
+    ]
+
+
+def test_frames_of_a_camera_are_records(write: Write) -> None:
+    path = write("f.bin", gmapd_bytes(CAMERA_CUBE, 50))
+    first, rest = (read_capture(path, records=span) for span in ((0, 9), (10, 49)))
+    np.testing.assert_array_equal(first.cube + rest.cube, CAMERA_CUBE)
+    assert (first.n_records, first.acquisition.n_pulses) == (50, 10)
 
 
 def test_many_pulses_widen_the_cube(write: Write) -> None:
@@ -153,6 +247,7 @@ REFUSED: tuple[tuple[str, bytes, dict[str, Any], str], ...] = (
     ("f.npy", npy_bytes(FRAMES), {"no_trigger": 255}, "= -1 .*255"),
     ("f.npy", npy_bytes(np.full((5, 2, 2), -1)), OTHERS, "triggers of the array = 0 .*n_bins"),
     ("f.npy", npy_bytes(FRAMES), OTHERS | {"n_pulses": 499}, "n_pulses = 499 .*500"),
+    ("f.npy", npy_bytes(FRAMES), OTHERS | {"records": 500}, "records = 500 .*one of 0 to 499"),
     ("f.npy", npy_bytes(FRAMES[0]), OTHERS, r"shape \(3, 4\).*\(pulse, row, col\)"),
     ("f.npy", npy_bytes(FRAMES[:0]), OTHERS, r"\(0, 3, 4\)"),
     ("f.npy", npy_bytes(FRAMES * 1j), OTHERS, "complex128"),

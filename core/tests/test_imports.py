@@ -14,15 +14,15 @@ import core
 PACKAGE = Path(core.__file__).parent
 
 ROOMS = (
-    {"kernels", "checks", "deprecation"},
+    {"kernels", "checks", "deprecation", "notebook", "scripts", "version"},
     {"parameters", "acquisition"},
-    {"trigger", "effects", "geometry", "metrics", "tracking_parameters"},
+    {"trigger", "effects", "geometry", "labels", "metrics", "tracking_parameters"},
     {"scene", "tracking", "capture"},
     {"simulation", "reductions", "inference"},
     {"corrections", "cost"},
     {"estimators"},
     {"inspection", "pipeline", "warmup", "io"},
-    {"out_of_core"},
+    {"out_of_core", "report"},
     {"studies"},
     {"cli"},
 )

@@ -5,21 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import stats
 
+import core
 from core import inspection
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.inspection import estimate_flux, pixels_in
+from core.inspection.profile import difference_of, ratio_of
 from core.metrics import Interval, restored
 from core.reductions import cut_gate
 from core.scene import Scene, scenes
 from core.simulation import simulate
+from core.studies.methods.calibration import FLUX_REGIMES, FluxRegime
+from core.tracking import TrackingParameters
 
 pytestmark = pytest.mark.compiled
 
@@ -106,13 +111,70 @@ def test_the_best_candidate_is_the_estimate(method: str) -> None:
     assert right >= 8  # neighbours may move a spatial method's
 
 
-def test_a_tracking_candidate_has_the_confidence_of_the_image() -> None:
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        ("tracking", None),
+        ("tracking", TrackingParameters(refine="likelihood")),
+        ("likelihood", None),
+        ("unmixing", None),
+    ],
+    ids=["tracking", "tracking refined", "likelihood", "unmixing"],
+)
+def test_the_candidate_at_the_estimate_is_the_estimate(method: str, settings: Any) -> None:
+    capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)
+    image = estimate(capture, method, settings)
+    for row, col in np.ndindex(8, 8):
+        report = inspection.pixel_report(capture, image, row, col, method, settings)
+        near = [c for c in report.candidates if abs(c.bin - report.answer_bin) < capture.echo_bins]
+        # Neighbours may move a spatial method's estimate away from all peaks.
+        assert len(near) == 1 or (method == "unmixing" and not near)
+        for each in near:
+            assert (each.bin, each.range_m) == (report.answer_bin, report.answer_m)
+            assert each.probability == report.confidence
+
+
+def test_candidates_within_one_pulse_are_one() -> None:
+    acquisition = Acquisition(n_bins=60, n_pulses=400)
+    pulse = Pulse.gaussian(2e-9)
+    scene = random_depths(8, acquisition=acquisition)
+    capture = simulate(scene, acquisition, Flux(0.1, 0.1), pulse, seed=4)
+    assert capture.echo_bins == 6
+    image = estimate(capture, "peak")
+    for row, col in np.ndindex(8, 8):
+        report = inspection.pixel_report(capture, image, row, col, "peak")
+        bins = np.sort([each.bin for each in report.candidates])
+        assert (np.diff(bins) >= capture.echo_bins).all()
+        scores = [each.score for each in report.candidates]
+        assert scores == sorted(scores, reverse=True)
+        assert report.candidates[0].score == report.curve.max()
+    mask = np.ones(capture.shape, bool)
+    pixel = inspection.region_report(capture, image, mask, "peak").pixel
+    assert pixel.candidates[0].bin == pixel.answer_bin
+    assert pixel.candidates[0].probability == pixel.confidence
+    assert all(abs(c.bin - pixel.answer_bin) >= 6 for c in pixel.candidates[1:])
+
+
+def test_a_report_has_the_intervals_of_the_range() -> None:
     capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)
     image = estimate(capture, "tracking")
-    for row, col in np.ndindex(8, 8):
-        best = inspection.pixel_report(capture, image, row, col).candidates[0]
-        assert best.bin == pytest.approx(image.bin[row, col])
-        assert best.probability == pytest.approx(image.confidence[row, col], abs=1e-6)
+    report = inspection.pixel_report(capture, image, 2, 3)
+    inner, outer = report.interval_68_m, report.interval_95_m
+    assert (inner, outer) == core.pixel_range_intervals(capture, image, 2, 3)
+    assert inner.value == outer.value == report.answer_m
+    assert outer.low < inner.low < inner.high < outer.high
+    half_m = (inner.high - inner.low) / 2
+    assert 0.01 < half_m < 0.1
+    assert report.interval_text == (
+        f"{inner.low + half_m:.3f} m ± {half_m:.3f} m (68 %), "
+        f"{outer.low:.3f} to {outer.high:.3f} m (95 %)"
+    )
+    coarse = replace(report, interval_68_m=Interval(50, 20, 80), interval_95_m=Interval(50, 0, 99))
+    assert coarse.interval_text == "50 m ± 30 m (68 %), 0 to 99 m (95 %)"
+    nothing = Capture(np.zeros((1, 1, 60), np.uint16), ACQUISITION)
+    empty = inspection.pixel_report(nothing, estimate(nothing, "peak"), 0, 0, "peak")
+    assert math.isnan(empty.interval_95_m.low)
+    assert empty.interval_text == "–"
 
 
 def test_hot_and_dead_pixels_are_found() -> None:
@@ -130,8 +192,17 @@ def test_hot_and_dead_pixels_are_found() -> None:
     assert health(2, 5) == "ordinary"
     report = inspection.capture_report(capture)
     assert (report.n_hot, report.n_dead) == (2, 2)
+    faulty, counts = inspection.faulty_pixels(capture), capture.counts
+    assert {each[:3] for each in faulty[:2]} == {(4, 4, "hot"), (0, 8, "hot")}
+    assert {each[:3] for each in faulty[2:]} == {(7, 2, "dead"), (0, 0, "dead")}
+    around = np.delete(counts[3:6, 3:6], 4)
+    of_middle = next(each for each in faulty if each.row == 4)
+    assert of_middle[3:] == (counts[4, 4], around.min(), around.max())
+    excess = [each.counts - each.neighbours_most for each in faulty[:2]]
+    assert excess == sorted(excess, reverse=True)
     dark = Capture(np.zeros((3, 3, 60), np.uint8), ACQUISITION)
     assert inspection.capture_report(dark).n_dead == 0
+    assert inspection.faulty_pixels(Capture(capture.cube[:2], ACQUISITION)) == []
     assert (
         inspection.pixel_report(dark, estimate(dark, "peak"), 1, 1).verdict.health == "cannot tell"
     )
@@ -248,6 +319,62 @@ def test_mean_flux_intervals_cover_the_truth(
     assert all(is_covered_often_enough(each, trials) for each in hits), hits
     # No bias that as many captures show: each lies off by a standard deviation of 1 at most.
     assert (np.abs(off) / math.sqrt(trials) < stats.norm.isf(SIGNIFICANCE / 2)).all(), off
+
+
+@pytest.mark.parametrize("regime", FLUX_REGIMES[2:4], ids=lambda regime: regime.pulse)
+def test_flux_depends_neither_on_the_pulse_nor_on_the_bins(regime: FluxRegime) -> None:
+    captures, truth = regime.captures(seed=3)
+    for of, true in zip(
+        (inspection.estimate_mean_flux, inspection.estimate_target_flux), truth, strict=True
+    ):
+        finest, coarsest = of(captures[0]), of(captures[-1])
+        for one, other, value in zip(finest, coarsest, true, strict=True):
+            assert one.overlaps(other)
+            # Half as wide again as the 95 % interval, which makes 99.7 %.
+            half = 0.75 * (one.high - one.low)
+            assert abs((one.high + one.low) / 2 - value) < half
+
+
+def test_the_flux_of_target_pixels_is_the_one_simulated() -> None:
+    scene = scenes["car"]()
+    capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.06), seed=1)
+    report = inspection.capture_report(capture)
+    assert covers(report.target_flux.signal, 0.1041) and covers(report.target_flux.sbr, 0.06)
+    assert report.target_flux.sbr.high - report.target_flux.sbr.low < 0.01
+    share = float(np.isfinite(np.asarray(capture.truth_range_m)).mean())
+    assert covers(report.flux.sbr, 0.06 * share)
+    assert report.echo_free_background is not None
+    assert covers(report.echo_free_background, Flux(0.1041, 0.06).background)
+    assert "they agree" in report.flux_remark and "times as long" not in report.flux_remark
+
+
+def test_a_report_says_where_bins_without_echoes_contradict_the_model() -> None:
+    captures, _ = FLUX_REGIMES[0].captures(seed=4)
+    capture, rng = captures[-1], np.random.default_rng(4)
+    # Fog: ten photons of a pixel that return from the first bins.
+    cube = capture.cube + rng.poisson(10 / 20, capture.cube.shape) * (np.arange(150) < 20)
+    report = inspection.capture_report(replace(capture, cube=cube.astype(np.uint32)))
+    free = report.echo_free_background
+    assert free is not None and "disagree" in report.flux_remark
+    assert report.flux.background.high > 1.5 * report.flux.background.low
+    assert report.flux.background.low <= free.low and free.high <= report.flux.background.high
+
+
+def test_intervals_of_differences_and_ratios_cover_the_truth() -> None:
+    rng, trials, mean = np.random.default_rng(5), 400, (30.0, 12.0)
+    tail, hits = 0.5 - inspection.LEVEL / 2, np.zeros(2, int)
+    for pair in rng.poisson(mean, (trials, 2)):
+        one, other = (
+            Interval(n, stats.gamma.ppf(tail, n) if n else 0.0, stats.gamma.isf(tail, n + 1))
+            for n in map(float, pair)
+        )
+        hits[0] += covers(difference_of(one, other), mean[0] - mean[1])
+        hits[1] += covers(ratio_of(one, other), mean[0] / mean[1])
+    assert all(is_covered_often_enough(each, trials) for each in hits), hits
+    nothing, some = Interval(0.0, 0.0, 3.7), Interval(4.0, 1.1, 10.2)
+    assert ratio_of(some, nothing).value == ratio_of(some, nothing).high == math.inf
+    assert ratio_of(nothing, some).value == ratio_of(nothing, some).low == 0.0
+    assert difference_of(nothing, some) == Interval(0.0, 0.0, difference_of(nothing, some).high)
 
 
 def _counts(shape: tuple[int, int, int], kind: str, n_pulses: int | None) -> np.ndarray:

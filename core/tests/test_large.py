@@ -9,13 +9,14 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import dask
 import numpy as np
 import pytest
 import xarray as xr
 
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
-from core.estimators import ESTIMATORS, estimate
+from core.estimators import ESTIMATORS, base, estimate
 from core.io.readers import sample
 from core.io.readers.labelled import dataset
 from core.out_of_core import tiles
@@ -24,6 +25,9 @@ from core.scene import Scene, scenes
 from core.simulation import simulate
 
 pytestmark = pytest.mark.compiled
+
+# Workers are forked from a process that has imported Dask, which each would import again.
+dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
 
 APART = [name for name, each in ESTIMATORS.items() if not each.whole_image and name != "oracle"]
 
@@ -45,8 +49,12 @@ COUNTS = dataset(CAPTURE).counts
     ids=["small chunks, some invalid pixels", "chunks of a column"],
 )
 def test_tiles_give_the_estimates_of_the_whole(
-    method: str, chunks: dict[str, int], false_alarm: float | None
+    method: str,
+    chunks: dict[str, int],
+    false_alarm: float | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(base, "NULL_SIDE", 48)  # 256 rows and columns take twenty times as long
     whole = estimate(CAPTURE, method, false_alarm=false_alarm)
     parts = estimate_large(COUNTS.chunk(chunks), method, false_alarm=false_alarm).compute()
     for name in set(IMAGES) - {"counts"}:

@@ -179,6 +179,18 @@ def test_bin_width_in_another_variable(
     assert "guessed: axes (row, col, bin), bin width" in capture.source
 
 
+def test_numbers_of_the_own_layout_are_used(save: Save, write: Write) -> None:
+    known = {"bin_width_s": 2e-9, "gate_delay_s": 1e-7, "n_pulses": 500.0, "pixel_angle_rad": 1e-3}
+    path = write(save(counts=CUBE, resolution=4e-12, **known))
+    capture = read_capture(path)
+    assert vars(capture.acquisition) == known | {"n_bins": 100}
+    assert capture.detection == "first"
+    assert "bin width" not in capture.source and "gate" not in capture.source
+    assert read_capture(path, n_pulses=900).acquisition.n_pulses == 900
+    with pytest.raises(CaptureError, match=r"n_pulses = .*0\.5.* whole number"):
+        read_capture(write(save(counts=CUBE, n_pulses=0.5)))
+
+
 # -- version 7.3 -----------------------------------------------------------------------------------
 
 

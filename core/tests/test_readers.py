@@ -127,6 +127,8 @@ def test_contract_arguments_that_do_not_fit(kept: Format, tmp_path: Path) -> Non
         {"first_detections": 0},
         {"no_trigger": 0.5},
         {"shape": (3, 0)},
+        {"records": -1},
+        {"records": (2, 1)},
         *kept.refuses,
     ]
     for arguments in refused:
@@ -216,6 +218,16 @@ def test_own_layout_lists_guesses_for_missing_fields(write: Write) -> None:
     capture = read_capture(path, gate_delay_s=2e-7)
     assert capture.acquisition.n_pulses is None and capture.pulse == Pulse()
     assert capture.source == "a wall; guessed: pulse gamma of 1 ns, all photons of a pulse"
+
+
+def test_numbers_of_the_own_layout_accompany_counts_of_another_name(write: Write) -> None:
+    known = {"bin_width_s": 2e-9, "gate_delay_s": 1e-7, "n_pulses": 500}
+    others = {"background": CUBE[0], "pixel_angle_rad": np.ones((3, 4)), "source": "?"}
+    path = write("a.npz", npz_bytes(counts=CUBE, **known, **others))
+    capture = read_capture(path)
+    assert vars(capture.acquisition) == known | {"n_bins": 100, "pixel_angle_rad": None}
+    assert capture.detection == "first" and capture.background is None
+    assert read_capture(path, bin_width_s=1e-9).acquisition.bin_width_s == 1e-9
 
 
 @pytest.mark.parametrize("content", [npz_bytes, mat_bytes], ids=["a.npz", "a.mat"])
@@ -646,7 +658,7 @@ def test_building_at_21_km(real_capture: Callable[[str], Path]) -> None:
     assert capture.acquisition.gate_delay_s == pytest.approx(4.43e-6, rel=1e-12)
     assert capture.source == (
         "21km_K11_night.mat, variable Ts_gated; guessed: time unit 1 ps, bin width 1 ns, "
-        "gate 4430-4630 ns, pulse Gaussian of 450 ps, all photons of a pulse"
+        "gate 4430-4630 ns, pulse Gaussian of 450 ps (430 ps to 490 ps), all photons of a pulse"
     )
 
 
@@ -696,6 +708,7 @@ def captures(draw: st.DrawFn) -> Capture:
         ),
         draw(pulses),
         truth_range_m=draw(images),
+        reported_range_m=draw(images),
         signal=draw(photons),
         background=draw(st.none() | st.floats(0, 1e6)),
         source=draw(st.text(st.characters(exclude_characters="\0", codec="utf-8"))),
@@ -714,7 +727,7 @@ def test_round_trip(capture: Capture) -> None:
     np.testing.assert_array_equal(read.cube, capture.cube)
     for name in ("acquisition", "pulse", "background", "detection"):
         assert getattr(read, name) == getattr(capture, name)
-    for image in ("truth_range_m", "signal"):
+    for image in ("truth_range_m", "reported_range_m", "signal"):
         kept, original = getattr(read, image), getattr(capture, image)
         assert (kept is None) == (original is None)
         assert kept is None or np.array_equal(kept, original, equal_nan=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,8 @@ from core.tests.instruments import (
     split,
     tmf8820_bytes,
     tmf8820_records,
+    tmf8829_bytes,
+    tmf8829_log,
     zipped,
 )
 from core.tests.refusing import assert_refused
@@ -49,7 +52,9 @@ def test_ptu_has_a_bin_width_and_all_photons(write: Write) -> None:
     assert capture.acquisition.n_bins == 782  # 781.25 to a period: the last one begins within
     np.testing.assert_array_equal(capture.cube[:, :, :100], CUBE)
     assert capture.detection == "all"
-    assert capture.source == "a.ptu; guessed: gate 0-12.512 ns, pulse Gaussian of 16 ps"
+    assert capture.source == (
+        "a.ptu; guessed: gate 0-12.512 ns, pulse Gaussian of 16 ps (one bin: width not determined)"
+    )
 
 
 def test_ptu_sums_frames_and_channels_or_takes_one(write: Write) -> None:
@@ -62,6 +67,20 @@ def test_ptu_sums_frames_and_channels_or_takes_one(write: Write) -> None:
         assert capture.source.startswith(f"a.ptu, channel {channel}, 2 frames summed; ")
     with pytest.raises(CaptureError, match=r"variable = 'channel 2' .*channel 0, channel 1"):
         read_capture(path, variable="channel 2")
+
+
+def test_ptu_frames_are_records(write: Write) -> None:
+    shares = np.random.default_rng(7).multinomial(CUBE, np.full(5, 0.2))
+    path = write("a.ptu", ptu_bytes(np.moveaxis(shares, -1, 0)[:, :, :, np.newaxis]))
+    for span, expected, text in (
+        (3, shares[..., 3], "frame 3 of 5"),
+        ((1, 3), shares[..., 1:4].sum(axis=-1), "frames 1 to 3 of 5 added"),
+        ((0, 4), CUBE, "all 5 frames added"),
+    ):
+        capture = read_capture(path, records=span)
+        np.testing.assert_array_equal(capture.cube, expected)
+        assert capture.source.startswith(f"a.ptu, {text}; ")
+        assert capture.n_records == 5
 
 
 def test_ptu_keeps_to_one_period(write: Write) -> None:
@@ -79,7 +98,10 @@ def test_sdt_has_a_bin_width_and_all_photons(kind: int, write: Write) -> None:
     capture = read_capture(path, n_pulses=10**6)
     assert capture.acquisition.bin_width_s == 125e-12  # the file holds numbers of 4 bytes
     assert capture.detection == "all"
-    assert capture.source == "a.sdt, block 0; guessed: gate 0-12.5 ns, pulse Gaussian of 125 ps"
+    assert capture.source == (
+        "a.sdt, block 0; guessed: gate 0-12.5 ns, "
+        "pulse Gaussian of 125 ps (one bin: width not determined)"
+    )
 
 
 def test_sdt_blocks_are_chosen_by_name(write: Write) -> None:
@@ -133,7 +155,8 @@ def test_tmf8820_pulse_and_truth(write: Write) -> None:
     )
     assert capture.detection == "all"
     assert capture.source == (
-        "a.json; guessed: bin width 91 ps, zero range 963.5 ps after the first bin"
+        "a.json, 3 records, one in each row; "
+        "guessed: bin width 91 ps, zero range 963.5 ps after the first bin"
     )
 
 
@@ -147,6 +170,30 @@ def test_tmf8820_record_is_a_square(write: Write) -> None:
     for name in ("record 3", "record -1", "record", "zone 1", "record 0 1"):
         with pytest.raises(CaptureError, match=r"variable = .*'record 0' to 'record 2'"):
             read_capture(path, variable=name)
+
+
+def test_tmf8820_records_are_added(write: Write) -> None:
+    records = tmf8820_records(CUBE)
+    for record, distance_m in zip(records, (0.1, 0.2, 0.2), strict=True):
+        record["dist_to_plane"] = distance_m
+        record["distances"] = [{"depths_1": [8, 9, 100, 0], "confs_1": [255, 255, 7, 0]}]
+    records[2]["distances"][0]["depths_1"] = [10, 9, 101, 5]
+    path = write("a.json", json.dumps(records).encode())
+    capture = read_capture(path, records=(1, 2))
+    np.testing.assert_array_equal(capture.cube, (CUBE[1] + CUBE[2]).reshape(2, 2, 100))
+    assert capture.source.startswith("a.json, records 1 to 2 of 3 added; ")
+    assert capture.n_records == read_capture(path).n_records == 3
+    np.testing.assert_array_equal(capture.truth_range_m, np.full((2, 2), 0.2))
+    np.testing.assert_allclose(capture.reported_range_m, [[0.009, 0.009], [0.1005, np.nan]])
+    assert read_capture(path, records=(0, 1)).truth_range_m is None  # the plane moved
+    one, same = read_capture(path, records=2), read_capture(path, variable="record 2")
+    np.testing.assert_array_equal(one.cube, same.cube)
+    assert one.source.startswith("a.json, record 2 of 3; ")
+    with pytest.raises(CaptureError, match=r"records = 1 is not accepted: .*variable names"):
+        read_capture(path, records=1, variable="record 1")
+    rows = read_capture(path)
+    assert rows.reported_range_m is not None and rows.shape == (3, 4)
+    np.testing.assert_allclose(rows.reported_range_m[:2], [[0.008, 0.009, 0.1, np.nan]] * 2)
 
 
 @pytest.mark.parametrize("pulse", [Pulse(1e-10), Pulse.gaussian(1e-10)])
@@ -167,6 +214,90 @@ def test_tmf8820_ranges_of_a_real_sensor() -> None:
         assert 0.004 < np.median(error_m) < 0.008
         assert np.all(np.abs(error_m) < 0.0182)
         assert error_m.std() < 0.0048
+
+
+# -- TMF8829 ------------------------------------------------------------------------------------
+
+PEAKS = (
+    [{"distance": 4000, "snr": 9}, {"distance": 1500, "snr": 40}],
+    [{"distance": 0, "snr": 0}],
+    [],
+    [{"snr": 5, "x": 1.0}],
+)
+RESULTS = [[{"noise": 1, "peaks": peaks} for peaks in PEAKS]] * 3
+
+
+def log_with(configuration: Any = None, **of_records: Any) -> bytes:
+    """A log of one record with the sample counts."""
+    log = tmf8829_log(CUBE[np.newaxis], **of_records) | {"configuration": configuration}
+    return json.dumps(log).encode()
+
+
+def test_tmf8829_records_add_up_to_all(write: Write) -> None:
+    path = write("a.json", tmf8829_bytes(CUBE, n_records=4))
+    whole = read_capture(path)
+    np.testing.assert_array_equal(whole.cube, CUBE)
+    assert whole.source.startswith("a.json, variable mp_histo, all 4 records added; ")
+    each = [read_capture(path, records=k) for k in range(4)]
+    np.testing.assert_array_equal(sum(one.cube for one in each), CUBE)
+    span = read_capture(path, records=(1, 3))
+    np.testing.assert_array_equal(span.cube, CUBE - each[0].cube)
+    assert span.source.startswith("a.json, variable mp_histo, records 1 to 3 of 4 added; ")
+    assert {one.n_records for one in (whole, span, *each)} == {4}
+    with pytest.raises(CaptureError, match=r"records = 4 is not accepted: give one of 0 to 3, "):
+        read_capture(path, records=4)
+
+
+def test_tmf8829_states_bins_pulse_and_ranges(write: Write) -> None:
+    settings = {"bin_shift": 1, "ref_bin_shift": 2, "histogram_bins": 121, "select": 1}
+    reference = [{"bin": [0, 3, 0, 10, 1000, 500, 20, 1]}] * 2
+    content = log_with(settings, ref_histo=reference, results=RESULTS)
+    capture = read_capture(write("a.json", content))
+    np.testing.assert_array_equal(capture.cube, CUBE[:, :, :60])  # half of bin 60 is filled
+    assert capture.acquisition.bin_width_s == pytest.approx(410e-12)
+    assert capture.pulse == Pulse.measured([20, 2000, 1000, 40, 2], 820e-12)
+    assert capture.acquisition.gate_delay_s == pytest.approx(-3 * 820e-12)  # as the pulse rises
+    assert capture.detection == "all" and capture.acquisition.n_pulses is None
+    np.testing.assert_array_equal(capture.reported_range_m, [[1.5, np.nan, np.nan, np.nan]] * 3)
+    assert capture.truth_range_m is None
+    in_bins = read_capture(write("b.json", log_with({"select": 0}, results=RESULTS)))
+    others = read_capture(write("c.json", log_with(results=RESULTS[:2])))
+    assert in_bins.reported_range_m is None and others.reported_range_m is None
+
+
+def test_tmf8829_of_repeated_columns_is_one_row_of_zones(write: Write) -> None:
+    cube = np.repeat(CUBE[:, :1], 3, axis=1)
+    log = tmf8829_log(cube[np.newaxis], results=[row[:3] for row in RESULTS])
+    capture = read_capture(write("a.json", json.dumps(log).encode()))
+    np.testing.assert_array_equal(capture.cube, CUBE[np.newaxis, :, 0])
+    np.testing.assert_array_equal(capture.reported_range_m, [[1.5, np.nan, np.nan]])
+    assert "the first row of zones, which the log repeats in each column" in capture.source
+
+
+def test_tmf8829_in_dual_mode_asks_for_the_histograms(write: Write) -> None:
+    accurate = tmf8829_log(2 * CUBE[np.newaxis])["Result_Set"][0]["mp_histo"]
+    path = write("a.json", log_with(mp_histo_HA=accurate))
+    with pytest.raises(CaptureError, match="give mp_histo or mp_histo_HA") as caught:
+        read_capture(path)
+    assert caught.value.variables == ("mp_histo", "mp_histo_HA")
+    np.testing.assert_array_equal(read_capture(path, variable="mp_histo_HA").cube, 2 * CUBE)
+
+
+def test_tmf8829_log_of_a_real_sensor(tmp_path: Path) -> None:
+    """Ranges of 26 records, added or one by one, within a bin (123 mm) of the sensor's own."""
+    packed = real_capture_path("tmf8829_log.json.gz")
+    plain = tmp_path / "tmf8829_log.json"
+    plain.write_bytes(gzip.decompress(packed.read_bytes()))
+    whole, first = read_capture(packed), read_capture(plain, records=(0, 12))
+    assert whole.cube.shape == (1, 16, 54)  # 218 bins of the sensor, four in each
+    assert whole.n_records == first.n_records == 26
+    last, one = read_capture(packed, records=(13, 25)), read_capture(packed, records=7)
+    np.testing.assert_array_equal(whole.cube, first.cube + last.cube)
+    assert whole.acquisition == one.acquisition
+    assert one.reported_range_m is not None
+    error_m = (estimate(one, "likelihood").range_m - one.reported_range_m)[0]
+    assert 0.01 < np.median(error_m) < 0.025
+    assert np.all(np.abs(error_m) < 0.123)
 
 
 # -- what must be refused -----------------------------------------------------------------------
@@ -223,7 +354,18 @@ REFUSED: tuple[tuple[str, bytes, str], ...] = (
     ("a.sdt", sdt_bytes(CUBE, of_measurement={"adc_re": 7}), r"shape of block 0 = \(1200,\)"),
     ("a.sdt", sdt_bytes(CUBE, of_blocks={"meas_desc_block_no": 5}), "blocks cannot be read"),
     ("a.json", b"record", "list of records.*damaged"),
-    ("a.json", b'{"hists": []}', "the file = 'dict'"),
+    ("a.json", b'{"hists": []}', "Result_Set = 'NoneType'.*a list of records"),
+    ("a.json", b'{"Result_Set": []}', "records = 0"),
+    ("a.json", b'{"Result_Set": [1]}', "record 0 = 'int'"),
+    ("a.json", b'{"Result_Set": [{}]}', "variable = None.*histograms.*none in its first record"),
+    ("a.json", b'{"Result_Set": [{"mp_histo": 1}]}', "mp_histo of record 0 = "),
+    ("a.json", b'{"Result_Set": [{"mp_histo": [[{"bin": ["1"]}]]}]}', "mp_histo of record 0"),
+    ("a.json", b'{"Result_Set": [{"mp_histo": ' + NESTED + b"}]}", "the log.*RecursionError"),
+    ("a.json", tmf8829_bytes(CUBE).replace(b"[2, ", b"[-2, ", 1), "mp_histo = -2"),
+    ("a.json", log_with({"bin_shift": 9}), "bin_shift = 9 .*0 to 3"),
+    ("a.json", log_with({"histogram_bins": 3}), "histogram_bins = 3 .*give 4, one bin"),
+    ("a.json", log_with(results=[[{"peaks": [{"distance": -1}]}]]), "distance of a peak = -1"),
+    ("a.json", log_with(ref_histo=[{"bin": [0, 0]}]), "ref_histo = 0.0 .*not all 0"),
     ("a.json", b"[]", "records = 0"),
     ("a.json", b'[{"hist": 1}]', "record 0 = 'dict'.*hists"),
     ("a.json", b'[{"hists": ' + NESTED + b"}]", "list of records.*RecursionError"),
@@ -270,8 +412,25 @@ fields = st.fixed_dictionaries(
 @settings(max_examples=200, deadline=None)
 @given(st.lists(fields | values, max_size=3) | values)
 def test_any_json_is_read_or_refused(tmp_path_factory: Any, records: Any) -> None:
+    require_read_or_refused(tmp_path_factory, records)
+
+
+histograms = st.lists(st.lists(st.fixed_dictionaries({"bin": counts | values}) | values))
+log_fields = st.fixed_dictionaries(
+    {"mp_histo": histograms | values},
+    optional={"ref_histo": histograms | values, "results": histograms | values},
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(log_fields | values, max_size=3) | values, values)
+def test_any_log_is_read_or_refused(tmp_path_factory: Any, records: Any, settings: Any) -> None:
+    require_read_or_refused(tmp_path_factory, {"Result_Set": records, "configuration": settings})
+
+
+def require_read_or_refused(tmp_path_factory: Any, content: Any) -> None:
     path = tmp_path_factory.mktemp("json") / "any.json"
-    path.write_text(json.dumps(records))
+    path.write_text(json.dumps(content))
     try:
         assert read_capture(path).cube.ndim == 3
     except CaptureError as error:

@@ -40,6 +40,7 @@ CAPTURE = Capture(
     ACQUISITION,
     Pulse.measured([1, 2, 1], 1e-9),
     truth_range_m=np.arange(12.0).reshape(3, 4),
+    reported_range_m=np.arange(1.0, 13.0).reshape(3, 4),
     signal=np.full((3, 4), 0.5),
     background=1.5,
     source="a wall",
@@ -62,6 +63,7 @@ def test_our_own_layout_keeps_everything(name: str, tmp_path: Path) -> None:
     for field in ("acquisition", "pulse", "background", "source", "detection"):
         assert getattr(read, field) == getattr(CAPTURE, field), field
     np.testing.assert_array_equal(read.truth_range_m, CAPTURE.truth_range_m)
+    np.testing.assert_array_equal(read.reported_range_m, CAPTURE.reported_range_m)
     np.testing.assert_array_equal(read.signal, CAPTURE.signal)
     opened = open_capture(path)
     assert describe(opened, ReadOptions()) == (ACQUISITION, CAPTURE.pulse, "first", "a wall")
@@ -90,7 +92,10 @@ def test_axes_and_times_are_known_by_their_names(name: str, tmp_path: Path) -> N
     acquisition = capture.acquisition
     assert acquisition.bin_width_s == pytest.approx(0.5e-9)
     assert acquisition.gate_delay_s == pytest.approx(250e-9)
-    guessed = f"{name}, variable hist; guessed: time is when a bin opens, pulse Gaussian of 500 ps"
+    guessed = (
+        f"{name}, variable hist; guessed: time is when a bin opens, "
+        "pulse Gaussian of 500 ps (one bin: width not determined)"
+    )
     assert capture.source == f"{guessed}, all photons of a pulse"
     opened = open_capture(path, n_pulses=500)
     assert opened.dims == ("row", "col", "bin") and opened.dtype == np.uint16
@@ -244,8 +249,10 @@ def test_any_labelled_array_is_described() -> None:
     array.t.attrs["units"] = "ns"
     known = describe(oriented(array, ReadOptions()), ReadOptions(), "mine")
     assert known.acquisition.gate_delay_s == pytest.approx(5e-9)
-    guessed = "t is when a bin opens, pulse Gaussian of 1 ns, all photons of a pulse"
-    assert known.source == f"mine; guessed: {guessed}"
+    assert known.source == (
+        "mine; guessed: t is when a bin opens, "
+        "pulse Gaussian of 1 ns (one bin: width not determined), all photons of a pulse"
+    )
     array.t.attrs["units"] = "furlongs"
     known = describe(oriented(array, ReadOptions()), ReadOptions(), "mine")
     assert "guessed: t, of unit 'furlongs', left out, bin width 1 ns" in known.source

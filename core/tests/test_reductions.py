@@ -119,10 +119,12 @@ def test_pooled_truth_is_of_the_pixels_that_have_one() -> None:
         np.full((2, 4, 3), 200, np.uint8),
         Acquisition(n_bins=3, n_pulses=None),
         truth_range_m=truth_m,
+        reported_range_m=truth_m + 1,
         signal=np.array([[0.0, 1.0, 2.0, 2.0], [2.0, 1.0, 2.0, 2.0]]),
     )
     pooled = pool_pixels(capture, 2)
     np.testing.assert_array_equal(pooled.truth_range_m, [[3.5, 7.0]])
+    np.testing.assert_array_equal(pooled.reported_range_m, [[4.5, 8.0]])
     np.testing.assert_array_equal(pooled.signal, [[1.0, 2.0]])
     np.testing.assert_array_equal(pooled.cube, np.full((1, 2, 3), 800))  # more than uint8 holds
     sky = replace(capture, truth_range_m=np.full((2, 4), np.nan))
@@ -167,7 +169,8 @@ def test_all_photons_are_kept_each_by_chance() -> None:
 
 
 def test_fewer_pulses_are_a_part_of_more(wall: Capture) -> None:
-    for capture in (wall, replace(wall, detection="all")):
+    some = skip_pixels(wall, 3)
+    for capture in (some, replace(some, detection="all")):
         more = capture
         for n_pulses in (499, 250, 30, 1):
             fewer = first_pulses(capture, n_pulses, seed=2)
@@ -234,13 +237,16 @@ def test_missing_pixels_take_the_value_of_a_neighbour(
         np.ones((*shape, 2), np.uint16),
         Acquisition(n_bins=2, n_pulses=None),
         truth_range_m=(row + 0.01 * col).astype(float),
+        reported_range_m=(row + 0.01 * col).astype(float),
     )
     if min(shape) < skip or len(range((skip - 1) // 2, min(shape), skip)) < pool:
         with pytest.raises(ValueError, match="a whole number from 1 to"):
             Reduction(skip=skip, pool=pool).of(marked)
         return
     reduction = Reduction(skip=skip, pool=pool)
-    found_m = reduction.spread(np.asarray(reduction.of(marked).truth_range_m), shape)
+    reduced = reduction.of(marked)
+    np.testing.assert_array_equal(reduced.reported_range_m, reduced.truth_range_m)
+    found_m = reduction.spread(np.asarray(reduced.truth_range_m), shape)
     assert found_m.shape == shape
     row_off = np.abs(np.round(found_m) - row)
     col_off = np.abs(found_m % 1 / 0.01 - col) if pool == 1 else np.zeros(shape)

@@ -304,10 +304,13 @@ def files(folder: Path) -> Answers:
     core.save_image(capture, image, folder / "image.csv")
     core.save_pixel(capture, 2, 2, None, folder / "pixel.csv")
     for name in ("image", "pixel"):
-        yield f"{name}.csv", np.genfromtxt(folder / f"{name}.csv", delimiter=",", skip_header=1)
+        lines = (folder / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+        table = [line for line in lines if not line.startswith("#")]
+        yield f"{name}.csv", np.genfromtxt(table, delimiter=",", skip_header=1)
     core.save_image(capture, image, folder / "image.npz")
     with np.load(folder / "image.npz") as stored:
-        yield "image.npz", {key: stored[key] for key in stored.files}
+        provenance = {"method", "settings", "software"}  # tested with every format
+        yield "image.npz", {key: stored[key] for key in stored.files if key not in provenance}
 
 
 def scene_files(folder: Path) -> Answers:

@@ -7,6 +7,7 @@ import time
 from functools import partial
 from typing import Any
 
+from app.model.uploads import safe_name
 from core.tests.samples import OWN_FIELDS, npz_bytes
 from tests.attacks.attack import MIB, Attack, Outcome, Server
 from tests.attacks.files import HUNGRY, STRAY
@@ -98,7 +99,7 @@ async def uploaded(name: str, content: bytes, server: Server) -> Outcome:
     """Open a file in one session; every page then shows it."""
     tab = await opened(server)
     await tab.upload(name, content)
-    said = await tab.until(name.rsplit(".", 1)[0][-20:])
+    said = await tab.until(safe_name(name).rsplit(".", 1)[0][-20:])
     tab.wire.close()
     held = said.startswith(("opened", "refused")) and server.memory.peak_bytes < MOST_BYTES
     return Outcome(1, said, held)

@@ -16,7 +16,7 @@ from app.model.colors import cloud_of, image_of
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import cloud_files, image_files
 from app.model.mesh import view_bounds
-from app.model.methods import method_title
+from app.model.methods import doubts_hold, method_title
 from app.model.state import CLOUDS, KINDS, Comparison, Viewing
 from app.model.store import Answer
 from app.pages.compare import text
@@ -29,7 +29,7 @@ from app.pages.compare.ranking import (
     score_curves,
     tasks_of,
 )
-from app.pages.navigation import Page
+from app.pages.navigation import Page, Shared
 from app.pages.session import Session
 from app.pages.shared.downloads import (
     CLOUD,
@@ -64,8 +64,12 @@ IMAGE_HEIGHT, CLOUD_HEIGHT = 216, 320
 GRID = """
 :host {{ display: grid !important; gap: 8px; width: 100%;
   grid-template-columns: repeat({columns}, minmax(0, 1fr)); }}
-@media (max-width: 900px) {{ :host {{ grid-template-columns: repeat({few}, minmax(0, 1fr)); }} }}
-@media (max-width: 500px) {{ :host {{ grid-template-columns: repeat({fewest}, minmax(0, 1fr)); }} }}
+@media screen and (max-width: 900px) {{
+  :host {{ grid-template-columns: repeat({few}, minmax(0, 1fr)); }}
+}}
+@media screen and (max-width: 500px) {{
+  :host {{ grid-template-columns: repeat({fewest}, minmax(0, 1fr)); }}
+}}
 .scroll-button {{ display: none; }}
 """
 CLOUDS_IN_A_ROW = 3
@@ -73,7 +77,7 @@ CLOUDS_IN_A_ROW = 3
 PLOTS = """
 :host { display: grid !important; gap: 8px; height: 290px;
   grid-template: minmax(0, 1fr) / minmax(0, 5fr) minmax(0, 3fr); }
-@media (max-width: 900px) {
+@media screen and (max-width: 900px) {
   :host { display: flex !important; flex-direction: column; height: 670px !important; }
 }
 """
@@ -92,7 +96,7 @@ class Compare(Section):
     Parameters
     ----------
     session : Session
-        The session whose capture is used; tracking has the session's settings.
+        The session whose capture is used, and whose settings the methods have.
 
     Attributes
     ----------
@@ -233,10 +237,13 @@ class Compare(Section):
         """Come on screen, or leave it."""
         self.is_on_screen = is_on_screen
         if is_on_screen:
-            chosen = self._chosen  # another page may have changed it
-            for method, panel in self.panels.items():
-                panel.show(chosen.settings[method])
-            self.picks.value = list(chosen.methods)
+            self._show_controls()  # another page may have changed the state
+            self.refresh()
+
+    def follow(self, answer: Answer) -> None:
+        """Show another estimate of the session."""
+        if self.is_on_screen:
+            self._show_controls()
             self.refresh()
 
     def paint(self, dark: bool) -> None:
@@ -247,6 +254,18 @@ class Compare(Section):
                 self._paint_picture(picture)
             self._draw_figures()
             self._choose_pixel()
+
+    def _show_controls(self) -> None:
+        chosen = self._chosen
+        for method, panel in self.panels.items():
+            panel.show(self.session.state.settings[method])
+            panel.mark_doubts(doubts_hold(self.session.answer.capture))
+        self._viewing.show(chosen.viewing)
+        self._false_alarm.value = chosen.false_alarm
+        if chosen.kind in self.kind.options:
+            self.kind.value = chosen.kind
+        if set(self.picks.value) != set(chosen.methods):
+            self.picks.value = list(chosen.methods)
 
     # Actions of the user
 
@@ -260,12 +279,13 @@ class Compare(Section):
         self.refresh()
 
     def _set(self, method: str, settings: Any) -> None:
-        self._choose(settings={**self._chosen.settings, method: settings})
+        state = self.session.state
+        state.settings = {**state.settings, method: settings}
 
     def _picked(self) -> None:
         picked = tuple(each for each in ESTIMATORS if each in self.picks.value)
         chosen = replace(self._chosen, methods=picked)
-        tasks = tasks_of(chosen, self.session.answer.request.tracking).values()
+        tasks = tasks_of(chosen, self.session.answer.request).values()
         self.results = {  # a failed method runs again when it is picked again
             task: result
             for task, result in self.results.items()
@@ -297,7 +317,7 @@ class Compare(Section):
     @property
     def tasks(self) -> dict[str, Task]:
         """The picked methods, in the order of the registry."""
-        return tasks_of(self._chosen, self.session.answer.request.tracking)
+        return tasks_of(self._chosen, self.session.answer.request)
 
     @property
     def answers(self) -> dict[str, Answer]:
@@ -403,12 +423,13 @@ class Compare(Section):
         if answer is None:
             raise ValueError(NOTHING_DRAWN)
         kind, viewing = self.kind.value, self._chosen.viewing
-        least, image_kind = viewing.least_confidence, IMAGE_KINDS.get(kind, kind)
-        _, look = image_of(self.session.answer, image_kind, least)
+        image_kind = IMAGE_KINDS.get(kind, kind)
+        _, look = image_of(self.session.answer, image_kind, viewing)
         if kind == CLOUDS:
             what, files = "cloud", cloud_files(answer, "Range", viewing)
         else:
-            files = image_files(answer, image_kind, least, self.pictures[place].image.figure)
+            figure = self.pictures[place].image.figure
+            files = image_files(answer, image_kind, viewing, figure, look, method_title(method))
             what = f"{kind} image"
         subject = ranged(self.session, answer, method, self.tasks[method].settings)
         subject = viewed(self.session, subject, viewing)
@@ -441,13 +462,13 @@ class Compare(Section):
 
     def _draw_pictures(self) -> None:
         answers, methods, is_clouds = self.answers, self.pictured, self.kind.value == CLOUDS
-        least = self._chosen.viewing.least_confidence
+        viewing = self._chosen.viewing
         image_kind = IMAGE_KINDS.get(self.kind.value, self.kind.value)
         with self.session.tasks.hold():
             columns = max(min(len(methods), CLOUDS_IN_A_ROW if is_clouds else MAX_PICTURES), 1)
             few, fewest = (1, 1) if is_clouds else (3, 2)
             self._grid.stylesheets = [GRID.format(columns=columns, few=few, fewest=fewest)]
-            _, look = image_of(self.session.answer, image_kind, least)
+            _, look = image_of(self.session.answer, image_kind, viewing)
             self._scale.update(look)
             self._make_pictures(len(methods))
             drawn = zip(self.pictures, self._buttons, methods, strict=False)
@@ -461,7 +482,7 @@ class Compare(Section):
                 if is_clouds:
                     self._draw_cloud(picture, method, answers[method])
                 else:
-                    values, _ = image_of(answers[method], image_kind, least)
+                    values, _ = image_of(answers[method], image_kind, viewing)
                     picture.draw_image(values, look)
 
     def _draw_cloud(self, picture: Picture, method: str, answer: Answer) -> None:
@@ -539,4 +560,9 @@ class Compare(Section):
         )
 
 
-PAGE = Page("Compare", Compare, "shows methods side by side")
+PAGE = Page(
+    "Compare",
+    Compare,
+    "shows methods side by side",
+    shared=frozenset({Shared.UNIT, Shared.TRACKING, Shared.REDUCTION}),
+)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from app.model.budget import ranging
 from app.model.state import Comparison
-from app.model.store import Answer, is_wrong
-from core import ESTIMATORS, Capture, RangeImage, TrackingParameters, estimate, limits, metrics, run
+from app.model.store import Answer, Request, is_wrong
+from core import ESTIMATORS, Capture, RangeImage, estimate, limits, metrics, run
 
 Array = NDArray[Any]
 
@@ -31,11 +31,10 @@ class Task:
     false_alarm: float = 1.0
 
 
-def tasks_of(chosen: Comparison, tracking: TrackingParameters) -> dict[str, Task]:
-    """Return the chosen methods, in the order of the registry."""
-    settings = {**chosen.settings, "tracking": tracking}
+def tasks_of(chosen: Comparison, request: Request) -> dict[str, Task]:
+    """Return the chosen methods with the settings of a request, in the order of the registry."""
     return {
-        method: Task(method, settings[method], chosen.false_alarm)
+        method: Task(method, request.settings_of(method), chosen.false_alarm)
         for method in ESTIMATORS
         if method in chosen.methods
     }
@@ -78,8 +77,8 @@ class Reference:
 
 def run_task(task: Task, explored: Answer) -> Result:
     """Run a method on the capture of an estimate, or take that estimate if it is the same."""
-    capture, request = explored.capture, explored.request
-    if task == Task("tracking", request.tracking):
+    capture = explored.capture
+    if task == Task(explored.method, explored.settings):
         answer = explored
     else:
         with ranging(capture, task.method, task.settings, task.false_alarm):

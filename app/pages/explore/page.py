@@ -9,7 +9,7 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 
-from app.model.colors import cloud_of, color_values, image_of
+from app.model.colors import cloud_of, color_values, image_of, legend
 from app.model.exports import cloud_files, facts_file
 from app.model.state import Viewing
 from app.model.store import Answer, inspect
@@ -18,7 +18,7 @@ from app.pages.navigation import Page
 from app.pages.session import Session
 from app.pages.shared.downloads import (
     CLOUD,
-    IMAGE,
+    IMAGE_AND_REPORT,
     Shown,
     downloadable_facts,
     explored,
@@ -33,12 +33,27 @@ from app.tasks.turns import TURNS
 from app.theme import WRONG_COLOR
 from app.widgets.cards import BREAK_PX, board, card, choice, column, part
 from app.widgets.cloud import PointCloud
-from app.widgets.controls import FACTS_PX, HEADLINE_PX, Facts, PixelKeys, SettingsPanel
+from app.widgets.controls import (
+    FACTS_PX,
+    HEADLINE_PX,
+    Facts,
+    PixelKeys,
+    SettingsPanel,
+    legend_line,
+)
 from app.widgets.figures import pane_of
 from app.widgets.image_view import ImageView
 from app.widgets.signal_plots import SignalPlots
 
-BOARD = board(780, 125, BREAK_PX)
+# Where the numbers of the pixel need more rows, the plots keep their height.
+BOARD = (
+    board(780, 125, BREAK_PX)
+    + f"""
+@media (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
+  :host {{ height: max(900px, calc(100vh - 125px)) !important; }}
+}}
+"""
+)
 COLUMN = column(8, BREAK_PX)
 
 PICTURES_DELAY_MS = 60
@@ -57,24 +72,38 @@ class Explore(Section):
         Figures of the image and numbers of the pixel.
     signals : SignalPlots
         The pixel's plots.
+    cards : list of pn.Column
+        These plots in their frames.
     image : ImageView
     image_keys : PixelKeys
         The keyboard of the image.
+    legend : Sentence
+        What is hidden in the image.
     cloud : PointCloud
     """
 
     def __init__(self, session: Session) -> None:
         super().__init__(session)
         self.figures = Facts(timed=True, min_height=HEADLINE_PX, sizing_mode="stretch_width")
-        self.numbers = Facts(min_height=2 * FACTS_PX, sizing_mode="stretch_width")
+        self.numbers = Facts(leading=True, min_height=3 * FACTS_PX, sizing_mode="stretch_width")
         self.signals = SignalPlots()
         self.image = ImageView(session.choose_pixel)
         self._painted = [self.signals, self.image]
         self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
+        self.cards = [
+            self.offer(card(pane_of(plot.figure)), what, partial(pixel_plot, session, plot, what))
+            for plot, what in zip(
+                self.signals.plots, ("histogram", "residual", "enhanced", "score"), strict=True
+            )
+        ]
         self._large = LargeView(session, self.image.figure)
         state = session.state
         self._viewing = SettingsPanel(Viewing(), partial(setattr, state, "viewing"))
+        self.legend = legend_line()
+        self._difference = pmui.Switch.from_param(
+            state.param.difference, label="First difference", size="small", margin=(0, 8)
+        )
         self._is_outdated, self._pictures_are_due = True, False
         self._requested_s = 0.0
         self._show_sidebar()
@@ -87,13 +116,13 @@ class Explore(Section):
 
     def layout(self) -> tuple[Any, Any]:
         """Return the two columns of the page, and its part of the sidebar."""
-        session, state = self.session, self.session.state
+        state = self.session.state
         left = (
             self.offer(
-                card(choice(text.IMAGE_HELP, state.param.image), self.image_keys),
+                card(choice(text.IMAGE_HELP, state.param.image), self.image_keys, self.legend),
                 "image",
                 self.image_shown,
-                IMAGE,
+                IMAGE_AND_REPORT,
             ),
             self._large.layout,
             self.offer(
@@ -103,27 +132,14 @@ class Explore(Section):
                 CLOUD,
             ),
         )
-        right = (
-            downloadable_facts(self.numbers, session, self.numbers_shown),
-            *(
-                self.offer(
-                    card(pane_of(plot.figure)), what, partial(pixel_plot, session, plot, what)
-                )
-                for plot, what in zip(
-                    self.signals.plots, ("histogram", "residual", "enhanced"), strict=True
-                )
-            ),
-        )
+        right = (downloadable_facts(self.numbers, self.session, self.numbers_shown), *self.cards)
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
             for content in (left, right)
         )
         main = [self.figures, pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both")]
-        difference = pmui.Switch.from_param(
-            state.param.difference, label="First difference", size="small", margin=(0, 8)
-        )
         return main, [
-            part("View", self._viewing.layout, difference),
+            part("View", self._viewing.layout, self._difference),
             part("About this page", pmui.Typography(text.EXPLANATION, margin=8), is_open=False),
         ]
 
@@ -143,7 +159,7 @@ class Explore(Section):
     def cloud_shown(self) -> Shown:
         """Return the cloud, for a download, with the colour scale of the image."""
         session, state = self.session, self.session.state
-        _, look = color_values(session.answer, state.cloud_color)
+        _, look = color_values(session.answer, state.cloud_color, state.viewing)
         files = cloud_files(session.answer, state.cloud_color, state.viewing)
         heading = f"3D cloud, coloured by {state.cloud_color.lower()}"
         subject = viewed(session, explored(session), state.viewing)
@@ -197,12 +213,19 @@ class Explore(Section):
         with self.session.tasks.hold():
             self.image.fit(*answer.capture.shape, answer.grid)
             self.signals.update(pixel, answer.capture.acquisition, state.difference, state.unit)
+            self._show_cards(is_tracking=pixel.signals is not None)
             self.image.mark(row, col)
             self.image_keys.shape = list(answer.capture.shape)
             self.image_keys.pixel = [row, col]
             self.cloud.selected = row * answer.capture.shape[1] + col
             self.numbers.facts = numbers
             self.figures.facts = text.figure_strip(answer)
+
+    def _show_cards(self, is_tracking: bool) -> None:
+        """Show the stages of the tracking differentiator, or the score of another method."""
+        _, residual, enhanced, score = self.cards
+        residual.visible = enhanced.visible = self._difference.visible = is_tracking
+        score.visible = not is_tracking
 
     def _request_pictures(self) -> None:
         """Draw image and cloud, unless other pages wait to draw their plots."""
@@ -220,7 +243,9 @@ class Explore(Section):
             return
         answer, state = self.session.answer, self.session.state
         with self.session.tasks.hold():
-            self.image.update(*image_of(answer, state.image, state.viewing.least_confidence))
+            values, look = image_of(answer, state.image, state.viewing)
+            self.image.update(values, look)
+            self.legend.text = legend(answer, state.image, state.viewing, values, look)
             cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing)
             self.cloud.draw(cloud, rgb, crosses, scene_id=self.session.scene_id())
             n_wrong = None if crosses is None else int(crosses.sum())

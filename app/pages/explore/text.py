@@ -61,23 +61,32 @@ def figure_strip(answer: Answer) -> list[Fact]:
 
 def pixel_numbers(answer: Answer, pixel: Pixel, unit: str = "bins") -> list[Fact]:
     """Return name, value and help of each number of a pixel, positions in a unit."""
-    tracking, sigma = answer.request.tracking, float(pixel.signals.sigma)
     n_pulses = answer.capture.gated_pulses
-    r_small = tracking.l * sigma
     row, col = answer.grid.place(pixel.row, pixel.col)
     has_truth = answer.capture.truth_range_m is not None
     numbers = [
-        ("Pixel", f"row {row}, col {col}", "Arrow keys on the image move it."),
         *estimate_facts(pixel, scale(unit, answer.capture.acquisition), has_truth),
-        ("σ", number(sigma, "counts"), "Standard deviation of the histogram."),
-        ("r small", number(r_small, ""), "l·σ: limit of the small scale's acceleration."),
-        ("r large", number(tracking.n * r_small, ""), "n·l·σ: limit for the large scale."),
+        ("Pixel", f"row {row}, col {col}", "Arrow keys on the image move it."),
+        *_accelerations(answer, pixel),
         ("Detections", count(pixel.counts), "Counts in this pixel's histogram."),
     ]
     if n_pulses is not None:
         fired = share(pixel.counts / n_pulses)
         numbers.append(("Pulses that fired", fired, "Share of pulses with a detection."))
     return numbers
+
+
+def _accelerations(answer: Answer, pixel: Pixel) -> list[Fact]:
+    """Return the limits of the tracking differentiator's scales; none for other methods."""
+    if pixel.signals is None:
+        return []
+    tracking, sigma = answer.settings, float(pixel.signals.sigma)
+    r_small = tracking.l * sigma
+    return [
+        ("σ", number(sigma, "counts"), "Standard deviation of the histogram."),
+        ("r small", number(r_small, ""), "l·σ: limit of the small scale's acceleration."),
+        ("r large", number(tracking.n * r_small, ""), "n·l·σ: limit for the large scale."),
+    ]
 
 
 def cloud_caption(answer: Answer, n_shown: int, n_wrong: int | None) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import panel as pn
@@ -31,7 +31,6 @@ from app.widgets.cards import button
 from app.widgets.controls import Facts, Knob, Sentence
 from app.widgets.figures import cover, pane_of
 from core.inspection import Accuracy, CaptureReport
-from core.parameters import Number, spec_of
 
 ADVICE = """
 :host { display: flex !important; align-items: center; gap: 8px; flex: none !important; }
@@ -74,8 +73,7 @@ class CaptureSection(Section):
         self.study = Study(session, self._steps, "shares of the pulses")
         self.facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")
         self.flux = Sentence(sizing_mode="stretch_width", margin=0)
-        (pulses,) = (each for each in fields(ReductionSettings) if each.name == "pulses")
-        self.pulses = Knob.of(cast(Number, spec_of(pulses)), 1.0, text.PULSES_HELP)
+        self.pulses = Knob.of_field(ReductionSettings(), "pulses")
         self.pulses.param.watch(lambda event: self._reduce(event.new), "value")
         self.advice = [Sentence(sizing_mode="stretch_width", margin=(2, 0)) for _ in range(2)]
         self.apply = [
@@ -151,7 +149,8 @@ class CaptureSection(Section):
     @property
     def _study_settings(self) -> Any:
         answer = self.session.answer
-        return answer.whole, replace(answer.request.less, pulses=1.0), answer.request.tracking
+        less = replace(answer.request.less, pulses=1.0)
+        return answer.whole, less, answer.method, answer.settings
 
     @property
     def _all_pulses(self) -> int:

@@ -4,40 +4,57 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
 
-from app.model.colors import map_of
-from app.model.state import MOST_PINS
+from app.model.colors import legend, map_of
+from app.model.state import MOST_PINS, Viewing
 from app.model.store import Answer
 from app.pages.inspect import text
 from app.pages.inspect.capture import CaptureSection
+from app.pages.inspect.pair import PairSection
 from app.pages.inspect.pins import PinsSection, pin_colors
-from app.pages.inspect.pixel import BREAK_PX, COLUMN, FILLING, PixelSection, framed
+from app.pages.inspect.pixel import BREAK_PX, COLUMN, FILLING, NARROW, PixelSection, framed
 from app.pages.inspect.results import Corners
 from app.pages.inspect.views import Navigator, rectangle
 from app.pages.navigation import Page, Pages
 from app.pages.session import Session
-from app.pages.shared.downloads import CORNER_PX, IMAGE, Shown, image_on_show
+from app.pages.shared.downloads import CORNER_PX, IMAGE_AND_REPORT, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
 from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part
 from app.widgets.component import until_session_ends
-from app.widgets.controls import Chips, PixelKeys, Sentence
+from app.widgets.controls import (
+    Chips,
+    PixelKeys,
+    Sentence,
+    SettingsPanel,
+    Table,
+    legend_line,
+)
 from core.checks import require
+from core.inspection import FaultyPixel, faulty_pixels
+from core.io import ColorScale, RangeColors
 
 # The map with a table below on the left, plots on the right.
 BOARD = board(600, 88, BREAK_PX)
 TABLES = f"""
 :host {{ flex: 0 1 auto !important; min-height: 0; min-width: 0; max-height: 34%;
   overflow-y: auto; }}
-@media (max-width: {BREAK_PX}px) {{ :host {{ max-height: none }} }}
+@media screen and (max-width: {BREAK_PX}px) {{ :host {{ max-height: none }} }}
 """
+KNOB_PX = 46
+"""Height of the slider below the map, reserved from the start."""
+
 MAP_DELAY_MS = 60
 """The map is drawn this long after the pixel's plots, which the eye follows."""
+
+LISTED = ".scroll { max-height: 232px; overflow-y: auto; }"
+"""Style of a list in the sidebar: it scrolls."""
 
 ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 4px 6px; }"
 
@@ -55,6 +72,14 @@ class Inspect(Section):
         Row and column of the pixel, rows and columns of a region.
     chips : Chips
         The pinned pixels.
+    legend : Sentence
+        What is hidden on the map.
+    least_confidence : Knob
+        Estimates of less confidence are hidden.
+    faulty : Table
+        The hot and dead pixels that differ most from their neighbours.
+    n_faulty : Sentence
+        How many there are.
     refusal : Sentence
         Why the last action was refused.
     """
@@ -74,7 +99,17 @@ class Inspect(Section):
             margin=0,
             styles={"position": "absolute"},
         )
+        self.legend = legend_line()
+        self._viewing = SettingsPanel(Viewing(), partial(setattr, state, "viewing"))
+        self.least_confidence = self._viewing.controls["least_confidence"]
+        self.least_confidence.min_height = KNOB_PX
         self.refusal = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
+        self.n_faulty = Sentence(sizing_mode="stretch_width", margin=(4, 8))
+        self.faulty = Table(
+            title=text.FAULTY, stylesheets=[NARROW, LISTED], sizing_mode="stretch_width", margin=0
+        )
+        # Sent and drawn only where there are such pixels.
+        self._faulty_part = part(text.FAULTY, self.n_faulty, self.faulty, is_shown=False)
         self.chips = Chips(label="Pinned pixels", sizing_mode="stretch_width", margin=0)
         self._map = pmui.Select.from_param(
             state.param.map,
@@ -109,6 +144,7 @@ class Inspect(Section):
                 "Pixel": lambda: PixelSection(session, "pixel").view,
                 "Region": lambda: PixelSection(session, "region").view,
                 "Pins": lambda: PinsSection(session).view,
+                "A/B": lambda: PairSection(session).view,
                 "Capture": lambda: CaptureSection(session).view,
             },
             label="",
@@ -130,6 +166,7 @@ class Inspect(Section):
         until_session_ends(self._mode.jscallback(value=choose, args=drags))
         for axis, field in enumerate(self.place):
             field.param.watch(lambda event, axis=axis: self._go_to(axis, event.new), "value")
+        self.faulty.param.watch(lambda event: self._inspect(event.new[0]), "acted")
         self.chips.param.watch(lambda event: session.choose_pixel(*event.new[0]), "chosen")
         self.chips.param.watch(lambda event: self._unpin(event.new[0]), "removed")
         for name, draw in self._marks.items():
@@ -144,7 +181,11 @@ class Inspect(Section):
             below.param.update(stylesheets=[TABLES], sizing_mode="stretch_width", margin=0)
         left = (
             _row(self._map, self._mode, self._clear),
-            self.offer(framed(self.navigator.pane, self.keys), "map", self._map_shown, IMAGE),
+            self.offer(
+                framed(self.navigator.pane, self.keys), "map", self._map_shown, IMAGE_AND_REPORT
+            ),
+            self.legend,
+            self.least_confidence,
             self._large.layout,
             _row(*self.place, self._pin),
             _row(*self.span, self._add),
@@ -157,8 +198,16 @@ class Inspect(Section):
             for content in (left, (sections.choice, *sections.mains.values()))
         )
         main = pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both", margin=0)
-        explanation = pmui.Typography(text.EXPLANATION, margin=8)
-        return main, part("How to read this page", explanation, is_open=False)
+        colors = [self._viewing.controls[each.name] for each in fields(RangeColors)]
+        return main, [
+            self._faulty_part,
+            part("View", *colors, self._viewing.doubts, is_open=False),
+            part(
+                "How to read this page",
+                pmui.Typography(text.EXPLANATION, margin=8),
+                is_open=False,
+            ),
+        ]
 
     def _map_shown(self) -> Shown:
         kind = self.session.state.map
@@ -230,6 +279,11 @@ class Inspect(Section):
         elif state.subject == "Region":
             state.subject = "Pixel"
 
+    def _inspect(self, pixel: list[int]) -> None:
+        """Choose a pixel and show what is known about it."""
+        self.session.choose_pixel(*pixel)
+        self.session.state.subject = "Pixel"
+
     def _pin_pixel(self) -> None:
         state = self.session.state
 
@@ -295,8 +349,30 @@ class Inspect(Section):
     def _request_map(self) -> None:
         if self.is_on_screen:
             answer, state = self.session.answer, self.session.state
-            work = partial(map_of, answer, state.map, state.viewing.least_confidence)
-            self.submit(work, lambda drawn: self.navigator.update(*drawn))
+            kind, viewing = state.map, state.viewing
+            self._viewing.show(viewing)
+
+            def work() -> tuple[tuple[Any, ColorScale], list[FaultyPixel]]:
+                return map_of(answer, kind, viewing), faulty_pixels(answer.capture)
+
+            def draw(found: tuple[tuple[Any, ColorScale], list[FaultyPixel]]) -> None:
+                drawn, faulty = found
+                self.navigator.update(*drawn)
+                self.legend.text = legend(answer, kind, viewing, *drawn)
+                self._list_faulty(answer, faulty)
+
+            self.submit(work, draw)
+
+    def _list_faulty(self, answer: Answer, faulty: list[FaultyPixel]) -> None:
+        """Mark and list the hot and dead pixels."""
+        self.navigator.mark_faulty(faulty)
+        listed = text.listed(faulty)
+        self._faulty_part.visible = bool(faulty)
+        self.n_faulty.text = text.faulty_sentence(faulty, len(listed))
+        self.faulty.param.update(
+            columns=text.FAULTY_COLUMNS if listed else [],
+            rows=[text.faulty_row(each, answer.grid) for each in listed],
+        )
 
 
 def _row(*content: Any) -> pn.Row:

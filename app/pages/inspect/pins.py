@@ -19,33 +19,36 @@ from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
 from app.theme import palette
 from app.widgets.controls import Sentence, Table
-from app.widgets.figures import cover, pane_of
+from app.widgets.figures import cover, fit, pane_of
 
 
 class PinsSection(Section):
-    """Histograms and enhanced signals of the pinned pixels, and a table.
+    """Histograms and scores of the pinned pixels, and a table.
 
     Attributes
     ----------
     found : list of Inspected
         The pixels that are shown.
-    counts, enhanced : GatePlot
+    counts, score : GatePlot
+    note : Sentence
+        Distances of the pins from the first one, or what to do.
     table : Table
     """
 
     def __init__(self, session: Session) -> None:
         super().__init__(session, "pins", "unit")
+        session.state.param.watch(lambda *_: self._write_note(), "viewing")
         self.found: list[Inspected] = []
         self._bins = Range1d(0, 1)
-        self.counts, self.enhanced = (
+        self.counts, self.score = (
             GatePlot(inspect_plots.overlay(self._bins, title, unit), has_top=unit == "Counts")
             for title, unit in (
                 ("Counts of the pinned pixels", "Counts"),
-                ("Enhanced signals of the pinned pixels", "Counts × weight"),
+                ("Scores of the pinned pixels", "Score"),
             )
         )
-        self._painted = [self.counts, self.enhanced]
-        self._note = Sentence(text=text.NO_PINS, sizing_mode="stretch_width", margin=0)
+        self._painted = [self.counts, self.score]
+        self.note = Sentence(text=text.NO_PINS, sizing_mode="stretch_width", margin=0)
         self.table = Table(
             title=text.PINS, stylesheets=[NARROW], sizing_mode="stretch_width", margin=0
         )
@@ -54,9 +57,9 @@ class PinsSection(Section):
         """Return the plots, and the table that stands below the map."""
         cards = [
             self.offer_plot(framed(pane_of(plot.figure)), what, plot, f"pins {what}")
-            for plot, what in ((self.counts, "counts"), (self.enhanced, "enhanced"))
+            for plot, what in ((self.counts, "counts"), (self.score, "scores"))
         ]
-        return stage(self._note, *cards), self.offer_table(self.table, "pins")
+        return stage(self.note, *cards), self.offer_table(self.table, "pins")
 
     def paint(self, dark: bool) -> None:
         """Change between light and dark mode."""
@@ -78,8 +81,8 @@ class PinsSection(Section):
         cover(self._bins, acquisition.n_bins)
         bins = plots.centres(acquisition.n_bins)
         for plot, quantity, curves in (
-            (self.counts, "counts", [each.pixel.signals.raw for each in found]),
-            (self.enhanced, "counts × weight", [each.pixel.signals.enhanced for each in found]),
+            (self.counts, "counts", [each.pixel.histogram for each in found]),
+            (self.score, "score", [each.pixel.score for each in found]),
         ):
             plot.follow(unit, acquisition)
             named = zip(names, curves, strict=True)
@@ -90,8 +93,10 @@ class PinsSection(Section):
                 "color": list(colors),
                 "label": names,
             }
-            plot.frame(*curves, np.zeros(1))
-        self._note.text = "" if found else text.NO_PINS
+        self.counts.frame(*(each.pixel.histogram for each in found), np.zeros(1))
+        if found:
+            lows, highs = zip(*(plots.score_ends(each.pixel.score) for each in found), strict=True)
+            fit(self.score.figure, min(lows), max(highs))
         self.table.param.update(
             columns=text.pin_columns(unit) if found else [],
             rows=[
@@ -100,6 +105,11 @@ class PinsSection(Section):
             ],
         )
         self.found = found
+        self._write_note()
+
+    def _write_note(self) -> None:
+        distances = text.distances(self.found, self.session.state.viewing)
+        self.note.text = distances if self.found else text.NO_PINS
 
 
 def pin_colors(dark: bool) -> tuple[str, ...]:

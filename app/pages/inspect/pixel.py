@@ -29,7 +29,11 @@ from app.widgets.figures import pane_of
 BREAK_PX = 1100
 """Width below which the parts of this page follow each other."""
 
-FACTS = ".fact-list { grid-template-columns: repeat(auto-fill, minmax(140px, 1fr)) !important; }"
+FACTS = """
+.fact-list { grid-template-columns: repeat(auto-fill, minmax(140px, 1fr)) !important; }
+.leading div:first-child { grid-column: auto !important; }
+.leading div:first-child dd { font-size: 15px !important; }
+"""
 FILLING = ":host { flex: 1 1 0 !important; min-height: 0; min-width: 0; }" + unrolled(BREAK_PX)
 COLUMN = column(6, BREAK_PX)
 FRAME = unrolled(BREAK_PX, "330px")
@@ -38,8 +42,8 @@ th, td { padding: 3px 6px !important; }
 tbody th { min-width: 40px !important; }
 """
 
-FACTS_ACROSS = 4
-"""Facts in a row on a laptop."""
+FACTS_ACROSS, FACT_ROWS = 4, 3
+"""Facts in a row on a laptop, and rows of them that are reserved from the start."""
 
 TABLE_PX = 217
 """Height of the table with the largest number of candidates, reserved from the start."""
@@ -94,10 +98,13 @@ class PixelSection(Section):
         self.cards = [
             self.offer_plot(framed(pane_of(plot.figure)), what, plot, what)
             for plot, what in zip(
-                self.plots.plots, ("counts", "rate", "residual and enhanced"), strict=True
+                self.plots.plots, ("counts", "rate", "residual and enhanced", "score"), strict=True
             )
         ]
-        self.facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")
+        height = FACT_ROWS * FACTS_PX
+        self.facts = Facts(
+            leading=True, stylesheets=[FACTS], min_height=height, sizing_mode="stretch_width"
+        )
         self.remark = Sentence(live=True, min_height=LINE_PX, sizing_mode="stretch_width", margin=0)
         self.table = Table(
             title=text.CANDIDATES,
@@ -159,8 +166,9 @@ class PixelSection(Section):
 
     def _draw(self, found: Inspected) -> None:
         self.plots.update(found, self.session.state.unit)
-        for each in self.cards:
-            each.visible = True
+        hidden = self.plots.score if found.pixel.signals is not None else self.plots.stages
+        for each, plot in zip(self.cards, self.plots.plots, strict=True):
+            each.visible = plot is not hidden
         self._drawn, self._is_outdated = found, False
         # Facts and table follow once the plots, which the eye follows, are on their way.
         self._write_soon()

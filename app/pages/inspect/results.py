@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.model.budget import spending
+from app.model.colors import shown
 from app.model.state import ReductionSettings
 from app.model.store import Answer, Pixel, inspect, reduced
 from core import inspection
 from core.cost import predicted_flux_time
 from core.inspection import Accuracy, CaptureReport, PixelReport, RegionReport, Suggestion
+from core.metrics import Interval, wilson
+
+Array = NDArray[Any]
 
 Corners = tuple[tuple[float, float], ...]
 """Corners (row, col) of a polygon."""
@@ -35,10 +41,9 @@ class Inspected:
 
 def inspect_pixel(answer: Answer, row: int, col: int) -> Inspected:
     """Inspect one pixel; its flux is estimated when it is first used."""
-    report = inspection.pixel_report(
-        answer.capture, answer.run.image, row, col, "tracking", answer.request.tracking
-    )
-    return Inspected(answer, inspect(answer, row, col), report)
+    chosen = answer.method, answer.settings
+    report = inspection.pixel_report(answer.capture, answer.run.image, row, col, *chosen)
+    return Inspected(answer, inspect(answer, row, col, report), report)
 
 
 def inspect_pixel_with_flux(answer: Answer, row: int, col: int) -> Inspected:
@@ -61,11 +66,10 @@ def inspect_region(answer: Answer, region: Corners) -> Inspected:
     mask = inspection.pixels_in(region, answer.capture.shape)
     n_pixels, n_bins = int(np.count_nonzero(mask)), answer.capture.acquisition.n_bins
     with spending((1, n_pixels, n_bins), "flux", predicted_flux_time(n_pixels, n_bins)):
-        report = inspection.region_report(
-            answer.capture, answer.run.image, mask, "tracking", answer.request.tracking
-        )
+        chosen = answer.method, answer.settings
+        report = inspection.region_report(answer.capture, answer.run.image, mask, *chosen)
     of_sum = replace(answer, run=replace(answer.run, capture=report.summed, image=report.image))
-    return Inspected(answer, inspect(of_sum, 0, 0), report.pixel, report)
+    return Inspected(answer, inspect(of_sum, 0, 0, report.pixel), report.pixel, report)
 
 
 def inspect_capture(answer: Answer) -> CaptureReport:
@@ -81,12 +85,10 @@ def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:
 
     def step() -> Accuracy:
         if not started:  # on the worker thread, since restoring all pulses may take long
-            request = answer.request
+            request, chosen = answer.request, (answer.method, answer.settings)
             all_pulses = replace(request, less=replace(request.less, pulses=1.0))
             capture = reduced(answer.whole, all_pulses)
-            started.append(
-                inspection.accuracy_over_pulses(capture, SHARES, "tracking", request.tracking)
-            )
+            started.append(inspection.accuracy_over_pulses(capture, SHARES, *chosen))
         return next(started[0])
 
     return [step] * len(SHARES)
@@ -99,3 +101,37 @@ def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[ReductionSettings
     first, end = (opens + less.merge * edge for edge in suggestion.gate)
     t_n = max(answer.request.tracking.t_n - suggestion.gate[0], 0)
     return replace(less, gate_from=first / n_bins, gate_to=min(end / n_bins, 1.0)), t_n
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two estimates of as many pixels, A and B."""
+
+    a: Answer
+    b: Answer
+    shown: tuple[Array, Array]
+    """Pixels (row, col) of each that are confident enough to be shown."""
+    difference_m: Array
+    """B minus A (row, col), NaN where one is not shown."""
+
+    def within(self, n_bins: float) -> Interval:
+        """Return the share of pixels in both whose ranges differ by at most some bins of B."""
+        known = self.difference_m[np.isfinite(self.difference_m)]
+        limit_m = n_bins * self.b.capture.acquisition.bin_length_m
+        return wilson(int((np.abs(known) <= limit_m).sum()), known.size)
+
+
+def pair_of(a: Answer, b: Answer, least_confidence: float) -> Pair:
+    """Compare two estimates.
+
+    Raises
+    ------
+    ValueError
+        If their images differ in shape.
+    """
+    if a.capture.shape != b.capture.shape:
+        sizes = [" × ".join(map(str, each.capture.shape)) for each in (a, b)]
+        raise ValueError("A has {} pixels, and B {}: their sizes must be equal.".format(*sizes))
+    in_a, in_b = shown(a, least_confidence), shown(b, least_confidence)
+    difference_m = b.run.image.range_m - a.run.image.range_m
+    return Pair(a, b, (in_a, in_b), np.where(in_a & in_b, difference_m, np.nan))

@@ -6,10 +6,23 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from app.model.large import Grid
+from app.model.methods import method_title
+from app.model.state import Viewing
 from app.model.store import Answer
-from app.model.text import CONFIDENCE_HELP, Fact, cell, estimate_facts, number, percent_cell, share
-from app.pages.inspect.results import Inspected
+from app.model.text import (
+    CONFIDENCE_HELP,
+    Fact,
+    cell,
+    estimate_facts,
+    milliseconds,
+    number,
+    percent_cell,
+    share,
+)
+from app.pages.inspect.results import Inspected, Pair
 from app.units import (
     AXIS_TITLES,
     OPPOSITE_UNIT,
@@ -17,12 +30,15 @@ from app.units import (
     Scale,
     bounds,
     count,
+    plus_minus,
     scale,
     three_digits,
 )
 from app.units import interval as format_interval
 from core import Capture
-from core.inspection import Candidate, CaptureReport, FluxEstimate
+from core.geometry import distance_m, pixel_angle_of, sight_lines
+from core.inspection import Candidate, CaptureReport, FaultyPixel, FluxEstimate
+from core.io import changed_settings
 from core.metrics import Interval
 
 EXPLANATION = """
@@ -30,7 +46,8 @@ EXPLANATION = """
 With *Rectangle* or *Lasso*, drag on the map to select a region; its histograms are summed and shown
 as one. With *Zoom*, drag to enlarge; the wheel zooms as well, and a double tap shows the whole map.
 
-**Compare.** *Pin this pixel*, or the key P, keeps up to four pixels.
+**Compare.** *Pin this pixel*, or the key P, keeps up to four pixels, and *Pins* their
+distances. *A/B* keeps an estimate and subtracts it from later ones.
 
 **Judge.** Candidates are the peaks of the estimator's score. Each has the probability of a surface
 within 3 bins of it, which does not depend on the estimator. S, B and SBR are estimated from the
@@ -48,10 +65,19 @@ SELECT_HELP = "Select region: all pixels in these rows and columns."
 CLEAR_HELP = "Clear region: remove the selected region."
 TOO_MANY_PINS = "Four pixels are pinned already: remove one first."
 NO_PINS = "No pixels are pinned. Select a pixel and press “Pin this pixel”, or P on the map."
+WIDTH_GUESSED = "Lengths across the line of sight follow from the field of view, which is a guess."
 NO_REGION = (
     "No region is selected. Drag a rectangle or a lasso on the map, or type rows and columns such "
     "as 10-20."
 )
+
+NO_A = (
+    "Keep the estimate on screen as A. Then choose another method, other settings or another "
+    "capture: that is B."
+)
+KEEP_HELP = "Keep as A: the estimate on screen, to compare it with later ones."
+FORGET_HELP = "Forget A."
+DIFFERENCE_TITLE = "B minus A"
 
 CANDIDATES = "Candidates: peaks of the estimator's score, best first."
 PINS = "Pinned pixels."
@@ -72,7 +98,7 @@ def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
     place = pixel_name((pixel.row, pixel.col), answer.grid)
     along = scale(unit, answer.capture.acquisition)
     has_truth = answer.capture.truth_range_m is not None
-    facts = [("Pixel", place, "Row and column."), *estimate_facts(pixel, along, has_truth)]
+    facts = [*estimate_facts(pixel, along, has_truth), ("Pixel", place, "Row and column.")]
     counts, help = count(pixel.counts), "Counts in the histogram of this pixel"
     if answer.capture.gated_pulses is not None:
         counts = count(pixel.counts, share(pixel.counts / answer.capture.gated_pulses))
@@ -85,8 +111,8 @@ def _region_facts(found: Inspected, unit: str) -> list[Fact]:
     assert region is not None
     spread = "Half the central 68 % range of the estimates, which is one standard deviation."
     return [
-        ("Pixels", count(region.n_pixels), "Pixels whose centre lies in the region."),
         *estimate_facts(found.pixel, along, has_truth=False),
+        ("Pixels", count(region.n_pixels), "Pixels whose centre lies in the region."),
         ("Median range", number(region.median_m, "m"), "Median of the estimates of its pixels."),
         ("Spread", number(region.spread_m, "m"), spread),
         ("Coverage", share(region.share_answered), "Share of its pixels with an estimate."),
@@ -104,6 +130,55 @@ def _flux(report: Any) -> list[Fact]:
         ("Signal S", interval(found.signal), f"Signal flux in {per}"),
         ("Background B", interval(found.background), f"Background flux over the gate in {per}"),
         ("SBR", interval(found.sbr), "Signal divided by background, with 95 % interval."),
+    ]
+
+
+def estimate_name(answer: Answer) -> str:
+    """Return scene or capture, method, and all that differs from its default."""
+    request = answer.request
+    light = (request.light,) if request.source.is_scene else ()
+    names = [request.source.title, method_title(answer.method)]
+    for settings in (*light, request.less, answer.settings):
+        names += changed_settings(settings)
+    return ", ".join(names)
+
+
+def pair_facts(pair: Pair) -> list[Fact]:
+    """Return name, value and help of each number of two estimates."""
+    (in_a, in_b), known = pair.shown, pair.difference_m[np.isfinite(pair.difference_m)]
+    facts: list[Fact] = [
+        ("In both", count(known.size), "Pixels that both show."),
+        ("Only in A", count(int((in_a & ~in_b).sum())), "Pixels that only A shows."),
+        ("Only in B", count(int((in_b & ~in_a).sum())), "Pixels that only B shows."),
+    ]
+    if known.size:
+        median_m, rms_m = float(np.median(known)), float(np.sqrt(np.mean(known**2)))
+        facts += [
+            ("Median B − A", number(median_m, "m", sign=True), "Over pixels in both."),
+            ("RMS of B − A", number(rms_m, "m"), "Root mean square over pixels in both."),
+        ]
+        for n in (1, 3):
+            within = pair.within(n)
+            ends = f"{share(within.low)} to {share(within.high)}"
+            name = f"Within {n} bin{'s' * (n > 1)}"
+            facts.append((name, share(within.value), f"Share of these; 95 % interval {ends}."))
+    for name, answer in (("A", pair.a), ("B", pair.b)):
+        if answer.run.figures:
+            rmse = number(answer.run.figures["rmse_m"], "m")
+            facts.append((f"RMSE of {name}", rmse, "Over target pixels with an estimate."))
+        time = milliseconds(answer.run.estimate_s)
+        facts.append((f"Time of {name}", time, "Time to estimate all pixels."))
+    return facts
+
+
+def pair_pixel_facts(pair: Pair, row: int, col: int) -> list[Fact]:
+    """Return name, value and help of each number of one pixel of two estimates."""
+    here_m = [float(each.run.image.range_m[row, col]) for each in (pair.a, pair.b)]
+    return [
+        ("Pixel", pixel_name((row, col), pair.b.grid), "Row and column."),
+        ("A here", number(here_m[0], "m"), "Estimate of A, shown or not."),
+        ("B here", number(here_m[1], "m"), "Estimate of B, shown or not."),
+        ("B − A here", number(here_m[1] - here_m[0], "m", sign=True), "Difference of the two."),
     ]
 
 
@@ -182,18 +257,84 @@ def pin_row(found: Inspected, name: str, color: str, along: Scale, other: Scale)
     }
 
 
+def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
+    """Return the distance of each pin from the first one; empty for fewer than two."""
+    if len(found) < 2:
+        return ""
+    answer = found[0].answer
+    shape, acquisition = answer.capture.shape, answer.capture.acquisition
+    lines = sight_lines(shape, pixel_angle_of(viewing.field_of_view_deg, shape[1]))
+    names = [pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
+    first, sentences = found[0].pixel, []
+    for name, pixel in zip(names[1:], (each.pixel for each in found[1:]), strict=True):
+        ends_m = np.array([(p.interval_95_m.low, p.interval_95_m.high) for p in (first, pixel)])
+        half_m = (ends_m[:, 1] - ends_m[:, 0]) / 2
+        towards = [lines[p.row, p.col] for p in (first, pixel)]
+        length_m, margin_m = distance_m(towards, ends_m.mean(axis=1), half_m)
+        known = math.isfinite(length_m)
+        length = plus_minus(length_m - margin_m, length_m + margin_m, "m") if known else "not known"
+        sentences.append(f"{length} to {name}")
+    guessed = "" if acquisition.pixel_angle_rad is not None else f" {WIDTH_GUESSED}"
+    return f"From {names[0]}: {', '.join(sentences)} (95 %).{guessed}"
+
+
 def pixel_name(pixel: tuple[int, int], grid: Grid) -> str:
     """Return row and column of a pixel in its file."""
     row, col = grid.place(*pixel)
     return f"{row}, {col}"
 
 
+# Hot and dead pixels
+
+FAULTY = "Hot and dead pixels"
+MOST_LISTED = 10
+"""Pixels of each kind that are listed."""
+
+FAULTY_COLUMNS: list[Sequence[Any]] = [
+    ("Pixel", "Row and column.", 1),
+    ("Fault", "Hot: more detections than all neighbours; dead: fewer.", 1),
+    ("Counts", "Detections; below, those of its eight neighbours.", -1),
+]
+
+
+def listed(faulty: Sequence[FaultyPixel]) -> list[FaultyPixel]:
+    """Return the first pixels of each kind."""
+    return [
+        each
+        for health in ("hot", "dead")
+        for each in [one for one in faulty if one.health == health][:MOST_LISTED]
+    ]
+
+
+def faulty_sentence(faulty: Sequence[FaultyPixel], n_listed: int) -> str:
+    """Return how many pixels are hot or dead, and how many of them are listed."""
+    if not faulty:
+        return "No pixel differs significantly from all its neighbours."
+    n_hot = sum(each.health == "hot" for each in faulty)
+    n_dead = len(faulty) - n_hot
+    sentence = f"{n_hot:,} hot (circles on the map), {n_dead:,} dead (crosses)."
+    if n_listed == len(faulty):
+        return sentence
+    more = f"{len(faulty) - n_listed:,} more are only marked."
+    return f"{sentence} Listed are up to {MOST_LISTED} of each that differ most; {more}"
+
+
+def faulty_row(pixel: FaultyPixel, grid: Grid) -> dict[str, Any]:
+    """Return the row of a hot or dead pixel, with a button that shows it."""
+    neighbours = f"{pixel.neighbours_least:,} to {pixel.neighbours_most:,}"
+    return {
+        "key": [pixel.row, pixel.col],
+        "name": pixel_name((pixel.row, pixel.col), grid),
+        "action": "Show",
+        "cells": [
+            (pixel.health, pixel.health, ""),
+            (f"{pixel.counts:,}", pixel.counts, neighbours),
+        ],
+    }
+
+
 # The capture as a whole
 
-PULSES_HELP = (
-    "Share of the pulses to use, as if the recording had ended earlier. A smaller share is a "
-    "subset of a larger one."
-)
 GATE_HELP = (
     "Apply the gate: bins outside it are cut, and T_n moves with it. “Data reduction” undoes it."
 )
@@ -204,23 +345,29 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
     """Return name, value and help of each number of a capture."""
     rows, cols = answer.capture.shape
     n_pulses = answer.capture.acquisition.n_pulses
-    flux, per = report.flux, f"mean of all pixels in {report.flux_unit}, with 95 % interval."
+    image, target = report.flux, report.target_flux
+    per = f"in {report.flux_unit}, with 95 % interval."
+    of_targets = "Mean of the target pixels, those with an echo"
+    of_all = "Mean of all pixels; those without an echo have no signal"
     hot, dead = ("–" if n is None else count(n) for n in (report.n_hot, report.n_dead))
     return [
         ("Pixels", f"{rows} × {cols}", "Rows and columns."),
         ("Pulses", "not known" if n_pulses is None else count(n_pulses), "Pulses per pixel."),
         ("Detections", number(float(answer.capture.counts.mean()), ""), "Mean of a pixel."),
-        ("Signal (PPP)", interval(flux.signal), f"Signal flux, {per}"),
-        ("Background", interval(flux.background), f"Background flux over the gate, {per}"),
-        ("SBR", interval(flux.sbr), "Signal divided by background, with 95 % interval."),
+        ("PPP, target pixels", interval(target.signal), f"{of_targets}: signal flux {per}"),
+        ("SBR, target pixels", interval(target.sbr), f"{of_targets}: signal over background."),
+        ("PPP, all pixels", interval(image.signal), f"{of_all}: signal flux {per}"),
+        ("SBR, all pixels", interval(image.sbr), f"{of_all}: signal over background."),
+        ("Background", interval(image.background), f"Mean of all pixels over the gate, {per}"),
         ("Hot pixels", hot, "Pixels with more detections than all neighbours."),
         ("Dead pixels", dead, "Pixels with fewer detections than all neighbours."),
     ]
 
 
 def flux_sentence(report: CaptureReport) -> str:
-    """Return how the fluxes of a capture were estimated."""
-    return f"Signal, background and SBR: {report.flux_method}; in {report.flux_unit}."
+    """Return how the fluxes of a capture were estimated, and how far they can be trusted."""
+    method = f"Signal, background and SBR: {report.flux_method}; in {report.flux_unit}."
+    return f"{method} {report.flux_remark}"
 
 
 def advice(report: CaptureReport, along: Scale) -> tuple[str, str]:

@@ -20,15 +20,17 @@ from bokeh.models import (
 from numpy.typing import NDArray
 
 from app.model.exports import Curve
+from app.model.store import Pixel
 from app.pages.inspect.results import Corners, Inspected
 from app.pages.shared.outputs import layers_of
 from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.theme import Palette
-from app.widgets.figures import Layers, cover, paint_frame, round_up
+from app.widgets.figures import Layers, cover, fit, paint_frame, round_up
 from app.widgets.image_view import ImageView
 from core import Acquisition
+from core.inspection import FaultyPixel
 
 Array = NDArray[Any]
 
@@ -91,12 +93,37 @@ class Navigator(ImageView):
             name="pins",
         )
 
+        self._faulty = inspect_plots.empty("x", "y", "marker")
+        for name, color, thickness in (("shadow", "#000000", 3.5), ("mark", "#ffffff", 1.5)):
+            figure.scatter(
+                "x",
+                "y",
+                marker="marker",
+                source=self._faulty,
+                size=7,
+                fill_alpha=0,
+                line_color=color,
+                line_width=thickness,
+                name=f"faulty {name}",
+            )
+
         def select(event: SelectionGeometry) -> None:
             if event.final:
                 corners = (self._grid.index(*each) for each in corners_of(event.geometry))
                 selected(tuple((round(row, 2), round(col, 2)) for row, col in corners))
 
         figure.on_event(SelectionGeometry, select)
+
+    def mark_faulty(self, faulty: Sequence[FaultyPixel]) -> None:
+        """Mark hot pixels by circles, dead ones by crosses."""
+        places = [self._grid.place(each.row, each.col) for each in faulty]
+        marks: dict[str, list[Any]] = {
+            "y": [row for row, _ in places],
+            "x": [col for _, col in places],
+            "marker": ["circle" if each.health == "hot" else "x" for each in faulty],
+        }
+        if marks != self._faulty.data:
+            self._faulty.data = marks
 
     def outline(self, region: Corners) -> None:
         """Outline a region; none if it is empty."""
@@ -135,6 +162,7 @@ PALETTE_NAMES = {
     "rate": "raw",
     "candidates": "text",
     "ranks": "text",
+    "score": "enhanced",
     "window": "residual",
     "t_n": "estimate",
     "present": "estimate",
@@ -228,15 +256,19 @@ class GatePlot(NamedLayers):
 
 
 class PixelPlots:
-    """Counts, rate and stages of a pixel or a region, linked along the gate.
+    """Counts, rate, and stages or score of a pixel or a region, linked along the gate.
 
     Attributes
     ----------
     bins : Range1d
         The common axis along the gate.
-    counts, rate, stages : GatePlot
+    counts, rate : GatePlot
+    stages : GatePlot
+        Residual and enhanced signal of the tracking differentiator.
+    score : GatePlot
+        Score of another method, in its place.
     plots : tuple of GatePlot
-        All three, from top to bottom.
+        All, from top to bottom.
     candidates : ColumnDataSource
         Marks of the candidates.
     """
@@ -255,7 +287,8 @@ class PixelPlots:
         self.counts = GatePlot(inspect_plots.counts(self.bins, marks), counts, has_top=True)
         self.rate = GatePlot(inspect_plots.rate(self.bins, marks), {"Rate": "rate"})
         self.stages = GatePlot(inspect_plots.stages(self.bins, marks), stages)
-        self.plots = self.counts, self.rate, self.stages
+        self.score = GatePlot(inspect_plots.score(self.bins, marks), {"Score": "score"})
+        self.plots = self.counts, self.rate, self.stages, self.score
 
     def paint(self, colors: Palette) -> None:
         """Take on the colours of a mode."""
@@ -264,33 +297,29 @@ class PixelPlots:
 
     def update(self, found: Inspected, unit: str) -> None:
         """Show a pixel or a region, with positions in a unit."""
-        pixel, report, signals = found.pixel, found.report, found.pixel.signals
+        pixel, report = found.pixel, found.report
         acquisition = found.answer.capture.acquisition
         cover(self.bins, acquisition.n_bins)
         for plot in self.plots:
             plot.follow(unit, acquisition)
-        has_model = pixel.expected is not None
-        expected = pixel.expected if has_model else np.full(acquisition.n_bins, np.nan)
-        assert expected is not None
         curves = partial(plots.bin_curves, inspect_plots.NAMES)
-        counts = curves(
-            "counts", raw=signals.raw, expected=expected, small=signals.small, large=signals.large
-        )
-        residual = curves("counts", residual=signals.residual)
-        enhanced = curves("counts × weight", enhanced=signals.enhanced)
         positions = {"truth": pixel.truth_bin, "estimate": pixel.answer_bin}
         candidates = [each.bin for each in report.candidates]
         marks = plots.marks(inspect_plots.NAMES, **positions, candidates=candidates)
-        self.counts.draw(acquisition, counts + marks)
-        self.counts.show("expected", has_model)
-        self.counts.frame(signals.raw, signals.large, expected)
+        self._draw_counts(pixel, acquisition, marks)
         self.rate.draw(acquisition, curves(report.rate_unit, rate=report.rate) + marks)
         self.rate.frame(report.rate)
         self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
         self.rate.figure.title.text = inspect_plots.RATE_TITLES[report.rate_unit]
-        self.stages.draw(acquisition, residual + enhanced + marks)
-        self.stages.frame(signals.residual)
-        self.stages.frame(signals.enhanced, axis="enhanced")
+        if pixel.signals is None:
+            self.score.draw(acquisition, curves("", score=pixel.score) + marks)
+            fit(self.score.figure, *plots.score_ends(pixel.score))
+        else:
+            residual = curves("counts", residual=pixel.signals.residual)
+            enhanced = curves("counts × weight", enhanced=pixel.signals.enhanced)
+            self.stages.draw(acquisition, residual + enhanced + marks)
+            self.stages.frame(pixel.signals.residual)
+            self.stages.frame(pixel.signals.enhanced, axis="enhanced")
         for name, position in positions.items():
             self.counts.write(name, x=np.full(2, position))
             for plot in self.plots:
@@ -300,3 +329,13 @@ class PixelPlots:
             "y": np.full(len(candidates), inspect_plots.CANDIDATE_HEIGHT, np.float32),
             "rank": [str(n + 1) for n in range(len(candidates))],
         }
+
+    def _draw_counts(self, pixel: Pixel, acquisition: Acquisition, marks: list[Curve]) -> None:
+        """Draw the counts, with those of the model and both scales where they are known."""
+        plot, lines = self.counts, plots.drawn(pixel.lines, acquisition.n_bins)
+        plot.figure.title.text = inspect_plots.COUNTS_TITLES[pixel.signals is not None]
+        curves = plots.bin_curves(inspect_plots.NAMES, "counts", raw=pixel.histogram, **lines)
+        plot.draw(acquisition, curves + marks)
+        for layer, counts in pixel.lines.items():
+            plot.show(layer, counts is not None)
+        plot.frame(pixel.histogram, *lines.values())

@@ -34,7 +34,7 @@ BOARD = """
 :host { display: grid !important; gap: 14px; align-items: start;
   grid-template-columns: 270px minmax(0, 1fr); flex: none !important; height: auto !important; }
 .bk-panel-models-layout-Column { flex: none !important; height: auto !important; }
-@media (max-width: 900px) {
+@media screen and (max-width: 900px) {
   :host { display: flex !important; flex-direction: column; }
   .bk-panel-models-layout-Column { width: 100%; }
 }
@@ -43,7 +43,7 @@ STACK = """
 :host { display: flex !important; flex-direction: column; gap: 8px;
   flex: none !important; max-height: none !important;
   height: max(640px, calc(100vh - 122px)) !important; }
-@media (max-width: 900px) { :host { height: auto !important; } }
+@media screen and (max-width: 900px) { :host { height: auto !important; } }
 """
 
 _SBR = Number("SBR", 0.02, 0.2, log=True, least=0.0, open_below=True)

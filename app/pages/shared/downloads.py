@@ -1,8 +1,9 @@
 """Downloads of what is on screen: a button for each card, file names, and contents.
 
-Files are made on demand. The browser makes pictures of what it shows, with heading, colour scale
-and description; a worker writes other files to a temporary file, which is sent in pieces, so that
-other messages pass in between, and then deleted.
+Files are made on demand. The browser makes pictures of plots and clouds as it shows them, with
+heading, colour scale and description. A worker writes other files, pictures of images among them,
+to a temporary file, which is sent in pieces, so that other messages pass in between, and then
+deleted.
 
 The menu is our own: that of panel-material-ui 0.16 (`MenuButton`) announces to screen readers
 neither that it is a menu nor whether it is open, and loses the keyboard focus while a file is
@@ -12,10 +13,8 @@ prepared.
 from __future__ import annotations
 
 import logging
-import re
-import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -24,9 +23,9 @@ from typing import IO, Any, BinaryIO, cast
 import panel as pn
 import param
 
+import core
 from app.model import download_text
-from app.model.colors import ColorScale
-from app.model.exports import Write, image_files
+from app.model.exports import Write, image_files, report_file
 from app.model.state import Viewing
 from app.model.store import Answer, Request
 from app.pages.session import Session
@@ -34,7 +33,7 @@ from app.tasks.scheduler import FILES
 from app.widgets.component import Component
 from app.widgets.figures import Layers
 from core import inspection
-from core.parameters import spec_of
+from core.io import ColorScale, changed_settings, file_name
 
 log = logging.getLogger(__name__)
 
@@ -42,16 +41,14 @@ PIECE_BYTES = 2**20
 """Size of a piece, which is one message."""
 
 PICTURES = ("png", "svg")
-"""Formats that the browser makes."""
+"""Formats that the browser makes, unless there is a writer for them."""
 
 PLOT = (*PICTURES, "csv")
 IMAGE = (*PLOT, "npz", "tif")
+IMAGE_AND_REPORT = (*IMAGE, "html")
 CLOUD = ("png", "ply", "las", "csv")
 TABLE = ("csv",)
 """Formats of each kind of card."""
-
-MOST_LETTERS = 120
-"""Longest file name; some systems accept at most 143 bytes."""
 
 CORNER_PX = 26
 """Height and width of a button."""
@@ -75,6 +72,8 @@ class Subject:
         Origin of the capture.
     part : str
         Rows and columns of the capture, if not all.
+    viewing : Viewing, optional
+        Confidence threshold and field of view, described in files; names have those in `settings`.
     """
 
     capture: str
@@ -82,57 +81,37 @@ class Subject:
     settings: Sequence[Any] = ()
     source: str = ""
     part: str = ""
+    viewing: Viewing | None = None
 
     @property
     def chosen(self) -> list[str]:
         """Settings that differ from their default, as ``symbol value`` without the space."""
-        return [
-            _named(_symbol(each), _plain(getattr(settings, each.name)))
-            for settings in self.settings
-            for each in fields(settings)
-            if getattr(settings, each.name) != each.default
-        ]
+        return [each for settings in self.settings for each in changed_settings(settings)]
 
     def file_name(self, what: str, suffix: str) -> str:
-        """Return a file name that is safe for every system and shell.
+        """Return the name of a file about this subject; see `core.io.file_name`."""
+        return file_name(
+            what,
+            suffix,
+            capture=self.capture,
+            part=self.part,
+            estimator=self.estimator,
+            settings=self.chosen,
+        )
 
-        Parameters
-        ----------
-        what : str
-            The plot, image or table in the file.
-        suffix : str
-            Suffix of the format without the point.
-        """
-        capture, what = _plain(self.capture)[:40].strip("-._") or "capture", _plain(what)[:40]
-        begin = "_".join(filter(None, (capture, self.part, self.estimator)))
-        room = MOST_LETTERS - len(f"{begin}_{what}.{suffix}")
-        chosen = ""
-        for each in self.chosen:
-            if len(chosen) + len(each) < room:
-                chosen += f"_{each}"
-        return f"{begin}{chosen}_{what}.{suffix}"
+    def lines(self, what: str) -> list[str]:
+        """Return the description inside a file: version, method, all settings and source."""
+        settings = [each for each in self.settings if not isinstance(each, Viewing)]
+        return [
+            f"firstphoton {core.__version__}: {what}",
+            *([f"method: {self.estimator}"] if self.estimator else []),
+            *(f"settings: {each}" for each in filter(None, (*settings, self.viewing))),
+            *([f"source: {' '.join(self.source.split())}"] if self.source else []),
+        ]
 
     def about(self, what: str) -> str:
         """Return the description inside a picture's file."""
-        parts = (self.estimator.replace("_", " "), " ".join(self.chosen), self.source)
-        return "; ".join([f"firstphoton: {what}", *filter(None, parts)])
-
-
-def _plain(value: Any) -> str:
-    """Reduce a value to letters without accents, digits, points, dashes and underscores."""
-    text = f"{value:.6g}" if isinstance(value, float) else str(value)
-    ascii_ = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
-    return re.sub(r"[^\w.+-]+", "-", ascii_).strip("-._")
-
-
-def _named(symbol: str, value: str) -> str:
-    return value if value.startswith(symbol) else symbol + value
-
-
-def _symbol(field: Any) -> str:
-    """Return a setting's symbol, or its name where the symbol has other than plain letters."""
-    symbol = spec_of(field).symbol.replace("_", "")
-    return symbol if symbol.isascii() and symbol.isalnum() else field.name.replace("_", "-")
+        return "; ".join(self.lines(what))
 
 
 @dataclass(frozen=True)
@@ -143,9 +122,9 @@ class Shown:
     ----------
     subject : Subject
     what : str
-        The plot, image or table that is shown; part of the files' names.
+        The plot, image or table that is shown; part of the files' names, except that of a report.
     files : mapping of str to callable
-        A writer for each format that is not a picture, by suffix without the point.
+        A writer for each format that the browser does not make, by suffix without the point.
     heading : str
         Heading of a picture without a title.
     scale : ColorScale, optional
@@ -200,11 +179,14 @@ class Download(Component):
         if suffix not in [known for known, _ in self.formats]:
             return
         shown = self._show()
-        self._name = shown.subject.file_name(shown.what, suffix)
-        if suffix in PICTURES:
+        what = "report" if suffix == "html" else shown.what
+        self._name = shown.subject.file_name(what, suffix)
+        if suffix not in shown.files:
             self._send_msg({"picture": self._picture(shown, suffix)})
         else:
-            self._work.submit(partial(_written, shown.files[suffix]), self._send_first, self._fail)
+            comments = shown.subject.lines(shown.what) if suffix == "csv" else ()
+            write = partial(_written, shown.files[suffix], comments)
+            self._work.submit(write, self._send_first, self._fail)
 
     def _picture(self, shown: Shown, suffix: str) -> dict[str, Any]:
         scale = shown.scale and {
@@ -243,11 +225,12 @@ class Download(Component):
             self._file = None
 
 
-def _written(write: Write) -> IO[bytes]:
-    """Write a temporary file; return it open, at its end. Closing it deletes it."""
+def _written(write: Write, comments: Iterable[str]) -> IO[bytes]:
+    """Write a temporary file, comments first; return it open, at its end. Closing it deletes it."""
     # tifffile requires a file that has a name.
     file = NamedTemporaryFile(prefix="firstphoton-")  # noqa: SIM115 - outlives this function
     try:
+        file.write("".join(f"# {comment}\r\n" for comment in comments).encode())
         write(cast(BinaryIO, file))
         file.flush()
         file.seek(0, 2)
@@ -325,14 +308,15 @@ def ranged(session: Session, answer: Answer, estimator: str, settings: Any) -> S
 
 def explored(session: Session) -> Subject:
     """Return the subject of the session's own estimate."""
-    return ranged(session, session.answer, "tracking", session.answer.request.tracking)
+    answer = session.answer
+    return ranged(session, answer, answer.method, answer.settings)
 
 
 def viewed(session: Session, subject: Subject, viewing: Viewing) -> Subject:
     """Add confidence threshold and field of view; the capture's own field of view is not named."""
-    if viewing.field_of_view_deg == session.own_field_of_view_deg:
-        viewing = Viewing(viewing.least_confidence)
-    return replace(subject, settings=(*subject.settings, viewing))
+    is_own = viewing.field_of_view_deg == session.own_field_of_view_deg
+    in_name = replace(viewing, field_of_view_deg=Viewing().field_of_view_deg) if is_own else viewing
+    return replace(subject, settings=(*subject.settings, in_name), viewing=viewing)
 
 
 def pixel_plot(session: Session, plot: Layers, what: str) -> Shown:
@@ -355,6 +339,8 @@ def region_on_show(session: Session) -> str:
 
 def image_on_show(session: Session, kind: str, figure: Any, what: str) -> Shown:
     """Return the content of an image; `kind` is that of `app.model.exports.image_files`."""
-    viewing = session.state.viewing
-    files = image_files(session.answer, kind, viewing.least_confidence, figure)
-    return Shown(viewed(session, explored(session), viewing), what, files)
+    answer, viewing, subject = session.answer, session.state.viewing, explored(session)
+    files = image_files(answer, kind, viewing, figure)
+    title = ", ".join(filter(None, (answer.request.source.title, subject.part.replace("_", " "))))
+    report = report_file(answer, session.state, title, session.own_field_of_view_deg)
+    return Shown(viewed(session, subject, viewing), what, files | {"html": report})

@@ -91,6 +91,11 @@ class CurrentEstimate:
         """The request described by the state."""
         return request_of(self._state, self._sources)
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether the answer is that of the latest request."""
+        return self._began_s is None
+
     def refresh(self) -> None:
         """Compute the state's request, or again when more of its file has been read."""
         request = self.request
@@ -124,7 +129,8 @@ class CurrentEstimate:
         """Return to the request that the page still shows, unless the user has moved on."""
         if request == self.request:
             # Sliders keep their values: the next move starts from there.
-            shown = replace(self.answer.request, light=request.light, tracking=request.tracking)
+            kept = {name: getattr(request, name) for name in ("light", "tracking", "settings")}
+            shown = replace(self.answer.request, **kept)
             with param.discard_events(self._state):
                 self._state.param.update(parameters_of(shown, self._sources))
             if not (request.source.is_scene or same_subject(request, self.answer.request)):
@@ -162,9 +168,11 @@ def lane_of(request: Request, previous: Answer) -> Lane:
     before = previous.request
     if previous.cutout is not None or previous.whole.cube.size > FEW_COUNTS:
         return GENERAL
-    if cost_of(previous.capture, "tracking", request.tracking).seconds > FEW_S:
+    method = request.method_for(previous.capture)
+    if cost_of(previous.capture, method, request.settings_of(method)).seconds > FEW_S:
         return GENERAL
-    if request == replace(before, tracking=request.tracking):
+    chosen = {name: getattr(request, name) for name in ("method", "tracking", "settings")}
+    if request == replace(before, **chosen):
         return PAGE
     same_scene = request.source is before.source and request.absent == before.absent
     return SHORT if request.source.is_scene and same_scene else GENERAL

@@ -13,7 +13,6 @@ import panel_material_ui as pmui
 from bokeh.events import Tap
 from bokeh.models import Range1d
 
-from app.model.colors import ColorScale
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import Curve, band, image_file, table_file
 from app.model.large import Grid
@@ -34,6 +33,7 @@ from app.widgets.cards import card
 from app.widgets.controls import Knob, Sentence, Table
 from app.widgets.figures import Layers, paint_frame, pane_of, round_up
 from app.widgets.method_picture import ScaleBar
+from core.io import ColorScale
 from core.parameters import Number
 from core.studies import outputs as items
 

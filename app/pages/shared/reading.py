@@ -1,8 +1,9 @@
-"""The form of options for reading a file, and the question of which of its arrays to read."""
+"""The form of options for reading a file, and what a file may ask for: an array, a record."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,7 +16,12 @@ from app.widgets.cards import button, part, select
 from app.widgets.controls import Sentence
 from core.io import ReadOptions, reading_options
 
+RECORD_MS = 1500
+"""Time between the records of a sequence that is played."""
+
 QUESTION = "Several arrays of {file} could be the capture. Which one?"
+
+ALL_RECORDS_HELP = "Add up all records of the file."
 
 
 class ReadingForm:
@@ -34,6 +40,10 @@ class ReadingForm:
         The form as a part of the sidebar.
     question : Column
         A button for each array of a file that could be the capture.
+    player : pmui.Player
+        Steps through the records of a file that is a sequence in time.
+    records : Column
+        The player, and a button that adds up all records.
     """
 
     def __init__(
@@ -57,11 +67,40 @@ class ReadingForm:
             is_shown=False,
         )
         self.question = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+        self.player = pmui.Player(
+            label="Record",
+            show_value=True,
+            show_loop_controls=False,
+            loop_policy="loop",
+            interval=RECORD_MS,
+            size="small",
+            sizing_mode="stretch_width",
+            margin=(4, 8),
+        )
+        self._record = 0
+        self.player.param.watch(lambda event: self._step(event.new), "value")
+        self._all = button(
+            "All records", ALL_RECORDS_HELP, partial(self._read_records, None), (0, 8)
+        )
+        self.records = pn.Column(
+            self.player,
+            self._all,
+            visible=False,
+            sizing_mode="stretch_width",
+            margin=0,
+        )
 
-    def show(self, reading: ReadOptions, used: Mapping[str, str]) -> None:
+    def show(
+        self, reading: ReadOptions, used: Mapping[str, str], n_records: int | None = None
+    ) -> None:
         """Show the options of the file on screen; keep what was typed if they are the same."""
         self.question.visible = self._about.visible = False
         self._fill(reading, used)
+        # With all records it stands at the first one.
+        self._record = reading.records if isinstance(reading.records, int) else 0
+        self.player.param.update(end=max((n_records or 1) - 1, 1), value=self._record)
+        self._all.variant = "outlined" if reading.records is not None else "contained"
+        self.records.visible = n_records is not None and n_records > 1
 
     def show_refused(self, request: Request, variables: Sequence[str], is_new: bool) -> None:
         """Open for a file that was refused, and ask for the array if several could be meant."""
@@ -79,6 +118,13 @@ class ReadingForm:
     def _choice(self, variable: str) -> pmui.Button:
         help = f"Read the array {variable}."
         return button(variable, help, partial(self._apply, {"variable": variable}), (2, 0, 6, 8))
+
+    def _step(self, record: int) -> None:
+        if record != self._record:  # else it is not the user who has moved the player
+            self._read_records(record)
+
+    def _read_records(self, records: int | None) -> None:
+        self._read(replace(self._reading, records=records))
 
     def _fill(self, reading: ReadOptions, used: Mapping[str, str]) -> None:
         shown = {name: reading.as_text(name) or used.get(name, "") for name in self._fields}

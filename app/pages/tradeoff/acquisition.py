@@ -28,7 +28,7 @@ from core.studies.tradeoff import (
 CURVES = """
 :host { display: grid !important; gap: 8px; flex: none !important; height: 668px !important;
   grid-template: repeat(2, 330px) / repeat(2, minmax(0, 1fr)); }
-@media (max-width: 900px) {
+@media screen and (max-width: 900px) {
   :host { grid-template: repeat(3, 330px) / minmax(0, 1fr); height: 1006px !important; }
 }
 """

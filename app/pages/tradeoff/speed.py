@@ -253,18 +253,13 @@ class SpeedSection(SettingsSection[Effort]):
 
 
 def show_point(session: Session, point: Point, measured_on: Request) -> None:
-    """Show a measured configuration: the paper's method on Explore, others on Compare."""
+    """Show a measured configuration on Explore."""
     state, candidate = session.state, point.candidate
     method, settings = candidate.method.estimator, candidate.settings
-    request = replace(measured_on, less=ReductionSettings.of(candidate.reduction, point.shape[2]))
-    if method == "tracking":
-        page, comparison = "Explore", state.comparison
-        request = replace(request, tracking=settings)
-    else:
-        page, comparison = "Compare", state.comparison.including(method, settings)
-        request = replace(request, tracking=state.tracking)
-    parameters = parameters_of(request, session.sources)
-    state.param.update(comparison=comparison, page=page, **parameters)
+    less = ReductionSettings.of(candidate.reduction, point.shape[2])
+    kept = {"tracking": state.tracking, "settings": state.settings}
+    request = replace(measured_on, less=less, method=method, **kept).with_settings(settings)
+    state.param.update(page="Explore", **parameters_of(request, session.sources))
 
 
 def _ends(intervals: Sequence[Interval]) -> dict[str, Array]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from core.acquisition import Pulse
 from core.capture import Capture, CaptureError
 from core.checks import refusing, require, shown
-from core.io.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820
+from core.io.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820, tmf8829
 from core.io.readers.content import Reader, decompressed, is_gzip, reader_of, suffixes_of
 from core.io.readers.guards import MAX_CUBE_BYTES, FileVersion
 from core.io.readers.options import ReadOptions, reading_options
@@ -49,6 +49,7 @@ READERS: tuple[Reader, ...] = (
     Reader("PicoQuant image", (".ptu",), ptu.read, ptu.recognizes),
     Reader("Becker & Hickl histograms", (".sdt",), sdt.read, sdt.recognizes),
     Reader("AMS TMF8820 records", (".json",), tmf8820.read, tmf8820.recognizes),
+    Reader("AMS TMF8829 log", (".json",), tmf8829.read, tmf8829.recognizes),
 )
 """All formats. Where several recognize a file and none has its suffix, the first one reads it."""
 
@@ -133,7 +134,7 @@ def open_capture(path: str | os.PathLike[str], **given: Any) -> xr.DataArray:
         _require_exists(path)
         open_counts = None if is_gzip(path) else reader_of(path, READERS).open_counts
         if open_counts is None:
-            return labelled.dataset(_read(path, request))["counts"]
+            return _read(path, request).to_xarray()["counts"]
         return open_counts(path, request)
 
 

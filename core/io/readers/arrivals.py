@@ -17,8 +17,8 @@ photons is found. If it holds at least nine tenths of all photons, the gate cove
 stretch, and the source gives the number of dropped photons. Otherwise the gate covers all photons,
 in wider bins.
 
-Pulse. A Gaussian of the width that `core.io.readers.pulse_guess` estimates, or of one bin. The
-number of pulses stays unknown.
+Pulse. The one that `core.io.readers.pulse_guess` estimates, or a Gaussian of one bin. The number of
+pulses stays unknown.
 
 Times of a common-stop instrument count backwards from ``stop_s``. A time in whole units covers all
 of its unit, so the last one before the stop becomes the first after the pulse.
@@ -81,6 +81,7 @@ def arrivals_capture(
     """
     _require_times(times, pixel, shape, name)
     request.refuse(["shape", "no_trigger"], "lists of photons lie in pixels already")
+    request.refuse(["records"], "lists of photons are no sequence of records")
     if request.first_detections is not None:
         kept = _rank(pixel) < request.first_detections
         times, pixel = times[kept], pixel[kept]

@@ -69,7 +69,7 @@ def reader_of(path: Path, readers: Sequence[Reader]) -> Reader:
     is_folder = path.is_dir()
     possible = [reader for reader in readers if bool(reader.folder_marks) == is_folder]
     of_suffix = [reader for reader in possible if path.suffix.lower() in reader.suffixes]
-    start = b"" if is_folder else _start(path)
+    start = b"" if is_folder else start_of(path)
     fitting = [
         reader
         for reader in possible
@@ -88,13 +88,15 @@ def reader_of(path: Path, readers: Sequence[Reader]) -> Reader:
 
 def suffixes_of(readers: Sequence[Reader]) -> dict[str, str]:
     """One-line descriptions of all formats by their suffixes, gzip files included."""
-    known = {suffix: reader.title for reader in readers for suffix in reader.suffixes}
+    known: dict[str, str] = {}
+    for suffix, title in ((each, reader.title) for reader in readers for each in reader.suffixes):
+        known[suffix] = f"{known[suffix]}, or {title}" if suffix in known else title
     return known | {GZIP: "any of these files, compressed by gzip"}
 
 
 def is_gzip(path: Path) -> bool:
     """Return whether a file is compressed by gzip, regardless of its name."""
-    return path.is_file() and _start(path).startswith(_GZIP_MAGIC)
+    return path.is_file() and start_of(path).startswith(_GZIP_MAGIC)
 
 
 @contextmanager
@@ -121,7 +123,8 @@ def decompressed(path: Path) -> Iterator[Path]:
         yield content
 
 
-def _start(path: Path) -> bytes:
+def start_of(path: Path) -> bytes:
+    """Return the first bytes of a file, as `Reader.recognizes` takes them."""
     with path.open("rb") as file:
         return file.read(_START_BYTES)
 

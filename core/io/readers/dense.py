@@ -77,9 +77,11 @@ def description_of(
         pixel_angle_rad=request.pixel_angle_rad,
     )
     pulse, detection = request.pulse or assumed_pulse, request.detection
+    interval = ""
     if pulse is None or detection is None:
         counts = sample()
-        pulse = pulse or guessed_pulse(counts, acquisition.bin_width_s)
+        if pulse is None:
+            pulse, interval = guessed_pulse(counts, acquisition.bin_width_s)
         detection = detection or guess_detection(counts, acquisition.n_pulses)
     found = list(guessed)
     if time_unit_s is not None and request.time_unit_s is None:
@@ -94,7 +96,8 @@ def description_of(
         found.append(f"{n_bins} bins")
     if request.pulse is None:
         shape = "Gaussian" if pulse.shape == "gaussian" else pulse.shape
-        found.append(f"pulse {shape} of {time_text(pulse.tau_s)}")
+        certainty = f" ({interval})" if interval else ""
+        found.append(f"pulse {shape} of {time_text(pulse.tau_s)}{certainty}")
     if request.detection is None:
         found.append("first photons only" if detection == "first" else "all photons of a pulse")
     listed = f"guessed: {', '.join(found)}" if found else ""
@@ -156,6 +159,7 @@ def dense_capture(
     request.refuse(["time_unit_s"], "a histogram cube takes bin_width_s alone")
     request.refuse(["first_detections"], "a histogram cube keeps no order of its photons")
     request.refuse(["shape", "no_trigger"], "a histogram cube has its own pixels")
+    request.refuse(["records"], "the file holds no sequence of records")
     agrees = request.n_bins in (None, n_bins)
     require("n_bins", request.n_bins, agrees, f"{n_bins}, the cube's last axis, or None")
     bin_width_s = request.bin_width_s or bin_width_s or 1e-9

@@ -17,7 +17,7 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -34,6 +34,8 @@ _NETCDF_ATTRIBUTES = ("CLASS", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_NCPrope
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 _ZARR_MARKS = ("zarr.json", ".zarray", ".zgroup")
 _ZARR_CODECS = {"zlib", "gzip", "zstd", "blosc", "shuffle", "fletcher32", "crc32c", "delta", "lz4"}
+_TMF8829_REFERENCES = {"mp_histo": "ref_histo", "mp_histo_HA": "ref_histo_HA"}
+_PAGE_NAME = 285  # number of a tag
 _DEPTH_MODES = ("I;16", "I;16L", "I;16B", "I;16N", "F")
 
 Reply = tuple[dict[str, Any], list[Any]]
@@ -469,19 +471,24 @@ def list_ptu(path: str) -> Reply:
         return {"tags": tags, "record_offset": int(file.record_offset)}, []
 
 
-def read_ptu(path: str, channel: int | None, shape: list[int]) -> Reply:
-    """Read the histograms (row, col, bin) of a channel, or of all, summed over the frames."""
+def read_ptu(path: str, channel: int | None, shape: list[int], span: list[int] | None) -> Reply:
+    """Read the histograms (row, col, bin) of a channel, or of all, summed over a span of frames.
+
+    There are no arrays if the file has no such channel or frames.
+    """
     from ptufile import PtuFile  # noqa: PLC0415
 
     with PtuFile(path, trimdims="T") as file:
         channels = [int(one) for one in file.active_channels]
-        known = {"channels": channels, "n_frames": int(file.shape[0])}
-        if not channels or channel not in (None, *channels):
+        n_frames = int(file.shape[0])
+        known = {"channels": channels, "n_frames": n_frames}
+        first, last = span or (0, n_frames - 1)
+        if channel not in (None, *channels) or not channels or last >= n_frames:
             return known, []
         rows, cols, n_bins = shape
         n_bins = min(n_bins, int(file.number_bins_max))
         image = file.decode_image(
-            frame=-1,
+            (slice(first, last + 1, -1), ...),  # a step of -1 sums
             channel=-1 if channel is None else channel,
             dtime=n_bins,
             dtype=np.uint16 if file.number_records < 2**16 else np.uint32,  # no bin holds more
@@ -489,30 +496,128 @@ def read_ptu(path: str, channel: int | None, shape: list[int]) -> Reply:
         return known, [image.reshape(rows, cols, n_bins)]
 
 
-def read_tmf8820(path: str, variable: str | None) -> Reply:
-    """Read histograms, reference histograms and distances of all records, or of one."""
+def read_tmf8820(path: str, variable: str | None, span: list[int] | None) -> Reply:
+    """Read histograms, plane distances and, if there are such, other parts of a list of records.
+
+    Parameters
+    ----------
+    variable : str or None
+        Name of one record, such as ``"record 17"``.
+    span : list of int or None
+        First and last record, None for all; without arrays if they are not in the file.
+    """
     records = json.loads(Path(path).read_bytes(), parse_constant=_refuse_constant)
-    is_list = isinstance(records, list)
-    require("the file", type(records).__name__, is_list, "a list of records")
-    require("records", len(records), len(records) > 0, "at least one")
-    for k, record in enumerate(records):
-        is_record = isinstance(record, dict) and "hists" in record
-        what = "a record with the histograms of a TMF8820, hists"
-        require(f"record {k}", type(record).__name__, is_record, what)
-    named = {f"record {k}": record for k, record in enumerate(records)}
-    last = f"None for all, or 'record 0' to 'record {len(records) - 1}'"
+    named = _named_records("the file", records)
+    last = f"None for all, or 'record 0' to 'record {len(named) - 1}'"
     require("variable", variable, variable is None or variable in named, last)
-    chosen = named if variable is None else {variable: named[variable]}
-    distances_m = []
+    chosen = _within(named, span) if variable is None else {variable: named[variable]}
     for name, record in chosen.items():
-        value = record.get("dist_to_plane")
-        plain = value is None or (isinstance(value, int | float) and 0 <= value < math.inf)
-        require(f"dist_to_plane of {name}", value, plain, "metres, or null")
-        distances_m.append(math.nan if value is None else value)
-    arrays = [_stacked(chosen, "hists", 2), np.array(distances_m, float)]
+        what = "a record with the histograms of a TMF8820, hists"
+        require(name, type(record).__name__, "hists" in record, what)
+    if not chosen:
+        return {"n_records": len(named), "parts": []}, []
+    distances_m = [
+        _metres(record.get("dist_to_plane"), f"dist_to_plane of {name}")
+        for name, record in chosen.items()
+    ]
+    parts = {"counts": _stacked(chosen, "hists", 2), "distances_m": np.array(distances_m, float)}
     if any("reference_hist" in record for record in chosen.values()):
-        arrays.append(_stacked(chosen, "reference_hist", 1))
-    return {}, arrays
+        parts["reference"] = _stacked(chosen, "reference_hist", 1)
+    reported_m = [_depths_m(record, parts["counts"].shape[1]) for record in chosen.values()]
+    if None not in reported_m:
+        parts["reported_m"] = np.array(reported_m, float)
+    return {"n_records": len(named), "parts": list(parts)}, list(parts.values())
+
+
+def _depths_m(record: dict[str, Any], n_zones: int) -> list[float] | None:
+    """Return the distance of the first target that the sensor found in each zone, in metres."""
+    match record.get("distances"):
+        case [{"depths_1": [*depths_mm], "confs_1": [*confidences]}, *_] if (
+            len(depths_mm) == len(confidences) == n_zones
+        ):
+            return [
+                _metres(depth, "depths_1", 1e-3) if confidence else math.nan
+                for depth, confidence in zip(depths_mm, confidences, strict=True)
+            ]
+    return None
+
+
+def read_tmf8829(path: str, variable: str | None, span: list[int] | None) -> Reply:
+    """Read histograms and, if there are such, other parts of the records of a log.
+
+    Parameters
+    ----------
+    variable : str or None
+        Name of the histograms; without arrays if it is unknown, or if it is None and there are
+        several or none.
+    span : list of int or None
+        First and last record, None for all; without arrays if they are not in the file.
+    """
+    log = json.loads(Path(path).read_bytes(), parse_constant=_refuse_constant)
+    require("the file", type(log).__name__, isinstance(log, dict), "the log of a TMF8829")
+    named, settings = _named_records("Result_Set", log.get("Result_Set")), log.get("configuration")
+    known: dict[str, Any] = {"n_records": len(named), "parts": []}
+    known["histograms"] = [name for name in _TMF8829_REFERENCES if name in named["record 0"]]
+    settings = settings if isinstance(settings, dict) else {}
+    known["settings"] = {name: value for name, value in settings.items() if type(value) is int}
+    chosen = _within(named, span)
+    wanted = known["histograms"] if variable is None else [variable]
+    if not chosen or len(wanted) != 1 or wanted[0] not in known["histograms"]:
+        return known, []
+    name, reference = wanted[0], _TMF8829_REFERENCES[wanted[0]]
+    plain = {
+        record: {
+            name: _bins(each.get(name)),
+            reference: _bins(each.get(reference)),
+            "results": _results_m(each.get("results")),
+        }
+        for record, each in chosen.items()
+    }
+    parts = {"counts": _stacked(plain, name, 3)}
+    if any(reference in each for each in chosen.values()):
+        parts["reference"] = _stacked(plain, reference, 2)
+    if all("results" in each for each in chosen.values()):
+        parts["reported_m"] = _stacked(plain, "results", 2)
+    return known | {"parts": list(parts)}, list(parts.values())
+
+
+def _bins(histograms: Any) -> Any:
+    """Return nested lists of histograms with their counts in place of ``{"bin": counts}``."""
+    if isinstance(histograms, list):
+        return [_bins(each) for each in histograms]
+    return histograms.get("bin") if isinstance(histograms, dict) else histograms
+
+
+def _results_m(results: Any) -> Any:
+    """Return the distance of the peak of highest SNR of each pixel in metres, NaN without one."""
+    if isinstance(results, list):
+        return [_results_m(each) for each in results]
+    peaks = results.get("peaks", ()) if isinstance(results, dict) else ()
+    best: dict[str, Any] = max(peaks, key=lambda peak: peak.get("snr", 0), default={})
+    return _metres(best.get("distance"), "distance of a peak", 1e-3) or math.nan
+
+
+def _named_records(what: str, records: Any) -> dict[str, dict[str, Any]]:
+    """Return records by their names."""
+    require(what, type(records).__name__, isinstance(records, list), "a list of records")
+    require("records", len(records), len(records) > 0, "at least one")
+    named = {f"record {k}": record for k, record in enumerate(records)}
+    for name, record in named.items():
+        require(name, type(record).__name__, isinstance(record, dict), "a record with histograms")
+    return named
+
+
+def _within(named: dict[str, dict[str, Any]], span: list[int] | None) -> dict[str, dict[str, Any]]:
+    """Return the records of a span."""
+    first, last = span or (0, len(named) - 1)
+    return dict(list(named.items())[first : last + 1])
+
+
+def _metres(value: Any, name: str, unit_m: float = 1.0) -> float:
+    """Return a distance in metres; NaN for None."""
+    plain = value is None or (isinstance(value, int | float) and 0 <= value < math.inf)
+    require(name, value, plain, "a distance, or null")
+    return math.nan if value is None else value * unit_m
 
 
 def _refuse_constant(name: str) -> float:
@@ -545,11 +650,40 @@ def read_depths(path: str, kind: str, most_pixels: int) -> Reply:
     from PIL import Image  # noqa: PLC0415
 
     with Image.open(path, formats=[kind]) as image:
-        n_pixels, most = image.width * image.height, f"up to {most_pixels:,}"
-        require("pixels of the image", n_pixels, n_pixels <= most_pixels, most)
-        what = "one 16-bit number or 32-bit float for each"
-        require("kind of pixels", image.mode, image.mode in _DEPTH_MODES, what)
-        return {}, [np.asarray(image)]
+        return {}, [_numbers(image, most_pixels, _DEPTH_MODES)]
+
+
+def _numbers(image: Any, most_pixels: int, modes: Sequence[str]) -> np.ndarray[Any, Any]:
+    n_pixels, most = image.width * image.height, f"up to {most_pixels:,}"
+    require("pixels of the image", n_pixels, n_pixels <= most_pixels, most)
+    what = "one 16-bit number or 32-bit float for each"
+    require("kind of pixels", image.mode, image.mode in modes, what)
+    return np.asarray(image)
+
+
+def list_tiff(path: str) -> Reply:
+    """List name and shape of the pages of a TIFF."""
+    from PIL import Image  # noqa: PLC0415
+
+    image: Any
+    with Image.open(path, formats=["TIFF"]) as image:
+        most = f"up to {MOST_LINKS:,}"
+        require("pages of the image", image.n_frames, image.n_frames <= MOST_LINKS, most)
+        pages = []
+        for page in range(image.n_frames):
+            image.seek(page)
+            name = str(image.tag_v2.get(_PAGE_NAME, ""))[: MOST_METADATA_BYTES // MOST_LINKS]
+            pages.append((name, (image.height, image.width)))
+    return {"pages": pages}, []
+
+
+def read_tiff(path: str, page: int, most_pixels: int) -> Reply:
+    """Read a page of whole numbers or 32-bit floats."""
+    from PIL import Image  # noqa: PLC0415
+
+    with Image.open(path, formats=["TIFF"]) as image:
+        image.seek(page)
+        return {}, [_numbers(image, most_pixels, (*_DEPTH_MODES, "L", "I"))]
 
 
 def read_mesh(path: str, suffix: str, most_faces: int) -> Reply:

@@ -6,7 +6,8 @@ while the number of bins is still unknown, a stretch of `STRETCH` values takes 4
 
 Each frame is one pulse, and each pixel triggers once in it or never: these are first photons, as
 many pulses as frames. Without ``n_bins`` the gate ends with the last trigger, which may lie in one
-of the first 65,536 bins: a larger number more likely stands for no trigger.
+of the first 65,536 bins: a larger number more likely stands for no trigger. Each frame is a record:
+``records`` counts some of them, in the gate of all.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import count_dtype, dense_capture
+from core.io.readers.frame_guess import resembles_frames
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.options import ReadOptions
+from core.io.readers.records import chosen_records, described
 
 AXES = ("pulse", "row", "col")
 STRETCH = 2**20
@@ -108,53 +111,77 @@ def frames_capture(
     ------
     ValueError
         If a value is neither a bin nor `no_trigger`, the requested number of pulses is not that of
-        the frames, or nothing triggered and ``n_bins`` is not given.
+        the frames, a requested record is not among them, or nothing triggered and ``n_bins`` is not
+        given.
     """
-    n_pulses = shape[0]
+    n_frames = shape[0]
+    chosen = chosen_records(request, n_frames)
     request.refuse(["time_unit_s"], "frames hold bins: bin_width_s is their unit")
     request.refuse(["first_detections"], "frames hold one detection of a pulse")
     request.refuse(["shape"], "frames have rows and columns")
-    agrees = request.n_pulses in (None, n_pulses)
-    require("n_pulses", request.n_pulses, agrees, f"{n_pulses}, one for each frame, or None")
+    agrees = request.n_pulses in (None, n_frames)
+    require("n_pulses", request.n_pulses, agrees, f"{n_frames}, one for each frame, or None")
+    if request.records is not None:
+        origin = f"{origin}, {described(chosen, n_frames, 'frame')}"
     if first_bin is None and no_trigger == 0:
         first_bin, guessed = 1, [*guessed, "1 stands for the first bin"]
-    cube = _count_triggers(stretches, shape, no_trigger, name, request.n_bins, first_bin or 0)
+    size = shape[1], shape[2], request.n_bins
+    cube = _count_triggers(stretches, size, chosen, no_trigger, name, first_bin or 0)
     detection = request.detection or "first"
-    known = replace(request, n_pulses=n_pulses, no_trigger=None, detection=detection)
-    return dense_capture(cube, origin, known, guessed=guessed, bin_width_s=bin_width_s)
+    known = replace(
+        request, n_pulses=len(chosen), no_trigger=None, detection=detection, records=None
+    )
+    capture = dense_capture(cube, origin, known, guessed=guessed, bin_width_s=bin_width_s)
+    return replace(capture, n_records=n_frames)
 
 
-def require_counts(array: NDArray[Any], name: str) -> None:
-    """Refuse an array of which more than half is one value that hardly is a count.
+def require_counts(array: NDArray[Any], name: str, axes: str | None) -> None:
+    """Refuse an array that probably holds raw frames.
+
+    Parameters
+    ----------
+    array : ndarray
+    name : str
+        Its name in errors.
+    axes : str or None
+        Order of the axes if it is given: those of counts.
 
     Raises
     ------
     ValueError
-        If its least value is negative, or its largest above 255, and as frequent as that: such a
-        value probably marks the pulses without a trigger in raw frames.
+        If more than half of the array is one value that hardly is a count (its least one if that
+        is negative, its largest one above 255): such a value probably marks the pulses without a
+        trigger. Without `axes` also if `core.io.readers.frame_guess` takes 0 for that value.
     """
     if array.ndim != 3 or not array.size or array.dtype.kind not in "iuf":
         return
+    frames = f"raw frames ({', '.join(AXES)})"
     least, largest = array.min().item(), array.max().item()
     for value in (least, largest):
         is_count = 0 <= value <= _LARGEST_USUAL_COUNT
         if not is_count and np.count_nonzero(array == value) > array.size / 2:
-            frames = f"raw frames ({', '.join(AXES)})"
             what = f"{value} if {name} holds {frames}: more than half of its values are {value}"
             require("no_trigger", None, False, what)
+    if axes is None and least == 0 and resembles_frames(array):
+        what = f"0 if {name} holds {frames}, as it seems, or axes if it holds counts"
+        require("no_trigger", None, False, what)
 
 
 def _count_triggers(
     stretches: Iterable[Stretch],
-    shape: tuple[int, int, int],
+    size: tuple[int, int, int | None],
+    chosen: range,
     no_trigger: int,
     name: str,
-    n_bins: int | None,
     first_bin: int,
 ) -> NDArray[np.unsignedinteger]:
-    """Return histograms (row, col, bin) of all frames; without `n_bins` up to the last trigger."""
-    n_pulses, n_rows, n_cols = shape
-    dtype = count_dtype(n_pulses)
+    """Return histograms (row, col, bin) of the chosen frames.
+
+    Their `size` is that of the frames and the number of bins, by default up to the last trigger of
+    all frames.
+    """
+    n_rows, n_cols, n_bins = size
+    dtype = count_dtype(len(chosen))
     cube = _more_bins(np.zeros((n_rows, n_cols, 0), dtype), n_bins or 0, name)
     end = first_bin + (n_bins or MOST_GUESSED_BINS)
     for start, frames in stretches:
@@ -173,9 +200,13 @@ def _count_triggers(
         last = int(numbers.max()) - first_bin
         if last >= cube.shape[2]:
             cube = _more_bins(cube, last + 1, name)
+        inside = slice(*(max(edge - start[0], 0) for edge in (chosen.start, chosen.stop)))
+        fired = fired[inside]
+        if len(fired) < len(frames):
+            numbers = frames[inside][fired]
         rows, cols = (k + np.arange(n) for k, n in zip(start[1:], frames.shape[1:], strict=True))
         lowest = (rows[:, None] * n_cols + cols) * cube.shape[2]
-        place = np.broadcast_to(lowest, frames.shape)[fired] + numbers.astype(np.int64) - first_bin
+        place = np.broadcast_to(lowest, fired.shape)[fired] + numbers.astype(np.int64) - first_bin
         np.add.at(cube.reshape(-1), place, dtype.type(1))
     require(f"triggers of {name}", 0, cube.shape[2] > 0, "n_bins, or frames in which a pixel fired")
     return cube

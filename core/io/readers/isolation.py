@@ -1,8 +1,8 @@
 """Decode files in processes of limited memory and time, so that no file harms this one.
 
-All formats that a library parses are decoded there, the records of a TMF8820 and depth maps too.
-Only NumPy's formats, raw camera frames and gzip are read in this process: their sizes are checked
-before memory is allocated, and nothing in them is interpreted.
+All formats that a library parses are decoded there, JSON records and depth maps too. Only NumPy's
+formats, raw camera frames and gzip are read in this process: their sizes are checked before memory
+is allocated, and nothing in them is interpreted.
 
 Processes that are idle are used again, one for each thread that reads at the same time.
 """

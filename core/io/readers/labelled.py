@@ -39,7 +39,6 @@ from core.io.readers.dense import (
 from core.io.readers.guards import require_fits
 from core.io.readers.layout import (
     completed,
-    fields_of,
     number,
     require_image,
     require_pulse_in_gate,
@@ -48,6 +47,7 @@ from core.io.readers.options import ReadOptions
 from core.io.readers.quantities import UNITS_S as TIME_UNITS_S
 from core.io.readers.sample import sample_of
 from core.io.readers.stored import CLASSIC_SIGNATURES, HDF5_SIGNATURE, Stored, arrays, choose
+from core.labels import dataset, with_description  # noqa: F401 - the layout that is read here
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -223,6 +223,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
     return replace(
         capture_of(np.ascontiguousarray(counts.data), known),
         truth_range_m=file.image("truth_range_m"),
+        reported_range_m=file.image("reported_range_m"),
         signal=file.image("signal"),
         background=number(counts.attrs, "background") if is_own else None,
     )
@@ -253,7 +254,7 @@ def open_counts(path: Path, request: ReadOptions) -> xr.DataArray:
         meta=np.empty((0, 0, 0), file.counts.dtype),
     )
     counts = file.labelled(lazy)
-    return _with_description(counts, describe(counts, request, file.origin, file.guessed))
+    return with_description(counts, describe(counts, request, file.origin, file.guessed))
 
 
 def _blocks(counts: CheckedCounts, time_axis: int) -> tuple[int, ...]:
@@ -266,42 +267,6 @@ def _blocks(counts: CheckedCounts, time_axis: int) -> tuple[int, ...]:
     what, remedy = f"a block of {counts.stored.name} with all its bins", "chunks of fewer pixels"
     require_fits(what, prod(block) * counts.dtype.itemsize, remedy)
     return tuple(block)
-
-
-def dataset(capture: Capture) -> xr.Dataset:
-    """Return a capture as ``counts``, with ``truth_range_m`` and ``signal`` where known."""
-    import xarray as xr  # noqa: PLC0415 - half a second that reading a .npz should not pay
-
-    counts = xr.DataArray(capture.cube, dims=AXES, attrs={"long_name": "detections"})
-    if capture.background is not None:
-        counts.attrs["background"] = capture.background
-    images = {
-        name: (AXES[:2], image, {"units": unit})
-        for name, image, unit in (
-            ("truth_range_m", capture.truth_range_m, "m"),
-            ("signal", capture.signal, "1"),
-        )
-        if image is not None
-    }
-    known = Description(capture.acquisition, capture.pulse, capture.detection, capture.source)
-    return xr.Dataset({"counts": _with_description(counts, known), **images})
-
-
-def _with_description(counts: xr.DataArray, known: Description) -> xr.DataArray:
-    """Return counts (row, col, bin) with a description as attributes and coordinates."""
-    acquisition = known.acquisition
-    opens = np.arange(acquisition.n_bins)
-    time_s = acquisition.gate_delay_s + opens * acquisition.bin_width_s
-    coordinates = {
-        "time_s": ("bin", time_s, {"units": "s", "long_name": "time after the pulse"}),
-        "range_m": ("bin", acquisition.bin_to_range_m(opens), {"units": "m"}),
-    }
-    labelled = counts.drop_vars([name for name in coordinates if name in counts.coords])
-    labelled = labelled.assign_coords(coordinates)
-    replaced = {"n_pulses", "pixel_angle_rad", "pulse_samples", "source"}
-    others = {name: value for name, value in counts.attrs.items() if name not in replaced}
-    labelled.attrs = others | fields_of(known)
-    return labelled
 
 
 def oriented(counts: xr.DataArray, request: ReadOptions) -> xr.DataArray:
@@ -380,6 +345,7 @@ def describe(
     """
     request.refuse(["time_unit_s", "first_detections"], "labelled counts have bins")
     request.refuse(["shape", "no_trigger"], "labelled counts have axes")
+    request.refuse(["records"], "labelled counts are no sequence")
     n_bins, stop_s = counts.sizes["bin"], request.stop_s
     require("n_bins", request.n_bins, request.n_bins in (None, n_bins), f"{n_bins} or None")
     known = completed(request, counts.attrs)

@@ -13,32 +13,17 @@ import numpy as np
 
 from core.acquisition import SHORTEST_PULSE_S, Acquisition, Pulse, require_time
 from core.checks import require
-from core.io.readers.dense import Description
 from core.io.readers.options import ReadOptions
 from core.io.readers.quantities import time_text
+
+TIMING = ("bin_width_s", "gate_delay_s", "pixel_angle_rad", "n_pulses")
+"""Fields that are one number each. Files of other layouts may state them under these names, too."""
 
 PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 """Fields that define a pulse together."""
 
 _MOST_SAMPLES = 2**20
 _MOST_SAMPLES_BEYOND_GATE = 2**16
-
-
-def fields_of(description: Description) -> dict[str, Any]:
-    """Return the fields that a file keeps; what is unknown is left out."""
-    acquisition, pulse = description.acquisition, description.pulse
-    known = {
-        "bin_width_s": acquisition.bin_width_s,
-        "gate_delay_s": acquisition.gate_delay_s,
-        "n_pulses": acquisition.n_pulses,
-        "pixel_angle_rad": acquisition.pixel_angle_rad,
-        "pulse_shape": pulse.shape,
-        "pulse_tau_s": pulse.tau_s,
-        "pulse_samples": list(pulse.samples) or None,
-        "detection": description.detection,
-        "source": description.source or None,
-    }
-    return {name: value for name, value in known.items() if value is not None}
 
 
 def completed(request: ReadOptions, known: Mapping[str, Any]) -> ReadOptions:
@@ -50,7 +35,7 @@ def completed(request: ReadOptions, known: Mapping[str, Any]) -> ReadOptions:
         If a field is invalid.
     """
     values: dict[str, Any] = {}
-    for name in ("bin_width_s", "gate_delay_s", "pixel_angle_rad", "n_pulses", "detection"):
+    for name in (*TIMING, "detection"):
         if getattr(request, name) is None and name in known:
             values[name] = known[name] if name == "detection" else number(known, name)
     if "n_pulses" in values:

@@ -2,8 +2,10 @@
 
 Either a cell array (row, col) holding each pixel's photon arrival times as a vector, or a cube
 (row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts, as published simulated
-captures are stored. The file may have other variables if only one fits; a number named like
-``bin_width`` or ``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
+captures are stored. The file may have other variables if only one fits. Numbers under the names of
+the project's own layout, ``bin_width_s``, ``gate_delay_s``, ``n_pulses`` and ``pixel_angle_rad``,
+are used. A number named like ``bin_width`` or ``resolution`` that is plausible in seconds is taken
+as the bin width, as a guess.
 
 The pixels of a sparse matrix follow each other column by column, as MATLAB's ``reshape`` lists
 them, or row by row with ``axes="row col"``. Rows and columns come from ``shape``; without it they
@@ -19,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from math import isqrt, prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +36,8 @@ from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
 from core.io.readers.dense import LARGEST_COUNT, count_dtype, cube_capture, dense_capture
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
+from core.io.readers.layout import TIMING, completed
+from core.io.readers.maps import Map
 from core.io.readers.options import ReadOptions, choose_variable
 from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
 
@@ -70,10 +75,14 @@ class Variable(NamedTuple):
         return (is_cube or is_list) and min(self.shape) > 0
 
     @property
+    def is_number(self) -> bool:
+        """Whether it is a single number."""
+        return self.kind in NUMERIC and set(self.shape) == {1}
+
+    @property
     def may_be_bin_width(self) -> bool:
         """Whether it is a single number with a name like that of a bin width."""
-        plain = self.name.lower().replace("_", "")
-        return self.kind in NUMERIC and set(self.shape) == {1} and plain in _WIDTH_NAMES
+        return self.is_number and self.name.lower().replace("_", "") in _WIDTH_NAMES
 
 
 class _Version5:
@@ -168,15 +177,11 @@ def _is_hdf5(start: bytes) -> bool:
 
 def read(path: Path, request: ReadOptions) -> Capture:
     """Read a cell array of arrival times, a cube, or a sparse matrix."""
-    with path.open("rb") as opened:
-        start = opened.read(_USER_BLOCK + len(HDF5_SIGNATURE))
-    if not _is_hdf5(start):
-        # SciPy takes a zero in the first four bytes for version 4.
-        known = start[124:128] in _VERSIONS_5 and 0 not in start[:4]
-        require("version", start[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
-    file = _Version73(path) if _is_hdf5(start) else _Version5(path)
+    file = _opened(path)
     variable = _choose(file.variables, request.variable)
     name, origin = variable.name, f"{path.name}, variable {variable.name}"
+    stated = (one for one in file.variables if one.is_number and one.name in TIMING)
+    request = completed(request, {one.name: file.array(one) for one in stated})
     if variable.kind == "cell":
         times, pixel = file.cells(variable)
         shape = (variable.shape[0], variable.shape[1])
@@ -189,6 +194,39 @@ def read(path: Path, request: ReadOptions) -> Capture:
         shaped, guessed = _with_shape(request, variable, file.variables)
         return _sparse_capture(parts, variable.shape, name, origin, shaped, guessed, width_s)
     return cube_capture(file.array(variable), name, origin, request, bin_width_s=width_s)
+
+
+def maps(path: Path) -> list[Map]:
+    """List matrices of numbers, and cells, each of which must then hold one number."""
+    file = _opened(path)
+    found = []
+    for each in file.variables:
+        if len(each.shape) == 2 and each.kind in (*NUMERIC, "cell"):
+            load = partial(_one_each, file) if each.kind == "cell" else file.array
+            found.append(Map(each.name, each.shape, partial(load, each)))
+    return found
+
+
+def _one_each(file: _Version5 | _Version73, variable: Variable) -> NDArray[Any]:
+    """Return the numbers of a cell array as a matrix."""
+    numbers, pixel = file.cells(variable)
+    size = np.bincount(pixel, minlength=prod(variable.shape))
+    accepted = "one number in each of them"
+    require(
+        f"numbers in a cell of {variable.name}", int(size.max()), bool((size == 1).all()), accepted
+    )
+    return np.asarray(numbers[np.argsort(pixel)].reshape(variable.shape))
+
+
+def _opened(path: Path) -> _Version5 | _Version73:
+    with path.open("rb") as opened:
+        start = opened.read(_USER_BLOCK + len(HDF5_SIGNATURE))
+    if _is_hdf5(start):
+        return _Version73(path)
+    # SciPy takes a zero in the first four bytes for version 4.
+    known = start[124:128] in _VERSIONS_5 and 0 not in start[:4]
+    require("version", start[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
+    return _Version5(path)
 
 
 def _choose(variables: Sequence[Variable], name: str | None) -> Variable:

@@ -1,7 +1,8 @@
 """NumPy ``.npy``: one histogram cube (row, col, bin) of non-negative whole numbers.
 
 If ``no_trigger`` is given, the array holds raw frames (pulse, row, col), see
-`core.io.readers.frames`. An array that looks like such is refused without it.
+`core.io.readers.frames`. An array that looks like such is refused without it; ``axes`` declares it
+a cube if 0 would mark no trigger.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from core.checks import require
 from core.io.readers.dense import cube_capture
 from core.io.readers.frames import Header, frames_from, require_counts
 from core.io.readers.guards import decoding, require_fits
+from core.io.readers.maps import Map
 from core.io.readers.options import ReadOptions
 
 
@@ -34,8 +36,20 @@ def read(path: Path, request: ReadOptions) -> Capture:
         if request.no_trigger is not None:
             return frames_in(file, size, "the array", path.name, request)
         cube = read_array(file, size, "the array")
-    require_counts(cube, "the array")
+    require_counts(cube, "the array", request.axes)
     return cube_capture(cube, "the array", path.name, request)
+
+
+def maps(path: Path) -> list[Map]:
+    """List the array of a file if it is an image."""
+
+    def load() -> NDArray[Any]:
+        with path.open("rb") as file:
+            return read_array(file, path.stat().st_size, "the array")
+
+    with path.open("rb") as file:
+        shape = read_header(file, "the array").shape
+    return [Map("", shape, load)] if len(shape) == 2 else []
 
 
 def frames_in(file: IO[bytes], size: int, name: str, origin: str, request: ReadOptions) -> Capture:

@@ -1,28 +1,29 @@
 """The project's own layout: a NumPy ``.npz`` archive, compressed or not.
 
-==================  ==============  ==========================================================
-field               shape           meaning
-==================  ==============  ==========================================================
-``format``          text            ``"firstphoton-capture-1"``; may be absent
-``cube``            (row, col, bin) counts, unsigned; the only field that must be there
-``bin_width_s``     scalar          width of a bin in seconds
-``gate_delay_s``    scalar          time from the pulse to the first bin in seconds
-``n_pulses``        scalar          pulses sent for each pixel; 0 or absent: unknown
-``pixel_angle_rad`` scalar          angle between neighbouring pixels in radians; absent: unknown
-``pulse_shape``     text            ``"gamma"``, ``"gaussian"`` or ``"measured"``
-``pulse_tau_s``     scalar          time constant, standard deviation or sample spacing
-``pulse_samples``   (sample,)       the measured pulse; empty or absent for the others
-``truth_range_m``   (row, col)      true range in metres, NaN without a target; may be absent
-``signal``          (row, col)      true signal photons per pulse; may be absent
-``background``      scalar          true background photons per pulse and gate; may be absent
-``detection``       text            ``"first"`` or ``"all"``, see `core.capture.Detection`
-``source``          text            where the capture came from; may be absent
-==================  ==============  ==========================================================
+====================  ==============  ==========================================================
+field                 shape           meaning
+====================  ==============  ==========================================================
+``format``            text            ``"firstphoton-capture-1"``; may be absent
+``cube``              (row, col, bin) counts, unsigned; the only field that must be there
+``bin_width_s``       scalar          width of a bin in seconds
+``gate_delay_s``      scalar          time from the pulse to the first bin in seconds
+``n_pulses``          scalar          pulses sent for each pixel; 0 or absent: unknown
+``pixel_angle_rad``   scalar          angle between neighbouring pixels in radians; absent: unknown
+``pulse_shape``       text            ``"gamma"``, ``"gaussian"`` or ``"measured"``
+``pulse_tau_s``       scalar          time constant, standard deviation or sample spacing
+``pulse_samples``     (sample,)       the measured pulse; empty or absent for the others
+``truth_range_m``     (row, col)      true range in metres, NaN without a target; may be absent
+``reported_range_m``  (row, col)      range in metres that the instrument reported; may be absent
+``signal``            (row, col)      true signal photons per pulse; may be absent
+``background``        scalar          true background photons per pulse and gate; may be absent
+``detection``         text            ``"first"`` or ``"all"``, see `core.capture.Detection`
+``source``            text            where the capture came from; may be absent
+====================  ==============  ==========================================================
 
 Text is an array of one unicode string. Where timing or pulse are absent they are guessed: bins of
 1 ns, a gate that opens with the pulse, and the default pulse. An archive of other names opens too
-if exactly one array has three axes, or if ``variable`` names one; its pulse is then guessed to be a
-Gaussian of one bin.
+if exactly one array has three axes, or if ``variable`` names one; the scalars of the table are used
+there, too, and the pulse is guessed from the counts.
 
 In place of a cube there may be raw ``frames`` (pulse, row, col) of trigger bins with a whole number
 ``no_trigger`` that marks no trigger, as in `core.io.readers.frames`; the other fields may
@@ -32,6 +33,8 @@ accompany them. Frames that are stored without compression may be larger than me
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from math import prod
 from pathlib import Path
 from typing import IO, Any
 from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
@@ -42,36 +45,37 @@ from numpy.typing import NDArray
 from core.acquisition import Floats, Pulse
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import AXES, Description, cube_capture, dense_capture, stored_counts
-from core.io.readers.frames import require_counts
+from core.io.readers.dense import AXES, cube_capture, dense_capture, stored_counts
+from core.io.readers.frames import Header, require_counts
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.layout import (
     PULSE,
+    TIMING,
     completed,
-    fields_of,
     number,
     require_image,
     require_pulse_in_gate,
 )
+from core.io.readers.maps import Map
 from core.io.readers.npy import frames_in, read_array, read_header
 from core.io.readers.options import ReadOptions, choose_variable
+from core.labels import fields_of
 
 FORMAT = "firstphoton-capture-1"
 
-_TIMING = ("bin_width_s", "gate_delay_s", "pixel_angle_rad", "n_pulses")
-_FIELDS = (*_TIMING, *PULSE, "format", "detection", "source", "no_trigger", "background")
+_FIELDS = (*TIMING, *PULSE, "format", "detection", "source", "no_trigger", "background")
 _MOST_BYTES = 2**16  # of a field that is one number or one text
 _MOST_BYTES_OF_SAMPLES = 2**23 + 2**12
 
 
 def fields(capture: Capture) -> dict[str, NDArray[Any]]:
     """Return the arrays that this layout keeps of a capture."""
-    known = Description(capture.acquisition, capture.pulse, capture.detection, capture.source)
     kept = {
         "format": FORMAT,
         "cube": capture.cube,
-        **fields_of(known),
+        **fields_of(capture),
         "truth_range_m": capture.truth_range_m,
+        "reported_range_m": capture.reported_range_m,
         "signal": capture.signal,
         "background": capture.background,
     }
@@ -85,17 +89,16 @@ def recognizes(start: bytes) -> bool:
 
 def read(path: Path, request: ReadOptions) -> Capture:
     """Read our own layout, the one cube of an archive, or raw frames."""
-    with decoding("the archive"):
-        archive = ZipFile(path)
-    with archive:
-        names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
+    with _archive(path) as archive:
+        names = _names(archive)
         name = _choose(archive, names, request)
         origin = f"{path.name}, variable {name}"
         is_frames = name == "frames" or (request.no_trigger is not None and name != "cube")
         if name != "cube" and not is_frames:
             counts = _array(archive, name)
-            require_counts(counts, name)
-            return cube_capture(counts, name, origin, request)
+            require_counts(counts, name, request.axes)
+            stated = {each: _field(archive, each) for each in TIMING if _is_number(archive, each)}
+            return cube_capture(counts, name, origin, completed(request, stated))
         known = {field: _field(archive, field) for field in names if field in _FIELDS}
         version = known.get("format", FORMAT)
         require("format", version, str(version) == FORMAT, FORMAT)
@@ -122,9 +125,36 @@ def read(path: Path, request: ReadOptions) -> Capture:
         return replace(
             capture,
             truth_range_m=_image(archive, "truth_range_m", capture.shape),
+            reported_range_m=_image(archive, "reported_range_m", capture.shape),
             signal=_image(archive, "signal", capture.shape),
             background=number(known, "background"),
         )
+
+
+def maps(path: Path) -> list[Map]:
+    """List the images of an archive."""
+
+    def load(name: str) -> NDArray[Any]:
+        with _archive(path) as archive:
+            return _array(archive, name)
+
+    with _archive(path) as archive:
+        shapes = {name: _header(archive, name).shape for name in _names(archive)}
+    return [Map(name, of, partial(load, name)) for name, of in shapes.items() if len(of) == 2]
+
+
+def _archive(path: Path) -> ZipFile:
+    with decoding("the archive"):
+        return ZipFile(path)
+
+
+def _names(archive: ZipFile) -> list[str]:
+    return [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
+
+
+def _header(archive: ZipFile, name: str) -> Header:
+    with _opened(archive, name) as file:
+        return read_header(file, name)
 
 
 def _choose(archive: ZipFile, names: list[str], request: ReadOptions) -> str:
@@ -135,8 +165,7 @@ def _choose(archive: ZipFile, names: list[str], request: ReadOptions) -> str:
             return name
     cubes = {}
     for name in names if variable is None else ():
-        with _opened(archive, name) as file:
-            header = read_header(file, name)
+        header = _header(archive, name)
         if len(header.shape) == 3:
             cubes[name] = header.dtype.kind in "iu"
     return choose_variable(variable, names, cubes, "a (row, col, bin) array", listed)
@@ -151,12 +180,20 @@ def _field(archive: ZipFile, name: str) -> Any:
     return array.item() if array.size == 1 else array
 
 
+def _is_number(archive: ZipFile, name: str) -> bool:
+    """Return whether an archive has one number of that name."""
+    if f"{name}.npy" not in archive.namelist():
+        return False
+    with _opened(archive, name) as file:
+        header = read_header(file, name)
+    return prod(header.shape) == 1 and header.dtype.kind in "iuf"
+
+
 def _image(archive: ZipFile, name: str, shape: tuple[int, int]) -> Floats | None:
     """Read an image that accompanies the counts, after checking its header."""
     if f"{name}.npy" not in archive.namelist():
         return None
-    with _opened(archive, name) as file:
-        header = read_header(file, name)
+    header = _header(archive, name)
     require(name, f"array of {header.dtype}", header.dtype.kind in "biuf", "real numbers")
     require_image(name, header.shape, shape)
     return np.asarray(_array(archive, name), np.float64)

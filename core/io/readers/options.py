@@ -96,6 +96,20 @@ def _is_shape(value: Any) -> bool:
     return is_pair and all(_is_whole(size) and size >= 1 for size in value)
 
 
+def _parsed_records(text: str) -> int | tuple[int, int]:
+    first, dash, last = text.partition("-")
+    return (int(first), int(last)) if dash else int(first)
+
+
+def _records_as_typed(records: int | tuple[int, int]) -> str:
+    return "-".join(map(str, records)) if isinstance(records, tuple) else str(records)
+
+
+def _are_records(value: Any) -> bool:
+    span = value if isinstance(value, tuple) else (value, value)
+    return len(span) == 2 and all(map(_is_whole, span)) and 0 <= span[0] <= span[1]
+
+
 _DETECTIONS = get_args(Detection)
 _NAMES = Kind("str", str, "names", _required("text", lambda value: isinstance(value, str)))
 _ANGLE = Kind(
@@ -120,6 +134,13 @@ _SHAPE = Kind(
     _required("rows and columns, each at least 1", _is_shape),
     lambda shape: " x ".join(map(str, shape)),
     ("ROWS", "COLS"),
+)
+_RECORDS = Kind(
+    "int or tuple of int",
+    _parsed_records,
+    "a record such as 0, or the first and the last one such as 3-7",
+    _required("a record from 0, or the first and the last one", _are_records),
+    _records_as_typed,
 )
 _PULSE = Kind(
     "Pulse",
@@ -216,6 +237,13 @@ class ReadOptions:
         _count(MOST_PULSES),
         "Number of detections to keep of each pixel, in the order of the file; only for a file "
         "that lists photons.",
+    )
+    records: int | tuple[int, int] | None = _option(
+        "Records",
+        "records",
+        _RECORDS,
+        "Records of a sequence in time that are added up, counted from 0: one such as 0, or a span "
+        "such as 3-7. A frame of raw frames or of a scan is a record.",
     )
 
     def __post_init__(self) -> None:
@@ -368,9 +396,13 @@ def read_options_from(chosen: Any) -> ReadOptions:
     )
 
 
-def with_flags(message: str) -> str:
-    """Return a message with the options of the command line instead of the fields' names."""
-    for name, option in reading_options().items():
+def with_flags(message: str, *others: str) -> str:
+    """Return a message with the options of the command line instead of the arguments' names.
+
+    `others` are names of arguments that are no fields of `ReadOptions`.
+    """
+    flags = {name: option.flag for name, option in reading_options().items()}
+    for name, flag in (flags | {name: name.replace("_", "-") for name in others}).items():
         if "_" in name:
-            message = re.sub(rf"\b{name}\b", f"--{option.flag}", message)
+            message = re.sub(rf"\b{name}\b", f"--{flag}", message)
     return message

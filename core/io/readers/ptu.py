@@ -1,10 +1,11 @@
 """PicoQuant ``.ptu``: images of time-tagged photons (T3 mode), as TCSPC electronics record them.
 
 Each photon carries its time since the laser's last pulse in bins of the instrument, whose width is
-in the file; bins that begin within one period of the laser are kept. Frames are summed, and so are
-detectors unless ``variable`` picks one, such as ``"channel 0"``. Photons outside the scan's lines,
-as on the way back of a mirror, belong to no pixel; incomplete frames at the beginning and the end
-are left out. The gate opens with the pulse by default. All photons of a pulse count.
+in the file; bins that begin within one period of the laser are kept. Frames are summed, all or
+those of ``records``, and so are detectors unless ``variable`` picks one, such as ``"channel 0"``.
+Photons outside the scan's lines, as on the way back of a mirror, belong to no pixel; incomplete
+frames at the beginning and the end are left out. The gate opens with the pulse by default. All
+photons of a pulse count.
 
 Electronics that measure from the photon to the next pulse (reverse start-stop) count backwards:
 give the laser's period as ``stop_s``.
@@ -26,6 +27,7 @@ from core.io.readers.dense import AXES, cube_capture
 from core.io.readers.guards import require_fits
 from core.io.readers.isolation import isolated
 from core.io.readers.options import ReadOptions
+from core.io.readers.records import chosen_records, described, span_of
 
 _BYTES_A_RECORD = 4
 _BYTES_A_COUNT = 4
@@ -56,21 +58,27 @@ def read(path: Path, request: ReadOptions) -> Capture:
     rows, cols = _require_image(header["tags"], n_bytes, n_bins)
     channel = _channel(request.variable)
     shape = [rows, cols, n_bins]
-    known, cubes = isolated(path, "the records", "read_ptu", channel=channel, shape=shape)
+    known, cubes = isolated(
+        path, "the records", "read_ptu", channel=channel, shape=shape, span=span_of(request)
+    )
     channels, n_frames = known["channels"], known["n_frames"]
     listed = ", ".join(f"channel {one}" for one in channels) or "none"
     require("photons of the image", listed, bool(channels), "a file with photons")
+    chosen = chosen_records(request, n_frames)
     require("variable", request.variable, bool(cubes), f"None for all, or one of {listed}")
-    summed = [f"{n_frames} frames"] * (n_frames > 1)
+    summed = [f"{n_frames} frames"] * (request.records is None and n_frames > 1)
     summed += [f"{len(channels)} channels"] * (channel is None and len(channels) > 1)
     origin = path.name if channel is None else f"{path.name}, channel {channel}"
+    origin += f", {described(chosen, n_frames, 'frame')}" if request.records is not None else ""
     origin += f", {' and '.join(summed)} summed" if summed else ""
     complete = replace(
         request,
         bin_width_s=request.bin_width_s or bin_width_s,
         detection=request.detection or "all",
+        records=None,
     )
-    return cube_capture(cubes[0], "the image", origin, complete, axes=" ".join(AXES))
+    capture = cube_capture(cubes[0], "the image", origin, complete, axes=" ".join(AXES))
+    return replace(capture, n_records=n_frames)
 
 
 def _bins(tags: Mapping[str, Any]) -> tuple[float, int]:

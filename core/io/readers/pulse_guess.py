@@ -1,49 +1,96 @@
-"""Width of the echo, estimated from the counts of a capture alone.
+"""Pulse, estimated from the counts of a capture alone.
 
-Two photons of the same echo lie within a pulse's width of each other, wherever the surface is; any
-other two may lie anywhere in the gate. So the gaps between two photons of the same pixel have a
-peak at zero, √2 as wide as the pulse, on a broad floor.
+Two photons of the same echo lie within a pulse's width of each other, wherever the surface is. So
+the gaps between two photons of the same pixel have a peak at zero: the autocorrelation of the
+pulse, √2 as wide as a Gaussian one.
 
-The gaps are counted by the autocorrelation of each pixel's histogram (Fourier transforms, in
-blocks, of as many evenly spread pixels as `_MOST_NUMBERS` allows), without the pairs of each photon
-with itself. Every photon is weighted by the inverse of the local level of the mean histogram, a
-running median over a quarter of the gate: otherwise the decay of first photons under a strong
-background would bend the floor. The remaining floor is a straight line. The peak of a Gaussian
-pulse on that line, blurred by the bins, is fitted by least squares: first the width of the most
-significant peak, then, around it, the width that fits best.
+Null. The gaps also crowd where the histograms of all pixels do: in the decay of first photons under
+a strong background, and at the depths of the scene. Photons exchanged between pixels keep these
+pairs and lose those of an echo. Their expected number is the autocorrelation of the pooled
+histogram, Σ n (n - 1) (m ⋆ m) with n photons in a pixel and shares m of the bins, and is
+subtracted. It is pooled in strata of pixels with similar numbers of photons, since brighter pixels
+may have another shape: a greater share of signal, or a faster decay.
 
-A width is estimated only if its peak is significant: fitted to each of 32 groups of pixels, the
-mean number of pairs in the peak is 6 standard errors above zero, and its height is at least 2 % of
-the floor, since a floor that is not quite straight might leave a smaller one. Pulses wider than a
-tenth of the gate (a twentieth, for a wall at one range) cannot be found. Nothing is estimated from
-fewer than 16 bins or 32 pixels, nor from more than 65,536 bins. Of a pulse with a tail, the width
-is that of the core.
+Scene at one depth. There the null contains all pairs of the echo, and the pooled histogram shows
+the pulse itself. The peaks q of the pooled histogram above its level, a running median, are
+therefore put back: Σ n (n - 1) (q ⋆ q). For depths that are spread out, this adds only a broad
+floor. In between, the sum is still the pairs of an echo.
+
+Evidence. Gaussian and gamma pulses compete, with standard deviations from a fifth of a bin to a
+tenth of the gate. Each predicts a peak, blurred by the bins, on a parabola for what remains of the
+floor; it holds at least the pairs of the pooled peaks. The smallest weighted misfit wins. The error
+of a difference between two misfits comes from the scatter between 32 groups of pixels, from the
+level below the pooled peaks, taken to be known to 2 %, and from the model, taken to be right to
+1 % of the peak. Candidates within three errors of the best form the interval. A gamma pulse is
+chosen only if every Gaussian is rejected.
+
+Pairs of a pulse below one bin depend on its position within the bin. Where all echoes lie in a few
+bins, this is not averaged out: pulses at any one position compete, too.
+
+The pulse is determined if the hypothesis of no echo is rejected by five errors, and the interval
+lies within a factor of 1.3 of the estimate. Nothing is estimated from fewer than 16 bins or 32
+pixels, nor from more than 65,536 bins. The pairs of a pulse and of its mirror image are the same:
+that a tail is late is assumed.
+
+Pairs are counted by Fourier transforms, of as many evenly spread pixels as `_MOST_NUMBERS` allows.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
 
 from core.acquisition import Floats, Pulse
+from core.io.readers.quantities import time_text
 
 _GROUPS = 32
+_MOST_STRATA = 8
+_FEWEST_PIXELS = 64  # in a stratum
+_FEWEST_PHOTONS = 100  # in a bin of a stratum
+_SMOOTH_PHOTONS = 1e4  # to which a histogram is smoothed for its level, which is noisy at the ends
 _MOST_NUMBERS = 2**24  # in all transforms together: a tenth of a second
-_NUMBERS_A_BLOCK = 2**20
 _FEWEST_BINS = 16
 _MOST_BINS = 2**16  # above, even one pixel of each group would take long
-_NARROWEST_BINS = 0.3  # standard deviation; below, two bins hold nearly all of an echo
+_NARROWEST_BINS = 0.2  # standard deviation; below, a bin holds nearly all of an echo
 _WIDEST_SHARE = 0.1  # of the gate; above, no floor is left
-_MOST_WEIGHT = 20.0  # of a photon where there are few
-_STANDARD_ERRORS = 6.0
-_LOWEST_PEAK = 0.02
+_STEP = 0.02  # between candidates, of their width
+_GAMMA_SIGMA = np.sqrt(2.0)  # standard deviation of a gamma pulse, in its tau
+_REJECTED = 3.0  # standard errors
+_ECHO_REJECTED = 5.0
+_MODEL_ERROR = 0.01  # of the peak: no echo is exactly Gaussian, and pile-up narrows it
+_CLOSE = 1.3  # largest factor between the ends of the interval and the estimate
+_SINGLE_LAGS = 16  # wider classes of lags follow
+_PHASES = np.arange(0.0, 1.0, 0.05)  # of an echo within its bin
+_FEW_BINS = 6  # that hold all echoes
+_LEVEL_ERROR = 0.02  # of a pooled histogram, as a share
+_LEVEL_ROUNDS = 3
+_PEAK_ERRORS = 5.0  # standard errors
+
+Cube = NDArray[np.unsignedinteger]
+Shape = Literal["gaussian", "gamma"]
 
 
-def guessed_pulse(cube: NDArray[np.unsignedinteger], bin_width_s: float) -> Pulse:
-    """Return a Gaussian of the estimated width, to two digits, else of one bin.
+class PulseGuess(NamedTuple):
+    """Pulse estimated from counts."""
+
+    shape: Shape
+    tau_bins: float
+    """``Pulse.tau_s`` in bins: the standard deviation of a Gaussian."""
+    low_bins: float
+    high_bins: float
+    """Ends of its interval, of three standard errors; from 0 if all narrower ones are alike."""
+
+    @property
+    def sigma_bins(self) -> float:
+        """Standard deviation in bins."""
+        return self.tau_bins * (_GAMMA_SIGMA if self.shape == "gamma" else 1.0)
+
+
+def guessed_pulse(cube: Cube, bin_width_s: float) -> tuple[Pulse, str]:
+    """Return the estimated pulse, else a Gaussian of one bin, and how well it is known.
 
     Parameters
     ----------
@@ -54,16 +101,20 @@ def guessed_pulse(cube: NDArray[np.unsignedinteger], bin_width_s: float) -> Puls
 
     Returns
     -------
-    Pulse
+    pulse : Pulse
+        Its width has two digits.
+    known : str
+        The interval of its width, or that it is not determined.
     """
-    sigma_bins = guessed_sigma_bins(cube)
-    if sigma_bins is None:
-        return Pulse.gaussian(bin_width_s)
-    return Pulse.gaussian(float(f"{sigma_bins * bin_width_s:.1e}"))
+    guess = pulse_guess(cube)
+    if guess is None:
+        return Pulse.gaussian(bin_width_s), "one bin: width not determined"
+    tau_s, low_s, high_s = (float(f"{bins * bin_width_s:.1e}") for bins in guess[1:])
+    return Pulse(tau_s, shape=guess.shape), f"{time_text(low_s)} to {time_text(high_s)}"
 
 
-def guessed_sigma_bins(cube: NDArray[np.unsignedinteger]) -> float | None:
-    """Return the standard deviation of a Gaussian pulse in bins; None if it cannot be estimated.
+def pulse_guess(cube: Cube) -> PulseGuess | None:
+    """Estimate the pulse and the interval of its width; None if the width is not determined.
 
     Parameters
     ----------
@@ -72,29 +123,95 @@ def guessed_sigma_bins(cube: NDArray[np.unsignedinteger]) -> float | None:
 
     Returns
     -------
-    float or None
+    PulseGuess or None
     """
     n_bins = cube.shape[2]
     if not _FEWEST_BINS <= n_bins <= _MOST_BINS or cube.shape[0] * cube.shape[1] < _GROUPS:
         return None
-    pairs = pairs_by_lag(cube, 3 * n_bins // 4)
-    total = pairs.sum(axis=0)
-    steps = np.arange(0.0, np.log(_WIDEST_SHARE * n_bins / _NARROWEST_BINS), 0.1)
-    rough = _NARROWEST_BINS * np.exp(steps)
-    significances = [_fit(total, sigma, _window(sigma, n_bins)).significance for sigma in rough]
-    best = rough[np.argmax(significances)]
-    window = _window(best, n_bins)
-    fine = best * np.exp(np.linspace(-0.5, 0.5, 101))
-    fits = [_fit(total, sigma, window) for sigma in fine]
-    chosen = int(np.argmin([fit.misfit for fit in fits]))
-    sigma_bins, fit = float(fine[chosen]), fits[chosen]
-    in_peak = pairs[:, :window] @ fit.peak_weights
-    error = in_peak.std(ddof=1) / np.sqrt(_GROUPS)
-    is_significant = in_peak.mean() > _STANDARD_ERRORS * error and fit.contrast > _LOWEST_PEAK
-    return sigma_bins if is_significant and sigma_bins < _WIDEST_SHARE * n_bins else None
+    pairs = _echo_pairs(cube, _lag_edges(3 * n_bins // 4))
+    if pairs.counted.sum() < 0.5:  # whole numbers, but for rounding
+        return None
+    tau, peaks = _candidates("gaussian", n_bins, pairs)
+    gamma_tau, gamma_peaks = _candidates("gamma", n_bins, pairs)
+    against = _competition(pairs, np.concatenate([peaks, gamma_peaks])).against
+    shape: Shape = "gaussian"
+    if against[: tau.size].min() > _REJECTED:
+        shape, tau, peaks = "gamma", gamma_tau, gamma_peaks
+    found = _competition(pairs, peaks)
+    left = tau[found.against < _REJECTED]
+    best, low, high = float(tau[found.best]), float(left.min()), float(left.max())
+    is_narrow = best / low < _CLOSE and high / best < _CLOSE and high < tau.max()
+    if not is_narrow or found.against_none < _ECHO_REJECTED:
+        return None
+    low = low / (1 + _STEP) if low > tau.min() else 0.0
+    return PulseGuess(shape, best, low, high * (1 + _STEP))
 
 
-def pairs_by_lag(cube: NDArray[np.unsignedinteger], n_lags: int) -> Floats:
+class _EchoPairs(NamedTuple):
+    """Pairs of photons of the same pixel by their gap, in classes of lags."""
+
+    edges: NDArray[np.int64]
+    """First lag of each class, and the end of the last, shape (class + 1,)."""
+    counted: Floats
+    """All pairs, shape (class,)."""
+    excess: Floats
+    """Pairs less those of the null, plus those of the pooled peaks, shape (group, class)."""
+    doubt: Floats
+    """Error of the pairs of the pooled peaks, that of their level, shape (class,)."""
+    pooled: float
+    """Number of pairs that the photons of the pooled peaks form at least."""
+    occupied_bins: float
+    """Bins that these peaks would fill if they were level; 0 without peaks."""
+
+
+def _echo_pairs(cube: Cube, edges: NDArray[np.int64]) -> _EchoPairs:
+    n_lags = int(edges[-1])
+    histograms = _sample(cube, n_lags)
+    n_photons = histograms.sum(axis=1, dtype=np.int64)
+    order = np.argsort(n_photons, kind="stable")
+    per_bin = n_photons.sum() / histograms.shape[1]
+    n_strata = int(
+        max(1, min(_MOST_STRATA, order.size / _FEWEST_PIXELS, per_bin / _FEWEST_PHOTONS))
+    )
+    strata = np.array_split(order, n_strata)
+    pooled = np.array([histograms[some].sum(axis=0, dtype=np.int64) for some in strata], float)
+    is_peak = np.zeros(pooled.shape[1], bool)
+    for _ in range(_LEVEL_ROUNDS):  # a broad peak lifts the median around it
+        level = np.array([_level(shape, is_peak) for shape in pooled])
+        is_peak = is_peak | _is_peak(pooled.sum(axis=0), level.sum(axis=0))
+    peak = np.where(is_peak, pooled - level, 0.0)
+
+    total = np.maximum(pooled.sum(axis=1), 2.0)
+    null = _autocorrelation(pooled, n_lags)
+    null[:, 0] -= pooled.sum(axis=1)  # each photon with itself
+    null /= (total * (total - 1))[:, np.newaxis]
+    echo = _autocorrelation(peak, n_lags)
+    echo[:, 0] -= pooled[:, is_peak].sum(axis=1)
+    echo /= (total**2)[:, np.newaxis]
+
+    n_pairs = n_photons[order] * (n_photons[order] - 1.0)
+    rank = np.arange(order.size)
+    weight = np.zeros((_GROUPS, n_strata))  # pairs of each group and stratum
+    stratum = np.repeat(np.arange(n_strata), [some.size for some in strata])
+    np.add.at(weight, (rank % _GROUPS, stratum), n_pairs)
+    counted = _in_classes(_pairs_of_groups(histograms, order, n_lags), edges)
+    below, above = level[:, is_peak].sum(axis=1), peak.sum(axis=1)
+    least = above - _LEVEL_ERROR * below - _REJECTED * np.sqrt(below)
+    share = np.maximum(least, 0.0) / total
+    doubt = 2 * np.minimum(_LEVEL_ERROR * below / np.maximum(above, 1.0), 1.0)
+    echo_by_class = _in_classes(echo, edges)
+    alike, at_zero = (weight.sum(axis=0) @ of_stratum for of_stratum in (share**2, echo[:, 0]))
+    return _EchoPairs(
+        edges=edges,
+        counted=counted.sum(axis=0),
+        excess=counted + weight @ (echo_by_class - _in_classes(null, edges)),
+        doubt=(weight.sum(axis=0) * doubt) @ echo_by_class,
+        pooled=float(alike),
+        occupied_bins=float(alike / at_zero) if at_zero > 0 else 0.0,
+    )
+
+
+def pairs_by_lag(cube: Cube, n_lags: int) -> Floats:
     """Count pairs of photons of the same pixel by their gap in bins, in groups of pixels.
 
     Parameters
@@ -107,77 +224,195 @@ def pairs_by_lag(cube: NDArray[np.unsignedinteger], n_lags: int) -> Floats:
     Returns
     -------
     ndarray, shape (group, lag)
-        Sums of the products of both photons' weights.
     """
-    n_bins = cube.shape[2]
-    size = scipy.fft.next_fast_len(n_bins + n_lags, real=True)
-    histograms = cube.reshape(-1, n_bins)
-    stride = -(-histograms.shape[0] * size // _MOST_NUMBERS)
-    weight = _weights(histograms[::stride].mean(axis=0))
+    histograms = _sample(cube, n_lags)
+    return _pairs_of_groups(histograms, np.arange(histograms.shape[0]), n_lags)
+
+
+def _sample(cube: Cube, n_lags: int) -> Cube:
+    """Return evenly spread histograms, shape (pixel, bin), as many as can be transformed."""
+    histograms = cube.reshape(-1, cube.shape[2])
+    numbers = histograms.shape[0] * _transform_size(cube.shape[2], n_lags)
+    return histograms[:: -(-numbers // _MOST_NUMBERS)]
+
+
+def _pairs_of_groups(histograms: Cube, order: NDArray[np.int64], n_lags: int) -> Floats:
+    """Count the pairs of every 32nd histogram, taken in that order, shape (group, lag)."""
+    size = _transform_size(histograms.shape[1], n_lags)
     power = np.zeros((_GROUPS, size // 2 + 1))
-    self_pairs = np.zeros(_GROUPS)
-    pixels_at_once = max(1, _NUMBERS_A_BLOCK // size)
+    n_photons = np.zeros(_GROUPS)
     for group in range(_GROUPS):
-        members = histograms[group * stride :: _GROUPS * stride]
-        for first in range(0, members.shape[0], pixels_at_once):
-            some = members[first : first + pixels_at_once] * weight
-            spectrum = scipy.fft.rfft(some, size, axis=1)
-            for part in (spectrum.real, spectrum.imag):
-                power[group] += np.einsum("pf,pf->f", part, part)
-            self_pairs[group] += (some @ weight).sum(dtype=float)
+        some = histograms[order[group::_GROUPS]].astype(np.float32)
+        spectrum = scipy.fft.rfft(some, size, axis=1)
+        for part in (spectrum.real, spectrum.imag):
+            power[group] += np.einsum("pf,pf->f", part, part)
+        n_photons[group] = some.sum(dtype=float)
     pairs = scipy.fft.irfft(power, size, axis=1)[:, :n_lags]
-    pairs[:, 0] -= self_pairs
+    pairs[:, 0] -= n_photons  # each photon with itself
     return np.asarray(pairs)
 
 
-def _weights(mean: Floats) -> NDArray[np.float32]:
-    """Return the weight of a photon in each bin that levels the mean histogram except for peaks."""
-    level = scipy.ndimage.median_filter(mean, size=max(3, mean.size // 4), mode="nearest")
-    typical = max(float(mean.mean()), np.finfo(float).tiny)
-    return np.asarray(typical / np.maximum(level, typical / _MOST_WEIGHT), np.float32)
+def _autocorrelation(shapes: Floats, n_lags: int) -> Floats:
+    """Correlate each row with itself, shape (row, lag)."""
+    size = _transform_size(shapes.shape[1], n_lags)
+    power = np.abs(scipy.fft.rfft(shapes, size, axis=1)) ** 2
+    return np.asarray(scipy.fft.irfft(power, size, axis=1)[:, :n_lags])
 
 
-class _Fit(NamedTuple):
-    significance: float
-    misfit: float
-    contrast: float
-    """Height of the peak as a share of the floor below it; infinite where there is no floor."""
-    peak_weights: Floats
-    """Weight of the pairs of each lag in the number of pairs in the peak, shape (lag,)."""
+def _transform_size(n_bins: int, n_lags: int) -> int:
+    return int(scipy.fft.next_fast_len(n_bins + n_lags, real=True))
 
 
-def _window(sigma_bins: float, n_bins: int) -> int:
-    """Return the number of lags that show both a peak and the floor around it."""
-    return int(min(np.ceil(12 * sigma_bins) + 12, 3 * n_bins // 4))
+def _level(shape: Floats, is_peak: NDArray[np.bool_]) -> Floats:
+    """Return the level of a histogram outside its peaks, interpolated below them.
 
-
-def _fit(pairs: Floats, sigma_bins: float, n_lags: int) -> _Fit:
-    """Fit a peak and the line of its floor to the pairs of the first lags."""
-    found = pairs[:n_lags]
-    lag = np.arange(n_lags)
-    terms = np.stack([_peak(lag, sigma_bins), np.ones(n_lags), lag / n_lags])
-    # Poisson weights, of at least the mean: chance lows would pull the fit down.
-    weighted = terms / np.maximum(found, max(found.mean(), 1.0))
-    covariance = np.linalg.pinv(weighted @ terms.T)
-    solve = covariance @ weighted
-    amplitudes = solve @ found
-    misfit = float(weighted[1] @ (found - amplitudes @ terms) ** 2)
-    floor, height = float(amplitudes[1]), float(amplitudes[0] * terms[0, 0])
-    contrast = height / floor if floor > 0 else np.inf
-    return _Fit(float(amplitudes[0] / np.sqrt(covariance[0, 0])), misfit, contrast, solve[0])
-
-
-def _peak(lag: NDArray[np.int64], sigma_bins: float) -> Floats:
-    """Return the share of an echo's pairs with a gap of `lag` bins.
-
-    The gap of two photons is √2 as wide as the pulse; that both are rounded to bins blurs it by a
-    triangle two bins wide.
+    It is the running median of what deviates from a decay, the one of first photons under a steady
+    background, fitted with Poisson weights.
     """
-    width = np.sqrt(2.0) * sigma_bins
+    if np.count_nonzero(~is_peak) < shape.size // 4:
+        is_peak = np.zeros_like(is_peak)
+    bins, outside = np.arange(shape.size), shape[~is_peak]
+    weight = np.sqrt(np.maximum(outside, 1e-3))
+    line = np.polyfit(bins[~is_peak], np.log(np.maximum(outside, 1.0)), 1, w=weight)
+    decay = np.exp(np.polyval(line, bins))
+    at_once = np.ceil(_SMOOTH_PHOTONS * outside.size / max(outside.sum(), 1.0))
+    at_once = int(max(1, min(at_once, outside.size // 8)))
+    smooth = scipy.ndimage.uniform_filter1d(outside / decay[~is_peak], at_once, mode="nearest")
+    median = scipy.ndimage.median_filter(smooth, size=shape.size // 2, mode="nearest")
+    return np.asarray(decay * np.interp(bins, bins[~is_peak], median))
 
-    def integrated_twice(gap: NDArray[np.floating]) -> Floats:
-        density = np.exp(-0.5 * (gap / width) ** 2) / np.sqrt(2 * np.pi)
-        return np.asarray(gap * scipy.special.ndtr(gap / width) + width * density)
 
-    below, at, above = (integrated_twice(lag + shift) for shift in (-1.0, 0.0, 1.0))
-    return np.asarray(below - 2 * at + above)
+def _is_peak(pooled: Floats, level: Floats) -> NDArray[np.bool_]:
+    """Find the bins where a histogram exceeds its level significantly, from fine to coarse."""
+    found = np.zeros(pooled.size, bool)
+    size = 1
+    while size <= pooled.size // 8:
+        above, below = (
+            size * scipy.ndimage.uniform_filter1d(shape, size, mode="constant")
+            for shape in (np.where(found, 0.0, pooled - level), level)
+        )
+        hit = above > np.maximum(_PEAK_ERRORS * np.sqrt(below + 1), _LEVEL_ERROR * below)
+        found |= scipy.ndimage.maximum_filter1d(hit, 2 * size + 5)  # with its flanks
+        size *= 2
+    return found
+
+
+def _lag_edges(n_lags: int) -> NDArray[np.int64]:
+    """Divide lags into single ones and classes that widen by a tenth; the last edge is `n_lags`."""
+    n_wide = max(0, int(np.ceil(np.log(n_lags / _SINGLE_LAGS) / np.log(1.1))))
+    wide = np.rint(_SINGLE_LAGS * 1.1 ** np.arange(n_wide)).astype(np.int64)
+    edges = np.unique(np.concatenate([np.arange(_SINGLE_LAGS), wide]))
+    return np.append(edges[edges < n_lags], n_lags)
+
+
+def _in_classes(pairs: Floats, edges: NDArray[np.int64]) -> Floats:
+    """Add the pairs of each class, shape (..., class)."""
+    return np.asarray(np.add.reduceat(pairs, edges[:-1], axis=-1))
+
+
+def _candidates(shape: Shape, n_bins: int, pairs: _EchoPairs) -> tuple[Floats, Floats]:
+    """Return the time constants of the candidates in bins, and their peaks as `_peaks` does."""
+    steps = np.arange(0.0, np.log(_WIDEST_SHARE * n_bins / _NARROWEST_BINS), _STEP)
+    sigma = _NARROWEST_BINS * np.exp(steps)
+    tau = sigma / (_GAMMA_SIGMA if shape == "gamma" else 1.0)
+    peaks = _peaks(shape, tau, pairs.edges)
+    if not 0 < pairs.occupied_bins < _FEW_BINS:
+        return tau, peaks
+    narrow = tau[sigma < 1.0]
+    at_phases = [_peaks_at(phase, shape, narrow, pairs.edges) for phase in _PHASES]
+    return np.append(tau, np.tile(narrow, _PHASES.size)), np.concatenate([peaks, *at_phases])
+
+
+def _peaks(shape: Shape, tau: Floats, edges: NDArray[np.int64]) -> Floats:
+    """Return the share of an echo's pairs in each class of lags.
+
+    The gap of two photons is √2 as wide as a Gaussian pulse. For a gamma pulse its density is
+    ``(1 + |x|) exp(-|x|) / (4 tau)``, with ``x`` the gap divided by tau. Both photons are rounded
+    to bins, which blurs the gap by a triangle two bins wide: the share of a lag is a second
+    difference of the density's second integral, and that of a class one of two first differences.
+
+    Parameters
+    ----------
+    shape : str
+        ``"gaussian"`` or ``"gamma"``.
+    tau : ndarray, shape (candidate,)
+        Time constants in bins.
+    edges : ndarray, shape (class + 1,)
+        As those of `_EchoPairs`.
+
+    Returns
+    -------
+    ndarray, shape (candidate, class)
+        Of the gaps from 0 up: a little more than half in total.
+    """
+    width = tau[:, np.newaxis] * (np.sqrt(2.0) if shape == "gaussian" else 1.0)
+
+    def integrated_twice(gap: Floats) -> Floats:
+        x = gap / width
+        if shape == "gamma":
+            return width * (np.maximum(x, 0.0) + (3 + np.abs(x)) * np.exp(-np.abs(x)) / 4)
+        density = np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi)
+        return np.asarray(width * (x * scipy.special.ndtr(x) + density))
+
+    at = edges.astype(float)
+    first = integrated_twice(at) - integrated_twice(at - 1.0)
+    return np.diff(first, axis=1)
+
+
+def _peaks_at(phase: float, shape: Shape, tau: Floats, edges: NDArray[np.int64]) -> Floats:
+    """Return what `_peaks` does for echoes whose time zero is `phase` bins after a bin's edge."""
+    bins = np.arange(-_SINGLE_LAGS, _SINGLE_LAGS + 1) - phase
+    share = np.diff(Pulse(1.0, shape=shape).cdf(bins / tau[:, np.newaxis]), axis=1)
+    peaks = np.zeros((tau.size, edges.size - 1))
+    for lag in range(min(_SINGLE_LAGS, edges.size - 1)):
+        peaks[:, lag] = (share[:, lag:] * share[:, : share.shape[1] - lag]).sum(axis=1)
+    return peaks
+
+
+class _Competition(NamedTuple):
+    """Comparison of candidates."""
+
+    best: int
+    """Candidate of the smallest misfit."""
+    against: Floats
+    """Standard errors by which each candidate is worse, shape (candidate,)."""
+    against_none: float
+    """Standard errors by which the hypothesis of no echo is worse."""
+
+
+def _competition(pairs: _EchoPairs, peaks: Floats) -> _Competition:
+    """Fit each candidate and compare them.
+
+    Parameters
+    ----------
+    pairs : _EchoPairs
+    peaks : ndarray, shape (candidate, class)
+        Shares of an echo's pairs.
+    """
+    width, n_lags = np.diff(pairs.edges), pairs.edges[-1]
+    # Poisson weights, of at least the mean: chance lows would pull the fit down.
+    scale = 1 / np.sqrt(np.maximum(pairs.counted, width * (pairs.counted.sum() / n_lags)))
+    middle = (pairs.edges[:-1] + pairs.edges[1:]) / (2 * n_lags)
+    floor, _ = np.linalg.qr((scale * width * middle ** np.arange(3)[:, np.newaxis]).T)
+    scaled = scale * peaks
+    scaled -= scaled @ floor @ floor.T
+    length = np.linalg.norm(scaled, axis=1)
+    scaled /= length[:, np.newaxis]
+    amplitudes = (scale * pairs.excess) @ scaled.T  # (group, candidate)
+    amplitude = amplitudes.sum(axis=0)
+    fitted = np.maximum(amplitude, pairs.pooled * length)
+    gain = (2 * amplitude - fitted) * fitted  # reduction of the misfit
+    best = int(np.argmax(gain))
+    by_group, doubt = (  # what they contribute to the gain, to first order
+        2 * fitted * contribution for contribution in (amplitudes, scaled @ (scale * pairs.doubt))
+    )
+
+    def errors(difference: Floats, of_groups: Floats, of_doubt: Floats) -> Floats:
+        variance = _GROUPS * of_groups.var(axis=0, ddof=1) + of_doubt**2
+        variance += (2 * _MODEL_ERROR) ** 2 * gain[best] * difference
+        # The gain is a square: z standard errors of the amplitude are z / 2 of the gain.
+        return np.asarray(2 * difference / np.sqrt(np.maximum(variance, 1.0)))
+
+    against = errors(gain[best] - gain, by_group[:, [best]] - by_group, doubt[best] - doubt)
+    against_none = errors(gain[best], by_group[:, best], doubt[best])
+    return _Competition(best, against, float(against_none))

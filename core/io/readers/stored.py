@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from core.checks import require
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
+from core.io.readers.maps import Map
 from core.io.readers.options import ReadOptions, choose_variable
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -149,6 +151,29 @@ def _require_readable(
     if in_chunk > n_bytes:
         n_chunks = prod(-(-n // step) for n, step in zip(shape, chunk, strict=True))
         require(f"chunks of {name}", n_chunks, n_chunks <= _MOST_CHUNKS, "larger chunks")
+
+
+def maps(path: Path) -> list[Map]:
+    """List the images of a file; NaN where a number is missing."""
+    listed, _ = arrays(path)
+    return [
+        Map(each.name, each.shape, partial(_decoded, each), str(each.attributes.get("units", "")))
+        for each in listed
+        if len(each.shape) == 2
+    ]
+
+
+def _decoded(image: Stored) -> NDArray[Any]:
+    """Return the numbers of an image that may be packed, by the conventions of netCDF."""
+    known = image.attributes
+    stored = image.whole()
+    gaps = [stored == known[name] for name in ("_FillValue", "missing_value") if name in known]
+    scale, offset = (
+        known.get(name, value) for name, value in (("scale_factor", 1), ("add_offset", 0))
+    )
+    numbers = stored.astype(float) * float(scale) + float(offset)
+    numbers[np.logical_or.reduce(gaps, axis=0)] = np.nan
+    return numbers
 
 
 def choose(arrays: Sequence[Stored], request: ReadOptions) -> Stored:

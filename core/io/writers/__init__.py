@@ -10,29 +10,46 @@ import os
 from collections.abc import Callable, Sequence
 from numbers import Integral
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.capture import Capture, CaptureInfo
 from core.checks import require
-from core.estimators import RangeImage
-from core.io.readers.labelled import dataset
+from core.estimators import RangeImage, settings_of
+from core.inference import RangeInterval
 from core.io.readers.npz import fields
 from core.io.writers import las, netcdf, npz, pcd, picture, ply, table, tiff
-from core.io.writers.product import Plane, Product
+from core.io.writers.colors import (
+    COLOR_MAPS,
+    OUTSIDE_COLOR,
+    ColorScale,
+    RangeColors,
+    colors_of,
+    range_scale,
+)
+from core.io.writers.picture import Picture
+from core.io.writers.product import Product, guessed_angle
 from core.io.writers.table import write_columns
 from core.io.writers.whole import whole_file, whole_folder
-from core.tracking import TrackingParameters
+from core.labels import Plane
 
 __all__ = [
     "CAPTURE_SUFFIXES",
     "CLOUD_SUFFIXES",
+    "COLOR_MAPS",
     "FOLDER_WRITERS",
+    "OUTSIDE_COLOR",
     "WRITERS",
+    "ColorScale",
+    "Picture",
     "Plane",
     "Product",
+    "RangeColors",
+    "colors_of",
+    "guessed_angle",
+    "range_scale",
     "save_capture",
     "save_image",
     "save_pixel",
@@ -89,14 +106,14 @@ def save_capture(
     path, suffix = _path_and_suffix(path, CAPTURE_SUFFIXES)
     if suffix == ".zarr":
         with whole_folder(path, overwrite=overwrite) as folder:
-            netcdf.write_folder(dataset(capture), folder)
+            netcdf.write_folder(capture.to_xarray(), folder)
         return
     with whole_file(path, overwrite=overwrite) as file:
         if suffix == ".npz":
             np.savez_compressed(file, allow_pickle=False, **fields(capture))
         else:
             compressed = {"counts": {"compression": "gzip", "shuffle": True}}
-            file.write(dataset(capture).to_netcdf(engine="h5netcdf", encoding=compressed))
+            file.write(capture.to_xarray().to_netcdf(engine="h5netcdf", encoding=compressed))
 
 
 def save_image(
@@ -108,6 +125,9 @@ def save_image(
     pixel_angle_rad: float | None = None,
     title: str = "",
     rgb: NDArray[np.uint8] | None = None,
+    remark: str = "",
+    interval: RangeInterval | None = None,
+    colors: RangeColors | None = None,
 ) -> None:
     """Write a range image atomically; the suffix determines the format.
 
@@ -124,8 +144,9 @@ def save_image(
     ``.png``, ``.svg``  picture of the range image
     ==================  ===========================================================================
 
-    Without a detection, an image holds NaN, a line of text an empty field, a cloud no point. The
-    modules of `core.io.writers` describe the formats, `core.geometry` the coordinates.
+    Every file states acquisition, method, settings, version and source. Without a detection, an
+    image holds NaN, a line of text an empty field, a cloud no point. The modules of
+    `core.io.writers` describe the formats, `core.geometry` the coordinates.
 
     Parameters
     ----------
@@ -145,12 +166,19 @@ def save_image(
         Title of a picture.
     rgb : ndarray of uint8, shape (row, col, 3), optional
         Colours of a cloud's points.
+    remark : str
+        Text that the file states next to that of the method, such as `core.io.guessed_angle`.
+    interval : RangeInterval, optional
+        95 % interval of each range (`core.range_interval`), for the formats that list pixels: NPZ,
+        netCDF, HDF5, Zarr and CSV.
+    colors : core.io.RangeColors, optional
+        Limits and colour map of a picture; by default those of the app.
 
     Raises
     ------
     ValueError
-        If the suffix is unknown, image and capture, or image and colours, differ in shape, the
-        angle is not between 0 and π/2, or a cloud needs an angle that is unknown.
+        If the suffix is unknown, image and capture, colours or interval differ in shape, the angle
+        is not between 0 and π/2, or a cloud needs an angle that is unknown.
     FileExistsError
         If the file exists and is not to be replaced.
     OSError
@@ -159,7 +187,16 @@ def save_image(
     path, suffix = _path_and_suffix(path, (*WRITERS, *FOLDER_WRITERS))
     if pixel_angle_rad is None:
         pixel_angle_rad = capture.acquisition.pixel_angle_rad
-    product = Product(capture, image, pixel_angle_rad, title, rgb)
+    product = Product(
+        capture,
+        image,
+        pixel_angle_rad,
+        title,
+        rgb,
+        remark=remark,
+        interval=interval,
+        colors=colors,
+    )
     if suffix in FOLDER_WRITERS:
         with whole_folder(path, overwrite=overwrite) as folder:
             FOLDER_WRITERS[suffix](product, folder)
@@ -172,33 +209,37 @@ def save_pixel(
     capture: Capture,
     row: int,
     col: int,
-    settings: TrackingParameters | None,
+    settings: Any,
     path: str | os.PathLike[str],
     *,
+    method: str = "tracking",
     overwrite: bool = False,
 ) -> None:
-    """Write the signals of the tracking differentiators in one pixel as CSV, one line a bin.
+    """Write the signals of one pixel as CSV, one line a bin.
 
     The columns are ``bin``, ``time_s`` and ``range_m`` (where the bin begins), ``counts`` (whole
     numbers), and the stages of `core.Signals` in counts: ``raw``, ``small``, ``large``,
-    ``residual``, ``enhanced``.
+    ``residual``, ``enhanced``; of methods other than the tracking differentiator, ``score``.
 
     Parameters
     ----------
     capture : Capture
     row, col : int
         The pixel.
-    settings : TrackingParameters or None
-        The recommended preset where None.
+    settings : object or None
+        Settings of the method, as for `core.estimate`; its defaults where None.
     path : path-like
         A name ending in ``.csv``.
+    method : str
+        As for `core.estimate`.
     overwrite : bool
         Replace a file of that name.
 
     Raises
     ------
     ValueError
-        If the name has another ending, the pixel lies outside the image, or the weight "survival"
+        If the name has another ending, the pixel lies outside the image, the method is unknown or
+        its settings are another's, or the weight "survival"
         lacks the capture's pulses.
     FileExistsError
         If the file exists and is not to be replaced.
@@ -206,11 +247,12 @@ def save_pixel(
         If the folder cannot be written; an older file is then left as it was.
     """
     path, _ = _path_and_suffix(path, (".csv",))
+    settings = settings_of(method, settings)
     for name, index, size in zip(("row", "col"), (row, col), capture.shape, strict=True):
         inside = isinstance(index, Integral) and 0 <= index < size
         require(name, index, inside, f"an integer from 0 to {size - 1}, within the image")
     with whole_file(path, overwrite=overwrite) as file:
-        table.write_pixel(capture, row, col, settings or TrackingParameters(), file)
+        table.write_pixel(capture, row, col, method, settings, file)
 
 
 def _path_and_suffix(path: str | os.PathLike[str], accepted: Sequence[str]) -> tuple[Path, str]:

@@ -3,7 +3,9 @@
 Coordinates are whole multiples of a step: the power of ten that is a thousandth of a bin or less,
 down to a hundredth of that; only a cloud too wide for 32 bits gets coarser ones. ``intensity`` is
 the counts, at most 65535, and colours fill 16 bits as the standard requires. Extra bytes hold the
-other columns, with units in their descriptions.
+other columns, with units in their descriptions. A record (VLR) of the user "firstphoton" holds the
+acquisition, method, settings (JSON), version and source as lines ``name: value`` of UTF-8, cut off
+at the 65,535 bytes that fit.
 """
 
 from __future__ import annotations
@@ -15,6 +17,9 @@ import numpy as np
 
 from core.acquisition import Floats
 from core.io.writers.product import COLORS, Product
+from core.labels import software
+
+_MOST_IN_RECORD = 2**16 - 1  # bytes
 
 DESCRIPTIONS = {
     "range_m": "range of the surface, m",
@@ -43,7 +48,9 @@ def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
     columns = product.point_columns(points)
     colors = {name: columns.pop(name) for name in COLORS if name in columns}
     header = laspy.LasHeader(version="1.4", point_format=7 if colors else 6)
-    header.generating_software = "firstphoton"
+    header.generating_software = software()
+    text = "\n".join(product.lines).encode()[:_MOST_IN_RECORD].decode(errors="ignore").encode()
+    header.vlrs.append(laspy.VLR("firstphoton", 1, "How the ranges were estimated", text))
     header.global_encoding.wkt = True  # as the standard requires of this point format
     header.offsets, header.scales = _grid(points.xyz_m, product.capture.acquisition.bin_length_m)
     header.add_extra_dims(

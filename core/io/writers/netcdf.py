@@ -1,7 +1,8 @@
 """netCDF-4 (which is HDF5) and Zarr, with the metadata of the CF conventions.
 
 Variables ``range_m``, ``confidence``, ``counts``, ``bin``, ``score``, ``valid`` (1 or 0) over the
-dimensions ``row`` and ``col``; acquisition and source are attributes of the file.
+dimensions ``row`` and ``col``; acquisition, method, settings (JSON), version and source are
+attributes of the file.
 """
 
 from __future__ import annotations
@@ -9,17 +10,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-import numpy as np
-
 from core.io.writers.product import Product
+from core.labels import images_dataset
 
 if TYPE_CHECKING:
     import xarray as xr
-
-_FLAGS: dict[str, Any] = {
-    "flag_values": np.array([0, 1], np.int8),
-    "flag_meanings": "no_estimate estimate",
-}
 
 
 def write(product: Product, file: BinaryIO) -> None:
@@ -48,16 +43,5 @@ def write_folder(data: xr.Dataset, folder: Path) -> None:
 
 
 def _dataset(product: Product) -> xr.Dataset:
-    import xarray as xr  # noqa: PLC0415 - slow to import
-
-    variables = {}
-    for name, (values, unit, meaning) in product.planes.items():
-        is_flag = values.dtype == bool  # which netCDF does not have
-        attributes = {"units": unit, "long_name": meaning} | (_FLAGS if is_flag else {})
-        variables[name] = (
-            ("row", "col"),
-            values.astype(np.int8) if is_flag else values,
-            attributes,
-        )
     about = {"Conventions": "CF-1.11", "title": product.heading}
-    return xr.Dataset(variables, attrs={**about, **product.facts})
+    return images_dataset(product.planes, {**about, **product.facts})

@@ -1,8 +1,10 @@
 """NumPy ``.npz``: the arrays of a range image as they are, without pickles.
 
-In addition to `RangeImage`'s fields and ``counts`` it holds scalars ``bin_width_s``,
+In addition to `RangeImage`'s fields and ``counts``, and ``range_low_m`` and ``range_high_m`` if
+intervals are given, it holds scalars ``bin_width_s``,
 ``gate_delay_s``, ``n_pulses`` (0 where not known), ``pixel_angle_rad`` (absent where not known),
-and the texts ``format``, ``detection`` (`core.capture.Detection`) and ``source``.
+and the texts ``format``, ``detection`` (`core.capture.Detection`), ``method``, ``settings`` (JSON),
+``software`` and ``source``; where they apply, ``false_alarm``, ``least_confidence``, ``remark``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """PCD 0.7 point clouds, binary, as the Point Cloud Library reads them.
 
 Coordinates are 32-bit floats, exact to 6e-8 of themselves; ``range_m`` is a double.
+Comments of the header hold the acquisition, method, settings (JSON), version and source, one line
+``name: value`` each, those of more than 500 characters in several.
 """
 
 from __future__ import annotations
@@ -21,4 +23,6 @@ def write(product: Product, file: BinaryIO) -> None:
     columns = xyz_m | product.point_columns(points)
     types = [values.dtype for values in columns.values()]
     cloud = PointCloud.from_points(list(columns.values()), list(columns), types)
+    for line in product.ascii_lines:
+        file.write(f"# {line}\n".encode())
     cloud.save(file, encoding=Encoding.BINARY)

@@ -1,71 +1,128 @@
-"""Pictures of a range image: PNG and SVG, the same bytes each time for the same image.
+"""Pictures of an image: PNG and SVG, the same bytes each time for the same image.
 
-The colours span the confident estimates; ranges beyond them are grey, pixels without one white.
+Values beyond the colours are grey, pixels without one white. The description within the file holds
+the acquisition, method, settings (JSON), version and source, one line ``name: value`` each.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from threading import Lock
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from core.io.writers.product import Product
+from core.io.writers.colors import ColorScale, range_scale
+from core.io.writers.product import Product, plain
+from core.labels import software
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_OUTSIDE, _INVALID = "#9aa2ab", "#ffffff"
+_INVALID = "#ffffff"
+_DOTS_PER_INCH = 200
+_WIDTH_INCHES = 6.4  # 1280 pixels
+
+DRAWING = Lock()
+"""Matplotlib's settings are those of the process: one thread draws at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image with its colours and texts.
+
+    Parameters
+    ----------
+    values : ndarray, shape (row, col)
+        NaN where there is none.
+    scale : ColorScale
+    title : str
+        By default that of the scale.
+    lines : sequence of str
+        Description within the file.
+    least_confidence : float, optional
+        Confidence below which values are left out.
+    first : tuple of int
+        Row and column of the first pixel, in those of the file.
+    step : int
+        Rows and columns of the file from one pixel to the next.
+    """
+
+    values: NDArray[Any]
+    scale: ColorScale
+    title: str = ""
+    lines: Sequence[str] = ()
+    least_confidence: float | None = None
+    first: tuple[int, int] = (0, 0)
+    step: int = 1
+
+    @classmethod
+    def of(cls, product: Product) -> Picture:
+        """Return the picture of a range image."""
+        image = product.image
+        scale = range_scale(product.capture, image, product.colors)
+        least = None if image.made_by is None else image.made_by.least_confidence
+        return cls(image.range_m, scale, plain(product.title), product.lines, least)
+
+    @property
+    def legend(self) -> str:
+        """Meaning of white and grey, with the number of pixels of each."""
+        least, n_white = self.least_confidence, int(np.isnan(self.values).sum())
+        what = f"no value, or confidence below {least:g}" if least else "no value"
+        legend = f"white: {what} ({n_white:,} of {self.values.size:,} pixels)"
+        if self.scale.outside is None:
+            return legend
+        return f"{legend} · grey: beyond the colours ({self.scale.n_outside(self.values):,})"
+
+    def write(self, file: BinaryIO, suffix: str) -> None:
+        """Write the picture as ``"png"`` or ``"svg"``; the text of an SVG stays text."""
+        import matplotlib  # noqa: PLC0415 - slow to import
+
+        known: dict[str, Any] = {"Description": "\n".join(self.lines)}
+        known |= {"Date": None, "Creator": software()} if suffix == "svg" else {}
+        known |= {"Software": software()} if suffix == "png" else {}
+        # The salt makes the identifiers within an SVG the same each time.
+        with (
+            DRAWING,
+            matplotlib.rc_context({"svg.hashsalt": "firstphoton", "svg.fonttype": "none"}),
+        ):
+            self._drawn().savefig(file, format=suffix, dpi=_DOTS_PER_INCH, metadata=known)
+
+    def _drawn(self) -> Figure:
+        from matplotlib.colors import ListedColormap  # noqa: PLC0415
+        from matplotlib.figure import Figure  # noqa: PLC0415
+
+        (rows, cols), scale = self.values.shape, self.scale
+        colors = ListedColormap(scale.colors).with_extremes(
+            bad=_INVALID, under=scale.outside, over=scale.outside
+        )
+        height = float(np.clip(5.2 * rows / cols, 1.6, 10.0))
+        figure = Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
+        axes = figure.add_subplot()
+        above, left = (at - self.step / 2 for at in self.first)
+        shown = axes.imshow(
+            self.values,
+            vmin=scale.low,
+            vmax=scale.high,
+            cmap=colors,
+            interpolation="none",
+            extent=(left, left + cols * self.step, above + rows * self.step, above),
+        )
+        axes.set_title(self.title or scale.title, parse_math=False, wrap=True)
+        axes.set(xlabel="Column (px)", ylabel="Row (px)")
+        ends = "neither" if scale.outside is None else "both"
+        figure.colorbar(shown, ax=axes, label=scale.legend, extend=ends)
+        figure.supxlabel(self.legend, fontsize="small")
+        return figure
 
 
 def write_png(product: Product, file: BinaryIO) -> None:
     """Write PNG."""
-    _write(product, file, format="png", dpi=150, metadata={"Software": None})
+    Picture.of(product).write(file, "png")
 
 
 def write_svg(product: Product, file: BinaryIO) -> None:
-    """Write SVG; its text stays text."""
-    _write(product, file, format="svg", metadata={"Date": None, "Creator": "firstphoton"})
-
-
-def _write(product: Product, file: BinaryIO, **options: Any) -> None:
-    import matplotlib  # noqa: PLC0415 - slow to import
-
-    # The salt makes the identifiers within an SVG the same each time.
-    with matplotlib.rc_context({"svg.hashsalt": "firstphoton", "svg.fonttype": "none"}):
-        _drawn(product).savefig(file, **options)
-
-
-def _drawn(product: Product) -> Figure:
-    import matplotlib  # noqa: PLC0415
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    rows, cols = product.image.range_m.shape
-    low_m, high_m = _limits_m(product)
-    colors = matplotlib.colormaps["viridis"].with_extremes(
-        bad=_INVALID, under=_OUTSIDE, over=_OUTSIDE
-    )
-    figure = Figure(
-        figsize=(6.4, float(np.clip(5.2 * rows / cols, 1.6, 10.0))), layout="constrained"
-    )
-    axes = figure.add_subplot()
-    shown = axes.imshow(
-        product.image.range_m, vmin=low_m, vmax=high_m, cmap=colors, interpolation="none"
-    )
-    axes.set_title(product.heading, parse_math=False, wrap=True)
-    axes.set(xlabel="Column (px)", ylabel="Row (px)")
-    figure.colorbar(shown, ax=axes, label="Range (m)", extend="both")
-    figure.supxlabel("white: no estimate · grey: beyond the colours", fontsize="small")
-    return figure
-
-
-def _limits_m(product: Product) -> tuple[float, float]:
-    """Return the ends of the colours: of confident estimates, else of all, else of the gate."""
-    image, acquisition = product.image, product.capture.acquisition
-    sure = image.range_m[image.valid & (image.confidence >= 0.9)]
-    sure = sure if sure.size else image.range_m[image.valid]
-    if not sure.size:
-        low_m, high_m = acquisition.bin_to_range_m([0, acquisition.n_bins])
-        return float(low_m), float(high_m)
-    low_m, high_m = np.percentile(sure, [1, 99])
-    margin_m = acquisition.bin_length_m + 0.05 * (high_m - low_m)
-    return float(low_m - margin_m), float(high_m + margin_m)
+    """Write SVG."""
+    Picture.of(product).write(file, "svg")

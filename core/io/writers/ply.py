@@ -1,7 +1,8 @@
 """PLY point clouds, binary and little-endian.
 
 Coordinates are 32-bit floats, which every reader supports: exact to a relative 6e-8. ``range_m``
-is a double.
+is a double. Comments of the header hold the acquisition, method, settings (JSON), version and
+source, one line ``name: value`` each, those of more than 500 characters in several.
 """
 
 from __future__ import annotations
@@ -18,4 +19,6 @@ def write(product: Product, file: BinaryIO) -> None:
     points = product.points()
     cloud = PointCloud(points.xyz_m, process=False)
     cloud.vertex_attributes = product.point_columns(points)
-    cloud.export(file, file_type="ply")
+    magic, kind, rest = cloud.export(file_type="ply").split(b"\n", 2)
+    comments = [f"comment {line}".encode() for line in product.ascii_lines]
+    file.write(b"\n".join([magic, kind, *comments, rest]))

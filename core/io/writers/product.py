@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from textwrap import wrap
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +13,15 @@ from numpy.typing import NDArray
 from core.capture import CaptureInfo
 from core.checks import require
 from core.estimators import RangeImage
-from core.geometry import Points, points_m
+from core.geometry import Points, guessed_field_of_view_deg, pixel_angle_of, points_m
+from core.inference import RangeInterval
+from core.io.writers.colors import RangeColors
+from core.labels import Plane, software
+
+_MOST_IN_LINE = 500  # characters
 
 COLORS = ("red", "green", "blue")
 """Columns of a cloud that has colours."""
-
-
-class Plane(NamedTuple):
-    """One image of a product, shape (row, col), its unit (by UDUNITS) and its meaning."""
-
-    values: NDArray[Any]
-    unit: str
-    meaning: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +42,18 @@ class Product:
         Colours of the points of a cloud.
     shown : mapping of str to Plane
         Further or replacing images of the capture; they come first among `planes`.
+    remark : str
+        Added to the fact of that name.
+    interval : RangeInterval, optional
+        95 % interval of each range.
+    colors : RangeColors, optional
+        Colours of a picture.
 
     Raises
     ------
     ValueError
-        If image and capture, image and colours, or image and what is shown differ in shape, or the
-        angle is not between 0 and π/2.
+        If image and capture, or image and one of colours, interval and what is shown, differ in
+        shape, or the angle is not between 0 and π/2.
     """
 
     capture: CaptureInfo
@@ -58,6 +62,9 @@ class Product:
     title: str = ""
     rgb: NDArray[np.uint8] | None = None
     shown: Mapping[str, Plane] = field(default_factory=dict)
+    remark: str = ""
+    interval: RangeInterval | None = None
+    colors: RangeColors | None = None
 
     def __post_init__(self) -> None:
         shape, angle_rad = self.image.range_m.shape, self.pixel_angle_rad
@@ -70,46 +77,70 @@ class Product:
         for name, plane in self.shown.items():
             of = plane.values.shape
             require(f"shown {name!r}", f"shape {of}", of == shape, f"shape {shape}, the image's")
+        for name, limit_m in self.interval_columns.items():
+            of = limit_m.shape
+            require(name, f"shape {of}", of == shape, f"shape {shape}, the image's")
         possible = angle_rad is None or 0 < angle_rad < np.pi / 2
         require("pixel_angle_rad", angle_rad, possible, "an angle between 0 and π/2 radians")
 
     @property
     def heading(self) -> str:
         """Title, or a general one."""
-        return _plain(self.title) or "Range image"
+        return plain(self.title) or "Range image"
+
+    @property
+    def interval_columns(self) -> dict[str, NDArray[np.float64]]:
+        """Limits of the 95 % interval by name; empty if it is not given."""
+        if self.interval is None:
+            return {}
+        return {"range_low_m": self.interval.low_m, "range_high_m": self.interval.high_m}
 
     @property
     def planes(self) -> dict[str, Plane]:
         """Images by name."""
-        image, shown = self.image, dict(self.shown)
-        known = {
-            "range_m": Plane(image.range_m, "m", "range of the surface, NaN without an estimate"),
-            "confidence": Plane(
-                image.confidence,
-                "1",
-                "probability that the estimate is right within 3 bins",
-            ),
-            "counts": Plane(self.capture.counts, "1", "detections of the pixel"),
-            "bin": Plane(image.bin, "1", "delay of the echo in bins, from the opening of the gate"),
-            "score": Plane(image.score, "1", "score of the estimate, of the estimator's own scale"),
-            "valid": Plane(image.valid, "1", "whether there is an estimate"),
-        }
+        shown, own = dict(self.shown), self.image.planes
+        counts = Plane(self.capture.counts, "1", "detections of the pixel")
+        known = {name: own.pop(name) for name in ("range_m", "confidence")}
+        known |= {"counts": counts, **own}
+        meaning = "limit of the 95 % interval of the range, given that the estimate is right"
+        limits = self.interval_columns.items()
+        known |= {name: Plane(limit_m, "m", meaning) for name, limit_m in limits}
         return shown | {name: plane for name, plane in known.items() if name not in shown}
 
     @property
     def facts(self) -> dict[str, str | int | float]:
-        """Acquisition and source; `n_pulses` is 0 and no `pixel_angle_rad` where not known."""
+        """Acquisition, method, version and source.
+
+        `n_pulses` is 0, and what is not known, such as `pixel_angle_rad`, is left out.
+        """
         acquisition = self.capture.acquisition
         facts: dict[str, str | int | float] = {
             "bin_width_s": float(acquisition.bin_width_s),
             "gate_delay_s": float(acquisition.gate_delay_s),
             "n_pulses": int(acquisition.n_pulses or 0),
             "detection": self.capture.detection,
-            "source": _plain(self.capture.source),
         }
         if self.pixel_angle_rad is not None:
             facts["pixel_angle_rad"] = float(self.pixel_angle_rad)
-        return facts
+        if self.image.made_by is not None:
+            facts |= self.image.made_by.facts
+        if self.remark:
+            facts["remark"] = "; ".join(filter(None, (str(facts.get("remark", "")), self.remark)))
+        facts |= {"software": software(), "source": self.capture.source}
+        return {
+            name: plain(fact) if isinstance(fact, str) else fact for name, fact in facts.items()
+        }
+
+    @property
+    def lines(self) -> list[str]:
+        """Facts as lines ``name: value``, for formats that hold text only."""
+        return [f"{name}: {fact}" for name, fact in self.facts.items()]
+
+    @property
+    def ascii_lines(self) -> list[str]:
+        """`lines` for headers that some programs read into short buffers of ASCII."""
+        escaped = [line.encode("ascii", "backslashreplace").decode() for line in self.lines]
+        return [part for line in escaped for part in wrap(line, _MOST_IN_LINE)]
 
     def points(self) -> Points:
         """Return the estimates in space.
@@ -143,6 +174,28 @@ class Product:
         }
 
 
-def _plain(text: str) -> str:
+def guessed_angle(field_of_view_deg: float) -> str:
+    """Return the remark on a cloud whose angle between pixels comes from a field of view."""
+    return (
+        f"the width of the cloud rests on a guess: a field of view of {field_of_view_deg:g} "
+        "degrees, which the capture does not state"
+    )
+
+
+def guessed_view(capture: CaptureInfo, image: RangeImage) -> dict[str, Any]:
+    """Return the arguments by which `core.save_image` can write a cloud of a capture.
+
+    Where the capture does not state the angle between pixels, the scene is guessed to be as wide
+    as it is deep, as in the app, and the file says so; empty otherwise.
+    """
+    acquisition = capture.acquisition
+    if acquisition.pixel_angle_rad is not None:
+        return {}
+    width_deg = guessed_field_of_view_deg(image.range_m, image.confidence, acquisition)
+    angle_rad = pixel_angle_of(width_deg, image.range_m.shape[1])
+    return {"pixel_angle_rad": angle_rad, "remark": guessed_angle(width_deg)}
+
+
+def plain(text: str) -> str:
     """Return text on one line, of characters that every format can hold."""
     return "".join(character if character.isprintable() else " " for character in text)

@@ -1,9 +1,10 @@
 """TIFF: pages of 32-bit floats: images that the product adds, range, confidence, counts.
 
 Ranges are exact to 6e-8 of themselves, counts up to 2**24. Each page has its name (the tag
-PageName), its meaning and unit (ImageDescription, and for GIS the tags of GDAL), and the
-acquisition. Image programs open the pages as a stack; a GIS opens the first, and the others as
-subdatasets. Invalid ranges are NaN; a page with NaN declares it "no data".
+PageName), its meaning and unit (ImageDescription, and for GIS the tags of GDAL), and as tags of
+GDAL the acquisition, method, settings (JSON), version and source. Image programs open the pages as
+a stack; a GIS opens the first, and the others as subdatasets. Invalid ranges are NaN; a page with
+NaN declares it "no data".
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from core.io.writers.product import Plane, Product
+from core.io.writers.product import Product
+from core.labels import Plane, software
 
 PAGES = ("range_m", "confidence", "counts")
 
@@ -36,7 +38,7 @@ def write(product: Product, file: BinaryIO) -> None:
                 photometric="minisblack",
                 description=f"{name} [{plane.unit}]: {plane.meaning}",
                 metadata=None,
-                software="firstphoton",
+                software=software(),
                 extratags=[(tag, "s", 0, text, True) for tag, text in tags.items()],
             )
 

@@ -211,8 +211,7 @@ def _twin(capture: Capture, sample: _Sample) -> tuple[NDArray[np.unsignedinteger
     twin = replace(
         capture,
         cube=counts[np.newaxis],
-        truth_range_m=None,
-        signal=None,
+        **capture.images(lambda _: None),
         flux_prior=flux_prior_of(capture),
     )
     return counts, corrections.delays(twin, "likelihood")[0]

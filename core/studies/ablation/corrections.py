@@ -80,8 +80,7 @@ def _first_rows(capture: Capture) -> Capture:
     part = replace(
         capture,
         cube=capture.cube[:rows].copy(),
-        truth_range_m=None,
-        signal=None,
+        **capture.images(lambda _: None),
         flux_prior=flux_prior_of(capture),
     )
     flux_model_of(part)

@@ -1,24 +1,36 @@
-"""Calibration of the confidence: is 0.9 right nine times in ten?"""
+"""Calibration of confidences and intervals: is 0.9 right nine times in ten?"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.acquisition import Floats
-from core.capture import Capture
+from core.acquisition import Acquisition, Floats, Flux, Pulse
+from core.capture import Capture, Detection
 from core.estimators import RangeImage, estimate
+from core.inference.intervals import range_interval
 from core.inference.posterior import TOLERANCE_BINS
-from core.metrics import ReliabilityBin, calibration_error, reliability
+from core.inspection import estimate_mean_flux, estimate_target_flux
+from core.inspection.pulse_fit import changed
+from core.metrics import Interval, ReliabilityBin, calibration_error, reliability, wilson
+from core.reductions import merge_bins
 from core.studies.outputs import Table, table
 from core.studies.paper.printed import TABLE_2
 from core.studies.trials import Condition
+from core.trigger import draw_counts, rate_per_bin
 
 METHODS = ("likelihood", "tracking", "coates", "peak")
 SCENES = ("uniform", "car")
+
+LEVELS = (0.68, 0.95)
+"""Levels of the intervals whose coverage is measured."""
+
+_PULSES, _SIDE = 1000, 48
 
 
 def confidence_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, NDArray[np.bool_]]:
@@ -89,4 +101,198 @@ def calibration_table(seeds: Sequence[int]) -> Table:
                 f"{t.confidence:.2f}: {t.right.value:.2f} ({t.count})" for t in report.tenths
             ),
         },
+    )
+
+
+@dataclass(frozen=True)
+class Regime:
+    """Pixels with random depths that see echoes of a Gaussian pulse."""
+
+    detection: Detection
+    sigma_bins: float
+    sbr: float
+
+    def capture(self, seed: int) -> Capture:
+        """Draw a capture; of all photons, those of as many pulses are counted."""
+        acquisition, flux, rng = Acquisition(), Flux(sbr=self.sbr), np.random.default_rng(seed)
+        pulse = Pulse.gaussian(self.sigma_bins * acquisition.bin_width_s)
+        onset = rng.uniform(0, acquisition.n_bins, (_SIDE, _SIDE))
+        signal = np.full(onset.shape, flux.signal)
+        rate = rate_per_bin(onset, signal, flux.background, pulse, acquisition)
+        is_first = self.detection == "first"
+        cube = draw_counts(rate if is_first else rate * _PULSES, _PULSES if is_first else None, rng)
+        truth_m = acquisition.bin_to_range_m(onset)
+        return Capture(cube, acquisition, pulse, truth_m, detection=self.detection)
+
+
+REGIMES = tuple(
+    Regime(*each)
+    for each in product(get_args(Detection), (0.5, 1.0, 2.0, 5.0), (0.03, 0.06, 0.3, 3.0))
+)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of the right estimates of a method whose interval contains the truth."""
+
+    regime: Regime
+    method: str
+    right: int
+    """Estimates within `TOLERANCE_BINS` of the truth."""
+    shares: tuple[Interval, ...]
+    """One for each of `LEVELS`."""
+
+
+def coverage(regime: Regime, method: str, seeds: Sequence[int]) -> Coverage:
+    """Measure the coverage of range intervals."""
+    right, hits = 0, np.zeros(len(LEVELS), int)
+    for capture in map(regime.capture, seeds):
+        image, truth_m = estimate(capture, method), np.asarray(capture.truth_range_m)
+        is_right = np.zeros(image.valid.shape, bool)
+        is_right[image.valid] = confidence_and_right(capture, image)[1]
+        right += int(np.count_nonzero(is_right))
+        for i, level in enumerate(LEVELS):
+            low_m, high_m = range_interval(capture, image, level)
+            hits[i] += np.count_nonzero(is_right & (low_m <= truth_m) & (truth_m <= high_m))
+    return Coverage(regime, method, right, tuple(wilson(int(hit), right) for hit in hits))
+
+
+def coverage_table(seeds: Sequence[int]) -> Table:
+    """Return the coverage of range intervals in each of `REGIMES`, for two methods."""
+    return table(
+        "coverage",
+        "Coverage of range intervals",
+        (coverage(*each, seeds) for each in product(REGIMES, ("likelihood", "tracking"))),
+        {
+            "detection": lambda found: found.regime.detection,
+            "pulse σ, bins": lambda found: f"{found.regime.sigma_bins:g}",
+            "SBR": lambda found: f"{found.regime.sbr:g}",
+            "method": lambda found: found.method,
+            "right": lambda found: found.right,
+            "68 %": lambda found: found.shares[0],
+            "95 %": lambda found: found.shares[1],
+        },
+        note="Share of the estimates within 3 bins of the truth whose interval contains the truth.",
+        formats={"68 %": ".3f", "95 %": ".3f"},
+    )
+
+
+@dataclass(frozen=True)
+class FluxRegime:
+    """Images of which a third is sky, recorded with another pulse than is assumed."""
+
+    detection: Detection
+    depths: str
+    """``"middle"`` of the gate, or ``"whole"`` gate, which leaves no bins without echoes."""
+    pulse: str
+    """Key of `TRUE_PULSES`."""
+
+    def captures(self, seed: int) -> tuple[list[Capture], list[tuple[float, float, float]]]:
+        """Draw the same photons in bins of each of `BIN_WIDTHS_S`, with true fluxes.
+
+        Those of the mean pixel and of the mean target pixel: signal, background and SBR.
+        """
+        rng, width_s = np.random.default_rng(seed), BIN_WIDTHS_S[0]
+        is_first = self.detection == "first"
+        n_pulses, signal, background = _FLUXES[self.detection]
+        acquisition = Acquisition(round(_GATE_S / width_s), width_s, n_pulses=n_pulses)
+        shape = (_FLUX_SIDE, _FLUX_SIDE)
+        low, high = _DEPTHS[self.depths]
+        onset = acquisition.n_bins * rng.uniform(low, high, shape)
+        onset[: _FLUX_SIDE // 3] = np.nan
+        target = np.isfinite(onset)
+        signals = np.where(target, signal * rng.gamma(4, 1 / 4, shape), 0.0)
+        pulse = changed(_ASSUMED_PULSE, *TRUE_PULSES[self.pulse], _RESOLUTION_S)
+        rate = rate_per_bin(onset, signals, background, pulse, acquisition)
+        cube = draw_counts(rate, n_pulses if is_first else None, rng)
+        finest = Capture(cube, acquisition, _ASSUMED_PULSE, detection=self.detection)
+        merged = [merge_bins(finest, round(each / width_s)) for each in BIN_WIDTHS_S]
+        means = float(signals.mean()), float(signals[target].mean())
+        return merged, [(each, background, each / background) for each in means]
+
+
+TRUE_PULSES = {
+    "as assumed": (1.0, 0.0, 0.0),
+    "half as long": (0.5, 0.0, 0.0),
+    "twice as long": (2.0, 0.0, 0.0),
+    "exponential tail": (1.0, 0.4, 1.5),
+}
+"""Stretch, share of a tail and its length, as for `core.inspection.pulse_fit.changed`."""
+
+BIN_WIDTHS_S = (0.25e-9, 0.5e-9, 1e-9)
+
+FLUX_REGIMES = tuple(
+    FluxRegime(*each, pulse)
+    for each in (("all", "middle"), ("all", "whole"), ("first", "whole"))
+    for pulse in TRUE_PULSES
+)
+_FLUXES = {"all": (None, 3.5, 0.25), "first": (200, 0.3, 1.0)}
+_DEPTHS = {"middle": (0.4, 0.6), "whole": (0.06, 0.8)}
+_ASSUMED_PULSE, _RESOLUTION_S = Pulse.gaussian(1e-9), 0.05e-9
+_GATE_S, _FLUX_SIDE, _TRIALS_PER_SEED = 150e-9, 32, 8
+
+
+@dataclass(frozen=True)
+class FluxCoverage:
+    """Share of the captures whose flux intervals contain the truth."""
+
+    regime: FluxRegime
+    bin_width_s: float
+    shares: dict[str, Interval]
+    """By the name of the flux."""
+    overlapping: Interval
+    """Share whose SBR intervals overlap those of the finest bins."""
+
+
+def flux_coverage(regime: FluxRegime, trials: Sequence[int]) -> Iterator[FluxCoverage]:
+    """Measure the coverage of flux intervals in bins of each width."""
+    hits: dict[float, list[list[bool]]] = {width_s: [] for width_s in BIN_WIDTHS_S}
+    for trial in trials:
+        captures, truth = regime.captures(trial)
+        found = [(estimate_mean_flux(each), estimate_target_flux(each)) for each in captures]
+        for width_s, fluxes in zip(BIN_WIDTHS_S, found, strict=True):
+            covered = [
+                interval.low <= true <= interval.high
+                for flux, true_flux in zip(fluxes, truth, strict=True)
+                for interval, true in zip(flux, true_flux, strict=True)
+            ]
+            overlaps = fluxes[0].sbr.overlaps(found[0][0].sbr)
+            hits[width_s].append([*covered, overlaps])
+    for width_s, each in hits.items():
+        signal, background, sbr, ppp, _, target_sbr, overlapping = (
+            wilson(int(n), len(each)) for n in np.sum(each, axis=0)
+        )
+        shares = {
+            "PPP, all pixels": signal,
+            "SBR, all pixels": sbr,
+            "PPP, target pixels": ppp,
+            "SBR, target pixels": target_sbr,
+            "background": background,
+        }
+        yield FluxCoverage(regime, width_s, shares, overlapping)
+
+
+def flux_table(seeds: Sequence[int]) -> Table:
+    """Return the coverage of flux intervals in each of `FLUX_REGIMES`, for 8 captures a seed."""
+    trials = range(_TRIALS_PER_SEED * seeds[0], _TRIALS_PER_SEED * (seeds[-1] + 1))
+    names = ("PPP, all pixels", "SBR, all pixels", "PPP, target pixels", "SBR, target pixels")
+
+    def share(name: str) -> Callable[[FluxCoverage], Interval]:
+        return lambda found: found.shares[name]
+
+    columns = (*names, "background", "SBR overlaps that of the finest bins")
+    return table(
+        "flux_coverage",
+        "Coverage of 95 % flux intervals, with a wrong pulse and in bins of several widths",
+        (found for regime in FLUX_REGIMES for found in flux_coverage(regime, trials)),
+        {
+            "photons": lambda found: found.regime.detection,
+            "depths": lambda found: f"{found.regime.depths} gate",
+            "true pulse": lambda found: found.regime.pulse,
+            "bins, ns": lambda found: f"{found.bin_width_s * 1e9:g}",
+            **{name: share(name) for name in columns[:-1]},
+            columns[-1]: lambda found: found.overlapping,
+        },
+        note="Share of the captures whose interval contains the truth.",
+        formats=dict.fromkeys(columns, ".2f"),
     )

@@ -24,9 +24,10 @@ from core.acquisition import Acquisition, Flux
 from core.estimators import settings_of
 from core.io.readers import open_capture
 from core.io.readers.dense import AXES
-from core.io.readers.labelled import dataset, describe
+from core.io.readers.labelled import describe
 from core.io.readers.options import ReadOptions
 from core.io.writers.whole import whole_folder
+from core.labels import dataset
 from core.out_of_core.tiles import IMAGES, estimate_large, learned, range_part
 from core.scene import Scene, scenes
 from core.simulation import simulate

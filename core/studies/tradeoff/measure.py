@@ -419,12 +419,10 @@ def _middle(capture: Capture) -> Capture:
         slice((size - side) // 2, (size - side) // 2 + side)
         for size, side in zip(capture.shape, sides, strict=True)
     )
-    truth_m, signal = capture.truth_range_m, capture.signal
     return replace(
         capture,
         cube=np.ascontiguousarray(capture.cube[rows, cols]),
-        truth_range_m=None if truth_m is None else truth_m[rows, cols],
-        signal=None if signal is None else signal[rows, cols],
+        **capture.images(lambda image: image[rows, cols]),
         source=f"{capture.source}; the middle {sides[0]} x {sides[1]} pixels",
     )
 

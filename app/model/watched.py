@@ -1,0 +1,111 @@
+"""A folder whose captures are opened as they are written."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from stat import S_ISREG
+
+from app.model.store import NO_OPTIONS, Source, content_key, file_source
+from app.model.uploads import cached_while_used
+from core.checks import require
+from core.io import SUFFIXES, ReadOptions
+
+log = logging.getLogger(__name__)
+
+LOOK_MS = 1000
+"""Time between two looks at a folder."""
+
+MOST_CAPTURES = 50
+"""Captures of a folder that are offered, the newest ones."""
+
+_State = tuple[int, int]  # size in bytes, and time of the last change in ns
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Captures that have just been written, and older ones that are no longer offered."""
+
+    found: Mapping[str, Source]
+    """By key, the newest last."""
+    outdated: tuple[str, ...]
+    """Keys."""
+
+    @property
+    def newest(self) -> str:
+        """Key of the newest capture."""
+        return list(self.found)[-1]
+
+    def update(self, sources: dict[str, Source], kept: str = "") -> None:
+        """Offer the captures; an outdated one of the key `kept` stays."""
+        sources.update(self.found)
+        for key in self.outdated:
+            if key != kept:
+                sources.pop(key, None)
+
+
+class WatchedFolder:
+    """Find the captures of a folder.
+
+    A file counts as written when two looks in a row find the same size and time. Of those that are
+    there at the first look, only the newest is opened.
+
+    Parameters
+    ----------
+    folder : Path
+    given : ReadOptions, optional
+        Options for reading.
+
+    Raises
+    ------
+    ValueError
+        If there is no such folder.
+    """
+
+    def __init__(self, folder: Path, given: ReadOptions = NO_OPTIONS) -> None:
+        require("watch", str(folder), folder.is_dir(), "an existing folder")
+        self._folder, self._given = folder, given
+        self._seen = self._states()
+        newest = max(self._seen, key=lambda path: self._seen[path][1], default=None)
+        self._handled = {path: at for path, at in self._seen.items() if path != newest}
+        self._keys: list[str] = []
+
+    def look(self) -> Arrival | None:
+        """Return what has been written since the last look; None if nothing was."""
+        states = self._states()
+        written = [
+            path
+            for path, state in states.items()
+            if self._seen.get(path) == state != self._handled.get(path)
+        ]
+        self._seen = states
+        found: dict[str, Source] = {}
+        for path in sorted(written, key=lambda path: states[path][1]):
+            self._handled[path] = states[path]
+            try:
+                key, source = content_key(path), file_source(path, given=self._given)
+                source = replace(source, load=cached_while_used(source.load))
+                source.read()
+            except (ValueError, OSError) as error:
+                log.warning("not opened: %s", error)
+            else:
+                found[key] = source
+        keys = [key for key in self._keys if key not in found] + list(found)
+        self._keys = keys[-MOST_CAPTURES:]
+        return Arrival(found, tuple(keys[:-MOST_CAPTURES])) if found else None
+
+    def _states(self) -> dict[Path, _State]:
+        """Return size and time of each file that may be a capture."""
+        states = {}
+        for path in self._folder.iterdir():
+            suffix = path.with_suffix("").suffix if path.suffix == ".gz" else path.suffix
+            if suffix.lower() in SUFFIXES and not path.name.startswith("."):
+                try:
+                    found = path.stat()
+                except OSError:
+                    continue  # it has just been removed
+                if S_ISREG(found.st_mode):
+                    states[path] = found.st_size, found.st_mtime_ns
+        return states

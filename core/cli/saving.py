@@ -1,0 +1,107 @@
+"""Several output files of a command: those that can be written are, whatever befalls the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from core.capture import Capture, CaptureInfo
+from core.checks import require, shown
+from core.cli.results import Incomplete
+from core.estimators import RangeImage
+from core.inference import range_interval
+from core.io.writers import CLOUD_SUFFIXES, RangeColors, save_image
+from core.io.writers.product import guessed_view
+from core.io.writers.whole import writing
+
+Refused = Mapping[Path, Exception]
+"""Files that cannot be written, and why."""
+
+
+def save_ranges(
+    capture: CaptureInfo,
+    image: RangeImage,
+    least_confidence: float | None,
+    overwrite: bool,
+    colors: RangeColors | None,
+    intervals: bool = False,
+) -> Callable[[Path], None]:
+    """Return a function that writes a range image without estimates of little confidence.
+
+    With `intervals`, for which the capture must be in memory, those of the ranges are written, too.
+    """
+    kept = image if least_confidence is None else image.confident(least_confidence)
+    view = guessed_view(capture, image)
+    interval = range_interval(capture, kept) if intervals and isinstance(capture, Capture) else None
+
+    def save(path: Path) -> None:
+        own = view if path.suffix.lower() in CLOUD_SUFFIXES else {}
+        known: dict[str, Any] = {"interval": interval, "colors": colors, **own}
+        save_image(capture, kept, path, overwrite=overwrite, **known)
+
+    return save
+
+
+def refused_outputs(paths: Sequence[Path], suffixes: Sequence[str], overwrite: bool) -> Refused:
+    """Return which files cannot be written, before anything is computed.
+
+    Raises
+    ------
+    Exception
+        Of the first file if none can be written.
+    """
+    found: dict[Path, Exception] = {}
+    for path in paths:
+        try:
+            _require_writable(path, suffixes, overwrite)
+        except (ValueError, OSError) as error:
+            found[path] = error
+    _require_some(paths, found)
+    return found
+
+
+def save_each(
+    paths: Sequence[Path], refused: Refused, save: Callable[[Path], None]
+) -> tuple[list[Path], Refused]:
+    """Write files that have not been refused; return those written, and all others."""
+    found, written = dict(refused), []
+    for path in dict.fromkeys(paths):
+        if path in found:
+            continue
+        try:
+            save(path)
+        except (ValueError, OSError) as error:
+            found[path] = error
+        else:
+            written.append(path)
+    return written, found
+
+
+def require_all(paths: Sequence[Path], refused: Refused) -> None:
+    """Raise `Incomplete` with a line for each file that is not written.
+
+    Raises
+    ------
+    Exception
+        Of the first file if none is written.
+    """
+    _require_some(paths, refused)
+    if refused:
+        reasons = (f"{shown(path)}: {error}" for path, error in refused.items())
+        raise Incomplete("\n".join(["Not written, unlike the other files:", *reasons]))
+
+
+def _require_some(paths: Sequence[Path], refused: Refused) -> None:
+    if paths and refused.keys() >= set(paths):
+        raise refused[paths[0]]
+
+
+def _require_writable(path: Path, suffixes: Sequence[str], overwrite: bool) -> None:
+    known = path.suffix.lower() in suffixes
+    require("suffix", path.suffix, known, "one of " + ", ".join(suffixes))
+    with writing(path):
+        if path.exists() and not overwrite:
+            raise FileExistsError(f"{path} exists: give another name, or --overwrite.")
+    if not path.absolute().parent.is_dir():
+        raise FileNotFoundError(f"{shown(path.parent)} is not a folder: create it first.")

@@ -1,0 +1,283 @@
+"""Intervals of the range of a surface, from the photons of its pixel.
+
+Given that a surface lies within `TOLERANCE_BINS` of an estimate, the probability of which is the
+confidence, its delay ``d`` has the posterior density ::
+
+    p(d) ∝ depth(d) Σ_l share_l L_l(d)
+
+over the signal levels ``l`` of `core.inference.flux`, with the likelihood ``L_l`` of the whole
+histogram (`core.inference.likelihood`). The levels are a grid, whose errors would bias intervals of
+many photons: signal and background of each are fitted to the pixel. The interval is about the
+surface and not about the method: it is the same for all estimates with the same window.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Floats, Pulse
+from core.capture import Capture
+from core.checks import require
+from core.inference.flux import LEVEL_SPAN, LEVELS, flux_model_of
+from core.inference.posterior import TOLERANCE_BINS
+from core.metrics import Interval
+
+if TYPE_CHECKING:
+    from core.estimators import RangeImage
+
+_COARSE_NODES = 8 * TOLERANCE_BINS + 1  # a quarter of a bin apart
+_NODES = 64  # delays at which the density is evaluated
+_DROP = 12.0  # log density below the maximum, at which a delay is negligible
+_MOST_ZOOMS = 12
+_LEVEL_ERROR = LEVEL_SPAN ** (0.5 / (LEVELS - 1)) - 1  # relative, of half a step between levels
+_FITTING_STEPS = 5
+_TAIL = 1e-6  # share of the photons of an echo that is left out on either side
+_AT_ONCE = 2**17  # numbers that fit in the cache
+
+
+class RangeInterval(NamedTuple):
+    """Limits of the range of each pixel in metres, shape (row, col), NaN without an estimate."""
+
+    low_m: Floats
+    high_m: Floats
+
+
+def range_interval(capture: Capture, image: RangeImage, level: float = 0.95) -> RangeInterval:
+    """Compute the central posterior interval of the range of each pixel.
+
+    It is calibrated: of the estimates within `TOLERANCE_BINS` of the surface, a share `level` have
+    an interval that contains the range of the surface. Whether a surface is there is what
+    `RangeImage.confidence` says.
+
+    Parameters
+    ----------
+    capture : Capture
+    image : RangeImage
+        Estimate of the capture by any method.
+    level : float
+        Probability of the interval.
+
+    Raises
+    ------
+    ValueError
+        If the level is not between 0 and 1, or the shapes differ.
+    """
+    shape = image.bin.shape
+    require("image", f"shape {shape}", shape == capture.shape, f"shape {capture.shape}")
+    limits = np.full((2, capture.counts.size), np.nan)
+    pixels = np.flatnonzero(image.valid)
+    n_bins = max(_NODES * _n_window_bins(capture), capture.acquisition.n_bins)
+    at_once = max(1, _AT_ONCE // n_bins)
+    for first in range(0, pixels.size, at_once):
+        some = pixels[first : first + at_once]
+        limits[:, some] = _quantiles_bins(capture, some, image.bin.ravel()[some], _tails(level))
+    low_m, high_m = capture.acquisition.bin_to_range_m(limits.reshape(2, *shape))
+    return RangeInterval(low_m, high_m)
+
+
+def pixel_range_intervals(
+    capture: Capture,
+    image: RangeImage,
+    row: int,
+    col: int,
+    levels: Sequence[float] = (0.68, 0.95),
+) -> tuple[Interval, ...]:
+    """Return the `range_interval` of one pixel for each level, without a pass over the image.
+
+    Returns
+    -------
+    tuple of Interval
+        The estimate and its limits in metres; NaN without an estimate.
+    """
+    estimate_m = float(image.range_m[row, col])
+    tails = np.ravel([_tails(level) for level in levels])
+    limits_m = np.full((tails.size, 1), np.nan)
+    if image.valid[row, col]:
+        pixel = np.array([row * capture.shape[1] + col])
+        limits = _quantiles_bins(capture, pixel, image.bin[row, col : col + 1], tails)
+        limits_m = capture.acquisition.bin_to_range_m(limits)
+    return tuple(Interval(estimate_m, *each) for each in limits_m.reshape(-1, 2).tolist())
+
+
+def _tails(level: float) -> Floats:
+    """Probabilities below the lower and the upper limit of a central interval."""
+    require("level", level, 0 < level < 1, "between 0 and 1")
+    return np.array([(1 - level) / 2, (1 + level) / 2])
+
+
+def _quantiles_bins(
+    capture: Capture, pixels: NDArray[np.intp], estimate_bin: Floats, shares: Floats
+) -> Floats:
+    """Quantiles of the delay of some pixels, given as flat indices, shape (share, pixel)."""
+    n_bins = capture.acquisition.n_bins
+    low = np.clip(estimate_bin - TOLERANCE_BINS, 0.0, n_bins)
+    high = np.clip(estimate_bin + TOLERANCE_BINS, 0.0, n_bins)
+    window = _window(capture, pixels, estimate_bin)
+    delay = _nodes(low, high, _COARSE_NODES)
+    best = np.argmax(_log_density(window, delay), axis=1)[:, np.newaxis]
+    window = _fitted(window, np.take_along_axis(delay, best, axis=1))
+    delay, density = _zoomed(window, low, high)
+    # Cumulative density by trapezoids, relative to the whole: the steps of a pixel are equal.
+    mass = np.zeros_like(density)
+    np.cumsum((density[:, 1:] + density[:, :-1]) / 2, axis=1, out=mass[:, 1:])
+    mass /= mass[:, -1:]
+    return np.stack([_inverse(mass, delay, share) for share in shares])
+
+
+def _inverse(mass: Floats, delay: Floats, share: float) -> Floats:
+    """Delay (pixel,) at which the increasing `mass` (pixel, node) is `share`."""
+    above = np.argmax(mass >= share, axis=1)[:, np.newaxis]
+    ends = np.concatenate([above - 1, above], axis=1)
+    (m0, m1), (d0, d1) = (np.take_along_axis(x, ends, axis=1).T for x in (mass, delay))
+    return np.asarray(d0 + (d1 - d0) * (share - m0) / (m1 - m0))
+
+
+class _Window(NamedTuple):
+    """Counts and fluxes of some pixels in the bins that an echo near their estimates can fill.
+
+    The rest of the gate is added up in one further bin, in which there is no echo.
+    """
+
+    pulse: Pulse
+    bin_width_s: float
+    edges: Floats
+    """Edges of the bins, shape (pixel, bin)."""
+    fired: Floats
+    """Counts, shape (pixel, bin); 0 outside the gate."""
+    unfired: Floats
+    """Pulses that did not fire by the end of the bin, likewise; for all photons 1 a bin."""
+    is_first: bool
+    """Whether only the first photon of a pulse is detected."""
+    signal: Floats
+    """Shape (level, pixel), without the level "no echo"."""
+    background: Floats
+    """Per bin, likewise."""
+    log_weight: Floats
+    """Logarithm of the prior probability of the level, likewise."""
+    depth: Floats
+    """`FluxModel.depth`."""
+
+
+def _n_window_bins(capture: Capture) -> int:
+    first, end = _echo_bins(capture)
+    return end - first + 2 * TOLERANCE_BINS + 1
+
+
+def _echo_bins(capture: Capture) -> tuple[int, int]:
+    """First and last edge of the bins that an echo fills, relative to its delay, in the gate."""
+    n_bins, width_s = capture.acquisition.n_bins, capture.acquisition.bin_width_s
+    first, end = (capture.pulse.quantile_s(share) / width_s for share in (_TAIL, 1 - _TAIL))
+    return math.floor(max(first, -n_bins)), math.ceil(min(end, n_bins))
+
+
+def _window(capture: Capture, pixels: NDArray[np.intp], estimate_bin: Floats) -> _Window:
+    flux, n_bins, n_pulses = flux_model_of(capture), capture.cube.shape[2], capture.gated_pulses
+    counts = capture.cube.reshape(-1, n_bins)[pixels].astype(float)
+    unfired = np.ones_like(counts) if n_pulses is None else n_pulses - np.cumsum(counts, axis=1)
+    signal, background = (x.reshape(len(x), -1)[1:, pixels] for x in (flux.signal, flux.background))
+    first = np.floor(estimate_bin).astype(np.intp) - TOLERANCE_BINS + _echo_bins(capture)[0]
+    bins = first[:, np.newaxis] + np.arange(_n_window_bins(capture))
+    inside = (bins >= 0) & (bins < n_bins)
+    some = np.arange(pixels.size)[:, np.newaxis], np.clip(bins, 0, n_bins - 1)
+
+    def in_window(values: Floats) -> Floats:
+        found = np.where(inside, values[some], 0.0)
+        rest = values.sum(axis=1, keepdims=True) - found.sum(axis=1, keepdims=True)
+        return np.concatenate([found, rest], axis=1)
+
+    log_share = np.log(np.maximum(flux.share[1:, np.newaxis], np.finfo(float).tiny))
+    return _Window(
+        capture.pulse,
+        capture.acquisition.bin_width_s,
+        np.concatenate([bins, bins[:, -1:] + 1], axis=1).astype(float),
+        in_window(counts),
+        in_window(unfired),
+        n_pulses is not None,
+        signal,
+        background / n_bins,
+        np.broadcast_to(log_share, signal.shape),
+        flux.depth,
+    )
+
+
+def _share(window: _Window, delay: Floats) -> Floats:
+    """Share of an echo's photons in each bin (pixel, node, bin), at delays (pixel, node)."""
+    until = (window.edges[:, np.newaxis] - delay[..., np.newaxis]) * window.bin_width_s
+    share = np.zeros((*delay.shape, window.fired.shape[1]))
+    share[..., :-1] = np.diff(window.pulse.cdf(until), axis=2)
+    return share
+
+
+def _log_density(window: _Window, delay: Floats) -> Floats:
+    """Logarithm of ``p(d)`` up to a constant of each pixel, at delays (pixel, node)."""
+    share, fired = _share(window, delay), window.fired[:, np.newaxis]
+    unfired = window.unfired.sum(axis=1)
+    unfired_echo = np.vecdot(share, window.unfired[:, np.newaxis])
+    log = np.full(delay.shape, -np.inf)
+    levels = zip(window.signal, window.background, window.log_weight, strict=True)
+    for signal, background, weight in levels:
+        rate = share * signal[:, np.newaxis, np.newaxis]
+        rate += background[:, np.newaxis, np.newaxis]
+        if window.is_first:
+            np.negative(np.expm1(np.negative(rate, out=rate), out=rate), out=rate)
+        found = np.vecdot(np.log(rate, out=rate), fired)
+        found -= signal[:, np.newaxis] * unfired_echo
+        found += (weight - unfired * background)[:, np.newaxis]
+        log = np.logaddexp(log, found)
+    at = np.clip(delay.astype(np.intp), 0, window.depth.size - 1)
+    return np.asarray(log + np.log(window.depth)[at])
+
+
+def _fitted(window: _Window, delay: Floats) -> _Window:
+    """Fit each level's signal and background to each pixel, given its delay (pixel, 1).
+
+    By Newton's method, the log likelihood of the pixel is maximised together with that of a normal
+    prior, whose standard deviation is half a step between levels for both fluxes.
+    """
+    p, fired, unfired = _share(window, delay)[:, 0], window.fired, window.unfired
+    signal, background = window.signal, window.background
+    n_bins = window.depth.size
+    precision = 1 / (_LEVEL_ERROR * signal) ** 2  # of the signal, and of all background
+    s, b = signal, background
+    for _ in range(_FITTING_STEPS):
+        rate = b[..., np.newaxis] + s[..., np.newaxis] * p
+        odds = np.expm1(rate) if window.is_first else rate
+        slope = fired / odds - unfired
+        curvature = fired / odds * (1 / odds + window.is_first)
+        slope_s = np.vecdot(slope, p) - precision * (s - signal)
+        slope_b = slope.sum(axis=-1) - precision * n_bins**2 * (b - background)
+        ss = np.vecdot(curvature, p**2) + precision
+        sb = np.vecdot(curvature, p)
+        bb = curvature.sum(axis=-1) + precision * n_bins**2
+        determinant = ss * bb - sb**2
+        # At most by half and to twice, so that both remain positive.
+        s = np.clip(s + (bb * slope_s - sb * slope_b) / determinant, s / 2, 2 * s)
+        b = np.clip(b + (ss * slope_b - sb * slope_s) / determinant, b / 2, 2 * b)
+    penalty = precision * ((s - signal) ** 2 + (n_bins * (b - background)) ** 2) / 2
+    return window._replace(signal=s, background=b, log_weight=window.log_weight - penalty)
+
+
+def _nodes(low: Floats, high: Floats, n_nodes: int) -> Floats:
+    """Equidistant delays from `low` to `high` (pixel,), shape (pixel, node)."""
+    return np.linspace(low, high, n_nodes, axis=1)
+
+
+def _zoomed(window: _Window, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Delays between limits (pixel,) that matter, and their relative densities, (pixel, node)."""
+    for _ in range(_MOST_ZOOMS):
+        delay = _nodes(low, high, _NODES)
+        log = _log_density(window, delay)
+        log -= log.max(axis=1, keepdims=True)
+        inside = log > -_DROP
+        first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
+        last = np.minimum(_NODES - np.argmax(inside[:, ::-1], axis=1), _NODES - 1)
+        if (3 * (last - first) >= 2 * _NODES).all():
+            break
+        ends = np.stack([first, last], axis=1)
+        low, high = np.take_along_axis(delay, ends, axis=1).T
+    return delay, np.exp(log)

@@ -1,0 +1,152 @@
+"""Where the echoes of a capture lie, and the background in the bins that hold none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import astuple
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # loads a submodule when it is first used
+from numpy.typing import NDArray
+
+from core.capture import Capture, cached_per_capture
+from core.inference.faults import ordinary_pixels
+from core.inference.posterior import TOLERANCE_BINS, posterior_of
+from core.inspection.maps import likeliest
+from core.inspection.profile import LEVEL, FluxEstimate, difference_of, ratio_of
+from core.metrics import Interval
+
+CONFIDENT = 0.9
+FEWEST = 10
+"""Confident estimates from which the delays of echoes are known."""
+
+_FOUND = 0.5  # least share of the echoes that must be found to know where there are none
+_FREE = 0.1  # least share of the gate without echoes
+_BEFORE, _BEHIND = 1, 4  # lengths of an echo that may be longer than its pulse
+_FEWEST_ARMED = 10  # pulses, for a rate
+
+
+class Echoes(NamedTuple):
+    """Delays of confident estimates, in bins."""
+
+    first: float
+    last: float
+    n_found: int
+
+
+@cached_per_capture
+def echoes_of(capture: Capture) -> Echoes | None:
+    """Find the first and last delay; None if there are too few confident estimates.
+
+    Leaves out as many estimates as are expected to be wrong, half of them at each end.
+    """
+    delay, probability = likeliest(capture)
+    sure = probability >= CONFIDENT
+    count = int(np.count_nonzero(sure))
+    if count < FEWEST:
+        return None
+    found = np.sort(delay[sure])
+    wrong = math.ceil(float((1 - probability[sure]).sum()) / 2)
+    return Echoes(float(found[wrong]), float(found[-1 - wrong]), count)
+
+
+@cached_per_capture
+def echo_free_flux(capture: Capture) -> FluxEstimate | None:
+    """Estimate mean fluxes with the background of the bins before and after all echoes.
+
+    All photons above that background are signal. This does not depend on the shape of the pulse:
+    margins allow for echoes that begin one length of the pulse early, or have a tail of four.
+
+    Returns
+    -------
+    FluxEstimate or None
+        Of the mean pixel, hot and dead ones left out, with 95 % intervals. None unless half of the
+        echoes are found, a tenth of the gate is free of them, and pulses are left after it.
+    """
+    window, kept, n_pulses = _window(capture), ordinary_pixels(capture), capture.gated_pulses
+    if window is None:
+        return None
+    free = 1 - (window[1] - window[0]) / capture.acquisition.n_bins
+    before, inside = (
+        capture.cube[:, :, slice(*bins)].sum(axis=2, dtype=np.int64)[kept]
+        for bins in ((0, window[0]), window)
+    )
+    parts = _photons([before, inside, capture.counts[kept] - before - inside], n_pulses)
+    if parts is None:
+        return None
+    echoing, rest = parts[1].interval, (parts[0] + parts[2]).interval
+    signal = difference_of(echoing, rest.scaled((1 - free) / free))
+    ratio = ratio_of(echoing, rest)
+    sbr = Interval(*(max(free * each - (1 - free), 0.0) for each in astuple(ratio)))
+    found = FluxEstimate(signal, rest.scaled(1 / free), sbr)
+    return found.scaled(1 / np.count_nonzero(kept)).of(capture)
+
+
+def total_flux(capture: Capture) -> Interval | None:
+    """Estimate signal and background together, likewise; None if too few pulses are left."""
+    kept = ordinary_pixels(capture)
+    parts = _photons([capture.counts[kept]], capture.gated_pulses)
+    if parts is None:
+        return None
+    pulses = 1 if capture.gated_pulses else capture.acquisition.n_pulses or 1
+    return parts[0].interval.scaled(1 / (pulses * np.count_nonzero(kept)))
+
+
+def _window(capture: Capture) -> tuple[int, int] | None:
+    """First bin and end of the window outside which there are no echoes, if that is known."""
+    echoes, n_bins = echoes_of(capture), capture.acquisition.n_bins
+    if echoes is None or echoes.n_found < _FOUND * posterior_of(capture).surface.sum():
+        return None
+    echo, tap = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
+    first = math.floor(echoes.first) + min(tap, 0) - TOLERANCE_BINS - _BEFORE * echo.size
+    end = math.ceil(echoes.last) + max(tap, 0) + TOLERANCE_BINS + _BEHIND * echo.size
+    first, end = max(first, 0), min(end, n_bins)
+    return (first, end) if end - first <= (1 - _FREE) * n_bins else None
+
+
+class _Photons(NamedTuple):
+    """Sum of weighted counts."""
+
+    total: float
+    variance: float
+    largest: float
+    """Largest weight of a count."""
+
+    def __add__(self, other: _Photons) -> _Photons:  # type: ignore[override]
+        total, variance = self.total + other.total, self.variance + other.variance
+        return _Photons(total, variance, max(self.largest, other.largest))
+
+    @property
+    def interval(self) -> Interval:
+        """Gamma interval of Fay & Feuer (1997); for equal weights that of Garwood (1936)."""
+        total, tail = max(self.total, 0.0), 0.5 - LEVEL / 2
+        more, wider = total + self.largest, self.variance + self.largest**2
+        low, high = (
+            float(scipy.special.gammaincinv(mean**2 / variance, share)) * variance / mean
+            if mean > 0
+            else 0.0
+            for mean, variance, share in ((total, self.variance, tail), (more, wider, 1 - tail))
+        )
+        return Interval(total, low, high)
+
+
+def _photons(counts: Sequence[NDArray[np.int64]], n_pulses: int | None) -> list[_Photons] | None:
+    """Photons in successive parts of the gate, from the counts of the pixels (pixel,) in each."""
+    if n_pulses is None:
+        return [_Photons(float(each.sum()), float(each.sum()), 1.0) for each in counts]
+    left = n_pulses - np.cumsum(counts, axis=0)
+    if left.min() < _FEWEST_ARMED:
+        return None
+    return list(map(_fired, left + counts, left))
+
+
+def _fired(armed: NDArray[np.int64], left: NDArray[np.int64]) -> _Photons:
+    """Photons per pulse of all pixels (pixel,) while pulses fired (Coates 1968).
+
+    With the variance of Greenwood (1926), by half of which a logarithm is biased.
+    """
+    variance = 1 / left - 1 / armed
+    rate = np.log(armed / left) - variance / 2
+    return _Photons(float(rate.sum()), float(variance.sum()), 1 / float(left.min()))

@@ -1,0 +1,88 @@
+"""Kernels that move delays to the nearby maximum of the likelihood.
+
+A window holds the bins that echoes near a delay can fill. Its delays ``d`` are steps of a fraction
+of a bin, so that ``T(d)`` of `core.inference.likelihood` is a correlation with a finely sampled
+echo: bin p of a window of P bins takes the sample ``d + (P - 1 - p) steps``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from core.kernels.parallel import COMPILED, PARALLEL
+
+
+@njit(**COMPILED)
+def _fill_gain(signal, background, is_first, echo, gain):  # type: ignore[no-untyped-def]
+    """Fill `gain` with the logarithm that each count adds to ``T(d)``, for samples of an echo."""
+    unit = math.expm1(background) if is_first else background
+    for i in range(echo.size):
+        s = signal * echo[i]
+        gain[i] = math.log1p((-math.expm1(-s) if is_first else s) / unit) if s > 0.0 else 0.0
+
+
+@njit(**COMPILED)
+def _fill_window(counts, n_pulses, first, fired, unfired):  # type: ignore[no-untyped-def]
+    """Fill counts and unfired pulses of the bins from `first`; 0 outside the gate."""
+    before = 0
+    for k in range(min(max(first, 0), counts.size)):
+        before += counts[k]
+    armed = float(n_pulses - before)
+    for p in range(fired.size):
+        k = first + p
+        is_inside = 0 <= k < counts.size
+        fired[p] = counts[k] if is_inside else 0.0
+        armed -= fired[p]
+        unfired[p] = (armed if n_pulses > 0 else 1.0) if is_inside else 0.0
+
+
+@njit(**COMPILED)
+def _fill_score(signal, echo, gain, steps, fired, unfired, score):  # type: ignore[no-untyped-def]
+    """Fill `score` with ``T(d)`` of the delays of a window."""
+    score[:] = 0.0
+    for p in range(fired.size):
+        first = (fired.size - 1 - p) * steps
+        count, expected = fired[p], signal * unfired[p]
+        for d in range(score.size):
+            score[d] += count * gain[first + d] - expected * echo[first + d]
+
+
+@njit(**COMPILED)
+def _highest(score, begin, end):  # type: ignore[no-untyped-def]
+    """Position of the maximum of `score` from `begin` to `end`, refined by a parabola."""
+    best = begin + score[begin:end].argmax()
+    if not begin < best < end - 1:
+        return float(best)
+    left, middle, right = score[best - 1], score[best], score[best + 1]
+    curvature = min(left - 2.0 * middle + right, -1e-9)
+    return best + min(max(0.5 * (left - right) / curvature, -0.5), 0.5)
+
+
+@njit(**PARALLEL)
+def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, reach, delay):  # type: ignore[no-untyped-def]
+    """Move each delay (block, lane) to the maximum of ``T(d)`` within `reach` bins of it.
+
+    `blocks` holds counts (block, bin, lane); `signal` and `background`, per bin, have the shape
+    (block, lane); `n_pulses` is 0 if unknown; `echo` has `steps` samples a bin, see the module,
+    and begins `first_tap` bins from a delay. NaN remains.
+    """
+    n_blocks, n_bins, lanes = blocks.shape
+    n_delays = (2 * reach + 1) * steps
+    for b in prange(n_blocks):
+        gain, score = np.empty(echo.size), np.empty(n_delays)
+        fired, unfired = np.empty((2, (echo.size - n_delays) // steps + 1))
+        last_signal, last_background = math.nan, math.nan
+        for i in range(lanes):
+            if math.isnan(delay[b, i]):
+                continue
+            if signal[b, i] != last_signal or background[b, i] != last_background:
+                last_signal, last_background = signal[b, i], background[b, i]
+                _fill_gain(last_signal, last_background, n_pulses > 0, echo, gain)
+            first = min(int(delay[b, i]), n_bins - 1) - reach
+            _fill_window(blocks[b, :, i], n_pulses, first + first_tap, fired, unfired)
+            _fill_score(last_signal, echo, gain, steps, fired, unfired, score)
+            begin, end = max(-first, 0) * steps, min(n_bins - first, 2 * reach + 1) * steps
+            delay[b, i] = first + (_highest(score, begin, end) + 0.5) / steps

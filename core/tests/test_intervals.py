@@ -1,0 +1,252 @@
+"""Tests of range intervals: against a slow twin, and of their coverage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+import core
+from core.acquisition import Acquisition, Pulse
+from core.capture import Capture
+from core.estimators import RangeImage, estimate
+from core.inference import TOLERANCE_BINS, flux_model_of
+from core.inference.flux import LEVEL_SPAN, LEVELS
+from core.studies.methods.calibration import (
+    FLUX_REGIMES,
+    Regime,
+    coverage,
+    coverage_table,
+    flux_table,
+)
+from core.studies.methods.calibration import LEVELS as COVERED
+from core.trigger import draw_counts, rate_per_bin
+
+pytestmark = pytest.mark.compiled
+
+SIGNIFICANCE = 1e-4  # by chance, one fixed seed in ten thousand would fall below
+N_BINS = 40
+
+PULSES = {
+    "gamma": Pulse(1e-9),
+    "gaussian": Pulse.gaussian(2e-9),
+    "narrow": Pulse.gaussian(0.1e-9),
+    "measured": Pulse.measured([0, 1, 4, 6, 3, 0.5], 0.7e-9),
+}
+
+
+def drawn(
+    pulse: Pulse, n_pulses: int | None, signal: float = 0.2, background: float = 0.5, seed: int = 0
+) -> Capture:
+    """Draw pixels with echoes anywhere in the gate, the first two at its ends.
+
+    All photons are those of 300 pulses.
+    """
+    acquisition, rng = Acquisition(n_bins=N_BINS, n_pulses=n_pulses), np.random.default_rng(seed)
+    onset = rng.uniform(0, N_BINS, (12, 12))
+    onset[0, :2] = 0.3, N_BINS - 3.2
+    rate = rate_per_bin(onset, np.full(onset.shape, signal), background, pulse, acquisition)
+    cube = draw_counts(rate if n_pulses else 300 * rate, n_pulses, rng)
+    kind = "first" if n_pulses else "all"
+    return Capture(cube, acquisition, pulse, acquisition.bin_to_range_m(onset), detection=kind)
+
+
+def image_at(capture: Capture, bins: np.ndarray) -> RangeImage:
+    """Return estimates at given delays."""
+    valid = np.isfinite(bins)
+    known = np.ones(bins.shape)
+    return RangeImage(capture.acquisition.bin_to_range_m(bins), bins, known, known, valid)
+
+
+def twin(capture: Capture, row: int, col: int, estimate_bin: float, level: float) -> np.ndarray:
+    """Compute the interval of one pixel, in bins, from the definition on a fine grid."""
+    counts, n_pulses = capture.cube[row, col].astype(float), capture.gated_pulses
+    flux = flux_model_of(capture)
+
+    def log_likelihood(delay: np.ndarray, signal: float, background: float) -> np.ndarray:
+        echo = np.full(delay.shape, signal)
+        rate = rate_per_bin(delay, echo, background, capture.pulse, capture.acquisition)
+        if n_pulses is None:
+            return (counts * np.log(rate) - rate).sum(axis=1)
+        unfired = n_pulses - np.cumsum(counts)
+        return (counts * np.log(-np.expm1(-rate)) - unfired * rate).sum(axis=1)
+
+    def log_density(delay: np.ndarray, levels: list[tuple[float, ...]]) -> np.ndarray:
+        of_levels = [np.log(w) + log_likelihood(delay, s, b) for w, s, b in levels]
+        depth = flux.depth[np.minimum(delay.astype(int), N_BINS - 1)]
+        return np.logaddexp.reduce(of_levels, axis=0) + np.log(depth)
+
+    given = list(
+        zip(flux.share[1:], flux.signal[1:, row, col], flux.background[1:, row, col], strict=True)
+    )
+    window = np.clip(estimate_bin + np.array([-1, 1]) * TOLERANCE_BINS, 0, N_BINS)
+    coarse = np.linspace(*window, 8 * TOLERANCE_BINS + 1)
+    best = coarse[[log_density(coarse, given).argmax()]]
+    fitted = []
+    for weight, signal, background in given:
+        sd = (LEVEL_SPAN ** (0.5 / (LEVELS - 1)) - 1) * signal
+
+        def loss(x: np.ndarray, start=(signal, background), sd: float = sd) -> float:
+            s, b = np.exp(x) * start
+            prior = ((s - start[0]) ** 2 + (b - start[1]) ** 2) / (2 * sd**2)
+            return float(prior - log_likelihood(best, s, b)[0])
+
+        found = optimize.minimize(loss, [0.0, 0.0], method="Nelder-Mead", tol=1e-9)
+        s, b = np.exp(found.x) * (signal, background)
+        penalty = ((s - signal) ** 2 + (b - background) ** 2) / (2 * sd**2)
+        fitted.append((weight * math.exp(-penalty), s, b))
+    delay = np.linspace(*window, 20_001)
+    log = log_density(delay, fitted)
+    mass = np.cumsum(np.exp(log - log.max()))
+    return np.interp([(1 - level) / 2, (1 + level) / 2], mass / mass[-1], delay)
+
+
+@pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
+@pytest.mark.parametrize("n_pulses", [300, None], ids=["first photons", "photons"])
+def test_intervals_are_those_of_the_definition(pulse: Pulse, n_pulses: int | None) -> None:
+    capture = drawn(pulse, n_pulses)
+    bins = capture.acquisition.range_m_to_bin(capture.truth_range_m) + 0.4
+    image = image_at(capture, np.minimum(bins, N_BINS))
+    for level in (0.68, 0.95):
+        found = core.range_interval(capture, image, level)
+        for row, col in ((0, 0), (0, 1), (5, 5)):
+            low, high = capture.acquisition.range_m_to_bin([x[row, col] for x in found])
+            expected = twin(capture, row, col, image.bin[row, col], level)
+            # Nodes are a fiftieth of the interval apart, or more if it is a small part of a bin.
+            atol = 0.01 * np.ptp(expected) + 0.005
+            np.testing.assert_allclose([low, high], expected, rtol=0, atol=atol)
+
+
+def test_intervals_are_of_valid_pixels_and_lie_within_the_tolerance() -> None:
+    capture = drawn(Pulse(), 300)
+    image = estimate(capture, "peak", false_alarm=0.01)
+    assert 0 < image.valid.sum() < image.valid.size
+    inner, outer = (core.range_interval(capture, image, level) for level in (0.68, 0.95))
+    tolerance_m = TOLERANCE_BINS * capture.acquisition.bin_length_m
+    begin_m, end_m = capture.acquisition.bin_to_range_m([0, N_BINS])
+    some = image.valid
+    for values in (*inner, *outer):
+        np.testing.assert_array_equal(np.isfinite(values), some)
+        assert (np.abs(values - image.range_m)[some] <= tolerance_m * (1 + 1e-9)).all()
+        assert ((values[some] >= begin_m) & (values[some] <= end_m)).all()
+    assert (outer.low_m < inner.low_m)[some].all() and (inner.high_m < outer.high_m)[some].all()
+
+
+def test_the_interval_of_a_pixel_is_that_of_the_image() -> None:
+    capture = drawn(Pulse(), 300)
+    bins = capture.acquisition.range_m_to_bin(capture.truth_range_m)
+    bins[:, ::3] = np.nan
+    image = image_at(capture, bins)
+    inner, outer = (core.range_interval(capture, image, level) for level in (0.68, 0.95))
+    for row, col in np.ndindex(capture.shape):
+        one, other = core.pixel_range_intervals(capture, image, row, col)
+        np.testing.assert_array_equal(one.value, image.range_m[row, col])
+        for found, of_image in ((one, inner), (other, outer)):
+            expected = of_image.low_m[row, col], of_image.high_m[row, col]
+            # Pixels of an image are zoomed together, so that nodes differ.
+            atol = 0.02 * (expected[1] - expected[0])
+            np.testing.assert_allclose((found.low, found.high), expected, rtol=0, atol=atol)
+
+
+def test_a_level_that_is_no_probability_is_refused() -> None:
+    capture = drawn(Pulse(), 300)
+    image = estimate(capture, "peak")
+    for level in (0.0, 1.0, math.nan):
+        with pytest.raises(ValueError, match=r"level = .* between 0 and 1"):
+            core.range_interval(capture, image, level)
+        with pytest.raises(ValueError, match=r"level = .* between 0 and 1"):
+            core.pixel_range_intervals(capture, image, 0, 0, (level,))
+    other = replace(capture, cube=capture.cube[:5], truth_range_m=None, flux_prior=None)
+    with pytest.raises(ValueError, match="image = "):
+        core.range_interval(other, image)
+
+
+@pytest.mark.parametrize("n_pulses", [None, 1, 1000])
+@pytest.mark.parametrize("n_bins", [1, 2, 9])
+@pytest.mark.parametrize("count", [0, 1])
+def test_intervals_are_always_defined(count: int, n_bins: int, n_pulses: int | None) -> None:
+    cube = np.zeros((1, 2, n_bins), np.uint16)
+    cube[..., 0] = count * (n_pulses or 1)
+    kind = "all" if n_pulses is None else "first"
+    capture = Capture(cube, Acquisition(n_bins=n_bins, n_pulses=n_pulses), detection=kind)
+    image = image_at(capture, np.array([[0.0, n_bins]]))
+    low_m, high_m = core.range_interval(capture, image)
+    assert (low_m < high_m).all()
+
+
+# -- coverage --------------------------------------------------------------------------------------
+
+
+def is_covered(hits: float, trials: int, level: float) -> bool:
+    """Return whether the truth lies in intervals as often as it should, but for chance."""
+    low, high = stats.binom.ppf([SIGNIFICANCE / 2, 1 - SIGNIFICANCE / 2], trials, level)
+    return bool(low <= hits <= high)
+
+
+@pytest.mark.parametrize(
+    ("regime", "method"),
+    [
+        (Regime("first", 1, 0.06), "tracking"),
+        (Regime("first", 5, 0.03), "likelihood"),
+        (Regime("all", 0.5, 3), "likelihood"),
+        (Regime("all", 2, 0.3), "tracking"),
+    ],
+    ids=str,
+)
+def test_intervals_of_right_estimates_cover_the_truth(regime: Regime, method: str) -> None:
+    found = coverage(regime, method, [0])
+    assert found.right > 500
+    for level, share in zip(COVERED, found.shares, strict=True):
+        assert is_covered(round(share.value * found.right), found.right, level), share
+
+
+@pytest.mark.parametrize("n_pulses", [400_000, None], ids=["first photons", "photons"])
+def test_intervals_of_many_photons_cover_the_truth(n_pulses: int | None) -> None:
+    """Sums of pixels have intervals of a hundredth of a bin, with the fluxes of one pixel."""
+    hits, trials, acquisition = np.zeros(2, int), 100, Acquisition(n_pulses=n_pulses)
+    kind = "all" if n_pulses is None else "first"
+    for seed in range(trials):
+        rng = np.random.default_rng(seed)
+        onset = rng.uniform(20, 90, (1, 1))
+        rate = rate_per_bin(onset, np.full((1, 1), 0.1), 0.5, Pulse(), acquisition)
+        cube = draw_counts(rate if n_pulses else 400_000 * rate, n_pulses, rng)
+        capture = Capture(cube, acquisition, detection=kind)
+        image, truth_m = image_at(capture, onset + 0.3), acquisition.bin_to_range_m(onset)[0, 0]
+        for i, each in enumerate(core.pixel_range_intervals(capture, image, 0, 0, COVERED)):
+            assert each.high - each.low < 0.04 * acquisition.bin_length_m
+            hits[i] += each.low <= truth_m <= each.high
+    for level, count in zip(COVERED, hits, strict=True):
+        assert is_covered(int(count), trials, level), hits
+
+
+def test_the_study_has_a_row_for_each_regime_and_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    regimes = (Regime("first", 1, 3), Regime("all", 1, 3))
+    monkeypatch.setattr("core.studies.methods.calibration.REGIMES", regimes)
+    monkeypatch.setattr("core.studies.methods.calibration._SIDE", 8)
+    found = coverage_table([0])
+    assert [row[:4] for row in found.rows] == [
+        (kind, "1", "3", method)
+        for kind in ("first", "all")
+        for method in ("likelihood", "tracking")
+    ]
+    for row in found.rows:
+        assert 0 < row[4] <= 64
+        assert row[5].low <= row[5].value <= row[6].value <= 1
+
+
+def test_the_flux_study_has_a_row_for_each_regime_and_bin_width(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    study = "core.studies.methods.calibration"
+    monkeypatch.setattr(f"{study}.FLUX_REGIMES", FLUX_REGIMES[-1:])
+    monkeypatch.setattr(f"{study}.BIN_WIDTHS_S", (1e-9, 2e-9))
+    monkeypatch.setattr(f"{study}._FLUX_SIDE", 6)
+    monkeypatch.setattr(f"{study}._TRIALS_PER_SEED", 2)
+    found = flux_table([0])
+    regime = ("first", "whole gate", "exponential tail")
+    assert [row[:4] for row in found.rows] == [(*regime, "1"), (*regime, "2")]
+    for row in found.rows:
+        assert all(0 <= each.low <= each.value <= each.high <= 1 for each in row[4:])

@@ -1,0 +1,117 @@
+"""Tests of delays that are refined below a bin by the likelihood in their neighbourhood."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from core.acquisition import Acquisition, Pulse
+from core.capture import Capture
+from core.estimators import estimate
+from core.inference import TOLERANCE_BINS, flux_model_of
+from core.inference.refinement import STEPS_PER_BIN, refined
+from core.studies.methods.calibration import Regime
+from core.tracking import PRESETS, tracking_signals
+from core.trigger import draw_counts, rate_per_bin
+
+N_BINS = 40
+
+PULSES = {
+    "gamma": Pulse(1e-9),
+    "gaussian": Pulse.gaussian(2e-9),  # wider than the tolerance
+    "measured": Pulse.measured([0, 1, 4, 6, 3, 0.5], 0.7e-9),
+}
+
+
+def drawn(pulse: Pulse, n_pulses: int | None, rows: int = 3) -> Capture:
+    """Draw pixels with echoes anywhere in the gate and different backgrounds."""
+    acquisition, rng = Acquisition(n_bins=N_BINS, n_pulses=n_pulses), np.random.default_rng(2)
+    onset = rng.uniform(0, N_BINS, (rows, 30))
+    rate = rate_per_bin(onset, np.full(onset.shape, 0.2), 0.0, pulse, acquisition)
+    rate += np.linspace(0.2, 1.0, 30)[:, np.newaxis] / N_BINS
+    cube = draw_counts(rate if n_pulses else 300 * rate, n_pulses, rng)
+    return Capture(cube, acquisition, pulse, detection="first" if n_pulses else "all")
+
+
+def twin(capture: Capture, row: int, col: int, delay_bin: float) -> float:
+    """Refine one delay as described, one likelihood at a time."""
+    flux, acquisition = flux_model_of(capture), capture.acquisition
+    counts, n_pulses = capture.cube[row, col].astype(float), capture.gated_pulses
+    signal = float(flux.typical_signal[row, col])
+    background = float(flux.typical_background[row, col])
+    within = (np.arange(STEPS_PER_BIN) + 0.5) / STEPS_PER_BIN
+    taps, first = capture.pulse.taps(N_BINS, acquisition.bin_width_s, within)
+    reach, at = max(TOLERANCE_BINS, capture.echo_bins) - 1, min(math.floor(delay_bin), N_BINS - 1)
+    delays, log = [], []
+    for k in range(max(at - reach, 0), min(at + reach, N_BINS - 1) + 1):
+        for step in range(STEPS_PER_BIN):
+            rate = np.full(N_BINS, background / N_BINS)
+            for tap, share in enumerate(taps[step]):
+                if 0 <= k + first + tap < N_BINS:
+                    rate[k + first + tap] += signal * share
+            if n_pulses is None:
+                log.append((counts * np.log(rate) - rate).sum())
+            else:
+                unfired = n_pulses - np.cumsum(counts)
+                log.append((counts * np.log(-np.expm1(-rate)) - unfired * rate).sum())
+            delays.append(k + within[step])
+    best = int(np.argmax(log))
+    if not 0 < best < len(log) - 1:
+        return float(delays[best])
+    left, middle, right = log[best - 1 : best + 2]
+    curvature = min(left - 2 * middle + right, -1e-9)
+    return float(delays[best] + 0.5 * (left - right) / curvature / STEPS_PER_BIN)
+
+
+@pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
+@pytest.mark.parametrize("n_pulses", [300, None], ids=["first photons", "photons"])
+def test_delays_move_to_the_largest_likelihood(pulse: Pulse, n_pulses: int | None) -> None:
+    capture = drawn(pulse, n_pulses)
+    start = np.random.default_rng(5).uniform(0, N_BINS, capture.shape)
+    start[0, :3] = 0.0, N_BINS, np.nan
+    before = start.copy()
+    found = refined(capture, flux_model_of(capture), start)
+    np.testing.assert_array_equal(start, before)
+    assert math.isnan(found[0, 2])
+    for row, col in [(0, 0), (0, 1), *((r, c) for r in range(3) for c in range(4, 30, 5))]:
+        expected = twin(capture, row, col, start[row, col])
+        assert found[row, col] == pytest.approx(expected, abs=1e-6)
+    assert np.nanmax(np.abs(found - start)) < max(TOLERANCE_BINS, capture.echo_bins)
+    assert np.nanmin(found) >= 0 and np.nanmax(found) <= N_BINS
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    "regime",
+    [Regime("first", 1, 0.06), Regime("first", 5, 0.3), Regime("all", 0.5, 3)],
+    ids=str,
+)
+def test_tracking_is_as_precise_as_the_likelihood(regime: Regime) -> None:
+    capture = regime.capture(0)
+    truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
+    found = {
+        name: estimate(capture, method, **more).bin - truth
+        for name, method, more in (
+            ("printed", "tracking", {}),
+            ("refined", "tracking", {"refine": "likelihood"}),
+            ("likelihood", "likelihood", {}),
+        )
+    }
+    right = np.all([np.abs(error) <= TOLERANCE_BINS for error in found.values()], axis=0)
+    assert right.sum() > 1000
+    rms = {name: math.sqrt(np.mean(error[right] ** 2)) for name, error in found.items()}
+    assert rms["refined"] <= 1.02 * rms["likelihood"] < 0.9 * rms["printed"]
+    assert abs(np.mean(found["refined"][right])) <= 0.1
+
+
+def test_the_printed_preset_gives_whole_bins_minus_the_lag() -> None:
+    capture = drawn(Pulse(), 300, rows=1)
+    printed = replace(PRESETS["as printed"], t_n=5)
+    bins = estimate(capture, "tracking", printed).bin[0]
+    position = tracking_signals(capture.cube[0], printed, 300).position_bin
+    lag = position - bins
+    clipped = (bins == 0) | (bins == N_BINS)
+    np.testing.assert_allclose(lag[~clipped], np.median(lag), atol=1e-9)

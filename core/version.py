@@ -1,0 +1,3 @@
+"""Version of the distribution, which pyproject.toml reads."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,43 @@
+"""A file that is a sequence in time, stepped through in the app."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import core
+from app.model.store import built_in_sources, file_source
+from tests.threads import HeldLayout, control
+
+
+@pytest.fixture
+def log(real_capture):
+    return real_capture("tmf8829_log.json.gz")
+
+
+def test_records_are_stepped_through_and_added_up(log):
+    layout = HeldLayout({"log": file_source(log)} | built_in_sources())
+    player, everything = control(layout, "Record"), control(layout, "All records")
+    added = layout.session.answer.capture.cube
+    assert player.end + 1 == layout.session.answer.whole.n_records == 26
+    player.value = 3
+    answer = layout.next_answer()
+    assert answer.request.reading.records == 3
+    np.testing.assert_array_equal(answer.whole.cube, core.read_capture(log, records=3).cube)
+    assert "reading.records=3" in layout.session.query()
+    everything.clicks += 1
+    answer = layout.next_answer()
+    assert answer.request.reading.records is None
+    np.testing.assert_array_equal(answer.whole.cube, added)
+
+
+def test_the_player_is_shown_for_sequences_alone(log):
+    layout = HeldLayout(built_in_sources() | {"log": file_source(log)})
+    (holder,) = layout.page.select(
+        lambda each: control(layout, "Record") in getattr(each, "objects", ())
+    )
+    assert not holder.visible
+    for source, is_sequence in (("log", True), ("sample", False), ("log", True), ("car", False)):
+        control(layout, "Scene or capture").value = source
+        layout.next_answer()
+        assert holder.visible == is_sequence
