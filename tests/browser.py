@@ -52,6 +52,9 @@ def browser_path() -> str | None:
     return named or next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
+TIMEOUT_MS = 60_000
+"""Limit of each wait for a page: pages are drawn in software, on few cores."""
+
 READY = ".stage[data-camera], [aria-label='Pinned pixels']"
 """Part of a page that is drawn late: Explore's cloud, or the pins of Inspect."""
 
@@ -117,6 +120,7 @@ def open_page(
     `prepare` is a script to run first; `watch` is called with the page before it loads anything.
     """
     page = browser.contexts[0].new_page()
+    page.set_default_timeout(TIMEOUT_MS)
     page.set_viewport_size({"width": width, "height": height})
     watch(page)
     page.add_init_script(prepare)

@@ -12,10 +12,9 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
 from core.tests.captures import real_capture_path
 from core.tests.garbage import pytest_collection, pytest_collection_finish  # noqa: F401 - hooks
-from tests.browser import chromium, open_page, serving
+from tests.browser import TIMEOUT_MS, chromium, open_page, serving
 
-# Pages are drawn in software, some with five clouds, on few cores.
-expect.set_options(timeout=60_000)
+expect.set_options(timeout=TIMEOUT_MS)
 
 
 OWN_SCHEMES = ("data", "blob")

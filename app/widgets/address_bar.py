@@ -25,28 +25,34 @@ class AddressBar(Component):
     ignores Back.
     """
 
-    query = param.String(default="", doc="Part of the address after the question mark.")
-    visited = param.List(default=[], doc="Query of the entry that was returned to, and when.")
+    entry = param.List(
+        default=["", 0], doc="Part of the address after the question mark, and the latest visit."
+    )
+    visited = param.List(
+        default=["", 0], doc="Query of the entry that was returned to, and the number of the visit."
+    )
 
     _esm = """
     export function render({ model }) {
       const step = () => history.state?.step ?? 0;
       let isNew = false;  // whether the next address is an entry of its own
       const show = () => {
-        const query = model.query ? `?${model.query}` : "";
-        const address = new URL(location.pathname + query + location.hash, location.href);
+        const [query, visit] = model.entry;
+        if (visit !== model.visited[1]) return;  // written before the latest visit was known
+        const search = query ? `?${query}` : "";
+        const address = new URL(location.pathname + search + location.hash, location.href);
         if (address.href !== location.href) {
           if (isNew) history.pushState({ step: step() + 1 }, "", address);
           else history.replaceState(history.state, "", address);
         }
         isNew = true;
       };
-      model.on("query", show);
+      model.on("entry", show);
       show();
 
       const visit = () => {
         isNew = false;  // the state is written once more when it is restored
-        model.visited = [location.search.slice(1), Date.now()];
+        model.visited = [location.search.slice(1), model.visited[1] + 1];
       };
       const TEXT = "input[type=text], input:not([type]), textarea";
       const press = (event) => {
@@ -91,8 +97,9 @@ class AddressBar(Component):
         """
         changes = 0
 
-        def write() -> None:
-            self.query = query()
+        def write(seen: int) -> None:
+            if seen == changes:
+                self.entry = [query(), self.visited[1]]
 
         def changed(*_events: Any) -> None:
             nonlocal changes
@@ -102,9 +109,10 @@ class AddressBar(Component):
         def check(seen: int) -> None:
             if seen == changes:
                 if is_settled():
-                    run_on_page(write)
+                    run_on_page(partial(write, seen))
                 else:
                     wait(REST_MS, partial(check, seen))
 
-        write()
+        write(changes)
         state.param.watch(changed, list(defaults()))
+        self.param.watch(changed, "visited")  # its entry is written, whatever could be restored
