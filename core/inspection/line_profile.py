@@ -58,7 +58,7 @@ def line_profile(
         Estimate of the capture. Pixels without an estimate, such as those that
         `RangeImage.confident` removes, have no range.
     points : sequence of (row, col)
-        Two or more pixels, which the line joins in this order.
+        Two or more pixels, not all the same, which the line joins in this order.
     pixel_angle_rad : float, optional
         Angle between the lines of sight of neighbouring pixels, in radians; the capture's own where
         None.
@@ -101,9 +101,10 @@ def _corners(points: Sequence[tuple[int, int]], shape: tuple[int, int]) -> NDArr
     corners = np.asarray(points)
     usable = corners.ndim == 2 and corners.shape[1] == 2 and len(corners) >= 2
     usable = usable and np.issubdtype(corners.dtype, np.integer)
-    usable = bool(usable and (corners >= 0).all() and (corners < shape).all())
+    usable = usable and bool((corners >= 0).all() and (corners < shape).all())
+    usable = usable and bool((corners != corners[0]).any())
     rows, cols = shape
-    require("points", points, usable, f"2 or more (row, col), below ({rows}, {cols})")
+    require("points", points, usable, f"2 or more different (row, col) below ({rows}, {cols})")
     return corners
 
 

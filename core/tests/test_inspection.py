@@ -282,7 +282,13 @@ def test_a_profile_holds_ranges_and_intervals_of_the_pixels_on_a_line() -> None:
     assert wider.distance_m[-1] == pytest.approx(2 * found.distance_m[8], rel=1e-4)
     unseen = inspection.line_profile(capture, image, [(8, 0), (8, 8)])
     assert np.isnan(unseen.distance_m).all()
-    for points in ([(0, 0)], [(0, 0), (0, 9)], [(0, -1), (0, 1)], [(0, 0.5), (1, 1)]):
+    for points in (
+        [(0, 0)],
+        [(1, 1), (1, 1)],
+        [(0, 0), (0, 9)],
+        [(0, -1), (0, 1)],
+        [(0, 0.5), (1, 1)],
+    ):
         with pytest.raises(ValueError, match=r"points = .* 2 or more"):
             inspection.line_profile(capture, image, points)
     unknown = replace(capture, acquisition=replace(acquisition, pixel_angle_rad=None))
