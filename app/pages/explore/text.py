@@ -103,4 +103,4 @@ def cloud_caption(
     line = f"{n_shown:,} of {total:,} estimates {'shown' if box == WHOLE else 'in the box'}"
     if n_wrong is not None:
         line += f", {n_wrong:,} of them wrong (crosses)"
-    return line + ("; width from a guessed field of view" if is_width_guessed else "")
+    return line + ("; width is a guess" if is_width_guessed else "")
