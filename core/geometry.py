@@ -7,6 +7,8 @@ cloud stands upright in programs that take z as up.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +18,12 @@ from core.acquisition import Acquisition, Floats
 from core.checks import require
 
 __all__ = [
+    "Box",
     "Points",
     "distance_m",
     "guessed_field_of_view_deg",
     "pixel_angle_of",
+    "pixels_in",
     "points_m",
     "sight_lines",
 ]
@@ -34,6 +38,55 @@ class Points(NamedTuple):
     """Row of each point's pixel, shape (point,)."""
     col: NDArray[np.int32]
     """Column of each point's pixel, shape (point,)."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """Part of a range image: the pixels in a polygon whose range lies between two limits.
+
+    Parameters
+    ----------
+    polygon : tuple of (row, col)
+        Corners, as for `pixels_in`; empty for all pixels.
+    from_m, to_m : float, optional
+        Shortest and longest range in metres; None for no limit.
+
+    Raises
+    ------
+    ValueError
+        If `to_m` is not above `from_m`.
+    """
+
+    polygon: tuple[tuple[float, float], ...] = ()
+    from_m: float | None = None
+    to_m: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.from_m is not None and self.to_m is not None:
+            is_above = self.from_m < self.to_m
+            require("to_m", self.to_m, is_above, f"a number above from_m = {self.from_m:g}")
+
+    def __str__(self) -> str:
+        corners = " ".join(f"{row:g},{col:g}" for row, col in self.polygon)
+        limits = {"from": self.from_m, "to": self.to_m}
+        ranges = [f"{name} {limit:g} m" for name, limit in limits.items() if limit is not None]
+        parts = [
+            *([f"pixels in the polygon of corners row,col {corners}"] if corners else []),
+            *([f"ranges {' '.join(ranges)}"] if ranges else []),
+        ]
+        return "; ".join(parts) or "everything"
+
+    def contains(self, range_m: ArrayLike) -> NDArray[np.bool_]:
+        """Return which pixels of a range image (row, col) are inside; none without a range."""
+        ranges = np.asarray(range_m, float)
+        inside: NDArray[np.bool_] = np.isfinite(ranges)
+        if self.polygon:
+            inside &= pixels_in(self.polygon, ranges.shape)
+        if self.from_m is not None:
+            inside &= ranges >= self.from_m
+        if self.to_m is not None:
+            inside &= ranges <= self.to_m
+        return inside
 
 
 def sight_lines(shape: tuple[int, int], pixel_angle_rad: float) -> Floats:
@@ -93,6 +146,33 @@ def points_m(range_m: ArrayLike, pixel_angle_rad: float) -> Points:
     lines = sight_lines(ranges.shape, pixel_angle_rad)
     xyz_m = ranges[row, col, np.newaxis] * lines[row, col]
     return Points(xyz_m, row.astype(np.int32), col.astype(np.int32))
+
+
+def pixels_in(polygon: Sequence[tuple[float, float]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Find the pixels whose centres lie in a polygon or on its edge, shape (row, col).
+
+    Parameters
+    ----------
+    polygon : sequence of (row, col)
+        Corners, at least 3, in pixels; the centre of the first pixel is (0, 0).
+    shape : tuple of int
+        Rows and columns of the image.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer corners, or one is not finite.
+    """
+    from matplotlib.path import Path  # noqa: PLC0415 - slow to load
+
+    corners = np.asarray(polygon, float)
+    usable = corners.ndim == 2 and corners.shape[1] == 2 and len(corners) >= 3
+    usable = usable and bool(np.isfinite(corners).all())
+    require("polygon", f"{len(polygon)} corners", usable, "3 or more finite (row, col)")
+    path, centres = Path(corners), np.indices(shape).reshape(2, -1).T
+    # The sign of the margin that includes the edge depends on the orientation of the polygon.
+    inside = [path.contains_points(centres, radius=margin) for margin in (-1e-9, 1e-9)]
+    return np.asarray(np.logical_or(*inside).reshape(shape))
 
 
 def distance_m(

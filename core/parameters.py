@@ -65,7 +65,9 @@ class Number:
     open_below : bool
         Whether `least` itself is refused.
     optional : bool
-        Whether None, which leaves the choice to the program, is accepted.
+        Whether None is accepted.
+    none_means : str
+        Meaning of None, which a form shows.
     doubtful : tuple of Zone
         Accepted values that make estimates unreliable.
     """
@@ -82,6 +84,7 @@ class Number:
     most: float = math.inf
     open_below: bool = False
     optional: bool = False
+    none_means: str = "automatic"
     doubtful: tuple[Zone, ...] = ()
 
     def check(self, name: str, value: object) -> None:

@@ -101,7 +101,8 @@ def _random(settings: Any, rng: np.random.Generator) -> Any:
         for each in fields(settings)
         if rng.random() < 0.5
     }
-    if {"color_from_m", "color_to_m"} <= changed.keys():
-        low, high = sorted((changed["color_from_m"], changed["color_to_m"]))
-        changed |= {"color_from_m": low, "color_to_m": high + 1.0}
+    for ends in (("color_from_m", "color_to_m"), ("from_m", "to_m")):
+        if {*ends} <= changed.keys():
+            low, high = sorted(changed[end] for end in ends)
+            changed |= dict(zip(ends, (low, high + 1.0), strict=True))
     return replace(settings, **changed)

@@ -39,8 +39,9 @@ from app.model.exports import (
     table_file,
 )
 from app.model.script import script_of
-from app.model.state import MAPS, Illumination, ReductionSettings, Viewing
+from app.model.state import MAPS, REGION, Crop, Illumination, ReductionSettings, Viewing
 from app.model.store import built_in_sources, inspect
+from app.pages.inspect.views import rectangle
 from app.pages.layout import Layout
 from app.pages.shared import downloads
 from app.pages.shared.downloads import Download, Shown, Subject
@@ -48,6 +49,7 @@ from app.theme import RANGE_COLORS
 from app.units import count, interval, number, share
 from core import TrackingParameters
 from core.cli import main
+from core.inspection import pixels_in
 from core.io import MOST_LETTERS
 from core.studies.outputs import Table
 from core.tests.test_export import drawn_pixels
@@ -62,7 +64,7 @@ def layout():
 @pytest.fixture
 def session(layout):
     """The session, whose viewing settings are restored afterwards."""
-    names = ("image", "cloud_color", "pixel", "viewing")
+    names = ("image", "cloud_color", "pixel", "viewing", "crop", "region")
     before = {name: getattr(layout.session.state, name) for name in names}
     yield layout.session
     layout.session.state.param.update(before)
@@ -341,6 +343,9 @@ def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(explore, sess
     rgb[np.frombuffer(cloud.wrong, bool)] = tuple(bytes.fromhex(cloud.wrong_color[1:]))
     ply = trimesh.load(io.BytesIO(files["ply"]), file_type="ply")
     las = laspy.read(io.BytesIO(files["las"]))
+    laz = laspy.read(io.BytesIO(files["laz"]))
+    assert len(files["laz"]) < len(files["las"])
+    np.testing.assert_array_equal(laz.xyz, las.xyz)
     table = columns_of(files["csv"])
     for points, colors in (
         (ply.vertices, ply.colors[:, :3]),
@@ -355,12 +360,42 @@ def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(explore, sess
     np.testing.assert_array_equal(ply.vertices.astype(np.float32), xyz_m)
 
 
+def test_a_cropped_cloud_and_its_files_hold_what_is_inside_and_state_the_box(explore, session):
+    whole = explore.cloud.caption
+    session.state.region = rectangle((20, 40), (10, 30))
+    assert explore.cloud.caption == whole  # a region alone crops nothing
+    middle_m = float(np.nanmedian(session.answer.run.image.range_m))
+    session.state.crop = Crop(REGION, to_m=middle_m)
+    image, box = session.answer.run.image, session.state.box
+    inside = image.valid & (image.confidence >= 0.9) & (image.range_m <= middle_m)
+    inside &= pixels_in(box.polygon, image.valid.shape)
+    np.testing.assert_array_equal(
+        np.frombuffer(explore.cloud.pixels, "<i4"), np.flatnonzero(inside)
+    )
+    assert f"{inside.sum():,} of 4,096 estimates in the box" in explore.cloud.caption
+    found = explore.cloud_shown()
+    name = found.subject.file_name(found.what, "laz")
+    assert name == f"car_rows20-40_cols10-30_tracking_to-m{middle_m:.6g}_cloud.laz"
+    assert f"box: {box}" in found.subject.lines(found.what)
+    files = {suffix: written(write) for suffix, write in found.files.items()}
+    assert f"comment box: {box}".encode() in files["ply"]
+    for suffix in ("las", "laz"):
+        las = laspy.read(io.BytesIO(files[suffix]))
+        assert len(las.x) == inside.sum()
+        assert f"box: {box}\n".encode() in las.vlrs.get_by_id("firstphoton")[0].record_data
+    assert columns_of(files["csv"])["range_m"].size == inside.sum()
+    session.state.crop = Crop(to_m=1.0)
+    with pytest.raises(ValueError, match="no estimate that is shown lies inside the box"):
+        explore.cloud_shown()
+
+
 @pytest.mark.parametrize("angle_rad", [None, 1e-3])
 def test_a_cloud_states_that_its_field_of_view_is_a_guess(session, angle_rad):
     run = session.answer.run
     acquisition = replace(run.capture.acquisition, pixel_angle_rad=angle_rad)
     run = replace(run, capture=replace(run.capture, acquisition=acquisition))
-    files = cloud_files(replace(session.answer, run=run), "Range", session.state.viewing)
+    answer = replace(session.answer, run=run)
+    files = cloud_files(answer, "Range", session.state.viewing, angle_rad is None)
     header = written(files["ply"]).partition(b"end_header")[0].decode()
     assert ("rests on a guess: a field of view of" in header) == (angle_rad is None)
 
@@ -623,6 +658,7 @@ def save_a_cloud_as_picture_and_points(here):
     for suffix, count_points in (
         ("ply", lambda content: len(trimesh.load(io.BytesIO(content), file_type="ply").vertices)),
         ("las", lambda content: len(laspy.read(io.BytesIO(content)).x)),
+        ("laz", lambda content: len(laspy.read(io.BytesIO(content)).x)),
         ("csv", lambda content: len(columns_of(content)["x_m"])),
     ):
         name, content = download(here, "3D cloud", suffix)

@@ -439,6 +439,14 @@ def test_pixels_are_pinned_and_compared_shown_in_every_unit_and_read_out(page, f
     np.testing.assert_array_equal(counts, [facade.capture.cube[pin] for pin in pins])
     listed = ",".join(f"[{row},{col}]" for row, col in pins)
     rests(page, f"pins=[{listed}]", "subject=Pins")
+    button(page, "Profile").click()
+    expect(page.get_by_text(f"4 pixels from {names[0]} to {names[-1]}")).to_be_visible()
+    of_pixels = ("Range along the line", "points")
+    assert drawn(page, *of_pixels, "col").tolist() == [col for _, col in pins]
+    np.testing.assert_array_equal(
+        drawn(page, *of_pixels, "range"), [facade.visible_m[pin] for pin in pins]
+    )
+    button(page, "Pins").click()
     while names:
         button(page, f"Remove {names.pop()}").press("Enter")
         expect(headers).to_have_text(names)
@@ -469,9 +477,16 @@ def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other
             and all(box["bottom"] <= below["top"] for box, below in pairwise(boxes))
         )
 
-    for subject, n_plots in (("Region", 4), ("Capture", 3), ("Pixel", 4), ("Pins", 3)):
+    for subject, n_plots in (
+        ("Region", 4),
+        ("Capture", 3),
+        ("Pixel", 4),
+        ("Pins", 3),
+        ("Profile", 2),
+    ):
         button(page, subject).click()
         eventually(lambda n_plots=n_plots: are_below_each_other(n_plots))
+    button(page, "Pins").click()
     expect(page.get_by_role("rowheader").filter(visible=True)).to_have_text(["30, 20", "30, 21"])
     button(page, "Remove 30, 20").press("Enter")
     button(page, "Region").click()

@@ -11,7 +11,8 @@ import pytest
 
 from app.model.address import Link
 from app.model.colors import map_of
-from app.model.state import MAPS, NEED_TRUTH, Illumination, ReductionSettings, Viewing
+from app.model.script import script_of
+from app.model.state import MAPS, NEED_TRUTH, Crop, Illumination, ReductionSettings, Viewing
 from app.model.store import built_in_sources, file_source
 from app.pages.inspect import text
 from app.pages.inspect.capture import CaptureSection
@@ -19,9 +20,12 @@ from app.pages.inspect.page import Inspect
 from app.pages.inspect.pair import PairSection
 from app.pages.inspect.pins import PinsSection
 from app.pages.inspect.pixel import PixelSection
-from app.pages.inspect.results import accuracy_steps, inspect_region, with_gate
+from app.pages.inspect.profile import ProfileSection
+from app.pages.inspect.results import accuracy_steps, inspect_region, profile_of, with_gate
 from app.pages.inspect.views import MAX_DRAWN_CORNERS, corners_of, rectangle
 from app.pages.session import Session
+from app.pages.shared.crop import NO_REGION
+from app.plots import inspect as inspect_plots
 from app.theme import DARK
 from app.units import scale
 from core import Acquisition, TrackingParameters, coates_rate, inspection, tracking_signals
@@ -360,6 +364,81 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
     page.chips.chosen = [[100, 132], 1]
     assert far.state.pixel == (100, 132)
     far.tasks.run_until(lambda: len(section.table.rows) == 3)
+
+
+# -- profile and crop ------------------------------------------------------------------------------
+
+
+def test_a_profile_runs_through_the_pins_and_is_saved_as_shown(building):
+    pins = ((20, 10), (45, 50))
+    building.state.param.update(page="Inspect", subject="Profile", pins=pins)
+    building.state.light = Illumination(sbr=0.5)
+    building.tasks.run_until(building.is_settled)
+    section = on_screen(ProfileSection(building))
+    answer, viewing = building.answer, building.state.viewing
+    assert section.view.main
+    expected = profile_of(answer, pins, viewing)
+    shown = section.plot.source("points").data
+    table = table_of(section, "profile")
+    for column, name, values in (
+        ("distance", inspect_plots.DISTANCE_LABEL, expected.distance_m),
+        ("range", "range (m)", expected.range_m),
+        ("low", "95 % interval, lowest (m)", expected.low_m),
+        ("high", "95 % interval, highest (m)", expected.high_m),
+        ("truth", "truth (m)", answer.capture.truth_range_m[expected.row, expected.col]),
+        ("row", "row", expected.row),
+        ("col", "col", expected.col),
+    ):
+        np.testing.assert_array_equal(shown[column], values)
+        np.testing.assert_array_equal(table[name], values)
+    assert section.note.text.startswith("41 pixels from 20, 10 to 45, 50, ")
+    assert text.WIDTH_GUESSED not in section.note.text  # the scene states its own
+    # A wider field of view, and fewer pixels on show.
+    wider = replace(viewing, field_of_view_deg=2 * viewing.field_of_view_deg, least_confidence=1.0)
+    before = section.found
+    building.state.viewing = wider
+    building.tasks.run_until(lambda: section.found is not before)
+    hidden = int((answer.run.image.confidence[expected.row, expected.col] < 1).sum())
+    assert f"{hidden} without a range, or hidden." in section.note.text
+    link = Link(dict(parse_qsl(building.query())))
+    again = Session(building.sources, link, tasks=HeldTasks()).state
+    assert (again.subject, again.pins, again.viewing) == ("Profile", pins, wider)
+    assert "core.inspection.line_profile(" in script_of(answer, building.state)
+    building.state.pins = pins[:1]
+    assert (section.note.text, section.found) == (text.NO_PROFILE, None)
+    with pytest.raises(ValueError, match="nothing is drawn here yet"):
+        section.downloads["profile"]()
+
+
+def test_lengths_rest_on_a_guess_unless_the_user_sets_the_field_of_view(far):
+    far.state.pins = ((100, 120), (130, 131))
+    section = on_screen(ProfileSection(far))
+    assert section.note.text.endswith(text.WIDTH_GUESSED)
+    far.state.viewing = replace(far.state.viewing, field_of_view_deg=1.0)
+    far.tasks.run_until(lambda: text.WIDTH_GUESSED not in section.note.text)
+    far.state.crop = Crop(to_m=1.0)
+    change(far, source="building")
+    assert far.state.crop == Crop()  # the limits were those of another scene
+
+
+def test_the_box_says_what_is_inside_refuses_crossed_limits_and_is_in_the_link(building):
+    page = Inspect(building)
+    page.show(True)
+    crop, image = page.crop, building.answer.run.image
+    n_shown = int((image.confidence >= 0.9).sum())
+    crop.settings.controls["to_m"].value = 840.0
+    assert building.state.crop == Crop(to_m=840.0)
+    n_inside = int(((image.confidence >= 0.9) & (image.range_m <= 840)).sum())
+    assert crop.note.text.startswith(f"{n_inside:,} of {n_shown:,} points are inside")
+    crop.settings.controls["from_m"].value = 850.0
+    assert "a number above Range from = 850" in crop.settings.doubts.text
+    assert building.state.crop == Crop(to_m=840.0)
+    crop.settings.controls["from_m"].value = None
+    crop.settings.controls["pixels"].value = "region"
+    assert crop.note.text == NO_REGION
+    link = Link(dict(parse_qsl(building.query())))
+    again = Session(building.sources, link, tasks=HeldTasks()).state
+    assert again.crop == Crop("region", None, 840.0)
 
 
 # -- A and B ---------------------------------------------------------------------------------------

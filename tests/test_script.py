@@ -122,9 +122,10 @@ STATES = {
     "&viewing.color_from_m=48&viewing.color_map=viridis&difference=true&pixel=[3,17]",
     "larger": "source=car_256&less.skip=3&image=Counts&absent=[%22signal_levels%22]",
     "inspected": "source=building&page=Inspect&map=SBR&pins=[[1,2],[30,41]]&pixel=[12,13]"
-    "&region=[[1,2],[1,12],[14,9.5]]&absent=[%22pulse_shape%22,%22reflectivity%22]",
-    "another method": "source=sample&page=Inspect&method=likelihood&pins=[[3,4]]"
-    "&region=[[1,2],[1,9],[7,5]]&settings.likelihood.steps_per_bin=4",
+    "&region=[[20,20],[20,50],[50,35.5]]&crop.pixels=region&crop.from_m=1"
+    "&absent=[%22pulse_shape%22,%22reflectivity%22]",
+    "another method": "source=sample&page=Inspect&method=likelihood&subject=Profile"
+    "&pins=[[3,4],[9,14]]&region=[[1,2],[1,9],[7,5]]&settings.likelihood.steps_per_bin=4",
     "file": "source=sample&reading.bin_width_s=1.5e-9&image=Counts",
 }
 
@@ -146,6 +147,11 @@ def test_scripts_reproduce_the_screen(tmp_path):
         same_pixel(more, str(pixel), inspect(answer, *pixel))
     mask = core.inspection.pixels_in(sessions["inspected"].state.region, answer.capture.shape)
     assert np.array_equal(more["region"].ravel(), answer.capture.cube[mask].sum(axis=0))
+    box = sessions["inspected"].state.box
+    inside = answer.run.image.confident(0.9).cropped(box)
+    header = (tmp_path / "inspected" / "cloud.ply").read_bytes().partition(b"end_header")[0]
+    assert f"comment box: {box}\n".encode() in header
+    assert f"element vertex {inside.valid.sum()}\n".encode() in header
     sbr = core.inspection.maps["SBR"](answer.capture)
     assert np.array_equal(more["picture"], sbr, equal_nan=True)
 
@@ -236,6 +242,8 @@ def test_every_parameter_is_in_the_script_of_some_page(name, car):
     first = {"source": "sample" if name in ("reading", "window") else "worn"}
     if name == "settings":
         first["comparison"] = Comparison(methods=tuple(core.ESTIMATORS))
+    if name == "crop":
+        first["region"] = ((1, 2), (1, 9), (7, 5))
     for value in ["building"] if name == "source" else another(name):
         seen = [{"page": page, **first} for page in PAGE_NAMES]
         assert any(

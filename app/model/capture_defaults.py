@@ -8,7 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from app.model.state import CLOUD_COLORS, IMAGES, MAPS, NEED_TRUTH, Comparison, State, Viewing
+from app.model.state import (
+    CLOUD_COLORS,
+    IMAGES,
+    MAPS,
+    NEED_TRUTH,
+    Comparison,
+    Crop,
+    State,
+    Viewing,
+)
 from app.model.store import Answer, same_pixels
 from core.geometry import guessed_field_of_view_deg
 from core.inspection import pixels_in
@@ -17,7 +26,7 @@ from core.report import telling_pixel
 KINDS = {"image": IMAGES, "map": MAPS, "cloud_color": CLOUD_COLORS}
 """Parameters of which some values require a truth, with all values."""
 
-FROM_CAPTURE = ("pixel", "pins", "region", "viewing", "comparison", *KINDS)
+FROM_CAPTURE = ("pixel", "pins", "region", "crop", "viewing", "comparison", *KINDS)
 """Parameters of the state whose default or possible values depend on the capture."""
 
 
@@ -52,6 +61,7 @@ def enter(state: State, answer: Answer, previous: Answer | None) -> None:
     changed: dict[str, Any] = {"field_of_view_deg": own["viewing"].field_of_view_deg}
     if previous is not None and previous.request.source is not answer.request.source:
         changed |= {"color_from_m": None, "color_to_m": None}  # limits of another scene
+        state.crop = Crop()
     compared = replace(state.comparison.viewing, **changed)
     here = {"pixel": state.pixel, "pins": state.pins, "region": state.region}
     kept = {} if previous is None else carried(here, previous, answer)

@@ -13,7 +13,7 @@ from app.model.state import Viewing
 from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS
 from core import inspection
-from core.geometry import pixel_angle_of
+from core.geometry import Box, pixel_angle_of
 from core.io import ColorScale, range_scale
 
 Array = NDArray[Any]
@@ -28,10 +28,15 @@ MAP_TITLES = {
 FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"
 
 
-def shown(answer: Answer, least_confidence: float) -> NDArray[np.bool_]:
-    """Return the pixels whose estimate is confident enough to be shown."""
+WHOLE = Box()
+"""A box that contains everything."""
+
+
+def shown(answer: Answer, least_confidence: float, box: Box = WHOLE) -> NDArray[np.bool_]:
+    """Return the pixels whose estimate is confident enough to be shown, and inside a box."""
     image = answer.run.image
-    return np.asarray(image.valid & (image.confidence >= least_confidence))
+    visible = image.valid & (image.confidence >= least_confidence)
+    return np.asarray(visible if box == WHOLE else visible & box.contains(image.range_m))
 
 
 def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
@@ -110,10 +115,10 @@ def color_values(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, Co
 
 
 def cloud_of(
-    answer: Answer, kind: str, viewing: Viewing
+    answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE
 ) -> tuple[pv.PolyData, NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Return a point cloud, its points' colours, and which are wrong; None without a truth."""
-    visible = shown(answer, viewing.least_confidence)
+    """Return the points inside a box, their colours, and which are wrong; None without a truth."""
+    visible = shown(answer, viewing.least_confidence, box)
     values, look = color_values(answer, kind, viewing)
     angle_rad = pixel_angle_of(viewing.field_of_view_deg, answer.capture.shape[1])
     range_m = np.where(visible, answer.run.image.range_m, np.nan)

@@ -15,6 +15,7 @@ FORMATS = {
     "html": "report: maps, cloud, numbers and script on one page",
     "ply": "the points on screen, with colours",
     "las": "the points on screen, for survey software",
+    "laz": "the same, compressed",
 }
 
 NOTHING_DRAWN = "There is nothing to save: nothing is drawn here yet. Try again later."
@@ -22,6 +23,11 @@ NOTHING_DRAWN = "There is nothing to save: nothing is drawn here yet. Try again 
 NO_POINTS = (
     "There is nothing to save: no estimate is confident enough to be shown. Lower “Show from "
     "confidence”, then try again."
+)
+
+NO_POINTS_INSIDE = (
+    "There is nothing to save: no estimate that is shown lies inside the box. Widen it under “Crop "
+    "the cloud”, then try again."
 )
 
 _GOES_ON = "The page works as before."

@@ -15,8 +15,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.model.colors import cloud_of, map_of, shown
-from app.model.download_text import NO_POINTS, NOTHING_DRAWN
+from app.model.colors import WHOLE, cloud_of, map_of, shown
+from app.model.download_text import NO_POINTS, NO_POINTS_INSIDE, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.script import script_of
 from app.model.state import UNITS, State, Viewing
@@ -25,7 +25,7 @@ from app.model.text import Fact
 from app.theme import WRONG_COLOR
 from app.units import AXIS_TITLES, Quantity, scale
 from core import Acquisition
-from core.geometry import pixel_angle_of
+from core.geometry import Box, pixel_angle_of
 from core.io import (
     WRITERS,
     ColorScale,
@@ -229,10 +229,11 @@ def _in_view(axis_range: Any, place: Array, half: float) -> NDArray[np.bool_]:
     return np.asarray((place + half > low) & (place - half < high))
 
 
-def _product(answer: Answer, least_confidence: float, **more: Any) -> Product:
+def _product(answer: Answer, least_confidence: float, box: Box = WHOLE, **more: Any) -> Product:
     """Return the pixels on show of an estimate, for `core.io.writers`."""
     more.setdefault("pixel_angle_rad", answer.capture.acquisition.pixel_angle_rad)
-    return Product(answer.capture, answer.run.image.confident(least_confidence), **more)
+    image = answer.run.image.confident(least_confidence)
+    return Product(answer.capture, image if box == WHOLE else image.cropped(box), **more)
 
 
 # Reports
@@ -269,8 +270,18 @@ def report_file(answer: Answer, state: State, title: str, own_field_of_view_deg:
 # Clouds
 
 
-def cloud_files(answer: Answer, kind: str, viewing: Viewing) -> dict[str, Write]:
+def cloud_files(
+    answer: Answer, kind: str, viewing: Viewing, is_width_guessed: bool, box: Box = WHOLE
+) -> dict[str, Write]:
     """Return the points of `app.model.colors.cloud_of` in their colours on screen.
+
+    Parameters
+    ----------
+    answer : Answer
+    kind, viewing, box
+        As for `cloud_of`.
+    is_width_guessed : bool
+        Whether the field of view is a guess; the files then say so.
 
     Raises
     ------
@@ -279,7 +290,10 @@ def cloud_files(answer: Answer, kind: str, viewing: Viewing) -> dict[str, Write]
     """
     if not shown(answer, viewing.least_confidence).any():
         raise ValueError(NO_POINTS)
-    prepare = partial(_cloud, answer, kind, viewing)
+    if not shown(answer, viewing.least_confidence, box).any():
+        raise ValueError(NO_POINTS_INSIDE)
+    remark = guessed_angle(viewing.field_of_view_deg) if is_width_guessed else ""
+    prepare = partial(_cloud, answer, kind, viewing, box, remark)
 
     def table(file: BinaryIO) -> None:
         product = prepare()
@@ -287,29 +301,23 @@ def cloud_files(answer: Answer, kind: str, viewing: Viewing) -> dict[str, Write]
         xyz_m = dict(zip(("x_m", "y_m", "z_m"), points.xyz_m.T, strict=True))
         write_columns(xyz_m | product.point_columns(points), file)
 
-    return {
-        "ply": lambda file: WRITERS[".ply"](prepare(), file),
-        "las": lambda file: WRITERS[".las"](prepare(), file),
-        "csv": table,
-    }
+    def points(suffix: str, file: BinaryIO) -> None:
+        WRITERS[f".{suffix}"](prepare(), file)
+
+    return {suffix: partial(points, suffix) for suffix in ("ply", "las", "laz")} | {"csv": table}
 
 
-def _cloud(answer: Answer, kind: str, viewing: Viewing) -> Product:
-    """Return the pixels on show with an image of their colours."""
-    cloud, rgb, wrong = cloud_of(answer, kind, viewing)
+def _cloud(answer: Answer, kind: str, viewing: Viewing, box: Box, remark: str) -> Product:
+    """Return the pixels inside a box with an image of their colours."""
+    cloud, rgb, wrong = cloud_of(answer, kind, viewing, box)
     rgb = rgb.copy()
     if wrong is not None:
         rgb[wrong] = tuple(bytes.fromhex(WRONG_COLOR[1:]))
     image = np.zeros((*answer.capture.shape, 3), np.uint8)
-    image[shown(answer, viewing.least_confidence)] = rgb
+    image[shown(answer, viewing.least_confidence, box)] = rgb
     angle_rad = float(cloud.field_data["pixel_angle_rad"][0])
-    unknown = answer.capture.acquisition.pixel_angle_rad is None
     return _product(
-        answer,
-        viewing.least_confidence,
-        pixel_angle_rad=angle_rad,
-        rgb=image,
-        remark=guessed_angle(viewing.field_of_view_deg) if unknown else "",
+        answer, viewing.least_confidence, box, pixel_angle_rad=angle_rad, rgb=image, remark=remark
     )
 
 

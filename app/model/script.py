@@ -10,9 +10,11 @@ from collections.abc import Iterator
 from dataclasses import fields
 from textwrap import indent
 
+from app.model.colors import WHOLE
 from app.model.state import CLOUDS, State, Viewing
 from app.model.store import Answer
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
+from core.geometry import Box
 from core.io import RangeColors
 from core.scripts import assign, call, changed_fields, literal
 
@@ -128,6 +130,7 @@ def _single_estimate(answer: Answer, state: State) -> Lines:
     yield assign("settings", f"core.ESTIMATORS[{method}].parameters", **settings)
     yield assign("image", "core.estimate", "capture", method, "settings")
     yield from _shown(state.viewing.least_confidence)
+    yield from _angle(state.viewing)
     yield f"picture = {IMAGES[kind]}"
     yield "\n# Signals of one pixel."
     yield f"row, col = {state.pixel[0]}, {state.pixel[1]}"
@@ -138,8 +141,7 @@ def _single_estimate(answer: Answer, state: State) -> Lines:
         yield "difference = core.first_difference(capture.cube[row, col])"
     yield "\n# Save image, point cloud and pixel."
     yield _saved('"range.png"', **_colors(state.viewing))
-    yield from _angle(state.viewing)
-    yield from _saved_cloud('"cloud.ply"')
+    yield from _saved_cloud('"cloud.ply"', state.box)
     pixel = ("capture", "row", "col", "settings", '"pixel.csv"')
     chosen = {} if answer.method == "tracking" else {"method": method}
     yield assign("", "core.save_pixel", *pixel, **chosen, overwrite="True")
@@ -160,6 +162,11 @@ def _reports(answer: Answer, state: State) -> Lines:
         yield "pinned = {}"
         for row, col in state.pins:
             yield _signals(answer.method, f"pinned[{row}, {col}]", f"{row}, {col}")
+    if state.subject == "Profile" and len(state.pins) > 1:
+        yield "\n# Profile along the line through the pinned pixels."
+        yield assign("points", "", *map(literal, state.pins))
+        line = ("capture", "shown", "points", "angle_rad")
+        yield assign("profile", "core.inspection.line_profile", *line)
     if state.region:
         yield "\n# Report on the region."
         yield assign("corners", "", *map(literal, state.region))
@@ -193,14 +200,19 @@ def _colors(viewing: Viewing) -> dict[str, str]:
     return {"colors": call("core.io.RangeColors", **changed)} if changed else {}
 
 
-def _saved(path: str, **options: str) -> str:
-    return assign("", "core.save_image", "capture", "shown", path, **options, overwrite="True")
+def _saved(path: str, image: str = "shown", **options: str) -> str:
+    return assign("", "core.save_image", "capture", image, path, **options, overwrite="True")
 
 
-def _saved_cloud(path: str) -> Lines:
+def _saved_cloud(path: str, box: Box = WHOLE) -> Lines:
+    image = "shown"
+    if box != WHOLE:
+        image = "cropped"
+        yield assign("box", "core.geometry.Box", **changed_fields(box))
+        yield "cropped = shown.cropped(box)"
     yield f"cloud = {path}"
-    yield "if shown.valid.any():  # a point cloud needs points"
-    yield indent(_saved("cloud", pixel_angle_rad="angle_rad"), "    ")
+    yield f"if {image}.valid.any():  # a point cloud needs points"
+    yield indent(_saved("cloud", image, pixel_angle_rad="angle_rad"), "    ")
 
 
 # The page that compares methods

@@ -13,8 +13,9 @@ from app.model.methods import OTHERS, default_settings
 from core import ESTIMATORS, Acquisition, Flux, TrackingParameters, Window
 from core.checks import require
 from core.estimators import FALSE_ALARM
+from core.geometry import Box
 from core.io import RangeColors, ReadOptions
-from core.parameters import Number, check_fields, parameter
+from core.parameters import Choice, Number, Settings, check_fields, parameter
 from core.reductions import Reduction
 from core.studies.ablation import TITLES
 
@@ -77,6 +78,63 @@ class Visibility:
 @dataclass(frozen=True)
 class Viewing(RangeColors, Visibility):
     """Display of the estimate; does not affect it."""
+
+
+ALL, REGION = "all", "region"
+"""Pixels that `Crop` keeps."""
+
+
+@dataclass(frozen=True)
+class Crop(Settings):
+    """Part of the scene that the 3D cloud of the estimate and its files hold.
+
+    Raises
+    ------
+    ValueError
+        If a field is out of its bounds, or the limits are not in ascending order.
+    """
+
+    pixels: str = parameter(
+        ALL,
+        Choice("Pixels", (ALL, REGION)),
+        "Pixels of the cloud: all, or those of the region that is selected on Inspect.",
+    )
+    from_m: float | None = parameter(
+        None,
+        Number(
+            "Range from",
+            0.0,
+            1e5,
+            unit="m",
+            least=-1e9,
+            most=1e9,
+            optional=True,
+            none_means="no limit",
+        ),
+        "Shortest range in the cloud.",
+    )
+    to_m: float | None = parameter(
+        None,
+        Number(
+            "Range to",
+            0.0,
+            1e5,
+            unit="m",
+            least=-1e9,
+            most=1e9,
+            optional=True,
+            none_means="no limit",
+        ),
+        "Longest range in the cloud.",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.box(())
+
+    def box(self, region: tuple[tuple[float, float], ...]) -> Box:
+        """Return the box that is kept, for the corners (row, col) of the selected region."""
+        return Box(region if self.pixels == REGION else (), self.from_m, self.to_m)
 
 
 @dataclass(frozen=True)
@@ -181,7 +239,7 @@ class Comparison:
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
 UNITS = ("bins", "ns", "m")
-SUBJECTS = ("Pixel", "Region", "Pins", "A/B", "Capture")
+SUBJECTS = ("Pixel", "Region", "Pins", "Profile", "A/B", "Capture")
 CLOUD_COLORS = ("Range", "Error", "Counts")
 NEED_TRUTH = ("Truth", "Error")
 
@@ -276,6 +334,7 @@ class State(param.Parameterized):
     image = param.Selector(default="Estimate", objects=list(IMAGES))
     cloud_color = param.Selector(default="Range", objects=list(CLOUD_COLORS))
     viewing = param.ClassSelector(class_=Viewing, default=Viewing())
+    crop = param.ClassSelector(class_=Crop, default=Crop())
     difference = param.Boolean(default=False, doc="Whether the first difference is drawn.")
     page: Any = Checked("Explore", _check_page, doc="Name of a page of `app.pages.catalog`.")
     unit = param.Selector(default="bins", objects=list(UNITS), doc="Unit of axes along the gate.")
@@ -291,3 +350,8 @@ class State(param.Parameterized):
     )
     kept = param.String(default="", doc="Query of the estimate that was kept as A.")
     comparison = param.ClassSelector(class_=Comparison, default=Comparison())
+
+    @property
+    def box(self) -> Box:
+        """The part of the scene that the cloud shows."""
+        return self.crop.box(self.region)

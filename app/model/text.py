@@ -24,7 +24,8 @@ Cell = tuple[str, float | None, str]
 """Text of a table's cell, the value to sort by, and a smaller second line."""
 
 FIELD_OF_VIEW_UNKNOWN = (
-    " The file does not state the field of view: the width of the cloud is a guess (see View)."
+    " The file does not state the field of view: the width of the cloud is a guess unless set "
+    "under View."
 )
 
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"

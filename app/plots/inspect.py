@@ -31,6 +31,13 @@ COUNTS_TITLES = {True: "Counts, and the two scales that follow them", False: "Co
 CANDIDATE_HEIGHT = 0.05
 """Height of the candidates' marks: near the bottom, where no legend hides them."""
 
+PROFILE_TITLE = "Range along the line through the pinned pixels"
+DISTANCE_LABEL = "Distance along the line (m)"
+PROFILE_COLUMNS = (
+    *("distance", "width", "range", "low", "high", "truth"),
+    *("confidence", "row", "col"),
+)
+
 NAMES = {
     "raw": "counts",
     "small": "small scale",
@@ -164,6 +171,50 @@ def accuracy() -> Any:
     drawing.xaxis.formatter = PrintfTickFormatter(format="%.3g")
     _vertical(drawing, empty("x", "y"), "present")
     return _with_legend(drawing, "bottom_right")
+
+
+def profile() -> Any:
+    """Plot ranges against the distance along a line, with their 95 % intervals."""
+    drawing = figure(
+        title=PROFILE_TITLE,
+        x_axis_label=DISTANCE_LABEL,
+        y_axis_label="Range (m)",
+        x_range=Range1d(0, 1),
+        y_range=Range1d(0, 1),
+        sizing_mode="stretch_both",
+        min_height=200,
+        tools="box_zoom,xwheel_zoom",
+        active_scroll="xwheel_zoom",
+        toolbar_location=None,
+    )
+    source = empty(*PROFILE_COLUMNS)
+    # Each pixel has a bar of its own: nothing is drawn where there is no estimate.
+    band = {"x": "distance", "bottom": "low", "top": "high", "width": "width"}
+    drawing.vbar(
+        **band,
+        source=source,
+        fill_alpha=0.3,
+        line_alpha=0.3,
+        name="interval",
+        legend_label=NAMES["interval"],
+    )
+    across = {"x": "distance", "source": source}
+    drawing.line(**across, y="range", line_width=1, line_alpha=0.5, name="line")
+    dashed = {"line_width": 2, "line_dash": "4 2", "legend_label": "truth"}
+    drawing.line(**across, y="truth", name="truth", **dashed)
+    points = drawing.scatter(**across, y="range", size=4, name="points", legend_label="estimate")
+    drawing.add_tools(
+        HoverTool(
+            renderers=[points],
+            tooltips=[
+                ("Row, column", "@row, @col"),
+                ("Distance (m)", "@distance{0.000}"),
+                ("Range (m)", "@range{0.000} [@low{0.000}, @high{0.000}]"),
+                ("Confidence", "@confidence{0.000}"),
+            ],
+        )
+    )
+    return _with_legend(drawing)
 
 
 def _over_the_gate(title: str, unit: str, bins: Range1d) -> Any:

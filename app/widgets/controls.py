@@ -46,6 +46,7 @@ class Knob(Component):
     log = param.Boolean(default=False)
     whole = param.Boolean(default=False)
     optional = param.Boolean(default=False, doc="Whether the field may be empty.")
+    empty = param.String(default="automatic", doc="Meaning of an empty field.")
     label = param.String(default="")
     unit = param.String(default="")
     help = param.String(default="")
@@ -68,6 +69,7 @@ class Knob(Component):
             log=spec.log,
             whole=spec.whole,
             optional=spec.optional,
+            empty=spec.none_means,
             label=spec.symbol,
             unit=spec.unit,
             help=help,

@@ -55,7 +55,7 @@ export function render({ model }) {
   const show = () => {
     const { value, low, high, initial, whole, log, doubtful } = model;
     track.parentElement.hidden = model.optional;
-    field.placeholder = model.optional ? "automatic" : "";
+    field.placeholder = model.optional ? model.empty : "";
     track.max = whole && !log ? high - low : STEPS;
     track.value = toPosition(value);
     track.style.setProperty("--filled", `${(100 * track.value) / track.max}%`);
@@ -79,7 +79,7 @@ export function render({ model }) {
     ask.title = help.textContent;
     ask.setAttribute("aria-label", `Help on ${model.label}`);
     track.title = model.help;
-    const initially = text(initial) || "automatic";
+    const initially = text(initial) || model.empty;
     reset.title = `Reset to ${initially}`;
     reset.setAttribute("aria-label", `Reset ${model.label} to ${initially}`);
     reset.style.visibility = value === initial ? "hidden" : "visible";

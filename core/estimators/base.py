@@ -15,6 +15,7 @@ from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.deprecation import renamed
+from core.geometry import Box
 from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
@@ -50,6 +51,8 @@ class Provenance:
         What the method left out of its model, see `Estimator.remark`.
     least_confidence : float, optional
         Estimates of less confidence have been removed, see `RangeImage.confident`.
+    box : Box, optional
+        Estimates outside it have been removed, see `RangeImage.cropped`.
     """
 
     method: str
@@ -57,12 +60,14 @@ class Provenance:
     false_alarm: float | None = None
     remark: str = ""
     least_confidence: float | None = None
+    box: Box | None = None
 
     @property
     def facts(self) -> dict[str, str | float]:
         """Facts for a file: all settings as JSON; what was not given is left out."""
         settings = json.dumps(asdict(self.settings), ensure_ascii=False)
-        known = vars(self) | {"settings": settings, "remark": self.remark or None}
+        box = self.box and str(self.box)
+        known = vars(self) | {"settings": settings, "remark": self.remark or None, "box": box}
         return {name: value for name, value in known.items() if value is not None}
 
 
@@ -149,9 +154,20 @@ class RangeImage:
             If `least` is not a probability.
         """
         require("least_confidence", least, 0 <= least <= 1, "a probability, 0 to 1")
-        kept = self.valid & (self.confidence >= least)
+        return self._kept(self.confidence >= least, least_confidence=least)
+
+    def cropped(self, box: Box) -> RangeImage:
+        """Return the image without estimates outside a box, which `made_by` then states.
+
+        Their scores and confidences are kept.
+        """
+        return self._kept(box.contains(self.range_m), box=box)
+
+    def _kept(self, pixels: NDArray[np.bool_], **why: Any) -> RangeImage:
+        """Return the image without the estimates of other pixels, and the reason in `made_by`."""
+        kept = self.valid & pixels
         range_m, bins = (np.where(kept, each, np.nan) for each in (self.range_m, self.bin))
-        made_by = self.made_by and replace(self.made_by, least_confidence=least)
+        made_by = self.made_by and replace(self.made_by, **why)
         return replace(self, range_m=range_m, bin=bins, valid=kept, made_by=made_by)
 
 

@@ -1,14 +1,16 @@
-"""Reports on a pixel, a region and a capture, with uncertainties."""
+"""Reports on a pixel, a line, a region and a capture, with uncertainties."""
 
+from core.geometry import pixels_in
 from core.inspection.capture import CaptureReport, Suggestion, capture_report
 from core.inspection.faulty import FaultyPixel, faulty_pixels
 from core.inspection.flux import estimate_flux
+from core.inspection.line_profile import LineProfile, line_profile
 from core.inspection.maps import maps
 from core.inspection.mean_flux import estimate_mean_flux, estimate_target_flux
 from core.inspection.pixel import PixelReport, RangeCandidate, pixel_report
 from core.inspection.profile import LEVEL, FluxEstimate
 from core.inspection.pulses import Accuracy, accuracy_over_pulses
-from core.inspection.region import RegionReport, pixels_in, region_report
+from core.inspection.region import RegionReport, region_report
 
 # Deprecated names, to be removed after the next release.
 LightFound, light_found, mean_light = FluxEstimate, estimate_flux, estimate_mean_flux
@@ -22,6 +24,7 @@ __all__ = [
     "FaultyPixel",
     "FluxEstimate",
     "LightFound",
+    "LineProfile",
     "PixelReport",
     "RangeCandidate",
     "RegionReport",
@@ -33,6 +36,7 @@ __all__ = [
     "estimate_target_flux",
     "faulty_pixels",
     "light_found",
+    "line_profile",
     "maps",
     "mean_light",
     "pixel_report",

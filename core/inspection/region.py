@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,33 +44,6 @@ class RegionReport(OldFluxNames):
     """Mean signal and background of the pixels, and their ratio, with 95 % intervals."""
     flux_unit: str
     flux_method: str
-
-
-def pixels_in(polygon: Sequence[tuple[float, float]], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Find the pixels whose centres lie in a polygon or on its edge, shape (row, col).
-
-    Parameters
-    ----------
-    polygon : sequence of (row, col)
-        Corners, at least 3, in pixels; the centre of the first pixel is (0, 0).
-    shape : tuple of int
-        Rows and columns of the image.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer corners, or one is not finite.
-    """
-    from matplotlib.path import Path  # noqa: PLC0415 - slow to load
-
-    corners = np.asarray(polygon, float)
-    usable = corners.ndim == 2 and corners.shape[1] == 2 and len(corners) >= 3
-    usable = usable and bool(np.isfinite(corners).all())
-    require("polygon", f"{len(polygon)} corners", usable, "3 or more finite (row, col)")
-    path, centres = Path(corners), np.indices(shape).reshape(2, -1).T
-    # The sign of the margin that includes the edge depends on the orientation of the polygon.
-    inside = [path.contains_points(centres, radius=margin) for margin in (-1e-9, 1e-9)]
-    return np.asarray(np.logical_or(*inside).reshape(shape))
 
 
 def region_report(

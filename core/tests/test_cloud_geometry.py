@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from core.geometry import distance_m, points_m, sight_lines
+from core.geometry import Box, distance_m, points_m, sight_lines
 
 ANGLE = 2e-3
 
@@ -100,3 +100,18 @@ def test_a_distance_follows_the_law_of_cosines_and_its_margin_the_scatter() -> N
 def test_one_point_is_as_far_from_itself_as_its_range_is_uncertain() -> None:
     line = sight_lines((3, 3), ANGLE)[1, 1]
     assert distance_m([line, line], [7.0, 7.0], [0.3, 0.4]) == (0.0, pytest.approx(0.5))
+
+
+def test_a_box_contains_the_ranges_between_its_limits_in_its_polygon() -> None:
+    range_m = np.array([[1.0, 2.0, 3.0], [np.nan, 5.0, 6.0]])
+    corners = ((-0.5, 0.5), (-0.5, 2.5), (1.5, 2.5), (1.5, 0.5))
+    assert Box().contains(range_m).tolist() == [[True] * 3, [False, True, True]]
+    assert range_m[Box(corners).contains(range_m)].tolist() == [2, 3, 5, 6]
+    assert range_m[Box(corners, 3.0).contains(range_m)].tolist() == [3, 5, 6]
+    assert range_m[Box((), 2.0, 5.0).contains(range_m)].tolist() == [2, 3, 5]
+    assert str(Box(((0, 1.5), (2, 3), (4, 5)), None, 48.0)) == (
+        "pixels in the polygon of corners row,col 0,1.5 2,3 4,5; ranges to 48 m"
+    )
+    assert (str(Box(from_m=1, to_m=2)), str(Box())) == ("ranges from 1 m to 2 m", "everything")
+    with pytest.raises(ValueError, match=r"to_m = 3\.0 is not accepted: give a number above"):
+        Box(from_m=3.0, to_m=3.0)

@@ -30,7 +30,7 @@ from core.acquisition import Acquisition
 from core.capture import Capture
 from core.estimators import Provenance, RangeImage
 from core.estimators.base import NoParameters
-from core.geometry import sight_lines
+from core.geometry import Box, sight_lines
 from core.io.readers.labelled import dataset
 from core.io.writers import (
     CAPTURE_SUFFIXES,
@@ -574,13 +574,15 @@ FACTS_OF: dict[str, Callable[[Path], dict[str, Any]]] = {
 @pytest.mark.parametrize("suffix", [*WRITERS, *FOLDER_WRITERS])
 def test_every_file_states_method_settings_version_and_source(tmp_path: Path, suffix: str) -> None:
     made_by = Provenance("tracking", TrackingParameters(l=0.02), 0.05, "no pile-up is undone")
-    image = replace(IMAGE, made_by=made_by).confident(0.7)
+    box = Box(from_m=1.0)
+    image = replace(IMAGE, made_by=made_by).confident(0.7).cropped(box)
     found = FACTS_OF[suffix](saved(tmp_path, suffix, image))
     settings = json.loads(found["settings"])
     assert settings == asdict(made_by.settings)
     assert (found["method"], found["remark"]) == ("tracking", "no pile-up is undone")
     assert float(found["false_alarm"]) == 0.05
     assert float(found["least_confidence"]) == 0.7
+    assert found["box"] == "ranges from 1 m" == str(box)
     assert found["software"] == f"firstphoton {core.__version__}"
     source = PLAIN_SOURCE
     if suffix in {".ply", ".pcd"}:  # ASCII
@@ -611,6 +613,11 @@ def test_estimates_state_how_they_were_made() -> None:
     np.testing.assert_array_equal(sure.range_m[sure.valid], image.range_m[sure.valid])
     with pytest.raises(ValueError, match="least_confidence = 90"):
         image.confident(90)
+    box = Box(((0, 0), (0, 2), (2, 2), (2, 0)), to_m=float(np.nanmedian(image.range_m)))
+    inside = image.cropped(box)
+    np.testing.assert_array_equal(inside.valid, image.valid & box.contains(image.range_m))
+    np.testing.assert_array_equal(np.isfinite(inside.range_m), inside.valid)
+    assert inside.made_by == replace(image.made_by, box=box)
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".h5"])

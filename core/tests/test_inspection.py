@@ -17,6 +17,7 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
+from core.geometry import Box
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.profile import difference_of, ratio_of
 from core.metrics import Interval, restored
@@ -248,6 +249,51 @@ def test_a_region_is_its_pixels_added_to_one() -> None:
         inspection.region_report(capture, image, np.zeros((8, 8), bool))
     with pytest.raises(ValueError, match="mask = "):
         inspection.region_report(capture, image, np.zeros((8, 7), bool))
+
+
+def test_a_profile_holds_ranges_and_intervals_of_the_pixels_on_a_line() -> None:
+    acquisition = replace(ACQUISITION, pixel_angle_rad=1e-3)
+    rows = np.repeat(np.linspace(20, 40, 9), 9).reshape(9, 9)  # in bins
+    scene = Scene(acquisition.bin_to_range_m(rows), acquisition=acquisition)
+    capture = simulate(scene, acquisition, Flux(1.0, 1.0), seed=8)
+    image = estimate(capture, "likelihood").cropped(Box(((-1, -1), (-1, 9), (5, 9), (5, -1))))
+    found = inspection.line_profile(capture, image, [(0, 0), (8, 4), (8, 4), (8, 8)])
+    assert list(zip(found.row, found.col, strict=True))[::2] == [
+        *((2 * n, n) for n in range(5)),
+        *((8, 6), (8, 8)),
+    ]
+    here = found.row, found.col
+    np.testing.assert_array_equal(found.range_m, image.range_m[here])
+    assert np.isnan(found.range_m[6:]).all() and np.isfinite(found.range_m[:6]).all()
+    interval = core.range_interval(capture, image)
+    np.testing.assert_allclose(found.low_m, interval.low_m[here])
+    np.testing.assert_allclose(found.high_m, interval.high_m[here])
+    assert capture.truth_range_m is not None and found.truth_m is not None
+    np.testing.assert_array_equal(found.truth_m, capture.truth_range_m[here])
+    np.testing.assert_array_equal(found.confidence, image.confidence[here])
+    # Across the line of sight, at the median depth: 8 rows and 4 columns, then 4 columns.
+    assert found.depth_m == pytest.approx(np.median(found.range_m[:6]), rel=1e-4)
+    pixel_m = found.depth_m * np.tan(1e-3)
+    assert found.distance_m[[0, 8, 12]] == pytest.approx(
+        [0, math.sqrt(80) * pixel_m, (math.sqrt(80) + 4) * pixel_m]
+    )
+    assert (np.diff(found.distance_m) > 0).all()
+    wider = inspection.line_profile(capture, image, [(0, 0), (8, 4)], 2e-3)
+    assert wider.distance_m[-1] == pytest.approx(2 * found.distance_m[8], rel=1e-4)
+    unseen = inspection.line_profile(capture, image, [(8, 0), (8, 8)])
+    assert np.isnan(unseen.distance_m).all()
+    for points in (
+        [(0, 0)],
+        [(1, 1), (1, 1)],
+        [(0, 0), (0, 9)],
+        [(0, -1), (0, 1)],
+        [(0, 0.5), (1, 1)],
+    ):
+        with pytest.raises(ValueError, match=r"points = .* 2 or more"):
+            inspection.line_profile(capture, image, points)
+    unknown = replace(capture, acquisition=replace(acquisition, pixel_angle_rad=None))
+    with pytest.raises(ValueError, match="pixel_angle_rad = None"):
+        inspection.line_profile(unknown, image, [(0, 0), (1, 1)])
 
 
 # -- a capture -------------------------------------------------------------------------------------

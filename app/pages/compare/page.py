@@ -426,7 +426,8 @@ class Compare(Section):
         image_kind = IMAGE_KINDS.get(kind, kind)
         _, look = image_of(self.session.answer, image_kind, viewing)
         if kind == CLOUDS:
-            what, files = "cloud", cloud_files(answer, "Range", viewing)
+            is_guessed = self.session.is_width_guessed(viewing)
+            what, files = "cloud", cloud_files(answer, "Range", viewing, is_guessed)
         else:
             figure = self.pictures[place].image.figure
             files = image_files(answer, image_kind, viewing, figure, look, method_title(method))

@@ -16,10 +16,12 @@ from app.model.store import Answer, inspect
 from app.pages.explore import text
 from app.pages.navigation import Page
 from app.pages.session import Session
+from app.pages.shared.crop import CropSection
 from app.pages.shared.downloads import (
     CLOUD,
     IMAGE_AND_REPORT,
     Shown,
+    cropped,
     downloadable_facts,
     explored,
     image_on_show,
@@ -80,6 +82,8 @@ class Explore(Section):
     legend : Sentence
         What is hidden in the image.
     cloud : PointCloud
+    crop : CropSection
+        The box to which the cloud is cropped.
     """
 
     def __init__(self, session: Session) -> None:
@@ -104,6 +108,7 @@ class Explore(Section):
         self._difference = pmui.Switch.from_param(
             state.param.difference, label="First difference", size="small", margin=(0, 8)
         )
+        self.crop = CropSection(session)
         self._is_outdated, self._pictures_are_due = True, False
         self._requested_s = 0.0
         self._show_sidebar()
@@ -112,7 +117,9 @@ class Explore(Section):
         draw_pixel = session.tasks.soon(self._draw_pixel)
         state.param.watch(draw_pixel, ["pixel", "difference", "unit"])
         draw_pictures = partial(session.tasks.queue, self._draw_pictures)
-        state.param.watch(lambda *_: draw_pictures(), ["image", "cloud_color", "viewing"])
+        state.param.watch(
+            lambda *_: draw_pictures(), ["image", "cloud_color", "viewing", "crop", "region"]
+        )
 
     def layout(self) -> tuple[Any, Any]:
         """Return the two columns of the page, and its part of the sidebar."""
@@ -140,6 +147,7 @@ class Explore(Section):
         main = [self.figures, pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both")]
         return main, [
             part("View", self._viewing.layout, self._difference),
+            self.crop.part,
             part("About this page", pmui.Typography(text.EXPLANATION, margin=8), is_open=False),
         ]
 
@@ -160,9 +168,11 @@ class Explore(Section):
         """Return the cloud, for a download, with the colour scale of the image."""
         session, state = self.session, self.session.state
         _, look = color_values(session.answer, state.cloud_color, state.viewing)
-        files = cloud_files(session.answer, state.cloud_color, state.viewing)
+        is_guessed = session.is_width_guessed(state.viewing)
+        chosen = state.cloud_color, state.viewing, is_guessed, state.box
+        files = cloud_files(session.answer, *chosen)
         heading = f"3D cloud, coloured by {state.cloud_color.lower()}"
-        subject = viewed(session, explored(session), state.viewing)
+        subject = cropped(session, viewed(session, explored(session), state.viewing))
         return Shown(subject, "cloud", files, heading, look)
 
     # Notifications
@@ -175,6 +185,7 @@ class Explore(Section):
             self._draw_pixel()
             self._draw_pictures()
         self._large.show(is_on_screen)
+        self.crop.show(is_on_screen)
 
     def follow(self, answer: Answer) -> None:
         """Show another estimate of the session."""
@@ -187,6 +198,7 @@ class Explore(Section):
             self._requested_s = perf_counter()
             self.session.tasks.call_later(PICTURES_DELAY_MS, self._request_pictures)
         self._large.follow(answer)
+        self.crop.follow(answer)
 
     def paint(self, dark: bool) -> None:
         """Change between light and dark mode."""
@@ -246,10 +258,14 @@ class Explore(Section):
             values, look = image_of(answer, state.image, state.viewing)
             self.image.update(values, look)
             self.legend.text = legend(answer, state.image, state.viewing, values, look)
-            cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing)
-            self.cloud.draw(cloud, rgb, crosses, scene_id=self.session.scene_id())
+            box, is_guessed = state.box, self.session.is_width_guessed(state.viewing)
+            cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing, box)
+            # Another box is framed by the camera, like another scene.
+            self.cloud.draw(cloud, rgb, crosses, scene_id=f"{self.session.scene_id()} {box}")
             n_wrong = None if crosses is None else int(crosses.sum())
-            self.cloud.caption = text.cloud_caption(answer, cloud.n_points, n_wrong)
+            self.cloud.caption = text.cloud_caption(
+                answer, cloud.n_points, n_wrong, box, is_guessed
+            )
 
 
 PAGE = Page("Explore", Explore, "shows one method in detail", sidebar_last=True)

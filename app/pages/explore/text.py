@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from app.model.colors import WHOLE
 from app.model.store import Answer, Pixel
 from app.model.text import Fact, estimate_facts, milliseconds, number, share
 from app.units import count, scale
+from core.geometry import Box
 
 IMAGE_HELP = "Quantity shown in the image"
 
@@ -89,8 +91,16 @@ def _accelerations(answer: Answer, pixel: Pixel) -> list[Fact]:
     ]
 
 
-def cloud_caption(answer: Answer, n_shown: int, n_wrong: int | None) -> str:
+def cloud_caption(
+    answer: Answer,
+    n_shown: int,
+    n_wrong: int | None,
+    box: Box = WHOLE,
+    is_width_guessed: bool = False,
+) -> str:
     """Return the line under the cloud."""
     total = answer.capture.shape[0] * answer.capture.shape[1]
-    line = f"{n_shown:,} of {total:,} estimates shown"
-    return line if n_wrong is None else f"{line}, {n_wrong:,} of them wrong (crosses)"
+    line = f"{n_shown:,} of {total:,} estimates {'shown' if box == WHOLE else 'in the box'}"
+    if n_wrong is not None:
+        line += f", {n_wrong:,} of them wrong (crosses)"
+    return line + ("; width is a guess" if is_width_guessed else "")

@@ -19,10 +19,12 @@ from app.pages.inspect.capture import CaptureSection
 from app.pages.inspect.pair import PairSection
 from app.pages.inspect.pins import PinsSection, pin_colors
 from app.pages.inspect.pixel import BREAK_PX, COLUMN, FILLING, NARROW, PixelSection, framed
+from app.pages.inspect.profile import ProfileSection
 from app.pages.inspect.results import Corners
 from app.pages.inspect.views import Navigator, rectangle
 from app.pages.navigation import Page, Pages
 from app.pages.session import Session
+from app.pages.shared.crop import CropSection
 from app.pages.shared.downloads import CORNER_PX, IMAGE_AND_REPORT, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
@@ -70,6 +72,8 @@ class Inspect(Section):
         The keyboard of the map.
     place, span : list of pmui.TextInput
         Row and column of the pixel, rows and columns of a region.
+    crop : CropSection
+        The box to which the cloud is cropped.
     chips : Chips
         The pinned pixels.
     legend : Sentence
@@ -110,6 +114,7 @@ class Inspect(Section):
         )
         # Sent and drawn only where there are such pixels.
         self._faulty_part = part(text.FAULTY, self.n_faulty, self.faulty, is_shown=False)
+        self.crop = CropSection(session)
         self.chips = Chips(label="Pinned pixels", sizing_mode="stretch_width", margin=0)
         self._map = pmui.Select.from_param(
             state.param.map,
@@ -144,6 +149,7 @@ class Inspect(Section):
                 "Pixel": lambda: PixelSection(session, "pixel").view,
                 "Region": lambda: PixelSection(session, "region").view,
                 "Pins": lambda: PinsSection(session).view,
+                "Profile": lambda: ProfileSection(session).view,
                 "A/B": lambda: PairSection(session).view,
                 "Capture": lambda: CaptureSection(session).view,
             },
@@ -171,6 +177,7 @@ class Inspect(Section):
         self.chips.param.watch(lambda event: self._unpin(event.new[0]), "removed")
         for name, draw in self._marks.items():
             state.param.watch(lambda _, draw=draw: self._draw_mark(draw), name)
+        state.param.watch(lambda *_: self._draw_mark(self._frame_pins), "subject")
         state.param.watch(lambda *_: self._request_map(), ["map", "viewing"])
 
     def layout(self) -> tuple[Any, Any]:
@@ -202,6 +209,7 @@ class Inspect(Section):
         return main, [
             self._faulty_part,
             part("View", *colors, self._viewing.doubts, is_open=False),
+            self.crop.part,
             part(
                 "How to read this page",
                 pmui.Typography(text.EXPLANATION, margin=8),
@@ -220,11 +228,13 @@ class Inspect(Section):
             self._enter()
             self._request_map()
         self._large.show(is_on_screen)
+        self.crop.show(is_on_screen)
         self._sections.show(is_on_screen)
 
     def follow(self, answer: Answer) -> None:
         """Show another estimate of the session."""
         self._large.follow(answer)
+        self.crop.follow(answer)
         if self.is_on_screen:
             self._enter()
             self._sections.follow(answer)
@@ -336,6 +346,7 @@ class Inspect(Section):
     def _frame_pins(self) -> None:
         pins, colors = self.session.state.pins, pin_colors(self.is_dark)
         self.navigator.pin(pins, colors)
+        self.navigator.join_pins(pins if self.session.state.subject == "Profile" else ())
         self.chips.chips = [
             [list(pin), text.pixel_name(pin, self.session.answer.grid), color]
             for pin, color in zip(pins, colors, strict=False)

@@ -108,7 +108,9 @@ class PinsSection(Section):
         self._write_note()
 
     def _write_note(self) -> None:
-        distances = text.distances(self.found, self.session.state.viewing)
+        viewing = self.session.state.viewing
+        is_guessed = self.session.is_width_guessed(viewing)
+        distances = text.distances(self.found, viewing, is_guessed)
         self.note.text = distances if self.found else text.NO_PINS
 
 

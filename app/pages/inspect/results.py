@@ -11,11 +11,19 @@ from numpy.typing import NDArray
 
 from app.model.budget import spending
 from app.model.colors import shown
-from app.model.state import ReductionSettings
+from app.model.state import ReductionSettings, Viewing
 from app.model.store import Answer, Pixel, inspect, reduced
 from core import inspection
 from core.cost import predicted_flux_time
-from core.inspection import Accuracy, CaptureReport, PixelReport, RegionReport, Suggestion
+from core.geometry import pixel_angle_of
+from core.inspection import (
+    Accuracy,
+    CaptureReport,
+    LineProfile,
+    PixelReport,
+    RegionReport,
+    Suggestion,
+)
 from core.metrics import Interval, wilson
 
 Array = NDArray[Any]
@@ -70,6 +78,13 @@ def inspect_region(answer: Answer, region: Corners) -> Inspected:
         report = inspection.region_report(answer.capture, answer.run.image, mask, *chosen)
     of_sum = replace(answer, run=replace(answer.run, capture=report.summed, image=report.image))
     return Inspected(answer, inspect(of_sum, 0, 0, report.pixel), report.pixel, report)
+
+
+def profile_of(answer: Answer, pins: Sequence[tuple[int, int]], viewing: Viewing) -> LineProfile:
+    """Return the ranges on show along the line that joins pixels."""
+    angle_rad = pixel_angle_of(viewing.field_of_view_deg, answer.capture.shape[1])
+    image = answer.run.image.confident(viewing.least_confidence)
+    return inspection.line_profile(answer.capture, image, pins, angle_rad)
 
 
 def inspect_capture(answer: Answer) -> CaptureReport:

@@ -37,7 +37,7 @@ from app.units import (
 from app.units import interval as format_interval
 from core import Capture
 from core.geometry import distance_m, pixel_angle_of, sight_lines
-from core.inspection import Candidate, CaptureReport, FaultyPixel, FluxEstimate
+from core.inspection import Candidate, CaptureReport, FaultyPixel, FluxEstimate, LineProfile
 from core.io import changed_settings
 from core.metrics import Interval
 
@@ -46,8 +46,12 @@ EXPLANATION = """
 With *Rectangle* or *Lasso*, drag on the map to select a region; its histograms are summed and shown
 as one. With *Zoom*, drag to enlarge; the wheel zooms as well, and a double tap shows the whole map.
 
-**Compare.** *Pin this pixel*, or the key P, keeps up to four pixels, and *Pins* their
-distances. *A/B* keeps an estimate and subtracts it from later ones.
+**Compare.** *Pin this pixel*, or the key P, keeps up to four pixels. *Pins* shows their distances,
+*Profile* the ranges along the line that joins them. *A/B* keeps an estimate and subtracts it from
+later ones.
+
+**Crop.** *Crop the cloud* limits the 3D cloud of Explore and its files to the region, to ranges, or
+to both.
 
 **Judge.** Candidates are the peaks of the estimator's score. Each has the probability of a surface
 within 3 bins of it, which does not depend on the estimator. S, B and SBR are estimated from the
@@ -59,13 +63,21 @@ MAP_HELP = (
     "detection. SBR: estimated from the counts."
 )
 MODE_HELP = "What dragging on the map does; a tap always selects a pixel."
-SUBJECT_HELP = "What to inspect: one pixel, the region, the pinned pixels, or the whole capture."
+SUBJECT_HELP = (
+    "What to inspect: one pixel, the region, the pinned pixels, the line that joins them, or the "
+    "whole capture."
+)
 PIN_HELP = "Pin this pixel: keep it for comparison (key P on the map)."
 SELECT_HELP = "Select region: all pixels in these rows and columns."
 CLEAR_HELP = "Clear region: remove the selected region."
 TOO_MANY_PINS = "Four pixels are pinned already: remove one first."
 NO_PINS = "No pixels are pinned. Select a pixel and press “Pin this pixel”, or P on the map."
 WIDTH_GUESSED = "Lengths across the line of sight follow from the field of view, which is a guess."
+NO_PROFILE = (
+    "Pin two or more pixels: the profile runs along the line that joins them. Select a pixel and "
+    "press “Pin this pixel”, or P on the map."
+)
+NO_RANGES = "No estimate on the line is confident enough to be shown. Lower “Show from confidence”."
 NO_REGION = (
     "No region is selected. Drag a rectangle or a lasso on the map, or type rows and columns such "
     "as 10-20."
@@ -257,12 +269,12 @@ def pin_row(found: Inspected, name: str, color: str, along: Scale, other: Scale)
     }
 
 
-def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
+def distances(found: Sequence[Inspected], viewing: Viewing, is_width_guessed: bool) -> str:
     """Return the distance of each pin from the first one; empty for fewer than two."""
     if len(found) < 2:
         return ""
     answer = found[0].answer
-    shape, acquisition = answer.capture.shape, answer.capture.acquisition
+    shape = answer.capture.shape
     lines = sight_lines(shape, pixel_angle_of(viewing.field_of_view_deg, shape[1]))
     names = [pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
     first, sentences = found[0].pixel, []
@@ -274,8 +286,23 @@ def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
         known = math.isfinite(length_m)
         length = plus_minus(length_m - margin_m, length_m + margin_m, "m") if known else "not known"
         sentences.append(f"{length} to {name}")
-    guessed = "" if acquisition.pixel_angle_rad is not None else f" {WIDTH_GUESSED}"
+    guessed = f" {WIDTH_GUESSED}" if is_width_guessed else ""
     return f"From {names[0]}: {', '.join(sentences)} (95 %).{guessed}"
+
+
+def profile_sentence(answer: Answer, profile: LineProfile, is_width_guessed: bool) -> str:
+    """Return where a profile runs, how much of it is hidden, and what its lengths rest on."""
+    row, col, n_pixels = profile.row.tolist(), profile.col.tolist(), profile.row.size
+    first, last = (pixel_name((row[end], col[end]), answer.grid) for end in (0, -1))
+    n_hidden = int(np.isnan(profile.range_m).sum())
+    line = f"{n_pixels:,} pixels from {first} to {last}"
+    if n_hidden == n_pixels:
+        return f"{line}. {NO_RANGES}"
+    length_m = number(float(profile.distance_m[-1]), "m")
+    line += f", {length_m} across the line of sight at a depth of {number(profile.depth_m, 'm')}."
+    if n_hidden:
+        line += f" {n_hidden:,} without a range, or hidden."
+    return f"{line} {WIDTH_GUESSED}" if is_width_guessed else line
 
 
 def pixel_name(pixel: tuple[int, int], grid: Grid) -> str:

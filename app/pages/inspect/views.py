@@ -93,6 +93,17 @@ class Navigator(ImageView):
             name="pins",
         )
 
+        self._line = inspect_plots.empty("x", "y")
+        for name, color, thickness in (("shadow", "#000000", 3.5), ("line", "#ffffff", 1.5)):
+            figure.line(
+                "x",
+                "y",
+                source=self._line,
+                line_color=color,
+                line_width=thickness,
+                name=f"line {name}",
+            )
+
         self._faulty = inspect_plots.empty("x", "y", "marker")
         for name, color, thickness in (("shadow", "#000000", 3.5), ("mark", "#ffffff", 1.5)):
             figure.scatter(
@@ -138,6 +149,11 @@ class Navigator(ImageView):
         ).reshape(-1, 4)
         sides = dict(zip(("left", "bottom", "right", "top"), frames.T, strict=True))
         self._pins.data = {**sides, "color": list(colors[: len(pins)])}
+
+    def join_pins(self, pins: Sequence[tuple[int, int]]) -> None:
+        """Draw a line that joins pixels; none if they are fewer than two."""
+        places = [self._grid.place(*pin) for pin in pins]
+        self._line.data = {"x": [col for _, col in places], "y": [row for row, _ in places]}
 
 
 def corners_of(geometry: Mapping[str, Any]) -> Corners:

@@ -25,14 +25,16 @@ import param
 
 import core
 from app.model import download_text
+from app.model.colors import WHOLE
 from app.model.exports import Write, image_files, report_file
-from app.model.state import Viewing
+from app.model.state import ALL, Crop, Viewing
 from app.model.store import Answer, Request
 from app.pages.session import Session
 from app.tasks.scheduler import FILES
 from app.widgets.component import Component
 from app.widgets.figures import Layers
 from core import inspection
+from core.geometry import Box
 from core.io import ColorScale, changed_settings, file_name
 
 log = logging.getLogger(__name__)
@@ -46,7 +48,7 @@ PICTURES = ("png", "svg")
 PLOT = (*PICTURES, "csv")
 IMAGE = (*PLOT, "npz", "tif")
 IMAGE_AND_REPORT = (*IMAGE, "html")
-CLOUD = ("png", "ply", "las", "csv")
+CLOUD = ("png", "ply", "las", "laz", "csv")
 TABLE = ("csv",)
 """Formats of each kind of card."""
 
@@ -74,6 +76,8 @@ class Subject:
         Rows and columns of the capture, if not all.
     viewing : Viewing, optional
         Confidence threshold and field of view, described in files; names have those in `settings`.
+    box : Box, optional
+        Part of the scene, described in files.
     """
 
     capture: str
@@ -82,6 +86,7 @@ class Subject:
     source: str = ""
     part: str = ""
     viewing: Viewing | None = None
+    box: Box | None = None
 
     @property
     def chosen(self) -> list[str]:
@@ -101,11 +106,12 @@ class Subject:
 
     def lines(self, what: str) -> list[str]:
         """Return the description inside a file: version, method, all settings and source."""
-        settings = [each for each in self.settings if not isinstance(each, Viewing)]
+        settings = [each for each in self.settings if not isinstance(each, Viewing | Crop)]
         return [
             f"firstphoton {core.__version__}: {what}",
             *([f"method: {self.estimator}"] if self.estimator else []),
             *(f"settings: {each}" for each in filter(None, (*settings, self.viewing))),
+            *([f"box: {self.box}"] if self.box else []),
             *([f"source: {' '.join(self.source.split())}"] if self.source else []),
         ]
 
@@ -317,6 +323,16 @@ def viewed(session: Session, subject: Subject, viewing: Viewing) -> Subject:
     is_own = viewing.field_of_view_deg == session.own_field_of_view_deg
     in_name = replace(viewing, field_of_view_deg=Viewing().field_of_view_deg) if is_own else viewing
     return replace(subject, settings=(*subject.settings, in_name), viewing=viewing)
+
+
+def cropped(session: Session, subject: Subject) -> Subject:
+    """Add the box to which the cloud is cropped, if any."""
+    crop, box = session.state.crop, session.state.box
+    if box == WHOLE:
+        return subject
+    limits = replace(crop, pixels=ALL)
+    part = region_on_show(session) if box.polygon else subject.part
+    return replace(subject, settings=(*subject.settings, limits), part=part, box=box)
 
 
 def pixel_plot(session: Session, plot: Layers, what: str) -> Shown:
