@@ -67,6 +67,8 @@ class Source:
     given: ReadOptions = NO_OPTIONS
     """Options for reading that hold unless a request has others."""
     truth: AddedTruth | None = None
+    path: Path | None = None
+    """Where the file is; None for a scene."""
 
     @property
     def is_scene(self) -> bool:
@@ -91,7 +93,7 @@ class Source:
 
 @dataclass(frozen=True)
 class AddedTruth:
-    """True ranges from another file than the capture's."""
+    """True ranges that a file holds: another one than the capture's, or the same."""
 
     to: Source
     """The capture."""
@@ -143,7 +145,7 @@ def file_source(
         return open_large(path, vars(reading.completed_by(given)))
 
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, load, large=opened, name=path.name, given=given)
+    return Source(title or path.name, load, large=opened, name=path.name, given=given, path=path)
 
 
 def content_key(path: Path) -> str:
