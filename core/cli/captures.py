@@ -41,7 +41,13 @@ from core.cli.saving import (
     save_ranges,
 )
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.inspection import PixelReport, capture_report, faulty_pixels, pixel_report
+from core.inspection import (
+    CaptureReport,
+    PixelReport,
+    capture_report,
+    faulty_pixels,
+    pixel_report,
+)
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
@@ -161,6 +167,7 @@ def _capture_facts(capture: Capture) -> dict[str, Any]:
         **_interval("target_sbr", target.sbr),
         **({} if free is None else _interval("echo_free_background", free)),
         "flux_remark": report.flux_remark,
+        **_stated_facts(report),
         "hot_pixels": report.n_hot,
         "hot_pixels_at": hot,
         "dead_pixels": report.n_dead,
@@ -171,6 +178,15 @@ def _capture_facts(capture: Capture) -> dict[str, Any]:
         "suggested_t_n": suggestion.t_n,
         "why_t_n": suggestion.why_t_n,
     }
+
+
+def _stated_facts(report: CaptureReport) -> dict[str, float]:
+    facts: dict[str, float] = {}
+    for each in report.stated:
+        name = f"stated_{each.name}"
+        facts |= {name: each.stated, **_interval(f"{name}_estimate", each.estimate)}
+        facts |= {f"{name}_difference": each.difference}
+    return facts
 
 
 def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:

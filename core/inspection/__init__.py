@@ -1,6 +1,11 @@
 """Reports on a pixel, a region and a capture, with uncertainties."""
 
-from core.inspection.capture import CaptureReport, Suggestion, capture_report
+from core.inspection.capture import (
+    CaptureReport,
+    StatedFluxCheck,
+    Suggestion,
+    capture_report,
+)
 from core.inspection.faulty import FaultyPixel, faulty_pixels
 from core.inspection.flux import estimate_flux
 from core.inspection.maps import maps
@@ -25,6 +30,7 @@ __all__ = [
     "PixelReport",
     "RangeCandidate",
     "RegionReport",
+    "StatedFluxCheck",
     "Suggestion",
     "accuracy_over_pulses",
     "capture_report",
