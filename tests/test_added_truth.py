@@ -72,7 +72,7 @@ def test_an_added_truth_is_scored_linked_and_in_the_script(
     session, image = layout.session, layout.session.answer.run.image
     assert session.answer.run.figures == {}
     upload(layout, known.truth_range_m)
-    layout.tasks.run_until(lambda: is_refused(layout, "truth_unit = None"))
+    layout.tasks.run_until(lambda: is_refused(layout, "“Unit of the truth” is empty"))
     assert session.answer.capture.truth_range_m is None
     control(layout, "Unit of the truth").value = "m"
     layout.tasks.run_until(lambda: session.answer.run.figures)

@@ -221,6 +221,20 @@ COMPUTED_FROM = tuple(each.name for each in fields(Request))
 
 
 @dataclass(frozen=True)
+class Refused:
+    """A file that could not be read."""
+
+    request: Request
+    variables: tuple[str, ...]
+    """Names of its arrays of which the user must choose one; empty for other errors."""
+
+    @classmethod
+    def of(cls, request: Request, error: Exception) -> Refused:
+        """Return what an error says about the file of a request."""
+        return cls(request, getattr(error, "variables", ()))
+
+
+@dataclass(frozen=True)
 class Answer:
     """The estimate that was computed for a request."""
 

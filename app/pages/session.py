@@ -59,10 +59,10 @@ class Session:
         self.tasks = tasks or PageTasks()
         self.failures = FailureLog()
         self.tasks.failed.subscribe(self.failures.report)
-        first_answer = restore(self.state, self.sources, link, self._own)
+        first_answer, refused_file = restore(self.state, self.sources, link, self._own)
         self.refused = link.refused
         self.estimate = CurrentEstimate(
-            self.state, self.sources, self.tasks, self.failures, first_answer
+            self.state, self.sources, self.tasks, self.failures, first_answer, refused_file
         )
         self._recalled: Link | None = None
         self.estimate.changed.subscribe(lambda _: self._find_places())

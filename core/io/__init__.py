@@ -9,6 +9,7 @@ from core.io.readers.options import (
     read_options_from,
     reading_options,
     with_flags,
+    with_labels,
 )
 from core.io.readers.truth import (
     TRUTH_OPTIONS,
@@ -77,5 +78,6 @@ __all__ = [
     "save_pixel",
     "truth_options_from",
     "with_flags",
+    "with_labels",
     "write_columns",
 ]

@@ -18,7 +18,7 @@ from app.pages.session import Session
 from app.widgets.cards import button, part, select
 from app.widgets.controls import Sentence
 from app.widgets.file_input import file_button
-from core.io import TRUTH_UNITS, PossibleTruth
+from core.io import TRUTH_OPTIONS, TRUTH_UNITS, PossibleTruth
 
 log = logging.getLogger(__name__)
 
@@ -64,11 +64,12 @@ class TruthForm:
         self._key = ""
         self._jobs = session.tasks.latest()
         self.status = Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8))
-        self.file = file_button("Add a truth", SUFFIXES, self._upload, self._refuse)
+        self.file = file_button(TRUTH_OPTIONS["truth"], SUFFIXES, self._upload, self._refuse)
         units = {"as the file states": ""} | {UNITS[unit]: unit for unit in TRUTH_UNITS}
-        self.unit = select("Unit of the truth", units, "", "Unit of the numbers in the file.")
+        label, help = TRUTH_OPTIONS["truth_unit"], "Unit of the numbers in the file."
+        self.unit = select(label, units, "", help)
         self.variable = pmui.TextInput(
-            label="Array of the truth",
+            label=TRUTH_OPTIONS["truth_variable"],
             description="Name of the array, if several would fit.",
             placeholder="the one that fits",
             size="small",

@@ -41,8 +41,12 @@ from core.io.readers.maps import Map
 TRUTH_UNITS = ("m", "bins", "ns")
 """Units that a caller may state."""
 
-TRUTH_OPTIONS = ("truth", "truth_unit", "truth_variable")
-"""Names of the options of `add_truth_options`."""
+TRUTH_OPTIONS = {
+    "truth": "Add a truth",
+    "truth_unit": "Unit of the truth",
+    "truth_variable": "Array of the truth",
+}
+"""Names of the options of `add_truth_options`, and their labels in a form."""
 
 _OWN_NAMES = ("truth_range_m", "range_m")
 _LIKELY_NAMES = ("truth", "depth", "range", "dist", "true", "gt", "bin", "delay", "tof")
