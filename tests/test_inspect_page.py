@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from dataclasses import replace
 from urllib.parse import parse_qsl
 
@@ -11,6 +12,7 @@ import pytest
 
 from app.model.address import Link
 from app.model.colors import map_of
+from app.model.script import script_of
 from app.model.state import MAPS, NEED_TRUTH, Illumination, ReductionSettings, Viewing
 from app.model.store import built_in_sources, file_source
 from app.pages.inspect import text
@@ -365,7 +367,7 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
 # -- A and B ---------------------------------------------------------------------------------------
 
 
-def test_an_estimate_is_kept_and_subtracted_from_another(building):
+def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, monkeypatch):
     section, sources = PairSection(building), building.sources
     section.show(True)
     assert section.note.text == text.NO_A
@@ -385,6 +387,15 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building):
     assert numbers["In both"] == f"{np.isfinite(difference_m).sum():,}"
     assert numbers["Only in A"] == f"{(shown[0] & ~shown[1]).sum():,}"
     assert "SBR0.3" in section.a.title.text and "Coates" in section.b.title.text
+    # The script computes both.
+    building.state.param.update(page="Inspect", subject="A/B")
+    monkeypatch.chdir(tmp_path)
+    script = script_of(building.answer, building.state, building.kept_answer)
+    (tmp_path / "script.py").write_text(script, "utf-8")
+    scripted = runpy.run_path("script.py")
+    np.testing.assert_array_equal(scripted["difference_m"], difference_m)
+    np.testing.assert_array_equal(scripted["image"].range_m, image_b.range_m)
+    assert script.count("core.simulate") == 1
     # Another session has only the link, and computes A again.
     link = Link(dict(parse_qsl(building.query())))
     again = PairSection(Session(sources, link, tasks=HeldTasks()))
@@ -392,6 +403,8 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building):
     again.session.tasks.run_until(lambda: again.pair)
     np.testing.assert_array_equal(again.pair.a.run.image.range_m, image_a.range_m)
     np.testing.assert_array_equal(again.pair.difference_m, difference_m)
+    same = script_of(again.session.answer, again.session.state, again.session.kept_answer)
+    assert same == script
     press(button(section, "Forget A"))
     assert section.note.text == text.NO_A and building.state.kept == ""
 

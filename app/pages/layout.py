@@ -305,7 +305,7 @@ class Layout:
 
     def _sidebar(self) -> list[Any]:
         session, asides = self.session, self.pages.asides
-        share = Share(lambda: script_of(session.answer, session.state))
+        share = Share(lambda: script_of(session.answer, session.state, session.kept_answer))
         return [
             self._source,
             self._file,
