@@ -125,7 +125,11 @@ def parser_of_arguments() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "captures", nargs="*", type=Path, help=f"capture files to open ({', '.join(SUFFIXES)})"
+        "captures",
+        nargs="*",
+        type=Path,
+        help=f"capture files to open ({', '.join(SUFFIXES)}); a quoted pattern such as "
+        "'run_*.npz' opens all that match as one sequence in time",
     )
     parser.add_argument(
         "--port", type=port_number, default=5006, help="default: 5006; 0 chooses a free one"

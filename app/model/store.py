@@ -41,7 +41,7 @@ from core import (
 from core.cost import Cost, predicted
 from core.inference import has_posterior, pixel_range_intervals, posterior_of
 from core.inspection import PixelReport
-from core.io import ReadOptions
+from core.io import ReadOptions, files_of
 from core.metrics import Interval
 
 NO_OPTIONS = ReadOptions()
@@ -154,7 +154,8 @@ def content_key(path: Path) -> str:
     It depends on the sizes of all files of a capture, and on both ends of the first ones.
     """
     digest = sha256()
-    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
+    inside = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else []
+    files = inside or files_of(path) or [path]
     for number, each in enumerate(files):
         size = each.stat().st_size
         digest.update(f"{each.relative_to(path.parent)} {size}\n".encode())

@@ -11,6 +11,7 @@ from core.io.readers.options import (
     with_flags,
     with_labels,
 )
+from core.io.readers.sequence import files_of
 from core.io.readers.truth import (
     TRUTH_OPTIONS,
     TRUTH_UNITS,
@@ -64,6 +65,7 @@ __all__ = [
     "colors_of",
     "distinct_names",
     "file_name",
+    "files_of",
     "guessed_angle",
     "open_capture",
     "possible_truths",

@@ -244,7 +244,8 @@ class ReadOptions:
         "records",
         _RECORDS,
         "Records of a sequence in time that are added up, counted from 0: one such as 0, or a span "
-        "such as 3-7. A frame of raw frames or of a scan is a record.",
+        "such as 3-7. A frame of raw frames or of a scan is a record, and so is each file of a "
+        "sequence such as 'run_*.npz'.",
     )
 
     def __post_init__(self) -> None:

@@ -37,6 +37,7 @@ from core.io.readers.isolation import isolated
 from core.io.readers.labelled import UNITS_S
 from core.io.readers.layout import require_image
 from core.io.readers.maps import Map
+from core.io.readers.sequence import files_of
 
 TRUTH_UNITS = ("m", "bins", "ns")
 """Units that a caller may state."""
@@ -154,6 +155,8 @@ def possible_truths(path: str | os.PathLike[str], capture: Capture) -> list[Poss
         If the file cannot be read.
     """
     path = Path(path)
+    if files_of(path):
+        return []  # a sequence has no file of its own
     with refusing(path, CaptureError), decompressed(path) as plain:
         list_maps = _lister(plain)
         maps = [] if list_maps is None else list_maps(plain)
