@@ -15,7 +15,7 @@ import os
 import signal
 import sys
 import webbrowser
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
@@ -28,6 +28,7 @@ import core
 from app import THRESHOLD
 from app.model import text
 from app.model.store import Source, built_in_sources, content_key, file_source
+from app.model.truth import with_chosen_truth
 from app.model.uploads import Uploads
 from app.model.watched import LOOK_MS, WatchedFolder
 from app.pages.layout import Arrivals, build_page
@@ -41,7 +42,16 @@ from app.tasks.scheduler import STUDIES
 from app.tasks.signals import Signal
 from app.widgets.connection import LINGER_S
 from app.widgets.controls import Sentence
-from core.io import SUFFIXES, ReadOptions, add_read_options, read_options_from, with_flags
+from core.io import (
+    SUFFIXES,
+    TRUTH_OPTIONS,
+    ReadOptions,
+    add_read_options,
+    add_truth_options,
+    read_options_from,
+    truth_options_from,
+    with_flags,
+)
 
 log = logging.getLogger(__name__)
 
@@ -52,10 +62,13 @@ def main(arguments: list[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     try:
         options = read_options_from(chosen)
-        files = readable(chosen.captures, options)
-        watched = None if chosen.watch is None else WatchedFolder(chosen.watch, options)
+        if not chosen.captures and chosen.watch is None:
+            truth_options_from(chosen, None)
+        add_truth = partial(with_chosen_truth, chosen)
+        files = readable(chosen.captures, options, add_truth)
+        watched = None if chosen.watch is None else WatchedFolder(chosen.watch, options, add_truth)
     except ValueError as error:
-        parser.error(with_flags(str(error)))
+        parser.error(with_flags(str(error), *TRUTH_OPTIONS))
     newest = None if watched is None else watched.look()
     # Files come first: the page opens on the first source.
     sources = {**(newest.found if newest else {}), **files, **built_in_sources()}
@@ -112,7 +125,11 @@ def parser_of_arguments() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "captures", nargs="*", type=Path, help=f"capture files to open ({', '.join(SUFFIXES)})"
+        "captures",
+        nargs="*",
+        type=Path,
+        help=f"capture files to open ({', '.join(SUFFIXES)}); a quoted pattern such as "
+        "'run_*.npz' opens all that match as one sequence in time",
     )
     parser.add_argument(
         "--port", type=port_number, default=5006, help="default: 5006; 0 chooses a free one"
@@ -140,12 +157,24 @@ def parser_of_arguments() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="open each capture that is written to this folder, beginning with the newest there",
     )
+    add_truth_options(parser)
     add_read_options(parser)
     return parser
 
 
-def readable(paths: Sequence[Path], options: ReadOptions) -> dict[str, Source]:
+def readable(
+    paths: Sequence[Path],
+    options: ReadOptions,
+    change: Callable[[Source], Source] = lambda source: source,
+) -> dict[str, Source]:
     """Return the files that can be read, by their key, and report the others.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    options : ReadOptions
+    change : callable, optional
+        Returns the source of a capture to serve in place of the one that was read.
 
     Raises
     ------
@@ -154,8 +183,8 @@ def readable(paths: Sequence[Path], options: ReadOptions) -> dict[str, Source]:
     """
     found, refused = {}, []
     for path in paths:
-        source = file_source(path, given=options, shared=True)
         try:
+            source = change(file_source(path, given=options, shared=True))
             print(source.read().source, flush=True)
             found[content_key(path)] = source
         except ValueError as error:  # unreadable or too large
@@ -163,7 +192,7 @@ def readable(paths: Sequence[Path], options: ReadOptions) -> dict[str, Source]:
     if refused and not found:
         raise ValueError("\n".join(map(str, refused)))
     for why in refused:
-        print(f"Not opened: {with_flags(str(why))}", file=sys.stderr, flush=True)
+        print(f"Not opened: {with_flags(str(why), *TRUTH_OPTIONS)}", file=sys.stderr, flush=True)
     return found
 
 

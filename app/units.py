@@ -98,6 +98,12 @@ def count(value: int, note: str = "") -> Quantity:
     return Quantity(f"{value:,} ({note})" if note else f"{value:,}", value, note=note)
 
 
+def noted(value: float, note: str) -> Quantity:
+    """Format a number with three digits, with a remark in brackets."""
+    text = three_digits(value)
+    return Quantity(f"{text} ({note})" if note else text, value, note=note)
+
+
 def share(value: float) -> Quantity:
     """Format a share in percent."""
     return Quantity(f"{100 * value:.1f} %", 100 * value, "%")

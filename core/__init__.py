@@ -35,7 +35,7 @@ Continue with labelled arrays, or save a file for other software.
 
 from core import inspection, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
-from core.capture import Capture, CaptureError
+from core.capture import Capture, CaptureError, StatedFlux
 from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
 from core.inference import RangeInterval, limits, pixel_range_intervals, range_interval
@@ -108,6 +108,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "Signals",
+    "StatedFlux",
     "TrackingParameters",
     "Window",
     "as_image",

@@ -52,6 +52,29 @@ class CaptureError(ValueError):
         return tuple(getattr(self.__cause__, "variables", ()))
 
 
+@dataclass(frozen=True)
+class StatedFlux:
+    """Mean fluxes of all pixels that a file states, to compare estimates with.
+
+    Raises
+    ------
+    ValueError
+        If one is negative or not finite.
+    """
+
+    signal: float | None = None
+    """Signal photons of a pixel, of all pulses together."""
+    background: float | None = None
+    """Background photons of a pixel, likewise, over the whole gate."""
+    sbr: float | None = None
+    """Signal over background."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None:
+                require(f"stated {name}", value, 0 <= value < np.inf, "finite and non-negative")
+
+
 @dataclass(frozen=True, eq=False)
 class Capture:
     """Histograms of trigger times, one for each pixel.
@@ -85,6 +108,8 @@ class Capture:
     n_records : int, optional
         Records in time of the file that the capture was read from, all of them or some added up;
         None for a file without a sequence.
+    stated_flux : StatedFlux, optional
+        Fluxes that the file states. No estimate uses them; reductions that change them drop them.
 
     Raises
     ------
@@ -103,6 +128,7 @@ class Capture:
     flux_prior: FluxPrior | None = field(default=None, repr=False)
     reported_range_m: Floats | None = None
     n_records: int | None = None
+    stated_flux: StatedFlux | None = None
 
     def __post_init__(self) -> None:
         cube = self.cube

@@ -77,6 +77,12 @@ def fields_of(known: Described) -> dict[str, Any]:
     return {name: value for name, value in fields.items() if value is not None}
 
 
+def stated_fields(capture: Capture) -> dict[str, float]:
+    """Return the fields that a file keeps of the fluxes that it states."""
+    stated = {} if capture.stated_flux is None else vars(capture.stated_flux)
+    return {f"stated_{name}": value for name, value in stated.items() if value is not None}
+
+
 def dataset(capture: Capture) -> xr.Dataset:
     """Return a capture as `core.Capture.to_xarray` describes."""
     import xarray as xr  # noqa: PLC0415 - half a second that reading a .npz should not pay
@@ -84,6 +90,7 @@ def dataset(capture: Capture) -> xr.Dataset:
     counts = xr.DataArray(capture.cube, dims=AXES, attrs={"long_name": "detections"})
     if capture.background is not None:
         counts.attrs["background"] = capture.background
+    counts.attrs |= stated_fields(capture)
     images = {
         name: (AXES[:2], image, {"units": unit})
         for name, image, unit in (

@@ -97,6 +97,7 @@ def cut_gate(capture: Capture, first_bin: int, end_bin: int) -> Capture:
         background=_share(capture.background, (end_bin - first_bin) / before.n_bins),
         source=source,
         flux_prior=None,
+        stated_flux=None,
     )
 
 
@@ -137,6 +138,7 @@ def pool_pixels(capture: Capture, side: int) -> Capture:
         **images,
         source=f"{capture.source}; {side} x {side} pixels added",
         flux_prior=None,
+        stated_flux=None,
     )
 
 
@@ -166,6 +168,7 @@ def first_pulses(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
         acquisition=replace(capture.acquisition, n_pulses=n_pulses),
         source=f"{capture.source}; {n_pulses} of {sent} pulses, seed {seed}",
         flux_prior=None,
+        stated_flux=None,
     )
 
 
@@ -187,6 +190,7 @@ def share_of_pulses(capture: Capture, share: float, seed: int = 0) -> Capture:
         background=_share(capture.background, share),
         source=f"{capture.source}; {share:.3g} of the pulses, seed {seed}",
         flux_prior=None,
+        stated_flux=None,
     )
 
 

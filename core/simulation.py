@@ -140,6 +140,7 @@ def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
         detection="first",
         source=source,
         flux_prior=None,
+        stated_flux=None,
     )
 
 

@@ -1,4 +1,4 @@
-"""True ranges that a user adds to a capture from another file."""
+"""True ranges that a user adds to a capture, from its own file or another one."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from io import BytesIO
 from urllib.parse import parse_qsl
 
 import numpy as np
+import panel as pn
 import pytest
 
 import core
@@ -16,6 +17,7 @@ from app.model.address import Link
 from app.model.script import script_of
 from app.model.store import file_source
 from app.model.uploads import Uploads
+from app.pages.shared.truth import UNITS
 from app.widgets.cards import Part
 from tests.threads import HeldLayout, control
 
@@ -58,13 +60,19 @@ def is_refused(layout, why):
     return any(text.startswith("Not added:") and why in text for text in texts)
 
 
+def is_shown(layout, label):
+    """Whether a button is on screen."""
+    columns = [each for each in layout.page.select(pn.Column) if each.visible]
+    return any(label == getattr(each, "label", None) for one in columns for each in one.select())
+
+
 def test_an_added_truth_is_scored_linked_and_in_the_script(
     layout, known, uploads, tmp_path, monkeypatch
 ):
     session, image = layout.session, layout.session.answer.run.image
     assert session.answer.run.figures == {}
     upload(layout, known.truth_range_m)
-    layout.tasks.run_until(lambda: is_refused(layout, "truth_unit = None"))
+    layout.tasks.run_until(lambda: is_refused(layout, "“Unit of the truth” is empty"))
     assert session.answer.capture.truth_range_m is None
     control(layout, "Unit of the truth").value = "m"
     layout.tasks.run_until(lambda: session.answer.run.figures)
@@ -80,6 +88,30 @@ def test_an_added_truth_is_scored_linked_and_in_the_script(
     np.testing.assert_array_equal(found["capture"].truth_range_m, known.truth_range_m)
     link = Link(dict(parse_qsl(session.query())))
     again = HeldLayout({"measured": session.sources["measured"]}, link, uploads)
+    assert again.session.refused == []
+    assert again.session.answer.run.figures == session.answer.run.figures
+
+
+def test_a_map_of_the_same_file_is_offered(known, tmp_path, monkeypatch):
+    path, bins = tmp_path / "both.npz", known.acquisition.range_m_to_bin(known.truth_range_m)
+    np.savez(path, counts=known.cube, bin=bins, bin_width_s=known.acquisition.bin_width_s)
+    opened = HeldLayout({"both": file_source(path)})
+    session, label = opened.session, "Use bin as the truth"
+    opened.tasks.run_until(lambda: is_shown(opened, label))
+    control(opened, label).clicks += 1
+    assert not is_shown(opened, label)
+    control(opened, UNITS["bins"]).clicks += 1
+    opened.tasks.run_until(lambda: session.answer.run.figures)
+    found = session.answer.capture.truth_range_m
+    np.testing.assert_allclose(found, session.answer.capture.acquisition.bin_to_range_m(bins))
+    opened.settle()
+    assert not is_shown(opened, label) and not is_shown(opened, UNITS["bins"])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "script.py").write_text(script_of(session.answer, session.state), "utf-8")
+    scripted = runpy.run_path("script.py")["capture"]
+    np.testing.assert_array_equal(scripted.truth_range_m, found)
+    link = Link(dict(parse_qsl(session.query())))
+    again = HeldLayout({"both": file_source(path)}, link)
     assert again.session.refused == []
     assert again.session.answer.run.figures == session.answer.run.figures
 

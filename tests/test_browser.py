@@ -664,7 +664,7 @@ def test_a_real_capture_is_ranged_and_its_reading_can_be_changed(page, real_capt
     expect(bin_width).to_have_value("2 ns")
     bin_width.fill("wide")
     new.get_by_role("button", name="Read again").click()
-    expect(new.get_by_role("alert").filter(has_text="bin_width_s = 'wide'")).to_be_visible()
+    expect(new.get_by_role("alert").filter(has_text="“Bin width” = 'wide'")).to_be_visible()
     # The number of pulses is unknown, and so is the share of them that survives.
     choose(new, "Weight", "survival")
     expect(warning(new)).to_contain_text("needs the number of pulses")

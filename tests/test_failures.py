@@ -40,7 +40,7 @@ from app.pages.tradeoff.acquisition import AcquisitionSection
 from app.pages.tradeoff.sensitivity import SensitivitySection, Swept
 from app.pages.tradeoff.speed import Effort, SpeedSection
 from core import ESTIMATORS, CaptureError
-from core.io import ReadOptions
+from core.io import ReadOptions, reading_options
 from core.studies.paper import figures as paper
 from core.studies.trials import Condition
 from tests.broken import AT_SEED, WHEN_DRAWN, WHEN_INSPECTED, WHEN_TAPPED
@@ -367,8 +367,8 @@ def test_a_refused_reading_option_is_reported_and_the_next_reading_works():
         control(layout, "Read again"),
     )
     for typed, sentence in (
-        ("<b>wide</b>", "bin_width_s = '<b>wide</b>' is not accepted: give"),
-        ("-2e-9", "bin_width_s = -2e-09"),
+        ("<b>wide</b>", "“Bin width” = '<b>wide</b>' is not accepted: give"),
+        ("-2e-9", "“Bin width” = -2e-09"),
     ):
         width.value = typed
         again.clicks += 1
@@ -410,6 +410,23 @@ def test_the_form_stays_open_for_a_file_that_is_refused(tmp_path):
     control(layout, "Read again").clicks += 1
     layout.tasks.run_until(lambda: session.answer.request.reading.variable == "day")
     assert session.state.reading == ReadOptions(variable="day", bin_width_s=64e-12)
+
+
+def test_the_form_is_open_for_a_file_that_a_link_names_and_that_is_refused(tmp_path):
+    frames = np.full((50, 4, 5), 65535, np.uint16)
+    frames[::5] = 7
+    np.save(tmp_path / "frames.npy", frames)
+    sources = {**few_pixels(), "frames": file_source(tmp_path / "frames.npy")}
+    layout = HeldLayout(sources, Link({"source": "frames", "reading.bin_width_s": "64 ps"}))
+    form = opened(layout, "Reading options")
+    assert form.visible and layout.session.state.source == next(iter(sources))
+    label = reading_options()["no_trigger"].label
+    assert layout.alert.text.count(f"“{label}” is empty") == 1
+    assert control(layout, "Bin width").value == "64 ps"
+    control(layout, label).value = "65535"
+    control(layout, "Read again").clicks += 1
+    layout.tasks.run_until(lambda: layout.session.state.source == "frames")
+    assert layout.next_answer().request.reading == ReadOptions(no_trigger=65535, bin_width_s=64e-12)
 
 
 def test_a_link_to_an_unreadable_file_shows_no_folder(monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from dataclasses import replace
 from urllib.parse import parse_qsl
 
@@ -444,7 +445,7 @@ def test_the_box_says_what_is_inside_refuses_crossed_limits_and_is_in_the_link(b
 # -- A and B ---------------------------------------------------------------------------------------
 
 
-def test_an_estimate_is_kept_and_subtracted_from_another(building):
+def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, monkeypatch):
     section, sources = PairSection(building), building.sources
     section.show(True)
     assert section.note.text == text.NO_A
@@ -464,6 +465,15 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building):
     assert numbers["In both"] == f"{np.isfinite(difference_m).sum():,}"
     assert numbers["Only in A"] == f"{(shown[0] & ~shown[1]).sum():,}"
     assert "SBR0.3" in section.a.title.text and "Coates" in section.b.title.text
+    # The script computes both.
+    building.state.param.update(page="Inspect", subject="A/B")
+    monkeypatch.chdir(tmp_path)
+    script = script_of(building.answer, building.state, building.kept_answer)
+    (tmp_path / "script.py").write_text(script, "utf-8")
+    scripted = runpy.run_path("script.py")
+    np.testing.assert_array_equal(scripted["difference_m"], difference_m)
+    np.testing.assert_array_equal(scripted["image"].range_m, image_b.range_m)
+    assert script.count("core.simulate") == 1
     # Another session has only the link, and computes A again.
     link = Link(dict(parse_qsl(building.query())))
     again = PairSection(Session(sources, link, tasks=HeldTasks()))
@@ -471,6 +481,8 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building):
     again.session.tasks.run_until(lambda: again.pair)
     np.testing.assert_array_equal(again.pair.a.run.image.range_m, image_a.range_m)
     np.testing.assert_array_equal(again.pair.difference_m, difference_m)
+    same = script_of(again.session.answer, again.session.state, again.session.kept_answer)
+    assert same == script
     press(button(section, "Forget A"))
     assert section.note.text == text.NO_A and building.state.kept == ""
 
@@ -559,6 +571,10 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
         assert facts[f"SBR, {pixels} pixels"] == text.interval(flux.sbr)
         assert facts[f"PPP, {pixels} pixels"] == text.interval(flux.signal)
     assert facts["Hot pixels"] == str(report.n_hot)
+    check = inspection.StatedFluxCheck("sbr", "", 2 * report.flux.sbr.value, report.flux.sbr)
+    stated = text.capture_facts(building.answer, replace(report, stated=(check,)))
+    (shown,) = (value for name, value, _ in stated if name == "SBR, stated")
+    assert shown.value == check.stated and shown.note == "estimate -50.0 %"
     assert report.flux_method in capture.flux.text
     assert report.flux_remark in capture.flux.text
     assert report.suggestion.why_gate in capture.advice[0].text

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from urllib.parse import parse_qsl
+
 import numpy as np
 import pytest
 
 import core
+from app.__main__ import readable
+from app.model.address import Link
 from app.model.store import built_in_sources, file_source
+from core.io import ReadOptions
 from tests.threads import HeldLayout, control
 
 
@@ -29,6 +34,20 @@ def test_records_are_stepped_through_and_added_up(log):
     answer = layout.next_answer()
     assert answer.request.reading.records is None
     np.testing.assert_array_equal(answer.whole.cube, added)
+
+
+def test_files_of_one_pattern_are_stepped_through(tmp_path):
+    cube = np.random.default_rng(0).poisson(0.3, (4, 6, 40)).astype(np.uint16)
+    for n in range(3):
+        np.savez(tmp_path / f"run_{n}.npz", cube=cube + n)
+    files = readable([tmp_path / "run_*.npz"], ReadOptions())
+    layout = HeldLayout(files)
+    assert control(layout, "Record").end == 2
+    control(layout, "Record").value = 1
+    np.testing.assert_array_equal(layout.next_answer().whole.cube, cube + 1)
+    again = HeldLayout(files, Link(dict(parse_qsl(layout.session.query()))))
+    assert again.session.refused == []
+    np.testing.assert_array_equal(again.session.answer.whole.cube, cube + 1)
 
 
 def test_the_player_is_shown_for_sequences_alone(log):

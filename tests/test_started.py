@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from pathlib import Path
 from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 
-from app.__main__ import main, readable
+from app.__main__ import main, parser_of_arguments, readable
 from app.model.address import Link
 from app.model.reading import options_in_use
 from app.model.script import script_of
 from app.model.store import built_in_sources
+from app.model.truth import with_chosen_truth
 from app.pages.session import Session
 from core.io import ReadOptions
 from tests.browser import eventually
@@ -56,6 +58,31 @@ def test_without_a_readable_file_each_is_reported_and_nothing_is_served(paths, c
     said = capsys.readouterr().err
     assert all(path.name in said for path in paths)
     assert "--bins = 41" in said
+
+
+def test_a_truth_is_added_to_each_capture_that_it_fits(paths, tmp_path, capsys):
+    truth_m, small = np.full((4, 6), 3.0), tmp_path / "small.npz"
+    np.savez(paths[2], day=CUBE, depth_m=truth_m)
+    np.savez(small, day=CUBE[1:])
+    np.save(tmp_path / "tape.npy", truth_m)
+    options = ReadOptions(variable="day", bin_width_s=1e-9)
+    for given, title, origin in (
+        (["--truth", str(tmp_path / "tape.npy"), "--truth-unit", "m"], "tape.npy", "tape.npy"),
+        (["--truth-variable", "depth_m"], "depth_m", "day.npz, variable depth_m"),
+    ):
+        chosen = parser_of_arguments().parse_args(given)
+        files = readable([paths[2], small], options, partial(with_chosen_truth, chosen))
+        (source,) = files.values()
+        assert source.title == f"day.npz with {title}"
+        assert f"truth: {origin}, in m" in source.read().source
+        np.testing.assert_array_equal(source.read().truth_range_m, truth_m)
+        assert capsys.readouterr().err.startswith("Not opened: ")
+
+
+def test_a_truth_without_a_capture_is_refused(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["--truth", "tape.npy"])
+    assert "a scene has its own truth" in capsys.readouterr().err
 
 
 def test_a_link_opens_the_same_file_or_none(paths, tmp_path):

@@ -11,17 +11,18 @@ from app.model import text
 from app.model.address import Link, defaults
 from app.model.capture_defaults import FROM_CAPTURE, defaults_of, enter, possible_kinds
 from app.model.state import State
-from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute
+from app.model.store import COMPUTED_FROM, Answer, Refused, Request, Source, compute
 
 log = logging.getLogger(__name__)
 
 
 def restore(
     state: State, sources: Mapping[str, Source], link: Link, own: Mapping[str, Any]
-) -> Answer:
+) -> tuple[Answer, Refused | None]:
     """Set a state as its link says, and compute the estimate.
 
-    Each setting that cannot be restored is described in ``link.refused``.
+    Each setting that cannot be restored is described in ``link.refused``; a file that cannot be
+    read is returned, too.
 
     Parameters
     ----------
@@ -31,11 +32,11 @@ def restore(
     own : mapping
         Defaults of this session that differ from the state's.
     """
-    answer = _first_answer(state, sources, link, own)
+    answer, refused = _first_answer(state, sources, link, own)
     enter(state, answer, None)
     state.param.update(places(link, answer))
     link.refuse_others()
-    return answer
+    return answer, refused
 
 
 def places(link: Link, answer: Answer) -> dict[str, Any]:
@@ -63,7 +64,7 @@ def choices(link: Link, own: Mapping[str, Any]) -> dict[str, Any]:
 
 def _first_answer(
     state: State, sources: Mapping[str, Source], link: Link, own: Mapping[str, Any]
-) -> Answer:
+) -> tuple[Answer, Refused | None]:
     before, changed = {**defaults(), **own}, choices(link, own)
     if changed["source"] not in sources:
         link.refused.append(text.source_is_gone(changed["source"]))
@@ -71,14 +72,22 @@ def _first_answer(
         changed = {name: value for name, value in changed.items() if name not in of_source}
     plain = {name: value for name, value in changed.items() if name not in COMPUTED_FROM}
     source = {name: value for name, value in changed.items() if name == "source"}
+    refused: Refused | None = None
     for attempt in (changed, plain | source, plain):
         state.param.update(before | attempt)
+        request = request_of(state, sources)
         try:
-            return compute(request_of(state, sources), None)
+            answer = compute(request, None)
         except Exception as error:  # the page reports any failure
             log.warning("could not restore the link", exc_info=error)
-            link.refused.append(text.reason(error))
-    return compute(request_of(state, sources), None)
+            why = text.reason(error)
+            link.refused += [] if why in link.refused else [why]
+            if refused is None and not request.source.is_scene:
+                refused = Refused.of(request, error)
+        else:
+            is_open = refused is None or answer.request.source is refused.request.source
+            return answer, None if is_open else refused
+    return compute(request_of(state, sources), None), refused
 
 
 def parsed(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import fields
+from itertools import chain
 from textwrap import indent
 
 from app.model.colors import WHOLE
@@ -34,7 +35,7 @@ COMMANDS = {"Trade-off": "python -m core tradeoff", "Paper": "python -m core pap
 Lines = Iterator[str]
 
 
-def script_of(answer: Answer, state: State) -> str:
+def script_of(answer: Answer, state: State, kept: Answer | None = None) -> str:
     """Return the script of what is on screen.
 
     Parameters
@@ -43,14 +44,23 @@ def script_of(answer: Answer, state: State) -> str:
         The estimate that is shown.
     state : State
         How it is shown.
+    kept : Answer, optional
+        The estimate that was kept as A, if it is known.
     """
-    compares = state.page == "Compare"
     title = "View of firstphoton"
     if state.page in COMMANDS:
         title = f"Explore view of firstphoton ({state.page}: {COMMANDS[state.page]})"
-    estimate = _comparison if compares else _single_estimate
-    body = "\n".join([*_capture(answer), *estimate(answer, state)])
+    if kept is not None and _shows_pair(state) and kept.capture.shape == answer.capture.shape:
+        lines = _pair(kept, answer, state)
+    else:
+        estimate = _comparison if state.page == "Compare" else _single_estimate
+        lines = chain(_capture(answer), estimate(answer, state))
+    body = "\n".join(lines)
     return f'"""{title}."""\n\n{_imports(body)}\n{body}\n'
+
+
+def _shows_pair(state: State) -> bool:
+    return bool(state.page == "Inspect" and state.subject == "A/B")
 
 
 def _imports(body: str) -> str:
@@ -125,11 +135,8 @@ def _file(answer: Answer) -> Lines:
 def _single_estimate(answer: Answer, state: State) -> Lines:
     is_inspect = state.page == "Inspect"
     kind = state.map if is_inspect else state.image
-    method, settings = literal(answer.method), changed_fields(answer.settings)
-    yield "\n# Estimate the ranges. `shown` has only pixels of sufficient confidence."
-    yield assign("settings", f"core.ESTIMATORS[{method}].parameters", **settings)
-    yield assign("image", "core.estimate", "capture", method, "settings")
-    yield from _shown(state.viewing.least_confidence)
+    method = literal(answer.method)
+    yield from _estimate(answer, state)
     yield from _angle(state.viewing)
     yield f"picture = {IMAGES[kind]}"
     yield "\n# Signals of one pixel."
@@ -147,6 +154,31 @@ def _single_estimate(answer: Answer, state: State) -> Lines:
     yield assign("", "core.save_pixel", *pixel, **chosen, overwrite="True")
     if kind != "Estimate":
         yield 'np.savetxt("picture.csv", picture, delimiter=",")'
+
+
+def _estimate(answer: Answer, state: State) -> Lines:
+    method, settings = literal(answer.method), changed_fields(answer.settings)
+    yield "\n# Estimate the ranges. `shown` has only pixels of sufficient confidence."
+    yield assign("settings", f"core.ESTIMATORS[{method}].parameters", **settings)
+    yield assign("image", "core.estimate", "capture", method, "settings")
+    yield from _shown(state.viewing.least_confidence)
+
+
+def _pair(a: Answer, b: Answer, state: State) -> Lines:
+    """Estimate A, then B as if it were alone, and subtract A."""
+    capture_a, capture_b = list(_capture(a)), list(_capture(b))
+    yield "# A is the estimate that was kept."
+    yield from capture_a
+    yield from _estimate(a, state)
+    yield _saved('"range_a.png"', **_colors(state.viewing))
+    yield "shown_a = shown"
+    yield "\n# B is the estimate on screen."
+    if capture_b != capture_a:
+        yield from capture_b
+    yield from _single_estimate(b, state)
+    yield "\n# Subtract A from B."
+    yield "difference_m = shown.range_m - shown_a.range_m"
+    yield 'np.savetxt("difference.csv", difference_m, delimiter=",")'
 
 
 def _reports(answer: Answer, state: State) -> Lines:

@@ -41,7 +41,7 @@ from core import (
 from core.cost import Cost, predicted
 from core.inference import has_posterior, pixel_range_intervals, posterior_of
 from core.inspection import PixelReport
-from core.io import ReadOptions
+from core.io import ReadOptions, files_of
 from core.metrics import Interval
 
 NO_OPTIONS = ReadOptions()
@@ -67,6 +67,8 @@ class Source:
     given: ReadOptions = NO_OPTIONS
     """Options for reading that hold unless a request has others."""
     truth: AddedTruth | None = None
+    path: Path | None = None
+    """Where the file is; None for a scene."""
 
     @property
     def is_scene(self) -> bool:
@@ -91,7 +93,7 @@ class Source:
 
 @dataclass(frozen=True)
 class AddedTruth:
-    """True ranges from another file than the capture's."""
+    """True ranges that a file holds: another one than the capture's, or the same."""
 
     to: Source
     """The capture."""
@@ -143,7 +145,7 @@ def file_source(
         return open_large(path, vars(reading.completed_by(given)))
 
     get = lru_cache(maxsize=1)(read) if shared else read
-    return Source(title or path.name, load, large=opened, name=path.name, given=given)
+    return Source(title or path.name, load, large=opened, name=path.name, given=given, path=path)
 
 
 def content_key(path: Path) -> str:
@@ -152,7 +154,8 @@ def content_key(path: Path) -> str:
     It depends on the sizes of all files of a capture, and on both ends of the first ones.
     """
     digest = sha256()
-    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
+    inside = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else []
+    files = inside or files_of(path) or [path]
     for number, each in enumerate(files):
         size = each.stat().st_size
         digest.update(f"{each.relative_to(path.parent)} {size}\n".encode())
@@ -216,6 +219,20 @@ class Request:
 
 COMPUTED_FROM = tuple(each.name for each in fields(Request))
 """Parameters of the state that a request is made of."""
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A file that could not be read."""
+
+    request: Request
+    variables: tuple[str, ...]
+    """Names of its arrays of which the user must choose one; empty for other errors."""
+
+    @classmethod
+    def of(cls, request: Request, error: Exception) -> Refused:
+        """Return what an error says about the file of a request."""
+        return cls(request, getattr(error, "variables", ()))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from app.units import Scale, between, plus_minus, supported_decimals
 from app.units import milliseconds as milliseconds  # noqa: PLC0414
 from app.units import number as number  # noqa: PLC0414
 from app.units import share as share  # noqa: PLC0414
+from core.io import TRUTH_OPTIONS, with_labels
 from core.metrics import Interval
 from core.studies.ablation import TITLES
 
@@ -116,9 +117,12 @@ def unfinished(error: Exception) -> str:
 
 
 def cause(error: Exception) -> str:
-    """Return the message of a ``ValueError``, which is written for users, or the type of others."""
+    """Return the message of a ``ValueError``, which is written for users, or the type of others.
+
+    Options are named by their labels.
+    """
     if isinstance(error, ValueError):
-        return without_folders(str(error))
+        return without_folders(with_labels(str(error), TRUTH_OPTIONS))
     kind = type(error).__name__
     if isinstance(error, MemoryError):
         return f"not enough memory on the server ({kind})"
@@ -218,7 +222,8 @@ def not_restored(refused: list[str]) -> str:
     """Return the message about settings of a link that were refused; empty if there are none."""
     if not refused:
         return ""
-    return f"Some settings in this link could not be restored. {' '.join(refused)}"
+    sentences = " ".join(with_labels(each) for each in refused)
+    return f"Some settings in this link could not be restored. {sentences}"
 
 
 def not_uploaded(reason: str, most_bytes: int) -> str:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from app.model.state import Illumination
 from app.model.store import AddedTruth, Answer, Source
+from app.model.uploads import cached_while_used
 from core import Capture, read_truth
 from core.checks import require
-from core.io import ReadOptions
+from core.io import PossibleTruth, ReadOptions, possible_truths, truth_options_from
 
 _BETWEEN = "|"
 
@@ -20,10 +22,10 @@ SUFFIXES = (".npy", ".npz", ".mat", ".tif", ".tiff", ".nc", ".h5", ".hdf5")
 
 @dataclass(frozen=True)
 class Truth:
-    """An uploaded file of true ranges, and how to read it."""
+    """A file of true ranges, and how to read it."""
 
     key: str
-    """Key of the upload."""
+    """Key of the upload; empty for the file of the capture itself."""
     unit: str = ""
     """Unit of the numbers; empty for the one that the file states."""
     variable: str = ""
@@ -47,17 +49,48 @@ def parts_of(key: str) -> tuple[str, Truth | None]:
 
 
 def with_truth(source: Source, truth: Truth, path: Path) -> Source:
-    """Return the source of a capture with a truth, whose file is at a path."""
+    """Return the source of a capture with a truth, whose file is at a path, in place of another."""
+    source = source.without_truth
 
     def load(light: Illumination, reading: ReadOptions, absent: Collection[str]) -> Capture:
         return read_truth(path, source.load(light, reading, absent), **truth.options)
 
     return replace(
         source,
-        title=f"{source.title} with {path.name}",
+        title=f"{source.title} with {truth.variable if path == source.path else path.name}",
         load=load,
         truth=AddedTruth(source, path.name, truth.options),
     )
+
+
+def with_chosen_truth(chosen: Namespace, source: Source) -> Source:
+    """Return the source of a file with the truth that the command line gives, if any.
+
+    Raises
+    ------
+    ValueError
+        If options for a truth contradict each other.
+    """
+    given = truth_options_from(chosen, source.path)
+    if not given:
+        return source
+    truth = Truth("", given["truth_unit"] or "", given["truth_variable"] or "")
+    known = with_truth(source, truth, given["path"])
+    return replace(known, load=cached_while_used(known.load))
+
+
+def offered_truths(answer: Answer) -> list[PossibleTruth]:
+    """Return the images of a capture's own file that may be its truth, if it has none.
+
+    Raises
+    ------
+    CaptureError
+        As `core.io.possible_truths`.
+    """
+    path = answer.request.source.path
+    if path is None or answer.cutout is not None or answer.whole.truth_range_m is not None:
+        return []
+    return possible_truths(path, answer.whole)
 
 
 def check_truth(answer: Answer, truth: Truth, path: Path) -> None:

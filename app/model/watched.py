@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from stat import S_ISREG
@@ -57,6 +57,8 @@ class WatchedFolder:
     folder : Path
     given : ReadOptions, optional
         Options for reading.
+    change : callable, optional
+        Returns the source of a capture to offer in place of the one that was found.
 
     Raises
     ------
@@ -64,9 +66,14 @@ class WatchedFolder:
         If there is no such folder.
     """
 
-    def __init__(self, folder: Path, given: ReadOptions = NO_OPTIONS) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        given: ReadOptions = NO_OPTIONS,
+        change: Callable[[Source], Source] = lambda source: source,
+    ) -> None:
         require("watch", str(folder), folder.is_dir(), "an existing folder")
-        self._folder, self._given = folder, given
+        self._folder, self._given, self._change = folder, given, change
         self._seen = self._states()
         newest = max(self._seen, key=lambda path: self._seen[path][1], default=None)
         self._handled = {path: at for path, at in self._seen.items() if path != newest}
@@ -85,7 +92,8 @@ class WatchedFolder:
         for path in sorted(written, key=lambda path: states[path][1]):
             self._handled[path] = states[path]
             try:
-                key, source = content_key(path), file_source(path, given=self._given)
+                key = content_key(path)
+                source = self._change(file_source(path, given=self._given))
                 source = replace(source, load=cached_while_used(source.load))
                 source.read()
             except (ValueError, OSError) as error:

@@ -30,7 +30,7 @@ from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
 from app.pages.shared.method import MethodChoice
 from app.pages.shared.reading import ReadingForm
-from app.pages.shared.truth import TruthForm
+from app.pages.shared.truth import TruthForm, TruthOffer
 from app.tasks.page import PageTasks
 from app.tasks.signals import Signal
 from app.theme import DARK, LIGHT, STYLES
@@ -258,6 +258,7 @@ class Layout:
         self._method = MethodChoice(session)
         self._reading = ReadingForm(self._read, session.failures.show)
         self._truth = TruthForm(session, self._uploads, self, self._add_truth)
+        self._truth_offer = TruthOffer(session, self._add_truth)
         unit = choice(text.UNIT_HELP, state.param.unit)
         unit.param.update(
             label="Gate axes in", sx=UNIT_BUTTONS, sizing_mode="stretch_width", margin=(4, 8)
@@ -304,13 +305,14 @@ class Layout:
 
     def _sidebar(self) -> list[Any]:
         session, asides = self.session, self.pages.asides
-        share = Share(lambda: script_of(session.answer, session.state))
+        share = Share(lambda: script_of(session.answer, session.state, session.kept_answer))
         return [
             self._source,
             self._file,
             *([] if self._arrivals is None else [self._follow]),
             self._reading.question,
             self._reading.records,
+            self._truth_offer.layout,
             self._shared[Shared.UNIT],
             *(aside for name, aside in asides.items() if not self._pages[name].sidebar_last),
             self._light_part,
@@ -370,6 +372,7 @@ class Layout:
         self._light_part.visible = is_scene
         self._reading.part.visible = self._truth.part.visible = not is_scene
         self._show_reading(answer)
+        self._truth_offer.show(answer)
         self._provenance.text = text.provenance(answer)[:2000]
         self._method.show(answer)
         self._panels["tracking"].mark_doubts(doubts_hold(answer.capture))
@@ -481,9 +484,11 @@ class Layout:
         found, upload = dict(sources), self._uploads.use(capture, self)
         if upload is not None:
             found[capture] = upload
-        path = None if truth is None else self._uploads.path(truth.key, self)
-        if truth is not None and path is not None and capture in found:
-            found[key] = with_truth(found[capture], truth, path)
+        if truth is not None and capture in found:
+            own = found[capture].path
+            path = self._uploads.path(truth.key, self) if truth.key else own
+            if path is not None:
+                found[key] = with_truth(found[capture], truth, path)
         return found
 
 

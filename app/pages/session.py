@@ -59,12 +59,13 @@ class Session:
         self.tasks = tasks or PageTasks()
         self.failures = FailureLog()
         self.tasks.failed.subscribe(self.failures.report)
-        first_answer = restore(self.state, self.sources, link, self._own)
+        first_answer, refused_file = restore(self.state, self.sources, link, self._own)
         self.refused = link.refused
         self.estimate = CurrentEstimate(
-            self.state, self.sources, self.tasks, self.failures, first_answer
+            self.state, self.sources, self.tasks, self.failures, first_answer, refused_file
         )
         self._recalled: Link | None = None
+        self._kept: tuple[str, Answer] | None = None
         self.estimate.changed.subscribe(lambda _: self._find_places())
 
     @property
@@ -110,6 +111,17 @@ class Session:
         _, chosen = parsed(query, self.sources, self._own)
         values = {name: chosen[name] for name in COMPUTED_FROM}
         return Request(**values | {"source": self.sources[chosen["source"]]})
+
+    @property
+    def kept_answer(self) -> Answer | None:
+        """The estimate that was kept as A; None if there is none, or it has not been computed."""
+        query, answer = self._kept or ("", None)
+        return answer if query == self.state.kept else None
+
+    def keep(self, query: str, answer: Answer) -> None:
+        """Keep an estimate as A, which `query` describes."""
+        self._kept = query, answer
+        self.state.kept = query
 
     def is_settled(self) -> bool:
         """Return whether all that was requested is on screen."""

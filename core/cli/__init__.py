@@ -10,9 +10,8 @@ from pathlib import Path
 
 import core
 from core.cli import ablation, batch, captures, report, studies, tradeoff
-from core.cli.options import TRUTH_OPTIONS
 from core.cli.results import CheckFailed, Incomplete
-from core.io import with_flags
+from core.io import TRUTH_OPTIONS, with_flags
 
 ACCEPTED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done; the machine (such as a full disk), a check or a part failed; bad input; Ctrl-C.

@@ -18,14 +18,12 @@ from core.capture import Capture, CaptureInfo
 from core.checks import printable, require
 from core.cli.options import (
     FLUX_OPTIONS,
-    TRUTH_OPTIONS,
     add_capture,
     add_colors,
     add_filters,
     add_flux,
     add_pixel,
     add_settings,
-    add_truth,
     angle,
     colors_given,
     flux_of,
@@ -33,7 +31,6 @@ from core.cli.options import (
     require_none,
     settings_given,
     show,
-    truth_options,
     whole_from_to,
 )
 from core.cli.saving import (
@@ -44,12 +41,24 @@ from core.cli.saving import (
     save_ranges,
 )
 from core.estimators import ESTIMATORS, RangeImage, estimate
-from core.inspection import PixelReport, capture_report, faulty_pixels, pixel_report
+from core.inspection import (
+    CaptureReport,
+    PixelReport,
+    capture_report,
+    faulty_pixels,
+    pixel_report,
+)
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
 from core.io.readers.options import ReadOptions, add_read_options
-from core.io.readers.truth import read_truth, truth_of
+from core.io.readers.truth import (
+    add_truth_options,
+    possible_truths,
+    read_truth,
+    truth_of,
+    truth_options_from,
+)
 from core.io.scene_files import read_scene
 from core.io.writers import (
     CAPTURE_SUFFIXES,
@@ -127,8 +136,20 @@ def _info(chosen: argparse.Namespace) -> None:
             "share_of_pixels_empty": float((photons == 0).mean()),
         }
     if counts.size <= _MAX_REPORTED:
-        facts |= _capture_facts(read_capture(chosen.capture, **reading(chosen)))
+        capture = read_capture(chosen.capture, **reading(chosen))
+        facts |= _truth_facts(chosen.capture, capture) | _capture_facts(capture)
     show(facts, chosen.json)
+
+
+def _truth_facts(path: Path, capture: Capture) -> dict[str, Any]:
+    """Return the images of the file that may be the truth, and the options that take one."""
+    known = capture.truth_range_m is not None
+    possible = [] if known else possible_truths(path, capture)
+    options = []
+    for each in possible:
+        unit = "" if each.is_unit_stated else f" --truth-unit {' or '.join(each.units)}"
+        options.append(f"--truth-variable {each.name}{unit}")
+    return {"possible_truths": options} if possible else {}
 
 
 def _capture_facts(capture: Capture) -> dict[str, Any]:
@@ -146,6 +167,7 @@ def _capture_facts(capture: Capture) -> dict[str, Any]:
         **_interval("target_sbr", target.sbr),
         **({} if free is None else _interval("echo_free_background", free)),
         "flux_remark": report.flux_remark,
+        **_stated_facts(report),
         "hot_pixels": report.n_hot,
         "hot_pixels_at": hot,
         "dead_pixels": report.n_dead,
@@ -156,6 +178,15 @@ def _capture_facts(capture: Capture) -> dict[str, Any]:
         "suggested_t_n": suggestion.t_n,
         "why_t_n": suggestion.why_t_n,
     }
+
+
+def _stated_facts(report: CaptureReport) -> dict[str, float]:
+    facts: dict[str, float] = {}
+    for each in report.stated:
+        name = f"stated_{each.name}"
+        facts |= {name: each.stated, **_interval(f"{name}_estimate", each.estimate)}
+        facts |= {f"{name}_difference": each.difference}
+    return facts
 
 
 def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
@@ -207,7 +238,7 @@ def _add_estimate(commands: Any) -> None:
         subject = method.add_mutually_exclusive_group()
         add_capture(subject)
         subject.add_argument("--scene", choices=scenes, default="car", help="to simulate (car)")
-        add_truth(method)
+        add_truth_options(method)
         add_flux(method)
         add_filters(method)
         add_colors(method)
@@ -228,10 +259,7 @@ def _add_estimate(commands: Any) -> None:
 
 def _estimate(chosen: argparse.Namespace) -> None:
     refused = _refused(chosen)
-    if chosen.capture is None:
-        require_none(vars(chosen), TRUTH_OPTIONS, "a scene has its own truth")
-    elif chosen.truth is None:
-        require_none(vars(chosen), TRUTH_OPTIONS, "there is no --truth")
+    truth_options_from(chosen, chosen.capture)
     settings = settings_given(chosen, ESTIMATORS[chosen.method].parameters)
     colors = colors_given(chosen)
     in_tiles = chosen.scheduler or _exceeds_memory(chosen)
@@ -270,8 +298,8 @@ def _range_at_once(
     chosen: argparse.Namespace, settings: Any
 ) -> tuple[CaptureInfo, RangeImage, dict[str, Any]]:
     capture = _capture(chosen)
-    if chosen.truth is not None:
-        capture = read_truth(chosen.truth, capture, **truth_options(chosen))
+    if truth := truth_options_from(chosen, chosen.capture):
+        capture = read_truth(capture=capture, **truth)
     print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
     found = run(capture, chosen.method, settings, chosen.false_alarm)
     facts: dict[str, Any] = found.figures | {
@@ -295,9 +323,8 @@ def _range_in_tiles(
     print(counts.attrs.get("source", ""), file=sys.stderr)
     acquisition = describe(counts, ReadOptions()).acquisition
     truth_m, origin = None, ""
-    if chosen.truth is not None:
-        options = truth_options(chosen)
-        truth_m, origin = truth_of(chosen.truth, counts.shape[:2], acquisition, **options)
+    if truth := truth_options_from(chosen, chosen.capture):
+        truth_m, origin = truth_of(shape=counts.shape[:2], acquisition=acquisition, **truth)
         print(origin, file=sys.stderr)
     started = perf_counter()
     parts = tiles.estimate_large(counts, chosen.method, settings, false_alarm=chosen.false_alarm)

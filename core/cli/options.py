@@ -19,7 +19,6 @@ from core.checks import require
 from core.estimators import FALSE_ALARM
 from core.io import read_options_from
 from core.io.readers.quantities import EXAMPLE_OF_ANGLE, parsed_angle
-from core.io.readers.truth import TRUTH_UNITS
 from core.io.writers import RangeColors
 from core.parameters import Choice, Number, spec_of
 
@@ -80,33 +79,6 @@ def add_processes(command: Any) -> None:
     cores = os.cpu_count() or 1
     help = f"that share the work ({cores})"
     command.add_argument("--processes", type=whole_from_to(1, 256), default=cores, help=help)
-
-
-TRUTH_OPTIONS = ("truth", "truth_unit", "truth_variable")
-
-
-def add_truth(command: Any) -> None:
-    """Add the options for the true ranges of a capture."""
-    group = command.add_argument_group("truth of a capture, to compare the estimates with")
-    group.add_argument(
-        "--truth",
-        type=Path,
-        metavar="FILE",
-        help="true ranges as an image of the capture's shape: .npy, .npz, .mat, .tif, .nc, .h5 or "
-        ".zarr, such as a result of `estimate` or a simulated capture",
-    )
-    group.add_argument(
-        "--truth-unit",
-        choices=TRUTH_UNITS,
-        help="of these: metres, bins after the opening of the gate, or nanoseconds after the "
-        "pulse; by default the unit that the file states",
-    )
-    group.add_argument("--truth-variable", metavar="NAME", help="of the array or page")
-
-
-def truth_options(chosen: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments of `core.read_truth`."""
-    return {"truth_unit": chosen.truth_unit, "truth_variable": chosen.truth_variable}
 
 
 def add_pixel(command: Any, help: str) -> None:

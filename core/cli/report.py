@@ -10,23 +10,19 @@ from typing import Any
 
 from core.checks import printable
 from core.cli.options import (
-    TRUTH_OPTIONS,
     add_false_alarm,
     add_pixel,
     add_settings,
-    add_truth,
     probability,
     reading,
-    require_none,
     settings_given,
     show,
-    truth_options,
 )
 from core.cli.saving import refused_outputs
 from core.estimators import ESTIMATORS, estimate
 from core.io.readers import read_capture
 from core.io.readers.options import add_read_options, read_options_from
-from core.io.readers.truth import read_truth
+from core.io.readers.truth import add_truth_options, read_truth, truth_options_from
 from core.report import LEAST_CONFIDENCE, save_report
 from core.scripts import assign, changed_fields, literal
 
@@ -59,7 +55,7 @@ def add(commands: Any) -> None:
         add_false_alarm(method)
         method.add_argument("--overwrite", action="store_true", help="replace the file")
         method.add_argument("--json", action="store_true", help="one JSON object instead of lines")
-        add_truth(method)
+        add_truth_options(method)
         add_settings(method, estimator.parameters)
         add_read_options(method)
         method.set_defaults(work=_report)
@@ -67,12 +63,11 @@ def add(commands: Any) -> None:
 
 def _report(chosen: argparse.Namespace) -> None:
     refused_outputs([chosen.out], (".html",), chosen.overwrite)
-    if chosen.truth is None:
-        require_none(vars(chosen), TRUTH_OPTIONS, "there is no --truth")
+    truth = truth_options_from(chosen, chosen.capture)
     settings = settings_given(chosen, ESTIMATORS[chosen.method].parameters)
     capture = read_capture(chosen.capture, **reading(chosen))
-    if chosen.truth is not None:
-        capture = read_truth(chosen.truth, capture, **truth_options(chosen))
+    if truth:
+        capture = read_truth(capture=capture, **truth)
     print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
     image = estimate(capture, chosen.method, settings, false_alarm=chosen.false_alarm)
     save_report(
@@ -98,11 +93,10 @@ def _lines(chosen: argparse.Namespace, settings: Any) -> Iterator[str]:
     yield "# Add the folder to the paths if necessary."
     options = changed_fields(read_options_from(chosen))
     yield assign("capture", "core.read_capture", literal(chosen.capture.name), **options)
-    if chosen.truth is not None:
-        known = truth_options(chosen).items()
-        given = {name: literal(value) for name, value in known if value is not None}
-        truth = literal(chosen.truth.name)
-        yield assign("capture", "core.read_truth", truth, "capture", **given)
+    if truth := truth_options_from(chosen, chosen.capture):
+        name = literal(truth.pop("path").name)
+        given = {option: literal(value) for option, value in truth.items() if value is not None}
+        yield assign("capture", "core.read_truth", name, "capture", **given)
     method = literal(chosen.method)
     yield assign("settings", f"core.ESTIMATORS[{method}].parameters", **changed_fields(settings))
     alarm = chosen.false_alarm

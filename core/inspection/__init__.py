@@ -1,7 +1,12 @@
 """Reports on a pixel, a line, a region and a capture, with uncertainties."""
 
 from core.geometry import pixels_in
-from core.inspection.capture import CaptureReport, Suggestion, capture_report
+from core.inspection.capture import (
+    CaptureReport,
+    StatedFluxCheck,
+    Suggestion,
+    capture_report,
+)
 from core.inspection.faulty import FaultyPixel, faulty_pixels
 from core.inspection.flux import estimate_flux
 from core.inspection.line_profile import LineProfile, line_profile
@@ -28,6 +33,7 @@ __all__ = [
     "PixelReport",
     "RangeCandidate",
     "RegionReport",
+    "StatedFluxCheck",
     "Suggestion",
     "accuracy_over_pulses",
     "capture_report",

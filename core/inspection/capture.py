@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,22 @@ class Suggestion:
     why_t_n: str
 
 
+class StatedFluxCheck(NamedTuple):
+    """Flux that the file states, and the estimate of the same."""
+
+    name: str
+    """``"signal"``, ``"background"`` or ``"sbr"``."""
+    unit: str
+    stated: float
+    estimate: Interval
+    """Mean of all pixels, with its 95 % interval."""
+
+    @property
+    def difference(self) -> float:
+        """Estimate minus statement."""
+        return self.estimate.value - self.stated
+
+
 @dataclass(frozen=True, eq=False)
 class CaptureReport(OldFluxNames):
     """Report on a capture as a whole."""
@@ -58,6 +75,8 @@ class CaptureReport(OldFluxNames):
     n_dead: int | None
     """Dead pixels, likewise."""
     suggestion: Suggestion
+    stated: tuple[StatedFluxCheck, ...]
+    """What the file states of the mean of all pixels."""
 
 
 def capture_report(capture: Capture) -> CaptureReport:
@@ -74,6 +93,20 @@ def capture_report(capture: Capture) -> CaptureReport:
         n_hot=None if faulty is None else int(np.count_nonzero(faulty.hot)),
         n_dead=None if faulty is None else int(np.count_nonzero(faulty.dead)),
         suggestion=suggestion(capture),
+        stated=_stated(capture, found.image),
+    )
+
+
+def _stated(capture: Capture, estimated: FluxEstimate) -> tuple[StatedFluxCheck, ...]:
+    """Compare the fluxes that a file states with estimates of the image."""
+    if capture.stated_flux is None:
+        return ()
+    in_all = estimated.scaled(capture.acquisition.n_pulses or 1)
+    units = FluxEstimate._fields, ("photons", "photons", "")
+    return tuple(
+        StatedFluxCheck(name, unit, stated, getattr(in_all, name))
+        for name, unit in zip(*units, strict=True)
+        if (stated := getattr(capture.stated_flux, name)) is not None
     )
 
 

@@ -107,4 +107,5 @@ def _summed(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
         **capture.images(lambda _: None),
         source=f"{capture.source}; {n_pixels} pixels added",
         flux_prior=None,
+        stated_flux=None,
     )

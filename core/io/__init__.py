@@ -9,8 +9,18 @@ from core.io.readers.options import (
     read_options_from,
     reading_options,
     with_flags,
+    with_labels,
 )
-from core.io.readers.truth import TRUTH_UNITS, read_truth
+from core.io.readers.sequence import files_of
+from core.io.readers.truth import (
+    TRUTH_OPTIONS,
+    TRUTH_UNITS,
+    PossibleTruth,
+    add_truth_options,
+    possible_truths,
+    read_truth,
+    truth_options_from,
+)
 from core.io.scene_files import SceneError, read_scene
 from core.io.writers import (
     COLOR_MAPS,
@@ -36,24 +46,29 @@ __all__ = [
     "OUTSIDE_COLOR",
     "READERS",
     "SUFFIXES",
+    "TRUTH_OPTIONS",
     "TRUTH_UNITS",
     "WRITERS",
     "ColorScale",
     "Option",
     "Picture",
     "Plane",
+    "PossibleTruth",
     "Product",
     "RangeColors",
     "ReadOptions",
     "SceneError",
     "add_read_options",
+    "add_truth_options",
     "bytes_of",
     "changed_settings",
     "colors_of",
     "distinct_names",
     "file_name",
+    "files_of",
     "guessed_angle",
     "open_capture",
+    "possible_truths",
     "range_scale",
     "read_capture",
     "read_options_from",
@@ -63,6 +78,8 @@ __all__ = [
     "save_capture",
     "save_image",
     "save_pixel",
+    "truth_options_from",
     "with_flags",
+    "with_labels",
     "write_columns",
 ]

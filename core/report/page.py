@@ -18,7 +18,14 @@ import numpy as np
 from core import metrics
 from core.capture import Capture
 from core.estimators import ESTIMATORS, Provenance, RangeImage
-from core.inspection import CaptureReport, FluxEstimate, PixelReport, capture_report, pixel_report
+from core.inspection import (
+    CaptureReport,
+    FluxEstimate,
+    PixelReport,
+    StatedFluxCheck,
+    capture_report,
+    pixel_report,
+)
 from core.io.writers.colors import ColorScale, colors_of, range_scale
 from core.io.writers.product import guessed_view, plain
 from core.labels import software
@@ -45,6 +52,7 @@ _WIDTHS = {
     "measured": "sample spacing",
 }
 _FEWEST_BINS = 5  # of an echo in the plot around an estimate
+_FLUXES = {"signal": "Signal", "background": "Background", "sbr": "SBR"}
 _LIBRARIES = ("numpy", "scipy", "numba")
 
 _PAGE = """<!doctype html>
@@ -163,6 +171,7 @@ def _fluxes(capture: Capture, report: CaptureReport) -> Iterator[str]:
     yield _intervals(report.target_flux, unit, targets)
     yield _intervals(report.flux, unit, "Mean of all pixels, with 95 % intervals")
     yield f'<p class="note">Method: {_text(report.flux_method)}. {_text(report.flux_remark)}</p>'
+    yield _stated(report.stated)
     yield _facts(counts)
     yield "<h3>Suggested settings</h3>"
     yield "<ul>"
@@ -463,12 +472,30 @@ def _interval(found: Interval) -> str:
 
 def _intervals(flux: FluxEstimate, unit: str, caption: str) -> str:
     """Return signal, background and their ratio with their intervals as a table."""
-    titles = (("Signal", unit), ("Background", unit), ("SBR", ""))
+    units = (unit, unit, "")
     rows = [
         (title, _number(each.value), f"{_number(each.low)} to {_number(each.high)}", of)
-        for (title, of), each in zip(titles, flux, strict=True)
+        for title, of, each in zip(_FLUXES.values(), units, flux, strict=True)
     ]
     return _table(caption, ("Quantity", "Value", "Interval", "Unit"), rows)
+
+
+def _stated(found: Sequence[StatedFluxCheck]) -> str:
+    """Return the fluxes that the file states beside their estimates; empty without any."""
+    if not found:
+        return ""
+    rows = [
+        (
+            _FLUXES[each.name],
+            _number(each.stated),
+            _interval(each.estimate),
+            _number(each.difference),
+            each.unit,
+        )
+        for each in found
+    ]
+    titles = ("Quantity", "Stated", "Estimate", "Estimate minus statement", "Unit")
+    return _table("Stated by the file for the mean of all pixels", titles, rows)
 
 
 def _line(range_m: float, color: str) -> Mark:

@@ -20,7 +20,7 @@ from core.acquisition import SPEED_OF_LIGHT_M_S, Acquisition
 from core.capture import Capture, CaptureError
 from core.cli import main
 from core.estimators import estimate
-from core.io import read_truth
+from core.io import PossibleTruth, possible_truths, read_capture, read_truth
 from core.io.writers import CAPTURE_SUFFIXES, save_capture, save_image
 from core.tests.captures import real_capture_path
 from core.tests.formats import put
@@ -180,6 +180,28 @@ def test_of_several_images_a_name_chooses(tmp_path: Path) -> None:
     np.savez(path, a_m=TRUTH_M, b_m=TRUTH_M + 1)
     found = read_truth(path, CAPTURE, truth_variable="b_m")
     np.testing.assert_array_equal(found.truth_range_m, TRUTH_M + 1)
+
+
+@pytest.mark.parametrize("write", [mat, mat73, np.savez])
+def test_maps_beside_the_counts_may_be_the_truth(
+    write: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / ("a.npz" if write is np.savez else "a.mat")
+    nearer_m = TRUTH_M - ACQUISITION.gate_delay_s * SPEED_OF_LIGHT_M_S / 2
+    beside = {"bin": BINS, "range_m": nearer_m, "depth": 1e6 * BINS, "albedo": BINS, "dist": BESIDE}
+    write(path, counts=CUBE, bin_width_s=np.array(1e-9), **beside)
+    found = possible_truths(path, read_capture(path))
+    # Most of the bins would be metres beyond a gate of 15 m.
+    assert found == [
+        PossibleTruth("range_m", ("m",), is_unit_stated=True),
+        PossibleTruth("bin", ("bins", "ns"), is_unit_stated=False),
+    ]
+    known = facts(capsys, "info", path)
+    assert known["possible_truths"][1] == "--truth-variable bin --truth-unit bins or ns"
+    given = ("--capture", path, "--truth-variable", "range_m", "--bin-width", "1ns")
+    known = facts(capsys, "estimate", "peak", *given)
+    assert known["pixels_with_a_target"] == 11
+    assert f"truth: {path.name}, variable range_m, in m" in known["source"]
 
 
 def test_a_published_truth_is_read() -> None:

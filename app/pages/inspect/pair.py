@@ -50,7 +50,6 @@ class PairSection(Section):
     def __init__(self, session: Session) -> None:
         super().__init__(session, "kept", "viewing")
         self.pair: Pair | None = None
-        self._a: tuple[str, Answer] | None = None
         self.a, self.b, self.difference = self._pictures = [
             Picture(session.choose_pixel, session.pick, HEIGHT_PX) for _ in range(3)
         ]
@@ -61,7 +60,8 @@ class PairSection(Section):
         self._painted += [picture.image for picture in self._pictures]
         self.facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")
         self.note = Sentence(live=True, text=text.NO_A, sizing_mode="stretch_width", margin=0)
-        self._forget = button("Forget A", text.FORGET_HELP, partial(self._keep, ""))
+        forget = partial(setattr, session.state, "kept", "")
+        self._forget = button("Forget A", text.FORGET_HELP, forget)
         self._of_images: list[Fact] = []
         self._content = pn.Column(visible=False, sizing_mode="stretch_width")
         session.state.param.watch(lambda *_: self._mark(), "pixel")
@@ -88,12 +88,7 @@ class PairSection(Section):
     # Actions of the user
 
     def _keep_present(self) -> None:
-        query = self.session.request_query()
-        self._a = query, self.session.answer
-        self._keep(query)
-
-    def _keep(self, query: str) -> None:
-        self.session.state.kept = query
+        self.session.keep(self.session.request_query(), self.session.answer)
 
     # Computation
 
@@ -111,8 +106,9 @@ class PairSection(Section):
         except ValueError as error:
             self._show_nothing(cause(error))
             return
-        known = self._a[1] if self._a and self._a[0] == kept else None
-        work = partial(compared, known, request, session.answer, session.state.viewing)
+        work = partial(
+            compared, session.kept_answer, request, session.answer, session.state.viewing
+        )
         draw = partial(self._draw, kept)
         self.submit(work, draw, lambda error: self._show_nothing(cause(error)))
 
@@ -124,7 +120,9 @@ class PairSection(Section):
         self._content.visible = False
 
     def _draw(self, kept: str, pair: Pair) -> None:
-        self.pair, self._a = pair, (kept, pair.a)
+        self.pair = pair
+        if kept == self.session.state.kept:
+            self.session.keep(kept, pair.a)
         viewing = self.session.state.viewing
         names = [text.estimate_name(each) for each in (pair.a, pair.b)]
         self.note.text = ""

@@ -30,6 +30,7 @@ from app.units import (
     Scale,
     bounds,
     count,
+    noted,
     plus_minus,
     scale,
     three_digits,
@@ -386,9 +387,24 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
         ("PPP, all pixels", interval(image.signal), f"{of_all}: signal flux {per}"),
         ("SBR, all pixels", interval(image.sbr), f"{of_all}: signal over background."),
         ("Background", interval(image.background), f"Mean of all pixels over the gate, {per}"),
+        *_stated_facts(report),
         ("Hot pixels", hot, "Pixels with more detections than all neighbours."),
         ("Dead pixels", dead, "Pixels with fewer detections than all neighbours."),
     ]
+
+
+def _stated_facts(report: CaptureReport) -> list[Fact]:
+    """Return what the file states, with the difference of the estimate, in percent."""
+    titles = {"signal": "Signal, stated", "background": "Background, stated", "sbr": "SBR, stated"}
+    facts: list[Fact] = []
+    for each in report.stated:
+        change = 100 * each.difference / each.stated if each.stated else math.nan
+        note = f"estimate {change:+.1f} %" if math.isfinite(change) else ""
+        of = f"in {each.unit} of a pixel" if each.unit else "signal over background"
+        estimate = interval(each.estimate)
+        help = f"Stated by the file, {of}. The estimate of the mean of all pixels is {estimate}."
+        facts.append((titles[each.name], noted(each.stated, note), help))
+    return facts
 
 
 def flux_sentence(report: CaptureReport) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from time import perf_counter
 
@@ -12,7 +12,16 @@ import param
 from app.model.capture_defaults import enter, own_field_of_view_deg
 from app.model.restore import parameters_of, request_of
 from app.model.state import State
-from app.model.store import COMPUTED_FROM, Answer, Request, Source, compute, same_subject, same_view
+from app.model.store import (
+    COMPUTED_FROM,
+    Answer,
+    Refused,
+    Request,
+    Source,
+    compute,
+    same_subject,
+    same_view,
+)
 from app.model.text import no_estimates
 from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
@@ -30,15 +39,6 @@ FEW_S = 0.25
 """Predicted time up to which an estimate may run on the page's thread."""
 
 
-@dataclass(frozen=True)
-class Refused:
-    """A file that could not be read."""
-
-    request: Request
-    variables: tuple[str, ...]
-    """Names of its arrays of which the user must choose one; empty for other errors."""
-
-
 class CurrentEstimate:
     """Keep the estimate for the state up to date.
 
@@ -50,6 +50,8 @@ class CurrentEstimate:
     failures : FailureLog
     first : Answer
         The estimate for the present state.
+    refused : Refused or None
+        The file that was requested instead, if it could not be read.
 
     Attributes
     ----------
@@ -72,9 +74,9 @@ class CurrentEstimate:
         tasks: PageTasks,
         failures: FailureLog,
         first: Answer,
+        refused: Refused | None = None,
     ) -> None:
-        self.answer = first
-        self.refused: Refused | None = None
+        self.answer, self.refused = first, refused
         self.changed: Signal[Answer] = Signal()
         self.busy: Signal[bool] = Signal()
         self._state, self._sources = state, sources
@@ -134,7 +136,7 @@ class CurrentEstimate:
             with param.discard_events(self._state):
                 self._state.param.update(parameters_of(shown, self._sources))
             if not (request.source.is_scene or same_subject(request, self.answer.request)):
-                self.refused = Refused(request, getattr(error, "variables", ()))
+                self.refused = Refused.of(request, error)
         self._end()
         self.changed.emit(self.answer)
         self._failures.report(error)

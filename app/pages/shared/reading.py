@@ -12,6 +12,7 @@ import panel_material_ui as pmui
 
 from app.model.reading import changed_options
 from app.model.store import Request
+from app.model.text import cause
 from app.widgets.cards import button, part, select
 from app.widgets.controls import Sentence
 from core.io import ReadOptions, reading_options
@@ -139,7 +140,7 @@ class ReadingForm:
         try:
             self._read(changed_options(self._reading, self._shown, typed))
         except ValueError as error:
-            self._complain(str(error))
+            self._complain(cause(error))
 
 
 def _text(field: Any) -> str:

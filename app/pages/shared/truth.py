@@ -1,27 +1,36 @@
-"""The form that adds true ranges to a capture."""
+"""The form that adds true ranges to a capture, and the offer of those in its own file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import panel as pn
 import panel_material_ui as pmui
 
+from app.model.store import Answer
 from app.model.text import cause
-from app.model.truth import SUFFIXES, Truth, check_truth
+from app.model.truth import SUFFIXES, Truth, check_truth, offered_truths
 from app.model.uploads import Uploads
 from app.pages.session import Session
-from app.widgets.cards import part, select
+from app.widgets.cards import button, part, select
 from app.widgets.controls import Sentence
 from app.widgets.file_input import file_button
-from core.io import TRUTH_UNITS
+from core.io import TRUTH_OPTIONS, TRUTH_UNITS, PossibleTruth
 
-HELP = (
+log = logging.getLogger(__name__)
+
+HELP = "Error, metrics and reliability are then shown."
+FORM_HELP = (
     "An image of the capture's shape: true ranges, another capture's estimates, or a simulated "
-    "capture. Error, metrics and reliability are then shown."
+    f"capture. {HELP}"
 )
 UNITS = {"m": "m", "bins": "bins after the opening of the gate", "ns": "ns after the pulse"}
+
+OFFER = "The file has images that may be the true ranges."
+UNIT_QUESTION = "In which unit is {name}?"
 
 
 class TruthForm:
@@ -55,11 +64,12 @@ class TruthForm:
         self._key = ""
         self._jobs = session.tasks.latest()
         self.status = Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8))
-        self.file = file_button("Add a truth", SUFFIXES, self._upload, self._refuse)
+        self.file = file_button(TRUTH_OPTIONS["truth"], SUFFIXES, self._upload, self._refuse)
         units = {"as the file states": ""} | {UNITS[unit]: unit for unit in TRUTH_UNITS}
-        self.unit = select("Unit of the truth", units, "", "Unit of the numbers in the file.")
+        label, help = TRUTH_OPTIONS["truth_unit"], "Unit of the numbers in the file."
+        self.unit = select(label, units, "", help)
         self.variable = pmui.TextInput(
-            label="Array of the truth",
+            label=TRUTH_OPTIONS["truth_variable"],
             description="Name of the array, if several would fit.",
             placeholder="the one that fits",
             size="small",
@@ -68,7 +78,7 @@ class TruthForm:
         )
         self.part = part(
             "Truth from a file",
-            Sentence(text=HELP, sizing_mode="stretch_width", margin=(4, 8)),
+            Sentence(text=FORM_HELP, sizing_mode="stretch_width", margin=(4, 8)),
             self.file,
             self.unit,
             self.variable,
@@ -102,3 +112,66 @@ class TruthForm:
 
     def _refuse(self, reason: str) -> None:
         self.status.text = f"Not added: {reason}"
+
+
+class TruthOffer:
+    """Buttons that take an image of the capture's own file as its truth.
+
+    Parameters
+    ----------
+    session : Session
+    add : callable
+        Called with the truth that the user chose.
+
+    Attributes
+    ----------
+    layout : Column
+        Visible where there is such an image, and the capture has no truth.
+    """
+
+    def __init__(self, session: Session, add: Callable[[Truth], None]) -> None:
+        self._add = add
+        self._jobs = session.tasks.latest()
+        self._subject: Any = None
+        self.layout = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+
+    def show(self, answer: Answer) -> None:
+        """Look for images that may be the truth of a capture."""
+        subject = answer.request.source, answer.request.reading
+        if subject == self._subject:
+            return
+        self._subject, self.layout.visible = subject, False
+        offer = partial(self._offer, subject)
+        self._jobs.submit(partial(offered_truths, answer), offer, self._log)
+
+    def _offer(self, subject: Any, found: Sequence[PossibleTruth]) -> None:
+        if subject == self._subject:  # else outdated
+            self._ask(OFFER, [_button(_label(each), HELP, self._choose, each) for each in found])
+
+    def _choose(self, truth: PossibleTruth) -> None:
+        """Take an image, or ask for its unit where the file leaves it open."""
+        name = truth.name
+        if truth.is_unit_stated:
+            self._add(Truth("", "", name))
+            return
+        help = f"{_label(truth)} in this unit."
+        self._ask(
+            UNIT_QUESTION.format(name=name),
+            [_button(UNITS[each], help, self._add, Truth("", each, name)) for each in truth.units],
+        )
+
+    def _ask(self, question: str, buttons: Sequence[Any]) -> None:
+        asked = Sentence(text=question, live=True, sizing_mode="stretch_width", margin=(4, 8))
+        self.layout[:] = [asked, pn.FlexBox(*buttons)]
+        self.layout.visible = bool(buttons)
+
+    def _log(self, error: Exception) -> None:
+        log.warning("could not list the images of a capture's file", exc_info=error)
+
+
+def _label(truth: PossibleTruth) -> str:
+    return f"Use {truth.name} as the truth"
+
+
+def _button(label: str, help: str, act: Callable[[Any], None], of: Any) -> pmui.Button:
+    return button(label, f"{label}: {help}", partial(act, of), (2, 0, 6, 8))

@@ -20,6 +20,7 @@ from core.io.readers import gmapd, labelled, matlab, npy, npz, ptu, sdt, tmf8820
 from core.io.readers.content import Reader, decompressed, is_gzip, reader_of, suffixes_of
 from core.io.readers.guards import MAX_CUBE_BYTES, FileVersion
 from core.io.readers.options import ReadOptions, reading_options
+from core.io.readers.sequence import files_of, read_files
 from core.io.readers.stored import ZARR_MARKS
 
 if TYPE_CHECKING:
@@ -86,7 +87,8 @@ def read_capture(path: str | os.PathLike[str], **given: Any) -> Capture:
     Parameters
     ----------
     path : path-like
-        A file of one of the `READERS`, or a Zarr directory.
+        A file of one of the `READERS`, or a Zarr directory. A pattern in the last part, such as
+        ``runs/run_*.npz``, stands for a sequence of files (`core.io.readers.sequence`).
     **given
 
     Returns
@@ -131,8 +133,7 @@ def open_capture(path: str | os.PathLike[str], **given: Any) -> xr.DataArray:
     path = Path(path)
     request = _request_of("open_capture", path, given)
     with refusing(path, CaptureError):
-        _require_exists(path)
-        open_counts = None if is_gzip(path) else reader_of(path, READERS).open_counts
+        open_counts = _opener(path)
         if open_counts is None:
             return _read(path, request).to_xarray()["counts"]
         return open_counts(path, request)
@@ -148,8 +149,7 @@ def bytes_of(path: str | os.PathLike[str], **options: Any) -> int | None:
     """
     path = Path(path)
     with refusing(path, CaptureError):
-        _require_exists(path)
-        if is_gzip(path) or reader_of(path, READERS).open_counts is None:
+        if _opener(path) is None:
             return None
     # With pulse and detection given, no count is read to guess them.
     return int(open_capture(path, **options | {"pulse": Pulse(), "detection": "all"}).nbytes)
@@ -164,10 +164,20 @@ def _request_of(function: str, path: Path, given: Mapping[str, Any]) -> ReadOpti
 
 
 def _read(path: Path, request: ReadOptions) -> Capture:
-    """Read a file, which must not change meanwhile."""
+    """Read a file, which must not change meanwhile, or a sequence of files."""
+    if files := files_of(path):
+        return read_files(files, request, _read)
     _require_exists(path)
     with FileVersion.of(path).unchanged(), decompressed(path) as plain:
         return reader_of(plain, READERS).read(plain, request)
+
+
+def _opener(path: Path) -> Callable[[Path, ReadOptions], xr.DataArray] | None:
+    """Return the function that opens a file without reading its counts, if there is one."""
+    if files_of(path):
+        return None
+    _require_exists(path)
+    return None if is_gzip(path) else reader_of(path, READERS).open_counts
 
 
 def _require_exists(path: Path) -> None:

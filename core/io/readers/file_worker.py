@@ -85,7 +85,10 @@ def _open_hdf5(path: str) -> Any:
 
 
 def list_hdf5(path: str) -> Reply:
-    """Describe all arrays of a file: name, shape, type, chunk, axes and attributes."""
+    """Describe all arrays of a file: name, shape, type, chunk, axes and attributes.
+
+    An array that is one number without axes counts as an attribute of its group, too.
+    """
     import h5py  # noqa: PLC0415
 
     arrays: list[dict[str, Any]] = []
@@ -97,9 +100,12 @@ def list_hdf5(path: str) -> Reply:
             elif isinstance(found, h5py.Group):
                 groups[name] = _hdf5_attributes(found)
             else:
-                known = _hdf5_attributes(found)
+                known, about = _hdf5_attributes(found), _described_hdf5(found)
                 if not str(known.get("NAME", "")).startswith(_NO_VARIABLE):
-                    arrays.append({"name": name, "attributes": known, **_described_hdf5(found)})
+                    arrays.append({"name": name, "attributes": known, **about})
+                if "value" in about:
+                    group, _, own_name = name.rpartition("/")
+                    groups[group].setdefault(own_name, about["value"])
     return {"arrays": arrays, "groups": groups}, []
 
 
@@ -140,8 +146,9 @@ def _described_hdf5(array: Any) -> dict[str, Any]:
             "type": array.dtype.newbyteorder("=").str,
             "chunk": array.chunks,
             "axes": _axes(array),
+            **({"value": array[()].item()} if array.shape == () else {}),
         }
-    except (ValueError, TypeError, RuntimeError, KeyError) as error:
+    except (ValueError, TypeError, RuntimeError, KeyError, OSError) as error:
         return {"refused": str(error)}
 
 

@@ -42,6 +42,7 @@ from core.io.readers.layout import (
     number,
     require_image,
     require_pulse_in_gate,
+    stated_flux,
 )
 from core.io.readers.options import ReadOptions
 from core.io.readers.quantities import UNITS_S as TIME_UNITS_S
@@ -226,6 +227,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
         reported_range_m=file.image("reported_range_m"),
         signal=file.image("signal"),
         background=number(counts.attrs, "background") if is_own else None,
+        stated_flux=stated_flux(counts.attrs),
     )
 
 

@@ -1,17 +1,19 @@
 """Fields that both layouts of this project share, `core.io.readers.npz` and `labelled`.
 
-They are the arrays of an archive, or the attributes of an array of counts.
+They are the arrays of an archive, or the attributes of an array of counts. Files of other layouts
+may state fluxes of their pixels under the names of `STATED`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from core.acquisition import SHORTEST_PULSE_S, Acquisition, Pulse, require_time
+from core.capture import StatedFlux
 from core.checks import require
 from core.io.readers.options import ReadOptions
 from core.io.readers.quantities import time_text
@@ -21,6 +23,21 @@ TIMING = ("bin_width_s", "gate_delay_s", "pixel_angle_rad", "n_pulses")
 
 PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 """Fields that define a pulse together."""
+
+STATED = {
+    "signal": ("meansignalphotons", "meansigdetect", "signalphotons", "signalppp", "sigppp"),
+    "background": (
+        "meanbackgroundphotons",
+        "meannoisephotons",
+        "backgroundphotons",
+        "backgroundppp",
+        "bgppp",
+        "noiseppp",
+    ),
+    "sbr": ("sbr", "meansbr", "signaltobackgroundratio"),
+}
+"""Names of numbers that state each field of `StatedFlux`, in lower case without underscores; the
+project's own layouts prefix the field with ``stated_``."""
 
 _MOST_SAMPLES = 2**20
 _MOST_SAMPLES_BEYOND_GATE = 2**16
@@ -46,6 +63,30 @@ def completed(request: ReadOptions, known: Mapping[str, Any]) -> ReadOptions:
     if request.pulse is None and any(name in known for name in PULSE):
         values["pulse"] = _pulse(known)
     return replace(request, **values)
+
+
+def stating(names: Iterable[str]) -> list[str]:
+    """Return the names of `STATED` among those of a file."""
+    return [name for name in names if _stated_field(name) is not None]
+
+
+def stated_flux(known: Mapping[str, Any]) -> StatedFlux | None:
+    """Return the fluxes that the numbers of a file state; None if there are none.
+
+    What is not one finite number of at least 0 is left out.
+    """
+    found: dict[str, float] = {}
+    for name in stating(known):
+        value = np.asarray(known[name])
+        if value.size == 1 and value.dtype.kind in "iuf" and 0 <= value.item() < np.inf:
+            found.setdefault(str(_stated_field(name)), float(value.item()))
+    return StatedFlux(**found) if found else None
+
+
+def _stated_field(name: str) -> str | None:
+    plain = name.lower().replace("_", "")
+    known = (field for field, names in STATED.items() if plain in (*names, f"stated{field}"))
+    return next(known, None)
 
 
 def number(known: Mapping[Any, Any], name: str) -> float | None:

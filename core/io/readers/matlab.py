@@ -4,8 +4,8 @@ Either a cell array (row, col) holding each pixel's photon arrival times as a ve
 (row, col, bin) of counts, or a sparse matrix (pixel, bin) of counts, as published simulated
 captures are stored. The file may have other variables if only one fits. Numbers under the names of
 the project's own layout, ``bin_width_s``, ``gate_delay_s``, ``n_pulses`` and ``pixel_angle_rad``,
-are used. A number named like ``bin_width`` or ``resolution`` that is plausible in seconds is taken
-as the bin width, as a guess.
+are used; fluxes under the names of `core.io.readers.layout.STATED` are kept. A number named like
+``bin_width`` or ``resolution`` that is plausible in seconds is taken as the bin width, as a guess.
 
 The pixels of a sparse matrix follow each other column by column, as MATLAB's ``reshape`` lists
 them, or row by row with ``axes="row col"``. Rows and columns come from ``shape``; without it they
@@ -36,7 +36,7 @@ from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
 from core.io.readers.dense import LARGEST_COUNT, count_dtype, cube_capture, dense_capture
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.layout import TIMING, completed
+from core.io.readers.layout import TIMING, completed, stated_flux, stating
 from core.io.readers.maps import Map
 from core.io.readers.options import ReadOptions, choose_variable
 from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
@@ -179,9 +179,20 @@ def read(path: Path, request: ReadOptions) -> Capture:
     """Read a cell array of arrival times, a cube, or a sparse matrix."""
     file = _opened(path)
     variable = _choose(file.variables, request.variable)
-    name, origin = variable.name, f"{path.name}, variable {variable.name}"
-    stated = (one for one in file.variables if one.is_number and one.name in TIMING)
-    request = completed(request, {one.name: file.array(one) for one in stated})
+    numbers = {one.name: one for one in file.variables if one.is_number}
+
+    def values(names: Iterable[str]) -> dict[str, Any]:
+        return {name: file.array(numbers[name]) for name in names if name in numbers}
+
+    origin = f"{path.name}, variable {variable.name}"
+    capture = _capture(file, variable, origin, completed(request, values(TIMING)))
+    return replace(capture, stated_flux=stated_flux(values(stating(numbers))))
+
+
+def _capture(
+    file: _Version5 | _Version73, variable: Variable, origin: str, request: ReadOptions
+) -> Capture:
+    name = variable.name
     if variable.kind == "cell":
         times, pixel = file.cells(variable)
         shape = (variable.shape[0], variable.shape[1])

@@ -16,6 +16,7 @@ field                 shape           meaning
 ``reported_range_m``  (row, col)      range in metres that the instrument reported; may be absent
 ``signal``            (row, col)      true signal photons per pulse; may be absent
 ``background``        scalar          true background photons per pulse and gate; may be absent
+``stated_sbr``, ...   scalars         fields of `core.capture.StatedFlux`; may be absent
 ``detection``         text            ``"first"`` or ``"all"``, see `core.capture.Detection`
 ``source``            text            where the capture came from; may be absent
 ====================  ==============  ==========================================================
@@ -55,11 +56,13 @@ from core.io.readers.layout import (
     number,
     require_image,
     require_pulse_in_gate,
+    stated_flux,
+    stating,
 )
 from core.io.readers.maps import Map
 from core.io.readers.npy import frames_in, read_array, read_header
 from core.io.readers.options import ReadOptions, choose_variable
-from core.labels import fields_of
+from core.labels import fields_of, stated_fields
 
 FORMAT = "firstphoton-capture-1"
 
@@ -78,6 +81,7 @@ def fields(capture: Capture) -> dict[str, NDArray[Any]]:
         "reported_range_m": capture.reported_range_m,
         "signal": capture.signal,
         "background": capture.background,
+        **stated_fields(capture),
     }
     return {name: np.asarray(value) for name, value in kept.items() if value is not None}
 
@@ -93,12 +97,15 @@ def read(path: Path, request: ReadOptions) -> Capture:
         names = _names(archive)
         name = _choose(archive, names, request)
         origin = f"{path.name}, variable {name}"
+        numbers = [each for each in stating(names) if _is_number(archive, each)]
+        stated = stated_flux({each: _field(archive, each) for each in numbers})
         is_frames = name == "frames" or (request.no_trigger is not None and name != "cube")
         if name != "cube" and not is_frames:
             counts = _array(archive, name)
             require_counts(counts, name, request.axes)
-            stated = {each: _field(archive, each) for each in TIMING if _is_number(archive, each)}
-            return cube_capture(counts, name, origin, completed(request, stated))
+            timing = {each: _field(archive, each) for each in TIMING if _is_number(archive, each)}
+            capture = cube_capture(counts, name, origin, completed(request, timing))
+            return replace(capture, stated_flux=stated)
         known = {field: _field(archive, field) for field in names if field in _FIELDS}
         version = known.get("format", FORMAT)
         require("format", version, str(version) == FORMAT, FORMAT)
@@ -128,6 +135,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
             reported_range_m=_image(archive, "reported_range_m", capture.shape),
             signal=_image(archive, "signal", capture.shape),
             background=number(known, "background"),
+            stated_flux=stated,
         )
 
 

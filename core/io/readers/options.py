@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
 from typing import Any, get_args
 
 import numpy as np
@@ -243,7 +244,8 @@ class ReadOptions:
         "records",
         _RECORDS,
         "Records of a sequence in time that are added up, counted from 0: one such as 0, or a span "
-        "such as 3-7. A frame of raw frames or of a scan is a record.",
+        "such as 3-7. A frame of raw frames or of a scan is a record, and so is each file of a "
+        "sequence such as 'run_*.npz'.",
     )
 
     def __post_init__(self) -> None:
@@ -402,7 +404,23 @@ def with_flags(message: str, *others: str) -> str:
     `others` are names of arguments that are no fields of `ReadOptions`.
     """
     flags = {name: option.flag for name, option in reading_options().items()}
-    for name, flag in (flags | {name: name.replace("_", "-") for name in others}).items():
-        if "_" in name:
-            message = re.sub(rf"\b{name}\b", f"--{flag}", message)
+    flags |= {name: name.replace("_", "-") for name in others}
+    return _renamed(message, {name: f"--{flag}" for name, flag in flags.items()})
+
+
+def with_labels(message: str, others: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a message with the labels of a form instead of the arguments' names.
+
+    `others` are labels of arguments that are no fields of `ReadOptions`, by their names.
+    """
+    labels = {name: option.label for name, option in reading_options().items()} | {**others}
+    found = _renamed(message, {name: f"“{label}”" for name, label in labels.items()})
+    return found.replace("” = None is not accepted", "” is empty")
+
+
+def _renamed(message: str, names: Mapping[str, str]) -> str:
+    """Replace the names of arguments; one that is a common word only where a value follows."""
+    for name, other in names.items():
+        end = r"\b" if "_" in name else r"(?= = )"
+        message = re.sub(rf"\b{name}{end}", other, message)
     return message

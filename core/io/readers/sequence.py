@@ -1,0 +1,85 @@
+"""Files of one name pattern as a sequence in time: each is a record, and records are added up.
+
+A path with a pattern in its last part, such as ``runs/run_*.npz``, stands for the files that match
+it, numbers in their order: ``run_2`` comes before ``run_10``. They must agree in size, timing and
+kind of detection. The pulse is that of the first one that is read.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from core.capture import IMAGES, Capture, CaptureError
+from core.checks import refusing, require
+from core.io.readers.dense import whole_counts
+from core.io.readers.options import ReadOptions
+from core.io.readers.records import chosen_records, described
+
+_PATTERN = re.compile(r"[*?\[]")
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the files that a pattern stands for, in order; none for the path of a file."""
+    if not _PATTERN.search(path.name) or path.exists():
+        return []
+    return sorted(path.parent.glob(path.name), key=_order)
+
+
+def _order(path: Path) -> list[tuple[bool, int, str]]:
+    """Return a key that sorts numbers in a name by their value."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(each.isdecimal(), int(each) if each.isdecimal() else 0, each) for each in parts]
+
+
+def read_files(
+    files: list[Path], request: ReadOptions, read: Callable[[Path, ReadOptions], Capture]
+) -> Capture:
+    """Read the requested files of a sequence, and add them up.
+
+    Parameters
+    ----------
+    files : list of Path
+        All files of the sequence.
+    request : ReadOptions
+        Its ``records`` are numbers of files.
+    read : callable
+        Reads one file.
+    """
+    chosen, one = chosen_records(request, len(files)), replace(request, records=None)
+    total: Capture | None = None
+    for file in files[chosen.start : chosen.stop]:
+        with refusing(file, CaptureError):
+            found = read(file, one)
+            total = found if total is None else _sum(total, found)
+        one = replace(one, pulse=total.pulse)
+    assert total is not None
+    source = f"{described(chosen, len(files), 'file')}; {total.source}"
+    stated = total.stated_flux if len(chosen) == 1 else None
+    return replace(total, source=source, n_records=len(files), stated_flux=stated)
+
+
+def _sum(total: Capture, one: Capture) -> Capture:
+    """Add the counts of a file; images and fluxes remain where both are the same."""
+    require("shape", one.cube.shape, one.cube.shape == total.cube.shape, f"{total.cube.shape}")
+    require("detection", one.detection, one.detection == total.detection, total.detection)
+    pulses = total.acquisition.n_pulses, one.acquisition.n_pulses
+    n_pulses = None if None in pulses else sum(filter(None, pulses))
+    before, here = (replace(each.acquisition, n_pulses=n_pulses) for each in (total, one))
+    require("acquisition", here, here == before, f"{before}, that of the files before")
+    cube = whole_counts(np.add(total.cube, one.cube, dtype=np.uint64), "the sum of the files")
+    compared = (*IMAGES, "background")
+    same: dict[str, Any] = {
+        name: getattr(total, name) if _agree(total, one, name) else None for name in compared
+    }
+    return replace(total, cube=cube, acquisition=before, **same)
+
+
+def _agree(total: Capture, one: Capture, name: str) -> bool:
+    values = getattr(total, name), getattr(one, name)
+    return all(each is not None for each in values) and np.array_equal(*values, equal_nan=True)

@@ -1,0 +1,104 @@
+"""Tests of fluxes that a file states: read, kept, and compared with estimates, never used."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from core import Capture, StatedFlux, estimate, read_capture, save_capture, scenes, simulate
+from core.acquisition import Flux
+from core.cli import main
+from core.inspection import capture_report
+from core.io.writers import CAPTURE_SUFFIXES
+from core.reductions import Reduction
+from core.tests.labelled_files import Matlab73, hdf5_bytes
+
+pytestmark = pytest.mark.files
+
+STATED = StatedFlux(signal=2.0, background=16.0, sbr=0.125)
+NAMED = {"SBR": 0.125, "mean_signal_photons": 2.0, "noise_ppp": 16.0, "mean_sbr": np.nan}
+
+
+def mat73(path: Path, counts: Any, **numbers: float) -> None:
+    file = Matlab73()
+    file.number("counts", counts)
+    for name, value in numbers.items():
+        file.number(name, value)
+    path.write_bytes(file.bytes())
+
+
+WRITE: dict[str, Callable[..., Any]] = {
+    "v5.mat": lambda path, **known: savemat(path, known),
+    "v73.mat": mat73,
+    "a.npz": np.savez,
+    "a.h5": lambda path, **known: path.write_bytes(hdf5_bytes(**known)),
+}
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    scene = scenes["staircase"](24)
+    return simulate(scene, replace(scene.acquisition, n_pulses=200), Flux(signal=0.05, sbr=0.5))
+
+
+@pytest.mark.parametrize("name", WRITE)
+def test_stated_fluxes_are_read_by_many_names_and_change_no_estimate(
+    name: str, capture: Capture, tmp_path: Path
+) -> None:
+    path, plain = tmp_path / name, tmp_path / "plain.npz"
+    WRITE[name](path, counts=capture.cube, **NAMED)
+    np.savez(plain, counts=capture.cube)
+    found, bare = read_capture(path), read_capture(plain)
+    assert (found.stated_flux, bare.stated_flux) == (STATED, None)
+    for method in ("likelihood", "tracking"):
+        images = [estimate(each, method) for each in (found, bare)]
+        np.testing.assert_array_equal(images[0].range_m, images[1].range_m)
+
+
+@pytest.mark.parametrize("suffix", CAPTURE_SUFFIXES)
+def test_stated_fluxes_are_saved(suffix: str, capture: Capture, tmp_path: Path) -> None:
+    path = tmp_path / f"a{suffix}"
+    save_capture(replace(capture, stated_flux=STATED), path)
+    assert read_capture(path).stated_flux == STATED
+
+
+def test_a_reduction_that_changes_the_fluxes_drops_what_was_stated(capture: Capture) -> None:
+    stated = replace(capture, stated_flux=STATED)
+    kept = {name: Reduction(**{name: 2}).of(stated).stated_flux for name in ("merge", "skip")}
+    assert kept == {"merge": STATED, "skip": STATED}
+    for change in ({"pool": 2}, {"gate": (0, 50)}, {"pulses": 0.5}):
+        assert Reduction(**change).of(stated).stated_flux is None
+
+
+def test_statement_and_estimate_are_compared_in_the_same_unit(
+    capture: Capture, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert capture.background is not None and capture.signal is not None
+    true = StatedFlux(float(capture.signal.mean()) * 200, capture.background * 200)
+    report = capture_report(replace(capture, stated_flux=true))
+    signal, background = report.stated
+    assert (signal.name, background.name) == ("signal", "background")
+    assert (signal.stated, signal.unit) == (true.signal, "photons")
+    assert signal.estimate == report.flux.signal.scaled(200)
+    for each in report.stated:
+        assert each.estimate.value == pytest.approx(each.stated, rel=0.1)
+        assert each.difference == each.estimate.value - each.stated
+    path = tmp_path / "a.npz"
+    save_capture(replace(capture, stated_flux=true), path)
+    assert main(["info", str(path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["stated_signal"] == true.signal
+    assert facts["stated_signal_difference"] == signal.difference
+    assert "stated_sbr" not in facts
+
+
+def test_stated_fluxes_are_checked() -> None:
+    with pytest.raises(ValueError, match="stated sbr = -1"):
+        StatedFlux(sbr=-1)
