@@ -42,7 +42,7 @@ from app.widgets.controls import (
     legend_line,
 )
 from app.widgets.figures import pane_of
-from app.widgets.image_view import ImageView
+from app.widgets.image_view import CONTAINER, ImageView
 from app.widgets.signal_plots import SignalPlots
 
 # Where the numbers of the pixel need more rows, the plots keep their height.
@@ -89,7 +89,9 @@ class Explore(Section):
         self.signals = SignalPlots()
         self.image = ImageView(session.choose_pixel)
         self._painted = [self.signals, self.image]
-        self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
+        self.image_keys = PixelKeys(
+            child=self.image.pane, stylesheets=[CONTAINER], sizing_mode="stretch_both"
+        )
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
         self.cards = [
             self.offer(card(pane_of(plot.figure)), what, partial(pixel_plot, session, plot, what))
