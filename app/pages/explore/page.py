@@ -50,7 +50,8 @@ BOARD = (
     board(780, 125, BREAK_PX)
     + f"""
 @media (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
-  :host {{ height: max(900px, calc(100vh - 125px)) !important; }}
+  :host {{ height: max(900px, calc(100vh - 125px)) !important;
+    grid-template-columns: repeat(2, minmax(0, 1fr)) !important; }}
 }}
 """
 )
@@ -139,7 +140,7 @@ class Explore(Section):
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
             for content in (left, right)
         )
-        main = [self.figures, pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both")]
+        main = [pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both"), self.figures]
         return main, [
             part("View", self._viewing.layout, self._difference),
             part("About this page", pmui.Typography(text.EXPLANATION, margin=8), is_open=False),
