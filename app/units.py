@@ -63,7 +63,7 @@ def number(value: float, unit: str, sign: bool = False, decimals: int | None = N
     if decimals is not None:
         text = f"{value:{plus},.{decimals}f}"
     elif sign or abs(value) < 1000:
-        text = f"{value:{plus}.4g}"
+        text = typeset(f"{value:{plus}.4g}")
     else:
         text = f"{value:,.2f}"
     return Quantity(f"{text} {unit}".strip(), value, unit)
@@ -121,9 +121,18 @@ def three_digits(value: float) -> str:
     if not math.isfinite(value):
         return "–" if math.isnan(value) else "∞"
     if 0 < abs(value) < 1e-3:
-        digits, power = f"{value:.2e}".split("e")
-        return f"{digits}×10{str(int(power)).translate(_RAISED)}"
+        return typeset(f"{value:.2e}")
     return f"{float(f'{value:.3g}'):,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def typeset(text: str) -> str:
+    """Write a number such as 1.2e-05 as 1.2×10⁻⁵, and 1.2e+03 as 1,200; others stay as they are."""
+    if "e" not in text:
+        return text
+    digits, power = text.split("e")
+    if int(power) > 0:
+        return f"{float(text):+,.0f}" if text.startswith("+") else f"{float(text):,.0f}"
+    return f"{digits}×10{str(int(power)).translate(_RAISED)}"
 
 
 def bounds(low: float, high: float) -> str:

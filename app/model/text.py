@@ -10,7 +10,7 @@ from concurrent.futures import BrokenExecutor
 from app.model.methods import METHOD_TITLES
 from app.model.state import AUTOMATIC
 from app.model.store import Answer, Pixel
-from app.units import Scale, between, plus_minus, supported_decimals
+from app.units import Scale, between, plus_minus, supported_decimals, typeset
 from app.units import milliseconds as milliseconds  # noqa: PLC0414
 from app.units import number as number  # noqa: PLC0414
 from app.units import share as share  # noqa: PLC0414
@@ -148,7 +148,8 @@ def without_folders(text: str) -> str:
 
 def cell(value: float, form: str = "{:.4g}", below: str = "") -> Cell:
     """Return a table's cell; a dash if the value is not finite."""
-    return (form.format(value), value, below) if math.isfinite(value) else ("–", None, below)
+    known = math.isfinite(value)
+    return (typeset(form.format(value)), value, below) if known else ("–", None, below)
 
 
 def percent_cell(value: float, below: str = "") -> Cell:
@@ -160,7 +161,7 @@ def interval_cell(found: Interval, form: str) -> Cell:
     """Return an estimate as a table's cell, with its interval below."""
     if math.isnan(found.value):
         return "–", None, ""
-    low, high = (form.removesuffix(" %").format(end) for end in (found.low, found.high))
+    low, high = (typeset(form.removesuffix(" %").format(end)) for end in (found.low, found.high))
     return cell(found.value, form, f"{low} to {high}")
 
 

@@ -94,6 +94,14 @@ def button(
     return made
 
 
+# After a change of the mode, a part's own background follows late, when its text has changed.
+PART = {
+    "color": "var(--mui-palette-text-primary)",
+    "backgroundColor": "transparent",
+    "& .MuiCardHeader-action .MuiIconButton-root": {"color": "inherit"},
+}
+
+
 class Part(pmui.Card):
     """A part of the sidebar that folds."""
 
@@ -109,6 +117,7 @@ def part(title: str, *content: Any, is_open: bool = True, is_shown: bool = True)
         collapsed=not is_open,
         visible=is_shown,
         variant="outlined",
+        sx=PART,
         sizing_mode="stretch_width",
         margin=(4, 6),
     )

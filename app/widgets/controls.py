@@ -21,7 +21,7 @@ import panel as pn
 import param
 from panel.custom import Child
 
-from app.widgets.cards import BREAK_PX, select
+from app.widgets.cards import select
 from app.widgets.component import Component
 from core.parameters import Number, joint_doubts, spec_of
 
@@ -256,7 +256,7 @@ def legend_line() -> Sentence:
     """Return the line below an image that says what is hidden in it."""
     # On one line where the image would shrink for a second one.
     line = "white-space: nowrap; overflow: hidden; text-overflow: ellipsis"
-    style = f"@media (min-width: {BREAK_PX + 1}px) {{ .note {{ {line} }} }}"
+    style = f"@media (min-width: 1281px) {{ .note {{ {line} }} }}"
     return Sentence(
         stylesheets=[style], min_height=LINE_PX, sizing_mode="stretch_width", margin=(0, 8, 4, 8)
     )

@@ -128,6 +128,24 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
 
 
+def proportioned(aspect: float, across_px: int, down_px: int) -> str:
+    """Return the style of a figure whose frame has the proportions of its image.
+
+    It is as large as its container allows.
+
+    Parameters
+    ----------
+    aspect : float
+        Width of the image divided by its height.
+    across_px, down_px : int
+        Room beside the frame, and above and below it.
+    """
+    width = f"(100cqh - {down_px}px) * {aspect:.5g} + {across_px}px"
+    height = f"(100cqw - {across_px}px) / {aspect:.5g} + {down_px}px"
+    return f""":host {{ flex: none !important; width: min(100cqw, {width}) !important;
+      height: min(100cqh, {height}) !important; }}"""
+
+
 def cover(bins: Range1d, n_bins: int) -> bool:
     """Fit an axis to a gate of another length; return whether it was another."""
     if n_bins == bins.reset_end:

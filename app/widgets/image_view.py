@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from app.model.large import Grid
 from app.plots import elements as plots
 from app.theme import Palette
-from app.widgets.figures import Plot, color_bars, paint_frame, pane_of
+from app.widgets.figures import Plot, color_bars, paint_frame, pane_of, proportioned
 from core.io import ColorScale
 
 Array = NDArray[Any]
@@ -26,8 +26,20 @@ return Number.isFinite(found) ? `${Number(found.toPrecision(5))} ${unit}` : "non
 """
 
 
+BORDER_PX = {"left": 52, "right": 66, "top": 26, "bottom": 40}
+"""Room for axes, title and colour bar; the title leaves room for a download button."""
+
+JOINED_BORDER_PX = {"left": 36, "right": 12, "top": 6, "bottom": 24}
+"""Room around one of several images, without labels and colour bar."""
+
+CONTAINER = ":host { container-type: size; }"
+"""Style of the part of a page that an image fills as far as its proportions allow."""
+
+
 class ImageView:
     """An image in which a tap selects a pixel.
+
+    The part of the page that holds it needs the style `CONTAINER`.
 
     Parameters
     ----------
@@ -44,6 +56,8 @@ class ImageView:
         self.figure = self._plot.figure
         self.pane = pane_of(self.figure)
         self.figure.match_aspect = True
+        self.figure.grid.visible = False
+        self._reserve(BORDER_PX)
         self.figure.x_range = DataRange1d(range_padding=0, renderers=[])
         self.figure.y_range = DataRange1d(range_padding=0, flipped=True, renderers=[])
         picture = self._plot.layers["picture"]
@@ -80,6 +94,7 @@ class ImageView:
         """Share zoom with the first of several images, and their colour scale."""
         self._bar.visible = False
         self.figure.xaxis.axis_label = self.figure.yaxis.axis_label = None
+        self._reserve(JOINED_BORDER_PX)
         if first is self:
             return
         for name in ("x_range", "y_range"):
@@ -101,9 +116,31 @@ class ImageView:
         self._shape, self._grid = (rows, cols), grid
         blank = [np.full((rows, cols), np.nan, np.float32)]
         left, above, *_ = plots.pixel_frame(*grid.place(0, 0), grid.step / 2)
-        size = {"dw": [cols * grid.step], "dh": [rows * grid.step]}
-        self._plot.source("picture").data = {"image": blank, "x": [left], "y": [above], **size}
+        width, height = cols * grid.step, rows * grid.step
+        box = {"x": [left], "y": [above], "dw": [width], "dh": [height]}
+        self._plot.source("picture").data = {"image": blank, **box}
         self.figure.tags = [*grid.first, grid.step, rows, cols]  # resets the zoom, see above
+        self.figure.xaxis.bounds = (left, left + width)
+        self.figure.yaxis.bounds = (above, above + height)
+        self._keep_proportions()
+
+    def _reserve(self, border_px: Mapping[str, int]) -> None:
+        """Reserve room around the image."""
+        self._border_px = border_px
+        self.figure.update(**{f"min_border_{side}": px for side, px in border_px.items()})
+        self._keep_proportions()
+
+    def _keep_proportions(self) -> None:
+        """Fit the frame to the image: a wider or higher one would show what is not there."""
+        rows, cols = self._shape
+        side = self._border_px
+        self.figure.stylesheets = [
+            proportioned(
+                max(cols, 1) / max(rows, 1),
+                side["left"] + side["right"],
+                side["top"] + side["bottom"],
+            )
+        ]
 
     def update(self, image: Array, look: ColorScale) -> None:
         """Show an image (row, col); NaN is blank."""

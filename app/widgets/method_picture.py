@@ -15,7 +15,7 @@ from app.theme import WRONG_COLOR, Palette
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import Sentence
 from app.widgets.figures import paint_frame, pane_of
-from app.widgets.image_view import ImageView
+from app.widgets.image_view import CONTAINER, ImageView
 from core.io import ColorScale
 
 Array = NDArray[Any]
@@ -57,7 +57,9 @@ class Picture:
             stylesheets=[CAPTION], sizing_mode="stretch_width", margin=(0, 8, 4, 8)
         )
         self._picked = picked
-        self._stage = pn.Column(self.image.pane, sizing_mode="stretch_width", margin=0)
+        self._stage = pn.Column(
+            self.image.pane, stylesheets=[CONTAINER], sizing_mode="stretch_width", margin=0
+        )
         self.card = pn.Column(
             self.title,
             self._stage,

@@ -64,7 +64,7 @@ IMAGE_HEIGHT, CLOUD_HEIGHT = 216, 320
 GRID = """
 :host {{ display: grid !important; gap: 8px; width: 100%;
   grid-template-columns: repeat({columns}, minmax(0, 1fr)); }}
-@media screen and (max-width: 900px) {{
+@media screen and (max-width: 1280px) {{
   :host {{ grid-template-columns: repeat({few}, minmax(0, 1fr)); }}
 }}
 @media screen and (max-width: 500px) {{
@@ -76,7 +76,8 @@ CLOUDS_IN_A_ROW = 3
 
 PLOTS = """
 :host { display: grid !important; gap: 8px; height: 290px;
-  grid-template: minmax(0, 1fr) / minmax(0, 5fr) minmax(0, 3fr); }
+  grid-template: minmax(0, 1fr) / minmax(0, 5fr); grid-auto-flow: column;
+  grid-auto-columns: minmax(0, 3fr); }
 @media screen and (max-width: 900px) {
   :host { display: flex !important; flex-direction: column; height: 670px !important; }
 }
@@ -191,7 +192,7 @@ class Compare(Section):
         self._facts = Facts(sizing_mode="stretch_width")
         self._reliability = ReliabilityPlot()
         self._reliability.pane.object.min_border_top = CORNER_PX
-        self._no_reliability = Sentence(text=text.RELIABILITY_UNKNOWN, margin=12)
+        self._reliability_card = card(self._reliability.pane)
         self._painted = [self._scale, self._reliability, self._curves]
         self.table = Table(title=text.TABLE, sizing_mode="stretch_width", margin=(6, 0))
 
@@ -206,10 +207,12 @@ class Compare(Section):
             sizing_mode="stretch_width",
             margin=(4, 0),
         )
-        reliability = card(self._reliability.pane, self._no_reliability)
+        self.offer_plot(
+            self._reliability_card, "reliability", self._reliability.plot, "reliability"
+        )
         plots = pn.Column(
             self.offer(card(self._curves.pane), "scores", self._curves_shown),
-            self.offer_plot(reliability, "reliability", self._reliability.plot, "reliability"),
+            self._reliability_card,
             stylesheets=[PLOTS],
             sizing_mode="stretch_width",
             height=290,
@@ -359,7 +362,7 @@ class Compare(Section):
         if self.kind.value not in kinds:
             self.kind.value = "Range"
         self.kind.options = kinds
-        self._reliability.pane.visible, self._no_reliability.visible = has_truth, not has_truth
+        self._reliability_card.visible = has_truth  # a reliability diagram requires the truth
         if session.scene_id() != self._scene_id:
             self._scene_id = session.scene_id()
             own = session.own_field_of_view_deg
@@ -467,7 +470,7 @@ class Compare(Section):
         image_kind = IMAGE_KINDS.get(self.kind.value, self.kind.value)
         with self.session.tasks.hold():
             columns = max(min(len(methods), CLOUDS_IN_A_ROW if is_clouds else MAX_PICTURES), 1)
-            few, fewest = (1, 1) if is_clouds else (3, 2)
+            few, fewest = (1, 1) if is_clouds else (min(columns, 3), 2)
             self._grid.stylesheets = [GRID.format(columns=columns, few=few, fewest=fewest)]
             _, look = image_of(self.session.answer, image_kind, viewing)
             self._scale.update(look)

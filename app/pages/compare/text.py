@@ -59,7 +59,6 @@ LIMIT_UNKNOWN = (
     "have."
 )
 
-RELIABILITY_UNKNOWN = "A reliability diagram requires the truth, which this capture lacks."
 
 AGREEMENT_ONLY = (
     "This capture has no truth: the table shows agreement with the likelihood, which is not "

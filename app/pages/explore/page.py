@@ -44,7 +44,7 @@ from app.widgets.controls import (
     legend_line,
 )
 from app.widgets.figures import pane_of
-from app.widgets.image_view import ImageView
+from app.widgets.image_view import CONTAINER, ImageView
 from app.widgets.signal_plots import SignalPlots
 
 # Where the numbers of the pixel need more rows, the plots keep their height.
@@ -52,7 +52,8 @@ BOARD = (
     board(780, 125, BREAK_PX)
     + f"""
 @media (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
-  :host {{ height: max(900px, calc(100vh - 125px)) !important; }}
+  :host {{ height: max(900px, calc(100vh - 125px)) !important;
+    grid-template-columns: repeat(2, minmax(0, 1fr)) !important; }}
 }}
 """
 )
@@ -93,7 +94,9 @@ class Explore(Section):
         self.signals = SignalPlots()
         self.image = ImageView(session.choose_pixel)
         self._painted = [self.signals, self.image]
-        self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
+        self.image_keys = PixelKeys(
+            child=self.image.pane, stylesheets=[CONTAINER], sizing_mode="stretch_both"
+        )
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
         self.cards = [
             self.offer(card(pane_of(plot.figure)), what, partial(pixel_plot, session, plot, what))
@@ -144,7 +147,7 @@ class Explore(Section):
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
             for content in (left, right)
         )
-        main = [self.figures, pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both")]
+        main = [pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both"), self.figures]
         return main, [
             part("View", self._viewing.layout, self._difference),
             self.crop.part,

@@ -25,10 +25,10 @@ from app.pages.inspect.views import Navigator, rectangle
 from app.pages.navigation import Page, Pages
 from app.pages.session import Session
 from app.pages.shared.crop import CropSection
-from app.pages.shared.downloads import CORNER_PX, IMAGE_AND_REPORT, Shown, image_on_show
+from app.pages.shared.downloads import IMAGE_AND_REPORT, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
-from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part
+from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part, unrolled
 from app.widgets.component import until_session_ends
 from app.widgets.controls import (
     Chips,
@@ -38,17 +38,17 @@ from app.widgets.controls import (
     Table,
     legend_line,
 )
+from app.widgets.image_view import CONTAINER
 from core.checks import require
 from core.inspection import FaultyPixel, faulty_pixels
 from core.io import ColorScale, RangeColors
 
 # The map with a table below on the left, plots on the right.
 BOARD = board(600, 88, BREAK_PX)
-TABLES = f"""
-:host {{ flex: 0 1 auto !important; min-height: 0; min-width: 0; max-height: 34%;
-  overflow-y: auto; }}
-@media screen and (max-width: {BREAK_PX}px) {{ :host {{ max-height: none }} }}
-"""
+# The same room below the map for all subjects, so that the map keeps its size.
+TABLES = """
+:host { flex: 0 0 34% !important; min-height: 0; min-width: 0; overflow-y: auto; }
+""" + unrolled(BREAK_PX)
 KNOB_PX = 46
 """Height of the slider below the map, reserved from the start."""
 
@@ -92,7 +92,6 @@ class Inspect(Section):
         super().__init__(session)
         state = session.state
         self.navigator = Navigator(session.choose_pixel, self._select)
-        self.navigator.figure.min_border_top = CORNER_PX  # else the button hides a number
         self._painted = [self.navigator]
         self._large = LargeView(session, self.navigator.figure)
         self.keys = PixelKeys(
@@ -183,14 +182,14 @@ class Inspect(Section):
     def layout(self) -> tuple[Any, Any]:
         """Return the two columns of the page, and its explanation."""
         sections = self._sections
+        framed_map = framed(self.navigator.pane, self.keys)
+        framed_map.stylesheets = [*framed_map.stylesheets, CONTAINER]
         for main, below in zip(sections.mains.values(), sections.asides.values(), strict=True):
             main.param.update(stylesheets=[FILLING], sizing_mode="stretch_both", margin=0)
             below.param.update(stylesheets=[TABLES], sizing_mode="stretch_width", margin=0)
         left = (
             _row(self._map, self._mode, self._clear),
-            self.offer(
-                framed(self.navigator.pane, self.keys), "map", self._map_shown, IMAGE_AND_REPORT
-            ),
+            self.offer(framed_map, "map", self._map_shown, IMAGE_AND_REPORT),
             self.legend,
             self.least_confidence,
             self._large.layout,

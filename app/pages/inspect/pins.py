@@ -30,6 +30,8 @@ class PinsSection(Section):
     found : list of Inspected
         The pixels that are shown.
     counts, score : GatePlot
+    cards : list of pn.Column
+        The plots in their frames, shown where there are pins.
     note : Sentence
         Distances of the pins from the first one, or what to do.
     table : Table
@@ -48,6 +50,10 @@ class PinsSection(Section):
             )
         )
         self._painted = [self.counts, self.score]
+        self.cards = [
+            self.offer_plot(framed(pane_of(plot.figure)), what, plot, f"pins {what}")
+            for plot, what in ((self.counts, "counts"), (self.score, "scores"))
+        ]
         self.note = Sentence(text=text.NO_PINS, sizing_mode="stretch_width", margin=0)
         self.table = Table(
             title=text.PINS, stylesheets=[NARROW], sizing_mode="stretch_width", margin=0
@@ -55,11 +61,7 @@ class PinsSection(Section):
 
     def layout(self) -> tuple[Any, Any]:
         """Return the plots, and the table that stands below the map."""
-        cards = [
-            self.offer_plot(framed(pane_of(plot.figure)), what, plot, f"pins {what}")
-            for plot, what in ((self.counts, "counts"), (self.score, "scores"))
-        ]
-        return stage(self.note, *cards), self.offer_table(self.table, "pins")
+        return stage(self.note, *self.cards), self.offer_table(self.table, "pins")
 
     def paint(self, dark: bool) -> None:
         """Change between light and dark mode."""
@@ -104,6 +106,8 @@ class PinsSection(Section):
                 for each, name, color in zip(found, names, colors, strict=True)
             ],
         )
+        for each in self.cards:
+            each.visible = bool(found)
         self.found = found
         self._write_note()
 

@@ -31,8 +31,7 @@ BREAK_PX = 1100
 
 FACTS = """
 .fact-list { grid-template-columns: repeat(auto-fill, minmax(140px, 1fr)) !important; }
-.leading div:first-child { grid-column: auto !important; }
-.leading div:first-child dd { font-size: 15px !important; }
+.leading div:nth-child(2) { grid-column: auto !important; }
 """
 FILLING = ":host { flex: 1 1 0 !important; min-height: 0; min-width: 0; }" + unrolled(BREAK_PX)
 COLUMN = column(6, BREAK_PX)
@@ -160,7 +159,8 @@ class PixelSection(Section):
         """Show a sentence in place of facts and plots."""
         self._drawn = self.found = None
         with self.session.tasks.hold():
-            self.facts.facts, self.remark.text, self.table.rows = [], why, []
+            self.facts.param.update(facts=[], min_height=0)
+            self.remark.text, self.table.rows = why, []
             for each in self.cards:
                 each.visible = False
 

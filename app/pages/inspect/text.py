@@ -14,6 +14,7 @@ from app.model.state import Viewing
 from app.model.store import Answer
 from app.model.text import (
     CONFIDENCE_HELP,
+    Cell,
     Fact,
     cell,
     estimate_facts,
@@ -260,14 +261,18 @@ def pin_row(found: Inspected, name: str, color: str, along: Scale, other: Scale)
         "cells": [
             (along.number(pixel.answer_bin), pixel.answer_bin if known else None, below),
             percent_cell(pixel.confidence),
-            (
-                three_digits(sbr.value),
-                sbr.value if math.isfinite(sbr.value) else None,
-                bounds(sbr.low, sbr.high),
-            ),
+            _sbr_cell(sbr),
             (report.verdict.health, report.verdict.health, ""),
         ],
     }
+
+
+def _sbr_cell(sbr: Interval) -> Cell:
+    """Return an SBR and its interval, or its lower bound where no background was detected."""
+    if math.isinf(sbr.value):
+        return interval(sbr), sbr.low if math.isfinite(sbr.low) else None, ""
+    known = sbr.value if math.isfinite(sbr.value) else None
+    return three_digits(sbr.value), known, bounds(sbr.low, sbr.high)
 
 
 def distances(found: Sequence[Inspected], viewing: Viewing, is_width_guessed: bool) -> str:

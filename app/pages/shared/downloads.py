@@ -271,6 +271,18 @@ def downloadable(
     return card
 
 
+def shown_with(card: pn.Column, content: Any, parameter: str) -> pn.Column:
+    """Show the download button of a card only while a parameter of its content is not empty."""
+    button = card[-1]
+
+    def show(*_: Any) -> None:
+        button.visible = bool(getattr(content, parameter))
+
+    content.param.watch(show, parameter)
+    show()
+    return card
+
+
 def below(table: Any) -> pn.Column:
     """Return a table with room for a download button above it."""
     table.margin = (CORNER_PX, 0, 0, 0)
@@ -281,7 +293,7 @@ def downloadable_facts(facts: Any, session: Session, show: Callable[[], Shown]) 
     """Return named values with a download button beside them."""
     facts.margin = (0, CORNER_PX, 0, 0)
     holder = pn.Column(facts, sizing_mode="stretch_width", margin=0)
-    return downloadable(holder, session, "numbers", show, TABLE)
+    return shown_with(downloadable(holder, session, "numbers", show, TABLE), facts, "facts")
 
 
 # Contents of cards

@@ -29,6 +29,7 @@ from app.pages.session import Session
 from app.pages.shared.downloads import PLOT, TABLE, Shown, Subject, downloadable
 from app.plots import elements as plots
 from app.theme import LIGHT, RANGE_COLORS, Palette
+from app.units import typeset
 from app.widgets.cards import card
 from app.widgets.controls import Knob, Sentence, Table
 from app.widgets.figures import Layers, paint_frame, pane_of, round_up
@@ -348,7 +349,7 @@ def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]
     below = ""
     if names[place + 1 : place + 3] == ("low", "high"):
         low, high = row[place + 1 : place + 3]
-        below = f"{items.as_text(low)} to {items.as_text(high)}"
+        below = f"{typeset(items.as_text(low))} to {typeset(items.as_text(high))}"
     if names[place] == "difference":
         low, high, printed = row[place - 3 : place]
         larger_is_better = names[place - 4].startswith("RD")
@@ -356,7 +357,7 @@ def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]
         below = "within chance" if low <= printed <= high else "better" if is_better else "worse"
         return [f"{value:+.4f}", value, below]
     known = not math.isnan(value)
-    return [items.as_text(value) if known else "–", value if known else None, below]
+    return [typeset(items.as_text(value)) if known else "–", value if known else None, below]
 
 
 def _name(text: Any) -> str:

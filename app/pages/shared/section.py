@@ -22,6 +22,7 @@ from app.pages.shared.downloads import (
     downloadable,
     downloadable_facts,
     explored,
+    shown_with,
 )
 from app.pages.shared.studies import Study, aside
 from app.tasks.scheduler import Step
@@ -179,7 +180,7 @@ class Section:
         def show() -> Shown:
             return self.saved(what, shown_table_file(table.columns, table.rows))
 
-        return self.offer(below(table), "table", show, TABLE)
+        return shown_with(self.offer(below(table), "table", show, TABLE), table, "rows")
 
 
 class SettingsSection(Section, Generic[Settings]):

@@ -105,6 +105,9 @@ class Study(_ControlledWork):
 class OnePiece(_ControlledWork, Generic[Result]):
     """Long work in one piece, with controls; a cancelled result is not drawn.
 
+    Where `show` is called, the first work starts on screen by itself. Until it is done it costs
+    nothing off screen: it is cancelled there, and starts again on screen.
+
     Parameters
     ----------
     session : Session
@@ -129,12 +132,32 @@ class OnePiece(_ControlledWork, Generic[Result]):
         super().__init__(session, noun, **start)
         self._make_work = work
         self._draw = draw
+        self._starts_by_itself = True
 
     def start(self, work: Work[Result] | None = None) -> None:
         """Start this work, or that for the present settings, in place of the present work."""
+        self._starts_by_itself = False
         work = work or self._make_work()
         self._session.failures.resolve(self)
         self._work.start_piece(work, self._draw)
+
+    def cancel(self) -> None:
+        """Cancel the work."""
+        self._starts_by_itself = False
+        super().cancel()
+
+    def show(self, is_on_screen: bool) -> None:
+        """Start the first work on screen; cancel it off screen."""
+        if not self._starts_by_itself:
+            return
+        if is_on_screen and not self._work.is_running:
+            self._work.start_piece(self._make_work(), self._draw_first)
+        elif not is_on_screen:
+            self._work.cancel()
+
+    def _draw_first(self, result: Result) -> None:
+        self._starts_by_itself = False
+        self._draw(result)
 
 
 def aside(explanation: str, *controls: Any) -> pn.Column:

@@ -37,6 +37,7 @@ class AblationSection(SettingsSection[Repetitions]):
         super().__init__(session, Repetitions(8), text.EXPLANATION)
         self._found: dict[str, Requirement] = {}
         self._studied = session.answer.request
+        self._repetitions = self.settings.repetitions
         self.study = OnePiece(session, self.work, self.draw, "parts")
         self.subject = Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8))
         self.table = Table(
@@ -47,6 +48,11 @@ class AblationSection(SettingsSection[Repetitions]):
         )
         self.table.param.watch(lambda event: self._switch(event.new[0]), "acted")
         self.refresh()
+
+    def show(self, is_on_screen: bool) -> None:
+        """Come on screen, or leave it."""
+        super().show(is_on_screen)
+        self.study.show(is_on_screen)
 
     def layout(self) -> tuple[Any, Any]:
         """Return the table, and its controls."""
@@ -72,7 +78,7 @@ class AblationSection(SettingsSection[Repetitions]):
         """Return the study of the present scene or capture."""
         request, whole = self.session.answer.request, self.session.answer.whole
         build, light, seeds = request.source.scene, request.light, range(self.settings.repetitions)
-        self._studied = request
+        self._studied, self._repetitions = request, self.settings.repetitions
 
         def work(
             progress: Callable[[int, int], None], cancelled: Callable[[], bool]
@@ -95,10 +101,11 @@ class AblationSection(SettingsSection[Repetitions]):
     def refresh(self) -> None:
         """Write the table."""
         request = self.session.answer.request
+        repetitions = self._repetitions if self._found and request.source.is_scene else 0
         build, absent = request.source.scene, self.session.state.absent
         own = [*CORRECTIONS, *(parts_of(build()) if build is not None else ())]
         with self.session.tasks.hold():
-            self.subject.text = text.subject(request.source.title, absent)
+            self.subject.text = text.subject(request.source.title, repetitions, absent)
             self.table.rows = [
                 text.row(name, self._found.get(name), name in own, name in absent)
                 for name in dict.fromkeys([*own, *self._found])

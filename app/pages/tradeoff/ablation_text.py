@@ -29,10 +29,11 @@ COLUMNS = (
 )
 
 
-def subject(title: str, absent: Collection[str]) -> str:
-    """Return what is studied, and what is switched off."""
+def subject(title: str, repetitions: int, absent: Collection[str]) -> str:
+    """Return what is studied, how often if it was simulated, and what is switched off."""
     names = ", ".join(TITLES[name] for name in TITLES if name in absent)
-    return f"{title}." + (f" Switched off on all pages: {names}." if names else "")
+    often = f", {repetitions} repetitions" if repetitions else ""
+    return f"{title}{often}." + (f" Switched off on all pages: {names}." if names else "")
 
 
 def row(name: str, found: Requirement | None, can_switch: bool, is_off: bool) -> dict[str, object]:
@@ -45,7 +46,7 @@ def row(name: str, found: Requirement | None, can_switch: bool, is_off: bool) ->
         "note": "off" if is_off else "",
     }
     if found is None:
-        return made | {"message": "Not studied yet: press Compute."}
+        return made | {"message": "Not studied yet."}
     worst = "" if math.isnan(found.worst) else f"at most {found.worst:.2g}"
     return made | {
         "note": f"{made['note']}; {found.why}".removeprefix("; "),

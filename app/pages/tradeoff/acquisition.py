@@ -7,6 +7,7 @@ from typing import Any
 
 import panel as pn
 
+from app.model.store import Answer
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
 from app.pages.shared.outputs import CurveCard, TableCard
@@ -59,6 +60,7 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         self.cards = [CurveCard() for _ in range(3)]
         self._painted = [*self.cards]
         self._required = TableCard(waiting="")
+        self._results = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self._simulated = session.answer.request
         for each in self.cards:
             each.offer(session, self.about)
@@ -72,8 +74,17 @@ class AcquisitionSection(SettingsSection[Repetitions]):
             stylesheets=[CURVES],
             margin=0,
         )
+        self._results[:] = [curves, self._required.layout]
         controls = self.controls(*self.study.controls)
-        return [self.subject, curves, self._required.layout], part("Simulation", controls)
+        return [self.subject, self._results], part("Simulation", controls)
+
+    def show(self, is_on_screen: bool) -> None:
+        """Come on screen, or leave it; the first simulation starts by itself."""
+        super().show(is_on_screen)
+        if _applies(self.session.answer):
+            self.study.show(is_on_screen)
+        elif not self._results.visible:
+            self.subject.text = text.FIRST_PHOTONS_ONLY
 
     def about(self) -> Subject:
         """Return what the section's files are about."""
@@ -81,6 +92,8 @@ class AcquisitionSection(SettingsSection[Repetitions]):
 
     def work(self) -> Work[tuple[str, list[Any]]]:
         """Return the simulation of the present scene or capture."""
+        if not _applies(self.session.answer):
+            raise ValueError(text.FIRST_PHOTONS_ONLY)
         source, repetitions = source_of(self.session.answer), self.settings.repetitions
         self._simulated = self.session.answer.request
 
@@ -97,7 +110,8 @@ class AcquisitionSection(SettingsSection[Repetitions]):
                 source if isinstance(source, Simulation) else surrogate_of(source, source.source)
             )
             found = acquisition_sweeps([simulation], range(repetitions), progress=report)
-            return simulation.note, list(acquisition_items(found))
+            said = text.simulated(simulation.name, repetitions, simulation.note)
+            return said, list(acquisition_items(found))
 
         return work
 
@@ -108,3 +122,11 @@ class AcquisitionSection(SettingsSection[Repetitions]):
             for each, curve in zip(self.cards, curves, strict=True):
                 each.show(curve)
             self._required.show(required)
+            self._results.visible = True
+
+
+def _applies(answer: Answer) -> bool:
+    """Whether pulses and flux of such a scene or capture can be varied."""
+    is_scene, capture = answer.request.source.is_scene, answer.whole
+    is_first = capture.detection == "first" and capture.acquisition.n_pulses is not None
+    return is_scene or is_first

@@ -50,17 +50,19 @@ from core.studies.trials import Method, default_methods
 Array = NDArray[Any]
 
 PLOT_HEIGHT = 430
-ANY_MERGE = "1, 2 and 4"
+ANY_MERGE, NO_MERGE = "1, 2 and 4", "none"
 
 
 @dataclass(frozen=True)
 class Effort(Repetitions):
-    """Amount of measurement."""
+    """Amount of measurement; by default the least, with which the page starts."""
 
     repeats: int = parameter(
-        7, Number("Timing rounds", 6, 50, log=True, whole=True, least=6), text.REPEATS_HELP
+        6, Number("Timing rounds", 6, 50, log=True, whole=True, least=6), text.REPEATS_HELP
     )
-    merges: str = parameter(ANY_MERGE, Choice("Bins merged", (ANY_MERGE, "none")), text.MERGES_HELP)
+    merges: str = parameter(
+        NO_MERGE, Choice("Bins merged", (NO_MERGE, ANY_MERGE)), text.MERGES_HELP
+    )
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,8 @@ class Goal(Checked):
 class SpeedSection(SettingsSection[Effort]):
     """Computing time and accuracy of each method, with and without merged bins.
 
+    A small measurement starts when it first comes on screen.
+
     Parameters
     ----------
     session : Session
@@ -106,9 +110,9 @@ class SpeedSection(SettingsSection[Effort]):
     """
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session, Effort(4), text.EXPLANATION)
+        super().__init__(session, Effort(), text.EXPLANATION)
         self.measured: list[Point] = []
-        self._measured_on = session.answer.request
+        self._measured_on, self._effort = session.answer.request, self.settings
         self._colors = LIGHT
         self._goal = Goal()
         self.goal = SettingsPanel(self._goal, self._goal_changed)
@@ -117,6 +121,7 @@ class SpeedSection(SettingsSection[Effort]):
             Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8)) for _ in range(3)
         )
         self.subject.text = text.NOT_MEASURED
+        self._results = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self.plot = layers_of(plots.tradeoff(self._colors))
         self.plot.source("points").selected.on_change("indices", self._tapped)
         self.table = Table(title=text.TITLE, sizing_mode="stretch_width", margin=(6, 0))
@@ -130,12 +135,17 @@ class SpeedSection(SettingsSection[Effort]):
             height=PLOT_HEIGHT,
             margin=0,
         )
-        table = self.offer(below(self.table), "table", self._shown, TABLE)
+        self._results[:] = [plot, self.offer(below(self.table), "table", self._shown, TABLE)]
         controls = [
             part("Goal", self.goal.layout),
             part("Measurement", self.controls(*self.study.controls)),
         ]
-        return [self.subject, *self.advice, plot, table], controls
+        return [self.subject, *self.advice, self._results], controls
+
+    def show(self, is_on_screen: bool) -> None:
+        """Come on screen, or leave it."""
+        super().show(is_on_screen)
+        self.study.show(is_on_screen)
 
     def about(self) -> Subject:
         """Return what the section's files are about."""
@@ -150,7 +160,8 @@ class SpeedSection(SettingsSection[Effort]):
         """Show whether the points are still those of the present capture."""
         if self.measured:
             is_present = same_capture(answer.request, self._measured_on)
-            self.subject.text = text.subject(self.measured[0], is_present)
+            effort = self._effort.repetitions, self._effort.repeats
+            self.subject.text = text.subject(self.measured[0], *effort, is_present)
 
     def paint(self, dark: bool) -> None:
         """Change between light and dark mode."""
@@ -176,7 +187,7 @@ class SpeedSection(SettingsSection[Effort]):
     def work(self) -> Work[tuple[Request, list[Point]]]:
         """Return the measurement of the present scene or capture."""
         answer, effort = self.session.answer, self.settings
-        source = source_of(answer)
+        self._effort, source = effort, source_of(answer)
         merges = (1, 2, 4) if effort.merges == ANY_MERGE else (1,)
         chosen = candidates(methods(answer), merges)
 
@@ -196,6 +207,7 @@ class SpeedSection(SettingsSection[Effort]):
     def draw(self, found: tuple[Request, list[Point]]) -> None:
         """Show measured points, and the request that they belong to."""
         self._measured_on, self.measured = found
+        self._results.visible = True
         self.follow(self.session.answer)
         self._redraw()
 

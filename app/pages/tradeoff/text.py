@@ -26,7 +26,8 @@ Tap a point, or press its button in the table, to open it.
 """
 
 NOT_MEASURED = (
-    "Press Compute to measure all methods on this server: about ten seconds for 64 × 64 pixels."
+    "All methods are measured on this server, which takes some seconds. The sidebar shows the "
+    "progress; Cancel stops it, Compute starts it again."
 )
 
 TITLE = "Speed and accuracy"
@@ -102,14 +103,15 @@ def tip(point: Point) -> str:
     )
 
 
-def subject(point: Point, is_present: bool) -> str:
-    """Return what was measured, and whether the other pages still show it."""
+def subject(point: Point, repetitions: int, rounds: int, is_present: bool) -> str:
+    """Return what was measured, how often, and whether the other pages still show it."""
     rows, cols, bins = point.shape
     sbr = "" if point.sbr is None else f", SBR {point.sbr:.3g}"
     pulses = "" if point.n_pulses is None else f", {point.n_pulses:,} pulses"
     note = f" ({point.note})" if point.note else ""
     outdated = "" if is_present else " The capture has changed since: press Compute to repeat it."
-    return f"{point.source}{note}, {rows} × {cols} × {bins}{sbr}{pulses}.{outdated}"
+    often = f"{repetitions} repetitions, {rounds} timing rounds"
+    return f"{point.source}{note}, {rows} × {cols} × {bins}{sbr}{pulses}; {often}.{outdated}"
 
 
 def advice(
@@ -147,7 +149,21 @@ Number of pulses, flux and length of the gate that reach a restoration degree: f
 known signal and background; and from simulation, for the likelihood with known and with estimated
 fluxes. Bands: 95 % intervals.
 """
-NOT_SIMULATED = "Press Compute to simulate 25 acquisitions of this scene: about half a minute."
+NOT_SIMULATED = (
+    "25 acquisitions of this scene are simulated, which takes up to half a minute. The sidebar "
+    "shows the progress; Cancel stops it, Compute starts it again."
+)
+FIRST_PHOTONS_ONLY = (
+    "This study varies pulses and flux of first-photon data. This capture holds all photons, or "
+    "its number of pulses is not known: choose a scene or another capture."
+)
+
+
+def simulated(name: str, repetitions: int, note: str) -> str:
+    """Return what was simulated, and how often."""
+    about = f" ({note})" if note else ""
+    return f"{name}{about}: {repetitions} repetitions of each acquisition."
+
 
 # Sensitivity
 
