@@ -81,13 +81,18 @@ def rate_and_n_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, F
     return np.asarray(-np.log1p(-np.minimum(fired, most))), np.maximum(armed, 0.0)
 
 
-def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
+def log_likelihood_ratio(
+    histogram: Floats, conditions: Conditions, rate: Floats | None = None
+) -> Floats:
     """Compute ``T(d)`` of the module's docstring at the beginning of each bin, as written.
 
     Parameters
     ----------
     histogram : ndarray, shape (..., bin)
     conditions : Conditions
+    rate : ndarray, shape (bin,), optional
+        Photons per pulse in each bin without the echo, ``b``, if they are not those of
+        `Conditions.background`: those of other echoes, too.
 
     Returns
     -------
@@ -97,16 +102,17 @@ def log_likelihood_ratio(histogram: Floats, conditions: Conditions) -> Floats:
     n_bins = acquisition.n_bins
     # At whole bins an echo is one filter, of its share in the bin `step` bins after the delay.
     echo = conditions.pulse.bin_probability(n_bins - 1.0, 2 * n_bins - 1, acquisition.bin_width_s)
-    b = np.maximum(conditions.background, _LEAST_BACKGROUND)[..., np.newaxis] / n_bins
+    level = np.maximum(conditions.background, _LEAST_BACKGROUND)[..., np.newaxis] / n_bins
     unfired = np.ones_like(histogram)
     if n_pulses is not None:
         unfired = n_pulses - np.cumsum(histogram, axis=-1)
     ratio = np.zeros_like(histogram)
     for at in np.flatnonzero(echo):
         s, step = np.asarray(conditions.signal)[..., np.newaxis] * echo[at], int(at) - n_bins + 1
-        gain = np.log1p(s / b) if n_pulses is None else np.log(np.expm1(-(b + s)) / np.expm1(-b))
         delay = slice(max(-step, 0), n_bins - max(step, 0))
         met = slice(max(step, 0), n_bins - max(-step, 0))
+        b = level if rate is None else rate[met]
+        gain = np.log1p(s / b) if n_pulses is None else np.log(np.expm1(-(b + s)) / np.expm1(-b))
         ratio[..., delay] += gain * histogram[..., met] - s * unfired[..., met]
     return ratio
 

@@ -46,8 +46,7 @@ _FEW = 24  # pixels, too few to estimate the scatter of the signals
 _DARK = 30  # photons in all, too few to separate signal and background
 _BRIGHT = 400  # photons of the brightest echo, enough for the mean
 _ECHO_BINS = 3  # bins of an echo, enough to locate it
-# Values of background and signal that are tried; the background is known when the target is found.
-_COARSE, _FINE = ((5, 9), (3, 9)), ((7, 15), (4, 15))
+_COARSE, _FINE = (7, 9), (9, 15)  # values of background and signal that are tried
 
 
 class MeanFlux(NamedTuple):
@@ -230,7 +229,8 @@ class _Mixture:
     def __init__(self, capture: Capture) -> None:
         known = detailed_flux_prior_of(capture)
         total, n_pulses = total_rates(capture), capture.gated_pulses or 1
-        pixels = np.random.default_rng(0).permutation(total.size)[:_SAMPLE]
+        # Not those from which the distribution of delays was learned, if there are others.
+        pixels = np.random.default_rng(0).permutation(total.size)[-_SAMPLE:]
         self._sample = _of_counts(capture, capture.cube[0, pixels])
         top = 2 * float(known.levels[-1])
         count = int(np.clip(math.ceil(2 * math.sqrt(top * n_pulses)), 12, 40))
@@ -248,8 +248,10 @@ class _Mixture:
         background = max(float(total.mean()) - mean, 0.5 / n_pulses)
         chance = math.sqrt(float(total.mean()) / n_pulses / pixels.size)
         half = min(4 * chance / background, 1.0)
+        if capture.gated_pulses is not None and total.size >= 2 * _SAMPLE:
+            self._known = self._sharpened(capture.pulse, math.log(background))
         fit = fit_pulse(
-            lambda pulse, at: self._score(pulse, math.log(background) + at * half),
+            lambda pulse, at: self._score(pulse, math.log(background) + at * half, self._known),
             capture.pulse,
             _BACKGROUNDS,
             capture.acquisition.bin_width_s / _SAMPLES_PER_BIN,
@@ -277,7 +279,7 @@ class _Mixture:
         def surface(log_background: Floats, root_signal: Floats) -> Floats:
             return self._log_likelihood(log_background, root_signal**2, of_target)
 
-        box = zoomed(box, surface, _COARSE[of_target])
+        box = zoomed(box, surface, _COARSE)
         # The tail of an echo beyond its taps is not background.
         echo, _ = self.pulse.taps(acquisition.n_bins, acquisition.bin_width_s)
         missed = max(1 - float(echo.sum()), 0.0)
@@ -291,35 +293,55 @@ class _Mixture:
                 background[-1] = np.inf
             return signal, background
 
-        return box, spans(box, surface(*box.grid(_FINE[of_target])), flux_at)
+        return box, spans(box, surface(*box.grid(_FINE)), flux_at)
 
-    def _score(self, pulse: Pulse, log_background: float) -> float:
+    def _sharpened(self, pulse: Pulse, log_background: float) -> FluxPrior:
+        """Return the prior with the power of its distribution of delays that is likeliest.
+
+        The learned distribution is blurred, since noise of pixels without an echo takes part in it.
+        Their noise would count as faint echoes, those of other pixels than it was learned from.
+        """
+        powers = [self._known.depth**power for power in _DEPTH_POWERS]
+        priors = [self._known._replace(depth=each / each.mean()) for each in powers]
+        return max(priors, key=lambda prior: self._score(pulse, log_background, prior))
+
+    def _score(self, pulse: Pulse, log_background: float, prior: FluxPrior) -> float:
         """Log likelihood of pulse and background, maximised over the shares of the levels."""
-        log = self._level_likelihoods(pulse, log_background, _TRIAL_SAMPLE, _TRIAL_STEPS)
+        pixels = np.arange(min(_TRIAL_SAMPLE, self._sample.shape[1]))
+        log = self._level_likelihoods(pulse, log_background, prior, pixels, _TRIAL_STEPS)
         top = log.max(axis=1, keepdims=True)
-        likelihood, share = np.exp(log - top), self._known.share.copy()
+        likelihood, share = np.exp(log - top), prior.share.copy()
         learn_shares(likelihood, share)
         return float(np.log(likelihood @ share).sum() + top.sum())
 
     def _tabulate(self, low: float, high: float) -> None:
         """Tabulate log likelihoods of the levels between two backgrounds (as logarithms)."""
         self._nodes = np.linspace(low, high, _NODES)
+        pixels = np.arange(self._sample.shape[1])
         self._logs = np.stack(
-            [self._level_likelihoods(self.pulse, each, _SAMPLE, _STEPS) for each in self._nodes]
+            [
+                self._level_likelihoods(self.pulse, each, self._known, pixels, _STEPS)
+                for each in self._nodes
+            ]
         )
 
     def _level_likelihoods(
-        self, pulse: Pulse, log_background: float, n_pixels: int, delays_per_echo: float
+        self,
+        pulse: Pulse,
+        log_background: float,
+        prior: FluxPrior,
+        pixels: NDArray[np.intp],
+        delays_per_echo: float,
     ) -> Floats:
-        """Log likelihood of each level in the first pixels, shape (pixel, level)."""
-        sample, pixels = replace(self._sample, pulse=pulse), np.arange(self._sample.shape[1])
+        """Log likelihood of each level in some pixels of the sample, shape (pixel, level)."""
+        sample = replace(self._sample, pulse=pulse)
         begin_s, end_s = pulse.span_s
         steps = math.ceil(
             delays_per_echo * self._sample.acquisition.bin_width_s / (end_s - begin_s)
         )
         steps = min(steps, _MOST_STEPS)
-        prior = self._known._replace(background=np.asarray(math.exp(log_background)))
-        return level_likelihoods(sample, pixels[:n_pixels], prior, steps)
+        prior = prior._replace(background=np.asarray(math.exp(log_background)))
+        return level_likelihoods(sample, pixels, prior, steps)
 
     def _log_likelihood(self, log_background: Floats, signal: Floats, of_target: bool) -> Floats:
         """Log likelihood, shape (background, signal)."""
@@ -347,6 +369,7 @@ class _Mixture:
 _BACKGROUNDS = np.array([-5.0, -2.5, -1.0, 0.0, 1.0, 2.5])  # from the first guess
 _SAMPLES_PER_BIN = 4
 _TRIAL_SAMPLE = 256  # pixels to which a pulse is fitted
+_DEPTH_POWERS = (1.0, 1.5, 2.0, 3.0)
 _NODES = 4
 _PIXELS_AT_ONCE = 128
 _LEAST_SHARE = 1e-6  # of pixels with an echo

@@ -19,9 +19,10 @@ from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.inference.faults import PixelVerdict, pixel_verdict
 from core.inference.intervals import pixel_range_intervals
 from core.inference.likelihood import rate_and_n_armed
-from core.inference.posterior import same_echo_bins, tolerance_probability_at
+from core.inference.posterior import same_echo_bins
 from core.inspection.flux import METHOD, estimate_flux
 from core.inspection.profile import FluxEstimate, OldFluxNames
+from core.inspection.surfaces import surface_probabilities
 from core.metrics import Interval
 
 MOST_CANDIDATES = 5
@@ -43,7 +44,8 @@ class RangeCandidate:
     relative: float
     """Score over that of the best candidate; 1 for that one."""
     probability: float
-    """Probability of a surface within 3 bins, which for the estimate is its confidence."""
+    """Probability of a surface within 3 bins, beside others where the pixel has several
+    (`core.inspection.surfaces`); for the estimate that of the report."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,8 @@ class PixelReport(OldFluxNames):
     answer_m: float
     """Range in the range image, likewise."""
     confidence: float
+    """Probability of a surface within 3 bins of the estimate. That of the range image, or more
+    where the pixel has several surfaces, of which the image knows one."""
     interval_68_m: Interval
     """Estimate with the 68 % interval of the range of the surface (`core.range_interval`)."""
     interval_95_m: Interval
@@ -145,6 +149,7 @@ def pixel_report(
     curve = ESTIMATORS[method].curves(capture, row, col, settings)
     lag = lag_bins(capture, method, settings)
     interval_68_m, interval_95_m = pixel_range_intervals(capture, image, row, col, (0.68, 0.95))
+    candidates, confidence = _candidates(capture, image, row, col, curve, lag)
 
     def find_flux() -> FluxEstimate:
         found = estimate_flux(counts, capture.acquisition, capture.pulse, capture.gated_pulses)
@@ -161,10 +166,10 @@ def pixel_report(
         lag_bins=lag,
         answer_bin=float(image.bin[row, col]),
         answer_m=float(image.range_m[row, col]),
-        confidence=float(image.confidence[row, col]),
+        confidence=confidence,
         interval_68_m=interval_68_m,
         interval_95_m=interval_95_m,
-        candidates=_candidates(capture, row, col, curve, lag, float(image.bin[row, col])),
+        candidates=candidates,
         find_flux=find_flux,
         flux_unit=flux_unit(capture),
         flux_method=METHOD,
@@ -185,15 +190,15 @@ def lag_bins(capture: Capture, method: str, settings: Any) -> float:
 
 
 def _candidates(
-    capture: Capture, row: int, col: int, curve: Floats, lag_bins: float, estimate_bin: float
-) -> tuple[RangeCandidate, ...]:
-    if not capture.counts[row, col]:
-        return ()
+    capture: Capture, image: RangeImage, row: int, col: int, curve: Floats, lag_bins: float
+) -> tuple[tuple[RangeCandidate, ...], float]:
+    """Return the candidates and the probability of the estimate, whether it is one of them."""
+    estimate_bin, confidence = float(image.bin[row, col]), float(image.confidence[row, col])
     peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
     peaks = peaks[curve[peaks] > 0]
     peaks = peaks[np.argsort(-curve[peaks], kind="stable")]
-    if not peaks.size:
-        return ()
+    if not peaks.size or not capture.counts[row, col]:
+        return (), confidence
     bins = np.clip(peaks - lag_bins, 0.0, capture.acquisition.n_bins)
     width_bins = same_echo_bins(capture)
     is_estimate = np.abs(bins - estimate_bin) < width_bins
@@ -201,10 +206,13 @@ def _candidates(
         bins[is_estimate.argmax()] = estimate_bin
     kept = _apart(bins, width_bins)
     bins, score = bins[kept], curve[peaks[kept]]
+    probability = surface_probabilities(capture, row, col, bins)
+    if estimate_bin in bins:
+        confidence = float(probability[bins == estimate_bin][0])
     range_m = capture.acquisition.bin_to_range_m(bins)
-    probability = tolerance_probability_at(capture, row, col, bins)
     columns = (bins, range_m, score, score / score[0], probability)
-    return tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
+    found = tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
+    return found, confidence
 
 
 def _apart(bins: Floats, width_bins: float) -> list[int]:

@@ -18,6 +18,7 @@ from core.capture import Capture
 from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.geometry import Box
+from core.inference import TOLERANCE_BINS
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.profile import difference_of, ratio_of
 from core.metrics import Interval, restored
@@ -26,6 +27,7 @@ from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies.methods.calibration import FLUX_REGIMES, FluxRegime
 from core.tracking import TrackingParameters
+from core.trigger import draw_counts, rate_per_bin
 
 pytestmark = pytest.mark.compiled
 
@@ -154,6 +156,32 @@ def test_candidates_within_one_pulse_are_one() -> None:
     assert pixel.candidates[0].bin == pixel.answer_bin
     assert pixel.candidates[0].probability == pixel.confidence
     assert all(abs(c.bin - pixel.answer_bin) >= 6 for c in pixel.candidates[1:])
+
+
+@pytest.mark.parametrize("n_pulses", [300, None], ids=["first photons", "photons"])
+def test_a_candidate_has_the_probability_of_a_surface_there(n_pulses: int | None) -> None:
+    """Half of the pixels see a net before a wall."""
+    acquisition, pulse = Acquisition(n_bins=150, n_pulses=n_pulses), Pulse.gaussian(1.5e-9)
+    rng, shape = np.random.default_rng(1), (8, 8)
+    walls, nets = rng.uniform(80, 140, shape), rng.uniform(10, 70, shape)
+    nets[4:] = np.nan
+    photons = 1.0 if n_pulses is None else 1 / 300
+    rate = rate_per_bin(walls, np.full(shape, 30 * photons), 10 * photons, pulse, acquisition)
+    rate += rate_per_bin(nets, np.full(shape, 10 * photons), 0.0, pulse, acquisition)
+    kind = "all" if n_pulses is None else "first"
+    capture = Capture(draw_counts(rate, n_pulses, rng), acquisition, pulse, detection=kind)
+    image = estimate(capture, "matched_filter")
+    probability, is_right, n_nets = [], [], 0
+    for row, col in np.ndindex(shape):
+        for each in inspection.pixel_report(capture, image, row, col, "matched_filter").candidates:
+            errors = np.abs(each.bin - np.array([walls[row, col], nets[row, col]]))
+            probability.append(each.probability)
+            is_right.append(bool(np.nanmin(errors) <= TOLERANCE_BINS))
+            n_nets += each.probability > 0.9 and bool(errors[1] <= TOLERANCE_BINS)
+    sure = np.array(probability) > 0.9
+    assert np.mean(np.array(is_right)[sure]) > 0.98
+    assert np.mean(np.array(is_right)[np.array(probability) < 0.1]) < 0.1
+    assert n_nets > 25
 
 
 def test_a_report_has_the_intervals_of_the_range() -> None:
@@ -379,6 +407,14 @@ def test_flux_depends_neither_on_the_pulse_nor_on_the_bins(regime: FluxRegime) -
             # Half as wide again as the 95 % interval, which makes 99.7 %.
             half = 0.75 * (one.high - one.low)
             assert abs((one.high + one.low) / 2 - value) < half
+
+
+def test_a_flux_lies_well_inside_its_interval() -> None:
+    """Signal and background of this capture are correlated."""
+    capture = FLUX_REGIMES[7].captures(1000)[0][1]
+    found = (inspection.estimate_target_flux(capture), inspection.estimate_mean_flux(capture))
+    for each in (*found[0], *found[1]):
+        assert each.low < 0.97 * each.value and 1.03 * each.value < each.high
 
 
 def test_the_flux_of_target_pixels_is_the_one_simulated() -> None:
