@@ -21,6 +21,7 @@ import panel as pn
 import param
 from panel.custom import Child
 
+from app.units import Scale
 from app.widgets.cards import BREAK_PX, select
 from app.widgets.component import Component
 from core.parameters import Number, joint_doubts, spec_of
@@ -36,6 +37,9 @@ class Knob(Component):
     optional number has no slider; an empty field stands for None.
 
     The `EditableFloatSlider` of panel-material-ui 0.16 follows a drag as fast, but it has no
+    A position along the gate is shown and typed in the unit of a `Scale`; the value itself, and its
+    bounds, remain in bins or in shares of the gate.
+
     logarithmic track, and its marks are points, not zones.
     """
 
@@ -49,6 +53,11 @@ class Knob(Component):
     label = param.String(default="")
     unit = param.String(default="")
     help = param.String(default="")
+    along = param.List(
+        default=[0.0, 1.0, None],
+        doc="Number shown for the value 0, change of it for 1, and decimals; None for all of them.",
+    )
+    parts = param.Integer(default=0, doc="Parts of 1 to which values are rounded; 0 for none.")
     doubtful = param.List(default=[], doc="Zones of unreliable values: low, high, and why.")
 
     # Panel would mark all pages of the server as busy with each move.
@@ -68,6 +77,7 @@ class Knob(Component):
             log=spec.log,
             whole=spec.whole,
             optional=spec.optional,
+            parts=int(spec.whole),
             label=spec.symbol,
             unit=spec.unit,
             help=help,
@@ -84,6 +94,11 @@ class Knob(Component):
         assert isinstance(spec, Number)
         return cls.of(spec, getattr(settings, name), field.metadata["help"])
 
+
+    def follow(self, along: Scale, n_bins: int = 1) -> None:
+        """Show edges of bins in a unit; the values are shares of `n_bins`, or bins by default."""
+        shown = [along.origin, along.step * n_bins, along.edge_decimals]
+        self.param.update(unit=along.name, along=shown, parts=n_bins)
 
 # As in knob.css.
 DOUBT = """

@@ -29,6 +29,7 @@ from app.pages.shared.downloads import (
 )
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
+from app.plots.gate_cut import Cut
 from app.tasks.turns import TURNS
 from app.theme import WRONG_COLOR
 from app.widgets.cards import BREAK_PX, board, card, choice, column, part
@@ -88,6 +89,7 @@ class Explore(Section):
         self.numbers = Facts(leading=True, min_height=3 * FACTS_PX, sizing_mode="stretch_width")
         self.signals = SignalPlots()
         self.image = ImageView(session.choose_pixel)
+        self.signals.cut.dragged.subscribe(session.cut_gate)
         self._painted = [self.signals, self.image]
         self.image_keys = PixelKeys(child=self.image.pane, sizing_mode="stretch_both")
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
@@ -216,6 +218,7 @@ class Explore(Section):
             self._show_cards(is_tracking=pixel.signals is not None)
             self.image.mark(row, col)
             self.image_keys.shape = list(answer.capture.shape)
+            self.signals.cut.update(Cut.of(answer, state.less))
             self.image_keys.pixel = [row, col]
             self.cloud.selected = row * answer.capture.shape[1] + col
             self.numbers.facts = numbers
