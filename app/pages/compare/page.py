@@ -414,7 +414,13 @@ class Compare(Section):
 
     def about(self) -> Subject:
         """Return what files about all methods are about."""
-        return looked_at(self.session, self.session.answer.request)
+        answer = self.session.answer
+        methods = {
+            method: f"{task.settings}, false alarms {task.false_alarm:g}"
+            for method, task in self.tasks.items()
+        }
+        subject = looked_at(self.session, answer.request)
+        return replace(subject, source=answer.capture.source, methods=methods)
 
     def picture_shown(self, place: int) -> Shown:
         """Return the picture at a place, as it is saved."""

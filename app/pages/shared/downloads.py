@@ -74,6 +74,8 @@ class Subject:
         Rows and columns of the capture, if not all.
     viewing : Viewing, optional
         Confidence threshold and field of view, described in files; names have those in `settings`.
+    methods : mapping of str to str
+        Settings of several estimators, described in files only.
     """
 
     capture: str
@@ -82,6 +84,7 @@ class Subject:
     source: str = ""
     part: str = ""
     viewing: Viewing | None = None
+    methods: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def chosen(self) -> list[str]:
@@ -106,6 +109,7 @@ class Subject:
             f"firstphoton {core.__version__}: {what}",
             *([f"method: {self.estimator}"] if self.estimator else []),
             *(f"settings: {each}" for each in filter(None, (*settings, self.viewing))),
+            *(f"method: {method}; settings: {each}" for method, each in self.methods.items()),
             *([f"source: {' '.join(self.source.split())}"] if self.source else []),
         ]
 
