@@ -240,7 +240,7 @@ def test_what_an_image_hides_is_said(car):
         values, look = looks.image_of(car, "Estimate", Viewing(least))
         said = looks.legend(car, "Estimate", Viewing(least), values, look)
         n_hidden = (image.valid & (image.confidence < least)).sum()
-        assert (f"{n_hidden:,} of {n_pixels:,} hidden" in said) == (n_hidden > 0)
+        assert (f"{n_hidden:,} of {n_pixels:,} estimates hidden" in said) == (n_hidden > 0)
         n_outside = ((values < look.low) | (values > look.high)).sum()
         assert (f"Grey: {n_outside:,} beyond" in said) == (n_outside > 0)
     nothing = np.full_like(values, np.nan)
@@ -255,7 +255,7 @@ def test_image_and_cloud_take_the_chosen_limits_and_colours(car):
     assert (look.low, look.high) == (48.5, 50.0)
     outside = (values < 48.5) | (values > 50.0)
     said = looks.legend(car, "Estimate", viewing, values, look)
-    assert f"Grey: {outside.sum():,} beyond the scale." in said
+    assert f"Grey: {outside.sum():,} beyond the colour scale." in said
     _, rgb, _ = looks.cloud_of(car, "Range", viewing)
     known = np.isfinite(values)
     np.testing.assert_array_equal(rgb, look.rgb(values[known]))

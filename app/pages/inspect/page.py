@@ -29,6 +29,7 @@ from app.pages.shared.section import Section
 from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part
 from app.widgets.component import until_session_ends
 from app.widgets.controls import (
+    KNOB_PX,
     Chips,
     PixelKeys,
     Sentence,
@@ -47,9 +48,6 @@ TABLES = f"""
   overflow-y: auto; }}
 @media screen and (max-width: {BREAK_PX}px) {{ :host {{ max-height: none }} }}
 """
-KNOB_PX = 46
-"""Height of the slider below the map, reserved from the start."""
-
 MAP_DELAY_MS = 60
 """The map is drawn this long after the pixel's plots, which the eye follows."""
 
