@@ -174,6 +174,11 @@ class Scale:
         """Number of decimals that resolves a hundredth of a bin."""
         return max(0, 2 - math.floor(math.log10(self.step)))
 
+    @property
+    def edge_decimals(self) -> int:
+        """Number of decimals that resolves a tenth of a bin; none for whole bins."""
+        return 0 if self.name == "bins" else max(0, self.decimals - 1)
+
     def number(self, position_bin: float) -> Quantity:
         """Format a position without its unit; a dash for NaN."""
         value = self.at(position_bin)

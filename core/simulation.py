@@ -89,7 +89,7 @@ def simulate(
         truth_range_m=np.array(scene.range_m, float),
         signal=_signal(scene, flux) if is_plain else None,
         background=flux.background if is_plain else None,
-        source=f"simulated, seed {seed}",
+        source=f"simulated, seed {seed}, SBR {flux.sbr:g}, PPP {flux.signal:g}",
     )
 
 

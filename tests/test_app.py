@@ -29,8 +29,10 @@ from app.pages.explore import text as explore_text
 from app.pages.layout import CUSTOM, Layout
 from app.pages.shared.estimate import lane_of
 from app.plots import elements as plots
+from app.plots.gate_cut import Cut
 from app.tasks.scheduler import GENERAL, PAGE, SHORT
 from app.theme import LIGHT
+from app.widgets.cards import Part
 from app.widgets.controls import Knob, SettingsPanel
 from app.widgets.figures import Plot
 from app.widgets.image_view import ImageView
@@ -238,7 +240,7 @@ def test_what_an_image_hides_is_said(car):
         values, look = looks.image_of(car, "Estimate", Viewing(least))
         said = looks.legend(car, "Estimate", Viewing(least), values, look)
         n_hidden = (image.valid & (image.confidence < least)).sum()
-        assert (f"{n_hidden:,} of {n_pixels:,} hidden" in said) == (n_hidden > 0)
+        assert (f"{n_hidden:,} of {n_pixels:,} estimates hidden" in said) == (n_hidden > 0)
         n_outside = ((values < look.low) | (values > look.high)).sum()
         assert (f"Grey: {n_outside:,} beyond" in said) == (n_outside > 0)
     nothing = np.full_like(values, np.nan)
@@ -253,7 +255,7 @@ def test_image_and_cloud_take_the_chosen_limits_and_colours(car):
     assert (look.low, look.high) == (48.5, 50.0)
     outside = (values < 48.5) | (values > 50.0)
     said = looks.legend(car, "Estimate", viewing, values, look)
-    assert f"Grey: {outside.sum():,} beyond the scale." in said
+    assert f"Grey: {outside.sum():,} beyond the colour scale." in said
     _, rgb, _ = looks.cloud_of(car, "Range", viewing)
     known = np.isfinite(values)
     np.testing.assert_array_equal(rgb, look.rgb(values[known]))
@@ -448,6 +450,7 @@ def test_axes_follow_another_gate(car, small_file):
     views = SignalPlots()
     views.update(inspect(car, 32, 30), car.capture.acquisition, with_difference=False)
     answer = compute(ask(file_source(small_file)), None)
+    views.cut.update(Cut.of(answer, ReductionSettings()))
     views.update(inspect(answer, 1, 2), answer.capture.acquisition, with_difference=False)
     for plot in views.plots:
         assert (plot.figure.x_range.start, plot.figure.x_range.end) == (0, 37)
@@ -745,6 +748,42 @@ def test_a_gate_that_ends_before_t_n_is_reported(layout, tmp_path):
     control(layout, "T_n").value = 3
     layout.next_answer()
     assert alert_of(layout) == ""
+
+
+def test_a_gate_is_cut_on_the_histogram_and_shown_in_the_unit_of_the_axes(layout, explore):
+    state, cut = layout.session.state, explore.signals.cut
+    (part,) = (each for each in layout.page.select(Part) if each.title == "Data reduction")
+    part.collapsed = False
+    gate = {name: control(layout, name) for name in ("Gate from", "Gate to", "T_n")}
+    state.less = ReductionSettings(merge=2)
+    layout.next_answer()
+    cut.box.left = 20  # of 100 bins, by the mouse
+    layout.next_answer()
+    cut.box.right = 90
+    assert layout.next_answer().capture.acquisition.n_bins == 35
+    layout.settle()
+    assert state.less == ReductionSettings(merge=2, gate_from=0.2, gate_to=0.9)
+    histogram = explore.signals.histogram.figure
+    assert (histogram.x_range.start, histogram.x_range.end) == (-10, 40)  # the whole gate
+
+    histogram.x_range.update(start=0, end=5)
+    gate["Gate from"].value = 0.3
+    layout.next_answer()
+    layout.settle()
+    assert (cut.box.left, cut.box.right) == (30, 90)
+    assert (histogram.x_range.start, histogram.x_range.end) == (-5, 0)  # as before, in the scene
+
+    def shown(name):
+        origin, step, _ = gate[name].along
+        return origin + step * gate[name].value, gate[name].unit
+
+    assert shown("Gate from") == (pytest.approx(30), "bins")
+    assert shown("T_n") == (20, "bins")
+    state.unit = "ns"
+    assert shown("Gate from") == (pytest.approx(280 + 30), "ns")
+    assert shown("Gate to") == (pytest.approx(280 + 90), "ns")
+    assert shown("T_n") == (pytest.approx(280 + 30 + 2 * 20), "ns")
+    assert state.tracking.t_n == 20
 
 
 def test_a_pixel_can_be_chosen_by_point_and_by_key(layout, explore):

@@ -544,6 +544,44 @@ CHANGE_QUICKLY = (
 )
 
 
+HANDLE = f"""() => {{
+  {VIEWS}
+  const plots = views.filter((view) => view.model.type === "Figure");
+  const {{ bbox, model, plot_view }} = plots.flatMap((plot) => plot.computed_renderer_views)
+    .find(({{ model }}) => model.type === "BoxAnnotation" && model.editable);
+  const {{ x, y }} = plot_view.canvas_view.el.getBoundingClientRect();
+  return [x + bbox.left, y + bbox.y_center, model.left];
+}}"""
+"""Place on the page of the handle at the start of the gate, and its bin."""
+
+
+def cut_the_gate(page: Page) -> None:
+    """Drag the start of the gate on the histogram, read and enter it in metres, and undo that."""
+    page.get_by_role("button", name="Data reduction", exact=True).press("Enter")
+    x, y, _ = page.evaluate(HANDLE)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 100, y, steps=4)
+    page.mouse.up()
+    end, _, first = page.evaluate(HANDLE)
+    assert first > 0
+    assert end == pytest.approx(x + 100, abs=6)
+    expect(slider(page, "Gate from (bins)")).to_have_value(str(first))
+    eventually(lambda: f"less.gate_from={first / 100}" in page.evaluate("location.href"))
+    before = look(page)["histogram"]
+    page.get_by_role("button", name="m", exact=True).click()
+    title = np.s_[-18:]  # of the axis
+    eventually(lambda: not np.array_equal(look(page)["histogram"][title], before[title]))
+    start_m, step_m = 41.97094, 0.149896229
+    expect(field(page, "Gate from")).to_have_value(f"{start_m + step_m * first:.2f}")
+    enter(page, "Gate from", "44")
+    expect(slider(page, "Gate from (m)")).to_have_value("14")
+    expect(field(page, "Gate from")).to_have_value(f"{start_m + step_m * 14:.2f}")
+    eventually(lambda: "less.gate_from=0.14" in page.evaluate("location.href"))
+    page.go_back()
+    expect(slider(page, "Gate from (m)")).to_have_value(str(first))
+
+
 def test_a_pixel_and_the_camera_are_moved_and_fast_moves_are_followed_to_the_last_value(start_page):
     place = choose_by_tap(start_page)
     move_by_keys(start_page, place)
@@ -555,6 +593,7 @@ def test_a_pixel_and_the_camera_are_moved_and_fast_moves_are_followed_to_the_las
     quickly = start_page.evaluate(CHANGE_QUICKLY)
     assert quickly["components"] > 20
     assert quickly["reverted"] == 0
+    cut_the_gate(start_page)
 
 
 # -- pictures --------------------------------------------------------------------------------------

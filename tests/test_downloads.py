@@ -407,6 +407,10 @@ def test_a_methods_picture_is_saved_as_its_estimate(layout, kind):
     eventually(lambda: "peak" in compare.answers)
     compare.kind.value = kind
     found = compare.picture_shown(compare.pictured.index("peak"))
+    described = compare.about().lines("methods")
+    assert f"source: {layout.session.answer.capture.source}" in described
+    for method, task in compare.tasks.items():
+        assert f"method: {method}; settings: {task.settings}, false alarms 1" in described
     layout.pages.choice.value = "Explore"
     image = compare.answers["peak"].run.image
     assert (found.heading, found.subject.estimator) == ("Peak of the histogram", "peak")
@@ -601,7 +605,7 @@ def save_a_plot_as_a_picture(here, browser, what, title):
     name, png = download(here, what, "png")
     assert name.startswith("car_tracking_")
     picture = Image.open(io.BytesIO(png))
-    assert "simulated, seed 0" in picture.text["Description"]
+    assert "simulated, seed 0, SBR" in picture.text["Description"]
     svg_name, svg = download(here, what, "svg")
     assert svg_name == name.replace(".png", ".svg")
     root = ElementTree.fromstring(svg)

@@ -525,7 +525,7 @@ def test_accuracy_is_studied_with_a_progress_bar_and_suggestions_are_applied(pag
     first, end = suggested.gate
     for shown in (
         f"Suggested gate, in bins: {first} to {end}. {suggested.why_gate}",
-        f"Suggested T_n: {suggested.t_n}. {suggested.why_t_n}",
+        f"Suggested T_n, in bins: {suggested.t_n}. {suggested.why_t_n}",
     ):
         expect(page.get_by_text(shown)).to_be_visible()
     apply_t_n, apply_gate = (

@@ -228,7 +228,7 @@ def test_confidence_below_which_estimates_are_hidden_is_set_beside_the_map(build
     confidence = building.answer.run.image.confidence
     for least in (0.5, 0.99):
         page.least_confidence.value = least
-        said = f"{(confidence < least).sum():,} of {confidence.size:,} hidden"
+        said = f"{(confidence < least).sum():,} of {confidence.size:,} estimates hidden"
         building.tasks.run_until(lambda said=said: said in page.legend.text)
         assert building.state.viewing.least_confidence == least
     building.state.viewing = replace(building.state.viewing, least_confidence=0.9)

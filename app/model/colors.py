@@ -39,27 +39,45 @@ def shown(answer: Answer, least_confidence: float, box: Box = WHOLE) -> NDArray[
     return np.asarray(visible if box == WHOLE else visible & box.contains(image.range_m))
 
 
+NO_VALUE = {"Truth": "without a target", "Confidence": "without an estimate"}
+"""Pixels that are blank in images of a kind, unless they are those of the estimates."""
+
+
 def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
-    """Return what is hidden in an image (row, col) of a kind of `map_of`, and what is grey.
+    """Return why pixels of an image (row, col) of a kind of `map_of` are blank, or grey.
 
     Parameters
     ----------
     values, look
         Of `map_of`.
     """
-    hides = kind in ("Estimate", "Error")
-    n_estimates, n_shown = int(answer.run.image.valid.sum()), int(np.isfinite(values).sum())
-    sentences = []
-    if hides and n_estimates > n_shown:
-        why = f"confidence below {viewing.least_confidence:g}"
-        if kind == "Error":
-            why += ", or no truth"
-        sentences.append(f"{n_estimates - n_shown:,} of {n_estimates:,} hidden: {why}.")
-    if hides and not n_shown and n_estimates:
+    n_blank, reasons, sentences = int(np.isnan(values).sum()), [], []
+    rest = NO_VALUE.get(kind, "without a value")
+    if kind in ("Estimate", "Error"):
+        rest = "without an estimate" + (" or truth" if kind == "Error" else "")
+        if n_hidden := n_below(answer, viewing.least_confidence):
+            reasons.append(hidden(answer, viewing.least_confidence))
+            n_blank -= n_hidden
+    if n_blank:
+        reasons.append(f"{n_blank:,} pixels {rest}")
+    if reasons:
+        sentences.append(f"Blank: {', '.join(reasons)}.")
+    if kind in ("Estimate", "Error") and answer.run.image.valid.any() and np.isnan(values).all():
         sentences.append("Lower “Show from confidence”.")
     if n_outside := look.n_outside(values):
-        sentences.append(f"Grey: {n_outside:,} beyond the scale.")
+        sentences.append(f"Grey: {n_outside:,} beyond the colour scale.")
     return " ".join(sentences)
+
+
+def n_below(answer: Answer, least_confidence: float) -> int:
+    """Return how many estimates are not confident enough to be shown."""
+    return int(answer.run.image.valid.sum() - shown(answer, least_confidence).sum())
+
+
+def hidden(answer: Answer, least_confidence: float) -> str:
+    """Return how many of the estimates are hidden, and why."""
+    n_hidden, n_estimates = n_below(answer, least_confidence), int(answer.run.image.valid.sum())
+    return f"{n_hidden:,} of {n_estimates:,} estimates hidden below confidence {least_confidence:g}"
 
 
 def image_of(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorScale]:

@@ -149,12 +149,13 @@ class ReductionSettings:
     gate_from: float = parameter(
         0.0,
         Number("Gate from", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
-        "Earlier bins are cut, with the pulses that fired in them.",
+        "Earlier bins are cut, with the pulses that fired in them. Drag the edges on a pixel's "
+        "histogram, or enter a position in the unit of the axes; bins are those of the whole gate.",
     )
     gate_to: float = parameter(
         1.0,
         Number("Gate to", 0.0, 1.0, least=0.0, most=1.0, unit="of the gate"),
-        "Later bins are cut, with the echoes in them.",
+        "Later bins are cut, with the echoes in them. As for “Gate from”.",
     )
     pool: int = parameter(
         1,
@@ -199,11 +200,19 @@ class ReductionSettings:
             reduction.pulses,
         )
 
+    def gate(self, n_bins: int) -> tuple[int, int]:
+        """Return the first of `n_bins` bins that is kept, and the end of the last."""
+        first = min(round(self.gate_from * n_bins), n_bins - 1)
+        return first, max(round(self.gate_to * n_bins), first + 1)
+
+    def with_gate(self, first: int, end: int, n_bins: int) -> ReductionSettings:
+        """Return the settings that keep some of `n_bins` bins, from `first` to before `end`."""
+        return replace(self, gate_from=first / n_bins, gate_to=end / n_bins)
+
     def reduction(self, n_bins: int) -> Reduction:
         """Return the reduction for a capture with `n_bins` bins."""
-        first = min(round(self.gate_from * n_bins), n_bins - 1)
-        end = max(round(self.gate_to * n_bins), first + 1)
-        gate = None if (first, end) == (0, n_bins) else (first, end)
+        ends = self.gate(n_bins)
+        gate = None if ends == (0, n_bins) else ends
         return Reduction(
             merge=self.merge, gate=gate, skip=self.skip, pool=self.pool, pulses=self.pulses
         )

@@ -34,6 +34,7 @@ from app.pages.shared.truth import TruthForm, TruthOffer
 from app.tasks.page import PageTasks
 from app.tasks.signals import Signal
 from app.theme import DARK, LIGHT, STYLES
+from app.units import scale
 from app.widgets.address_bar import AddressBar
 from app.widgets.cards import choice, part, select
 from app.widgets.connection import Connection
@@ -343,6 +344,7 @@ class Layout:
         self.pages.choice.link(state, value="page", bidirectional=True)
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
         self._fit_sidebar()
+        state.param.watch(lambda *_: self._follow_unit(), "unit")
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if self._arrivals is not None:
             self._arrivals.subscribe(self._hear_of)
@@ -381,7 +383,16 @@ class Layout:
         self._panels["tracking"].controls["t_n"].high = max(
             answer.capture.acquisition.n_bins - 1, 1
         )
+        self._follow_unit()
         self.pages.follow(answer)
+
+    def _follow_unit(self) -> None:
+        """Show T_n and the ends of the cut gate in the unit of the axes."""
+        answer, unit = self.session.answer, self.session.state.unit
+        whole = answer.whole.acquisition
+        self._panels["tracking"].controls["t_n"].follow(scale(unit, answer.capture.acquisition))
+        for name in ("gate_from", "gate_to"):
+            self._panels["less"].controls[name].follow(scale(unit, whole), whole.n_bins)
 
     def _show_reading(self, answer: Answer) -> None:
         refused = self.session.estimate.refused

@@ -166,6 +166,11 @@ class Session:
         with self.tasks.hold():  # one message for all consequences
             self.state.pixel = (min(max(row, 0), rows - 1), min(max(col, 0), cols - 1))
 
+    def cut_gate(self, ends: tuple[int, int]) -> None:
+        """Keep the bins of the whole gate from the first of these to before the second."""
+        state = self.state
+        state.less = state.less.with_gate(*ends, self.answer.whole.acquisition.n_bins)
+
     def pick(self, index: int) -> None:
         """Show the pixel with this index in the flattened image; -1 is none."""
         if index >= 0:

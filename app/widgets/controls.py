@@ -21,6 +21,7 @@ import panel as pn
 import param
 from panel.custom import Child
 
+from app.units import Scale
 from app.widgets.cards import select
 from app.widgets.component import Component
 from core.parameters import Number, joint_doubts, spec_of
@@ -34,6 +35,9 @@ class Knob(Component):
     Unreliable values are marked on the slider; while one of them is set, a sentence says why. Only
     values between `low` and `high` can be set; the field refuses others with a sentence. An
     optional number has no slider; an empty field stands for None.
+
+    A position along the gate is shown and typed in the unit of a `Scale`; the value itself, and its
+    bounds, remain in bins or in shares of the gate.
 
     The `EditableFloatSlider` of panel-material-ui 0.16 follows a drag as fast, but it has no
     logarithmic track, and its marks are points, not zones.
@@ -49,6 +53,11 @@ class Knob(Component):
     empty = param.String(default="automatic", doc="Meaning of an empty field.")
     label = param.String(default="")
     unit = param.String(default="")
+    along = param.List(
+        default=[0.0, 1.0, None],
+        doc="Number shown for the value 0, change of it for 1, and decimals; None for all of them.",
+    )
+    parts = param.Integer(default=0, doc="Parts of 1 to which values are rounded; 0 for none.")
     help = param.String(default="")
     doubtful = param.List(default=[], doc="Zones of unreliable values: low, high, and why.")
 
@@ -68,6 +77,7 @@ class Knob(Component):
             high=spec.high,
             log=spec.log,
             whole=spec.whole,
+            parts=int(spec.whole),
             optional=spec.optional,
             empty=spec.none_means,
             label=spec.symbol,
@@ -85,6 +95,11 @@ class Knob(Component):
         spec = spec_of(field)
         assert isinstance(spec, Number)
         return cls.of(spec, getattr(settings, name), field.metadata["help"])
+
+    def follow(self, along: Scale, n_bins: int = 1) -> None:
+        """Show edges of bins in a unit; the values are shares of `n_bins`, or bins by default."""
+        shown = [along.origin, along.step * n_bins, along.edge_decimals]
+        self.param.update(unit=along.name, along=shown, parts=n_bins)
 
 
 # As in knob.css.
@@ -124,8 +139,12 @@ class SettingsPanel(Generic[Settings]):
     @property
     def layout(self) -> pn.Column:
         """All controls in the order of the fields, and a sentence on unreliable combinations."""
-        content = (*self.controls.values(), self.doubts)
-        return pn.Column(*content, sizing_mode="stretch_width", margin=0)
+        return self.without()
+
+    def without(self, *names: str) -> pn.Column:
+        """Return the layout without some controls, which stand elsewhere."""
+        kept = (each for name, each in self.controls.items() if name not in names)
+        return pn.Column(*kept, self.doubts, sizing_mode="stretch_width", margin=0)
 
     def show(self, settings: Settings) -> None:
         """Set every control without reporting a change."""
@@ -184,8 +203,8 @@ def _control(field: Field[Any], value: Any) -> Any:
     return select(spec.symbol, list(spec.options), value, help)
 
 
-HEADLINE_PX, FACTS_PX, LINE_PX = 37, 32, 17
-"""Heights of timed facts, of a row of others, and of a sentence; reserved from the start."""
+HEADLINE_PX, FACTS_PX, LINE_PX, KNOB_PX = 37, 32, 17, 46
+"""Heights of timed facts, of a row of others, a sentence and a slider; reserved from the start."""
 
 
 class Facts(Component):
@@ -254,12 +273,8 @@ class Sentence(Component):
 
 def legend_line() -> Sentence:
     """Return the line below an image that says what is hidden in it."""
-    # On one line where the image would shrink for a second one.
-    line = "white-space: nowrap; overflow: hidden; text-overflow: ellipsis"
-    style = f"@media (min-width: 1281px) {{ .note {{ {line} }} }}"
-    return Sentence(
-        stylesheets=[style], min_height=LINE_PX, sizing_mode="stretch_width", margin=(0, 8, 4, 8)
-    )
+    # Room for two lines from the start: the image keeps its size.
+    return Sentence(min_height=2 * LINE_PX, sizing_mode="stretch_width", margin=(0, 8, 4, 8))
 
 
 class Chips(Component):

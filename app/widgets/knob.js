@@ -21,12 +21,14 @@ export function render({ model }) {
     "label", "unit", "field", "reset", "ask", "zones", "track", "error", "doubt", "help",
   ].map((name) => root.querySelector("." + name));
 
+  const rounded = (value) => model.parts ? Math.round(value * model.parts) / model.parts : value;
+
   // Position on the track <-> value.
   const toValue = (position) => {
-    const { low, high, log, whole } = model;
+    const { low, high, log, parts } = model;
     const share = position / Number(track.max);
     const value = log ? low * (high / low) ** share : low + (high - low) * share;
-    return whole ? Math.round(value) : Number(value.toPrecision(3));
+    return parts ? rounded(value) : Number(value.toPrecision(3));
   };
   const toPosition = (value) => {
     const { low, high, log } = model;
@@ -35,6 +37,8 @@ export function render({ model }) {
   };
   const text = (value) => {
     if (value === null) return "";
+    const [origin, step, decimals] = model.along;
+    if (decimals !== null) return (origin + step * value).toFixed(decimals);
     const size = Math.abs(value);
     return size !== 0 && (size < 1e-3 || size >= 1e6) ? value.toExponential() : String(value);
   };
@@ -53,10 +57,10 @@ export function render({ model }) {
     field.setAttribute("aria-invalid", message !== "");
   };
   const show = () => {
-    const { value, low, high, initial, whole, log, doubtful } = model;
+    const { value, low, high, initial, parts, log, doubtful } = model;
     track.parentElement.hidden = model.optional;
     field.placeholder = model.optional ? model.empty : "";
-    track.max = whole && !log ? high - low : STEPS;
+    track.max = parts && !log ? Math.round((high - low) * parts) : STEPS;
     track.value = toPosition(value);
     track.style.setProperty("--filled", `${(100 * track.value) / track.max}%`);
     track.setAttribute("aria-valuetext", `${text(value)} ${model.unit}`);
@@ -98,14 +102,17 @@ export function render({ model }) {
   });
   field.addEventListener("change", () => {
     const { low, high, whole } = model;
+    const [origin, step, decimals] = model.along;
     const typed = field.value.trim();
-    const value = Number(typed.replace(",", "."));
+    const number = Number(typed.replace(",", "."));
+    const value = decimals === null ? number : rounded((number - origin) / step);
+    const isWhole = decimals === null ? whole : decimals === 0;
     if (typed === "" && model.optional) {
       set(null);
-    } else if (typed !== "" && value >= low && value <= high && !(whole && value % 1)) {
+    } else if (typed !== "" && value >= low && value <= high && !(isWhole && number % 1)) {
       set(value);
     } else {
-      const kind = whole ? "a whole number" : "a number";
+      const kind = isWhole ? "a whole number" : "a number";
       complain(`“${typed}” is not accepted: enter ${kind} from ${text(low)} to ${text(high)}.`);
     }
   });
@@ -116,7 +123,7 @@ export function render({ model }) {
     ask.setAttribute("aria-expanded", String(!help.hidden));
   });
 
-  model.on(["value", "low", "high", "initial", "label", "doubtful"], show);
+  model.on(["value", "low", "high", "initial", "label", "doubtful", "along"], show);
   show();
   return root;
 }

@@ -12,8 +12,9 @@ from app.model.exports import Curve
 from app.model.store import Pixel
 from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes, GateReadOut
+from app.plots.gate_cut import GateCut
 from app.theme import LIGHT, Palette
-from app.widgets.figures import Plot, cover, fit, round_up
+from app.widgets.figures import Plot, fit, round_up
 from core import Acquisition, Signals
 
 Array = NDArray[Any]
@@ -29,6 +30,8 @@ class SignalPlots:
         Stages of the tracking differentiator.
     score : Plot
         Score of another method, in place of these.
+    cut : GateCut
+        The ends of the gate on the histogram, and the extent of all plots.
     """
 
     def __init__(self) -> None:
@@ -44,6 +47,7 @@ class SignalPlots:
             figure.min_border_left, figure.min_border_right = 46, 14
             figure.min_border_top = figure.min_border_bottom = 4
             figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
+        self.cut = GateCut(self.histogram.figure, self._bins)
         # The second axis appears once: the plots are stacked.
         self._axes = [GateAxes(plot.figure, plot is self.histogram) for plot in self.plots]
         raw = ("Counts", self.histogram.source("raw"), "top")
@@ -74,6 +78,7 @@ class SignalPlots:
         """Apply the colours of a theme."""
         for plot in self.plots:
             plot.paint(colors)
+        self.cut.paint(colors)
 
     def update(
         self, pixel: Pixel, acquisition: Acquisition, with_difference: bool, unit: str = "bins"
@@ -83,7 +88,7 @@ class SignalPlots:
             axes.follow(unit, acquisition)
         for read_out in self._read_outs:
             read_out.follow(acquisition)
-        if cover(self._bins, acquisition.n_bins):
+        if self.histogram.source("raw").data["top"].size != acquisition.n_bins:
             self._lay_out(acquisition.n_bins)
         self._draw_histogram(pixel, acquisition)
         if pixel.signals is None:

@@ -373,7 +373,7 @@ def _simulate(chosen: argparse.Namespace) -> None:
     if chosen.pulses is not None:
         acquisition = replace(acquisition, n_pulses=chosen.pulses)
     capture = simulate(scene, acquisition, flux_of(chosen), seed=chosen.seed or 0)
-    given = {"unit": chosen.unit_m, "distance": chosen.distance_m, "SBR": chosen.sbr}
+    given = {"unit": chosen.unit_m, "distance": chosen.distance_m}
     options = [f"{name} {value:g}" for name, value in given.items() if value is not None]
     source = ", ".join((printable(chosen.scene), capture.source, *options))
     _save_captures(replace(capture, source=source), chosen, refused)

@@ -138,7 +138,8 @@ def test_a_simulated_capture_is_written_and_read_back(
     assert capture.acquisition == expected.acquisition
     assert (capture.pulse, capture.detection) == (expected.pulse, expected.detection)
     np.testing.assert_allclose(capture.truth_range_m, expected.truth_range_m)
-    assert capture.source == found["source"] == f"staircase, {expected.source}, SBR 0.5"
+    assert capture.source == found["source"] == f"staircase, {expected.source}"
+    assert expected.source == "simulated, seed 3, SBR 0.5, PPP 0.1041"
     assert found["photons"] == expected.counts.sum()
     code, _, err = ran(capsys, *arguments, "--out", path)
     assert code == 2

@@ -46,7 +46,7 @@ from app.pages.shared.downloads import (
 from app.pages.shared.section import Section
 from app.theme import method_style, palette
 from app.widgets.cards import card, part
-from app.widgets.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table
+from app.widgets.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table, legend_line
 from app.widgets.method_picture import Picture, ScaleBar
 from app.widgets.method_plots import CurvePlot, ReliabilityPlot, Style
 from core import ESTIMATORS, Capture
@@ -155,6 +155,7 @@ class Compare(Section):
             for method, panel in self.panels.items()
         }
         self._viewing = SettingsPanel(Comparison().viewing, self._change_view)
+        self._viewing.controls["least_confidence"].max_width = 480
         self.kind = pmui.RadioButtonGroup(
             options=list(KINDS),
             value=chosen.kind,
@@ -187,6 +188,7 @@ class Compare(Section):
         self._keys.param.watch(lambda event: self.session.choose_pixel(*event.new), "pixel")
         self._grid = pn.Column(self._keys, sizing_mode="stretch_width", margin=0)
         self._scale = ScaleBar()
+        self.legend = legend_line()
         self.remarks = Sentence(sizing_mode="stretch_width", margin=(2, 0))
         self._curves = CurvePlot()
         self._facts = Facts(sizing_mode="stretch_width")
@@ -221,6 +223,8 @@ class Compare(Section):
             head,
             self._grid,
             self._scale.pane,
+            self.legend,
+            self._viewing.controls["least_confidence"],
             self.remarks,
             self.offer_facts(self._facts, lambda: f"numbers {pixel_on_show(self.session)}"),
             plots,
@@ -230,7 +234,7 @@ class Compare(Section):
         return main, [
             part("Methods", self.picks, self._false_alarm),
             *self._folds.values(),
-            part("View", self._viewing.layout, is_open=False),
+            part("View", self._viewing.without("least_confidence"), is_open=False),
             part("How to read this page", explanation, is_open=False),
         ]
 
@@ -417,7 +421,13 @@ class Compare(Section):
 
     def about(self) -> Subject:
         """Return what files about all methods are about."""
-        return looked_at(self.session, self.session.answer.request)
+        answer = self.session.answer
+        methods = {
+            method: f"{task.settings}, false alarms {task.false_alarm:g}"
+            for method, task in self.tasks.items()
+        }
+        subject = looked_at(self.session, answer.request)
+        return replace(subject, source=answer.capture.source, methods=methods)
 
     def picture_shown(self, place: int) -> Shown:
         """Return the picture at a place, as it is saved."""
@@ -488,6 +498,7 @@ class Compare(Section):
                 else:
                     values, _ = image_of(answers[method], image_kind, viewing)
                     picture.draw_image(values, look)
+            self.legend.text = text.legend(answers, self.kind.value, viewing.least_confidence)
 
     def _draw_cloud(self, picture: Picture, method: str, answer: Answer) -> None:
         cloud, rgb, wrong = cloud_of(answer, "Range", self._chosen.viewing)

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from app.model.colors import n_below
+from app.model.methods import METHOD_TITLES
 from app.model.store import Answer
 from app.model.text import (
     NOT_COMPUTED,
@@ -225,6 +227,21 @@ def failure(error: Exception) -> str:
 def no_reference(error: Exception) -> str:
     """Return why the reference could not be computed."""
     return f"{reason(error)} The next capture will be tried again."
+
+
+def legend(answers: Mapping[str, Answer], kind: str, least_confidence: float) -> str:
+    """Return how many estimates of each method the pictures of a kind hide, and what is grey."""
+    if kind == "Confidence":
+        return "Blank: pixels without an estimate."
+    counts = [
+        f"{n_hidden:,} of {int(each.run.image.valid.sum()):,} ({METHOD_TITLES[method]})"
+        for method, each in answers.items()
+        if (n_hidden := n_below(each, least_confidence))
+    ]
+    blank = "Blank: pixels without an estimate. Grey: beyond the colour scale."
+    if not counts:
+        return blank
+    return f"{blank} Hidden below confidence {least_confidence:g}: {', '.join(counts)}."
 
 
 def remarks(capture: Capture, n_working: int, n_pictures: int) -> str:

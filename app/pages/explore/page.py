@@ -31,6 +31,7 @@ from app.pages.shared.downloads import (
 )
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
+from app.plots.gate_cut import Cut
 from app.tasks.turns import TURNS
 from app.theme import WRONG_COLOR
 from app.widgets.cards import BREAK_PX, board, card, choice, column, part
@@ -38,6 +39,7 @@ from app.widgets.cloud import PointCloud
 from app.widgets.controls import (
     FACTS_PX,
     HEADLINE_PX,
+    KNOB_PX,
     Facts,
     PixelKeys,
     SettingsPanel,
@@ -92,6 +94,7 @@ class Explore(Section):
         self.figures = Facts(timed=True, min_height=HEADLINE_PX, sizing_mode="stretch_width")
         self.numbers = Facts(leading=True, min_height=3 * FACTS_PX, sizing_mode="stretch_width")
         self.signals = SignalPlots()
+        self.signals.cut.dragged.subscribe(session.cut_gate)
         self.image = ImageView(session.choose_pixel)
         self._painted = [self.signals, self.image]
         self.image_keys = PixelKeys(
@@ -107,6 +110,8 @@ class Explore(Section):
         self._large = LargeView(session, self.image.figure)
         state = session.state
         self._viewing = SettingsPanel(Viewing(), partial(setattr, state, "viewing"))
+        self._least_confidence = self._viewing.controls["least_confidence"]
+        self._least_confidence.min_height = KNOB_PX
         self.legend = legend_line()
         self._difference = pmui.Switch.from_param(
             state.param.difference, label="First difference", size="small", margin=(0, 8)
@@ -134,6 +139,7 @@ class Explore(Section):
                 self.image_shown,
                 IMAGE_AND_REPORT,
             ),
+            self._least_confidence,
             self._large.layout,
             self.offer(
                 card(choice(text.CLOUD_HELP, state.param.cloud_color), self.cloud),
@@ -149,7 +155,7 @@ class Explore(Section):
         )
         main = [pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both"), self.figures]
         return main, [
-            part("View", self._viewing.layout, self._difference),
+            part("View", self._viewing.without("least_confidence"), self._difference),
             self.crop.part,
             part("About this page", pmui.Typography(text.EXPLANATION, margin=8), is_open=False),
         ]
@@ -227,6 +233,7 @@ class Explore(Section):
         numbers = text.pixel_numbers(answer, pixel, state.unit)
         with self.session.tasks.hold():
             self.image.fit(*answer.capture.shape, answer.grid)
+            self.signals.cut.update(Cut.of(answer, state.less))
             self.signals.update(pixel, answer.capture.acquisition, state.difference, state.unit)
             self._show_cards(is_tracking=pixel.signals is not None)
             self.image.mark(row, col)

@@ -31,6 +31,7 @@ from app.pages.shared.section import Section
 from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part, unrolled
 from app.widgets.component import until_session_ends
 from app.widgets.controls import (
+    KNOB_PX,
     Chips,
     PixelKeys,
     Sentence,
@@ -49,9 +50,6 @@ BOARD = board(600, 88, BREAK_PX)
 TABLES = """
 :host { flex: 0 0 34% !important; min-height: 0; min-width: 0; overflow-y: auto; }
 """ + unrolled(BREAK_PX)
-KNOB_PX = 46
-"""Height of the slider below the map, reserved from the start."""
-
 MAP_DELAY_MS = 60
 """The map is drawn this long after the pixel's plots, which the eye follows."""
 

@@ -22,6 +22,7 @@ from app.pages.inspect.views import PixelPlots
 from app.pages.session import Session
 from app.pages.shared.downloads import Shown, pixel_on_show, region_on_show
 from app.pages.shared.section import Section
+from app.plots.gate_cut import Cut
 from app.widgets.cards import card, column, unrolled
 from app.widgets.controls import FACTS_PX, LINE_PX, Facts, Sentence, Table
 from app.widgets.figures import pane_of
@@ -93,6 +94,7 @@ class PixelSection(Section):
         self._write_soon = session.tasks.soon(self._write)
         self._drawn: Inspected | None = None
         self.plots = PixelPlots()
+        self.plots.cut.dragged.subscribe(session.cut_gate)
         self._painted = [self.plots]
         self.cards = [
             self.offer_plot(framed(pane_of(plot.figure)), what, plot, what)
@@ -165,7 +167,9 @@ class PixelSection(Section):
                 each.visible = False
 
     def _draw(self, found: Inspected) -> None:
-        self.plots.update(found, self.session.state.unit)
+        state = self.session.state
+        self.plots.cut.update(Cut.of(found.answer, state.less))
+        self.plots.update(found, state.unit)
         hidden = self.plots.score if found.pixel.signals is not None else self.plots.stages
         for each, plot in zip(self.cards, self.plots.plots, strict=True):
             each.visible = plot is not hidden

@@ -112,10 +112,10 @@ def accuracy_steps(answer: Answer) -> Sequence[Callable[[], Accuracy]]:
 def with_gate(answer: Answer, suggestion: Suggestion) -> tuple[ReductionSettings, int]:
     """Return the reduction that crops to the suggested gate, and T_n at its old place."""
     less, n_bins = answer.request.less, answer.whole.acquisition.n_bins
-    opens, _ = less.reduction(n_bins).gate or (0, n_bins)
+    opens, _ = less.gate(n_bins)
     first, end = (opens + less.merge * edge for edge in suggestion.gate)
     t_n = max(answer.request.tracking.t_n - suggestion.gate[0], 0)
-    return replace(less, gate_from=first / n_bins, gate_to=min(end / n_bins, 1.0)), t_n
+    return less.with_gate(first, min(end, n_bins), n_bins), t_n
 
 
 @dataclass(frozen=True)

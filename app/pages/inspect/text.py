@@ -424,7 +424,7 @@ def advice(report: CaptureReport, along: Scale) -> tuple[str, str]:
     first, end = (f"{along.at(edge):.6g}" for edge in suggestion.gate)
     return (
         f"Suggested gate, in {along.name}: {first} to {end}. {suggestion.why_gate}",
-        f"Suggested T_n: {suggestion.t_n}. {suggestion.why_t_n}",
+        f"Suggested T_n, in {along.name}: {along.at(suggestion.t_n):.6g}. {suggestion.why_t_n}",
     )
 
 

@@ -26,8 +26,9 @@ from app.pages.shared.outputs import layers_of
 from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
 from app.plots.gate_axes import GateAxes, GateReadOut
+from app.plots.gate_cut import GateCut
 from app.theme import Palette
-from app.widgets.figures import Layers, cover, fit, paint_frame, round_up
+from app.widgets.figures import Layers, fit, paint_frame, round_up
 from app.widgets.image_view import ImageView
 from core import Acquisition
 from core.inspection import FaultyPixel
@@ -287,6 +288,8 @@ class PixelPlots:
         All, from top to bottom.
     candidates : ColumnDataSource
         Marks of the candidates.
+    cut : GateCut
+        The ends of the gate on the counts, and the extent of all plots.
     """
 
     def __init__(self) -> None:
@@ -305,17 +308,18 @@ class PixelPlots:
         self.stages = GatePlot(inspect_plots.stages(self.bins, marks), stages)
         self.score = GatePlot(inspect_plots.score(self.bins, marks), {"Score": "score"})
         self.plots = self.counts, self.rate, self.stages, self.score
+        self.cut = GateCut(self.counts.figure, self.bins)
 
     def paint(self, colors: Palette) -> None:
         """Take on the colours of a mode."""
         for plot in self.plots:
             plot.paint(colors)
+        self.cut.paint(colors)
 
     def update(self, found: Inspected, unit: str) -> None:
         """Show a pixel or a region, with positions in a unit."""
         pixel, report = found.pixel, found.report
         acquisition = found.answer.capture.acquisition
-        cover(self.bins, acquisition.n_bins)
         for plot in self.plots:
             plot.follow(unit, acquisition)
         curves = partial(plots.bin_curves, inspect_plots.NAMES)

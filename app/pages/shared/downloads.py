@@ -78,6 +78,8 @@ class Subject:
         Confidence threshold and field of view, described in files; names have those in `settings`.
     box : Box, optional
         Part of the scene, described in files.
+    methods : mapping of str to str
+        Settings of several estimators, described in files only.
     """
 
     capture: str
@@ -87,6 +89,7 @@ class Subject:
     part: str = ""
     viewing: Viewing | None = None
     box: Box | None = None
+    methods: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def chosen(self) -> list[str]:
@@ -112,6 +115,7 @@ class Subject:
             *([f"method: {self.estimator}"] if self.estimator else []),
             *(f"settings: {each}" for each in filter(None, (*settings, self.viewing))),
             *([f"box: {self.box}"] if self.box else []),
+            *(f"method: {method}; settings: {each}" for method, each in self.methods.items()),
             *([f"source: {' '.join(self.source.split())}"] if self.source else []),
         ]
 

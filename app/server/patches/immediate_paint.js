@@ -7,9 +7,11 @@
   const session = Bokeh.require("client/session").ClientSession.prototype;
   const layer = Bokeh.Models.get("GlyphRenderer").prototype.default_view.prototype;
   const plot = Bokeh.Models.get("Figure").prototype.default_view.prototype;
+  const axis = Bokeh.require("models/axes/axis").AxisView.prototype;
   const { _handle_patch: take } = session;
   const { update_data: update } = layer;
   const { schedule_paint: schedule } = plot;
+  const { _init_axis_label: label } = axis;
   let updates, outdated; // while messages are being taken in
 
   const paint = () => {
@@ -30,6 +32,11 @@
     const updated = update.call(this, indices);
     updates?.push(updated);
     return updated;
+  };
+  axis._init_axis_label = function () {
+    const labelled = label.call(this);
+    updates?.push(labelled);
+    return labelled;
   };
   plot.schedule_paint = function () {
     if (outdated && !this.is_paused) outdated.add(this);
