@@ -78,6 +78,7 @@ PLOTS = """
 :host { display: grid !important; gap: 8px; height: 290px;
   grid-template: minmax(0, 1fr) / minmax(0, 5fr); grid-auto-flow: column;
   grid-auto-columns: minmax(0, 3fr); }
+.scroll-button { display: none; }
 @media screen and (max-width: 900px) {
   :host { display: flex !important; flex-direction: column; height: 670px !important; }
 }

@@ -32,7 +32,8 @@ BREAK_PX = 1100
 
 FACTS = """
 .fact-list { grid-template-columns: repeat(auto-fill, minmax(140px, 1fr)) !important; }
-.leading div:nth-child(2) { grid-column: auto !important; }
+.leading div:nth-child(-n + 2) { grid-column: auto !important; }
+.leading div:first-child dd { font-size: 16px !important; }
 """
 FILLING = ":host { flex: 1 1 0 !important; min-height: 0; min-width: 0; }" + unrolled(BREAK_PX)
 COLUMN = column(6, BREAK_PX)
