@@ -168,8 +168,9 @@ class Session:
 
     def cut_gate(self, ends: tuple[int, int]) -> None:
         """Keep the bins of the whole gate from the first of these to before the second."""
-        state = self.state
-        state.less = state.less.with_gate(*ends, self.answer.whole.acquisition.n_bins)
+        less = self.state.less.with_gate(*ends, self.answer.whole.acquisition.n_bins)
+        if less != self.state.less:  # param would announce an equal object
+            self.state.less = less
 
     def pick(self, index: int) -> None:
         """Show the pixel with this index in the flattened image; -1 is none."""

@@ -79,6 +79,7 @@ class GateAxes:
 # At the pointer: the number of the bin, the position of its centre, or the value of a curve.
 READ_OUT = """
 const bin = special_vars.index;
+const [along] = renderer.tags;
 if (format === "bin") return String(bin);
 if (format in along) {
   const [origin, step, decimals] = along[format];
@@ -102,9 +103,10 @@ class GateReadOut:
     """
 
     def __init__(self, figure: Any, renderer: Any, rows: Sequence[tuple[str, Any, str]]) -> None:
-        self._names = CustomJSHover(code=READ_OUT)
-        self._columns = {f"{n}": column for n, (_, _, column) in enumerate(rows)}
-        self._sources = {f"{n}": source for n, (_, source, _) in enumerate(rows)}
+        columns = {f"{n}": column for n, (_, _, column) in enumerate(rows)}
+        sources = {f"{n}": source for n, (_, source, _) in enumerate(rows)}
+        args = {"renderer": renderer, "sources": sources, "columns": columns}
+        self._renderer = renderer
         self._acquisition: Acquisition | None = None
         self.follow(Acquisition())
         field = "@left" if "left" in renderer.data_source.data else "@bin"
@@ -119,7 +121,7 @@ class GateReadOut:
                     ("Range", f"{field}{{m}}"),
                     *values,
                 ],
-                formatters={field: self._names},
+                formatters={field: CustomJSHover(args=args, code=READ_OUT)},
             )
         )
 
@@ -129,8 +131,7 @@ class GateReadOut:
             return
         self._acquisition = acquisition
         along = {name: scale(name, acquisition) for name in ("ns", "m")}
-        self._names.args = {
-            "along": {n: [each.origin, each.step, each.decimals] for n, each in along.items()},
-            "sources": self._sources,
-            "columns": self._columns,
-        }
+        # Not as an argument: with those that are models, Bokeh would go through the whole page.
+        self._renderer.tags = [
+            {n: [each.origin, each.step, each.decimals] for n, each in along.items()}
+        ]

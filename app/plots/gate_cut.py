@@ -16,6 +16,7 @@ from app.theme import Palette
 WHOLE = "whole gate"
 
 FOLLOW = """
+const [first, merge] = whole.tags;
 whole.setv({start: first + merge * bins.start, end: first + merge * bins.end});
 """
 
@@ -85,7 +86,8 @@ class GateCut:
         self._bins = bins
         self._shown: Cut | None = None
         self._is_silent = False
-        self._whole = Range1d(0, 1)
+        # Tags, since arguments with models would make Bokeh go through the whole page.
+        self._whole = Range1d(0, 1, tags=[0, 1])
         figure.extra_x_ranges = {WHOLE: self._whole}
         self._handle = AreaVisuals(line_width=1.5)
         self.box = BoxAnnotation(
@@ -104,12 +106,10 @@ class GateCut:
             line_alpha=0.6,
         )
         figure.add_layout(self.box)
-        self._follow = CustomJS(
-            args={"whole": self._whole, "bins": bins, "first": 0, "merge": 1}, code=FOLLOW
-        )
+        follow = CustomJS(args={"whole": self._whole, "bins": bins}, code=FOLLOW)
         snap = CustomJS(args={"box": self.box}, code=SNAP)
         for model, names, code in (
-            (bins, ("start", "end"), self._follow),
+            (bins, ("start", "end"), follow),
             (self.box, ("left", "right"), snap),
         ):
             for name in names:
@@ -141,7 +141,7 @@ class GateCut:
         if before is not None and before.n_bins == cut.n_bins:
             ends = {n: cut.within(before.in_whole(getattr(self._bins, n))) for n in ends}
         self.box.right_limit = cut.n_bins
-        self._follow.args = {**self._follow.args, "first": cut.first, "merge": cut.merge}
+        self._whole.tags = [cut.first, cut.merge]
         self._bins.update(**ends, **whole)
         in_whole = {name: cut.in_whole(end) for name, end in ends.items()}
         self._whole.update(**in_whole, reset_start=0, reset_end=cut.n_bins)
