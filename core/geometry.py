@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,7 +82,7 @@ class Box:
         ranges = np.asarray(range_m, float)
         inside: NDArray[np.bool_] = np.isfinite(ranges)
         if self.polygon:
-            inside &= pixels_in(self.polygon, ranges.shape)
+            inside &= _mask(tuple(map(tuple, self.polygon)), ranges.shape)
         if self.from_m is not None:
             inside &= ranges >= self.from_m
         if self.to_m is not None:
@@ -173,6 +174,14 @@ def pixels_in(polygon: Sequence[tuple[float, float]], shape: tuple[int, ...]) ->
     # The sign of the margin that includes the edge depends on the orientation of the polygon.
     inside = [path.contains_points(centres, radius=margin) for margin in (-1e-9, 1e-9)]
     return np.asarray(np.logical_or(*inside).reshape(shape))
+
+
+@lru_cache(maxsize=4)  # a slider of the limits changes only the ranges
+def _mask(polygon: tuple[Any, ...], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return `pixels_in` as a read-only array."""
+    inside = pixels_in(polygon, shape)
+    inside.setflags(write=False)
+    return inside
 
 
 def distance_m(

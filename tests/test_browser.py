@@ -570,6 +570,7 @@ def cut_the_gate(page: Page) -> None:
     eventually(lambda: f"less.gate_from={first / 100}" in page.evaluate("location.href"))
     before = look(page)["histogram"]
     page.get_by_role("button", name="m", exact=True).click()
+    eventually(lambda: "unit=m" in page.evaluate("location.href"))  # a step of its own
     title = np.s_[-18:]  # of the axis
     eventually(lambda: not np.array_equal(look(page)["histogram"][title], before[title]))
     start_m, step_m = 41.97094, 0.149896229

@@ -12,6 +12,8 @@ from PIL import Image
 from playwright.sync_api import expect
 
 import core
+from app.model.colors import Unseen
+from app.model.methods import METHOD_TITLES
 from app.model.state import CLOUDS, FIRST_METHODS, Illumination, ReductionSettings
 from app.model.store import Request, built_in_sources, compute
 from app.pages.compare import ranking, text
@@ -308,6 +310,19 @@ def test_all_methods_fit_in_the_table_and_the_first_six_have_pictures(stage):
     assert stage.page.status.text == f"{len(ESTIMATORS)} methods compared"
     assert len(stage.page.pictures) == MAX_PICTURES
     assert f"first {MAX_PICTURES}" in stage.page.remarks.text
+
+
+def test_the_legend_counts_what_pictures_do_not_show(stage):
+    pictures = {"peak": Unseen(n_blank=2, n_outside=1234), "cfar": Unseen(n_blank=3, n_hidden=4)}
+    peak, cfar = (METHOD_TITLES[method] for method in pictures)
+    assert text.legend(pictures, 0.9) == (
+        f"Blank, without a value: 2 ({peak}), 3 ({cfar}). Hidden below confidence 0.9: 4 ({cfar}). "
+        f"Grey, beyond the colour scale: 1,234 ({peak})."
+    )
+    stage.page.show(True)
+    stage.settle()
+    stage.page.kind.value = CLOUDS  # of all estimates
+    assert stage.page.legend.text == ""
 
 
 def test_without_a_method_the_page_asks_for_one(stage):

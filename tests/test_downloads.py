@@ -372,7 +372,8 @@ def test_a_cropped_cloud_and_its_files_hold_what_is_inside_and_state_the_box(exp
     np.testing.assert_array_equal(
         np.frombuffer(explore.cloud.pixels, "<i4"), np.flatnonzero(inside)
     )
-    assert f"{inside.sum():,} of 4,096 estimates in the box" in explore.cloud.caption
+    of = f"{inside.sum():,} of {image.valid.sum():,} estimates"
+    assert f"{of} shown in the box" in explore.cloud.caption
     found = explore.cloud_shown()
     name = found.subject.file_name(found.what, "laz")
     assert name == f"car_rows20-40_cols10-30_tracking_to-m{middle_m:.6g}_cloud.laz"

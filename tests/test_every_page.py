@@ -28,6 +28,7 @@ def expect_readable(page: Page, name: str) -> None:
     """Expect the page of this name with plots that can be read, in windows of all sizes."""
     button = page.get_by_role("button", name=name, exact=True)
     expect(button).to_have_attribute("aria-pressed", "true")
+    eventually(lambda: page.evaluate(PLOTS), limit_s=300.0)  # some are of a study
     for width, height in SIZES_PX:
         page.set_viewport_size({"width": width, "height": height})
 

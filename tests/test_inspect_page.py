@@ -27,6 +27,7 @@ from app.pages.inspect.views import MAX_DRAWN_CORNERS, corners_of, rectangle
 from app.pages.session import Session
 from app.pages.shared.crop import NO_REGION
 from app.plots import inspect as inspect_plots
+from app.plots.gate_cut import Cut
 from app.theme import DARK
 from app.units import scale
 from core import Acquisition, TrackingParameters, coates_rate, inspection, tracking_signals
@@ -418,6 +419,8 @@ def test_lengths_rest_on_a_guess_unless_the_user_sets_the_field_of_view(far):
     far.state.viewing = replace(far.state.viewing, field_of_view_deg=1.0)
     far.tasks.run_until(lambda: text.WIDTH_GUESSED not in section.note.text)
     far.state.crop = Crop(to_m=1.0)
+    change(far, less=ReductionSettings(gate_from=0.1))
+    assert (far.state.viewing.field_of_view_deg, far.state.crop) == (1.0, Crop(to_m=1.0))
     change(far, source="building")
     assert far.state.crop == Crop()  # the limits were those of another scene
 
@@ -483,8 +486,11 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, mon
     np.testing.assert_array_equal(again.pair.difference_m, difference_m)
     same = script_of(again.session.answer, again.session.state, again.session.kept_answer)
     assert same == script
+    kept = building.state.kept
     press(button(section, "Forget A"))
     assert section.note.text == text.NO_A and building.state.kept == ""
+    building.state.kept = kept  # as by Undo
+    assert building.kept_answer is None  # A does not stay in memory
 
 
 def test_estimates_of_other_sizes_are_not_subtracted(building):
@@ -618,6 +624,15 @@ def test_a_gate_is_applied_to_an_already_reduced_capture(building):
     assert less.reduction(n_bins).gate == (opens + 8, opens + 180)
     assert less.merge == 2
     assert t_n == max(answer.request.tracking.t_n - 4, 0)
+
+
+def test_a_gate_of_another_capture_is_not_cut(building):
+    cut = Cut.of(building.answer, ReductionSettings())
+    before = building.state.less
+    building.cut_gate(replace(cut, n_bins=cut.n_bins + 1, wanted=(0, cut.n_bins + 1)))
+    assert building.state.less is before
+    building.cut_gate(replace(cut, wanted=(0, cut.n_bins // 2)))
+    assert building.state.less.gate(cut.n_bins) == (0, cut.n_bins // 2)
 
 
 def test_accuracy_against_pulses_is_drawn_step_by_step(building):

@@ -54,7 +54,7 @@ def change(session, **chosen):
 
 @pytest.fixture(scope="module")
 def found():
-    """A small study of the car, and the request that it belongs to."""
+    """A small study of the car, after its request and its effort."""
     section = SpeedSection(Session(built_in_sources()))
     section.change(Effort(repetitions=2, repeats=6, merges="none"))
     return section.work()(ignored, never)
@@ -62,13 +62,13 @@ def found():
 
 @pytest.fixture
 def measured(found):
-    return found[1]
+    return found[-1]
 
 
 @pytest.fixture
 def section(found, session):
     made = SpeedSection(session)
-    made.draw((session.answer.request, found[1]))
+    made.draw((session.answer.request, *found[1:]))
     return made
 
 
@@ -267,14 +267,16 @@ def test_parts_and_corrections_are_switched_off_and_on(ablation, session):
 
 
 def test_verdicts_are_those_of_the_scene_with_its_flux(ablation, session):
-    found = ablation.work()(ignored, never)
-    ablation.draw(found)
+    verdicts = ablation.work()(ignored, never)
+    ablation.draw(verdicts)
     rows = rows_of(ablation)
-    for each in found:
+    for each in verdicts.found:
         assert rows[each.part]["cells"][0][0] == each.verdict
         assert each.why in rows[each.part]["note"]
         assert len(rows[each.part]["cells"]) == len(ablation_text.COLUMNS) - 1
     change(session, light=Illumination(sbr=0.5))
+    assert all("message" in row for row in ablation.table.rows)
+    ablation.draw(verdicts)  # of the scene before: it ends late
     assert all("message" in row for row in ablation.table.rows)
 
 

@@ -51,25 +51,47 @@ def defaults_of(answer: Answer) -> dict[str, Any]:
     }
 
 
-def enter(state: State, answer: Answer, previous: Answer | None) -> None:
-    """Adapt the state to another capture; keep the pixel, pins and region that lie in it."""
+def enter(
+    state: State, answer: Answer, previous: Answer | None, previous_width_deg: float | None = None
+) -> None:
+    """Adapt the state to another capture; keep what still holds for it.
+
+    Parameters
+    ----------
+    state : State
+    answer, previous : Answer
+        Its estimate, and the one before.
+    previous_width_deg : float, optional
+        The field of view that suited the capture before.
+    """
     for name, possible in possible_kinds(answer).items():
         state.param[name].objects = possible
         if getattr(state, name) not in possible:
             setattr(state, name, possible[0])
     own = defaults_of(answer)
-    changed: dict[str, Any] = {"field_of_view_deg": own["viewing"].field_of_view_deg}
-    if previous is not None and previous.request.source is not answer.request.source:
-        changed |= {"color_from_m": None, "color_to_m": None}  # limits of another scene
-        state.crop = Crop()
-    compared = replace(state.comparison.viewing, **changed)
     here = {"pixel": state.pixel, "pins": state.pins, "region": state.region}
-    kept = {} if previous is None else carried(here, previous, answer)
+    kept: dict[str, Any] = {} if previous is None else carried(here, previous, answer)
+    of_scene: dict[str, Any] = {}
+    if previous is not None and not _same_scene(previous, answer):
+        of_scene, kept["crop"] = {"color_from_m": None, "color_to_m": None}, Crop()
+    has_same_width = previous is not None and same_pixels(answer, previous)
+
+    def adapted(viewing: Viewing) -> Viewing:
+        if has_same_width and viewing.field_of_view_deg != previous_width_deg:  # set by the user
+            return replace(viewing, **of_scene)
+        width_deg = own["viewing"].field_of_view_deg
+        return replace(viewing, field_of_view_deg=width_deg, **of_scene)
+
+    compared = replace(state.comparison, viewing=adapted(state.comparison.viewing))
     state.param.update(
-        viewing=replace(state.viewing, **changed),
-        comparison=replace(state.comparison, viewing=compared),
+        viewing=adapted(state.viewing),
+        comparison=compared,
         **{"pixel": own["pixel"], "pins": (), "region": ()} | kept,
     )
+
+
+def _same_scene(one: Answer, other: Answer) -> bool:
+    return one.request.source.without_truth is other.request.source.without_truth
 
 
 def carried(here: Mapping[str, Any], before: Answer, answer: Answer) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyvista as pv
@@ -39,8 +39,31 @@ def shown(answer: Answer, least_confidence: float, box: Box = WHOLE) -> NDArray[
     return np.asarray(visible if box == WHOLE else visible & box.contains(image.range_m))
 
 
-NO_VALUE = {"Truth": "without a target", "Confidence": "without an estimate"}
-"""Pixels that are blank in images of a kind, unless they are those of the estimates."""
+NO_VALUE = {
+    "Estimate": "without an estimate",
+    "Truth": "without a target",
+    "Error": "without an estimate or truth",
+    "Confidence": "without an estimate",
+}
+"""Pixels that are blank in images of a kind, hidden estimates aside."""
+
+
+class Unseen(NamedTuple):
+    """How many pixels of an image or cloud its colours do not show."""
+
+    n_blank: int = 0
+    """Pixels without a value, hidden estimates aside."""
+    n_hidden: int = 0
+    """Estimates that are not confident enough to be shown."""
+    n_outside: int = 0
+    """Values beyond the colour scale."""
+
+
+def unseen(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> Unseen:
+    """Count the pixels of an image that are blank or grey; parameters are those of `legend`."""
+    hides = kind in ("Estimate", "Error")
+    n_hidden = n_below(answer, viewing.least_confidence) if hides else 0
+    return Unseen(int(np.isnan(values).sum()) - n_hidden, n_hidden, look.n_outside(values))
 
 
 def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
@@ -51,21 +74,17 @@ def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
     values, look
         Of `map_of`.
     """
-    n_blank, reasons, sentences = int(np.isnan(values).sum()), [], []
-    rest = NO_VALUE.get(kind, "without a value")
-    if kind in ("Estimate", "Error"):
-        rest = "without an estimate" + (" or truth" if kind == "Error" else "")
-        if n_hidden := n_below(answer, viewing.least_confidence):
-            reasons.append(hidden(answer, viewing.least_confidence))
-            n_blank -= n_hidden
-    if n_blank:
-        reasons.append(f"{n_blank:,} pixels {rest}")
+    found, reasons, sentences = unseen(answer, kind, viewing, values, look), [], []
+    if found.n_hidden:
+        reasons.append(hidden(answer, viewing.least_confidence))
+    if found.n_blank:
+        reasons.append(f"{found.n_blank:,} pixels {NO_VALUE.get(kind, 'without a value')}")
     if reasons:
         sentences.append(f"Blank: {', '.join(reasons)}.")
     if kind in ("Estimate", "Error") and answer.run.image.valid.any() and np.isnan(values).all():
         sentences.append("Lower “Show from confidence”.")
-    if n_outside := look.n_outside(values):
-        sentences.append(f"Grey: {n_outside:,} beyond the colour scale.")
+    if found.n_outside:
+        sentences.append(f"Grey: {found.n_outside:,} beyond the colour scale.")
     return " ".join(sentences)
 
 

@@ -31,7 +31,10 @@ FIELD_OF_VIEW_UNKNOWN = (
 
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
 
-CONFIDENCE_HELP = "Probability of a surface within 3 bins of the estimate."
+CONFIDENCE_HELP = (
+    "Probability of a surface within 3 bins of the estimate. In a pixel of several surfaces, the "
+    "report's confidence may exceed that of the map, which assumes one."
+)
 
 RANGE_HELP = (
     "Range of the surface from the photons of this pixel, if there is one within 3 bins of the "

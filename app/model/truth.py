@@ -51,13 +51,14 @@ def parts_of(key: str) -> tuple[str, Truth | None]:
 def with_truth(source: Source, truth: Truth, path: Path) -> Source:
     """Return the source of a capture with a truth, whose file is at a path, in place of another."""
     source = source.without_truth
+    name = (path == source.path and truth.variable) or path.name
 
     def load(light: Illumination, reading: ReadOptions, absent: Collection[str]) -> Capture:
         return read_truth(path, source.load(light, reading, absent), **truth.options)
 
     return replace(
         source,
-        title=f"{source.title} with {truth.variable if path == source.path else path.name}",
+        title=f"{source.title} with {name}",
         load=load,
         truth=AddedTruth(source, path.name, truth.options),
     )

@@ -15,6 +15,7 @@ from app.model.state import State, Viewing
 from app.model.store import COMPUTED_FROM, Answer, Request, Source
 from app.pages.shared.estimate import CurrentEstimate
 from app.pages.shared.failures import FailureLog
+from app.plots.gate_cut import Cut
 from app.tasks.page import PageTasks
 
 
@@ -123,6 +124,11 @@ class Session:
         self._kept = query, answer
         self.state.kept = query
 
+    def forget(self) -> None:
+        """Forget the estimate that was kept as A, and free its memory."""
+        self._kept = None
+        self.state.kept = ""
+
     def is_settled(self) -> bool:
         """Return whether all that was requested is on screen."""
         return self._recalled is None and self.estimate.is_settled
@@ -166,9 +172,12 @@ class Session:
         with self.tasks.hold():  # one message for all consequences
             self.state.pixel = (min(max(row, 0), rows - 1), min(max(col, 0), cols - 1))
 
-    def cut_gate(self, ends: tuple[int, int]) -> None:
-        """Keep the bins of the whole gate from the first of these to before the second."""
-        less = self.state.less.with_gate(*ends, self.answer.whole.acquisition.n_bins)
+    def cut_gate(self, cut: Cut) -> None:
+        """Keep the wanted bins of the whole gate, unless they are those of another gate."""
+        n_bins = self.answer.whole.acquisition.n_bins
+        if cut.n_bins != n_bins:
+            return  # dragged before the capture changed
+        less = self.state.less.with_gate(*cut.wanted, n_bins)
         if less != self.state.less:  # param would announce an equal object
             self.state.less = less
 

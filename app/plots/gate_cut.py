@@ -75,14 +75,14 @@ class GateCut:
 
     Attributes
     ----------
-    dragged : Signal of tuple of int
-        Emitted with the first bin and the end of the last, in the whole gate, while one is dragged.
+    dragged : Signal of Cut
+        Emitted with the cut that is wanted while an end is dragged.
     box : BoxAnnotation
         The part that is kept, in bins of the whole gate.
     """
 
     def __init__(self, figure: Any, bins: Range1d) -> None:
-        self.dragged: Signal[tuple[int, int]] = Signal()
+        self.dragged: Signal[Cut] = Signal()
         self._bins = bins
         self._shown: Cut | None = None
         self._is_silent = False
@@ -151,5 +151,5 @@ class GateCut:
         return round(self.box.left), round(self.box.right)
 
     def _moved(self, _side: str, _old: float, _new: float) -> None:
-        if not self._is_silent:
-            self.dragged.emit(self._ends)
+        if self._shown is not None and not self._is_silent:
+            self.dragged.emit(replace(self._shown, wanted=self._ends))

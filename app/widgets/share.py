@@ -64,10 +64,13 @@ class Share:
 
     def _show(self) -> None:
         self._code.text = self._script()
-        if self._dialog is None:  # made on demand: few users open it
-            self._dialog = self._make_dialog()
-            self.layout.append(self._dialog)
-        self._dialog.open = True
+        if self._dialog is not None:
+            self._dialog.open = True
+            return
+        # Made on demand: few users open it. It is open when it is added, since the browser loses a
+        # change between the first drawing of a component and its subscription to changes.
+        self._dialog = self._make_dialog()
+        self.layout.append(self._dialog)
 
     def _make_dialog(self) -> pmui.Dialog:
         copy, status = _copy_button(
@@ -87,6 +90,7 @@ class Share:
             ),
             self._code,
             pn.Row(copy, save, status, margin=(8, 0), styles={"gap": "8px"}),
+            open=True,
             title=TITLE,
             title_variant="h6",
             show_close_button=True,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from core.acquisition import Floats
-from core.capture import Capture, CaptureInfo
+from core.capture import Capture, CaptureError, CaptureInfo
 from core.checks import printable, require
 from core.cli.options import (
     FLUX_OPTIONS,
@@ -143,8 +143,12 @@ def _info(chosen: argparse.Namespace) -> None:
 
 def _truth_facts(path: Path, capture: Capture) -> dict[str, Any]:
     """Return the images of the file that may be the truth, and the options that take one."""
-    known = capture.truth_range_m is not None
-    possible = [] if known else possible_truths(path, capture)
+    if capture.truth_range_m is not None:
+        return {}
+    try:
+        possible = possible_truths(path, capture)
+    except CaptureError:  # the capture itself is readable
+        return {}
     options = []
     for each in possible:
         unit = "" if each.is_unit_stated else f" --truth-unit {' or '.join(each.units)}"

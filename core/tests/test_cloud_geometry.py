@@ -106,7 +106,8 @@ def test_a_box_contains_the_ranges_between_its_limits_in_its_polygon() -> None:
     range_m = np.array([[1.0, 2.0, 3.0], [np.nan, 5.0, 6.0]])
     corners = ((-0.5, 0.5), (-0.5, 2.5), (1.5, 2.5), (1.5, 0.5))
     assert Box().contains(range_m).tolist() == [[True] * 3, [False, True, True]]
-    assert range_m[Box(corners).contains(range_m)].tolist() == [2, 3, 5, 6]
+    for _ in range(2):  # the second time from memory
+        assert range_m[Box(corners).contains(range_m)].tolist() == [2, 3, 5, 6]
     assert range_m[Box(corners, 3.0).contains(range_m)].tolist() == [3, 5, 6]
     assert range_m[Box((), 2.0, 5.0).contains(range_m)].tolist() == [2, 3, 5]
     assert str(Box(((0, 1.5), (2, 3), (4, 5)), None, 48.0)) == (

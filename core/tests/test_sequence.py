@@ -58,8 +58,11 @@ def test_a_sequence_is_ranged_from_the_command_line(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"cube": CUBES[0][:2], "truth_range_m": None, "signal": None}, r"shape = \(2, 4, 40\)"),
-        ({"detection": "all"}, "detection = 'all'"),
+        (
+            {"cube": CUBES[0][:2], "truth_range_m": None, "signal": None},
+            r"shape of the file = \(2, 4, 40\)",
+        ),
+        ({"detection": "all"}, "detections of the file = 'all'"),
         ({"acquisition": replace(ACQUISITION, bin_width_s=2e-9)}, "that of the files before"),
     ],
 )

@@ -133,7 +133,7 @@ def test_a_file_may_state_its_unit(tmp_path: Path) -> None:
         (npy_bytes(TRUTH_M.T), {"truth_unit": "m"}, r"shape \(4, 3\).*shape \(3, 4\)"),
         (npy_bytes(TRUTH_M[..., None]), {"truth_unit": "m"}, "truth_variable = None"),
         (npy_bytes(TRUTH_M), {"truth_unit": "mm"}, "truth_unit = 'mm'"),
-        (npy_bytes(BINS), {"truth_unit": "m"}, "20 to 31 m' .*149.896 to 164.886 m"),
+        (npy_bytes(BINS), {"truth_unit": "m"}, "true ranges = '20 to 31 m' .*149.896 to 164.886 m"),
         (npy_bytes(BINS * np.nan), {"truth_unit": "bins"}, "no target"),
         (npy_bytes(-BINS), {"truth_unit": "bins"}, r"pixel \(0, 0\) = -20"),
         (npy_bytes(np.full(SHAPE, "a")), {"truth_unit": "m"}, "real numbers"),
@@ -182,6 +182,11 @@ def test_of_several_images_a_name_chooses(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.truth_range_m, TRUTH_M + 1)
 
 
+def refuse(*_: object) -> None:
+    """Raise, as for a file whose images cannot be listed."""
+    raise CaptureError("no")
+
+
 @pytest.mark.parametrize("write", [mat, mat73, np.savez])
 def test_maps_beside_the_counts_may_be_the_truth(
     write: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -198,6 +203,9 @@ def test_maps_beside_the_counts_may_be_the_truth(
     ]
     known = facts(capsys, "info", path)
     assert known["possible_truths"][1] == "--truth-variable bin --truth-unit bins or ns"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("core.cli.captures.possible_truths", refuse)
+        assert "possible_truths" not in facts(capsys, "info", path)
     given = ("--capture", path, "--truth-variable", "range_m", "--bin-width", "1ns")
     known = facts(capsys, "estimate", "peak", *given)
     assert known["pixels_with_a_target"] == 11
@@ -245,6 +253,8 @@ def test_a_capture_with_a_truth_gets_the_figures_of_a_simulated_one(
         (("--capture", "wall.npz", "--truth", "truth.npy"), "--truth-unit = None"),
         (("--capture", "wall.npz", "--truth-unit", "m"), "there is no --truth"),
         (("--truth", "truth.npy"), "a scene has its own truth"),
+        (("--capture", "wal*.npz", "--truth-variable", "a"), "a sequence has no file of its own"),
+        (("--capture", "wall.npz", "--truth", "truth.npy", "--truth-unit", "m"), ": true ranges ="),
         (("--capture", "wall.npz", "--truth", "no.npy"), "no.npy: path = "),
     ],
 )

@@ -12,7 +12,7 @@ import numpy as np
 import panel as pn
 import panel_material_ui as pmui
 
-from app.model.colors import cloud_of, image_of
+from app.model.colors import Unseen, cloud_of, image_of, n_below, unseen
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import cloud_files, image_files
 from app.model.mesh import view_bounds
@@ -487,6 +487,7 @@ class Compare(Section):
             self._scale.update(look)
             self._make_pictures(len(methods))
             drawn = zip(self.pictures, self._buttons, methods, strict=False)
+            found = {}
             for picture, button, method in drawn:
                 picture.title.text = button.what = method_title(method)
                 button.offer(CLOUD if is_clouds else IMAGE)
@@ -494,12 +495,15 @@ class Compare(Section):
                 picture.resize(CLOUD_HEIGHT if is_clouds else IMAGE_HEIGHT)
                 if method not in answers:
                     continue
+                answer = answers[method]
                 if is_clouds:
-                    self._draw_cloud(picture, method, answers[method])
+                    self._draw_cloud(picture, method, answer)
+                    found[method] = Unseen(n_hidden=n_below(answer, viewing.least_confidence))
                 else:
-                    values, _ = image_of(answers[method], image_kind, viewing)
+                    values, _ = image_of(answer, image_kind, viewing)
                     picture.draw_image(values, look)
-            self.legend.text = text.legend(answers, self.kind.value, viewing.least_confidence)
+                    found[method] = unseen(answer, image_kind, viewing, values, look)
+            self.legend.text = text.legend(found, viewing.least_confidence)
 
     def _draw_cloud(self, picture: Picture, method: str, answer: Answer) -> None:
         cloud, rgb, wrong = cloud_of(answer, "Range", self._chosen.viewing)

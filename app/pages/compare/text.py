@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from app.model.colors import n_below
+from app.model.colors import Unseen
 from app.model.methods import METHOD_TITLES
 from app.model.store import Answer
 from app.model.text import (
@@ -229,19 +229,23 @@ def no_reference(error: Exception) -> str:
     return f"{reason(error)} The next capture will be tried again."
 
 
-def legend(answers: Mapping[str, Answer], kind: str, least_confidence: float) -> str:
-    """Return how many estimates of each method the pictures of a kind hide, and what is grey."""
-    if kind == "Confidence":
-        return "Blank: pixels without an estimate."
-    counts = [
-        f"{n_hidden:,} of {int(each.run.image.valid.sum()):,} ({METHOD_TITLES[method]})"
-        for method, each in answers.items()
-        if (n_hidden := n_below(each, least_confidence))
-    ]
-    blank = "Blank: pixels without an estimate. Grey: beyond the colour scale."
-    if not counts:
-        return blank
-    return f"{blank} Hidden below confidence {least_confidence:g}: {', '.join(counts)}."
+def legend(pictures: Mapping[str, Unseen], least_confidence: float) -> str:
+    """Return how many pixels are blank, grey or hidden in the picture of each method."""
+    reasons = (
+        "Blank, without a value",
+        f"Hidden below confidence {least_confidence:g}",
+        "Grey, beyond the colour scale",
+    )  # in the order of the fields of `Unseen`
+    sentences = []
+    for why, counts in zip(reasons, zip(*pictures.values(), strict=True), strict=False):
+        listed = [
+            f"{n:,} ({METHOD_TITLES[method]})"
+            for method, n in zip(pictures, counts, strict=True)
+            if n
+        ]
+        if listed:
+            sentences.append(f"{why}: {', '.join(listed)}.")
+    return " ".join(sentences)
 
 
 def remarks(capture: Capture, n_working: int, n_pictures: int) -> str:

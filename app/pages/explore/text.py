@@ -99,8 +99,8 @@ def cloud_caption(
     is_width_guessed: bool = False,
 ) -> str:
     """Return the line under the cloud."""
-    total = answer.capture.shape[0] * answer.capture.shape[1]
-    line = f"{n_shown:,} of {total:,} estimates {'shown' if box == WHOLE else 'in the box'}"
+    total, where = int(answer.run.image.valid.sum()), "" if box == WHOLE else " in the box"
+    line = f"{n_shown:,} of {total:,} estimates shown{where}"
     if n_wrong is not None:
         line += f", {n_wrong:,} of them wrong (crosses)"
     return line + ("; width is a guess" if is_width_guessed else "")

@@ -60,8 +60,7 @@ class PairSection(Section):
         self._painted += [picture.image for picture in self._pictures]
         self.facts = Facts(stylesheets=[FACTS], sizing_mode="stretch_width")
         self.note = Sentence(live=True, text=text.NO_A, sizing_mode="stretch_width", margin=0)
-        forget = partial(setattr, session.state, "kept", "")
-        self._forget = button("Forget A", text.FORGET_HELP, forget)
+        self._forget = button("Forget A", text.FORGET_HELP, session.forget)
         self._of_images: list[Fact] = []
         self._content = pn.Column(visible=False, sizing_mode="stretch_width")
         session.state.param.watch(lambda *_: self._mark(), "pixel")

@@ -53,4 +53,4 @@ def _inside(answer: Answer, least_confidence: float, box: Box) -> str:
     if box == WHOLE:
         return "The cloud shows the whole scene."
     n_shown, n_inside = (int(shown(answer, least_confidence, b).sum()) for b in (WHOLE, box))
-    return f"{n_inside:,} of {n_shown:,} points are inside: the cloud and its files hold only them."
+    return f"{n_inside:,} of {n_shown:,} points are inside. Only these are shown and saved."

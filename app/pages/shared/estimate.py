@@ -114,8 +114,9 @@ class CurrentEstimate:
         previous, self.answer, self.refused = self.answer, answer, None
         self._take_reduction(answer)
         if not same_view(answer.request, previous.request):
+            before_deg = self.own_field_of_view_deg
             self.own_field_of_view_deg = own_field_of_view_deg(answer)
-            enter(self._state, answer, previous)
+            enter(self._state, answer, previous, before_deg)
         with self._tasks.hold():  # one message for all consequences
             self._failures.clear(no_estimates(answer))
             self._end()

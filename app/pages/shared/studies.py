@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, Generic, TypeVar
 
 import panel as pn
@@ -38,8 +37,7 @@ class _ControlledWork:
         help: str = "Compute: starts again with the settings above.",
     ) -> None:
         self._session, self._noun = session, noun
-        fail = partial(session.failures.report, describe=unfinished, part=self)
-        self._work = session.tasks.long_work(self._show_progress, fail)
+        self._work = session.tasks.long_work(self._show_progress, self._failed)
         self._start = button(label, help, self.start, margin=(6, 4, 6, 8))
         self._start.variant = "contained"
         cancel_help = "Cancel: stops the work and keeps its results so far."
@@ -62,6 +60,9 @@ class _ControlledWork:
     def cancel(self) -> None:
         """Cancel the work."""
         self._work.cancel()
+
+    def _failed(self, error: Exception) -> None:
+        self._session.failures.report(error, describe=unfinished, part=self)
 
     def _show_progress(self) -> None:
         work = self._work
@@ -150,14 +151,19 @@ class OnePiece(_ControlledWork, Generic[Result]):
         """Start the first work on screen; cancel it off screen."""
         if not self._starts_by_itself:
             return
-        if is_on_screen and not self._work.is_running:
-            self._work.start_piece(self._make_work(), self._draw_first)
-        elif not is_on_screen:
+        if not is_on_screen:
             self._work.cancel()
+        elif not self._work.is_running:
+            self._session.failures.resolve(self)
+            self._work.start_piece(self._make_work(), self._draw_first)
 
     def _draw_first(self, result: Result) -> None:
         self._starts_by_itself = False
         self._draw(result)
+
+    def _failed(self, error: Exception) -> None:
+        self._starts_by_itself = False
+        super()._failed(error)
 
 
 def aside(explanation: str, *controls: Any) -> pn.Column:

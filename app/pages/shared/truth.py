@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -29,7 +30,7 @@ FORM_HELP = (
 )
 UNITS = {"m": "m", "bins": "bins after the opening of the gate", "ns": "ns after the pulse"}
 
-OFFER = "The file has images that may be the true ranges."
+OFFER = "This file may contain the true ranges."
 UNIT_QUESTION = "In which unit is {name}?"
 
 
@@ -137,7 +138,8 @@ class TruthOffer:
 
     def show(self, answer: Answer) -> None:
         """Look for images that may be the truth of a capture."""
-        subject = answer.request.source, answer.request.reading
+        # A sequence has the same images for each of its records.
+        subject = answer.request.source, replace(answer.request.reading, records=None)
         if subject == self._subject:
             return
         self._subject, self.layout.visible = subject, False

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from app.model.store import Answer, same_subject
+from app.model.store import Answer, Request, same_subject
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
 from app.pages.shared.section import Repetitions, SettingsSection
@@ -16,6 +17,16 @@ from app.widgets.cards import part
 from app.widgets.controls import Sentence, Table
 from core import CORRECTIONS, parts_of
 from core.studies.ablation import Requirement, requirements
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """Verdicts, and what they hold for."""
+
+    request: Request
+    repetitions: int
+    """0 for a capture, which is not simulated."""
+    found: tuple[Requirement, ...]
 
 
 class AblationSection(SettingsSection[Repetitions]):
@@ -36,8 +47,7 @@ class AblationSection(SettingsSection[Repetitions]):
     def __init__(self, session: Session) -> None:
         super().__init__(session, Repetitions(8), text.EXPLANATION)
         self._found: dict[str, Requirement] = {}
-        self._studied = session.answer.request
-        self._repetitions = self.settings.repetitions
+        self._studied, self._repetitions = session.answer.request, 0
         self.study = OnePiece(session, self.work, self.draw, "parts")
         self.subject = Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8))
         self.table = Table(
@@ -74,38 +84,38 @@ class AblationSection(SettingsSection[Repetitions]):
         state = self.session.state
         state.absent = state.absent ^ {name}
 
-    def work(self) -> Work[tuple[Requirement, ...]]:
+    def work(self) -> Work[Verdicts]:
         """Return the study of the present scene or capture."""
         request, whole = self.session.answer.request, self.session.answer.whole
-        build, light, seeds = request.source.scene, request.light, range(self.settings.repetitions)
-        self._studied, self._repetitions = request, self.settings.repetitions
+        build, light, repetitions = request.source.scene, request.light, self.settings.repetitions
 
-        def work(
-            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-        ) -> tuple[Requirement, ...]:
+        def work(progress: Callable[[int, int], None], cancelled: Callable[[], bool]) -> Verdicts:
             reports: dict[str, Any] = {"progress": progress, "cancelled": cancelled}
             if build is None:
-                return requirements(whole, **reports)
-            scene = build()
+                return Verdicts(request, 0, requirements(whole, **reports))
+            scene, seeds = build(), range(repetitions)
             gate = light.acquisition(scene.acquisition)
-            return requirements(scene, light.flux, acquisition=gate, seeds=seeds, **reports)
+            found = requirements(scene, light.flux, acquisition=gate, seeds=seeds, **reports)
+            return Verdicts(request, repetitions, found)
 
         return work
 
-    def draw(self, found: tuple[Requirement, ...]) -> None:
+    def draw(self, verdicts: Verdicts) -> None:
         """Show verdicts, unless another scene or capture has been chosen since."""
-        if same_subject(self.session.answer.request, self._studied):
-            self._found = {each.part: each for each in found}
+        if same_subject(self.session.answer.request, verdicts.request):
+            self._studied, self._repetitions = verdicts.request, verdicts.repetitions
+            self._found = {each.part: each for each in verdicts.found}
         self.refresh()
 
     def refresh(self) -> None:
         """Write the table."""
         request = self.session.answer.request
-        repetitions = self._repetitions if self._found and request.source.is_scene else 0
         build, absent = request.source.scene, self.session.state.absent
         own = [*CORRECTIONS, *(parts_of(build()) if build is not None else ())]
         with self.session.tasks.hold():
-            self.subject.text = text.subject(request.source.title, repetitions, absent)
+            self.subject.text = text.subject(
+                request.source.title, self._repetitions if self._found else 0, absent
+            )
             self.table.rows = [
                 text.row(name, self._found.get(name), name in own, name in absent)
                 for name in dict.fromkeys([*own, *self._found])

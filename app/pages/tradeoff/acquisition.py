@@ -7,7 +7,7 @@ from typing import Any
 
 import panel as pn
 
-from app.model.store import Answer
+from app.model.store import Answer, Request
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
 from app.pages.shared.outputs import CurveCard, TableCard
@@ -81,25 +81,32 @@ class AcquisitionSection(SettingsSection[Repetitions]):
     def show(self, is_on_screen: bool) -> None:
         """Come on screen, or leave it; the first simulation starts by itself."""
         super().show(is_on_screen)
-        if _applies(self.session.answer):
-            self.study.show(is_on_screen)
-        elif not self._results.visible:
-            self.subject.text = text.FIRST_PHOTONS_ONLY
+        self._start_first()
+
+    def follow(self, answer: Answer) -> None:
+        """Show another estimate; a first simulation starts where it applies."""
+        self._start_first()
+
+    def _start_first(self) -> None:
+        applies = _applies(self.session.answer)
+        if not self._results.visible:
+            self.subject.text = text.NOT_SIMULATED if applies else text.FIRST_PHOTONS_ONLY
+        self.study.show(self.is_on_screen and applies)
 
     def about(self) -> Subject:
         """Return what the section's files are about."""
         return looked_at(self.session, self._simulated)
 
-    def work(self) -> Work[tuple[str, list[Any]]]:
+    def work(self) -> Work[tuple[Request, str, list[Any]]]:
         """Return the simulation of the present scene or capture."""
         if not _applies(self.session.answer):
             raise ValueError(text.FIRST_PHOTONS_ONLY)
-        source, repetitions = source_of(self.session.answer), self.settings.repetitions
-        self._simulated = self.session.answer.request
+        request, source = self.session.answer.request, source_of(self.session.answer)
+        repetitions = self.settings.repetitions
 
         def work(
             progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-        ) -> tuple[str, list[Any]]:
+        ) -> tuple[Request, str, list[Any]]:
             def report(done: int, of: int) -> None:
                 if cancelled():
                     raise Cancelled
@@ -111,13 +118,13 @@ class AcquisitionSection(SettingsSection[Repetitions]):
             )
             found = acquisition_sweeps([simulation], range(repetitions), progress=report)
             said = text.simulated(simulation.name, repetitions, simulation.note)
-            return said, list(acquisition_items(found))
+            return request, said, list(acquisition_items(found))
 
         return work
 
-    def draw(self, found: tuple[str, list[Any]]) -> None:
+    def draw(self, found: tuple[Request, str, list[Any]]) -> None:
         """Show a note on the simulation, the curves and the table."""
-        self.subject.text, (*curves, required) = found
+        self._simulated, self.subject.text, (*curves, required) = found
         with self.session.tasks.hold():
             for each, curve in zip(self.cards, curves, strict=True):
                 each.show(curve)

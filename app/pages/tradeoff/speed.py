@@ -184,29 +184,30 @@ class SpeedSection(SettingsSection[Effort]):
 
     # Measurement
 
-    def work(self) -> Work[tuple[Request, list[Point]]]:
+    def work(self) -> Work[tuple[Request, Effort, list[Point]]]:
         """Return the measurement of the present scene or capture."""
         answer, effort = self.session.answer, self.settings
-        self._effort, source = effort, source_of(answer)
+        source = source_of(answer)
         merges = (1, 2, 4) if effort.merges == ANY_MERGE else (1,)
         chosen = candidates(methods(answer), merges)
 
         def work(
             progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-        ) -> tuple[Request, list[Point]]:
-            return answer.request, study(
+        ) -> tuple[Request, Effort, list[Point]]:
+            points = study(
                 [(source, affordable(source, chosen))],
                 seeds=range(effort.repetitions),
                 repeats=effort.repeats,
                 progress=progress,
                 cancelled=cancelled,
             )
+            return answer.request, effort, points
 
         return work
 
-    def draw(self, found: tuple[Request, list[Point]]) -> None:
-        """Show measured points, and the request that they belong to."""
-        self._measured_on, self.measured = found
+    def draw(self, found: tuple[Request, Effort, list[Point]]) -> None:
+        """Show measured points, with the request and the effort that they belong to."""
+        self._measured_on, self._effort, self.measured = found
         self._results.visible = True
         self.follow(self.session.answer)
         self._redraw()

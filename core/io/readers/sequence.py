@@ -66,8 +66,9 @@ def read_files(
 
 def _sum(total: Capture, one: Capture) -> Capture:
     """Add the counts of a file; images and fluxes remain where both are the same."""
-    require("shape", one.cube.shape, one.cube.shape == total.cube.shape, f"{total.cube.shape}")
-    require("detection", one.detection, one.detection == total.detection, total.detection)
+    shape, detection = total.cube.shape, total.detection
+    require("shape of the file", one.cube.shape, one.cube.shape == shape, f"{shape}")
+    require("detections of the file", one.detection, one.detection == detection, detection)
     pulses = total.acquisition.n_pulses, one.acquisition.n_pulses
     n_pulses = None if None in pulses else sum(filter(None, pulses))
     before, here = (replace(each.acquisition, n_pulses=n_pulses) for each in (total, one))

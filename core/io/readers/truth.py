@@ -238,10 +238,14 @@ def truth_options_from(chosen: argparse.Namespace, capture: Path | None) -> dict
         If the options contradict each other.
     """
     given = {name: getattr(chosen, name) for name in TRUTH_OPTIONS}
-    path = given.pop("truth") or (capture if given["truth_variable"] else None)
+    is_sequence = capture is not None and bool(files_of(capture))
+    own = None if is_sequence else capture
+    path = given.pop("truth") or (own if given["truth_variable"] else None)
     if capture is not None and path is not None:
         return {"path": path, **given}
-    why = "a scene has its own truth" if capture is None else "there is no --truth"
+    without_file = "a sequence has no file of its own; give --truth"
+    missing = without_file if is_sequence else "there is no --truth"
+    why = "a scene has its own truth" if capture is None else missing
     for name in TRUTH_OPTIONS:
         value = getattr(chosen, name)
         require(name, value, value is None, f"None: {why}")
@@ -319,7 +323,7 @@ def _stated_unit(found: Map) -> str | None:
 def _ranges_m(values: NDArray[Any], unit: str, acquisition: Acquisition) -> Floats:
     """Convert an image to ranges in metres, NaN without a target."""
     is_real = values.dtype.kind in "biuf"
-    require("truth", f"array of {values.dtype}", is_real, "real numbers")
+    require("true ranges", f"array of {values.dtype}", is_real, "real numbers")
     numbers = values.astype(np.float64)
     numbers[~np.isfinite(numbers)] = np.nan
     below = numbers < 0
@@ -351,4 +355,4 @@ def _require_in_gate(truth_m: Floats, acquisition: Acquisition) -> None:
     low_m, high_m = _gate_m(acquisition)
     found = f"{known.min():.6g} to {known.max():.6g} m" if known.size else "no target"
     accepted = f"targets within the gate, {low_m:.6g} to {high_m:.6g} m, in another unit perhaps"
-    require("truth", found, bool(_in_gate(truth_m, acquisition).any()), accepted)
+    require("true ranges", found, bool(_in_gate(truth_m, acquisition).any()), accepted)
