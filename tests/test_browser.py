@@ -244,8 +244,8 @@ def choose_by_tap(page: Page) -> np.ndarray:
 
 def move_by_keys(page: Page, place: np.ndarray) -> None:
     """Move from the pixel at a place in the picture, and then to the left edge."""
+    image(page).focus()  # its outline, instead of that of the plot, is no mark
     (row, col), before = pixel_on_show(page), look(page)
-    image(page).focus()
     for key, down, right in (
         ("ArrowRight", 0, 1),
         ("ArrowDown", 1, 0),
