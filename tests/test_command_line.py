@@ -109,7 +109,7 @@ def shows(page: Page, rows: str, cols: str) -> None:
 
 def zoom(page: Page) -> None:
     """Drag a box on the image."""
-    box = page.locator("[data-part=image]").bounding_box()
+    box = page.locator("[data-part=image] .bk-Figure").bounding_box()
     left, top = box["x"] + 0.4 * box["width"], box["y"] + 0.4 * box["height"]
     page.mouse.move(left, top)
     page.mouse.down()

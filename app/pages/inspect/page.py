@@ -48,7 +48,7 @@ from core.io import ColorScale, RangeColors
 BOARD = board(600, 88, BREAK_PX)
 # The same room below the map for all subjects, so that the map keeps its size.
 TABLES = """
-:host { flex: 0 0 34% !important; min-height: 0; min-width: 0; overflow-y: auto; }
+:host { flex: 0 0 20% !important; min-height: 0; min-width: 0; overflow-y: auto; }
 """ + unrolled(BREAK_PX)
 MAP_DELAY_MS = 60
 """The map is drawn this long after the pixel's plots, which the eye follows."""
