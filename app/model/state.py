@@ -84,6 +84,11 @@ ALL, REGION = "all", "region"
 """Pixels that `Crop` keeps."""
 
 
+def _range_limit(symbol: str) -> Number:
+    bounds: dict[str, Any] = {"unit": "m", "least": -1e9, "most": 1e9}
+    return Number(symbol, 0.0, 1e5, optional=True, none_means="no limit", **bounds)
+
+
 @dataclass(frozen=True)
 class Crop(Settings):
     """Part of the scene that the 3D cloud of the estimate and its files hold.
@@ -101,30 +106,12 @@ class Crop(Settings):
     )
     from_m: float | None = parameter(
         None,
-        Number(
-            "Range from",
-            0.0,
-            1e5,
-            unit="m",
-            least=-1e9,
-            most=1e9,
-            optional=True,
-            none_means="no limit",
-        ),
+        _range_limit("Range from"),
         "Shortest range in the cloud.",
     )
     to_m: float | None = parameter(
         None,
-        Number(
-            "Range to",
-            0.0,
-            1e5,
-            unit="m",
-            least=-1e9,
-            most=1e9,
-            optional=True,
-            none_means="no limit",
-        ),
+        _range_limit("Range to"),
         "Longest range in the cloud.",
     )
 

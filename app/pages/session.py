@@ -87,7 +87,11 @@ class Session:
     def is_width_guessed(self, viewing: Viewing) -> bool:
         """Return whether a field of view is neither stated by the file nor set by the user."""
         is_known = self.answer.capture.acquisition.pixel_angle_rad is not None
-        return not is_known and viewing.field_of_view_deg == self.own_field_of_view_deg
+        return not is_known and self.has_own_width(viewing)
+
+    def has_own_width(self, viewing: Viewing) -> bool:
+        """Return whether a field of view is the one that suits the present capture."""
+        return viewing.field_of_view_deg == self.own_field_of_view_deg
 
     def query(self) -> str:
         """Return the query of a link to what the page shows."""

@@ -76,7 +76,7 @@ class CaptureReport(OldFluxNames):
     """Dead pixels, likewise."""
     suggestion: Suggestion
     stated: tuple[StatedFluxCheck, ...]
-    """What the file states of the mean of all pixels."""
+    """Mean fluxes that the file states, next to the estimates; empty if it states none."""
 
 
 def capture_report(capture: Capture) -> CaptureReport:

@@ -336,8 +336,9 @@ def explored(session: Session) -> Subject:
 
 def viewed(session: Session, subject: Subject, viewing: Viewing) -> Subject:
     """Add confidence threshold and field of view; the capture's own field of view is not named."""
-    is_own = viewing.field_of_view_deg == session.own_field_of_view_deg
-    in_name = replace(viewing, field_of_view_deg=Viewing().field_of_view_deg) if is_own else viewing
+    in_name = viewing
+    if session.has_own_width(viewing):
+        in_name = replace(viewing, field_of_view_deg=Viewing().field_of_view_deg)
     return replace(subject, settings=(*subject.settings, in_name), viewing=viewing)
 
 
