@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,15 @@ from scipy import stats
 
 import core
 from core import inspection
-from core.acquisition import Acquisition, Flux, Pulse
+from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.geometry import Box
 from core.inference import TOLERANCE_BINS
 from core.inspection import estimate_flux, pixels_in
-from core.inspection.profile import difference_of, ratio_of
+from core.inspection.profile import Box as Bounds
+from core.inspection.profile import difference_of, ratio_of, zoomed
 from core.metrics import Interval, restored
 from core.reductions import cut_gate
 from core.scene import Scene, scenes
@@ -407,6 +409,19 @@ def test_flux_depends_neither_on_the_pulse_nor_on_the_bins(regime: FluxRegime) -
             # Half as wide again as the 95 % interval, which makes 99.7 %.
             half = 0.75 * (one.high - one.low)
             assert abs((one.high + one.low) / 2 - value) < half
+
+
+def test_the_search_for_fluxes_ends_around_their_peak() -> None:
+    start = Bounds((-2.5, 0.95), (-1.3, 2.05), (-15.0, 0.0), (12.0, 5.3))
+    for peak, sd in product(np.linspace(0, 5, 101), (0.05, 0.1, 0.2, 0.3, 0.5)):
+
+        def surface(first: Floats, second: Floats, peak: float = peak, sd: float = sd) -> Floats:
+            along = ((first - peak) / sd) ** 2 / 2
+            return np.asarray(-along[:, np.newaxis] - ((second - 1.5) / 0.05) ** 2 / 2)
+
+        found = zoomed(start, surface, (7, 9))
+        assert found.low[0] < peak - 1.96 * sd and peak + 1.96 * sd < found.high[0]
+        assert found.high[0] - found.low[0] < 16 * sd
 
 
 def test_a_flux_lies_well_inside_its_interval() -> None:
