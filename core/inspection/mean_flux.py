@@ -28,7 +28,7 @@ from core.capture import Capture, cached_per_capture
 from core.inference.faults import ordinary_pixels
 from core.inference.flux import detailed_flux_prior_of, level_likelihoods, total_rates
 from core.inference.flux_model import FluxPrior
-from core.inspection.echoes import echo_free_flux, total_flux
+from core.inspection.echoes import darkest_flux, echo_free_flux, total_flux
 from core.inspection.flux import estimate_flux
 from core.inspection.profile import LEVEL, Box, FluxEstimate, difference_of, ratio_of, spans, zoomed
 from core.inspection.pulse_fit import fit_pulse
@@ -59,7 +59,9 @@ class MeanFlux(NamedTuple):
     model: FluxEstimate
     """The image's by the likelihood alone."""
     free: FluxEstimate | None
-    """The image's by the bins without echoes alone (`core.inspection.echoes.echo_free_flux`)."""
+    """The image's by the bins without echoes alone (`core.inspection.echoes.echo_free_flux`). If
+    they are unknown, by the darkest tenth of the gate where that contradicts the likelihood
+    (`core.inspection.echoes.darkest_flux`)."""
     pulse: Pulse
     """The capture's, or the one that fits the echoes clearly better
     (`core.inspection.pulse_fit`)."""
@@ -123,11 +125,18 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     mixture, scale = _Mixture(some), 1.0 if acquisition.n_pulses else 1 / share
     model, target = (each.of(some).scaled(scale) for each in (mixture.image, mixture.target))
     whole = _with_total(model, total_flux(ordinary))
-    signal = _at_same_share(target.signal, model.signal, whole.signal)
+    # The share of target pixels in a sample differs from that of the image, by chance.
+    is_whole = n_pixels <= _SAMPLE
+    signal = (
+        _at_same_share(target.signal, model.signal, whole.signal) if is_whole else target.signal
+    )
     if signal != target.signal:
         sbr = ratio_of(signal, whole.background)
         target = FluxEstimate(signal, whole.background, sbr)
-    return _combined(MeanFlux(whole, target, whole, echo_free_flux(capture), mixture.pulse))
+    free, darkest = echo_free_flux(capture), darkest_flux(capture)
+    if free is None and darkest and darkest.background.high < whole.background.low:
+        free = darkest
+    return _combined(MeanFlux(whole, target, whole, free, mixture.pulse))
 
 
 def _with_total(model: FluxEstimate, total: Interval | None) -> FluxEstimate:

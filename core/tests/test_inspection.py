@@ -445,11 +445,14 @@ def test_the_flux_of_target_pixels_is_the_one_simulated() -> None:
     assert "they agree" in report.flux_remark and "times as long" not in report.flux_remark
 
 
-def test_a_report_says_where_bins_without_echoes_contradict_the_model() -> None:
-    captures, _ = FLUX_REGIMES[0].captures(seed=4)
+@pytest.mark.parametrize(("regime", "n_fog"), [(0, 20), (4, 120)], ids=["known", "darkest"])
+def test_a_report_says_where_bins_without_echoes_contradict_the_model(
+    regime: int, n_fog: int
+) -> None:
+    captures, _ = FLUX_REGIMES[regime].captures(seed=4)
     capture, rng = captures[-1], np.random.default_rng(4)
-    # Fog: ten photons of a pixel that return from the first bins.
-    cube = capture.cube + rng.poisson(10 / 20, capture.cube.shape) * (np.arange(150) < 20)
+    # Fog: photons that return from the first bins.
+    cube = capture.cube + rng.poisson(0.5, capture.cube.shape) * (np.arange(150) < n_fog)
     report = inspection.capture_report(replace(capture, cube=cube.astype(np.uint32)))
     free = report.echo_free_background
     assert free is not None and "disagree" in report.flux_remark
