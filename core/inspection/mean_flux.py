@@ -26,7 +26,12 @@ from numpy.typing import NDArray
 from core.acquisition import Floats, Pulse
 from core.capture import Capture, cached_per_capture
 from core.inference.faults import ordinary_pixels
-from core.inference.flux import detailed_flux_prior_of, level_likelihoods, total_rates
+from core.inference.flux import (
+    SAMPLE,
+    detailed_flux_prior_of,
+    level_likelihoods,
+    total_rates,
+)
 from core.inference.flux_model import FluxPrior
 from core.inspection.echoes import darkest_flux, echo_free_flux, total_flux
 from core.inspection.flux import estimate_flux
@@ -238,8 +243,7 @@ class _Mixture:
     def __init__(self, capture: Capture) -> None:
         known = detailed_flux_prior_of(capture)
         total, n_pulses = total_rates(capture), capture.gated_pulses or 1
-        # Not those from which the distribution of delays was learned, if there are others.
-        pixels = np.random.default_rng(0).permutation(total.size)[-_SAMPLE:]
+        pixels = _drawn(total.size)
         self._sample = _of_counts(capture, capture.cube[0, pixels])
         top = 2 * float(known.levels[-1])
         count = int(np.clip(math.ceil(2 * math.sqrt(top * n_pulses)), 12, 40))
@@ -373,6 +377,21 @@ class _Mixture:
 
         least = np.zeros(signal.size) if of_target else signal / self._levels[-1]
         return np.asarray(_largest(fit, np.clip(least, _LEAST_SHARE, 1.0)) + top.sum())
+
+
+def _drawn(n_pixels: int) -> NDArray[np.intp]:
+    """Draw pixels, as many of each part of the image as it has.
+
+    Neighbours are alike, so that as large a share of the sample has an echo as of the image. Those
+    from which the distribution of delays was learned are left out, if there are others.
+    """
+    rng = np.random.default_rng(0)
+    others = rng.permutation(n_pixels)[max(min(SAMPLE, n_pixels - _SAMPLE), 0) :]
+    if others.size <= _SAMPLE:
+        return others
+    ends = np.linspace(0, others.size, _SAMPLE + 1)
+    at = (ends[:-1] + rng.random(_SAMPLE) * np.diff(ends)).astype(int)
+    return rng.permutation(np.sort(others)[at])
 
 
 _BACKGROUNDS = np.array([-5.0, -2.5, -1.0, 0.0, 1.0, 2.5])  # from the first guess

@@ -445,6 +445,16 @@ def test_the_flux_of_target_pixels_is_the_one_simulated() -> None:
     assert "they agree" in report.flux_remark and "times as long" not in report.flux_remark
 
 
+def test_fluxes_of_a_dim_car_are_those_of_all_its_pixels() -> None:
+    """The share of target pixels in a random sample would be off by a tenth."""
+    scene = scenes["car"]()
+    capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.03), seed=4)
+    found = inspection.estimate_mean_flux(capture)
+    signal = 0.1041 * float(np.isfinite(scene.range_m).mean())
+    assert covers(found.signal, signal) and covers(found.background, 3.47)
+    assert abs(found.signal.value - signal) < 0.06 * signal
+
+
 @pytest.mark.parametrize(("regime", "n_fog"), [(0, 20), (4, 120)], ids=["known", "darkest"])
 def test_a_report_says_where_bins_without_echoes_contradict_the_model(
     regime: int, n_fog: int
