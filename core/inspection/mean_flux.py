@@ -10,6 +10,11 @@ true distribution, so that the model need not be exact where signals are clear.
 
 Target pixels are those with an echo: the same likelihood, as a function of their mean signal
 instead of that of all pixels.
+
+The intervals cover the means of the pixels of the capture that are neither hot nor dead, for any
+width and tail of the pulse, and include the chance by which a sample differs from the image. They
+hold for the fitted pulse: what its uncertainty adds is not included, since it is small against
+the chance of the background (``python -m core calibration --only fluxes``).
 """
 
 from __future__ import annotations
