@@ -58,7 +58,7 @@ table2: $(VENV)/.app ## the paper's Table 2 beside ours
 uniform: $(VENV)/.app ## every method on depths uniform over the gate
 	$(BIN)/python -m core uniform
 
-calibration: $(VENV)/.app ## is a confidence of 0.9 right nine times in ten?
+calibration: $(VENV)/.app ## are confidences and intervals right as often as they say?
 	$(BIN)/python -m core calibration
 
 results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)

@@ -43,7 +43,16 @@ def add(commands: Any) -> None:
     command = _added(
         commands, "calibration", "compare confidences and intervals with errors", _calibration
     )
-    _add_count(command, "--seeds", 1, MAX_SEEDS, 5)
+    _add_count(command, "--seeds", 1, MAX_SEEDS, 2)
+    _add_count(command, "--captures", 1, 1000, 8)
+    command.add_argument(
+        "--only",
+        choices=("confidence", "ranges", "fluxes"),
+        nargs="+",
+        default=("confidence", "ranges", "fluxes"),
+        help="measure these; --seeds holds for confidence and ranges, --captures for each regime "
+        "of the fluxes (all)",
+    )
 
     command = _added(commands, "field", "compare methods on published captures", _field)
     command.add_argument("captures", type=Path, help="the folder that holds them")
@@ -114,17 +123,12 @@ def _uniform(chosen: argparse.Namespace) -> None:
 
 def _calibration(chosen: argparse.Namespace) -> None:
     seeds = range(chosen.seeds)
-    publish(
-        (
-            each(seeds)
-            for each in (
-                calibration.calibration_table,
-                calibration.coverage_table,
-                calibration.flux_table,
-            )
-        ),
-        chosen,
-    )
+    tables = {
+        "confidence": lambda: calibration.calibration_table(seeds),
+        "ranges": lambda: calibration.coverage_table(seeds),
+        "fluxes": lambda: calibration.flux_table(chosen.captures),
+    }
+    publish((tables[name]() for name in chosen.only), chosen)
 
 
 def _field(chosen: argparse.Namespace) -> None:

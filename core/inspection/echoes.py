@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import astuple
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ _FOUND = 0.5  # least share of the echoes that must be found to know where there
 _FREE = 0.1  # least share of the gate without echoes
 _BEFORE, _BEHIND = 1, 4  # lengths of an echo that may be longer than its pulse
 _FEWEST_ARMED = 10  # pulses, for a rate
+_WINDOWS = 10  # of the gate, of which the darkest bounds the background
 
 
 class Echoes(NamedTuple):
@@ -65,33 +67,61 @@ def echo_free_flux(capture: Capture) -> FluxEstimate | None:
         Of the mean pixel, hot and dead ones left out, with 95 % intervals. None unless half of the
         echoes are found, a tenth of the gate is free of them, and pulses are left after it.
     """
-    window, kept, n_pulses = _window(capture), ordinary_pixels(capture), capture.gated_pulses
+    window, n_bins = _window(capture), capture.acquisition.n_bins
     if window is None:
         return None
-    free = 1 - (window[1] - window[0]) / capture.acquisition.n_bins
-    before, inside = (
-        capture.cube[:, :, slice(*bins)].sum(axis=2, dtype=np.int64)[kept]
-        for bins in ((0, window[0]), window)
-    )
-    parts = _photons([before, inside, capture.counts[kept] - before - inside], n_pulses)
+    parts = _photons_between(capture, [0, *window, n_bins])
     if parts is None:
         return None
-    echoing, rest = parts[1].interval, (parts[0] + parts[2]).interval
-    signal = difference_of(echoing, rest.scaled((1 - free) / free))
-    ratio = ratio_of(echoing, rest)
+    free = 1 - (window[1] - window[0]) / n_bins
+    return _flux_of(capture, parts[1], parts[0] + parts[2], free, LEVEL)
+
+
+@cached_per_capture
+def darkest_flux(capture: Capture) -> FluxEstimate | None:
+    """Estimate mean fluxes as `echo_free_flux` does, with the background of the darkest window.
+
+    Of ten windows that the gate is divided into. Echoes only add photons, whatever their shape and
+    number: if the background is uniform, the darkest window is an upper bound of it. The intervals
+    hold for each of the ten windows together.
+
+    Returns
+    -------
+    FluxEstimate or None
+        None if the gate has fewer than ten bins, or pulses are not left after it.
+    """
+    n_bins = capture.acquisition.n_bins
+    ends = np.linspace(0, n_bins, _WINDOWS + 1).astype(int)
+    parts = _photons_between(capture, ends.tolist()) if n_bins >= _WINDOWS else None
+    if parts is None:
+        return None
+    level, shares = 1 - (1 - LEVEL) / _WINDOWS, np.diff(ends) / n_bins
+    highest = [part.interval(level).high / share for part, share in zip(parts, shares, strict=True)]
+    darkest = int(np.argmin(highest))
+    rest = sum(parts[:darkest] + parts[darkest + 1 :], _Photons(0.0, 0.0, 0.0))
+    return _flux_of(capture, rest, parts[darkest], float(shares[darkest]), level)
+
+
+def _flux_of(
+    capture: Capture, echoing: _Photons, rest: _Photons, free: float, level: float
+) -> FluxEstimate:
+    """Mean fluxes, from the photons of all pixels in bins with echoes and in a share without."""
+    found, background = echoing.interval(level), rest.interval(level)
+    signal = difference_of(found, background.scaled((1 - free) / free))
+    ratio = ratio_of(found, background)
     sbr = Interval(*(max(free * each - (1 - free), 0.0) for each in astuple(ratio)))
-    found = FluxEstimate(signal, rest.scaled(1 / free), sbr)
-    return found.scaled(1 / np.count_nonzero(kept)).of(capture)
+    fluxes = FluxEstimate(signal, background.scaled(1 / free), sbr)
+    return fluxes.scaled(1 / np.count_nonzero(ordinary_pixels(capture))).of(capture)
 
 
 def total_flux(capture: Capture) -> Interval | None:
     """Estimate signal and background together, likewise; None if too few pulses are left."""
-    kept = ordinary_pixels(capture)
-    parts = _photons([capture.counts[kept]], capture.gated_pulses)
+    parts = _photons_between(capture, [0, capture.acquisition.n_bins])
     if parts is None:
         return None
     pulses = 1 if capture.gated_pulses else capture.acquisition.n_pulses or 1
-    return parts[0].interval.scaled(1 / (pulses * np.count_nonzero(kept)))
+    n_pixels = np.count_nonzero(ordinary_pixels(capture))
+    return parts[0].interval(LEVEL).scaled(1 / (pulses * n_pixels))
 
 
 def _window(capture: Capture) -> tuple[int, int] | None:
@@ -118,10 +148,9 @@ class _Photons(NamedTuple):
         total, variance = self.total + other.total, self.variance + other.variance
         return _Photons(total, variance, max(self.largest, other.largest))
 
-    @property
-    def interval(self) -> Interval:
+    def interval(self, level: float) -> Interval:
         """Gamma interval of Fay & Feuer (1997); for equal weights that of Garwood (1936)."""
-        total, tail = max(self.total, 0.0), 0.5 - LEVEL / 2
+        total, tail = max(self.total, 0.0), 0.5 - level / 2
         more, wider = total + self.largest, self.variance + self.largest**2
         low, high = (
             float(scipy.special.gammaincinv(mean**2 / variance, share)) * variance / mean
@@ -132,8 +161,12 @@ class _Photons(NamedTuple):
         return Interval(total, low, high)
 
 
-def _photons(counts: Sequence[NDArray[np.int64]], n_pulses: int | None) -> list[_Photons] | None:
-    """Photons in successive parts of the gate, from the counts of the pixels (pixel,) in each."""
+def _photons_between(capture: Capture, ends: Sequence[int]) -> list[_Photons] | None:
+    """Photons of the ordinary pixels between successive bins; None if too few pulses are left."""
+    kept, n_pulses = capture.cube[ordinary_pixels(capture)], capture.gated_pulses
+    counts = np.stack(
+        [kept[:, first:end].sum(axis=1, dtype=np.int64) for first, end in pairwise(ends)]
+    )
     if n_pulses is None:
         return [_Photons(float(each.sum()), float(each.sum()), 1.0) for each in counts]
     left = n_pulses - np.cumsum(counts, axis=0)

@@ -10,6 +10,11 @@ true distribution, so that the model need not be exact where signals are clear.
 
 Target pixels are those with an echo: the same likelihood, as a function of their mean signal
 instead of that of all pixels.
+
+The intervals cover the means of the pixels of the capture that are neither hot nor dead, for any
+width and tail of the pulse, and include the chance by which a sample differs from the image. They
+hold for the fitted pulse: what its uncertainty adds is not included, since it is small against
+the chance of the background (``python -m core calibration --only fluxes``).
 """
 
 from __future__ import annotations
@@ -26,9 +31,14 @@ from numpy.typing import NDArray
 from core.acquisition import Floats, Pulse
 from core.capture import Capture, cached_per_capture
 from core.inference.faults import ordinary_pixels
-from core.inference.flux import detailed_flux_prior_of, level_likelihoods, total_rates
+from core.inference.flux import (
+    SAMPLE,
+    detailed_flux_prior_of,
+    level_likelihoods,
+    total_rates,
+)
 from core.inference.flux_model import FluxPrior
-from core.inspection.echoes import echo_free_flux, total_flux
+from core.inspection.echoes import darkest_flux, echo_free_flux, total_flux
 from core.inspection.flux import estimate_flux
 from core.inspection.profile import LEVEL, Box, FluxEstimate, difference_of, ratio_of, spans, zoomed
 from core.inspection.pulse_fit import fit_pulse
@@ -59,7 +69,9 @@ class MeanFlux(NamedTuple):
     model: FluxEstimate
     """The image's by the likelihood alone."""
     free: FluxEstimate | None
-    """The image's by the bins without echoes alone (`core.inspection.echoes.echo_free_flux`)."""
+    """The image's by the bins without echoes alone (`core.inspection.echoes.echo_free_flux`). If
+    they are unknown, by the darkest tenth of the gate where that contradicts the likelihood
+    (`core.inspection.echoes.darkest_flux`)."""
     pulse: Pulse
     """The capture's, or the one that fits the echoes clearly better
     (`core.inspection.pulse_fit`)."""
@@ -123,11 +135,18 @@ def _mean_flux(capture: Capture) -> MeanFlux:
     mixture, scale = _Mixture(some), 1.0 if acquisition.n_pulses else 1 / share
     model, target = (each.of(some).scaled(scale) for each in (mixture.image, mixture.target))
     whole = _with_total(model, total_flux(ordinary))
-    signal = _at_same_share(target.signal, model.signal, whole.signal)
+    # The share of target pixels in a sample differs from that of the image, by chance.
+    is_whole = n_pixels <= _SAMPLE
+    signal = (
+        _at_same_share(target.signal, model.signal, whole.signal) if is_whole else target.signal
+    )
     if signal != target.signal:
         sbr = ratio_of(signal, whole.background)
         target = FluxEstimate(signal, whole.background, sbr)
-    return _combined(MeanFlux(whole, target, whole, echo_free_flux(capture), mixture.pulse))
+    free, darkest = echo_free_flux(capture), darkest_flux(capture)
+    if free is None and darkest and darkest.background.high < whole.background.low:
+        free = darkest
+    return _combined(MeanFlux(whole, target, whole, free, mixture.pulse))
 
 
 def _with_total(model: FluxEstimate, total: Interval | None) -> FluxEstimate:
@@ -229,8 +248,7 @@ class _Mixture:
     def __init__(self, capture: Capture) -> None:
         known = detailed_flux_prior_of(capture)
         total, n_pulses = total_rates(capture), capture.gated_pulses or 1
-        # Not those from which the distribution of delays was learned, if there are others.
-        pixels = np.random.default_rng(0).permutation(total.size)[-_SAMPLE:]
+        pixels = _drawn(total.size)
         self._sample = _of_counts(capture, capture.cube[0, pixels])
         top = 2 * float(known.levels[-1])
         count = int(np.clip(math.ceil(2 * math.sqrt(top * n_pulses)), 12, 40))
@@ -364,6 +382,21 @@ class _Mixture:
 
         least = np.zeros(signal.size) if of_target else signal / self._levels[-1]
         return np.asarray(_largest(fit, np.clip(least, _LEAST_SHARE, 1.0)) + top.sum())
+
+
+def _drawn(n_pixels: int) -> NDArray[np.intp]:
+    """Draw pixels, as many of each part of the image as it has.
+
+    Neighbours are alike, so that as large a share of the sample has an echo as of the image. Those
+    from which the distribution of delays was learned are left out, if there are others.
+    """
+    rng = np.random.default_rng(0)
+    others = rng.permutation(n_pixels)[max(min(SAMPLE, n_pixels - _SAMPLE), 0) :]
+    if others.size <= _SAMPLE:
+        return others
+    ends = np.linspace(0, others.size, _SAMPLE + 1)
+    at = (ends[:-1] + rng.random(_SAMPLE) * np.diff(ends)).astype(int)
+    return rng.permutation(np.sort(others)[at])
 
 
 _BACKGROUNDS = np.array([-5.0, -2.5, -1.0, 0.0, 1.0, 2.5])  # from the first guess

@@ -114,17 +114,24 @@ class Box(NamedTuple):
         for axis, size in enumerate(inside.shape):
             found = np.flatnonzero(inside.any(axis=1 - axis))
             step = (self.high[axis] - self.low[axis]) / (size - 1)
-            more = [size if found[0] == 0 else 1, size if found[-1] == size - 1 else 1]
+            is_cut = found[0] == 0, found[-1] == size - 1
+            # A margin of one step would leave the maximum next to the opposite side of the box,
+            # which would then move to and fro, and grow.
+            margin = 2 if any(is_cut) else 1
+            more = [size if cut else margin for cut in is_cut]
             low.append(max(self.low[axis] + (found[0] - more[0]) * step, self.least[axis]))
             high.append(min(self.low[axis] + (found[-1] + more[1]) * step, self.most[axis]))
         return self._replace(low=(low[0], low[1]), high=(high[0], high[1]))
 
     def is_much_of(self, other: Box) -> bool:
-        """Return whether this box lies in the other and is at least half as wide."""
+        """Return whether this box lies in the other and is nearly as wide.
+
+        More than half as wide: so is the box around two points on both sides of a narrow peak.
+        """
         return all(
             other.low[i] <= self.low[i]
             and self.high[i] <= other.high[i]
-            and 2 * (self.high[i] - self.low[i]) >= other.high[i] - other.low[i]
+            and self.high[i] - self.low[i] >= _MUCH * (other.high[i] - other.low[i])
             for i in range(2)
         )
 
@@ -140,7 +147,7 @@ def zoomed(box: Box, surface: Surface, size: tuple[int, int]) -> Box:
     return box
 
 
-_MOST_ZOOMS = 30
+_MOST_ZOOMS, _MUCH = 30, 0.6
 _FINEST = (81, 121)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,15 @@ from scipy import stats
 
 import core
 from core import inspection
-from core.acquisition import Acquisition, Flux, Pulse
+from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.geometry import Box
 from core.inference import TOLERANCE_BINS
 from core.inspection import estimate_flux, pixels_in
-from core.inspection.profile import difference_of, ratio_of
+from core.inspection.profile import Box as Bounds
+from core.inspection.profile import difference_of, ratio_of, zoomed
 from core.metrics import Interval, restored
 from core.reductions import cut_gate
 from core.scene import Scene, scenes
@@ -409,6 +411,19 @@ def test_flux_depends_neither_on_the_pulse_nor_on_the_bins(regime: FluxRegime) -
             assert abs((one.high + one.low) / 2 - value) < half
 
 
+def test_the_search_for_fluxes_ends_around_their_peak() -> None:
+    start = Bounds((-2.5, 0.95), (-1.3, 2.05), (-15.0, 0.0), (12.0, 5.3))
+    for peak, sd in product(np.linspace(0, 5, 101), (0.05, 0.1, 0.2, 0.3, 0.5)):
+
+        def surface(first: Floats, second: Floats, peak: float = peak, sd: float = sd) -> Floats:
+            along = ((first - peak) / sd) ** 2 / 2
+            return np.asarray(-along[:, np.newaxis] - ((second - 1.5) / 0.05) ** 2 / 2)
+
+        found = zoomed(start, surface, (7, 9))
+        assert found.low[0] < peak - 1.96 * sd and peak + 1.96 * sd < found.high[0]
+        assert found.high[0] - found.low[0] < 16 * sd
+
+
 def test_a_flux_lies_well_inside_its_interval() -> None:
     """Signal and background of this capture are correlated."""
     capture = FLUX_REGIMES[7].captures(1000)[0][1]
@@ -430,11 +445,24 @@ def test_the_flux_of_target_pixels_is_the_one_simulated() -> None:
     assert "they agree" in report.flux_remark and "times as long" not in report.flux_remark
 
 
-def test_a_report_says_where_bins_without_echoes_contradict_the_model() -> None:
-    captures, _ = FLUX_REGIMES[0].captures(seed=4)
+def test_fluxes_of_a_dim_car_are_those_of_all_its_pixels() -> None:
+    """The share of target pixels in a random sample would be off by a tenth."""
+    scene = scenes["car"]()
+    capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.03), seed=4)
+    found = inspection.estimate_mean_flux(capture)
+    signal = 0.1041 * float(np.isfinite(scene.range_m).mean())
+    assert covers(found.signal, signal) and covers(found.background, 3.47)
+    assert abs(found.signal.value - signal) < 0.06 * signal
+
+
+@pytest.mark.parametrize(("regime", "n_fog"), [(0, 20), (4, 120)], ids=["known", "darkest"])
+def test_a_report_says_where_bins_without_echoes_contradict_the_model(
+    regime: int, n_fog: int
+) -> None:
+    captures, _ = FLUX_REGIMES[regime].captures(seed=4)
     capture, rng = captures[-1], np.random.default_rng(4)
-    # Fog: ten photons of a pixel that return from the first bins.
-    cube = capture.cube + rng.poisson(10 / 20, capture.cube.shape) * (np.arange(150) < 20)
+    # Fog: photons that return from the first bins.
+    cube = capture.cube + rng.poisson(0.5, capture.cube.shape) * (np.arange(150) < n_fog)
     report = inspection.capture_report(replace(capture, cube=cube.astype(np.uint32)))
     free = report.echo_free_background
     assert free is not None and "disagree" in report.flux_remark

@@ -181,7 +181,8 @@ def coverage_table(seeds: Sequence[int]) -> Table:
 class FluxRegime:
     """Images of which a third is sky, recorded with another pulse than is assumed."""
 
-    detection: Detection
+    photons: str
+    """Key of `FLUXES`."""
     depths: str
     """``"middle"`` of the gate, or ``"whole"`` gate, which leaves no bins without echoes."""
     pulse: str
@@ -193,8 +194,7 @@ class FluxRegime:
         Those of the mean pixel and of the mean target pixel: signal, background and SBR.
         """
         rng, width_s = np.random.default_rng(seed), BIN_WIDTHS_S[0]
-        is_first = self.detection == "first"
-        n_pulses, signal, background = _FLUXES[self.detection]
+        n_pulses, signal, background = FLUXES[self.photons]
         acquisition = Acquisition(round(_GATE_S / width_s), width_s, n_pulses=n_pulses)
         shape = (_FLUX_SIDE, _FLUX_SIDE)
         low, high = _DEPTHS[self.depths]
@@ -204,12 +204,20 @@ class FluxRegime:
         signals = np.where(target, signal * rng.gamma(4, 1 / 4, shape), 0.0)
         pulse = changed(_ASSUMED_PULSE, *TRUE_PULSES[self.pulse], _RESOLUTION_S)
         rate = rate_per_bin(onset, signals, background, pulse, acquisition)
-        cube = draw_counts(rate, n_pulses if is_first else None, rng)
-        finest = Capture(cube, acquisition, _ASSUMED_PULSE, detection=self.detection)
+        cube = draw_counts(rate, n_pulses, rng)
+        detection: Detection = "all" if n_pulses is None else "first"
+        finest = Capture(cube, acquisition, _ASSUMED_PULSE, detection=detection)
         merged = [merge_bins(finest, round(each / width_s)) for each in BIN_WIDTHS_S]
         means = float(signals.mean()), float(signals[target].mean())
         return merged, [(each, background, each / background) for each in means]
 
+
+FLUXES = {
+    "all": (None, 3.5, 0.25),
+    "first": (200, 0.3, 1.0),
+    "first, SBR 0.03": (1000, 0.1041, 3.47),
+}
+"""Pulses, and signal of a target pixel and background per pulse; photons of all pulses if None."""
 
 TRUE_PULSES = {
     "as assumed": (1.0, 0.0, 0.0),
@@ -219,80 +227,91 @@ TRUE_PULSES = {
 }
 """Stretch, share of a tail and its length, as for `core.inspection.pulse_fit.changed`."""
 
-BIN_WIDTHS_S = (0.25e-9, 0.5e-9, 1e-9)
+BIN_WIDTHS_S = (0.25e-9, 1e-9)
 
-FLUX_REGIMES = tuple(
-    FluxRegime(*each, pulse)
-    for each in (("all", "middle"), ("all", "whole"), ("first", "whole"))
-    for pulse in TRUE_PULSES
+FLUX_REGIMES = (
+    *(
+        FluxRegime(*each, pulse)
+        for each in (("all", "middle"), ("all", "whole"), ("first", "whole"))
+        for pulse in TRUE_PULSES
+    ),
+    FluxRegime("first, SBR 0.03", "middle", "as assumed"),
 )
-_FLUXES = {"all": (None, 3.5, 0.25), "first": (200, 0.3, 1.0)}
 _DEPTHS = {"middle": (0.4, 0.6), "whole": (0.06, 0.8)}
 _ASSUMED_PULSE, _RESOLUTION_S = Pulse.gaussian(1e-9), 0.05e-9
-_GATE_S, _FLUX_SIDE, _TRIALS_PER_SEED = 150e-9, 32, 8
+_GATE_S, _FLUX_SIDE = 150e-9, 32
+
+FLUX_CHECKS = (
+    "PPP, all pixels",
+    "background",
+    "SBR, all pixels",
+    "PPP, target pixels",
+    "SBR, target pixels",
+    "SBR overlaps that of the finest bins",
+)
+"""Statements about a capture of which `flux_coverage` counts how many hold."""
 
 
 @dataclass(frozen=True)
 class FluxCoverage:
-    """Share of the captures whose flux intervals contain the truth."""
+    """Captures whose flux intervals contain the truth."""
 
-    regime: FluxRegime
+    regime: FluxRegime | None
+    """None: all of them together."""
     bin_width_s: float
-    shares: dict[str, Interval]
-    """By the name of the flux."""
-    overlapping: Interval
-    """Share whose SBR intervals overlap those of the finest bins."""
+    captures: int
+    hits: NDArray[np.int64]
+    """Shape (check,): captures for which each of `FLUX_CHECKS` holds."""
+
+    def share(self, check: str) -> Interval:
+        """Return the share of the captures for which one of `FLUX_CHECKS` holds."""
+        return wilson(int(self.hits[FLUX_CHECKS.index(check)]), self.captures)
 
 
-def flux_coverage(regime: FluxRegime, trials: Sequence[int]) -> Iterator[FluxCoverage]:
+def flux_coverage(regime: FluxRegime, seeds: Sequence[int]) -> list[FluxCoverage]:
     """Measure the coverage of flux intervals in bins of each width."""
-    hits: dict[float, list[list[bool]]] = {width_s: [] for width_s in BIN_WIDTHS_S}
-    for trial in trials:
-        captures, truth = regime.captures(trial)
-        found = [(estimate_mean_flux(each), estimate_target_flux(each)) for each in captures]
-        for width_s, fluxes in zip(BIN_WIDTHS_S, found, strict=True):
-            covered = [
-                interval.low <= true <= interval.high
-                for flux, true_flux in zip(fluxes, truth, strict=True)
-                for interval, true in zip(flux, true_flux, strict=True)
-            ]
-            overlaps = fluxes[0].sbr.overlaps(found[0][0].sbr)
-            hits[width_s].append([*covered, overlaps])
-    for width_s, each in hits.items():
-        signal, background, sbr, ppp, _, target_sbr, overlapping = (
-            wilson(int(n), len(each)) for n in np.sum(each, axis=0)
-        )
-        shares = {
-            "PPP, all pixels": signal,
-            "SBR, all pixels": sbr,
-            "PPP, target pixels": ppp,
-            "SBR, target pixels": target_sbr,
-            "background": background,
-        }
-        yield FluxCoverage(regime, width_s, shares, overlapping)
+    hits = np.zeros((len(BIN_WIDTHS_S), len(FLUX_CHECKS)), int)
+    for seed in seeds:
+        captures, truth = regime.captures(seed)
+        images = [estimate_mean_flux(each) for each in captures]
+        for i, (capture, image) in enumerate(zip(captures, images, strict=True)):
+            target = estimate_target_flux(capture)
+            intervals = (*image, target.signal, target.sbr)
+            true = (*truth[0], truth[1][0], truth[1][2])
+            covers = [each.low <= x <= each.high for each, x in zip(intervals, true, strict=True)]
+            hits[i] += [*covers, image.sbr.overlaps(images[0].sbr)]
+    return [
+        FluxCoverage(regime, width_s, len(seeds), each)
+        for width_s, each in zip(BIN_WIDTHS_S, hits, strict=True)
+    ]
 
 
-def flux_table(seeds: Sequence[int]) -> Table:
-    """Return the coverage of flux intervals in each of `FLUX_REGIMES`, for 8 captures a seed."""
-    trials = range(_TRIALS_PER_SEED * seeds[0], _TRIALS_PER_SEED * (seeds[-1] + 1))
-    names = ("PPP, all pixels", "SBR, all pixels", "PPP, target pixels", "SBR, target pixels")
+def flux_table(captures: int) -> Table:
+    """Return the coverage of flux intervals in each of `FLUX_REGIMES`, and in all together."""
+    found = [
+        each
+        for i, regime in enumerate(FLUX_REGIMES)
+        for each in flux_coverage(regime, range(i * captures, (i + 1) * captures))
+    ]
+    for width_s in BIN_WIDTHS_S:
+        hits = [each.hits for each in found if each.bin_width_s == width_s]
+        found.append(FluxCoverage(None, width_s, captures * len(hits), np.sum(hits, axis=0)))
 
-    def share(name: str) -> Callable[[FluxCoverage], Interval]:
-        return lambda found: found.shares[name]
+    def share(check: str) -> Callable[[FluxCoverage], Interval]:
+        return lambda of: of.share(check)
 
-    columns = (*names, "background", "SBR overlaps that of the finest bins")
     return table(
         "flux_coverage",
         "Coverage of 95 % flux intervals, with a wrong pulse and in bins of several widths",
-        (found for regime in FLUX_REGIMES for found in flux_coverage(regime, trials)),
+        found,
         {
-            "photons": lambda found: found.regime.detection,
-            "depths": lambda found: f"{found.regime.depths} gate",
-            "true pulse": lambda found: found.regime.pulse,
-            "bins, ns": lambda found: f"{found.bin_width_s * 1e9:g}",
-            **{name: share(name) for name in columns[:-1]},
-            columns[-1]: lambda found: found.overlapping,
+            "photons": lambda of: of.regime.photons if of.regime else "all regimes",
+            "depths": lambda of: f"{of.regime.depths} gate" if of.regime else "",
+            "true pulse": lambda of: of.regime.pulse if of.regime else "",
+            "bins, ns": lambda of: f"{of.bin_width_s * 1e9:g}",
+            "captures": lambda of: of.captures,
+            **{check: share(check) for check in FLUX_CHECKS},
         },
         note="Share of the captures whose interval contains the truth.",
-        formats=dict.fromkeys(columns, ".2f"),
+        formats=dict.fromkeys(FLUX_CHECKS, ".2f"),
     )
