@@ -313,6 +313,16 @@ def test_a_region_is_its_pixels_added_to_one() -> None:
         inspection.region_report(capture, image, np.zeros((8, 7), bool))
 
 
+def test_fluxes_of_a_region_are_with_the_pulse_of_its_echoes() -> None:
+    wall = Scene(np.full((8, 8), ACQUISITION.bin_to_range_m(30.3)), acquisition=ACQUISITION)
+    capture = simulate(wall, ACQUISITION, Flux(0.2, 0.5), Pulse.gaussian(2e-9), seed=1)
+    wrong = replace(capture, pulse=Pulse.gaussian(0.7e-9))
+    mask = np.ones(capture.shape, bool)
+    region = inspection.region_report(wrong, estimate(wrong, "peak"), mask, "peak")
+    for flux in (region.flux, region.pixel.flux):
+        assert covers(flux.signal, 0.2) and covers(flux.background, 0.4)
+
+
 def test_a_profile_holds_ranges_and_intervals_of_the_pixels_on_a_line() -> None:
     acquisition = replace(ACQUISITION, pixel_angle_rad=1e-3)
     rows = np.repeat(np.linspace(20, 40, 9), 9).reshape(9, 9)  # in bins
