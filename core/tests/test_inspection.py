@@ -23,7 +23,7 @@ from core.inference.posterior import same_echo_bins
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.profile import difference_of, ratio_of
 from core.metrics import Interval, restored
-from core.reductions import cut_gate
+from core.reductions import cut_gate, share_of_pulses
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies.methods.calibration import FLUX_REGIMES, FluxRegime
@@ -596,6 +596,10 @@ def test_accuracy_over_pulses_is_held_against_the_truth_or_all_pulses() -> None:
     assert part.against == "all pulses" and part.n_pulses is None
     assert whole.within.value == 1.0 and whole.rmse_m.value == 0.0
     assert part.within.value < 1.0
+    confident = estimate(unknown, "peak").confident(inspection.CONFIDENT).range_m
+    fewer = estimate(share_of_pulses(unknown, 0.1), "peak").range_m
+    hits, targets = restored(fewer, confident, TOLERANCE_BINS * ACQUISITION.bin_length_m)
+    assert targets < capture.counts.size and part.within.value == hits / targets
     steps = inspection.accuracy_over_pulses(capture, [0.5])
     assert next(steps).share == 0.5  # one at a time
     with pytest.raises(ValueError, match="share = 0"):

@@ -39,7 +39,14 @@ from app.units import (
 from app.units import interval as format_interval
 from core import Capture
 from core.geometry import distance_m, pixel_angle_of, sight_lines
-from core.inspection import Candidate, CaptureReport, FaultyPixel, FluxEstimate, LineProfile
+from core.inspection import (
+    CONFIDENT,
+    Candidate,
+    CaptureReport,
+    FaultyPixel,
+    FluxEstimate,
+    LineProfile,
+)
 from core.io import changed_settings
 from core.metrics import Interval
 
@@ -433,5 +440,5 @@ def accuracy_titles(capture: Capture) -> tuple[str, str, str]:
     across = "Share of the pulses" if capture.acquisition.n_pulses is None else "Pulses"
     if capture.truth_range_m is not None:
         return "Accuracy against number of pulses", across, "Within 3 bins of the truth"
-    title = "Agreement with the estimate from all pulses (not accuracy)"
+    title = f"Agreement with all pulses, in pixels confident by {CONFIDENT:g} (not accuracy)"
     return title, across, "Within 3 bins of it"
