@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -111,9 +110,9 @@ class PixelReport(OldFluxNames):
         """
         inner, outer = self.interval_68_m, self.interval_95_m
         half_m, middle_m = (inner.high - inner.low) / 2, (inner.high + inner.low) / 2
-        if not half_m > 0:
+        digits = inner.decimals
+        if digits is None:
             return "–"
-        digits = max(0, 1 - math.floor(math.log10(half_m)))
         return (
             f"{middle_m:.{digits}f} m ± {half_m:.{digits}f} m (68 %), "
             f"{outer.low:.{digits}f} to {outer.high:.{digits}f} m (95 %)"
