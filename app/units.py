@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 from core import Acquisition
+from core.metrics import Interval
 
 OPPOSITE_UNIT = {"bins": "m", "ns": "m", "m": "bins"}
 """Unit of the axis opposite to the chosen one."""
@@ -69,15 +70,10 @@ def number(value: float, unit: str, sign: bool = False, decimals: int | None = N
     return Quantity(f"{text} {unit}".strip(), value, unit)
 
 
-def supported_decimals(low: float, high: float) -> int | None:
-    """Return the decimals that give half the width of an interval two digits; None without one."""
-    half = (high - low) / 2
-    return max(0, 1 - math.floor(math.log10(half))) if half > 0 else None
-
-
 def plus_minus(low: float, high: float, unit: str) -> Quantity:
     """Format an interval as its middle and half its width; a dash for NaN."""
-    middle, half, decimals = (low + high) / 2, (high - low) / 2, supported_decimals(low, high)
+    middle, half = (low + high) / 2, (high - low) / 2
+    decimals = Interval(middle, low, high).decimals
     if decimals is None:
         return Quantity("", math.nan, unit)
     text = f"{middle:,.{decimals}f} ± {half:.{decimals}f} {unit}"
@@ -86,7 +82,7 @@ def plus_minus(low: float, high: float, unit: str) -> Quantity:
 
 def between(low: float, high: float, unit: str) -> Quantity:
     """Format the ends of an interval; a dash for NaN."""
-    decimals = supported_decimals(low, high)
+    decimals = Interval((low + high) / 2, low, high).decimals
     if decimals is None:
         return Quantity("", math.nan, unit)
     text = f"{low:,.{decimals}f}–{high:,.{decimals}f} {unit}"

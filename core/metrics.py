@@ -191,6 +191,12 @@ class Interval:
     low: float
     high: float
 
+    @property
+    def decimals(self) -> int | None:
+        """Decimals that give half its width two significant digits; None without a width."""
+        half = (self.high - self.low) / 2
+        return max(0, 1 - math.floor(math.log10(half))) if 0 < half < math.inf else None
+
     def scaled(self, factor: float) -> Interval:
         """Return the interval of the estimate multiplied by a positive `factor`."""
         return Interval(self.value * factor, self.low * factor, self.high * factor)

@@ -22,6 +22,7 @@ from app.pages.compare.ranking import Task
 from app.pages.session import Session
 from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
 from core import ESTIMATORS, TrackingParameters
+from core.inspection import CONFIDENT
 from core.io import ReadOptions
 from tests.browser import choose, eventually, fact
 from tests.test_downloads import columns_of, download, written
@@ -118,6 +119,7 @@ def test_the_limit_is_known_where_truth_and_flux_are(car):
 def test_without_truth_there_is_agreement_and_no_limit(sample):
     reference = ranking.reference_of(sample.capture)
     assert reference.limit is None
+    assert reference.likelihood.confidence[reference.likelihood.valid].min() >= CONFIDENT
     row, last = rows_of(sample, ["likelihood"], reference)
     titles = [title for title, *_ in text.columns(sample.capture)]
     assert "RMSE (m)" not in titles

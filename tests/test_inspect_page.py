@@ -393,6 +393,9 @@ def test_a_profile_runs_through_the_pins_and_is_saved_as_shown(building):
     ):
         np.testing.assert_array_equal(shown[column], values)
         np.testing.assert_array_equal(table[name], values)
+    assert shown["text"][0] == text.range_text(*(shown[n][0] for n in ("range", "low", "high")))
+    assert text.range_text(50.1234, 47.0, 53.0) == "50.1 m (47.0–53.0 m)"
+    assert text.range_text(5.12345, 5.10, 5.14) == "5.123 m (5.100–5.140 m)"
     assert section.note.text.startswith("41 pixels from 20, 10 to 45, 50, ")
     assert text.WIDTH_GUESSED not in section.note.text  # the scene states its own
     # A wider field of view, and fewer pixels on show.

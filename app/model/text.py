@@ -10,7 +10,7 @@ from concurrent.futures import BrokenExecutor
 from app.model.methods import METHOD_TITLES
 from app.model.state import AUTOMATIC
 from app.model.store import Answer, Pixel
-from app.units import Scale, between, plus_minus, supported_decimals, typeset
+from app.units import Scale, between, plus_minus, typeset
 from app.units import milliseconds as milliseconds  # noqa: PLC0414
 from app.units import number as number  # noqa: PLC0414
 from app.units import share as share  # noqa: PLC0414
@@ -171,7 +171,7 @@ def interval_cell(found: Interval, form: str) -> Cell:
 def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
     """Return name, value and help of a pixel's estimate, compared with the truth if it is known."""
     inner, outer = pixel.interval_68_m, pixel.interval_95_m
-    decimals = supported_decimals(inner.low, inner.high)
+    decimals = inner.decimals
     facts: list[Fact] = [
         ("Range (68 %)", plus_minus(inner.low, inner.high, "m"), RANGE_HELP.format("68 %")),
         ("Range (95 %)", between(outer.low, outer.high, "m"), RANGE_HELP.format("95 %")),

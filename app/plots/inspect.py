@@ -35,7 +35,7 @@ PROFILE_TITLE = "Range along the line through the pinned pixels"
 DISTANCE_LABEL = "Distance along the line (m)"
 PROFILE_COLUMNS = (
     *("distance", "width", "range", "low", "high", "truth"),
-    *("confidence", "row", "col"),
+    *("confidence", "row", "col", "text"),
 )
 
 NAMES = {
@@ -209,7 +209,7 @@ def profile() -> Any:
             tooltips=[
                 ("Row, column", "@row, @col"),
                 ("Distance (m)", "@distance{0.000}"),
-                ("Range (m)", "@range{0.000} [@low{0.000}, @high{0.000}]"),
+                ("Range (95 %)", "@text"),
                 ("Confidence", "@confidence{0.000}"),
             ],
         )

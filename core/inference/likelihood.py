@@ -90,7 +90,7 @@ def log_likelihood_ratio(
     ----------
     histogram : ndarray, shape (..., bin)
     conditions : Conditions
-    rate : ndarray, shape (bin,), optional
+    rate : ndarray, shape (..., bin), optional
         Photons per pulse in each bin without the echo, ``b``, if they are not those of
         `Conditions.background`: those of other echoes, too.
 
@@ -111,10 +111,32 @@ def log_likelihood_ratio(
         s, step = np.asarray(conditions.signal)[..., np.newaxis] * echo[at], int(at) - n_bins + 1
         delay = slice(max(-step, 0), n_bins - max(step, 0))
         met = slice(max(step, 0), n_bins - max(-step, 0))
-        b = level if rate is None else rate[met]
+        b = level if rate is None else rate[..., met]
         gain = np.log1p(s / b) if n_pulses is None else np.log(np.expm1(-(b + s)) / np.expm1(-b))
         ratio[..., delay] += gain * histogram[..., met] - s * unfired[..., met]
     return ratio
+
+
+def log_rate_ratio(histogram: Floats, n_pulses: int | None, rate: Floats, other: Floats) -> Floats:
+    """Log likelihood ratio of one rate to another.
+
+    Parameters
+    ----------
+    histogram : ndarray, shape (..., bin)
+    n_pulses : int or None
+        As `Conditions.n_pulses`.
+    rate, other : ndarray, shape (..., bin)
+        Photons per pulse in each bin, positive.
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
+    if n_pulses is None:
+        return np.asarray((np.log(rate / other) * histogram - (rate - other)).sum(axis=-1))
+    unfired = n_pulses - np.cumsum(histogram, axis=-1)
+    gain = np.log(np.expm1(-rate) / np.expm1(-other))
+    return np.asarray((gain * histogram - (rate - other) * unfired).sum(axis=-1))
 
 
 class LikelihoodInput(NamedTuple):

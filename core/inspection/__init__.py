@@ -7,6 +7,7 @@ from core.inspection.capture import (
     Suggestion,
     capture_report,
 )
+from core.inspection.echoes import CONFIDENT
 from core.inspection.faulty import FaultyPixel, faulty_pixels
 from core.inspection.flux import estimate_flux
 from core.inspection.line_profile import LineProfile, line_profile
@@ -22,6 +23,7 @@ LightFound, light_found, mean_light = FluxEstimate, estimate_flux, estimate_mean
 Candidate = RangeCandidate
 
 __all__ = [
+    "CONFIDENT",
     "LEVEL",
     "Accuracy",
     "Candidate",

@@ -153,7 +153,7 @@ def suggestion(capture: Capture) -> Suggestion:
     if echoes is None:
         why = f"Fewer than {FEWEST} estimates are confident: the delays of echoes are unknown."
         t_n = min(_MARGIN_BINS, n_bins - 1)
-        return Suggestion((0, n_bins), why, t_n, f"{why} The differentiators need {t_n} bins.")
+        return Suggestion((0, n_bins), why, t_n, f"The differentiators need {t_n} bins to settle.")
     lag = lag_bins(capture, "tracking", TrackingParameters())
     echo, tap = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
     between = f"in bins {echoes.first:.0f} to {echoes.last:.0f}"

@@ -20,6 +20,8 @@ from core.inspection.profile import LEVEL, FluxEstimate, difference_of, ratio_of
 from core.metrics import Interval
 
 CONFIDENT = 0.9
+"""Confidence from which an estimate is taken for a surface, where there is no truth."""
+
 FEWEST = 10
 """Confident estimates from which the delays of echoes are known."""
 

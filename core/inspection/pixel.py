@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -95,7 +94,10 @@ class PixelReport(OldFluxNames):
     def flux(self) -> FluxEstimate:
         """Signal, background and their ratio with 95 % intervals, estimated on first access.
 
-        In photons per pulse if the number of pulses is known, otherwise in photons.
+        In photons per pulse if the number of pulses is known, otherwise in photons. With the pulse
+        of the capture, as its estimates: one pixel does not show that another fits better, and the
+        fit to all pixels (`CaptureReport.flux`) takes as long as an estimate. `RegionReport.pixel`
+        uses the pulse that fits the pixels of the region.
         """
         return self.find_flux()
 
@@ -108,9 +110,9 @@ class PixelReport(OldFluxNames):
         """
         inner, outer = self.interval_68_m, self.interval_95_m
         half_m, middle_m = (inner.high - inner.low) / 2, (inner.high + inner.low) / 2
-        if not half_m > 0:
+        digits = inner.decimals
+        if digits is None:
             return "–"
-        digits = max(0, 1 - math.floor(math.log10(half_m)))
         return (
             f"{middle_m:.{digits}f} m ± {half_m:.{digits}f} m (68 %), "
             f"{outer.low:.{digits}f} to {outer.high:.{digits}f} m (95 %)"
@@ -150,11 +152,6 @@ def pixel_report(
     lag = lag_bins(capture, method, settings)
     interval_68_m, interval_95_m = pixel_range_intervals(capture, image, row, col, (0.68, 0.95))
     candidates, confidence = _candidates(capture, image, row, col, curve, lag)
-
-    def find_flux() -> FluxEstimate:
-        found = estimate_flux(counts, capture.acquisition, capture.pulse, capture.gated_pulses)
-        return found.of(capture)
-
     return PixelReport(
         row=row,
         col=col,
@@ -170,11 +167,18 @@ def pixel_report(
         interval_68_m=interval_68_m,
         interval_95_m=interval_95_m,
         candidates=candidates,
-        find_flux=find_flux,
+        find_flux=partial(pixel_flux, capture, row, col),
         flux_unit=flux_unit(capture),
         flux_method=METHOD,
         verdict=pixel_verdict(capture, row, col),
     )
+
+
+def pixel_flux(capture: Capture, row: int, col: int) -> FluxEstimate:
+    """Estimate the fluxes of one pixel as `PixelReport.flux`."""
+    counts = capture.cube[row, col].astype(float)
+    found = estimate_flux(counts, capture.acquisition, capture.pulse, capture.gated_pulses)
+    return found.of(capture)
 
 
 def flux_unit(capture: Capture) -> str:

@@ -16,6 +16,7 @@ from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, estimate, settings_of
 from core.inference.posterior import TOLERANCE_BINS
+from core.inspection.echoes import CONFIDENT
 from core.metrics import Interval
 from core.reductions import share_of_pulses
 
@@ -28,11 +29,11 @@ class Accuracy:
     n_pulses: int | None
     """None if unknown."""
     against: Literal["truth", "all pulses"]
-    """Reference: the truth or, if it is unknown, the estimates with all pulses, which may be
-    wrong."""
+    """Reference: the truth or, if it is unknown, the estimates with all pulses whose confidence is
+    at least `CONFIDENT`, which may be wrong."""
     within: Interval | None
-    """Share of the pixels within 3 bins of the reference, with Wilson's 95 % interval; None
-    without a reference."""
+    """Share of the pixels with a reference within 3 bins of it, with Wilson's 95 % interval; None
+    without any."""
     rmse_m: Interval | None
     """Root mean square difference from the reference over estimated pixels, with a 95 % interval
     from the scatter of its squares; None without estimates."""
@@ -75,7 +76,8 @@ def _steps(
 ) -> Iterator[Accuracy]:
     truth_m, against = capture.truth_range_m, "truth"
     if truth_m is None:
-        truth_m, against = estimate(capture, method, settings).range_m, "all pulses"
+        image = estimate(capture, method, settings).confident(CONFIDENT)
+        truth_m, against = image.range_m, "all pulses"
     for share in shares:
         some = share_of_pulses(capture, share)
         yield _accuracy(some, estimate(some, method, settings), truth_m, share, against)

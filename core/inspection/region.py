@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, estimate
-from core.inspection.mean_flux import METHOD, estimate_mean_flux, selected_pixels
-from core.inspection.pixel import PixelReport, flux_unit, pixel_report
+from core.inspection.mean_flux import METHOD, mean_flux_of, selected_pixels
+from core.inspection.pixel import PixelReport, flux_unit, pixel_flux, pixel_report
 from core.inspection.profile import FluxEstimate, OldFluxNames
 
 
@@ -31,7 +32,7 @@ class RegionReport(OldFluxNames):
     image: RangeImage
     """Estimate of the sum, shape (1, 1)."""
     pixel: PixelReport
-    """Report on the sum."""
+    """Report on the sum; its fluxes are with the pulse that fits the echoes of the region."""
     share_answered: float
     """Share of the pixels with an estimate."""
     median_m: float
@@ -75,6 +76,9 @@ def region_report(
     require("region", f"{n_pixels} pixels", n_pixels > 0, "one that contains the centre of a pixel")
     own, summed = selected_pixels(capture, mask), _summed(capture, mask)
     of_sum = estimate(summed, method, settings)
+    mean_flux = mean_flux_of(own)
+    fitted = replace(summed, pulse=mean_flux.pulse)
+    pixel = pixel_report(summed, of_sum, 0, 0, method, settings)
     range_m = image.range_m[mask & image.valid]
     low_m, median_m, high_m = (
         np.quantile(range_m, [0.16, 0.5, 0.84]) if range_m.size else np.full(3, np.nan)
@@ -83,13 +87,13 @@ def region_report(
         n_pixels=n_pixels,
         summed=summed,
         image=of_sum,
-        pixel=pixel_report(summed, of_sum, 0, 0, method, settings),
+        pixel=replace(pixel, find_flux=partial(pixel_flux, fitted, 0, 0)),
         share_answered=range_m.size / n_pixels,
         median_m=float(median_m),
         spread_m=float(high_m - low_m) / 2,
         mean_confidence=float(image.confidence[mask].mean()),
         mean_counts=float(capture.counts[mask].mean()),
-        flux=estimate_mean_flux(own),
+        flux=mean_flux.image,
         flux_unit=flux_unit(own),
         flux_method=METHOD,
     )

@@ -254,19 +254,19 @@ def _pixel(capture: Capture, made_by: Provenance, report: PixelReport) -> Iterat
         signals = tracking_signals(report.counts, made_by.settings, capture.gated_pulses)
         histogram |= {"small scale": signals.small, "large scale": signals.large}
         stages = {"enhanced": signals.enhanced, "residual": signals.residual}
-    where = f"row {row}, column {col}"
+    decimals, where = inner.decimals, f"row {row}, column {col}"
     yield _heading_2(f"Pixel in {where}")
     yield f'<p class="lead">Range: {_text(report.interval_text)}</p>'
     facts = [
-        ("Estimate", _metres(report.answer_m, capture)),
-        ("68 % interval", _between(inner, capture)),
-        ("95 % interval", _between(outer, capture)),
+        ("Estimate", _metres(report.answer_m, capture, decimals)),
+        ("68 % interval", _between(inner, capture, decimals)),
+        ("95 % interval", _between(outer, capture, decimals)),
         ("Confidence", _number(report.confidence)),
         ("Detections", _number(int(report.counts.sum()))),
         ("Verdict", _text(f"{report.verdict.health}. {report.verdict.why}")),
     ]
     if truth_m is not None:
-        known = "no target" if math.isnan(truth_m) else _metres(truth_m, capture)
+        known = "no target" if math.isnan(truth_m) else _metres(truth_m, capture, decimals)
         facts.insert(3, ("Truth", known))
     yield _facts(facts)
     yield (
@@ -451,18 +451,20 @@ def _number(value: float, text: str = "") -> str:
         return "–"
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
-    form = "," if isinstance(value, int) else ".4g"
-    return f'<data value="{value}">{text or format(value, form)}</data>'
+    if not text and abs(value) >= 1000:
+        text = f"{value if isinstance(value, int) else float(f'{value:.4g}'):,.0f}"
+    return f'<data value="{value}">{text or format(value, ".4g")}</data>'
 
 
-def _metres(value_m: float, capture: Capture) -> str:
-    """Return a range with the decimals that resolve a hundredth of a bin."""
-    decimals = max(0, 2 - math.floor(math.log10(capture.acquisition.bin_length_m)))
+def _metres(value_m: float, capture: Capture, decimals: int | None = None) -> str:
+    """Return a range, by default with the decimals that resolve a hundredth of a bin."""
+    if decimals is None:
+        decimals = max(0, 2 - math.floor(math.log10(capture.acquisition.bin_length_m)))
     return "–" if math.isnan(value_m) else f"{_number(value_m, f'{value_m:,.{decimals}f}')}\u00a0m"
 
 
-def _between(interval: Interval, capture: Capture) -> str:
-    ends = (_metres(end, capture) for end in (interval.low, interval.high))
+def _between(interval: Interval, capture: Capture, decimals: int | None) -> str:
+    ends = (_metres(end, capture, decimals) for end in (interval.low, interval.high))
     return " to ".join(ends) if math.isfinite(interval.low) else "–"
 
 

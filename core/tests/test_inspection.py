@@ -20,11 +20,12 @@ from core.effects import FaultyPixels
 from core.estimators import ESTIMATORS, estimate
 from core.geometry import Box
 from core.inference import TOLERANCE_BINS
+from core.inference.posterior import same_echo_bins
 from core.inspection import estimate_flux, pixels_in
 from core.inspection.profile import Box as Bounds
 from core.inspection.profile import difference_of, ratio_of, zoomed
 from core.metrics import Interval, restored
-from core.reductions import cut_gate
+from core.reductions import cut_gate, share_of_pulses
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies.methods.calibration import FLUX_REGIMES, FluxRegime
@@ -153,37 +154,70 @@ def test_candidates_within_one_pulse_are_one() -> None:
         scores = [each.score for each in report.candidates]
         assert scores == sorted(scores, reverse=True)
         assert report.candidates[0].score == report.curve.max()
-    mask = np.ones(capture.shape, bool)
-    pixel = inspection.region_report(capture, image, mask, "peak").pixel
-    assert pixel.candidates[0].bin == pixel.answer_bin
-    assert pixel.candidates[0].probability == pixel.confidence
-    assert all(abs(c.bin - pixel.answer_bin) >= 6 for c in pixel.candidates[1:])
 
 
-@pytest.mark.parametrize("n_pulses", [300, None], ids=["first photons", "photons"])
-def test_a_candidate_has_the_probability_of_a_surface_there(n_pulses: int | None) -> None:
-    """Half of the pixels see a net before a wall."""
-    acquisition, pulse = Acquisition(n_bins=150, n_pulses=n_pulses), Pulse.gaussian(1.5e-9)
+def net_before_wall(
+    n_pulses: int | None, sigma_bins: float, net: float = 10.0
+) -> tuple[Capture, Floats, Floats]:
+    """Draw walls of 30 photons and, in half of the pixels, nets of fewer; also their delays."""
+    acquisition = Acquisition(n_bins=150, n_pulses=n_pulses)
+    pulse = Pulse.gaussian(sigma_bins * acquisition.bin_width_s)
     rng, shape = np.random.default_rng(1), (8, 8)
     walls, nets = rng.uniform(80, 140, shape), rng.uniform(10, 70, shape)
     nets[4:] = np.nan
-    photons = 1.0 if n_pulses is None else 1 / 300
+    photons = 1.0 if n_pulses is None else 1 / n_pulses
     rate = rate_per_bin(walls, np.full(shape, 30 * photons), 10 * photons, pulse, acquisition)
-    rate += rate_per_bin(nets, np.full(shape, 10 * photons), 0.0, pulse, acquisition)
+    rate += rate_per_bin(nets, np.full(shape, net * photons), 0.0, pulse, acquisition)
     kind = "all" if n_pulses is None else "first"
-    capture = Capture(draw_counts(rate, n_pulses, rng), acquisition, pulse, detection=kind)
+    cube = draw_counts(rate, n_pulses, rng)
+    return Capture(cube, acquisition, pulse, detection=kind), walls, nets
+
+
+@pytest.mark.parametrize(("n_pulses", "sigma_bins"), [(300, 3.0), (None, 0.7)])
+def test_estimate_and_candidates_of_a_region_agree(n_pulses: int | None, sigma_bins: float) -> None:
+    capture = net_before_wall(n_pulses, sigma_bins)[0]
+    rng, width_bins, n_sure = np.random.default_rng(0), same_echo_bins(capture), []
+    for method in ("tracking", "matched_filter", "peak"):
+        image = estimate(capture, method)
+        for share in (0.0, 0.05, 0.5):
+            mask = rng.random(capture.shape) < share
+            mask[rng.integers(4), rng.integers(8)] = True
+            region = inspection.region_report(capture, image, mask, method)
+            pixel = region.pixel
+            bins = np.array([each.bin for each in pixel.candidates])
+            assert (np.diff(np.sort(bins)) >= width_bins).all()
+            near = [c for c in pixel.candidates if abs(c.bin - pixel.answer_bin) < width_bins]
+            assert [(c.bin, c.probability) for c in near] == [(pixel.answer_bin, pixel.confidence)]
+            # The estimate alone assumes one surface.
+            assert pixel.confidence >= region.image.confidence[0, 0]
+            n_sure.append(sum(each.probability > 0.9 for each in pixel.candidates))
+    assert max(n_sure) >= 2
+
+
+@pytest.mark.parametrize(
+    ("n_pulses", "net"),
+    [(300, 10.0), (300, 5.0), (None, 10.0)],
+    ids=["first photons", "faint net", "photons"],
+)
+def test_a_candidate_has_the_probability_of_a_surface_there(
+    n_pulses: int | None, net: float
+) -> None:
+    """Half of the pixels see a net before a wall."""
+    capture, *delays = net_before_wall(n_pulses, 1.5, net)
     image = estimate(capture, "matched_filter")
-    probability, is_right, n_nets = [], [], 0
-    for row, col in np.ndindex(shape):
+    probability, is_right = [], []
+    for row, col in np.ndindex(capture.shape):
         for each in inspection.pixel_report(capture, image, row, col, "matched_filter").candidates:
-            errors = np.abs(each.bin - np.array([walls[row, col], nets[row, col]]))
+            errors = np.abs(each.bin - np.array([delay[row, col] for delay in delays]))
             probability.append(each.probability)
             is_right.append(bool(np.nanmin(errors) <= TOLERANCE_BINS))
-            n_nets += each.probability > 0.9 and bool(errors[1] <= TOLERANCE_BINS)
-    sure = np.array(probability) > 0.9
-    assert np.mean(np.array(is_right)[sure]) > 0.98
-    assert np.mean(np.array(is_right)[np.array(probability) < 0.1]) < 0.1
-    assert n_nets > 25
+    told, right = np.array(probability), np.array(is_right)
+    assert np.mean(right[told > 0.9]) > 0.98
+    assert np.mean(right[told < 0.1]) < 0.05
+    between = (told >= 0.1) & (told <= 0.9)
+    chance = math.sqrt(float((told * (1 - told))[between].sum()))
+    assert abs(told[between].sum() - np.count_nonzero(right[between])) < 3 * chance
+    assert np.count_nonzero(right[told > 0.9]) > capture.counts.size + (25 if net == 10.0 else 10)
 
 
 def test_a_report_has_the_intervals_of_the_range() -> None:
@@ -279,6 +313,16 @@ def test_a_region_is_its_pixels_added_to_one() -> None:
         inspection.region_report(capture, image, np.zeros((8, 8), bool))
     with pytest.raises(ValueError, match="mask = "):
         inspection.region_report(capture, image, np.zeros((8, 7), bool))
+
+
+def test_fluxes_of_a_region_are_with_the_pulse_of_its_echoes() -> None:
+    wall = Scene(np.full((8, 8), ACQUISITION.bin_to_range_m(30.3)), acquisition=ACQUISITION)
+    capture = simulate(wall, ACQUISITION, Flux(0.2, 0.5), Pulse.gaussian(2e-9), seed=1)
+    wrong = replace(capture, pulse=Pulse.gaussian(0.7e-9))
+    mask = np.ones(capture.shape, bool)
+    region = inspection.region_report(wrong, estimate(wrong, "peak"), mask, "peak")
+    for flux in (region.flux, region.pixel.flux):
+        assert covers(flux.signal, 0.2) and covers(flux.background, 0.4)
 
 
 def test_a_profile_holds_ranges_and_intervals_of_the_pixels_on_a_line() -> None:
@@ -580,6 +624,10 @@ def test_accuracy_over_pulses_is_held_against_the_truth_or_all_pulses() -> None:
     assert part.against == "all pulses" and part.n_pulses is None
     assert whole.within.value == 1.0 and whole.rmse_m.value == 0.0
     assert part.within.value < 1.0
+    confident = estimate(unknown, "peak").confident(inspection.CONFIDENT).range_m
+    fewer = estimate(share_of_pulses(unknown, 0.1), "peak").range_m
+    hits, targets = restored(fewer, confident, TOLERANCE_BINS * ACQUISITION.bin_length_m)
+    assert targets < capture.counts.size and part.within.value == hits / targets
     steps = inspection.accuracy_over_pulses(capture, [0.5])
     assert next(steps).share == 0.5  # one at a time
     with pytest.raises(ValueError, match="share = 0"):

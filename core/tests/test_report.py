@@ -153,6 +153,7 @@ def test_numbers_are_those_of_the_reports(page: Page, image: core.RangeImage) ->
     assert page.values["95 % interval"] == [pixel.interval_95_m.low, pixel.interval_95_m.high]
     assert page.values["Confidence"] == [pixel.confidence]
     assert f"Range: {pixel.interval_text}" in page.texts["p"]
+    assert f"{pixel.answer_m:.{pixel.interval_68_m.decimals}f}" in page.texts["data"]
     for rank, candidate in enumerate(pixel.candidates, 1):
         bin_, range_m, score, relative, probability = page.values[str(rank)]
         assert (bin_, range_m, score) == (candidate.bin, candidate.range_m, candidate.score)

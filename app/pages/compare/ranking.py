@@ -13,6 +13,7 @@ from app.model.budget import ranging
 from app.model.state import Comparison
 from app.model.store import Answer, Request, is_wrong
 from core import ESTIMATORS, Capture, RangeImage, estimate, limits, metrics, run
+from core.inspection import CONFIDENT
 
 Array = NDArray[Any]
 
@@ -70,7 +71,7 @@ class Reference:
     limit: limits.Limit | None
     """The physical limit; None where truth, flux or number of pulses is not known."""
     likelihood: RangeImage | None
-    """The likelihood's estimate, for captures without truth."""
+    """The likelihood's confident estimates, for captures without truth."""
     failure: str = ""
     """Why neither could be computed."""
 
@@ -122,14 +123,18 @@ def reference_of(capture: Capture) -> Reference:
     with ranging(capture, "likelihood"):
         return Reference(
             limits.limit(capture) if has_limit else None,
-            estimate(capture, "likelihood") if capture.truth_range_m is None else None,
+            estimate(capture, "likelihood").confident(CONFIDENT)
+            if capture.truth_range_m is None
+            else None,
         )
 
 
 def agreement(image: RangeImage, other: RangeImage, tolerance_bins: float = 3.0) -> float:
-    """Share of pixels with both estimates in which they agree; NaN if there is no such pixel."""
-    both = image.valid & other.valid
-    close = np.abs(image.bin - other.bin)[both] <= tolerance_bins
+    """Share of the estimates of another image with which one agrees; NaN without any.
+
+    A pixel in which only the other has an estimate counts as disagreement.
+    """
+    close = (np.abs(image.bin - other.bin) <= tolerance_bins)[other.valid]
     return float(close.mean()) if close.size else float("nan")
 
 

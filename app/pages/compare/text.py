@@ -27,6 +27,7 @@ from app.model.text import (
 from app.pages.compare.ranking import TOLERANCES_BINS, Reference, Result, Task, agreement
 from app.units import count
 from core import ESTIMATORS, Capture
+from core.inspection import CONFIDENT
 
 Column = tuple[str, str, int]
 """Title, help, and sort order of the first click: 1 ascending, -1 descending."""
@@ -63,8 +64,8 @@ LIMIT_UNKNOWN = (
 
 
 AGREEMENT_ONLY = (
-    "This capture has no truth: the table shows agreement with the likelihood, which is not "
-    "accuracy."
+    "This capture has no truth: the table shows agreement with the likelihood in target pixels of "
+    f"which it is confident ({CONFIDENT:g} or more). That is not accuracy."
 )
 
 _TIME: Column = (
@@ -78,7 +79,10 @@ def columns(capture: Capture) -> list[Column]:
     """Return the columns of the table; those that need the truth only if there is one."""
     method: Column = ("Method", "Estimators of core.ESTIMATORS.", 1)
     if capture.truth_range_m is None:
-        agreement = "Share of pixels within 3 bins of the likelihood: agreement, not accuracy."
+        agreement = (
+            "Share of the pixels of which the likelihood is confident, within 3 bins of it: "
+            "agreement, not accuracy."
+        )
         return [
             method,
             ("Agreement, not accuracy", agreement, -1),

@@ -107,6 +107,7 @@ def _columns(found: LineProfile, grid: Grid) -> dict[str, NDArray[Any]]:
     """Return the data of the plot, one element a pixel."""
     row, col = grid.place(found.row, found.col)
     nothing = np.full(found.row.size, np.nan)
+    ranges_m = zip(found.range_m, found.low_m, found.high_m, strict=True)
     return {
         "distance": found.distance_m,
         "width": np.gradient(found.distance_m),
@@ -117,6 +118,7 @@ def _columns(found: LineProfile, grid: Grid) -> dict[str, NDArray[Any]]:
         "confidence": found.confidence,
         "row": row,
         "col": col,
+        "text": np.array([text.range_text(*each) for each in ranges_m]),
     }
 
 

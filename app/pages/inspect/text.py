@@ -29,6 +29,7 @@ from app.units import (
     OPPOSITE_UNIT,
     Quantity,
     Scale,
+    between,
     bounds,
     count,
     noted,
@@ -39,7 +40,14 @@ from app.units import (
 from app.units import interval as format_interval
 from core import Capture
 from core.geometry import distance_m, pixel_angle_of, sight_lines
-from core.inspection import Candidate, CaptureReport, FaultyPixel, FluxEstimate, LineProfile
+from core.inspection import (
+    CONFIDENT,
+    Candidate,
+    CaptureReport,
+    FaultyPixel,
+    FluxEstimate,
+    LineProfile,
+)
 from core.io import changed_settings
 from core.metrics import Interval
 
@@ -124,11 +132,17 @@ def _region_facts(found: Inspected, unit: str) -> list[Fact]:
     region, along = found.region, scale(unit, found.answer.capture.acquisition)
     assert region is not None
     spread = "Half the central 68 % range of the estimates, which is one standard deviation."
+    median_m, half_m = region.median_m, region.spread_m
+    decimals = Interval(median_m, median_m - half_m, median_m + half_m).decimals
     return [
         *estimate_facts(found.pixel, along, has_truth=False),
         ("Pixels", count(region.n_pixels), "Pixels whose centre lies in the region."),
-        ("Median range", number(region.median_m, "m"), "Median of the estimates of its pixels."),
-        ("Spread", number(region.spread_m, "m"), spread),
+        (
+            "Median range",
+            number(median_m, "m", decimals=decimals),
+            "Median of the estimates of its pixels.",
+        ),
+        ("Spread", number(half_m, "m", decimals=decimals), spread),
         ("Coverage", share(region.share_answered), "Share of its pixels with an estimate."),
         ("Mean confidence", share(region.mean_confidence), "Mean over the pixels."),
         ("Mean detections", number(region.mean_counts, ""), "Mean over the pixels."),
@@ -296,6 +310,12 @@ def distances(found: Sequence[Inspected], viewing: Viewing, is_width_guessed: bo
     return f"From {names[0]}: {', '.join(sentences)} (95 %).{guessed}"
 
 
+def range_text(range_m: float, low_m: float, high_m: float) -> str:
+    """Format a range and its interval with the digits that the interval supports."""
+    decimals = Interval(range_m, low_m, high_m).decimals
+    return f"{number(range_m, 'm', decimals=decimals)} ({between(low_m, high_m, 'm')})"
+
+
 def profile_sentence(answer: Answer, profile: LineProfile, is_width_guessed: bool) -> str:
     """Return where a profile runs, how much of it is hidden, and what its lengths rest on."""
     row, col, n_pixels = profile.row.tolist(), profile.col.tolist(), profile.row.size
@@ -433,5 +453,5 @@ def accuracy_titles(capture: Capture) -> tuple[str, str, str]:
     across = "Share of the pulses" if capture.acquisition.n_pulses is None else "Pulses"
     if capture.truth_range_m is not None:
         return "Accuracy against number of pulses", across, "Within 3 bins of the truth"
-    title = "Agreement with the estimate from all pulses (not accuracy)"
+    title = f"Agreement with all pulses, in pixels confident by {CONFIDENT:g} (not accuracy)"
     return title, across, "Within 3 bins of it"

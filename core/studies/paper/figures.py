@@ -5,6 +5,7 @@ Only the settings of its figures were available; their content is inferred and m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
 from functools import partial
@@ -16,6 +17,8 @@ from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS
 from core.inference.limits import limit
+from core.inspection.echoes import CONFIDENT
+from core.inspection.maps import likeliest
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies.outputs import Item, Pictures, Plot, Table, table
@@ -409,7 +412,11 @@ def by_place(
 
 
 def agreement(capture: Capture, name: str) -> Table:
-    """Return the share of pixels in which two methods agree within 3 bins; needs no truth."""
+    """Return the share of pixels in which two methods agree within 3 bins; needs no truth.
+
+    Of the pixels in which a surface is confident: elsewhere, methods agree on noise.
+    """
+    is_confident = likeliest(capture)[1] >= CONFIDENT
     bins = {
         method.name: _delays(capture, method)
         for method in COMPARED
@@ -417,14 +424,19 @@ def agreement(capture: Capture, name: str) -> Table:
     }
 
     def share(one: str, other: str) -> float:
-        return 1.0 if one == other else float((np.abs(bins[one] - bins[other]) <= 3).mean())
+        close = np.abs(bins[one] - bins[other])[is_confident] <= 3
+        if one == other:
+            return 1.0
+        return float(close.mean()) if close.size else math.nan
 
     return table(
         "agreement",
         f"Agreement within 3 bins on {name}",
         bins,
         {"method": str, **{other: partial(share, other=other) for other in bins}},
-        "A measured capture without truth: methods that agree may all be wrong.",
+        "A measured capture without truth: methods that agree may all be wrong. "
+        f"{np.count_nonzero(is_confident):,} of {is_confident.size:,} pixels, those in which a "
+        f"surface has a confidence of {CONFIDENT:g} or more.",
     )
 
 
