@@ -44,10 +44,11 @@ def twin(capture: Capture, row: int, col: int, delay_bin: float) -> float:
     background = float(flux.typical_background[row, col])
     within = (np.arange(STEPS_PER_BIN) + 0.5) / STEPS_PER_BIN
     taps, first = capture.pulse.taps(N_BINS, acquisition.bin_width_s, within)
-    reach, at = max(TOLERANCE_BINS, capture.echo_bins) - 1, min(math.floor(delay_bin), N_BINS - 1)
     delays, log = [], []
-    for k in range(max(at - reach, 0), min(at + reach, N_BINS - 1) + 1):
+    for k in range(N_BINS):
         for step in range(STEPS_PER_BIN):
+            if abs(k + within[step] - delay_bin) >= max(TOLERANCE_BINS, capture.echo_bins):
+                continue
             rate = np.full(N_BINS, background / N_BINS)
             for tap, share in enumerate(taps[step]):
                 if 0 <= k + first + tap < N_BINS:
