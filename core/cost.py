@@ -46,6 +46,7 @@ _NULL_COUNT_BYTES = 12.0
 _FIXED_S = 0.01
 _PIXEL_S = 0.4e-6
 _ENTRY_S, _LANE_S, _TAP_S = 4e-9, 40e-9, 0.15e-9  # per level and delay; per row of lanes
+_REFINED_S, _REFINED_BYTES = 2e-9, 40.0  # of a pixel: per squared tap; images in blocks
 _LEARNED_S = 30e-9  # per level and delay of the sample, for all steps of the maximisation
 _ECHO_S = 25e-9  # per bin of an expected echo
 _NULL_S = 60e-9
@@ -142,6 +143,9 @@ def predicted(
         seconds += (entry_s + _LANE_S / lanes) * n_bins * _USUAL_LEVELS * _filled(n_pixels, lanes)
     if method == "tracking" or (not posterior_is_cached and lanes == LANES):
         n_bytes += 2 * n_bins * _filled(n_pixels, LANES)
+    if method == "tracking" and (settings is None or settings.refine == "likelihood"):
+        n_bytes += _REFINED_BYTES * n_pixels
+        seconds += _REFINED_S * n_taps**2 * n_pixels
     if steps:
         lanes = lanes_of(_USUAL_LEVELS, n_bins * steps)
         n_bytes += 8 * lanes * _USUAL_LEVELS * n_bins * steps

@@ -110,7 +110,7 @@ def _paper(chosen: argparse.Namespace) -> None:
 
 
 def _table2(chosen: argparse.Namespace) -> None:
-    settings = PRESETS[chosen.preset]
+    settings = paper.in_whole_bins(chosen.preset)
     print(f"Preset {chosen.preset}, seeds 0 to {chosen.seeds - 1}: {settings}\n")
     method = Method(chosen.preset, "tracking", settings)
     plan = {Condition("car", sbr): [method] for sbr in TABLE_2}

@@ -1,7 +1,7 @@
 """The paper's estimator, the dual-scale tracking differentiator of `core.tracking`.
 
-It finds the bin of the echo. If `TrackingParameters.refine` is "likelihood", the range below a bin
-is that of the largest likelihood in the neighbourhood.
+It finds the bin of the echo. The largest likelihood in the neighbourhood gives the range below a
+bin, unless `TrackingParameters.refine` is "none".
 """
 
 from __future__ import annotations

@@ -16,10 +16,11 @@ STEPS_PER_BIN = 4
 
 
 def refined(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
-    """Move delays to the largest likelihood of the same echo (`same_echo_bins`).
+    """Move delays to the largest likelihood of the same echo.
 
     The likelihood ``T(d)`` of `core.inference.likelihood` with the typical fluxes of each pixel is
-    computed at four delays in each bin; a parabola refines between them.
+    computed at four delays in each bin, those less than `same_echo_bins` away; a parabola refines
+    between them.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ def refined(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
     ndarray, shape (row, col)
     """
     acquisition, n_pixels = capture.acquisition, delay_bin.size
-    reach = same_echo_bins(capture) - 1
+    reach = same_echo_bins(capture)
     within = (np.arange(STEPS_PER_BIN) + 0.5) / STEPS_PER_BIN
     taps, first = capture.pulse.taps(acquisition.n_bins, acquisition.bin_width_s, within)
     # In the order in which a bin meets it while the delay grows.

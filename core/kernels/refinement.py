@@ -28,7 +28,7 @@ def _fill_gain(signal, background, is_first, echo, gain):  # type: ignore[no-unt
 def _fill_window(counts, n_pulses, first, fired, unfired):  # type: ignore[no-untyped-def]
     """Fill counts and unfired pulses of the bins from `first`; 0 outside the gate."""
     before = 0
-    for k in range(min(max(first, 0), counts.size)):
+    for k in range(min(max(first, 0), counts.size) if n_pulses > 0 else 0):
         before += counts[k]
     armed = float(n_pulses - before)
     for p in range(fired.size):
@@ -46,8 +46,10 @@ def _fill_score(signal, echo, gain, steps, fired, unfired, score):  # type: igno
     for p in range(fired.size):
         first = (fired.size - 1 - p) * steps
         count, expected = fired[p], signal * unfired[p]
+        # Slices: the compiler vectorises only indices that it knows to be non-negative.
+        gained, missed = gain[first : first + score.size], echo[first : first + score.size]
         for d in range(score.size):
-            score[d] += count * gain[first + d] - expected * echo[first + d]
+            score[d] += count * gained[d] - expected * missed[d]
 
 
 @njit(**COMPILED)
@@ -63,7 +65,7 @@ def _highest(score, begin, end):  # type: ignore[no-untyped-def]
 
 @njit(**PARALLEL)
 def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, reach, delay):  # type: ignore[no-untyped-def]
-    """Move each delay (block, lane) to the maximum of ``T(d)`` within `reach` bins of it.
+    """Move each delay (block, lane) to the maximum of ``T(d)`` less than `reach` bins from it.
 
     `blocks` holds counts (block, bin, lane); `signal` and `background`, per bin, have the shape
     (block, lane); `n_pulses` is 0 if unknown; `echo` has `steps` samples a bin, see the module,
@@ -84,5 +86,7 @@ def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, 
             first = min(int(delay[b, i]), n_bins - 1) - reach
             _fill_window(blocks[b, :, i], n_pulses, first + first_tap, fired, unfired)
             _fill_score(last_signal, echo, gain, steps, fired, unfired, score)
-            begin, end = max(-first, 0) * steps, min(n_bins - first, 2 * reach + 1) * steps
+            at = (delay[b, i] - first) * steps - 0.5
+            begin = max(math.floor(at - reach * steps) + 1, -first * steps)
+            end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
             delay[b, i] = first + (_highest(score, begin, end) + 0.5) / steps

@@ -38,7 +38,11 @@ every_estimator = pytest.mark.parametrize("method", ESTIMATORS)
 single_pixel = pytest.mark.parametrize(
     "method", [name for name in ESTIMATORS if name not in ("kde", "chi", "unmixing")]
 )
-scale_free = pytest.mark.parametrize("method", ["tracking", "peak", "matched_filter"])
+scale_free = pytest.mark.parametrize(
+    "case",
+    [("tracking", TrackingParameters(refine="none")), ("peak", None), ("matched_filter", None)],
+    ids=lambda case: case[0],
+)
 
 
 def simulated(size: int = 8, n_pulses: int = 1000, sbr: float = 0.06, **more: Any) -> Capture:
@@ -185,10 +189,10 @@ def test_a_later_echo_gives_a_later_estimate(method: str, later: int) -> None:
 
 
 @scale_free
-def test_counts_and_pulses_have_no_unit(method: str) -> None:
+def test_counts_and_pulses_have_no_unit(case: tuple[str, Any]) -> None:
     one = simulated()
     four = capture_of(4 * one.cube, n_pulses=4000)  # a power of two, so that ties stay ties
-    np.testing.assert_array_equal(estimate(four, method).bin, estimate(one, method).bin)
+    np.testing.assert_array_equal(estimate(four, *case).bin, estimate(one, *case).bin)
 
 
 @every_case

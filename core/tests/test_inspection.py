@@ -121,11 +121,11 @@ def test_the_best_candidate_is_the_estimate(method: str) -> None:
     ("method", "settings"),
     [
         ("tracking", None),
-        ("tracking", TrackingParameters(refine="likelihood")),
+        ("tracking", TrackingParameters(refine="none")),
         ("likelihood", None),
         ("unmixing", None),
     ],
-    ids=["tracking", "tracking refined", "likelihood", "unmixing"],
+    ids=["tracking", "tracking in whole bins", "likelihood", "unmixing"],
 )
 def test_the_candidate_at_the_estimate_is_the_estimate(method: str, settings: Any) -> None:
     capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from core.inference import TOLERANCE_BINS, flux_model_of
 from core.inference.refinement import STEPS_PER_BIN, refined
 from core.studies.methods.calibration import Regime
 from core.tracking import PRESETS, tracking_signals
+from core.tracking_parameters import Refine
 from core.trigger import draw_counts, rate_per_bin
 
 N_BINS = 40
@@ -44,10 +47,11 @@ def twin(capture: Capture, row: int, col: int, delay_bin: float) -> float:
     background = float(flux.typical_background[row, col])
     within = (np.arange(STEPS_PER_BIN) + 0.5) / STEPS_PER_BIN
     taps, first = capture.pulse.taps(N_BINS, acquisition.bin_width_s, within)
-    reach, at = max(TOLERANCE_BINS, capture.echo_bins) - 1, min(math.floor(delay_bin), N_BINS - 1)
     delays, log = [], []
-    for k in range(max(at - reach, 0), min(at + reach, N_BINS - 1) + 1):
+    for k in range(N_BINS):
         for step in range(STEPS_PER_BIN):
+            if abs(k + within[step] - delay_bin) >= max(TOLERANCE_BINS, capture.echo_bins):
+                continue
             rate = np.full(N_BINS, background / N_BINS)
             for tap, share in enumerate(taps[step]):
                 if 0 <= k + first + tap < N_BINS:
@@ -83,28 +87,48 @@ def test_delays_move_to_the_largest_likelihood(pulse: Pulse, n_pulses: int | Non
     assert np.nanmin(found) >= 0 and np.nanmax(found) <= N_BINS
 
 
+REGIMES = [
+    *product(["first", "all"], [0.5, 1.0, 2.0, 5.0], [0.3, 3.0]),
+    *[("first", sigma_bins, 0.06) for sigma_bins in (0.5, 1.0, 2.0)],
+    *[("all", sigma_bins, 0.03) for sigma_bins in (1.0, 5.0)],
+]
+FAINT = [("first", 5.0, 0.03), ("first", 5.0, 0.06)]
+"""Regimes in which the likelihood itself is hardly more precise than the tolerance."""
+
+
 @pytest.mark.compiled
-@pytest.mark.parametrize(
-    "regime",
-    [Regime("first", 1, 0.06), Regime("first", 5, 0.3), Regime("all", 0.5, 3)],
-    ids=str,
-)
+@pytest.mark.parametrize("regime", [Regime(*each) for each in REGIMES + FAINT], ids=str)
 def test_tracking_is_as_precise_as_the_likelihood(regime: Regime) -> None:
     capture = regime.capture(0)
     truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
     found = {
         name: estimate(capture, method, **more).bin - truth
         for name, method, more in (
-            ("printed", "tracking", {}),
-            ("refined", "tracking", {"refine": "likelihood"}),
+            ("printed", "tracking", {"refine": "none"}),
+            ("refined", "tracking", {}),
             ("likelihood", "likelihood", {}),
         )
     }
     right = np.all([np.abs(error) <= TOLERANCE_BINS for error in found.values()], axis=0)
-    assert right.sum() > 1000
     rms = {name: math.sqrt(np.mean(error[right] ** 2)) for name, error in found.items()}
-    assert rms["refined"] <= 1.02 * rms["likelihood"] < 0.9 * rms["printed"]
-    assert abs(np.mean(found["refined"][right])) <= 0.1
+    bias = {name: abs(np.mean(error[right])) for name, error in found.items()}
+    assert rms["refined"] <= 1.02 * rms["likelihood"] < rms["printed"]
+    if (regime.detection, regime.sigma_bins, regime.sbr) in FAINT:
+        # Estimates right by chance dominate: their mean error is that of the likelihood.
+        assert rms["likelihood"] > 0.4 * TOLERANCE_BINS
+        assert bias["refined"] == pytest.approx(bias["likelihood"], abs=0.02)
+    else:
+        assert right.sum() > 900
+        assert bias["refined"] <= 0.1
+        assert rms["likelihood"] < 0.9 * rms["printed"]
+
+
+def test_refined_delays_take_all_fractions_of_a_bin() -> None:
+    capture = Regime("first", 1.0, 0.3).capture(0)
+    whole, refined = (estimate(capture, "tracking", refine=each).bin for each in get_args(Refine))
+    assert len(np.unique(np.round((whole - whole[0, 0]) % 1, 6) % 1)) == 1
+    tenths = np.bincount((refined[np.isfinite(refined)] % 1 * 10).astype(int), minlength=10)
+    assert tenths.min() > 0.5 * tenths.mean()
 
 
 def test_the_printed_preset_gives_whole_bins_minus_the_lag() -> None:

@@ -141,6 +141,16 @@ MORE_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {
 """Settings other than the defaults."""
 
 
+def whole_bins(method: str) -> Any:
+    """Return default settings of a method, tracking without its refinement below a bin.
+
+    The likelihood, by which it is refined, has cases of its own.
+    """
+    return core.ESTIMATORS[method].parameters(
+        **({"refine": "none"} if method == "tracking" else {})
+    )
+
+
 # -- cases -----------------------------------------------------------------------------------------
 
 
@@ -151,7 +161,7 @@ def estimates(name: str, _: Path) -> Answers:
     known = capture.signal is not None and capture.background is not None
     for method in core.ESTIMATORS:
         if known or method != "oracle":
-            yield method, core.estimate(capture, method)
+            yield method, core.estimate(capture, method, whole_bins(method))
 
 
 def settings(method: str, _: Path) -> Answers:
@@ -159,9 +169,9 @@ def settings(method: str, _: Path) -> Answers:
     capture = drawn(some_of("car"), 0.15, 0.15, seed=10)
     for each in MORE_SETTINGS.get(method, ()):
         name = ", ".join(f"{key} {value}" for key, value in each.items())
-        yield name, core.estimate(capture, method, **each)
+        yield name, core.estimate(capture, method, replace(whole_bins(method), **each))
     short = core.reductions.cut_gate(capture, 0, 60)
-    yield "false alarms 0.1", core.estimate(short, method, false_alarm=0.1)
+    yield "false alarms 0.1", core.estimate(short, method, whole_bins(method), false_alarm=0.1)
 
 
 def tracking(_: Path) -> Answers:
@@ -203,8 +213,9 @@ def pixels(_: Path) -> Answers:
     for name in ("car", "worn", "all photons", "unknown pulses"):
         capture = CAPTURES[name]()
         for method in ("tracking", "likelihood", "shi"):
-            image = core.estimate(capture, method)
-            report = core.inspection.pixel_report(capture, image, 1, 3, method)
+            chosen = method, whole_bins(method)
+            image = core.estimate(capture, *chosen)
+            report = core.inspection.pixel_report(capture, image, 1, 3, *chosen)
             flux = report.flux if method == "tracking" else None
             yield f"{name}, {method}", {"report": report, "flux": flux}
 
@@ -213,8 +224,9 @@ def regions(_: Path) -> Answers:
     for name, method in (("car", "tracking"), ("fog", "coates"), ("all photons", "likelihood")):
         capture = CAPTURES[name]()
         mask = core.inspection.pixels_in([(0, 0), (0, 4), (4, 4), (3, 0)], capture.shape)
-        image = core.estimate(capture, method)
-        report = core.inspection.region_report(capture, image, mask, method)
+        chosen = method, whole_bins(method)
+        image = core.estimate(capture, *chosen)
+        report = core.inspection.region_report(capture, image, mask, *chosen)
         yield name, {"mask": mask, "report": report, "flux": report.pixel.flux}
 
 
@@ -224,13 +236,14 @@ def whole(_: Path) -> Answers:
         yield name, core.inspection.capture_report(capture)
         yield f"{name}, maps", {key: of(capture) for key, of in core.inspection.maps.items()}
     for name in ("car, SBR 2", "sample"):
-        steps = core.inspection.accuracy_over_pulses(CAPTURES[name](), [0.1, 0.5])
+        chosen = "tracking", whole_bins("tracking")
+        steps = core.inspection.accuracy_over_pulses(CAPTURES[name](), [0.1, 0.5], *chosen)
         yield f"{name}, fewer pulses", list(steps)
 
 
 def figures(_: Path) -> Answers:
     capture, of = CAPTURES["edges"](), core.metrics
-    ran = core.run(capture, "tracking", false_alarm=0.2)
+    ran = core.run(capture, "tracking", whole_bins("tracking"), false_alarm=0.2)
     answer_m, truth_m = ran.image.range_m, ran.capture.truth_range_m
     yield "run", {"image": ran.image, "figures": ran.figures}
     right = np.abs(of.errors_m(answer_m, np.nan_to_num(truth_m))) < 0.5
@@ -297,10 +310,12 @@ def files(folder: Path) -> Answers:
     for method, estimator in core.ESTIMATORS.items():
         if not estimator.whole_image and method != "oracle":
             alarms = 0.1 if method == "peak" else None
-            parts = core.estimate_large(counts.chunk(row=4, col=3), method, false_alarm=alarms)
+            parts = core.estimate_large(
+                counts.chunk(row=4, col=3), method, whole_bins(method), false_alarm=alarms
+            )
             ranged = parts.compute(scheduler="synchronous")
             yield f"parts, {method}", {key: ranged[key].to_numpy() for key in ranged}
-    image = core.estimate(capture, "tracking")
+    image = core.estimate(capture, "tracking", refine="none")
     core.save_image(capture, image, folder / "image.csv")
     core.save_pixel(capture, 2, 2, None, folder / "pixel.csv")
     for name in ("image", "pixel"):

@@ -9,7 +9,7 @@ import numpy as np
 
 from core.metrics import Interval
 from core.studies.outputs import Table, table
-from core.studies.paper.figures import COMPARED
+from core.studies.paper.figures import COMPARED, WHOLE_BINS
 from core.studies.trials import Condition, Results, summary
 
 SBRS = (0.06, 0.04, 0.03)
@@ -51,5 +51,6 @@ def uniform_table(results: Results) -> Table:
             "ms": ms,
             "ns per pixel and bin": lambda name: 1e6 * ms(name) / n_counts,
         },
+        WHOLE_BINS,
         formats={"ms": ".1f", "ns per pixel and bin": ".0f"},
     )

@@ -34,7 +34,7 @@ from core.studies.statistics import MIN_REPEATS, median_interval
 from core.studies.timing import interleaved, machine
 from core.tracking import TrackingParameters, track, tracking_signals
 
-SETTINGS = TrackingParameters()
+SETTINGS = TrackingParameters(refine="none")  # as the plain loop
 FLUX = Flux(0.1041, 0.06)
 
 PLAIN = "plain numba loop over pixels"
@@ -111,13 +111,13 @@ def variants(extent: Extent) -> dict[str, Floats]:
     capture = simulate(scene, acquisition, FLUX, seed=1)
     counts = capture.cube.reshape(-1, extent.bins)
     numbers, blocks, estimator = counts.astype(float), to_blocks(counts), ESTIMATORS["tracking"]
-    estimate(capture, "tracking")  # estimates its flux
+    estimate(capture, "tracking", SETTINGS)  # estimates its flux
     once: dict[str, Callable[[], object]] = {
         "numpy over bins": lambda: numpy_over_bins(numbers, SETTINGS),
         PLAIN: lambda: plain_loop(numbers, SETTINGS),
         "all signals": lambda: tracking_signals(counts, SETTINGS),
         "tracking, once in blocks, caches cold": lambda: track(blocks, SETTINGS),
-        "core.estimate of a new capture": lambda: estimate(replace(capture), "tracking"),
+        "core.estimate of a new capture": lambda: estimate(replace(capture), "tracking", SETTINGS),
         SIMULATION: lambda: simulate(scene, acquisition, FLUX, seed=1),
     }
     in_a_row: dict[str, Callable[[], object]] = {
@@ -125,7 +125,7 @@ def variants(extent: Extent) -> dict[str, Floats]:
         "block layout": lambda: to_blocks(counts),
         MOVE: lambda: track(blocks, SETTINGS),
         "Estimator.delays, flux known": lambda: estimator.delays(capture, SETTINGS),
-        PUBLIC: lambda: estimate(capture, "tracking"),
+        PUBLIC: lambda: estimate(capture, "tracking", SETTINGS),
     }
     repeated = {name: _repeated(call) for name, call in in_a_row.items()}
     taken = interleaved(once | repeated, extent.rounds)

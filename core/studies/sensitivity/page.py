@@ -22,7 +22,8 @@ INTRODUCTION = (
     f"fewer than {sensitivity.FAILING:g} of the best value's correct estimates remain, the method "
     "fails. Depths are uniform over the gate; for methods that use neighbours they are constant in "
     "tiles of 8 x 8 pixels. An estimate is correct within 3 bins. All other parameters have their "
-    "defaults; the SBR is the first at which the method restores nine pixels in ten.",
+    "defaults, but tracking is not refined below a bin; the SBR is the first at which the method "
+    "restores nine pixels in ten.",
 )
 
 

@@ -2,7 +2,8 @@
 
 One parameter at a time is swept through all accepted values, the others at their defaults, on
 depths uniform over the gate. A value is trusted where it loses at most `LOSS` of the pixels against
-the best value of its sweep; differences are paired over pixels.
+the best value of its sweep; differences are paired over pixels. Tracking is not refined below a
+bin: the refinement hides the difference between an estimate in the right bin and one beside it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
-from core.estimators import ESTIMATORS, estimate
+from core.estimators import ESTIMATORS, estimate, settings_of
 from core.inference.posterior import TOLERANCE_BINS
 from core.kernels.blocks import to_blocks
 from core.parameters import Number, Zone, joint_doubts, spec_of
@@ -161,7 +162,7 @@ SCENE_VALUES: dict[str, tuple[float, ...]] = {
 
 def measured(capture: Capture, method: str, settings: Any, value: float) -> Point:
     """Compare a method's estimates with the truth of a capture."""
-    image = estimate(capture, method, settings)
+    image = estimate(capture, method, _in_whole_bins(settings_of(method, settings)))
     truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
     target = np.isfinite(truth)
     right = np.abs(np.nan_to_num(image.bin, nan=np.inf) - truth) <= TOLERANCE_BINS
@@ -172,6 +173,11 @@ def measured(capture: Capture, method: str, settings: Any, value: float) -> Poin
         float(image.valid[target].mean()),
         float(confidence.mean()) if confidence.size else math.nan,
     )
+
+
+def _in_whole_bins(settings: Any) -> Any:
+    is_tracking = isinstance(settings, TrackingParameters)
+    return replace(settings, refine="none") if is_tracking else settings
 
 
 @cache
