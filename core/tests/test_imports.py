@@ -21,8 +21,8 @@ ROOMS = (
     {"simulation", "reductions", "inference"},
     {"corrections", "cost"},
     {"estimators"},
-    {"inspection", "pipeline", "warmup", "io"},
-    {"out_of_core", "report"},
+    {"inspection", "pipeline", "io"},
+    {"out_of_core", "report", "warmup"},
     {"studies"},
     {"cli"},
 )
