@@ -14,7 +14,7 @@ import core
 PACKAGE = Path(core.__file__).parent
 
 ROOMS = (
-    {"kernels", "checks", "deprecation", "notebook", "scripts", "version"},
+    {"kernels", "checks", "deprecation", "notebook", "scripts", "typesetting", "version"},
     {"parameters", "acquisition"},
     {"trigger", "effects", "geometry", "labels", "metrics", "tracking_parameters"},
     {"scene", "tracking", "capture"},

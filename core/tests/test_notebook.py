@@ -34,7 +34,7 @@ ENGINES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ["core", "core.io.names"])
+@pytest.mark.parametrize("name", ["core", "core.io.names", "core.typesetting"])
 def test_examples_give_the_results_they_show(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -29,12 +29,10 @@ from app.units import (
     OPPOSITE_UNIT,
     Quantity,
     Scale,
-    bounds,
     count,
     noted,
     plus_minus,
     scale,
-    three_digits,
 )
 from app.units import interval as format_interval
 from core import Capture
@@ -42,6 +40,7 @@ from core.geometry import distance_m, pixel_angle_of, sight_lines
 from core.inspection import Candidate, CaptureReport, FaultyPixel, FluxEstimate, LineProfile
 from core.io import changed_settings
 from core.metrics import Interval
+from core.typesetting import bounds, three_digits
 
 EXPLANATION = """
 **Choose.** Tap the map, use the arrow keys (with Shift: eight pixels), or type a row and a column.
