@@ -10,14 +10,12 @@ from dataclasses import dataclass
 
 from core import Acquisition
 from core.metrics import Interval
+from core.typesetting import interval_text, three_digits, typeset
 
 OPPOSITE_UNIT = {"bins": "m", "ns": "m", "m": "bins"}
 """Unit of the axis opposite to the chosen one."""
 
 AXIS_TITLES = {"bins": "Bin", "ns": "Time (ns)", "m": "Range (m)"}
-
-
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class Quantity(str):
@@ -112,35 +110,9 @@ def milliseconds(seconds: float) -> Quantity:
     return Quantity(f"{seconds:.2f} s", seconds, "s")
 
 
-def three_digits(value: float) -> str:
-    """Format a number with three digits; a dash for NaN."""
-    if not math.isfinite(value):
-        return "–" if math.isnan(value) else "∞"
-    if 0 < abs(value) < 1e-3:
-        return typeset(f"{value:.2e}")
-    return f"{float(f'{value:.3g}'):,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def typeset(text: str) -> str:
-    """Write a number such as 1.2e-05 as 1.2×10⁻⁵, and 1.2e+03 as 1,200; others stay as they are."""
-    if "e" not in text:
-        return text
-    digits, power = text.split("e")
-    if int(power) > 0:
-        return f"{float(text):+,.0f}" if text.startswith("+") else f"{float(text):,.0f}"
-    return f"{digits}×10{str(int(power)).translate(_RAISED)}"
-
-
-def bounds(low: float, high: float) -> str:
-    """Format the ends of an interval; empty for NaN."""
-    return "" if math.isnan(low) else f"[{three_digits(low)}–{three_digits(high)}]"
-
-
 def interval(value: float, low: float, high: float) -> Quantity:
     """Format a number with the ends of its interval, or with the lower one if it has no other."""
-    is_open = math.isinf(value) and math.isfinite(low)
-    text = f"> {three_digits(low)}" if is_open else f"{three_digits(value)} {bounds(low, high)}"
-    return Quantity(text.strip(), value, low=low, high=high)
+    return Quantity(interval_text(value, low, high), value, low=low, high=high)
 
 
 @dataclass(frozen=True)

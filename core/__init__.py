@@ -86,6 +86,7 @@ PUBLIC_MODULES = (
     "core.studies.sensitivity",
     "core.studies.tradeoff",
     "core.studies.trials",
+    "core.typesetting",
 )
 """Modules whose ``__all__`` is public, too."""
 

@@ -1,4 +1,4 @@
-"""Compilation ahead of the first use."""
+"""Compilation and imports ahead of the first use."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
+from core.inspection import pixel_report
 from core.kernels.parallel import SERIAL_BELOW
 from core.scene import Scene
 from core.simulation import simulate
@@ -14,7 +15,7 @@ from core.tracking import PRESETS, track, tracking_signals
 
 
 def warm_up() -> None:
-    """Compile every kernel, so that no later call has to.
+    """Compile every kernel and import what a pixel's report needs, so that no later call has to.
 
     Takes seconds on a new machine. Compiled code is cached on disk; later starts take a tenth.
     """
@@ -23,7 +24,7 @@ def warm_up() -> None:
     small = simulate(scene, acquisition, Flux())
     pixels = SERIAL_BELOW // acquisition.n_bins + 1
     large = Capture(np.zeros((pixels, 1, acquisition.n_bins), np.uint16), acquisition)
-    for method in ESTIMATORS:
-        estimate(small, method)
+    images = {method: estimate(small, method) for method in ESTIMATORS}
+    pixel_report(small, images["tracking"], 0, 0)  # `scipy.signal` takes a second to import
     track(large.blocks, PRESETS["recommended"])
     tracking_signals(small.cube, PRESETS["recommended"])

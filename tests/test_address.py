@@ -129,7 +129,7 @@ def test_a_session_opens_on_its_link():
 def test_the_capture_sets_what_the_link_leaves_open():
     building, chosen_view = opened("source=building"), opened("source=building&pixel=[1,2]")
     assert building.query() == "source=building"
-    assert building.state.viewing.field_of_view_deg == building.own_field_of_view_deg != 5.0
+    assert building.state.viewing.field_of_view_deg is None
     assert chosen_view.state.pixel == (1, 2)
     half = opened("viewing.least_confidence=0.5")
     assert half.state.viewing == replace(opened("").state.viewing, least_confidence=0.5)

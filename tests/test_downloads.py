@@ -396,7 +396,7 @@ def test_a_cloud_states_that_its_field_of_view_is_a_guess(session, angle_rad):
     acquisition = replace(run.capture.acquisition, pixel_angle_rad=angle_rad)
     run = replace(run, capture=replace(run.capture, acquisition=acquisition))
     answer = replace(session.answer, run=run)
-    files = cloud_files(answer, "Range", session.state.viewing, angle_rad is None)
+    files = cloud_files(answer, "Range", session.state.viewing)
     header = written(files["ply"]).partition(b"end_header")[0].decode()
     assert ("rests on a guess: a field of view of" in header) == (angle_rad is None)
 

@@ -41,6 +41,21 @@ def test_a_file_in_parts_arrives_whole(given, complaints):
     assert complaints == []
 
 
+def test_several_files_arrive_together_within_one_limit(complaints):
+    given = FileInput(complaints.append, max_file_size=10, multiple=True)
+    for content, arrived in ((b"12345", [b"abcde", b"12345"]), (b"123456", None)):
+        given.clear()
+        given._handle_msg({"status": "initializing"})
+        send(given, name="1.npz", total_chunks=1, data=b"abcde")
+        send(given, name="2.npz", total_chunks=1, data=content)
+        given._handle_msg({"status": "finished"})
+        assert given.value == arrived
+    assert len(complaints) == 1 and "bytes of the files = 11" in complaints[0]
+    for _ in range(2):
+        send(given, name="1.npz", total_chunks=1)
+    assert "one file at a time" in complaints[1]
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

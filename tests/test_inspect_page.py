@@ -399,7 +399,9 @@ def test_a_profile_runs_through_the_pins_and_is_saved_as_shown(building):
     assert section.note.text.startswith("41 pixels from 20, 10 to 45, 50, ")
     assert text.WIDTH_GUESSED not in section.note.text  # the scene states its own
     # A wider field of view, and fewer pixels on show.
-    wider = replace(viewing, field_of_view_deg=2 * viewing.field_of_view_deg, least_confidence=1.0)
+    wider = replace(
+        viewing, field_of_view_deg=2 * answer.own_field_of_view_deg, least_confidence=1.0
+    )
     before = section.found
     building.state.viewing = wider
     building.tasks.run_until(lambda: section.found is not before)
@@ -419,6 +421,12 @@ def test_lengths_rest_on_a_guess_unless_the_user_sets_the_field_of_view(far):
     far.state.pins = ((100, 120), (130, 131))
     section = on_screen(ProfileSection(far))
     assert section.note.text.endswith(text.WIDTH_GUESSED)
+    # It remains a guess in the link, with other settings, and after a reload.
+    change(far, tracking=TrackingParameters(l=0.02))
+    again = Session(far.sources, Link(dict(parse_qsl(far.query()))), tasks=HeldTasks())
+    for session in (far, again):
+        assert session.answer.is_width_guessed(session.state.viewing)
+        assert "in degrees is a guess" in script_of(session.answer, session.state)
     far.state.viewing = replace(far.state.viewing, field_of_view_deg=1.0)
     far.tasks.run_until(lambda: text.WIDTH_GUESSED not in section.note.text)
     far.state.crop = Crop(to_m=1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from contextvars import ContextVar
 
@@ -195,13 +196,22 @@ def test_threads_are_given_in_the_order_of_the_requests(n_threads):
 # -- long work -------------------------------------------------------------------------------------
 
 
+class AwayTasks(HeldTasks):
+    """A page that may be away; it runs delayed callbacks when it is back."""
+
+    is_away = False
+
+    def call_later(self, _wait_ms, act):
+        self.queue(act)
+
+
 class Study:
     """Long work in three steps that wait for a signal, and its results."""
 
     def __init__(self, fails_at=None):
         self.gate, self.drawn, self.failures = threading.Semaphore(0), [], []
         self.n_begun, self.fails_at = 0, fails_at
-        self.page = HeldTasks()
+        self.page = AwayTasks()
         self.work = LongWork(self.page, lambda: None, self.failures.append)
         self.steps = [Step(lambda k=k: self.run(k), self.drawn.append) for k in range(3)]
 
@@ -215,6 +225,40 @@ class Study:
     def finish(self):
         while self.work.is_running:
             self.page.run_one()
+
+
+def test_steps_wait_for_a_page_that_is_away_and_keep_what_is_done():
+    study = Study()
+    study.work.start(study.steps)
+    study.page.is_away = True
+    study.gate.release(3)
+    study.page.run_one()
+    study.page.run_one()
+    assert (study.drawn, study.n_begun, study.work.is_running) == ([0], 1, True)
+    study.page.is_away = False
+    study.finish()
+    assert study.drawn == [0, 1, 2]
+
+
+def test_a_piece_ends_when_its_page_is_away_and_starts_again_when_it_is_back():
+    study, begun = Study(), []
+
+    def piece(_progress, cancelled):
+        begun.append(True)
+        while not cancelled():
+            if len(begun) == 2:
+                return "done"
+            time.sleep(0.001)
+        raise RuntimeError("cancelled")
+
+    study.work.start_piece(piece, study.drawn.append)
+    eventually(lambda: begun)
+    study.page.is_away = True
+    study.page.run_one()  # the end of the first attempt
+    assert (study.drawn, study.failures, study.work.is_running) == ([], [], True)
+    study.page.is_away = False
+    study.finish()
+    assert (study.drawn, study.failures, len(begun)) == (["done"], [], 2)
 
 
 def test_paused_work_continues_with_the_next_step():

@@ -289,7 +289,7 @@ class Last:
         os.kill(os.getpid(), signal.SIGTERM)
 
 def page_for(*_):
-    page = SimpleNamespace(queue=nothing, is_gone=False)
+    page = SimpleNamespace(queue=nothing, is_gone=False, is_away=False)
     LongWork(page, lambda: None, nothing).start_piece(long_work, nothing)
     Last()
 

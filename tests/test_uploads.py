@@ -6,14 +6,19 @@ import gc
 import re
 import tempfile
 from pathlib import Path
+from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 
+from app.model.address import Link
+from app.model.script import script_of
 from app.model.state import Illumination
+from app.model.store import built_in_sources
 from app.model.uploads import Bounds, Uploads, safe_name
 from core import Acquisition, Capture, save_capture
 from core.io import ReadOptions
+from tests.threads import HeldLayout, control
 
 
 class Session:
@@ -48,7 +53,7 @@ def load(source, reading: ReadOptions | None = None) -> Capture:
 
 def test_a_file_is_deleted_with_its_last_user_and_loaded_once_for_all(folder, content):
     uploads, first, other = Uploads(), Session(), Session()
-    key = uploads.add("mine.npz", content, first)
+    key = uploads.add({"mine.npz": content}, first)
     source = uploads.use(key, other)
     capture = load(source)
     assert (source.title, capture.shape) == ("mine.npz", (4, 6))
@@ -61,12 +66,31 @@ def test_a_file_is_deleted_with_its_last_user_and_loaded_once_for_all(folder, co
     assert uploads.use(key, other) is None
 
 
+def test_files_that_differ_in_numbers_open_as_one_sequence_and_others_one_by_one(content):
+    uploads = Uploads()
+    layout = HeldLayout(built_in_sources(), uploads=uploads)
+    names = ["run_10_a.npz", "run_2_a.npz", "run_7_a.npz"]
+    button = control(layout, "Open a capture file")
+    button.param.update(filename=names, value=[content] * 3)
+    answer = layout.next_answer()
+    single = load(uploads.use(uploads.add({"one.npz": content}, layout), layout))
+    assert answer.whole.n_records == 3
+    assert np.array_equal(answer.whole.cube, 3 * single.cube)
+    assert "run_*_a.npz" in script_of(answer, layout.session.state)
+    again = HeldLayout(built_in_sources(), Link(dict(parse_qsl(layout.session.query()))), uploads)
+    assert again.session.answer.whole.n_records == 3
+    button.param.update(filename=["day.npz", "night.npz"], value=[content] * 2)
+    assert layout.next_answer().request.source.title == "day.npz"
+    titles = [source.title for source in layout.session.sources.values()]
+    assert titles[-3:] == ["run_*_a.npz", "day.npz", "night.npz"]
+
+
 @pytest.mark.parametrize("collected", ["session", "uploads"])
 def test_files_are_deleted_with_a_forgotten_session_and_with_the_process(
     folder, content, collected
 ):
     owners = {"uploads": Uploads(), "session": Session()}
-    owners["uploads"].add("mine.npz", content, owners["session"])
+    owners["uploads"].add({"mine.npz": content}, owners["session"])
     del owners[collected]
     gc.collect()
     if "uploads" in owners:
@@ -76,7 +100,7 @@ def test_files_are_deleted_with_a_forgotten_session_and_with_the_process(
 
 def test_keys_cannot_be_guessed(folder, content):
     uploads, session = Uploads(), Session()
-    keys = {uploads.add("mine.npz", content, session) for _ in range(5)}
+    keys = {uploads.add({"mine.npz": content}, session) for _ in range(5)}
     assert len(keys) == 5
     assert all(re.fullmatch(r"[\w-]{22}", key) for key in keys)
     for guess in ("", "mine.npz", "../mine.npz", "file 1"):
@@ -96,14 +120,14 @@ def test_keys_cannot_be_guessed(folder, content):
 def test_a_limit_that_is_exceeded_is_named_until_a_user_leaves(folder, bounds, sessions, named):
     uploads, users = Uploads(bounds), [Session() for _ in range(3)]
     for user in sessions[:-1]:
-        uploads.add("a.npz", bytes(10), users[user])
+        uploads.add({"a.npz": bytes(10)}, users[user])
     before = stored(folder)
     with pytest.raises(ValueError, match=named):
-        uploads.add("a.npz", bytes(10), users[sessions[-1]])
+        uploads.add({"a.npz": bytes(10)}, users[sessions[-1]])
     assert stored(folder) == before
     if before:
         uploads.leave(users[0])
-        uploads.add("a.npz", bytes(10), users[sessions[-1]])
+        uploads.add({"a.npz": bytes(10)}, users[sessions[-1]])
 
 
 def test_a_full_disk_leaves_nothing_behind(folder, content, monkeypatch):
@@ -112,7 +136,7 @@ def test_a_full_disk_leaves_nothing_behind(folder, content, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(OSError, match="No space"):
-        Uploads().add("mine.npz", content, Session())
+        Uploads().add({"mine.npz": content}, Session())
     assert list(folder.iterdir()) == []
 
 

@@ -6,20 +6,15 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from app.model.state import (
     CLOUD_COLORS,
     IMAGES,
     MAPS,
     NEED_TRUTH,
-    Comparison,
     Crop,
     State,
-    Viewing,
 )
 from app.model.store import Answer, same_pixels
-from core.geometry import guessed_field_of_view_deg
 from core.inspection import pixels_in
 from core.report import telling_pixel
 
@@ -41,19 +36,10 @@ def possible_kinds(answer: Answer) -> dict[str, list[str]]:
 
 def defaults_of(answer: Answer) -> dict[str, Any]:
     """Return the defaults that a capture brings, by the state's parameter."""
-    field_of_view_deg = own_field_of_view_deg(answer)
-    comparison = Comparison()
-    compared = replace(comparison.viewing, field_of_view_deg=field_of_view_deg)
-    return {
-        "pixel": telling_pixel(answer.capture, answer.run.image),
-        "viewing": Viewing(field_of_view_deg=field_of_view_deg),
-        "comparison": replace(comparison, viewing=compared),
-    }
+    return {"pixel": telling_pixel(answer.capture, answer.run.image)}
 
 
-def enter(
-    state: State, answer: Answer, previous: Answer | None, previous_width_deg: float | None = None
-) -> None:
+def enter(state: State, answer: Answer, previous: Answer | None) -> None:
     """Adapt the state to another capture; keep what still holds for it.
 
     Parameters
@@ -61,8 +47,6 @@ def enter(
     state : State
     answer, previous : Answer
         Its estimate, and the one before.
-    previous_width_deg : float, optional
-        The field of view that suited the capture before.
     """
     for name, possible in possible_kinds(answer).items():
         state.param[name].objects = possible
@@ -71,20 +55,14 @@ def enter(
     own = defaults_of(answer)
     here = {"pixel": state.pixel, "pins": state.pins, "region": state.region}
     kept: dict[str, Any] = {} if previous is None else carried(here, previous, answer)
-    of_scene: dict[str, Any] = {}
+    changed: dict[str, Any] = {}
     if previous is not None and not _same_scene(previous, answer):
-        of_scene, kept["crop"] = {"color_from_m": None, "color_to_m": None}, Crop()
-    has_same_width = previous is not None and same_pixels(answer, previous)
-
-    def adapted(viewing: Viewing) -> Viewing:
-        if has_same_width and viewing.field_of_view_deg != previous_width_deg:  # set by the user
-            return replace(viewing, **of_scene)
-        width_deg = own["viewing"].field_of_view_deg
-        return replace(viewing, field_of_view_deg=width_deg, **of_scene)
-
-    compared = replace(state.comparison, viewing=adapted(state.comparison.viewing))
+        changed, kept["crop"] = {"color_from_m": None, "color_to_m": None}, Crop()
+    if previous is None or not same_pixels(answer, previous):
+        changed["field_of_view_deg"] = None
+    compared = replace(state.comparison, viewing=replace(state.comparison.viewing, **changed))
     state.param.update(
-        viewing=adapted(state.viewing),
+        viewing=replace(state.viewing, **changed),
         comparison=compared,
         **{"pixel": own["pixel"], "pins": (), "region": ()} | kept,
     )
@@ -117,15 +95,3 @@ def carried(here: Mapping[str, Any], before: Answer, answer: Answer) -> dict[str
         "pins": tuple(pins),
         "region": region if holds_some else (),
     }
-
-
-def own_field_of_view_deg(answer: Answer) -> float:
-    """Return the image's width as the capture states it; else about as wide as the scene is deep.
-
-    Rounded to three digits, for links.
-    """
-    acquisition, image = answer.capture.acquisition, answer.run.image
-    if acquisition.pixel_angle_rad is None:
-        return guessed_field_of_view_deg(image.range_m, image.confidence, acquisition)
-    half_width = answer.capture.shape[1] / 2 * np.tan(acquisition.pixel_angle_rad)
-    return float(f"{np.degrees(2 * np.arctan(half_width)):.3g}")

@@ -157,7 +157,7 @@ def cloud_of(
     """Return the points inside a box, their colours, and which are wrong; None without a truth."""
     visible = shown(answer, viewing.least_confidence, box)
     values, look = color_values(answer, kind, viewing)
-    angle_rad = pixel_angle_of(viewing.field_of_view_deg, answer.capture.shape[1])
+    angle_rad = pixel_angle_of(answer.field_of_view_deg(viewing), answer.capture.shape[1])
     range_m = np.where(visible, answer.run.image.range_m, np.nan)
     wrong = is_wrong(answer)
     return (

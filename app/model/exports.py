@@ -239,7 +239,7 @@ def _product(answer: Answer, least_confidence: float, box: Box = WHOLE, **more: 
 # Reports
 
 
-def report_file(answer: Answer, state: State, title: str, own_field_of_view_deg: float) -> Write:
+def report_file(answer: Answer, state: State, title: str) -> Write:
     """Return the report on the capture, the estimate and the pixel on screen, as HTML.
 
     Parameters
@@ -249,19 +249,17 @@ def report_file(answer: Answer, state: State, title: str, own_field_of_view_deg:
         How it is shown.
     title : str
         Of the report.
-    own_field_of_view_deg : float
-        The capture's own; where it is shown, `core` states whether it is a guess.
     """
     viewing = state.viewing
-    is_own = viewing.field_of_view_deg == own_field_of_view_deg
-    angle_rad = pixel_angle_of(viewing.field_of_view_deg, answer.capture.shape[1])
+    chosen_deg = viewing.field_of_view_deg
+    chosen_rad = None if chosen_deg is None else pixel_angle_of(chosen_deg, answer.capture.shape[1])
     return partial(
         write_report,
         answer.capture,
         answer.run.image,
         pixel=state.pixel,
         least_confidence=viewing.least_confidence,
-        pixel_angle_rad=None if is_own else angle_rad,
+        pixel_angle_rad=chosen_rad,  # `core` states whether its own is a guess
         title=title,
         script=script_of(answer, state),
     )
@@ -270,18 +268,14 @@ def report_file(answer: Answer, state: State, title: str, own_field_of_view_deg:
 # Clouds
 
 
-def cloud_files(
-    answer: Answer, kind: str, viewing: Viewing, is_width_guessed: bool, box: Box = WHOLE
-) -> dict[str, Write]:
+def cloud_files(answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE) -> dict[str, Write]:
     """Return the points of `app.model.colors.cloud_of` in their colours on screen.
 
     Parameters
     ----------
     answer : Answer
     kind, viewing, box
-        As for `cloud_of`.
-    is_width_guessed : bool
-        Whether the field of view is a guess; the files then say so.
+        As for `cloud_of`. Where the field of view is a guess, the files say so.
 
     Raises
     ------
@@ -292,7 +286,8 @@ def cloud_files(
         raise ValueError(NO_POINTS)
     if not shown(answer, viewing.least_confidence, box).any():
         raise ValueError(NO_POINTS_INSIDE)
-    remark = guessed_angle(viewing.field_of_view_deg) if is_width_guessed else ""
+    is_guessed = answer.is_width_guessed(viewing)
+    remark = guessed_angle(answer.own_field_of_view_deg) if is_guessed else ""
     prepare = partial(_cloud, answer, kind, viewing, box, remark)
 
     def table(file: BinaryIO) -> None:

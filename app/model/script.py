@@ -137,7 +137,7 @@ def _single_estimate(answer: Answer, state: State) -> Lines:
     kind = state.map if is_inspect else state.image
     method = literal(answer.method)
     yield from _estimate(answer, state)
-    yield from _angle(state.viewing)
+    yield from _angle(answer, state.viewing)
     yield f"picture = {IMAGES[kind]}"
     yield "\n# Signals of one pixel."
     yield f"row, col = {state.pixel[0]}, {state.pixel[1]}"
@@ -220,8 +220,10 @@ def _shown(least_confidence: float) -> Lines:
     yield assign("shown", "image.confident", literal(least_confidence))
 
 
-def _angle(viewing: Viewing) -> Lines:
-    arguments = literal(viewing.field_of_view_deg), "capture.shape[1]"
+def _angle(answer: Answer, viewing: Viewing) -> Lines:
+    if answer.is_width_guessed(viewing):
+        yield "\n# The horizontal field of view in degrees is a guess: the capture states none."
+    arguments = literal(answer.field_of_view_deg(viewing)), "capture.shape[1]"
     yield assign("angle_rad", "core.geometry.pixel_angle_of", *arguments)
 
 
@@ -267,7 +269,7 @@ def _comparison(answer: Answer, state: State) -> Lines:
     has_clouds = chosen.kind == CLOUDS
     yield "\n# Save the images. `shown` has only pixels of sufficient confidence."
     if has_clouds:
-        yield from _angle(chosen.viewing)
+        yield from _angle(answer, chosen.viewing)
     yield "pictures = {}"
     yield "for method, image in images.items():"
     kind = chosen.kind if chosen.kind in ("Error", "Confidence") else "Estimate"

@@ -68,10 +68,20 @@ class Visibility:
         "Estimates with less confidence are hidden in image and cloud, but count in the figures. "
         "0 also shows estimates from noise alone.",
     )
-    field_of_view_deg: float = parameter(
-        5.0,
-        Number("Field of view", 0.001, 120.0, log=True, unit="degrees", least=0.0, open_below=True),
-        "Horizontal field of view of the sensor; determines the width of the cloud in metres.",
+    field_of_view_deg: float | None = parameter(
+        None,
+        Number(
+            "Field of view",
+            0.001,
+            120.0,
+            log=True,
+            unit="degrees",
+            least=0.0,
+            open_below=True,
+            optional=True,
+        ),
+        "Horizontal field of view of the sensor; determines the width of the cloud in metres. "
+        "Empty: as the capture states it, else a guess.",
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.model.methods import default_settings, suitable_method
-from app.model.state import AUTOMATIC, Illumination, ReductionSettings
+from app.model.state import AUTOMATIC, Illumination, ReductionSettings, Viewing
 from core import (
     CORRECTIONS,
     ESTIMATORS,
@@ -39,6 +39,7 @@ from core import (
     without_correction,
 )
 from core.cost import Cost, predicted
+from core.geometry import guessed_field_of_view_deg
 from core.inference import has_posterior, pixel_range_intervals, posterior_of
 from core.inspection import PixelReport
 from core.io import ReadOptions, files_of
@@ -245,6 +246,8 @@ class Answer:
     """Seconds spent simulating or reading."""
     whole: Capture
     """The capture before its reduction."""
+    own_field_of_view_deg: float
+    """Horizontal field of view that the capture states, else a guess; see `field_of_view_deg`."""
     cutout: Cutout | None = None
     """The part in memory of a file larger than memory."""
     requested: ReductionSettings = field(default_factory=ReductionSettings)
@@ -265,6 +268,16 @@ class Answer:
     def settings(self) -> Any:
         """Settings of the estimator."""
         return self.request.settings_of(self.method)
+
+    def field_of_view_deg(self, viewing: Viewing) -> float:
+        """Return the field of view that the user has set, else the capture's own."""
+        chosen = viewing.field_of_view_deg
+        return self.own_field_of_view_deg if chosen is None else chosen
+
+    def is_width_guessed(self, viewing: Viewing) -> bool:
+        """Return whether the field of view is neither stated by the capture nor set by the user."""
+        is_stated = self.capture.acquisition.pixel_angle_rad is not None
+        return viewing.field_of_view_deg is None and not is_stated
 
     @property
     def grid(self) -> Grid:
@@ -314,7 +327,23 @@ def compute(request: Request, previous: Answer | None) -> Answer:
             capture = replace(capture, source=source)
         capture_s = perf_counter() - started
     estimated, flux_s = _estimate(capture, request, previous)
-    return Answer(request, estimated, capture_s + flux_s, whole, cutout, requested)
+    if previous is not None and same_view(request, previous.request):
+        width_deg = previous.own_field_of_view_deg  # the cloud keeps its width
+    else:
+        width_deg = _own_field_of_view_deg(estimated)
+    return Answer(request, estimated, capture_s + flux_s, whole, width_deg, cutout, requested)
+
+
+def _own_field_of_view_deg(run: Run) -> float:
+    """Return the image's width as the capture states it; else about as wide as the scene is deep.
+
+    Rounded to three digits, as a form shows it.
+    """
+    acquisition, image = run.capture.acquisition, run.image
+    if acquisition.pixel_angle_rad is None:
+        return guessed_field_of_view_deg(image.range_m, image.confidence, acquisition)
+    half_width = run.capture.shape[1] / 2 * np.tan(acquisition.pixel_angle_rad)
+    return float(f"{np.degrees(2 * np.arctan(half_width)):.3g}")
 
 
 def _estimate(capture: Capture, request: Request, previous: Answer | None) -> tuple[Run, float]:

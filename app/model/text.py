@@ -10,13 +10,14 @@ from concurrent.futures import BrokenExecutor
 from app.model.methods import METHOD_TITLES
 from app.model.state import AUTOMATIC
 from app.model.store import Answer, Pixel
-from app.units import Scale, between, plus_minus, typeset
+from app.units import Scale, between, plus_minus
 from app.units import milliseconds as milliseconds  # noqa: PLC0414
 from app.units import number as number  # noqa: PLC0414
 from app.units import share as share  # noqa: PLC0414
 from core.io import TRUTH_OPTIONS, with_labels
 from core.metrics import Interval
 from core.studies.ablation import TITLES
+from core.typesetting import typeset
 
 Fact = tuple[str, str, str]
 """Name, value and help; a value that is a number is an `app.units.Quantity`."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
@@ -20,6 +20,7 @@ from weakref import WeakSet, WeakValueDictionary, finalize
 from app.model.store import Source, file_source
 from core import Capture
 from core.checks import require
+from core.io import pattern_of
 
 MEBIBYTE = 2**20
 
@@ -38,21 +39,30 @@ class Bounds:
 
 
 class _Upload:
-    """A file in a folder of its own, which is deleted with this object or with the process.
+    """Files in a folder of their own, which is deleted with this object or with the process.
+
+    The path of several is the pattern of their names: they are a sequence.
 
     Raises
     ------
+    ValueError
+        If the names of several files do not follow one pattern.
     OSError
-        If it cannot be written; the folder is deleted then.
+        If they cannot be written; the folder is deleted then.
     """
 
-    def __init__(self, name: str, content: bytes, user: object) -> None:
+    def __init__(self, files: Mapping[str, bytes], user: object) -> None:
+        stored = {safe_name(name): content for name, content in files.items()}
+        pattern = pattern_of(list(stored))
+        fits = pattern is not None and len(stored) == len(files)
+        require("files", ", ".join(files), fits, "names that differ in numbers only")
         folder = mkdtemp(prefix="firstphoton-")
         self.remove = finalize(self, rmtree, folder, ignore_errors=True)
-        self.n_bytes, self.users = len(content), WeakSet([user])
-        self.path = Path(folder) / safe_name(name)
+        self.n_bytes, self.users = _size(files), WeakSet([user])
+        self.path = Path(folder) / str(pattern)
         try:
-            self.path.write_bytes(content)
+            for name, content in stored.items():
+                (Path(folder) / name).write_bytes(content)
         except OSError:
             self.remove()
             raise
@@ -64,8 +74,8 @@ class Uploads:
     """Uploaded files of all sessions, in temporary folders.
 
     A user is any object that stands for a session. A file counts towards the limits of each user,
-    whoever uploaded it. It is deleted with its last user, and all files are deleted when the
-    process ends.
+    whoever uploaded it; a sequence counts as one file. It is deleted with its last user, and all
+    files are deleted when the process ends.
 
     Parameters
     ----------
@@ -77,21 +87,27 @@ class Uploads:
         self._uploads: dict[str, _Upload] = {}
         self._lock = Lock()
 
-    def add(self, name: str, content: bytes, user: object) -> str:
-        """Store a file for a user, and return its key.
+    def add(self, files: Mapping[str, bytes], user: object) -> str:
+        """Store a file, or the files of a sequence, for a user, and return the key.
+
+        Parameters
+        ----------
+        files : mapping of str to bytes
+            Contents by name. Names of several files differ in numbers only.
+        user : object
 
         Raises
         ------
         ValueError
-            If a limit is exceeded.
+            If a limit is exceeded, or the names do not fit.
         OSError
-            If the file cannot be written.
+            If a file cannot be written.
         """
         with self._lock:
             self._delete_unused()
-            self._require_room(len(content), user)
+            self._require_room(_size(files), user)
             key = secrets.token_urlsafe(16)
-            self._uploads[key] = _Upload(name, content, user)
+            self._uploads[key] = _Upload(files, user)
             return key
 
     def use(self, key: str, user: object) -> Source | None:
@@ -144,6 +160,10 @@ def _require_size(what: str, n_bytes: int, most_bytes: int) -> None:
     size = f"{n_bytes / MEBIBYTE:.1f} MiB"
     accepted = f"at most {most_bytes / MEBIBYTE:.0f} MiB, or the path of the file{_OPTION}"
     require(f"size of {what}", size, n_bytes <= most_bytes, accepted)
+
+
+def _size(files: Mapping[str, bytes]) -> int:
+    return sum(map(len, files.values()))
 
 
 def cached_while_used(load: Callable[..., Capture]) -> Callable[..., Capture]:

@@ -42,7 +42,7 @@ from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import file_button
 from app.widgets.share import Share
 from core import PRESETS, TrackingParameters
-from core.io import SUFFIXES, ReadOptions
+from core.io import SUFFIXES, ReadOptions, pattern_of
 
 CUSTOM = "custom"
 
@@ -239,6 +239,7 @@ class Layout:
             SUFFIXES,
             self._upload,
             lambda reason: session.failures.show(text.not_uploaded(reason, MAX_UPLOAD_BYTES)),
+            multiple=True,
         )
         self._follow = pmui.Switch(
             label="Follow new captures",
@@ -432,15 +433,20 @@ class Layout:
         if name in PRESETS:
             self.session.state.tracking = PRESETS[name]
 
-    def _upload(self, name: str, content: bytes) -> None:
+    def _upload(self, files: dict[str, bytes]) -> None:
+        """Offer files as one sequence in time if their names say so, else each by itself."""
+        is_sequence = pattern_of(list(files)) is not None
+        keys = []
         try:
-            key = self._uploads.add(name, content, self)
+            for each in [files] if is_sequence else [{name: files[name]} for name in files]:
+                keys.append(self._uploads.add(each, self))
         except (ValueError, OSError) as error:
             self.session.failures.show(text.not_kept(error))
-            return
-        self.session.sources.update(self._with_uploads({}, key))
-        self._source.options = self._titles()
-        self._uploaded = self._source.value = key
+        for key in keys:
+            self.session.sources.update(self._with_uploads({}, key))
+        if keys:
+            self._source.options = self._titles()
+            self._uploaded = self._source.value = keys[0]
 
     def _read(self, options: ReadOptions) -> None:
         """Read the file that the form is for: the one on screen, or the one that was refused."""

@@ -11,7 +11,7 @@ from urllib.parse import parse_qsl, urlencode
 from app.model.address import Link, query_of
 from app.model.capture_defaults import defaults_of
 from app.model.restore import parameters_of, parsed, places, restore
-from app.model.state import State, Viewing
+from app.model.state import State
 from app.model.store import COMPUTED_FROM, Answer, Request, Source
 from app.pages.shared.estimate import CurrentEstimate
 from app.pages.shared.failures import FailureLog
@@ -78,20 +78,6 @@ class Session:
     def page(self) -> Any:
         """The document that the browser shows; None without a browser."""
         return self.tasks.document
-
-    @property
-    def own_field_of_view_deg(self) -> float:
-        """The field of view that suits the present capture."""
-        return self.estimate.own_field_of_view_deg
-
-    def is_width_guessed(self, viewing: Viewing) -> bool:
-        """Return whether a field of view is neither stated by the file nor set by the user."""
-        is_known = self.answer.capture.acquisition.pixel_angle_rad is not None
-        return not is_known and self.has_own_width(viewing)
-
-    def has_own_width(self, viewing: Viewing) -> bool:
-        """Return whether a field of view is the one that suits the present capture."""
-        return viewing.field_of_view_deg == self.own_field_of_view_deg
 
     def query(self) -> str:
         """Return the query of a link to what the page shows."""

@@ -13,6 +13,9 @@ from app.tasks.scheduler import GENERAL, Act, Lane, Latest, LongWork
 from app.tasks.signals import Signal
 from app.tasks.turns import TURNS
 
+AWAY_S = 5.0
+"""Time without a connection after which a page counts as away; a lost one is back sooner."""
+
 
 class PageTasks:
     """Runs callbacks on the thread of the page that is being built, and its work elsewhere.
@@ -42,6 +45,14 @@ class PageTasks:
     def is_gone(self) -> bool:
         """Whether the page's session has ended."""
         return self._was_served and not self.is_served
+
+    @property
+    def is_away(self) -> bool:
+        """Whether the page has had no connection for some seconds: closed, reloaded, or offline."""
+        session = self.document.session_context.session if self.is_served else None
+        if session is None or session.connection_count:
+            return False
+        return bool(session.milliseconds_since_last_unsubscribe > 1000 * AWAY_S)
 
     @property
     def is_at_hand(self) -> bool:

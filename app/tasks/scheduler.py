@@ -32,9 +32,16 @@ class PageThread(Protocol):
     def is_at_hand(self) -> bool:
         """Whether the caller is on the page's thread and no other page is waiting."""
 
+    def call_later(self, wait_ms: int, act: Act) -> None:
+        """Call a function after a delay."""
+
     @property
     def is_gone(self) -> bool:
         """Whether the page's session has ended."""
+
+    @property
+    def is_away(self) -> bool:
+        """Whether no browser has shown the page for some seconds."""
 
 
 class Lane:
@@ -230,10 +237,19 @@ class _Run:
     is_running: bool = False
     is_working: bool = False
     is_reporting: bool = False
+    is_interrupted: bool = False
+
+
+RETURN_MS = 1000
+"""Time between two looks for the browser of a page that is away."""
 
 
 class LongWork:
     """Work in steps that can be paused in between, or in one piece that reports its progress.
+
+    While the page is away nothing is computed for it: no further step is started, and one that
+    looks whether it is cancelled ends. What was drawn remains, and the work goes on with that step
+    once the page is back.
 
     Parameters
     ----------
@@ -296,7 +312,10 @@ class LongWork:
 
     def _continue(self, run: _Run) -> None:
         if run.is_running and not run.is_working and not self._is_paused:
-            run.is_working = True
+            if self._page.is_away:
+                self._page.call_later(RETURN_MS, partial(self._continue, run))
+                return
+            run.is_working, run.is_interrupted = True, False
             step = run.steps[run.next_step]
             self._channel.submit(
                 step.work, partial(self._draw, run, step), partial(self._fail, run)
@@ -314,7 +333,10 @@ class LongWork:
         self._continue(run)
 
     def _fail(self, run: _Run, error: Exception) -> None:
-        if run.is_running:  # else it was cancelled
+        if run.is_interrupted and run.is_running:
+            run.is_working = False
+            self._continue(run)
+        elif run.is_running:  # else it was cancelled
             self.cancel()
             self._failed(error)
 
@@ -330,4 +352,6 @@ class LongWork:
             self._changed()
 
     def _is_cancelled(self, run: _Run) -> bool:
-        return not run.is_running or self._page.is_gone or STUDIES.is_closed
+        run.is_interrupted = run.is_interrupted or self._page.is_away
+        is_over = not run.is_running or self._page.is_gone or STUDIES.is_closed
+        return is_over or run.is_interrupted

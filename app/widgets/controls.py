@@ -34,7 +34,7 @@ class Knob(Component):
 
     Unreliable values are marked on the slider; while one of them is set, a sentence says why. Only
     values between `low` and `high` can be set; the field refuses others with a sentence. An
-    optional number has no slider; an empty field stands for None.
+    optional number has no slider, unless its substitute is known; an empty field stands for None.
 
     A position along the gate is shown and typed in the unit of a `Scale`; the value itself, and its
     bounds, remain in bins or in shares of the gate.
@@ -51,6 +51,7 @@ class Knob(Component):
     whole = param.Boolean(default=False)
     optional = param.Boolean(default=False, doc="Whether the field may be empty.")
     empty = param.String(default="automatic", doc="Meaning of an empty field.")
+    substitute = param.Number(default=None, doc="Number for which an empty field stands.")
     label = param.String(default="")
     unit = param.String(default="")
     along = param.List(

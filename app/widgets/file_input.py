@@ -14,16 +14,20 @@ from core.checks import require
 PART_BYTES = 4 * 2**20
 """Size of the parts in which a file arrives, each in its own message."""
 
+MOST_FILES = 500
+"""Files that can be chosen at once."""
+
 _LONGEST_NAME = 1024
 
 
 def file_button(
     label: str,
     suffixes: Iterable[str],
-    receive: Callable[[str, bytes], None],
+    receive: Callable[[dict[str, bytes]], None],
     complain: Callable[[str], None],
+    multiple: bool = False,
 ) -> FileInput:
-    """Return a button that opens a file.
+    """Return a button that opens a file, or several at once.
 
     Parameters
     ----------
@@ -31,12 +35,15 @@ def file_button(
     suffixes : iterable of str
         For the dialog that it opens.
     receive : callable
-        Called with the name and the content of each file.
+        Called with the contents of the files by name.
     complain : callable
         Called with the reason where a file is refused.
+    multiple : bool
+        Whether several files can be chosen.
     """
     made = FileInput(
         complain,
+        multiple=multiple,
         label=label,
         accept=",".join(suffixes),
         max_file_size=MAX_UPLOAD_BYTES,
@@ -46,17 +53,18 @@ def file_button(
         margin=(4, 8),
     )
 
-    def take(content: bytes | None) -> None:
+    def take(content: Any) -> None:
         if content:
             made.value = None  # the same file can be chosen again
-            receive(made.filename, content)
+            names, contents = (made.filename, content) if multiple else ([made.filename], [content])
+            receive(dict(zip(names, contents, strict=True)))
 
     made.param.watch(lambda event: take(event.new), "value")
     return made
 
 
 class FileInput(pmui.FileInput):
-    """Accept one file at a time, of at most `max_file_size` bytes.
+    """Accept one file at a time, or several if `multiple`, of at most `max_file_size` bytes in all.
 
     The browser checks the size first, but a client may send anything.
 
@@ -67,7 +75,9 @@ class FileInput(pmui.FileInput):
     """
 
     def __init__(self, complain: Callable[[str], None], **params: Any) -> None:
-        super().__init__(chunk_size=PART_BYTES, **params)
+        super().__init__(
+            chunk_size=PART_BYTES, max_total_file_size=params.get("max_file_size"), **params
+        )
         self._complain = complain
 
     def _handle_msg(self, msg: Mapping[str, Any]) -> None:
@@ -98,8 +108,16 @@ class FileInput(pmui.FileInput):
         require("number of a part", number, fits, f"1 to {total}")
         fits = isinstance(data, bytes) and len(data) <= PART_BYTES
         require("content of a part", type(data).__name__, fits, f"at most {PART_BYTES:,} bytes")
-        is_one = not self._buffer and all(kept == name for kept in self._file_buffer)
+        earlier = {kept["filename"] for kept in self._buffer}
+        is_next = name not in earlier if self.multiple else not earlier
+        is_one = is_next and all(kept == name for kept in self._file_buffer)
         require("file name", name, is_one, "one file at a time")
+        n_files = len(earlier) + 1
+        require("files at once", n_files, n_files <= MOST_FILES, f"up to {MOST_FILES}")
+        size = len(data) + sum(len(kept["value"]) for kept in self._buffer)
+        size += sum(map(len, self._file_buffer.get(name, {"chunks": {}})["chunks"].values()))
+        most_bytes = f"at most {self.max_file_size:,}"
+        require("bytes of the files", size, size <= self.max_file_size, most_bytes)
 
     def _discard(self) -> None:
         self._file_buffer.clear()

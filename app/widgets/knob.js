@@ -57,13 +57,15 @@ export function render({ model }) {
     field.setAttribute("aria-invalid", message !== "");
   };
   const show = () => {
-    const { value, low, high, initial, parts, log, doubtful } = model;
-    track.parentElement.hidden = model.optional;
-    field.placeholder = model.optional ? model.empty : "";
+    const { value, low, high, initial, parts, log, doubtful, substitute } = model;
+    const effective = value ?? substitute;
+    const empty = [model.empty, text(substitute)].filter(Boolean).join(" ");
+    track.parentElement.hidden = model.optional && substitute === null;
+    field.placeholder = model.optional ? empty : "";
     track.max = parts && !log ? Math.round((high - low) * parts) : STEPS;
-    track.value = toPosition(value);
+    track.value = toPosition(effective);
     track.style.setProperty("--filled", `${(100 * track.value) / track.max}%`);
-    track.setAttribute("aria-valuetext", `${text(value)} ${model.unit}`);
+    track.setAttribute("aria-valuetext", `${text(effective)} ${model.unit}`);
     field.value = text(value);
     label.textContent = model.label;
     unit.textContent = model.unit && `(${model.unit})`;
@@ -83,7 +85,7 @@ export function render({ model }) {
     ask.title = help.textContent;
     ask.setAttribute("aria-label", `Help on ${model.label}`);
     track.title = model.help;
-    const initially = text(initial) || model.empty;
+    const initially = text(initial) || empty;
     reset.title = `Reset to ${initially}`;
     reset.setAttribute("aria-label", `Reset ${model.label} to ${initially}`);
     reset.style.visibility = value === initial ? "hidden" : "visible";
@@ -123,7 +125,8 @@ export function render({ model }) {
     ask.setAttribute("aria-expanded", String(!help.hidden));
   });
 
-  model.on(["value", "low", "high", "initial", "label", "doubtful", "along"], show);
+  const shown = ["value", "low", "high", "initial", "label", "doubtful", "along"];
+  model.on([...shown, "empty", "substitute"], show);
   show();
   return root;
 }

@@ -18,6 +18,7 @@ from core.inspection.pixel import flux_unit, lag_bins
 from core.inspection.profile import FluxEstimate, OldFluxNames
 from core.metrics import Interval
 from core.tracking import START_BINS, TrackingParameters
+from core.typesetting import interval_text, three_digits
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,8 @@ def _flux_remark(capture: Capture, found: MeanFlux) -> str:
     """Return how far the fluxes can be trusted, in sentences."""
     begin_s, end_s = capture.pulse.span_s
     fitted_begin_s, fitted_end_s = found.pulse.span_s
-    unit, wide = flux_unit(capture), (fitted_end_s - fitted_begin_s) / (end_s - begin_s)
+    unit = flux_unit(capture)
+    wide = three_digits((fitted_end_s - fitted_begin_s) / (end_s - begin_s))
     if found.free is None:
         remark = "Too few bins are known to be free of echoes to check the background."
     else:
@@ -129,12 +131,12 @@ def _flux_remark(capture: Capture, found: MeanFlux) -> str:
             else "they agree."
         )
     if found.pulse != capture.pulse:
-        remark += f" The echoes are {wide:.2g} times as long as the pulse, which does not fit."
+        remark += f" The echoes are {wide} times as long as the pulse, which does not fit."
     return remark
 
 
 def _text(found: Interval) -> str:
-    return f"{found.value:.3g} [{found.low:.3g}, {found.high:.3g}]"
+    return interval_text(found.value, found.low, found.high)
 
 
 @cached_per_capture

@@ -11,7 +11,7 @@ from core.io.readers.options import (
     with_flags,
     with_labels,
 )
-from core.io.readers.sequence import files_of
+from core.io.readers.sequence import files_of, pattern_of
 from core.io.readers.truth import (
     TRUTH_OPTIONS,
     TRUTH_UNITS,
@@ -68,6 +68,7 @@ __all__ = [
     "files_of",
     "guessed_angle",
     "open_capture",
+    "pattern_of",
     "possible_truths",
     "range_scale",
     "read_capture",

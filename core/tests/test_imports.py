@@ -14,15 +14,15 @@ import core
 PACKAGE = Path(core.__file__).parent
 
 ROOMS = (
-    {"kernels", "checks", "deprecation", "notebook", "scripts", "version"},
+    {"kernels", "checks", "deprecation", "notebook", "scripts", "typesetting", "version"},
     {"parameters", "acquisition"},
     {"trigger", "effects", "geometry", "labels", "metrics", "tracking_parameters"},
     {"scene", "tracking", "capture"},
     {"simulation", "reductions", "inference"},
     {"corrections", "cost"},
     {"estimators"},
-    {"inspection", "pipeline", "warmup", "io"},
-    {"out_of_core", "report"},
+    {"inspection", "pipeline", "io"},
+    {"out_of_core", "report", "warmup"},
     {"studies"},
     {"cli"},
 )

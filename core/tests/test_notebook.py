@@ -33,8 +33,11 @@ ENGINES: dict[str, dict[str, Any]] = {
 }
 
 
+EXAMPLES = ("core", "core.io.names", "core.io.readers.sequence", "core.typesetting")
+
+
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ["core", "core.io.names"])
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_give_the_results_they_show(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

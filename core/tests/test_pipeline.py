@@ -62,7 +62,7 @@ def test_without_truth_there_are_no_figures() -> None:
     assert run(Capture(capture.cube, capture.acquisition), "peak").figures == {}
 
 
-def test_nothing_is_left_to_compile_after_warming_up() -> None:
+def test_nothing_is_left_to_compile_or_import_after_warming_up() -> None:
     # In a fresh process, whose kernels no other test has entered.
     script = """
 import core, numba, sys
@@ -75,14 +75,16 @@ kernels = [each for module in modules for each in vars(module).values()
            if isinstance(each, Dispatcher) and each.__module__ == module.__name__]
 assert bool(kernels) != bool(numba.config.DISABLE_JIT)
 core.warm_up()
-warm = [len(each.signatures) for each in kernels]
+warm, imported = [len(each.signatures) for each in kernels], set(sys.modules)
 scene = core.scenes["uniform"](8)
 capture = core.simulate(scene, scene.acquisition, core.Flux())
 for method in core.ESTIMATORS:
     core.run(capture, method)
 for settings in core.PRESETS.values():
     core.tracking_signals(capture.cube, settings)
-    core.estimate(capture, "tracking", settings)
+    image = core.estimate(capture, "tracking", settings)
+core.inspection.pixel_report(capture, image, 0, 0)
+assert not {name for name in set(sys.modules) - imported if name.startswith("scipy")}
 assert [len(each.signatures) for each in kernels] == warm
 """
     root = Path(core.__file__).parents[1]

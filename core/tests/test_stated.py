@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.io import savemat
 
 from core import Capture, StatedFlux, estimate, read_capture, save_capture, scenes, simulate
-from core.acquisition import Flux
+from core.acquisition import Flux, Pulse
 from core.cli import main
 from core.inspection import capture_report
 from core.io.writers import CAPTURE_SUFFIXES
@@ -34,11 +35,18 @@ def mat73(path: Path, counts: Any, **numbers: float) -> None:
     path.write_bytes(file.bytes())
 
 
+def labelled(counts: Any, **numbers: float) -> xr.Dataset:
+    """Counts, and numbers as arrays without axes."""
+    return xr.Dataset({"counts": (("row", "col", "bin"), counts.astype(np.int32)), **numbers})
+
+
 WRITE: dict[str, Callable[..., Any]] = {
     "v5.mat": lambda path, **known: savemat(path, known),
     "v73.mat": mat73,
     "a.npz": np.savez,
     "a.h5": lambda path, **known: path.write_bytes(hdf5_bytes(**known)),
+    "a.zarr": lambda path, **known: labelled(**known).to_zarr(path, consolidated=False),
+    "a.nc": lambda path, **known: labelled(**known).to_netcdf(path, engine="scipy"),
 }
 
 
@@ -60,6 +68,25 @@ def test_stated_fluxes_are_read_by_many_names_and_change_no_estimate(
     for method in ("likelihood", "tracking"):
         images = [estimate(each, method) for each in (found, bare)]
         np.testing.assert_array_equal(images[0].range_m, images[1].range_m)
+
+
+@pytest.mark.parametrize("name", WRITE)
+def test_pulses_and_bin_width_are_read_by_other_names_only_where_these_are_plain(
+    name: str, tmp_path: Path
+) -> None:
+    counts = np.ones((3, 4, 8), np.uint16)
+    plain = {"Num_Shots": 200.0, "bin_width_ps": 512.0}
+    for number, (stated, expected) in enumerate(
+        (
+            (plain, (200, 512e-12)),
+            (plain | {"pulses": 300.0, "bin_size_ns": 1.0}, (None, 1e-9)),  # contradictions
+            ({"n_frames": 200.0, "cycles": 200.0}, (None, 1e-9)),  # ambiguous
+        )
+    ):
+        path = tmp_path / f"{number}{name}"
+        WRITE[name](path, counts=counts, **stated)
+        found = read_capture(path, pulse=Pulse()).acquisition
+        assert (found.n_pulses, found.bin_width_s) == expected
 
 
 @pytest.mark.parametrize("suffix", CAPTURE_SUFFIXES)

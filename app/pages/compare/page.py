@@ -44,6 +44,7 @@ from app.pages.shared.downloads import (
     viewed,
 )
 from app.pages.shared.section import Section
+from app.pages.shared.viewing import show_own_width
 from app.theme import method_style, palette
 from app.widgets.cards import card, part
 from app.widgets.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table, legend_line
@@ -370,9 +371,8 @@ class Compare(Section):
         self._reliability_card.visible = has_truth  # a reliability diagram requires the truth
         if session.scene_id() != self._scene_id:
             self._scene_id = session.scene_id()
-            own = session.own_field_of_view_deg
             self._viewing.show(self._chosen.viewing)
-            self._viewing.controls["field_of_view_deg"].initial = own
+            show_own_width(self._viewing, session.answer)
             cloud, _, wrong = cloud_of(session.answer, "Range", session.state.viewing)
             self._bounds = view_bounds(cloud, None if wrong is None else ~wrong)
         for picture in self.pictures:
@@ -440,8 +440,7 @@ class Compare(Section):
         image_kind = IMAGE_KINDS.get(kind, kind)
         _, look = image_of(self.session.answer, image_kind, viewing)
         if kind == CLOUDS:
-            is_guessed = self.session.is_width_guessed(viewing)
-            what, files = "cloud", cloud_files(answer, "Range", viewing, is_guessed)
+            what, files = "cloud", cloud_files(answer, "Range", viewing)
         else:
             figure = self.pictures[place].image.figure
             files = image_files(answer, image_kind, viewing, figure, look, method_title(method))

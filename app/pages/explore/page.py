@@ -31,6 +31,7 @@ from app.pages.shared.downloads import (
 )
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
+from app.pages.shared.viewing import show_own_width
 from app.plots.gate_cut import Cut
 from app.tasks.turns import TURNS
 from app.theme import WRONG_COLOR
@@ -177,9 +178,7 @@ class Explore(Section):
         """Return the cloud, for a download, with the colour scale of the image."""
         session, state = self.session, self.session.state
         _, look = color_values(session.answer, state.cloud_color, state.viewing)
-        is_guessed = session.is_width_guessed(state.viewing)
-        chosen = state.cloud_color, state.viewing, is_guessed, state.box
-        files = cloud_files(session.answer, *chosen)
+        files = cloud_files(session.answer, state.cloud_color, state.viewing, state.box)
         heading = f"3D cloud, coloured by {state.cloud_color.lower()}"
         subject = cropped(session, viewed(session, explored(session), state.viewing))
         return Shown(subject, "cloud", files, heading, look)
@@ -219,8 +218,7 @@ class Explore(Section):
 
     def _show_sidebar(self) -> None:
         self._viewing.show(self.session.state.viewing)
-        own = self.session.own_field_of_view_deg
-        self._viewing.controls["field_of_view_deg"].initial = own
+        show_own_width(self._viewing, self.session.answer)
 
     def _draw_pixel(self) -> None:
         """Draw the pixel's plots and numbers, and the frames that mark it."""
@@ -268,7 +266,7 @@ class Explore(Section):
             values, look = image_of(answer, state.image, state.viewing)
             self.image.update(values, look)
             self.legend.text = legend(answer, state.image, state.viewing, values, look)
-            box, is_guessed = state.box, self.session.is_width_guessed(state.viewing)
+            box, is_guessed = state.box, answer.is_width_guessed(state.viewing)
             cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing, box)
             # Another box is framed by the camera, like another scene.
             self.cloud.draw(cloud, rgb, crosses, scene_id=f"{self.session.scene_id()} {box}")

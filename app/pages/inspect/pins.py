@@ -112,9 +112,7 @@ class PinsSection(Section):
         self._write_note()
 
     def _write_note(self) -> None:
-        viewing = self.session.state.viewing
-        is_guessed = self.session.is_width_guessed(viewing)
-        distances = text.distances(self.found, viewing, is_guessed)
+        distances = text.distances(self.found, self.session.state.viewing)
         self.note.text = distances if self.found else text.NO_PINS
 
 

@@ -10,6 +10,7 @@ import panel as pn
 
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import Write
+from app.model.store import Answer
 from app.model.text import COMPUTING, reason
 from app.pages.inspect import text
 from app.pages.inspect.results import (
@@ -53,6 +54,9 @@ IMMEDIATE_BINS = 1000
 """Gate up to which a pixel is inspected where the event arrives: 6 ms at 200 bins, 13 ms at 1000;
 a worker thread would cost more."""
 
+IMMEDIATE_PIXELS = 2**18
+"""Likewise for the image, in which the first report looks for hot and dead pixels: 30 ms."""
+
 
 def framed(*content: Any) -> pn.Column:
     """Return a card that keeps its height where the page's parts follow each other."""
@@ -64,6 +68,12 @@ def framed(*content: Any) -> pn.Column:
 def stage(*content: Any) -> pn.Column:
     """Return the column to the right of the map."""
     return pn.Column(*content, stylesheets=[COLUMN, FILLING], sizing_mode="stretch_both", margin=0)
+
+
+def _is_immediate(answer: Answer) -> bool:
+    capture = answer.capture
+    is_short = capture.acquisition.n_bins <= IMMEDIATE_BINS
+    return is_short and capture.counts.size <= IMMEDIATE_PIXELS
 
 
 class PixelSection(Section):
@@ -138,7 +148,7 @@ class PixelSection(Section):
             return
         answer, state = self.session.answer, self.session.state
         if self._subject == "pixel":
-            if answer.capture.acquisition.n_bins <= IMMEDIATE_BINS:
+            if _is_immediate(answer):
                 with self.session.tasks.hold():
                     self._draw(inspect_pixel(answer, *state.pixel))
                 self.session.failures.resolve(self)

@@ -84,8 +84,7 @@ class ProfileSection(Section):
         session = self.session
         if len(session.state.pins) < 2:
             return  # outdated
-        is_guessed = session.is_width_guessed(session.state.viewing)
-        sentence = text.profile_sentence(session.answer, found, is_guessed)
+        sentence = text.profile_sentence(session.answer, found, session.state.viewing)
         if not np.isfinite(found.distance_m).any():
             self._show_nothing(sentence)
             return

@@ -82,7 +82,7 @@ def inspect_region(answer: Answer, region: Corners) -> Inspected:
 
 def profile_of(answer: Answer, pins: Sequence[tuple[int, int]], viewing: Viewing) -> LineProfile:
     """Return the ranges on show along the line that joins pixels."""
-    angle_rad = pixel_angle_of(viewing.field_of_view_deg, answer.capture.shape[1])
+    angle_rad = pixel_angle_of(answer.field_of_view_deg(viewing), answer.capture.shape[1])
     image = answer.run.image.confident(viewing.least_confidence)
     return inspection.line_profile(answer.capture, image, pins, angle_rad)
 

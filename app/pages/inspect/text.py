@@ -30,12 +30,10 @@ from app.units import (
     Quantity,
     Scale,
     between,
-    bounds,
     count,
     noted,
     plus_minus,
     scale,
-    three_digits,
 )
 from app.units import interval as format_interval
 from core import Capture
@@ -50,6 +48,7 @@ from core.inspection import (
 )
 from core.io import changed_settings
 from core.metrics import Interval
+from core.typesetting import bounds, three_digits
 
 EXPLANATION = """
 **Choose.** Tap the map, use the arrow keys (with Shift: eight pixels), or type a row and a column.
@@ -289,13 +288,13 @@ def _sbr_cell(sbr: Interval) -> Cell:
     return three_digits(sbr.value), known, bounds(sbr.low, sbr.high)
 
 
-def distances(found: Sequence[Inspected], viewing: Viewing, is_width_guessed: bool) -> str:
+def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
     """Return the distance of each pin from the first one; empty for fewer than two."""
     if len(found) < 2:
         return ""
     answer = found[0].answer
     shape = answer.capture.shape
-    lines = sight_lines(shape, pixel_angle_of(viewing.field_of_view_deg, shape[1]))
+    lines = sight_lines(shape, pixel_angle_of(answer.field_of_view_deg(viewing), shape[1]))
     names = [pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
     first, sentences = found[0].pixel, []
     for name, pixel in zip(names[1:], (each.pixel for each in found[1:]), strict=True):
@@ -306,7 +305,7 @@ def distances(found: Sequence[Inspected], viewing: Viewing, is_width_guessed: bo
         known = math.isfinite(length_m)
         length = plus_minus(length_m - margin_m, length_m + margin_m, "m") if known else "not known"
         sentences.append(f"{length} to {name}")
-    guessed = f" {WIDTH_GUESSED}" if is_width_guessed else ""
+    guessed = f" {WIDTH_GUESSED}" if answer.is_width_guessed(viewing) else ""
     return f"From {names[0]}: {', '.join(sentences)} (95 %).{guessed}"
 
 
@@ -316,7 +315,7 @@ def range_text(range_m: float, low_m: float, high_m: float) -> str:
     return f"{number(range_m, 'm', decimals=decimals)} ({between(low_m, high_m, 'm')})"
 
 
-def profile_sentence(answer: Answer, profile: LineProfile, is_width_guessed: bool) -> str:
+def profile_sentence(answer: Answer, profile: LineProfile, viewing: Viewing) -> str:
     """Return where a profile runs, how much of it is hidden, and what its lengths rest on."""
     row, col, n_pixels = profile.row.tolist(), profile.col.tolist(), profile.row.size
     first, last = (pixel_name((row[end], col[end]), answer.grid) for end in (0, -1))
@@ -328,7 +327,7 @@ def profile_sentence(answer: Answer, profile: LineProfile, is_width_guessed: boo
     line += f", {length_m} across the line of sight at a depth of {number(profile.depth_m, 'm')}."
     if n_hidden:
         line += f" {n_hidden:,} without a range, or hidden."
-    return f"{line} {WIDTH_GUESSED}" if is_width_guessed else line
+    return f"{line} {WIDTH_GUESSED}" if answer.is_width_guessed(viewing) else line
 
 
 def pixel_name(pixel: tuple[int, int], grid: Grid) -> str:

@@ -335,11 +335,9 @@ def explored(session: Session) -> Subject:
 
 
 def viewed(session: Session, subject: Subject, viewing: Viewing) -> Subject:
-    """Add confidence threshold and field of view; the capture's own field of view is not named."""
-    in_name = viewing
-    if session.has_own_width(viewing):
-        in_name = replace(viewing, field_of_view_deg=Viewing().field_of_view_deg)
-    return replace(subject, settings=(*subject.settings, in_name), viewing=viewing)
+    """Add confidence threshold and field of view; names state only one that the user has set."""
+    described = replace(viewing, field_of_view_deg=session.answer.field_of_view_deg(viewing))
+    return replace(subject, settings=(*subject.settings, viewing), viewing=described)
 
 
 def cropped(session: Session, subject: Subject) -> Subject:
@@ -375,5 +373,5 @@ def image_on_show(session: Session, kind: str, figure: Any, what: str) -> Shown:
     answer, viewing, subject = session.answer, session.state.viewing, explored(session)
     files = image_files(answer, kind, viewing, figure)
     title = ", ".join(filter(None, (answer.request.source.title, subject.part.replace("_", " "))))
-    report = report_file(answer, session.state, title, session.own_field_of_view_deg)
+    report = report_file(answer, session.state, title)
     return Shown(viewed(session, subject, viewing), what, files | {"html": report})

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import param
 
-from app.model.capture_defaults import enter, own_field_of_view_deg
+from app.model.capture_defaults import enter
 from app.model.restore import parameters_of, request_of
 from app.model.state import State
 from app.model.store import (
@@ -61,8 +61,6 @@ class CurrentEstimate:
         Emitted with each new estimate, and with the old one again where a request failed.
     refused : Refused or None
         The file that was requested last, as long as it could not be read.
-    own_field_of_view_deg : float
-        The field of view that suits the present capture.
     busy : Signal of bool
         Emitted with True when a request takes long, and with False when it is done.
     """
@@ -84,7 +82,6 @@ class CurrentEstimate:
         self._channel = tasks.latest()
         self._is_busy = False
         self._began_s: float | None = None
-        self.own_field_of_view_deg = own_field_of_view_deg(first)
         self._take_reduction(first)
         state.param.watch(lambda *_: self.refresh(), list(COMPUTED_FROM))
 
@@ -114,9 +111,7 @@ class CurrentEstimate:
         previous, self.answer, self.refused = self.answer, answer, None
         self._take_reduction(answer)
         if not same_view(answer.request, previous.request):
-            before_deg = self.own_field_of_view_deg
-            self.own_field_of_view_deg = own_field_of_view_deg(answer)
-            enter(self._state, answer, previous, before_deg)
+            enter(self._state, answer, previous)
         with self._tasks.hold():  # one message for all consequences
             self._failures.clear(no_estimates(answer))
             self._end()

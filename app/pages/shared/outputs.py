@@ -29,7 +29,6 @@ from app.pages.session import Session
 from app.pages.shared.downloads import PLOT, TABLE, Shown, Subject, downloadable
 from app.plots import elements as plots
 from app.theme import LIGHT, RANGE_COLORS, Palette
-from app.units import typeset
 from app.widgets.cards import card
 from app.widgets.controls import Knob, Sentence, Table
 from app.widgets.figures import Layers, paint_frame, pane_of, round_up
@@ -37,6 +36,7 @@ from app.widgets.method_picture import ScaleBar
 from core.io import ColorScale
 from core.parameters import Number
 from core.studies import outputs as items
+from core.typesetting import typeset
 
 Item = TypeVar("Item")
 

@@ -90,9 +90,9 @@ class TruthForm:
         for control, event in ((self.unit, "value"), (self.variable, "enter_pressed")):
             control.param.watch(lambda _: self._try(), event)
 
-    def _upload(self, name: str, content: bytes) -> None:
+    def _upload(self, files: dict[str, bytes]) -> None:
         try:
-            self._key = self._uploads.add(name, content, self._user)
+            self._key = self._uploads.add(files, self._user)
         except (ValueError, OSError) as error:
             self._refuse(cause(error))
         else:

@@ -285,8 +285,12 @@ def _decode_blosc(_: Any, data: Any, out: Any = None) -> Any:
 
 
 def list_zarr(path: str) -> Reply:
-    """Describe the arrays of a Zarr directory, with its folders and files that must not change."""
-    root, groups, n_bytes = Path(path), {}, 0
+    """Describe the arrays of a Zarr directory, with its folders and files that must not change.
+
+    An array that is one number without axes counts as an attribute of its group, too.
+    """
+    root, n_bytes = Path(path), 0
+    groups: dict[str, dict[str, Any]] = {}
     arrays: list[dict[str, Any]] = []
 
     def version(place: Path) -> tuple[str, int, int]:
@@ -312,6 +316,9 @@ def list_zarr(path: str) -> Reply:
             groups[inside] = one["group"]
         else:
             arrays.append({"name": inside or root.name, **place, **one})
+        if "value" in one:
+            group, _, own_name = inside.rpartition("/")
+            groups.setdefault(group, {}).setdefault(own_name, one["value"])
     require("arrays", 0, bool(arrays), "a directory that holds some, of Zarr version 2 or 3")
     return {"arrays": arrays, "groups": groups}, []
 
@@ -353,9 +360,15 @@ def _described_zarr(folder: Path) -> dict[str, Any]:
             "shape": found.shape,
             "type": found.dtype.newbyteorder("=").str,
             "chunk": found.shards or found.chunks,
+            **({"value": found[()].item()} if _is_stored_number(folder, found) else {}),
         }
     except Exception as error:  # undocumented: any
         return {"attributes": known, "refused": f"{type(error).__name__}: {str(error)[:500]}"}
+
+
+def _is_stored_number(folder: Path, array: Any) -> bool:
+    """Whether an array is one number without axes, and not merely its fill value."""
+    return not array.shape and (folder / str(array.metadata.encode_chunk_key(()))).exists()
 
 
 def _missing(array: Any, known: dict[str, Any]) -> dict[str, float]:
@@ -399,18 +412,24 @@ def _open_netcdf3(path: str) -> Any:
 
 
 def list_netcdf3(path: str) -> Reply:
-    """Describe all variables of a file."""
+    """Describe all variables of a file.
+
+    A variable that is one number without axes counts as an attribute of the file, too.
+    """
     file, arrays = _open_netcdf3(path), []
+    known = _plain(file._attributes)
     for name, variable in file.variables.items():
         one = {"name": name, "attributes": _plain(variable._attributes)}
         if variable.data.dtype.kind in "iuf" and variable.data.size:
             dtype = variable.data.dtype.newbyteorder("=")
             one |= {"shape": variable.data.shape, "type": dtype.str, "chunk": None}
             one["axes"] = list(variable.dimensions)
+            if variable.data.shape == ():
+                known.setdefault(name, variable.data.item())
         else:
             one["refused"] = "no numbers"
         arrays.append(one)
-    return {"arrays": arrays, "groups": {"": _plain(file._attributes)}}, []
+    return {"arrays": arrays, "groups": {"": known}}, []
 
 
 def read_netcdf3(path: str, name: str, box: list[list[int]]) -> Reply:

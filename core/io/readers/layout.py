@@ -1,7 +1,8 @@
 """Fields that both layouts of this project share, `core.io.readers.npz` and `labelled`.
 
 They are the arrays of an archive, or the attributes of an array of counts. Files of other layouts
-may state fluxes of their pixels under the names of `STATED`.
+may state fluxes of their pixels under the names of `STATED`, the number of pulses under those of
+`PULSES`, and a bin width with its unit in the name, such as ``bin_width_ps``.
 """
 
 from __future__ import annotations
@@ -12,14 +13,31 @@ from typing import Any
 
 import numpy as np
 
-from core.acquisition import SHORTEST_PULSE_S, Acquisition, Pulse, require_time
+from core.acquisition import MOST_PULSES, SHORTEST_PULSE_S, Acquisition, Pulse, require_time
 from core.capture import StatedFlux
 from core.checks import require
 from core.io.readers.options import ReadOptions
-from core.io.readers.quantities import time_text
+from core.io.readers.quantities import UNITS_S, parsed_time, time_text
 
 TIMING = ("bin_width_s", "gate_delay_s", "pixel_angle_rad", "n_pulses")
 """Fields that are one number each. Files of other layouts may state them under these names, too."""
+
+PULSES = (
+    "npulses",
+    "numpulses",
+    "numberofpulses",
+    "pulses",
+    "pulsesperpixel",
+    "nshots",
+    "numshots",
+    "numberofshots",
+    "shots",
+    "shotsperpixel",
+)
+"""Other names of ``n_pulses``, as those of `STATED`. Frames, cycles and exposures may each hold any
+number of pulses."""
+
+_BIN_WIDTHS = {f"{name}{unit}": unit for name in ("binwidth", "binsize") for unit in UNITS_S}
 
 PULSE = ("pulse_shape", "pulse_tau_s", "pulse_samples")
 """Fields that define a pulse together."""
@@ -55,6 +73,9 @@ def completed(request: ReadOptions, known: Mapping[str, Any]) -> ReadOptions:
     for name in (*TIMING, "detection"):
         if getattr(request, name) is None and name in known:
             values[name] = known[name] if name == "detection" else number(known, name)
+    for name, value in _by_other_names(known).items():
+        if getattr(request, name) is None:
+            values.setdefault(name, value)
     if "n_pulses" in values:
         n_pulses = values["n_pulses"]
         whole = n_pulses.is_integer() and n_pulses >= 0
@@ -63,6 +84,34 @@ def completed(request: ReadOptions, known: Mapping[str, Any]) -> ReadOptions:
     if request.pulse is None and any(name in known for name in PULSE):
         values["pulse"] = _pulse(known)
     return replace(request, **values)
+
+
+def timing(names: Iterable[str]) -> list[str]:
+    """Return the names of `TIMING` among those of a file, and other names of the same numbers."""
+    return [name for name in names if name in TIMING or _plain(name) in (*PULSES, *_BIN_WIDTHS)]
+
+
+def _by_other_names(known: Mapping[str, Any]) -> dict[str, float]:
+    """Return pulses and bin width by their names in `TIMING`; none that is stated in two ways."""
+    found: dict[str, set[float]] = {"n_pulses": set(), "bin_width_s": set()}
+    for name in known:
+        value, plain = _real(known[name]), _plain(name)
+        if plain in PULSES and value and value.is_integer() and 1 <= value <= MOST_PULSES:
+            found["n_pulses"].add(value)
+        elif plain in _BIN_WIDTHS and value:
+            found["bin_width_s"].add(parsed_time(f"{value!r} {_BIN_WIDTHS[plain]}"))
+    return {name: values.pop() for name, values in found.items() if len(values) == 1}
+
+
+def _real(given: Any) -> float | None:
+    """Return one finite number of at least 0; None for anything else."""
+    value = np.asarray(given)
+    fits = value.size == 1 and value.dtype.kind in "iuf" and 0 <= value.item() < np.inf
+    return float(value.item()) if fits else None
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "")
 
 
 def stating(names: Iterable[str]) -> list[str]:
@@ -77,14 +126,13 @@ def stated_flux(known: Mapping[str, Any]) -> StatedFlux | None:
     """
     found: dict[str, float] = {}
     for name in stating(known):
-        value = np.asarray(known[name])
-        if value.size == 1 and value.dtype.kind in "iuf" and 0 <= value.item() < np.inf:
-            found.setdefault(str(_stated_field(name)), float(value.item()))
+        if (value := _real(known[name])) is not None:
+            found.setdefault(str(_stated_field(name)), value)
     return StatedFlux(**found) if found else None
 
 
 def _stated_field(name: str) -> str | None:
-    plain = name.lower().replace("_", "")
+    plain = _plain(name)
     known = (field for field, names in STATED.items() if plain in (*names, f"stated{field}"))
     return next(known, None)
 

@@ -36,7 +36,7 @@ from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
 from core.io.readers.dense import LARGEST_COUNT, count_dtype, cube_capture, dense_capture
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
-from core.io.readers.layout import TIMING, completed, stated_flux, stating
+from core.io.readers.layout import completed, stated_flux, stating, timing
 from core.io.readers.maps import Map
 from core.io.readers.options import ReadOptions, choose_variable
 from core.io.readers.stored import HDF5_SIGNATURE, Stored, arrays
@@ -185,7 +185,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
         return {name: file.array(numbers[name]) for name in names if name in numbers}
 
     origin = f"{path.name}, variable {variable.name}"
-    capture = _capture(file, variable, origin, completed(request, values(TIMING)))
+    capture = _capture(file, variable, origin, completed(request, values(timing(numbers))))
     return replace(capture, stated_flux=stated_flux(values(stating(numbers))))
 
 

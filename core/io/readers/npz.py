@@ -58,6 +58,7 @@ from core.io.readers.layout import (
     require_pulse_in_gate,
     stated_flux,
     stating,
+    timing,
 )
 from core.io.readers.maps import Map
 from core.io.readers.npy import frames_in, read_array, read_header
@@ -103,8 +104,9 @@ def read(path: Path, request: ReadOptions) -> Capture:
         if name != "cube" and not is_frames:
             counts = _array(archive, name)
             require_counts(counts, name, request.axes)
-            timing = {each: _field(archive, each) for each in TIMING if _is_number(archive, each)}
-            capture = cube_capture(counts, name, origin, completed(request, timing))
+            numbers = [each for each in timing(names) if _is_number(archive, each)]
+            known = {each: _field(archive, each) for each in numbers}
+            capture = cube_capture(counts, name, origin, completed(request, known))
             return replace(capture, stated_flux=stated)
         known = {field: _field(archive, field) for field in names if field in _FIELDS}
         version = known.get("format", FORMAT)

@@ -8,7 +8,7 @@ kind of detection. The pulse is that of the first one that is read.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,28 @@ def files_of(path: Path) -> list[Path]:
     if not _PATTERN.search(path.name) or path.exists():
         return []
     return sorted(path.parent.glob(path.name), key=_order)
+
+
+def pattern_of(names: Sequence[str]) -> str | None:
+    """Return the pattern for file names that differ in numbers only; None for other names.
+
+    Parameters
+    ----------
+    names : sequence of str
+        At least one. A single name is its own pattern.
+
+    Examples
+    --------
+    >>> pattern_of(["night_2_raw.npz", "night_10_raw.npz"])
+    'night_*_raw.npz'
+    """
+    parts = [re.split(r"(\d+)", name) for name in names]
+    if len({len(each) for each in parts}) > 1:
+        return None
+    columns = [sorted(set(column)) for column in zip(*parts, strict=True)]
+    if any(len(column) > 1 and not column[0].isdecimal() for column in columns):
+        return None
+    return "".join(column[0] if len(column) == 1 else "*" for column in columns)
 
 
 def _order(path: Path) -> list[tuple[bool, int, str]]:
