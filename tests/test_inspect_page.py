@@ -110,7 +110,7 @@ def test_axes_facts_and_table_follow_the_unit_without_new_curves(far):
         far.state.unit = unit
         far.tasks.run_until(lambda title=title: section.table.columns[1][0] == title)
         assert (figure.below[0].axis_label, figure.above[0].axis_label) == (title, opposite)
-        along = scale(unit, far.answer.capture.acquisition)
+        along = scale(unit, far.answer.gate)
         assert section.table.rows[0]["cells"][0][0] == along.number(best.bin)
         assert ("Position" in values(section.facts)) == (unit != "m")
         np.testing.assert_array_equal(section.plots.counts.curve("raw"), curve)
@@ -682,3 +682,10 @@ def test_without_truth_accuracy_is_called_agreement(far):
     title, across, _ = text.accuracy_titles(far.answer.whole)
     assert "not accuracy" in title
     assert across == "Share of the pulses"
+
+
+def test_ranks_of_close_candidates_are_above_each_other():
+    rows = inspect_plots.lifts([50.0, 52.0, 90.0, 49.0, 56.9], gap=5.0)
+    step = rows[0] - rows[1]
+    assert step >= 11  # px of a line
+    assert rows == [rows[0] - step * row for row in (0, 1, 0, 2, 0)]

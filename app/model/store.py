@@ -17,6 +17,7 @@ from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.model.methods import default_settings, suitable_method
 from app.model.state import AUTOMATIC, Illumination, ReductionSettings
+from app.units import ShownGate
 from core import (
     CORRECTIONS,
     ESTIMATORS,
@@ -265,6 +266,13 @@ class Answer:
     def settings(self) -> Any:
         """Settings of the estimator."""
         return self.request.settings_of(self.method)
+
+    @property
+    def gate(self) -> ShownGate:
+        """The gate of the capture as a part of the whole one."""
+        less = self.request.less
+        first, _ = less.gate(self.whole.acquisition.n_bins)
+        return ShownGate(self.capture.acquisition, first, less.merge)
 
     @property
     def grid(self) -> Grid:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from app.model.exports import Curve, Write, plot_file
 from app.theme import STYLES, Palette
-from core import Acquisition
+from app.units import ShownGate
 
 
 class Layers:
@@ -32,7 +32,7 @@ class Layers:
     def __init__(self, figure: Any, layers: Mapping[str, Mapping[str, Any]]) -> None:
         self.figure = figure
         self.layers = layers
-        self._along: Acquisition | str = ""
+        self._along: ShownGate | str = ""
         self._curves: Sequence[Curve] = ()
         reset = CustomJS(args={"figure": self.figure}, code="figure.reset.emit()")
         self.figure.js_on_event(DoubleTap, reset)
@@ -49,7 +49,7 @@ class Layers:
         if new:
             data.update(new)
 
-    def keep(self, along: Acquisition | str, curves: Sequence[Curve]) -> None:
+    def keep(self, along: ShownGate | str, curves: Sequence[Curve]) -> None:
         """Keep what the layers show for a download; `along` is the gate or the axis label."""
         self._along, self._curves = along, curves
 

@@ -24,6 +24,7 @@ from core.inspection import (
     PixelReport,
     StatedFluxCheck,
     capture_report,
+    echo_view,
     pixel_report,
 )
 from core.io.writers.colors import ColorScale, colors_of, range_scale
@@ -51,7 +52,6 @@ _WIDTHS = {
     "gaussian": "standard deviation",
     "measured": "sample spacing",
 }
-_FEWEST_BINS = 5  # of an echo in the plot around an estimate
 _FLUXES = {"signal": "Signal", "background": "Background", "sbr": "SBR"}
 _LIBRARIES = ("numpy", "scipy", "numba")
 
@@ -278,19 +278,14 @@ def _pixel(capture: Capture, made_by: Provenance, report: PixelReport) -> Iterat
         (_stages_title(report), gate_svg(acquisition, stages, marks, "Score", "score")),
     ]
     if not math.isnan(report.answer_bin):
-        near = gate_svg(acquisition, histogram, marks, "Detections", "near", _near(capture, report))
+        view_bins = echo_view(capture, report.answer_bin)
+        near = gate_svg(acquisition, histogram, marks, "Detections", "near", view_bins)
         drawn.append(("Histogram around the estimate", near))
     plots = (_figure(svg, f"{title}, {where}", f"{title}.") for title, svg in drawn)
     yield f'<div class="plots">{"".join(plots)}</div>'
     yield _intervals(report.flux, report.flux_unit, "Flux of the pixel, with 95 % intervals")
     yield f'<p class="note">Method: {_text(report.flux_method)}.</p>'
     yield _candidates(capture, report)
-
-
-def _near(capture: Capture, report: PixelReport) -> tuple[float, float]:
-    """Return the ends of a few echoes around the estimate, in bins."""
-    half = 2 * max(capture.echo_bins, _FEWEST_BINS)
-    return max(report.answer_bin - half, 0), min(report.answer_bin + half, report.counts.size)
 
 
 def _stages_title(report: PixelReport) -> str:

@@ -568,13 +568,14 @@ class Compare(Section):
         answers = {method: each for method, each in answers.items() if method in self.tasks}
         if pixel != self.session.state.pixel or not answers:
             return  # outdated
-        acquisition, truth_m = self._capture.acquisition, self._capture.truth_range_m
+        answer = next(iter(answers.values()))
+        acquisition, truth_m = answer.capture.acquisition, answer.capture.truth_range_m
         truth = np.nan if truth_m is None else float(truth_m[pixel])
         self._curves.update(
             {method: curve for method, curve in curves.items() if method in answers},
             {method: float(each.run.image.bin[pixel]) for method, each in answers.items()},
             float(acquisition.range_m_to_bin(truth)),
-            acquisition,
+            answer.gate,
             self._styles(),
             self.session.state.unit,
         )

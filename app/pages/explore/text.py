@@ -67,7 +67,7 @@ def pixel_numbers(answer: Answer, pixel: Pixel, unit: str = "bins") -> list[Fact
     row, col = answer.grid.place(pixel.row, pixel.col)
     has_truth = answer.capture.truth_range_m is not None
     numbers = [
-        *estimate_facts(pixel, scale(unit, answer.capture.acquisition), has_truth),
+        *estimate_facts(pixel, scale(unit, answer.gate), has_truth),
         ("Pixel", f"row {row}, col {col}", "Arrow keys on the image move it."),
         *_accelerations(answer, pixel),
         ("Detections", count(pixel.counts), "Counts in this pixel's histogram."),

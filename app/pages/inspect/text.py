@@ -25,7 +25,6 @@ from app.model.text import (
 )
 from app.pages.inspect.results import Inspected, Pair
 from app.units import (
-    AXIS_TITLES,
     OPPOSITE_UNIT,
     Quantity,
     Scale,
@@ -110,7 +109,7 @@ def facts(found: Inspected, unit: str) -> list[Fact]:
 def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
     answer, pixel = found.answer, found.pixel
     place = pixel_name((pixel.row, pixel.col), answer.grid)
-    along = scale(unit, answer.capture.acquisition)
+    along = scale(unit, answer.gate)
     has_truth = answer.capture.truth_range_m is not None
     facts = [*estimate_facts(pixel, along, has_truth), ("Pixel", place, "Row and column.")]
     counts, help = count(pixel.counts), "Counts in the histogram of this pixel"
@@ -121,7 +120,7 @@ def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
 
 
 def _region_facts(found: Inspected, unit: str) -> list[Fact]:
-    region, along = found.region, scale(unit, found.answer.capture.acquisition)
+    region, along = found.region, scale(unit, found.answer.gate)
     assert region is not None
     spread = "Half the central 68 % range of the estimates, which is one standard deviation."
     return [
@@ -206,11 +205,11 @@ def remark(found: Inspected) -> str:
     )
 
 
-def candidate_columns(unit: str) -> list[Sequence[Any]]:
+def candidate_columns(along: Scale) -> list[Sequence[Any]]:
     """Return title, help and sort order of the candidates' columns."""
     return [
         ("Rank", "Rank by score.", 1),
-        (AXIS_TITLES[unit], "Position along the gate, the estimator's lag removed.", 1),
+        (along.title, "Position along the gate, the estimator's lag removed.", 1),
         ("Score", "The estimator's score; below, relative to the best.", -1),
         ("Probability", "Probability of a surface within 3 bins.", -1),
     ]
@@ -233,15 +232,14 @@ def candidate_rows(candidates: Sequence[Candidate], along: Scale, other: Scale) 
 
 def both_scales(unit: str, answer: Answer) -> tuple[Scale, Scale]:
     """Return the chosen unit along the gate, and the unit shown below it."""
-    acquisition = answer.capture.acquisition
-    return scale(unit, acquisition), scale(OPPOSITE_UNIT[unit], acquisition)
+    return scale(unit, answer.gate), scale(OPPOSITE_UNIT[unit], answer.gate)
 
 
-def pin_columns(unit: str) -> list[Sequence[Any]]:
+def pin_columns(along: Scale) -> list[Sequence[Any]]:
     """Return title, help and sort order of the pins' columns."""
     return [
         ("Pixel", "Row and column.", 1),
-        (AXIS_TITLES[unit], "The estimate along the gate.", 1),
+        (along.title, "The estimate along the gate.", 1),
         ("Confidence", CONFIDENCE_HELP, -1),
         ("SBR", "Signal divided by background; below, its 95 % interval.", -1),
         ("Verdict", "Whether the pixel is hot or dead.", 1),

@@ -28,9 +28,9 @@ from app.plots import inspect as inspect_plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.plots.gate_cut import GateCut
 from app.theme import Palette
+from app.units import ShownGate
 from app.widgets.figures import Layers, fit, paint_frame, round_up
 from app.widgets.image_view import ImageView
-from core import Acquisition
 from core.inspection import FaultyPixel
 
 Array = NDArray[Any]
@@ -245,17 +245,17 @@ class GatePlot(NamedLayers):
         """Return a curve (bin,) as it is drawn, in 32 bits."""
         return np.asarray(self.source(self._curve_layer).data[name])
 
-    def follow(self, unit: str, acquisition: Acquisition) -> None:
+    def follow(self, unit: str, gate: ShownGate) -> None:
         """Change the unit or the gate of the axes."""
-        self._axes.follow(unit, acquisition)
+        self._axes.follow(unit, gate)
         if self._read_out is not None:
-            self._read_out.follow(acquisition)
+            self._read_out.follow(gate)
 
-    def draw(self, acquisition: Acquisition, curves: Sequence[Curve]) -> None:
+    def draw(self, gate: ShownGate, curves: Sequence[Curve]) -> None:
         """Draw curves (bin,), and keep them for a download; marks are only kept."""
-        self.keep(acquisition, curves)
+        self.keep(gate, curves)
         columns = {each.layer: each.y for each in curves if each.y is not None}
-        bins = plots.centres(acquisition.n_bins)
+        bins = plots.centres(gate.n_bins)
         if len(self.curve("bin")) != bins.size:
             columns["bin"] = bins
             self.source(self._curve_layer).data = {
@@ -294,7 +294,7 @@ class PixelPlots:
 
     def __init__(self) -> None:
         nowhere, upright = plots.marker_line(np.nan, 1.0)
-        self.candidates = inspect_plots.empty("x", "y", "rank")
+        self.candidates = inspect_plots.empty("x", "y", "rank", "lift")
         marks = {
             "truth": ColumnDataSource({"x": nowhere, "y": upright}),
             "estimate": ColumnDataSource({"x": nowhere, "y": upright}),
@@ -314,48 +314,51 @@ class PixelPlots:
         """Take on the colours of a mode."""
         for plot in self.plots:
             plot.paint(colors)
+        self.counts.layers["ranks"]["glyph"].background_fill_color = colors.paper
         self.cut.paint(colors)
 
     def update(self, found: Inspected, unit: str) -> None:
         """Show a pixel or a region, with positions in a unit."""
         pixel, report = found.pixel, found.report
-        acquisition = found.answer.capture.acquisition
+        gate = found.answer.gate
         for plot in self.plots:
-            plot.follow(unit, acquisition)
+            plot.follow(unit, gate)
         curves = partial(plots.bin_curves, inspect_plots.NAMES)
         positions = {"truth": pixel.truth_bin, "estimate": pixel.answer_bin}
         candidates = [each.bin for each in report.candidates]
         marks = plots.marks(inspect_plots.NAMES, **positions, candidates=candidates)
-        self._draw_counts(pixel, acquisition, marks)
-        self.rate.draw(acquisition, curves(report.rate_unit, rate=report.rate) + marks)
+        self._draw_counts(pixel, gate, marks)
+        self.rate.draw(gate, curves(report.rate_unit, rate=report.rate) + marks)
         self.rate.frame(report.rate)
         self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
         self.rate.figure.title.text = inspect_plots.RATE_TITLES[report.rate_unit]
         if pixel.signals is None:
-            self.score.draw(acquisition, curves("", score=pixel.score) + marks)
+            self.score.draw(gate, curves("", score=pixel.score) + marks)
             fit(self.score.figure, *plots.score_ends(pixel.score))
         else:
             residual = curves("counts", residual=pixel.signals.residual)
             enhanced = curves("counts × weight", enhanced=pixel.signals.enhanced)
-            self.stages.draw(acquisition, residual + enhanced + marks)
+            self.stages.draw(gate, residual + enhanced + marks)
             self.stages.frame(pixel.signals.residual)
             self.stages.frame(pixel.signals.enhanced, axis="enhanced")
         for name, position in positions.items():
             self.counts.write(name, x=np.full(2, position))
             for plot in self.plots:
                 plot.show(name, bool(np.isfinite(position)))
+        extent = self.bins.reset_end - self.bins.reset_start
         self.candidates.data = {
             "x": np.array(candidates, np.float32),
             "y": np.full(len(candidates), inspect_plots.CANDIDATE_HEIGHT, np.float32),
             "rank": [str(n + 1) for n in range(len(candidates))],
+            "lift": inspect_plots.lifts(candidates, inspect_plots.RANK_GAP * extent),
         }
 
-    def _draw_counts(self, pixel: Pixel, acquisition: Acquisition, marks: list[Curve]) -> None:
+    def _draw_counts(self, pixel: Pixel, gate: ShownGate, marks: list[Curve]) -> None:
         """Draw the counts, with those of the model and both scales where they are known."""
-        plot, lines = self.counts, plots.drawn(pixel.lines, acquisition.n_bins)
+        plot, lines = self.counts, plots.drawn(pixel.lines, gate.n_bins)
         plot.figure.title.text = inspect_plots.COUNTS_TITLES[pixel.signals is not None]
         curves = plots.bin_curves(inspect_plots.NAMES, "counts", raw=pixel.histogram, **lines)
-        plot.draw(acquisition, curves + marks)
+        plot.draw(gate, curves + marks)
         for layer, counts in pixel.lines.items():
             plot.show(layer, counts is not None)
         plot.frame(pixel.histogram, *lines.values())
