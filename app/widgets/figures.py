@@ -128,6 +128,11 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
 
 
+def around(border_px: Mapping[str, int]) -> tuple[int, int]:
+    """Return the room beside the frame of a figure, and above and below it, in px."""
+    return border_px["left"] + border_px["right"], border_px["top"] + border_px["bottom"]
+
+
 def proportioned(aspect: float, across_px: int, down_px: int) -> str:
     """Return the style of a figure whose frame has the proportions of its image.
 
