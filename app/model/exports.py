@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.model.colors import WHOLE, cloud_of, map_of, shown
+from app.model.colors import cloud_of, map_of, shown
 from app.model.download_text import NO_POINTS, NO_POINTS_INSIDE, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.script import script_of
@@ -24,7 +24,7 @@ from app.model.store import Answer
 from app.model.text import Fact
 from app.theme import WRONG_COLOR
 from app.units import Quantity, ShownGate, scale
-from core.geometry import Box, pixel_angle_of
+from core.geometry import WHOLE, Box, pixel_angle_of
 from core.io import (
     WRITERS,
     ColorScale,
@@ -261,6 +261,7 @@ def report_file(answer: Answer, state: State, title: str, own_field_of_view_deg:
         pixel=state.pixel,
         least_confidence=viewing.least_confidence,
         pixel_angle_rad=None if is_own else angle_rad,
+        box=state.box,
         title=title,
         script=script_of(answer, state),
     )

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from app.model.colors import WHOLE
 from app.model.store import Answer, Pixel
 from app.model.text import Fact, estimate_facts, milliseconds, number, share
 from app.units import count, scale
-from core.geometry import Box
+from core.geometry import WHOLE, Box
 
 IMAGE_HELP = "Quantity shown in the image"
 
