@@ -48,8 +48,9 @@ With *Rectangle* or *Lasso*, drag on the map to select a region; its histograms 
 as one. With *Zoom*, drag to enlarge; the wheel zooms as well, and a double tap shows the whole map.
 
 **Compare.** *Pin this pixel*, or the key P, keeps up to four pixels. *Pins* shows their distances,
-*Profile* the ranges along the line that joins them. *A/B* keeps an estimate and subtracts it from
-later ones.
+*Profile* the ranges along the line that joins them. With *Line*, drag on the map to draw that
+line: its ends, and up to two bends, become the pinned pixels. *A/B* keeps an estimate and subtracts
+it from later ones.
 
 **Crop.** *Crop the cloud* limits the 3D cloud of Explore and its files to the region, to ranges, or
 to both.
@@ -63,7 +64,10 @@ MAP_HELP = (
     "Quantity shown on the map. Peak: largest count of a pixel. Fired: share of pulses with a "
     "detection. SBR: estimated from the counts."
 )
-MODE_HELP = "What dragging on the map does; a tap always selects a pixel."
+MODE_HELP = (
+    "What dragging on the map does: zoom, select a region by a rectangle or a lasso, or draw the "
+    "line of a profile. A tap always selects a pixel."
+)
 SUBJECT_HELP = (
     "What to inspect: one pixel, the region, the pinned pixels, the line that joins them, or the "
     "whole capture."
@@ -75,8 +79,8 @@ TOO_MANY_PINS = "Four pixels are pinned already: remove one first."
 NO_PINS = "No pixels are pinned. Select a pixel and press “Pin this pixel”, or P on the map."
 WIDTH_GUESSED = "Lengths across the line of sight follow from the field of view, which is a guess."
 NO_PROFILE = (
-    "Pin two or more pixels: the profile runs along the line that joins them. Select a pixel and "
-    "press “Pin this pixel”, or P on the map."
+    "Choose “Line” above the map and drag on the map: the profile runs along the line that you "
+    "draw. It also runs along the line that joins two or more pinned pixels."
 )
 NO_RANGES = "No estimate on the line is confident enough to be shown. Lower “Show from confidence”."
 NO_REGION = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from bokeh.models import (
     BoxSelectTool,
     BoxZoomTool,
     ColumnDataSource,
+    FreehandDrawTool,
     LassoSelectTool,
     Range1d,
     WheelZoomTool,
@@ -20,6 +22,7 @@ from bokeh.models import (
 from numpy.typing import NDArray
 
 from app.model.exports import Curve
+from app.model.state import MOST_PINS
 from app.model.store import Pixel
 from app.pages.inspect.results import Corners, Inspected
 from app.pages.shared.outputs import layers_of
@@ -34,9 +37,16 @@ from app.widgets.image_view import ImageView
 from core.inspection import FaultyPixel
 
 Array = NDArray[Any]
+Pixels = tuple[tuple[int, int], ...]
+"""Rows and columns of pixels."""
 
 MAX_DRAWN_CORNERS = 60
 """Corners kept of a lasso: enough for its shape, few enough for a link."""
+
+
+NO_STROKE: dict[str, list[list[float]]] = {"xs": [[]], "ys": [[]]}
+"""Data of a line that has not been drawn; without the path, Bokeh's tool would fail where a drag
+begins beside the image."""
 
 
 class Navigator(ImageView):
@@ -48,6 +58,8 @@ class Navigator(ImageView):
         Called with the row and column of a tapped pixel.
     selected : callable
         Called with the corners of a drawn region.
+    joined : callable
+        Called with the pixels at the vertices of a drawn line.
 
     Attributes
     ----------
@@ -56,14 +68,22 @@ class Navigator(ImageView):
     """
 
     def __init__(
-        self, tapped: Callable[[int, int], None], selected: Callable[[Corners], None]
+        self,
+        tapped: Callable[[int, int], None],
+        selected: Callable[[Corners], None],
+        joined: Callable[[Pixels], None],
     ) -> None:
         super().__init__(tapped)
         figure = self.figure
+        self.drawn = ColumnDataSource(NO_STROKE)
+        stroke = figure.multi_line(
+            "xs", "ys", source=self.drawn, line_color="#ffffff", line_width=2, name="stroke"
+        )
         # The tools select nothing in the image itself: a layer outlines the region.
         by_hand = {
             "Rectangle": BoxSelectTool(renderers=[]),
             "Lasso": LassoSelectTool(renderers=[], continuous=False),
+            "Line": FreehandDrawTool(renderers=[stroke], num_objects=1),
         }
         wheel = WheelZoomTool()
         figure.add_tools(*by_hand.values(), wheel)
@@ -126,6 +146,21 @@ class Navigator(ImageView):
 
         figure.on_event(SelectionGeometry, select)
 
+        def join(_attribute: str, _old: Any, new: Mapping[str, Any]) -> None:
+            path = np.column_stack([np.asarray(new[axis][-1], float) for axis in ("ys", "xs")])
+            if len(path):
+                self.drawn.data = dict(NO_STROKE)  # a layer joins the pins
+                joined(self._on_line(path))
+
+        self.drawn.on_change("data", join)
+
+    def _on_line(self, path: Array) -> Pixels:
+        """Return the pixels, once each, at the vertices of a path (vertex, row and col)."""
+        first, last = (0, 0), tuple(size - 1 for size in self._shape)
+        inside = np.clip(path, *(np.array(self._grid.place(*at)) for at in (first, last)))
+        pixels = [self._grid.pixel(*inside[at]) for at in vertices(inside, self.half_frame)]
+        return tuple(dict.fromkeys(pixels))
+
     def mark_faulty(self, faulty: Sequence[FaultyPixel]) -> None:
         """Mark hot pixels by circles, dead ones by crosses."""
         places = [self._grid.place(each.row, each.col) for each in faulty]
@@ -155,6 +190,25 @@ class Navigator(ImageView):
         """Draw a line that joins pixels; none if they are fewer than two."""
         places = [self._grid.place(*pin) for pin in pins]
         self._line.data = {"x": [col for _, col in places], "y": [row for row, _ in places]}
+
+
+def vertices(path: Array, tolerance: float) -> list[int]:
+    """Return the indices of the ends of a path (point, 2), and of its strongest bends in between.
+
+    They are at most `MOST_PINS`, and fewer if no point is farther than `tolerance` from the lines
+    that join them.
+    """
+    kept = [0, len(path) - 1]
+    while len(kept) < MOST_PINS:
+        away = np.zeros(len(path))
+        for first, last in pairwise(kept):
+            (down, across), part = path[last] - path[first], slice(first, last + 1)
+            (rows, cols), length = (path[part] - path[first]).T, np.hypot(down, across)
+            away[part] = np.abs(rows * across - cols * down) / length if length else 0.0
+        if away.max() <= tolerance:
+            break
+        kept = sorted([*kept, int(away.argmax())])
+    return kept
 
 
 def corners_of(geometry: Mapping[str, Any]) -> Corners:
