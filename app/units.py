@@ -16,6 +16,8 @@ OPPOSITE_UNIT = {"bins": "m", "ns": "m", "m": "bins"}
 """Unit of the axis opposite to the chosen one."""
 
 AXIS_TITLES = {"bins": "Bin", "ns": "Time (ns)", "m": "Range (m)"}
+WHOLE_GATE_TITLE = "Bin of the whole gate"
+"""Title of an axis over bins of a cut gate, or over merged bins."""
 
 
 class Quantity(str):
@@ -116,6 +118,30 @@ def interval(value: float, low: float, high: float) -> Quantity:
 
 
 @dataclass(frozen=True)
+class ShownGate:
+    """The gate of a reduced capture as a part of the whole one, whose bins are those on screen.
+
+    Parameters
+    ----------
+    acquisition : Acquisition
+        Of the reduced capture, whose bins positions are given in.
+    first : int
+        Bin of the whole gate at which it opens.
+    merge : int
+        Bins of the whole gate in each of its bins.
+    """
+
+    acquisition: Acquisition
+    first: int = 0
+    merge: int = 1
+
+    @property
+    def n_bins(self) -> int:
+        """Number of its bins."""
+        return self.acquisition.n_bins
+
+
+@dataclass(frozen=True)
 class Scale:
     """A unit along a gate.
 
@@ -132,6 +158,12 @@ class Scale:
     name: str
     origin: float
     step: float
+
+    @property
+    def title(self) -> str:
+        """Title of an axis or a column."""
+        is_whole = self.name != "bins" or (self.origin, self.step) == (0, 1)
+        return AXIS_TITLES[self.name] if is_whole else WHOLE_GATE_TITLE
 
     def at(self, position_bin: float) -> float:
         """Convert a position from bins to the unit."""
@@ -159,10 +191,11 @@ class Scale:
         return Quantity(text, number.value, self.name)
 
 
-def scale(unit: str, acquisition: Acquisition) -> Scale:
-    """Return a unit of `app.model.state.UNITS` for the gate of an acquisition."""
+def scale(unit: str, gate: ShownGate) -> Scale:
+    """Return a unit of `app.model.state.UNITS` along a gate; bins are those of the whole gate."""
+    acquisition = gate.acquisition
     if unit == "bins":
-        return Scale(unit, 0.0, 1.0)
+        return Scale(unit, float(gate.first), float(gate.merge))
     if unit == "ns":
         return Scale(unit, acquisition.gate_delay_s * 1e9, acquisition.bin_width_s * 1e9)
     return Scale(unit, float(acquisition.bin_to_range_m(0)), acquisition.bin_length_m)

@@ -19,6 +19,7 @@ from core.acquisition import Acquisition, Floats
 from core.checks import require
 
 __all__ = [
+    "WHOLE",
     "Box",
     "Points",
     "distance_m",
@@ -88,6 +89,10 @@ class Box:
         if self.to_m is not None:
             inside &= ranges <= self.to_m
         return inside
+
+
+WHOLE = Box()
+"""The box that holds everything."""
 
 
 def sight_lines(shape: tuple[int, int], pixel_angle_rad: float) -> Floats:

@@ -426,7 +426,7 @@ def columns(plot, layer):
 
 def test_a_pixels_stages_stand_in_its_plots(car):
     views, pixel = SignalPlots(), inspect(car, 32, 30)
-    views.update(pixel, car.capture.acquisition, with_difference=True)
+    views.update(pixel, car.gate, with_difference=True)
     signals = pixel.signals
     drawn = {
         "raw": (columns(views.histogram, "raw")["top"], signals.raw),
@@ -448,10 +448,10 @@ def test_a_pixels_stages_stand_in_its_plots(car):
 
 def test_axes_follow_another_gate(car, small_file):
     views = SignalPlots()
-    views.update(inspect(car, 32, 30), car.capture.acquisition, with_difference=False)
+    views.update(inspect(car, 32, 30), car.gate, with_difference=False)
     answer = compute(ask(file_source(small_file)), None)
     views.cut.update(Cut.of(answer, ReductionSettings()))
-    views.update(inspect(answer, 1, 2), answer.capture.acquisition, with_difference=False)
+    views.update(inspect(answer, 1, 2), answer.gate, with_difference=False)
     for plot in views.plots:
         assert (plot.figure.x_range.start, plot.figure.x_range.end) == (0, 37)
         for layer in plot.layers:
@@ -470,7 +470,7 @@ def test_lines_without_a_position_are_not_drawn(car, sample):
     views = SignalPlots()
     for answer, has_truth in ((car, True), (sample, False), (car, True)):
         pixel = inspect(answer, 32, 30)
-        views.update(pixel, answer.capture.acquisition, with_difference=False)
+        views.update(pixel, answer.gate, with_difference=False)
         for plot in (views.histogram, views.residual, views.enhanced):
             assert plot.layers["truth"]["glyph_renderer"].visible == has_truth
             assert legend(plot)["truth"] == has_truth
@@ -743,11 +743,21 @@ def test_a_gate_that_ends_before_t_n_is_reported(layout, tmp_path):
     save_capture(Capture(cube, Acquisition(9)), path)
     open_file(layout, path)
     layout.next_answer()
-    assert "T_n = 20 excludes all 9 bins" in alert_of(layout)
+    assert "T_n excludes all 9 bins of the gate" in alert_of(layout)
     assert control(layout, "T_n").high == 8
     control(layout, "T_n").value = 3
     layout.next_answer()
     assert alert_of(layout) == ""
+
+
+def test_a_button_zooms_all_plots_to_the_echo_and_back(layout, explore):
+    layout.session.state.pixel = (32, 32)
+    layout.settle()
+    estimate = explore.signals.histogram.source("estimate").data["bin"][0]
+    bins = explore.signals.residual.figure.x_range
+    for ends in ((estimate - 10, estimate + 10), (0, 100)):
+        explore.zoom.button.clicks += 1
+        assert (bins.start, bins.end) == pytest.approx(ends)
 
 
 def test_a_gate_is_cut_on_the_histogram_and_shown_in_the_unit_of_the_axes(layout, explore):
@@ -778,7 +788,8 @@ def test_a_gate_is_cut_on_the_histogram_and_shown_in_the_unit_of_the_axes(layout
         return origin + step * gate[name].value, gate[name].unit
 
     assert shown("Gate from") == (pytest.approx(30), "bins")
-    assert shown("T_n") == (20, "bins")
+    assert shown("T_n") == (30 + 2 * 20, "bins")  # of the whole gate, like the axes
+    assert histogram.below[0].axis_label == "Bin of the whole gate"
     state.unit = "ns"
     assert shown("Gate from") == (pytest.approx(280 + 30), "ns")
     assert shown("Gate to") == (pytest.approx(280 + 90), "ns")

@@ -16,6 +16,7 @@ from app.model.colors import Unseen
 from app.model.methods import METHOD_TITLES
 from app.model.state import CLOUDS, FIRST_METHODS, Illumination, ReductionSettings
 from app.model.store import Request, built_in_sources, compute
+from app.model.text import COMPUTING
 from app.pages.compare import ranking, text
 from app.pages.compare.page import MAX_PICTURES, Compare
 from app.pages.compare.ranking import Task
@@ -271,10 +272,17 @@ def test_cancel_stops_before_the_next_method_and_resumes(stage):
     button = stage.stop()
     stage.drain()
     stage.tasks.run_until(lambda: stage.page.status.text.startswith("Stopped: "))
-    assert 0 < len(stage.page.results) < 5
+    n_done = len(stage.page.results)
+    assert 0 < n_done < 5
     assert button.label == "Resume"
+    captions = [picture.caption.text for picture in stage.page.pictures]
+    assert captions[n_done:] == [text.waiting("peak", None)] * (5 - n_done)
+    assert text.waiting("peak", None) not in captions[:n_done]
     stage.stop()
+    assert stage.page.pictures[n_done].caption.text == COMPUTING
     stage.settle()
+    captions = [picture.caption.text for picture in stage.page.pictures]
+    assert all("confidence" in caption for caption in captions)
     assert stage.page.status.text == "5 methods compared"
     assert not button.visible
 

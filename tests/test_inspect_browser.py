@@ -128,7 +128,12 @@ COUNTS, RATE, STAGES = "Counts, and the two scales", "Rate", "Residual, and enha
 # -- actions of a user -----------------------------------------------------------------------------
 
 
-TOOLS = {"Rectangle": "BoxSelectTool", "Lasso": "LassoSelectTool", "Zoom": "BoxZoomTool"}
+TOOLS = {
+    "Rectangle": "BoxSelectTool",
+    "Lasso": "LassoSelectTool",
+    "Line": "FreehandDrawTool",
+    "Zoom": "BoxZoomTool",
+}
 """What a drag on the map does, and Bokeh's tool that does it."""
 
 
@@ -399,6 +404,10 @@ def test_regions_are_dragged_outlined_and_summed(page, facade):
     for mode in DRAGS:
         expect_sum_of_dragged(page, facade, mode)
     clear_region(page)
+    ends = (0.2, 0.3), (0.8, 0.6)
+    names = [", ".join(str(round(at)) for at in place_at(page, *end)) for end in ends]
+    drag(page, "Line", *ends)
+    expect(page.get_by_text(f"pixels from {names[0]} to {names[1]}, ")).to_be_visible()
     page.evaluate("() => { WebSocket.prototype.send = () => {}; }")
     for mode in TOOLS:  # without the server
         choose_drag(page, mode)

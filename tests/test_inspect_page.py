@@ -110,7 +110,7 @@ def test_axes_facts_and_table_follow_the_unit_without_new_curves(far):
         far.state.unit = unit
         far.tasks.run_until(lambda title=title: section.table.columns[1][0] == title)
         assert (figure.below[0].axis_label, figure.above[0].axis_label) == (title, opposite)
-        along = scale(unit, far.answer.capture.acquisition)
+        along = scale(unit, far.answer.gate)
         assert section.table.rows[0]["cells"][0][0] == along.number(best.bin)
         assert ("Position" in values(section.facts)) == (unit != "m")
         np.testing.assert_array_equal(section.plots.counts.curve("raw"), curve)
@@ -693,3 +693,25 @@ def test_without_truth_accuracy_is_called_agreement(far):
     title, across, _ = text.accuracy_titles(far.answer.whole)
     assert "not accuracy" in title
     assert across == "Share of the pulses"
+
+
+def test_ranks_of_close_candidates_are_above_each_other():
+    rows = inspect_plots.lifts([50.0, 52.0, 90.0, 49.0, 56.9], gap=5.0)
+    step = rows[0] - rows[1]
+    assert step >= 11  # px of a line
+    assert rows == [rows[0] - step * row for row in (0, 1, 0, 2, 0)]
+
+
+def test_a_line_drawn_on_the_map_pins_its_ends_and_bends_for_a_profile(building):
+    page, state = Inspect(building), building.state
+    page.show(True)
+    _, cols = building.answer.capture.shape
+    down = np.linspace(2.0, 40.0, 30)
+    page.navigator.drawn.data = {"xs": [np.full(30, 5.2)], "ys": [down]}
+    assert (state.pins, state.subject) == (((2, 5), (40, 5)), "Profile")
+    assert page.navigator.drawn.data["xs"] == [[]]  # the pins are joined by a layer of their own
+    bent = {"xs": [[3.0, 3.0, 30.0, cols + 9]], "ys": [[10.0, 30.0, 30.4, 30.0]]}
+    page.navigator.drawn.data = bent
+    assert state.pins == ((10, 3), (30, 3), (30, cols - 1))
+    page.navigator.drawn.data = {"xs": [[7.0, 7.1]], "ys": [[7.0, 7.1]]}  # not a line
+    assert len(state.pins) == 3

@@ -120,6 +120,7 @@ def test_pictures_share_scale_and_view_and_compare_a_pixel(pictures):
     assert one.x_range is other.x_range
     assert one.y_range is other.y_range
     assert len({each.renderers[0].glyph.color_mapper for each in (one, other)}) == 1
+    assert "* 1.5 " in one.stylesheets[0]  # the frame has the proportions of 2 × 3 pixels
     row, column = gallery.place
     assert (row.high, column.high) == (1, 2)
     row.value, column.value = 0, 2

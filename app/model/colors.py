@@ -13,7 +13,7 @@ from app.model.state import Viewing
 from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS
 from core import inspection
-from core.geometry import Box, pixel_angle_of
+from core.geometry import WHOLE, Box, pixel_angle_of
 from core.io import ColorScale, range_scale
 
 Array = NDArray[Any]
@@ -26,10 +26,6 @@ MAP_TITLES = {
     "SBR": "Signal over background, estimated from the counts",
 }
 FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"
-
-
-WHOLE = Box()
-"""A box that contains everything."""
 
 
 def shown(answer: Answer, least_confidence: float, box: Box = WHOLE) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.model.colors import WHOLE, cloud_of, map_of, shown
+from app.model.colors import cloud_of, map_of, shown
 from app.model.download_text import NO_POINTS, NO_POINTS_INSIDE, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.script import script_of
@@ -23,9 +23,8 @@ from app.model.state import UNITS, State, Viewing
 from app.model.store import Answer
 from app.model.text import Fact
 from app.theme import WRONG_COLOR
-from app.units import AXIS_TITLES, Quantity, scale
-from core import Acquisition
-from core.geometry import Box, pixel_angle_of
+from app.units import Quantity, ShownGate, scale
+from core.geometry import WHOLE, Box, pixel_angle_of
 from core.io import (
     WRITERS,
     ColorScale,
@@ -92,7 +91,7 @@ def band(
     return [Curve(layer, f"{name}, {end}", x, y, unit) for end, y in limits]
 
 
-def plot_file(curves: Sequence[Curve], along: Acquisition | str, x_range: Any) -> Write:
+def plot_file(curves: Sequence[Curve], along: ShownGate | str, x_range: Any) -> Write:
     """Return curves as CSV, as far as they are in view.
 
     The first column is the horizontal axis. Curves over the same positions share rows; others have
@@ -101,9 +100,9 @@ def plot_file(curves: Sequence[Curve], along: Acquisition | str, x_range: Any) -
     Parameters
     ----------
     curves : sequence of Curve
-    along : Acquisition or str
+    along : ShownGate or str
         Label of the horizontal axis, or for curves over bins their gate: the first columns are then
-        bins, nanoseconds and metres.
+        bins of the whole gate, nanoseconds and metres.
     x_range : bokeh.models.Range1d
         The horizontal axis as it is zoomed.
 
@@ -127,12 +126,12 @@ def plot_file(curves: Sequence[Curve], along: Acquisition | str, x_range: Any) -
     return partial(write_columns, columns)
 
 
-def _axis(x: Floats, along: Acquisition | str) -> dict[str, Floats]:
+def _axis(x: Floats, along: ShownGate | str) -> dict[str, Floats]:
     """Return the columns of the horizontal axis."""
     if isinstance(along, str):
         return {along: x}
-    scales = {AXIS_TITLES[unit]: scale(unit, along) for unit in UNITS}
-    return {title: each.origin + each.step * x for title, each in scales.items()}
+    scales = (scale(unit, along) for unit in UNITS)
+    return {each.title: each.origin + each.step * x for each in scales}
 
 
 def _view(axis_range: Any) -> tuple[float, float]:
@@ -260,6 +259,7 @@ def report_file(answer: Answer, state: State, title: str) -> Write:
         pixel=state.pixel,
         least_confidence=viewing.least_confidence,
         pixel_angle_rad=chosen_rad,  # `core` states whether its own is a guess
+        box=state.box,
         title=title,
         script=script_of(answer, state),
     )

@@ -11,11 +11,10 @@ from dataclasses import fields
 from itertools import chain
 from textwrap import indent
 
-from app.model.colors import WHOLE
 from app.model.state import CLOUDS, State, Viewing
 from app.model.store import Answer
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
-from core.geometry import Box
+from core.geometry import WHOLE, Box
 from core.io import RangeColors
 from core.scripts import assign, call, changed_fields, literal
 

@@ -17,6 +17,7 @@ from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.model.methods import default_settings, suitable_method
 from app.model.state import AUTOMATIC, Illumination, ReductionSettings, Viewing
+from app.units import ShownGate
 from core import (
     CORRECTIONS,
     ESTIMATORS,
@@ -278,6 +279,13 @@ class Answer:
         """Return whether the field of view is neither stated by the capture nor set by the user."""
         is_stated = self.capture.acquisition.pixel_angle_rad is not None
         return viewing.field_of_view_deg is None and not is_stated
+
+    @property
+    def gate(self) -> ShownGate:
+        """The gate of the capture as a part of the whole one."""
+        less = self.request.less
+        first, _ = less.gate(self.whole.acquisition.n_bins)
+        return ShownGate(self.capture.acquisition, first, less.merge)
 
     @property
     def grid(self) -> Grid:

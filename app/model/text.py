@@ -97,7 +97,7 @@ def no_estimates(answer: Answer) -> str:
         return "No pixel has an estimate: no photon was detected."
     n_bins, t_n = answer.capture.acquisition.n_bins, answer.settings.t_n
     if t_n >= n_bins:
-        return f"T_n = {t_n} excludes all {n_bins} bins: reduce it."
+        return f"T_n excludes all {n_bins} bins of the gate: reduce it."
     return (
         "No pixel has an estimate: both scales are equal everywhere, or no photon was detected. "
         "Undo the last change, or choose a preset."

@@ -34,7 +34,7 @@ from app.pages.shared.truth import TruthForm, TruthOffer
 from app.tasks.page import PageTasks
 from app.tasks.signals import Signal
 from app.theme import DARK, LIGHT, STYLES
-from app.units import scale
+from app.units import ShownGate, scale
 from app.widgets.address_bar import AddressBar
 from app.widgets.cards import choice, part, select
 from app.widgets.connection import Connection
@@ -390,8 +390,8 @@ class Layout:
     def _follow_unit(self) -> None:
         """Show T_n and the ends of the cut gate in the unit of the axes."""
         answer, unit = self.session.answer, self.session.state.unit
-        whole = answer.whole.acquisition
-        self._panels["tracking"].controls["t_n"].follow(scale(unit, answer.capture.acquisition))
+        whole = ShownGate(answer.whole.acquisition)
+        self._panels["tracking"].controls["t_n"].follow(scale(unit, answer.gate))
         for name in ("gate_from", "gate_to"):
             self._panels["less"].controls[name].follow(scale(unit, whole), whole.n_bins)
 

@@ -325,8 +325,9 @@ def curves(item: items.Plot, colors: Palette) -> Any:
             renderer = drawing.line(x, y, color=color, line_dash=dash, line_width=2, name=name)
         entries.append(LegendItem(label=name.replace("_", " "), renderers=[renderer]))
     many = len(entries) > 6
-    # The same room for all legends keeps plots below each other aligned.
-    drawing.min_border_right = 196 if many else 14
+    # The same room for all legends keeps plots below each other aligned; one above the plot leaves
+    # room for a download button.
+    drawing.min_border_right = 196 if many else 32
     legend = Legend(
         items=entries,
         orientation="vertical" if many else "horizontal",

@@ -16,7 +16,8 @@ from bokeh.models import (
     LinearAxis,
 )
 
-from app.units import AXIS_TITLES, OPPOSITE_UNIT, scale
+from app.model.state import UNITS
+from app.units import OPPOSITE_UNIT, ShownGate, scale
 from core import Acquisition
 
 # Ticks at 1, 2, 2.5 or 5 times a power of ten in the unit, and where these are in bins.
@@ -64,23 +65,27 @@ class GateAxes:
             args = {"origin": 0.0, "step": 1.0, "name": "bins"}
             axis.ticker = CustomJSTicker(args=args, major_code=TICKS)
             axis.formatter = CustomJSTickFormatter(args=args, code=LABELS)
-        self.follow("bins", Acquisition())
+        self.follow("bins", ShownGate(Acquisition()))
 
-    def follow(self, unit: str, acquisition: Acquisition) -> None:
+    def follow(self, unit: str, gate: ShownGate) -> None:
         """Set the unit and the gate."""
         for axis, name in zip(self._axes, (unit, OPPOSITE_UNIT[unit]), strict=False):
-            along = scale(name, acquisition)
+            along = scale(name, gate)
             args = {"origin": along.origin, "step": along.step, "name": name}
             if axis.formatter.args != args:
                 axis.ticker.args = axis.formatter.args = args
-            axis.axis_label = AXIS_TITLES[name]
+            axis.axis_label = along.title
 
 
-# At the pointer: the number of the bin, the position of its centre, or the value of a curve.
+# At the pointer: the bins of the whole gate, the position of the centre, or the value of a curve.
 READ_OUT = """
 const bin = special_vars.index;
 const [along] = renderer.tags;
-if (format === "bin") return String(bin);
+if (format === "bin") {
+  const [first, merge] = along.bins;
+  const begin = first + merge * bin;
+  return merge > 1 ? `${begin}–${begin + merge - 1}` : String(begin);
+}
 if (format in along) {
   const [origin, step, decimals] = along[format];
   return `${(origin + step * (bin + 0.5)).toFixed(decimals)} ${format}`;
@@ -107,8 +112,8 @@ class GateReadOut:
         sources = {f"{n}": source for n, (_, source, _) in enumerate(rows)}
         args = {"renderer": renderer, "sources": sources, "columns": columns}
         self._renderer = renderer
-        self._acquisition: Acquisition | None = None
-        self.follow(Acquisition())
+        self._gate: ShownGate | None = None
+        self.follow(ShownGate(Acquisition()))
         field = "@left" if "left" in renderer.data_source.data else "@bin"
         values = [(name, f"{field}{{{n}}}") for n, (name, _, _) in enumerate(rows)]
         figure.add_tools(
@@ -125,12 +130,12 @@ class GateReadOut:
             )
         )
 
-    def follow(self, acquisition: Acquisition) -> None:
+    def follow(self, gate: ShownGate) -> None:
         """Set the gate."""
-        if acquisition == self._acquisition:
+        if gate == self._gate:
             return
-        self._acquisition = acquisition
-        along = {name: scale(name, acquisition) for name in ("ns", "m")}
+        self._gate = gate
+        along = {name: scale(name, gate) for name in UNITS}
         # Not as an argument: with those that are models, Bokeh would go through the whole page.
         self._renderer.tags = [
             {n: [each.origin, each.step, each.decimals] for n, each in along.items()}

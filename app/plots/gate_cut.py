@@ -49,8 +49,8 @@ class Cut:
     @classmethod
     def of(cls, answer: Answer, wanted: ReductionSettings) -> Cut:
         """Return the cut of an estimate, and that of the present settings."""
-        n_bins, less = answer.whole.acquisition.n_bins, answer.request.less
-        return cls(n_bins, less.gate(n_bins)[0], less.merge, wanted.gate(n_bins))
+        n_bins, gate = answer.whole.acquisition.n_bins, answer.gate
+        return cls(n_bins, gate.first, gate.merge, wanted.gate(n_bins))
 
     def within(self, position: float) -> float:
         """Convert a position in the whole gate to one in the gate that is shown."""
@@ -123,6 +123,12 @@ class GateCut:
         self._handle.update(
             fill_color=colors.paper, line_color=colors.text, hover_fill_color=colors.muted
         )
+
+    def toggle_zoom(self, start: float, end: float) -> None:
+        """Zoom all plots to a part of the gate that is shown; if they are, to the whole gate."""
+        if (self._bins.start, self._bins.end) == (start, end):
+            start, end = self._bins.reset_start, self._bins.reset_end
+        self._bins.update(start=start, end=end)
 
     def update(self, cut: Cut) -> None:
         """Show a cut."""

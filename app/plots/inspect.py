@@ -6,7 +6,7 @@ extend from bottom to top whatever the data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bokeh.models import (
@@ -30,6 +30,10 @@ COUNTS_TITLES = {True: "Counts, and the two scales that follow them", False: "Co
 """Titles with and without the scales."""
 CANDIDATE_HEIGHT = 0.05
 """Height of the candidates' marks: near the bottom, where no legend hides them."""
+RANK_GAP = 0.05
+"""Distance, as a share of the gate, below which two ranks would overlap on a narrow screen."""
+RANK_PX = 13
+"""Height of a rank."""
 
 PROFILE_TITLE = "Range along the line through the pinned pixels"
 DISTANCE_LABEL = "Distance along the line (m)"
@@ -55,6 +59,20 @@ NAMES = {
 def empty(*columns: str) -> ColumnDataSource:
     """Return an empty source."""
     return ColumnDataSource({name: [] for name in columns})
+
+
+def lifts(positions: Sequence[float], gap: float) -> list[float]:
+    """Return the vertical offset in px of the rank of each candidate, best first.
+
+    A rank is above those before it that are nearer than `gap`. Zooming in only separates them.
+    """
+    rows: list[int] = []
+    for n, position in enumerate(positions):
+        near = {
+            row for row, other in zip(rows, positions, strict=False) if abs(other - position) < gap
+        }
+        rows.append(next(row for row in range(n + 1) if row not in near))
+    return [-4.0 - RANK_PX * row for row in rows]
 
 
 def counts(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
@@ -286,8 +304,11 @@ def _marked(drawing: Any, marks: Mapping[str, ColumnDataSource], with_ranks: boo
     drawing.scatter("x", "y", marker="triangle", size=8, **places, name="candidates")
     if with_ranks:
         # Above their marks; at their side they would overlap the next one.
-        above = {"y_offset": -4, "text_align": "center", "text_baseline": "bottom"}
-        drawing.text("x", "y", "rank", **places, **above, text_font_size="11px", name="ranks")
+        above = {"y_offset": "lift", "text_align": "center", "text_baseline": "bottom"}
+        # Legible on bars and curves; `PixelPlots.paint` sets the colour.
+        plate = {"background_fill_alpha": 0.8, "padding": (0, 2), "border_radius": 2}
+        style = {"text_font_size": "11px", "name": "ranks"}
+        drawing.text("x", "y", "rank", **places, **above, **plate, **style)
     return _with_legend(drawing)
 
 

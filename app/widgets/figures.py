@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from app.model.exports import Curve, Write, plot_file
 from app.theme import STYLES, Palette
-from core import Acquisition
+from app.units import ShownGate
 
 
 class Layers:
@@ -32,7 +32,7 @@ class Layers:
     def __init__(self, figure: Any, layers: Mapping[str, Mapping[str, Any]]) -> None:
         self.figure = figure
         self.layers = layers
-        self._along: Acquisition | str = ""
+        self._along: ShownGate | str = ""
         self._curves: Sequence[Curve] = ()
         reset = CustomJS(args={"figure": self.figure}, code="figure.reset.emit()")
         self.figure.js_on_event(DoubleTap, reset)
@@ -49,7 +49,7 @@ class Layers:
         if new:
             data.update(new)
 
-    def keep(self, along: Acquisition | str, curves: Sequence[Curve]) -> None:
+    def keep(self, along: ShownGate | str, curves: Sequence[Curve]) -> None:
         """Keep what the layers show for a download; `along` is the gate or the axis label."""
         self._along, self._curves = along, curves
 
@@ -126,6 +126,11 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
             if isinstance(model, getattr(bokeh.models, kind)):
                 model.update(**sizes)
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
+
+
+def around(border_px: Mapping[str, int]) -> tuple[int, int]:
+    """Return the room beside the frame of a figure, and above and below it, in px."""
+    return border_px["left"] + border_px["right"], border_px["top"] + border_px["bottom"]
 
 
 def proportioned(aspect: float, across_px: int, down_px: int) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from app.model.large import Grid
 from app.plots import elements as plots
 from app.theme import Palette
-from app.widgets.figures import Plot, color_bars, paint_frame, pane_of, proportioned
+from app.widgets.figures import Plot, around, color_bars, paint_frame, pane_of, proportioned
 from core.io import ColorScale
 
 Array = NDArray[Any]
@@ -133,14 +133,8 @@ class ImageView:
     def _keep_proportions(self) -> None:
         """Fit the frame to the image: a wider or higher one would show what is not there."""
         rows, cols = self._shape
-        side = self._border_px
-        self.figure.stylesheets = [
-            proportioned(
-                max(cols, 1) / max(rows, 1),
-                side["left"] + side["right"],
-                side["top"] + side["bottom"],
-            )
-        ]
+        aspect = max(cols, 1) / max(rows, 1)
+        self.figure.stylesheets = [proportioned(aspect, *around(self._border_px))]
 
     def update(self, image: Array, look: ColorScale) -> None:
         """Show an image (row, col); NaN is blank."""

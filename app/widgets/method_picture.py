@@ -11,6 +11,7 @@ from bokeh.models import ColorBar, LinearColorMapper, Range1d
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
+from app.model.large import Grid
 from app.theme import WRONG_COLOR, Palette
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import Sentence
@@ -25,8 +26,9 @@ PICTURE = """
 :host { display: flex !important; flex-direction: column; min-width: 0; overflow: hidden;
   height: 100% !important;
   border: 1px solid var(--mui-palette-divider, #d5dbe2); border-radius: 8px;
-  background: var(--mui-palette-background-paper, #fff); transition: opacity 0.2s 0.25s; }
+  background: var(--mui-palette-background-paper, #fff); }
 """
+STAGE = CONTAINER + ":host { transition: opacity 0.2s 0.25s }"
 
 # Titles of one to three lines: the pictures below them are aligned.
 TITLE = ":host { flex: 1 !important } .note { font-weight: 600 }"
@@ -56,9 +58,9 @@ class Picture:
         self.caption = Sentence(
             stylesheets=[CAPTION], sizing_mode="stretch_width", margin=(0, 8, 4, 8)
         )
-        self._picked = picked
+        self._picked, self._is_blank = picked, True
         self._stage = pn.Column(
-            self.image.pane, stylesheets=[CONTAINER], sizing_mode="stretch_width", margin=0
+            self.image.pane, stylesheets=[STAGE], sizing_mode="stretch_width", margin=0
         )
         self.card = pn.Column(
             self.title,
@@ -70,8 +72,14 @@ class Picture:
         )
         self.resize(height)
 
+    def enter(self, rows: int, cols: int, grid: Grid) -> None:
+        """Prepare for another capture; the picture is blank until it is drawn."""
+        self._is_blank = True
+        self.image.enter(rows, cols, grid)
+
     def draw_image(self, values: Array, look: ColorScale) -> None:
         """Show an image (row, col) in place of the cloud."""
+        self._is_blank = False
         self.image.pane.visible = True
         if self.cloud is not None:
             self.cloud.visible = False
@@ -82,11 +90,13 @@ class Picture:
         self._stage.height = height
 
     def dim(self, is_outdated: bool) -> None:
-        """Draw an outdated picture faintly."""
-        self.card.styles = {"opacity": "0.35" if is_outdated else "1"}
+        """Draw an outdated picture faintly, and no axes around nothing."""
+        outdated = "0" if self._is_blank else "0.35"
+        self._stage.styles = {"opacity": outdated if is_outdated else "1"}
 
     def show_cloud(self, dark: bool) -> PointCloud:
         """Show the cloud in place of the image; it is made on demand."""
+        self._is_blank = False
         if self.cloud is None:
             self.cloud = PointCloud(
                 wrong_color=WRONG_COLOR, link="methods", dark=dark, sizing_mode="stretch_both"

@@ -14,8 +14,8 @@ from app.model.methods import METHOD_TITLES
 from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes
 from app.theme import LIGHT, Palette
+from app.units import ShownGate
 from app.widgets.figures import Plot, fit, paint_frame, pane_of
-from core import Acquisition
 
 Array = NDArray[Any]
 
@@ -83,16 +83,16 @@ class CurvePlot:
         curves: Mapping[str, Array],
         estimates: Mapping[str, float],
         truth_bin: float,
-        acquisition: Acquisition,
+        gate: ShownGate,
         styles: Mapping[str, Style],
         unit: str,
     ) -> None:
         """Show a pixel: curves (bin,), estimates in bins and styles of lines, by method."""
         plot, bins = self.plot, self.plot.figure.x_range
-        if bins.end != acquisition.n_bins:
-            bins.update(end=acquisition.n_bins, reset_end=acquisition.n_bins)
-        self._axes.follow(unit, acquisition)
-        centres = plots.centres(acquisition.n_bins)
+        if bins.end != gate.n_bins:
+            bins.update(end=gate.n_bins, reset_end=gate.n_bins)
+        self._axes.follow(unit, gate)
+        centres = plots.centres(gate.n_bins)
         lines = {method: (centres, curve) for method, curve in curves.items()}
         self._lines.update(lines, styles)
         lowest = min((float(curve.min()) for curve in curves.values()), default=0.0)
@@ -115,7 +115,7 @@ class CurvePlot:
             for each in estimated
         ]
         truth = Curve("truth", "truth", truth_bin)
-        plot.keep(acquisition, [*curves_of(lines, "score, scaled"), truth, *marks])
+        plot.keep(gate, [*curves_of(lines, "score, scaled"), truth, *marks])
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme; those of the lines come with `update`."""

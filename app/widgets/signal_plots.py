@@ -14,8 +14,9 @@ from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.plots.gate_cut import GateCut
 from app.theme import LIGHT, Palette
+from app.units import ShownGate
 from app.widgets.figures import Plot, fit, round_up
-from core import Acquisition, Signals
+from core import Signals
 
 Array = NDArray[Any]
 
@@ -81,23 +82,23 @@ class SignalPlots:
         self.cut.paint(colors)
 
     def update(
-        self, pixel: Pixel, acquisition: Acquisition, with_difference: bool, unit: str = "bins"
+        self, pixel: Pixel, gate: ShownGate, with_difference: bool, unit: str = "bins"
     ) -> None:
         """Show a pixel, with axes in a unit."""
         for axes in self._axes:
-            axes.follow(unit, acquisition)
+            axes.follow(unit, gate)
         for read_out in self._read_outs:
-            read_out.follow(acquisition)
-        if self.histogram.source("raw").data["top"].size != acquisition.n_bins:
-            self._lay_out(acquisition.n_bins)
-        self._draw_histogram(pixel, acquisition)
+            read_out.follow(gate)
+        if self.histogram.source("raw").data["top"].size != gate.n_bins:
+            self._lay_out(gate.n_bins)
+        self._draw_histogram(pixel, gate)
         if pixel.signals is None:
-            self._draw_score(pixel, acquisition)
+            self._draw_score(pixel, gate)
         else:
-            self._draw_stages(pixel, pixel.signals, acquisition, with_difference)
+            self._draw_stages(pixel, pixel.signals, gate, with_difference)
 
-    def _draw_histogram(self, pixel: Pixel, acquisition: Acquisition) -> None:
-        plot, lines = self.histogram, plots.drawn(pixel.lines, acquisition.n_bins)
+    def _draw_histogram(self, pixel: Pixel, gate: ShownGate) -> None:
+        plot, lines = self.histogram, plots.drawn(pixel.lines, gate.n_bins)
         plot.figure.title.text = plots.HISTOGRAM_TITLES[pixel.signals is not None]
         plot.write("raw", top=pixel.histogram)
         for layer, counts in lines.items():
@@ -105,21 +106,21 @@ class SignalPlots:
             plot.show(layer, pixel.lines[layer] is not None)
         self._frame(plot, pixel, 0.0, pixel.histogram, *lines.values())
         curves = plots.bin_curves(plots.HISTOGRAM_NAMES, "counts", raw=pixel.histogram, **lines)
-        plot.keep(acquisition, curves + _marks(pixel))
+        plot.keep(gate, curves + _marks(pixel))
 
-    def _draw_score(self, pixel: Pixel, acquisition: Acquisition) -> None:
+    def _draw_score(self, pixel: Pixel, gate: ShownGate) -> None:
         plot, score = self.score, pixel.score
         plot.write("enhanced", score=score)
         low, high = plots.score_ends(score)
         fit(plot.figure, low, high)
         self._mark(plot, pixel, low, high)
         curves = plots.bin_curves(plots.SCORE_NAMES, "", enhanced=score)
-        plot.keep(acquisition, curves + _marks(pixel))
+        plot.keep(gate, curves + _marks(pixel))
 
     def _draw_stages(
-        self, pixel: Pixel, signals: Signals, acquisition: Acquisition, with_difference: bool
+        self, pixel: Pixel, signals: Signals, gate: ShownGate, with_difference: bool
     ) -> None:
-        nothing = np.full(acquisition.n_bins, np.nan)
+        nothing = np.full(gate.n_bins, np.nan)
         difference = pixel.difference if with_difference else nothing
         self.residual.write("residual", residual=signals.residual)
         self.residual.write("raw", residual=difference)
@@ -139,8 +140,8 @@ class SignalPlots:
             *curves({}, "", weight=signals.weight),  # as it is; on screen it is scaled
             *curves({}, "counts × weight", enhanced=signals.enhanced),
         ]
-        self.residual.keep(acquisition, residual + _marks(pixel))
-        self.enhanced.keep(acquisition, enhanced + _marks(pixel))
+        self.residual.keep(gate, residual + _marks(pixel))
+        self.enhanced.keep(gate, enhanced + _marks(pixel))
 
     def _lay_out(self, n_bins: int) -> None:
         """Prepare the plots for another number of bins."""

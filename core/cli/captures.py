@@ -20,12 +20,14 @@ from core.cli.options import (
     FLUX_OPTIONS,
     add_capture,
     add_colors,
+    add_crop,
     add_filters,
     add_flux,
     add_pixel,
     add_settings,
     angle,
     colors_given,
+    crop_given,
     flux_of,
     reading,
     require_none,
@@ -245,6 +247,7 @@ def _add_estimate(commands: Any) -> None:
         add_truth_options(method)
         add_flux(method)
         add_filters(method)
+        add_crop(method)
         add_colors(method)
         _add_out(method, "the range image", (*WRITERS, *FOLDER_WRITERS), more=_CLOUD_HELP)
         method.add_argument(
@@ -265,13 +268,13 @@ def _estimate(chosen: argparse.Namespace) -> None:
     refused = _refused(chosen)
     truth_options_from(chosen, chosen.capture)
     settings = settings_given(chosen, ESTIMATORS[chosen.method].parameters)
-    colors = colors_given(chosen)
+    colors, box = colors_given(chosen), crop_given(chosen)
     in_tiles = chosen.scheduler or _exceeds_memory(chosen)
     accepted = "False for a capture that is ranged in tiles"
     require("intervals", chosen.intervals, not (chosen.intervals and in_tiles), accepted)
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
     save = save_ranges(
-        described, image, chosen.least_confidence, chosen.overwrite, colors, chosen.intervals
+        described, image, chosen.least_confidence, chosen.overwrite, colors, chosen.intervals, box
     )
     written, refused = save_each(chosen.out, refused, save)
     has_cloud = any(path.suffix.lower() in CLOUD_SUFFIXES for path in written)

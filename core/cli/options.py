@@ -8,6 +8,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from core.acquisition import Flux
 from core.checks import require
 from core.estimators import FALSE_ALARM
+from core.geometry import Box
 from core.io import read_options_from
 from core.io.readers.quantities import EXAMPLE_OF_ANGLE, parsed_angle
 from core.io.writers import RangeColors
@@ -105,6 +107,52 @@ def add_filters(command: Any) -> None:
         help="leave estimates of less confidence out of the files, as the app does below 0.9; they "
         "still count in the figures; by default all are written",
     )
+
+
+def add_crop(command: Any) -> None:
+    """Add the options for the box to which a point cloud is cropped."""
+    group = command.add_argument_group("crop of the point cloud, as in the app")
+    group.add_argument(
+        "--crop",
+        type=_limit,
+        nargs=2,
+        metavar=("FROM", "TO"),
+        default=(None, None),
+        help="shortest and longest range in metres; - for no limit",
+    )
+    group.add_argument(
+        "--crop-pixels",
+        type=_corners,
+        metavar="'ROW,COL ROW,COL ...'",
+        default=(),
+        help="corners of a polygon that holds the pixels, as files state them",
+    )
+
+
+def crop_given(chosen: argparse.Namespace) -> Box:
+    """Return the box that the options of `add_crop` give."""
+    return Box(chosen.crop_pixels, *chosen.crop)
+
+
+def _limit(text: str) -> float | None:
+    """Parse the limit of a range; None for -."""
+    if text == "-":
+        return None
+    with suppress(ValueError):
+        if math.isfinite(value := float(text)):
+            return value
+    raise argparse.ArgumentTypeError(f"{text} is not accepted: give metres, or - for no limit.")
+
+
+def _corners(text: str) -> tuple[tuple[float, float], ...]:
+    """Parse the corners of a polygon."""
+    with suppress(ValueError):
+        pairs = (each.split(",") for each in text.split())
+        corners = tuple((float(row), float(col)) for row, col in pairs)
+        if len(corners) >= 3 and np.isfinite(corners).all():
+            return corners
+    message = f"{text} is not accepted: give 3 or more row,col separated by spaces."
+    raise argparse.ArgumentTypeError(message)
 
 
 def add_colors(command: Any) -> None:

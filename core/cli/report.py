@@ -10,9 +10,11 @@ from typing import Any
 
 from core.checks import printable
 from core.cli.options import (
+    add_crop,
     add_false_alarm,
     add_pixel,
     add_settings,
+    crop_given,
     probability,
     reading,
     settings_given,
@@ -20,11 +22,12 @@ from core.cli.options import (
 )
 from core.cli.saving import refused_outputs
 from core.estimators import ESTIMATORS, estimate
+from core.geometry import WHOLE
 from core.io.readers import read_capture
 from core.io.readers.options import add_read_options, read_options_from
 from core.io.readers.truth import add_truth_options, read_truth, truth_options_from
 from core.report import LEAST_CONFIDENCE, save_report
-from core.scripts import assign, changed_fields, literal
+from core.scripts import assign, call, changed_fields, literal
 
 
 def add(commands: Any) -> None:
@@ -53,6 +56,7 @@ def add(commands: Any) -> None:
             help=f"maps and cloud hide estimates of less confidence ({LEAST_CONFIDENCE:g})",
         )
         add_false_alarm(method)
+        add_crop(method)
         method.add_argument("--overwrite", action="store_true", help="replace the file")
         method.add_argument("--json", action="store_true", help="one JSON object instead of lines")
         add_truth_options(method)
@@ -64,7 +68,7 @@ def add(commands: Any) -> None:
 def _report(chosen: argparse.Namespace) -> None:
     refused_outputs([chosen.out], (".html",), chosen.overwrite)
     truth = truth_options_from(chosen, chosen.capture)
-    settings = settings_given(chosen, ESTIMATORS[chosen.method].parameters)
+    settings, box = settings_given(chosen, ESTIMATORS[chosen.method].parameters), crop_given(chosen)
     capture = read_capture(chosen.capture, **reading(chosen))
     if truth:
         capture = read_truth(capture=capture, **truth)
@@ -77,6 +81,7 @@ def _report(chosen: argparse.Namespace) -> None:
         overwrite=chosen.overwrite,
         pixel=chosen.pixel and tuple(chosen.pixel),
         least_confidence=chosen.least_confidence,
+        box=box,
         title=chosen.capture.name,
         script=_script(chosen, settings),
     )
@@ -105,5 +110,7 @@ def _lines(chosen: argparse.Namespace, settings: Any) -> Iterator[str]:
     view = {"least_confidence": literal(chosen.least_confidence)}
     if chosen.pixel is not None:
         view["pixel"] = literal(tuple(chosen.pixel))
+    if (box := crop_given(chosen)) != WHOLE:
+        view["box"] = call("core.geometry.Box", **changed_fields(box))
     out, title = literal(chosen.out.name), literal(chosen.capture.name)
     yield assign("", "core.save_report", "capture", "image", out, title=title, **view)

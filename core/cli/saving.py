@@ -10,6 +10,7 @@ from core.capture import Capture, CaptureInfo
 from core.checks import require, shown
 from core.cli.results import Incomplete
 from core.estimators import RangeImage
+from core.geometry import WHOLE, Box
 from core.inference import range_interval
 from core.io.writers import CLOUD_SUFFIXES, RangeColors, save_image
 from core.io.writers.product import guessed_view
@@ -26,19 +27,23 @@ def save_ranges(
     overwrite: bool,
     colors: RangeColors | None,
     intervals: bool = False,
+    box: Box = WHOLE,
 ) -> Callable[[Path], None]:
     """Return a function that writes a range image without estimates of little confidence.
 
     With `intervals`, for which the capture must be in memory, those of the ranges are written, too.
+    Point clouds hold only what is inside `box`.
     """
     kept = image if least_confidence is None else image.confident(least_confidence)
     view = guessed_view(capture, image)
     interval = range_interval(capture, kept) if intervals and isinstance(capture, Capture) else None
 
     def save(path: Path) -> None:
-        own = view if path.suffix.lower() in CLOUD_SUFFIXES else {}
+        is_cloud = path.suffix.lower() in CLOUD_SUFFIXES
+        own = view if is_cloud else {}
         known: dict[str, Any] = {"interval": interval, "colors": colors, **own}
-        save_image(capture, kept, path, overwrite=overwrite, **known)
+        inside = kept.cropped(box) if is_cloud and box != WHOLE else kept
+        save_image(capture, inside, path, overwrite=overwrite, **known)
 
     return save
 

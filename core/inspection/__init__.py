@@ -13,7 +13,7 @@ from core.inspection.flux import estimate_flux
 from core.inspection.line_profile import LineProfile, line_profile
 from core.inspection.maps import maps
 from core.inspection.mean_flux import estimate_mean_flux, estimate_target_flux
-from core.inspection.pixel import PixelReport, RangeCandidate, pixel_report
+from core.inspection.pixel import PixelReport, RangeCandidate, echo_view, pixel_report
 from core.inspection.profile import LEVEL, FluxEstimate
 from core.inspection.pulses import Accuracy, accuracy_over_pulses
 from core.inspection.region import RegionReport, region_report
@@ -39,6 +39,7 @@ __all__ = [
     "Suggestion",
     "accuracy_over_pulses",
     "capture_report",
+    "echo_view",
     "estimate_flux",
     "estimate_mean_flux",
     "estimate_target_flux",

@@ -25,6 +25,7 @@ from core.inspection.surfaces import surface_probabilities
 from core.metrics import Interval
 
 MOST_CANDIDATES = 5
+_FEWEST_BINS = 5  # of an echo in a plot around it
 
 
 @dataclass(frozen=True)
@@ -184,6 +185,12 @@ def pixel_flux(capture: Capture, row: int, col: int) -> FluxEstimate:
 def flux_unit(capture: Capture) -> str:
     """Return the unit of fluxes: ``"photons"`` if the number of pulses is unknown."""
     return "photons" if capture.acquisition.n_pulses is None else "photons per pulse"
+
+
+def echo_view(capture: Capture, at_bin: float) -> tuple[float, float]:
+    """Return the ends of a plot of a few echoes around a delay, in bins within the gate."""
+    half = 2 * max(capture.echo_bins, _FEWEST_BINS)
+    return max(at_bin - half, 0.0), min(at_bin + half, float(capture.acquisition.n_bins))
 
 
 @cached_per_capture

@@ -11,6 +11,7 @@ import numpy as np
 from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, require_capture
+from core.geometry import WHOLE, Box
 from core.io.writers.whole import whole_file
 
 __all__ = ["LEAST_CONFIDENCE", "save_report", "telling_pixel", "write_report"]
@@ -28,6 +29,7 @@ def save_report(
     pixel: tuple[int, int] | None = None,
     least_confidence: float = LEAST_CONFIDENCE,
     pixel_angle_rad: float | None = None,
+    box: Box = WHOLE,
     title: str = "",
     script: str = "",
 ) -> None:
@@ -55,6 +57,8 @@ def save_report(
     pixel_angle_rad : float, optional
         Angle between the lines of sight of neighbouring pixels, in radians; the capture's own where
         None, or a guess, which the report mentions.
+    box : Box
+        Part of the scene that the cloud shows.
     title : str
         Such as the name of the capture's file.
     script : str
@@ -80,6 +84,7 @@ def save_report(
             pixel=pixel,
             least_confidence=least_confidence,
             pixel_angle_rad=pixel_angle_rad,
+            box=box,
             title=title,
             script=script,
         )
@@ -93,6 +98,7 @@ def write_report(
     pixel: tuple[int, int] | None = None,
     least_confidence: float = LEAST_CONFIDENCE,
     pixel_angle_rad: float | None = None,
+    box: Box = WHOLE,
     title: str = "",
     script: str = "",
 ) -> None:
@@ -112,7 +118,7 @@ def write_report(
     require("image.made_by", made_by, made_by is not None, "an image that core.estimate returned")
     known = telling_pixel(capture, image) if pixel is None else pixel
     page = page_of(
-        capture, image, known, least_confidence, pixel_angle_rad, title=title, script=script
+        capture, image, known, least_confidence, pixel_angle_rad, box, title=title, script=script
     )
     file.write(page.encode("utf-8", "backslashreplace"))
 

@@ -18,12 +18,14 @@ import numpy as np
 from core import metrics
 from core.capture import Capture
 from core.estimators import ESTIMATORS, Provenance, RangeImage
+from core.geometry import WHOLE, Box
 from core.inspection import (
     CaptureReport,
     FluxEstimate,
     PixelReport,
     StatedFluxCheck,
     capture_report,
+    echo_view,
     pixel_report,
 )
 from core.io.writers.colors import ColorScale, colors_of, range_scale
@@ -51,7 +53,6 @@ _WIDTHS = {
     "gaussian": "standard deviation",
     "measured": "sample spacing",
 }
-_FEWEST_BINS = 5  # of an echo in the plot around an estimate
 _FLUXES = {"signal": "Signal", "background": "Background", "sbr": "SBR"}
 _LIBRARIES = ("numpy", "scipy", "numba")
 
@@ -91,6 +92,7 @@ def page_of(
     pixel: tuple[int, int],
     least_confidence: float,
     pixel_angle_rad: float | None,
+    box: Box,
     *,
     title: str,
     script: str,
@@ -111,7 +113,7 @@ def page_of(
         *_maps(capture, image, shown, scale, pixel, step),
         *_all_pixels(capture, capture_found),
         *_pixel(capture, made_by, pixel_found),
-        *_cloud(capture, image, shown, scale, pixel_angle_rad, step),
+        *_cloud(capture, image, shown, scale, pixel_angle_rad, box, step),
         *_accuracy(capture, image),
         *_settings(made_by, least_confidence),
         *_script(script),
@@ -278,19 +280,14 @@ def _pixel(capture: Capture, made_by: Provenance, report: PixelReport) -> Iterat
         (_stages_title(report), gate_svg(acquisition, stages, marks, "Score", "score")),
     ]
     if not math.isnan(report.answer_bin):
-        near = gate_svg(acquisition, histogram, marks, "Detections", "near", _near(capture, report))
+        view_bins = echo_view(capture, report.answer_bin)
+        near = gate_svg(acquisition, histogram, marks, "Detections", "near", view_bins)
         drawn.append(("Histogram around the estimate", near))
     plots = (_figure(svg, f"{title}, {where}", f"{title}.") for title, svg in drawn)
     yield f'<div class="plots">{"".join(plots)}</div>'
     yield _intervals(report.flux, report.flux_unit, "Flux of the pixel, with 95 % intervals")
     yield f'<p class="note">Method: {_text(report.flux_method)}.</p>'
     yield _candidates(capture, report)
-
-
-def _near(capture: Capture, report: PixelReport) -> tuple[float, float]:
-    """Return the ends of a few echoes around the estimate, in bins."""
-    half = 2 * max(capture.echo_bins, _FEWEST_BINS)
-    return max(report.answer_bin - half, 0), min(report.answer_bin + half, report.counts.size)
 
 
 def _stages_title(report: PixelReport) -> str:
@@ -323,6 +320,7 @@ def _cloud(
     shown: RangeImage,
     scale: ColorScale,
     pixel_angle_rad: float | None,
+    box: Box,
     step: int,
 ) -> Iterator[str]:
     remark = ""
@@ -330,15 +328,18 @@ def _cloud(
     if angle_rad is None:
         view = guessed_view(capture, image)
         angle_rad, remark = view["pixel_angle_rad"], f" Note that {view['remark']}."
-    cloud = cloud_of(shown.range_m, scale, angle_rad, step)
+    inside = np.where(box.contains(shown.range_m), shown.range_m, np.nan)
+    cloud = cloud_of(inside, scale, angle_rad, step)
     yield _heading_2("Point cloud")
     if cloud is None:
-        yield _paragraph("There are no points: no estimate is confident enough.")
+        where = "" if box == WHOLE else f" in the box: {box}"
+        yield _paragraph(f"There are no points: no estimate is confident enough{_text(where)}.")
         return
     thinned = f", of 1 of {step} rows and 1 of {step} columns" if step > 1 else ""
     data = {name: value for name, value in asdict(cloud).items() if name != "n_points"}
     attributes = " ".join(f'data-{name}="{value}"' for name, value in data.items())
-    label = f"Point cloud of {cloud.n_points:,} estimates"
+    where = "" if box == WHOLE else f" in the box ({_text(box)})"
+    label = f"Point cloud of {cloud.n_points:,} estimates{where}"
     yield (
         f'<figure><canvas id="cloud" tabindex="0" role="img" aria-label="{label}" {attributes}>'
         f"</canvas><figcaption>{label}{thinned}, in the colours of the map of range.{_text(remark)}"

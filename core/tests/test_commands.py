@@ -17,7 +17,7 @@ from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.cli import main
 from core.estimators import estimate
-from core.geometry import guessed_field_of_view_deg, pixel_angle_of
+from core.geometry import Box, guessed_field_of_view_deg, pixel_angle_of
 from core.inference import range_interval
 from core.io import readers
 from core.io.readers import Reader, read_capture
@@ -173,12 +173,17 @@ def test_estimate_writes_what_it_reports(
     with np.load(npz) as archive:
         np.testing.assert_array_equal(archive["range_low_m"], range_interval(car, image).low_m)
     sure, given = tmp_path / "sure.npz", ("--least-confidence", 0.99, "--overwrite")
-    more = facts(capsys, "estimate", "peak", *arguments[:2], *given, "--out", sure)
+    cloud, crop = tmp_path / "cropped.ply", ("--crop", 50, "-", "--crop-pixels", "0,0 0,63 63,0")
+    files = ("--out", sure, "--out", cloud)
+    more = facts(capsys, "estimate", "peak", *arguments[:2], *given, *crop, *files)
     peak = estimate(car, "peak")
     assert more["pixels_estimated"] == peak.valid.sum()
     with np.load(sure) as archive:
         np.testing.assert_array_equal(archive["valid"], peak.confident(0.99).valid)
         assert (archive["method"], archive["settings"]) == ("peak", "{}")
+    inside = peak.confident(0.99).cropped(Box(((0, 0), (0, 63), (63, 0)), 50.0)).valid
+    assert 0 < inside.sum() < peak.confident(0.99).valid.sum()
+    assert f"element vertex {inside.sum()}\n".encode() in cloud.read_bytes()
     arguments = ("--t-n", 30, "--weight", "none", "--sbr", 0.2, "--seed", 1)
     found = facts(capsys, "estimate", "tracking", *arguments)
     image = estimate(car, "tracking", t_n=30, weight="none")

@@ -376,7 +376,7 @@ class Compare(Section):
             cloud, _, wrong = cloud_of(session.answer, "Range", session.state.viewing)
             self._bounds = view_bounds(cloud, None if wrong is None else ~wrong)
         for picture in self.pictures:
-            picture.image.enter(*self._capture.shape, session.answer.grid)
+            picture.enter(*self._capture.shape, session.answer.grid)
 
     def _continue(self) -> None:
         """Compute the next missing result, unless something is running or stopped."""
@@ -464,7 +464,11 @@ class Compare(Section):
     def _show_progress(self, missing: list[Task]) -> None:
         total, done = len(self.tasks), len(self.tasks) - len(missing)
         is_running = self._is_busy and bool(missing)
-        self.status.text = text.progress(done, total, missing[0].method if is_running else None)
+        running = missing[0].method if is_running else None
+        self.status.text = text.progress(done, total, running)
+        for picture, method in zip(self.pictures, self.pictured, strict=False):
+            if self.tasks[method] in missing:
+                picture.caption.text = text.waiting(method, running)
         self._bar.param.update(value=100 * done // max(total, 1), visible=is_running)
         self._stop.param.update(
             label="Resume" if self._is_stopped else "Cancel", visible=bool(missing)
@@ -520,7 +524,7 @@ class Compare(Section):
             self.pictures.append(picture)
             self._buttons.append(button)
             picture.image.join(self.pictures[0].image)
-            picture.image.enter(*self._capture.shape, self.session.answer.grid)
+            picture.enter(*self._capture.shape, self.session.answer.grid)
             self._paint_picture(picture)
         cards = [*(picture.card for picture in self.pictures[:count]), self._keys]
         if cards != self._grid.objects:
@@ -557,7 +561,8 @@ class Compare(Section):
             for picture, method in zip(self.pictures, self.pictured, strict=False):
                 picture.image.mark(row, col)
                 answer = answers.get(method)
-                picture.caption.text = "" if answer is None else text.caption(answer, row, col)
+                if answer is not None:
+                    picture.caption.text = text.caption(answer, row, col)
                 if picture.cloud is not None:
                     picture.cloud.selected = row * self._capture.shape[1] + col
 
@@ -567,13 +572,14 @@ class Compare(Section):
         answers = {method: each for method, each in answers.items() if method in self.tasks}
         if pixel != self.session.state.pixel or not answers:
             return  # outdated
-        acquisition, truth_m = self._capture.acquisition, self._capture.truth_range_m
+        answer = next(iter(answers.values()))
+        acquisition, truth_m = answer.capture.acquisition, answer.capture.truth_range_m
         truth = np.nan if truth_m is None else float(truth_m[pixel])
         self._curves.update(
             {method: curve for method, curve in curves.items() if method in answers},
             {method: float(each.run.image.bin[pixel]) for method, each in answers.items()},
             float(acquisition.range_m_to_bin(truth)),
-            acquisition,
+            answer.gate,
             self._styles(),
             self.session.state.unit,
         )

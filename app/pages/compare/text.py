@@ -12,6 +12,7 @@ from app.model.colors import Unseen
 from app.model.methods import METHOD_TITLES
 from app.model.store import Answer
 from app.model.text import (
+    COMPUTING,
     NOT_COMPUTED,
     TRUTH_HELP,
     Cell,
@@ -219,6 +220,13 @@ def progress(done: int, total: int, method: str | None) -> str:
     if method is not None:
         return f"{done + 1} of {total}: {ESTIMATORS[method].title}"
     return f"{total} methods compared" if done == total else f"Stopped: {done} of {total} done"
+
+
+def waiting(method: str, running: str | None) -> str:
+    """Return why a method has no picture yet; `running` is the one that is running."""
+    if running is None:
+        return "Stopped. Press Resume to compute it."
+    return COMPUTING if method == running else "Waiting for its turn."
 
 
 def failure(error: Exception) -> str:

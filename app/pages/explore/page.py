@@ -29,6 +29,7 @@ from app.pages.shared.downloads import (
     pixel_plot,
     viewed,
 )
+from app.pages.shared.echo_zoom import EchoZoom
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
 from app.pages.shared.viewing import show_own_width
@@ -77,6 +78,7 @@ class Explore(Section):
     figures, numbers : Facts
         Figures of the image and numbers of the pixel.
     signals : SignalPlots
+    zoom : EchoZoom
         The pixel's plots.
     cards : list of pn.Column
         These plots in their frames.
@@ -108,6 +110,8 @@ class Explore(Section):
                 self.signals.plots, ("histogram", "residual", "enhanced", "score"), strict=True
             )
         ]
+        self.zoom = EchoZoom(self.signals.cut)
+        self.cards[0].append(self.zoom.button)
         self._large = LargeView(session, self.image.figure)
         state = session.state
         self._viewing = SettingsPanel(Viewing(), partial(setattr, state, "viewing"))
@@ -232,7 +236,8 @@ class Explore(Section):
         with self.session.tasks.hold():
             self.image.fit(*answer.capture.shape, answer.grid)
             self.signals.cut.update(Cut.of(answer, state.less))
-            self.signals.update(pixel, answer.capture.acquisition, state.difference, state.unit)
+            self.signals.update(pixel, answer.gate, state.difference, state.unit)
+            self.zoom.follow(answer.capture, pixel.answer_bin)
             self._show_cards(is_tracking=pixel.signals is not None)
             self.image.mark(row, col)
             self.image_keys.shape = list(answer.capture.shape)

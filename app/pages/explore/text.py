@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from app.model.colors import WHOLE
 from app.model.store import Answer, Pixel
 from app.model.text import Fact, estimate_facts, milliseconds, number, share
 from app.units import count, scale
-from core.geometry import Box
+from core.geometry import WHOLE, Box
 
 IMAGE_HELP = "Quantity shown in the image"
 
@@ -67,7 +66,7 @@ def pixel_numbers(answer: Answer, pixel: Pixel, unit: str = "bins") -> list[Fact
     row, col = answer.grid.place(pixel.row, pixel.col)
     has_truth = answer.capture.truth_range_m is not None
     numbers = [
-        *estimate_facts(pixel, scale(unit, answer.capture.acquisition), has_truth),
+        *estimate_facts(pixel, scale(unit, answer.gate), has_truth),
         ("Pixel", f"row {row}, col {col}", "Arrow keys on the image move it."),
         *_accelerations(answer, pixel),
         ("Detections", count(pixel.counts), "Counts in this pixel's histogram."),

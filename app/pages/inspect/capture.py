@@ -201,12 +201,12 @@ class CaptureSection(Section):
         """Draw the sum of all pixels (bin,); `marks` are kept for a download."""
         if answer is not self.session.answer:
             return  # outdated
-        acquisition = answer.capture.acquisition
+        gate = answer.gate
         with self.session.tasks.hold():
-            cover(self._bins, acquisition.n_bins)
-            self.counts.follow(self.session.state.unit, acquisition)
+            cover(self._bins, gate.n_bins)
+            self.counts.follow(self.session.state.unit, gate)
             curves = plots.bin_curves(inspect_plots.NAMES, "counts", raw=counts)
-            self.counts.draw(acquisition, [*curves, *marks])
+            self.counts.draw(gate, [*curves, *marks])
             self.counts.frame(counts)
 
     def _arrived(self, answer: Answer, report: CaptureReport) -> None:
@@ -230,7 +230,7 @@ class CaptureSection(Section):
         answer, report = self._reported, self.report
         if not self.is_on_screen or answer is not self.session.answer or report is None:
             return
-        acquisition, suggestion = answer.capture.acquisition, report.suggestion
+        gate, suggestion = answer.gate, report.suggestion
         positions = {"t_n": answer.request.tracking.t_n, "suggested": suggestion.t_n}
         first, end = suggestion.gate
         marks = plots.marks(inspect_plots.NAMES, window=suggestion.gate, **positions)
@@ -241,8 +241,8 @@ class CaptureSection(Section):
                 self.counts.mark(layer, position)
             self.facts.facts = text.capture_facts(answer, report)
             self.flux.text = text.flux_sentence(report)
-            along = scale(self.session.state.unit, acquisition)
+            along = scale(self.session.state.unit, gate)
             for sentence, advice in zip(self.advice, text.advice(report, along), strict=True):
                 sentence.text = advice
-            self.apply[0].disabled = suggestion.gate == (0, acquisition.n_bins)
+            self.apply[0].disabled = suggestion.gate == (0, gate.n_bins)
             self.apply[1].disabled = suggestion.t_n == answer.request.tracking.t_n

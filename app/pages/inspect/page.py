@@ -21,7 +21,7 @@ from app.pages.inspect.pins import PinsSection, pin_colors
 from app.pages.inspect.pixel import BREAK_PX, COLUMN, FILLING, NARROW, PixelSection, framed
 from app.pages.inspect.profile import ProfileSection
 from app.pages.inspect.results import Corners
-from app.pages.inspect.views import Navigator, rectangle
+from app.pages.inspect.views import Navigator, Pixels, rectangle
 from app.pages.navigation import Page, Pages
 from app.pages.session import Session
 from app.pages.shared.crop import CropSection
@@ -89,7 +89,7 @@ class Inspect(Section):
     def __init__(self, session: Session) -> None:
         super().__init__(session)
         state = session.state
-        self.navigator = Navigator(session.choose_pixel, self._select)
+        self.navigator = Navigator(session.choose_pixel, self._select, self._join)
         self._painted = [self.navigator]
         self._large = LargeView(session, self.navigator.figure)
         self.keys = PixelKeys(
@@ -186,13 +186,13 @@ class Inspect(Section):
             main.param.update(stylesheets=[FILLING], sizing_mode="stretch_both", margin=0)
             below.param.update(stylesheets=[TABLES], sizing_mode="stretch_width", margin=0)
         left = (
-            _row(self._map, self._mode, self._clear),
+            _row(self._map, self._mode),
             self.offer(framed_map, "map", self._map_shown, IMAGE_AND_REPORT),
             self.legend,
             self.least_confidence,
             self._large.layout,
             _row(*self.place, self._pin),
-            _row(*self.span, self._add),
+            _row(*self.span, self._add, self._clear),
             self.refusal,
             self.chips,
             *sections.asides.values(),
@@ -285,6 +285,11 @@ class Inspect(Section):
             state.subject = "Region"
         elif state.subject == "Region":
             state.subject = "Pixel"
+
+    def _join(self, pixels: Pixels) -> None:
+        """Pin the pixels that a line joins, and show the profile along it."""
+        if len(pixels) > 1:
+            self.session.state.param.update(pins=pixels, subject="Profile")
 
     def _inspect(self, pixel: list[int]) -> None:
         """Choose a pixel and show what is known about it."""

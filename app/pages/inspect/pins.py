@@ -76,19 +76,19 @@ class PinsSection(Section):
 
     def _draw(self, found: list[Inspected]) -> None:
         unit, answer = self.session.state.unit, self.session.answer
-        acquisition = answer.capture.acquisition
+        gate = answer.gate
         colors = pin_colors(self.is_dark)[: len(found)]
         names = [text.pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
         scales = text.both_scales(unit, answer)
-        cover(self._bins, acquisition.n_bins)
-        bins = plots.centres(acquisition.n_bins)
+        cover(self._bins, gate.n_bins)
+        bins = plots.centres(gate.n_bins)
         for plot, quantity, curves in (
             (self.counts, "counts", [each.pixel.histogram for each in found]),
             (self.score, "score", [each.pixel.score for each in found]),
         ):
-            plot.follow(unit, acquisition)
+            plot.follow(unit, gate)
             named = zip(names, curves, strict=True)
-            plot.keep(acquisition, [Curve("lines", n, bins, y, quantity) for n, y in named])
+            plot.keep(gate, [Curve("lines", n, bins, y, quantity) for n, y in named])
             plot.source("lines").data = {
                 "xs": [bins.astype(np.float32)] * len(found),
                 "ys": [np.asarray(curve, np.float32) for curve in curves],
@@ -100,7 +100,7 @@ class PinsSection(Section):
             lows, highs = zip(*(plots.score_ends(each.pixel.score) for each in found), strict=True)
             fit(self.score.figure, min(lows), max(highs))
         self.table.param.update(
-            columns=text.pin_columns(unit) if found else [],
+            columns=text.pin_columns(scales[0]) if found else [],
             rows=[
                 text.pin_row(each, name, color, *scales)
                 for each, name, color in zip(found, names, colors, strict=True)

@@ -22,6 +22,7 @@ from app.pages.inspect.results import (
 from app.pages.inspect.views import PixelPlots
 from app.pages.session import Session
 from app.pages.shared.downloads import Shown, pixel_on_show, region_on_show
+from app.pages.shared.echo_zoom import EchoZoom
 from app.pages.shared.section import Section
 from app.plots.gate_cut import Cut
 from app.widgets.cards import card, column, unrolled
@@ -90,6 +91,7 @@ class PixelSection(Section):
     found : Inspected or None
         What is shown; None while there is nothing to show.
     plots : PixelPlots
+    zoom : EchoZoom
     cards : list of pn.Column
         The plots in their frames.
     facts : Facts
@@ -113,6 +115,8 @@ class PixelSection(Section):
                 self.plots.plots, ("counts", "rate", "residual and enhanced", "score"), strict=True
             )
         ]
+        self.zoom = EchoZoom(self.plots.cut)
+        self.cards[0].append(self.zoom.button)
         height = FACT_ROWS * FACTS_PX
         self.facts = Facts(
             leading=True, stylesheets=[FACTS], min_height=height, sizing_mode="stretch_width"
@@ -181,6 +185,7 @@ class PixelSection(Section):
         state = self.session.state
         self.plots.cut.update(Cut.of(found.answer, state.less))
         self.plots.update(found, state.unit)
+        self.zoom.follow(found.answer.capture, found.pixel.answer_bin)
         hidden = self.plots.score if found.pixel.signals is not None else self.plots.stages
         for each, plot in zip(self.cards, self.plots.plots, strict=True):
             each.visible = plot is not hidden
@@ -195,13 +200,12 @@ class PixelSection(Section):
         unit = self.session.state.unit
         facts = text.facts(found, unit)
         rows = -(-len(facts) // FACTS_ACROSS)
+        scales = text.both_scales(unit, found.answer)
         with self.session.tasks.hold():
             self.facts.param.update(facts=facts, min_height=rows * FACTS_PX)
             self.remark.text = text.remark(found)
             self.table.param.update(
-                columns=text.candidate_columns(unit),
-                rows=text.candidate_rows(
-                    found.report.candidates, *text.both_scales(unit, found.answer)
-                ),
+                columns=text.candidate_columns(scales[0]),
+                rows=text.candidate_rows(found.report.candidates, *scales),
             )
         self.found = found

@@ -25,7 +25,6 @@ from app.model.text import (
 )
 from app.pages.inspect.results import Inspected, Pair
 from app.units import (
-    AXIS_TITLES,
     OPPOSITE_UNIT,
     Quantity,
     Scale,
@@ -56,8 +55,9 @@ With *Rectangle* or *Lasso*, drag on the map to select a region; its histograms 
 as one. With *Zoom*, drag to enlarge; the wheel zooms as well, and a double tap shows the whole map.
 
 **Compare.** *Pin this pixel*, or the key P, keeps up to four pixels. *Pins* shows their distances,
-*Profile* the ranges along the line that joins them. *A/B* keeps an estimate and subtracts it from
-later ones.
+*Profile* the ranges along the line that joins them. With *Line*, drag on the map to draw that
+line: its ends, and up to two bends, become the pinned pixels. *A/B* keeps an estimate and subtracts
+it from later ones.
 
 **Crop.** *Crop the cloud* limits the 3D cloud of Explore and its files to the region, to ranges, or
 to both.
@@ -71,7 +71,10 @@ MAP_HELP = (
     "Quantity shown on the map. Peak: largest count of a pixel. Fired: share of pulses with a "
     "detection. SBR: estimated from the counts."
 )
-MODE_HELP = "What dragging on the map does; a tap always selects a pixel."
+MODE_HELP = (
+    "What dragging on the map does: zoom, select a region by a rectangle or a lasso, or draw the "
+    "line of a profile. A tap always selects a pixel."
+)
 SUBJECT_HELP = (
     "What to inspect: one pixel, the region, the pinned pixels, the line that joins them, or the "
     "whole capture."
@@ -83,8 +86,8 @@ TOO_MANY_PINS = "Four pixels are pinned already: remove one first."
 NO_PINS = "No pixels are pinned. Select a pixel and press “Pin this pixel”, or P on the map."
 WIDTH_GUESSED = "Lengths across the line of sight follow from the field of view, which is a guess."
 NO_PROFILE = (
-    "Pin two or more pixels: the profile runs along the line that joins them. Select a pixel and "
-    "press “Pin this pixel”, or P on the map."
+    "Choose “Line” above the map and drag on the map: the profile runs along the line that you "
+    "draw. It also runs along the line that joins two or more pinned pixels."
 )
 NO_RANGES = "No estimate on the line is confident enough to be shown. Lower “Show from confidence”."
 NO_REGION = (
@@ -117,7 +120,7 @@ def facts(found: Inspected, unit: str) -> list[Fact]:
 def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
     answer, pixel = found.answer, found.pixel
     place = pixel_name((pixel.row, pixel.col), answer.grid)
-    along = scale(unit, answer.capture.acquisition)
+    along = scale(unit, answer.gate)
     has_truth = answer.capture.truth_range_m is not None
     facts = [*estimate_facts(pixel, along, has_truth), ("Pixel", place, "Row and column.")]
     counts, help = count(pixel.counts), "Counts in the histogram of this pixel"
@@ -128,7 +131,7 @@ def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
 
 
 def _region_facts(found: Inspected, unit: str) -> list[Fact]:
-    region, along = found.region, scale(unit, found.answer.capture.acquisition)
+    region, along = found.region, scale(unit, found.answer.gate)
     assert region is not None
     spread = "Half the central 68 % range of the estimates, which is one standard deviation."
     median_m, half_m = region.median_m, region.spread_m
@@ -219,11 +222,11 @@ def remark(found: Inspected) -> str:
     )
 
 
-def candidate_columns(unit: str) -> list[Sequence[Any]]:
+def candidate_columns(along: Scale) -> list[Sequence[Any]]:
     """Return title, help and sort order of the candidates' columns."""
     return [
         ("Rank", "Rank by score.", 1),
-        (AXIS_TITLES[unit], "Position along the gate, the estimator's lag removed.", 1),
+        (along.title, "Position along the gate, the estimator's lag removed.", 1),
         ("Score", "The estimator's score; below, relative to the best.", -1),
         ("Probability", "Probability of a surface within 3 bins.", -1),
     ]
@@ -246,15 +249,14 @@ def candidate_rows(candidates: Sequence[Candidate], along: Scale, other: Scale) 
 
 def both_scales(unit: str, answer: Answer) -> tuple[Scale, Scale]:
     """Return the chosen unit along the gate, and the unit shown below it."""
-    acquisition = answer.capture.acquisition
-    return scale(unit, acquisition), scale(OPPOSITE_UNIT[unit], acquisition)
+    return scale(unit, answer.gate), scale(OPPOSITE_UNIT[unit], answer.gate)
 
 
-def pin_columns(unit: str) -> list[Sequence[Any]]:
+def pin_columns(along: Scale) -> list[Sequence[Any]]:
     """Return title, help and sort order of the pins' columns."""
     return [
         ("Pixel", "Row and column.", 1),
-        (AXIS_TITLES[unit], "The estimate along the gate.", 1),
+        (along.title, "The estimate along the gate.", 1),
         ("Confidence", CONFIDENCE_HELP, -1),
         ("SBR", "Signal divided by background; below, its 95 % interval.", -1),
         ("Verdict", "Whether the pixel is hot or dead.", 1),

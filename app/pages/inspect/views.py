@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from bokeh.models import (
     BoxSelectTool,
     BoxZoomTool,
     ColumnDataSource,
+    FreehandDrawTool,
     LassoSelectTool,
     Range1d,
     WheelZoomTool,
@@ -20,6 +22,7 @@ from bokeh.models import (
 from numpy.typing import NDArray
 
 from app.model.exports import Curve
+from app.model.state import MOST_PINS
 from app.model.store import Pixel
 from app.pages.inspect.results import Corners, Inspected
 from app.pages.shared.outputs import layers_of
@@ -28,15 +31,22 @@ from app.plots import inspect as inspect_plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.plots.gate_cut import GateCut
 from app.theme import Palette
+from app.units import ShownGate
 from app.widgets.figures import Layers, fit, paint_frame, round_up
 from app.widgets.image_view import ImageView
-from core import Acquisition
 from core.inspection import FaultyPixel
 
 Array = NDArray[Any]
+Pixels = tuple[tuple[int, int], ...]
+"""Rows and columns of pixels."""
 
 MAX_DRAWN_CORNERS = 60
 """Corners kept of a lasso: enough for its shape, few enough for a link."""
+
+
+NO_STROKE: dict[str, list[list[float]]] = {"xs": [[]], "ys": [[]]}
+"""Data of a line that has not been drawn; without the path, Bokeh's tool would fail where a drag
+begins beside the image."""
 
 
 class Navigator(ImageView):
@@ -48,6 +58,8 @@ class Navigator(ImageView):
         Called with the row and column of a tapped pixel.
     selected : callable
         Called with the corners of a drawn region.
+    joined : callable
+        Called with the pixels at the vertices of a drawn line.
 
     Attributes
     ----------
@@ -56,14 +68,22 @@ class Navigator(ImageView):
     """
 
     def __init__(
-        self, tapped: Callable[[int, int], None], selected: Callable[[Corners], None]
+        self,
+        tapped: Callable[[int, int], None],
+        selected: Callable[[Corners], None],
+        joined: Callable[[Pixels], None],
     ) -> None:
         super().__init__(tapped)
         figure = self.figure
+        self.drawn = ColumnDataSource(NO_STROKE)
+        stroke = figure.multi_line(
+            "xs", "ys", source=self.drawn, line_color="#ffffff", line_width=2, name="stroke"
+        )
         # The tools select nothing in the image itself: a layer outlines the region.
         by_hand = {
             "Rectangle": BoxSelectTool(renderers=[]),
             "Lasso": LassoSelectTool(renderers=[], continuous=False),
+            "Line": FreehandDrawTool(renderers=[stroke], num_objects=1),
         }
         wheel = WheelZoomTool()
         figure.add_tools(*by_hand.values(), wheel)
@@ -126,6 +146,21 @@ class Navigator(ImageView):
 
         figure.on_event(SelectionGeometry, select)
 
+        def join(_attribute: str, _old: Any, new: Mapping[str, Any]) -> None:
+            path = np.column_stack([np.asarray(new[axis][-1], float) for axis in ("ys", "xs")])
+            if len(path):
+                self.drawn.data = dict(NO_STROKE)  # a layer joins the pins
+                joined(self._on_line(path))
+
+        self.drawn.on_change("data", join)
+
+    def _on_line(self, path: Array) -> Pixels:
+        """Return the pixels, once each, at the vertices of a path (vertex, row and col)."""
+        first, last = (0, 0), tuple(size - 1 for size in self._shape)
+        inside = np.clip(path, *(np.array(self._grid.place(*at)) for at in (first, last)))
+        pixels = [self._grid.pixel(*inside[at]) for at in vertices(inside, self.half_frame)]
+        return tuple(dict.fromkeys(pixels))
+
     def mark_faulty(self, faulty: Sequence[FaultyPixel]) -> None:
         """Mark hot pixels by circles, dead ones by crosses."""
         places = [self._grid.place(each.row, each.col) for each in faulty]
@@ -155,6 +190,25 @@ class Navigator(ImageView):
         """Draw a line that joins pixels; none if they are fewer than two."""
         places = [self._grid.place(*pin) for pin in pins]
         self._line.data = {"x": [col for _, col in places], "y": [row for row, _ in places]}
+
+
+def vertices(path: Array, tolerance: float) -> list[int]:
+    """Return the indices of the ends of a path (point, 2), and of its strongest bends in between.
+
+    They are at most `MOST_PINS`, and fewer if no point is farther than `tolerance` from the lines
+    that join them.
+    """
+    kept = [0, len(path) - 1]
+    while len(kept) < MOST_PINS:
+        away = np.zeros(len(path))
+        for first, last in pairwise(kept):
+            (down, across), part = path[last] - path[first], slice(first, last + 1)
+            (rows, cols), length = (path[part] - path[first]).T, np.hypot(down, across)
+            away[part] = np.abs(rows * across - cols * down) / length if length else 0.0
+        if away.max() <= tolerance:
+            break
+        kept = sorted([*kept, int(away.argmax())])
+    return kept
 
 
 def corners_of(geometry: Mapping[str, Any]) -> Corners:
@@ -245,17 +299,17 @@ class GatePlot(NamedLayers):
         """Return a curve (bin,) as it is drawn, in 32 bits."""
         return np.asarray(self.source(self._curve_layer).data[name])
 
-    def follow(self, unit: str, acquisition: Acquisition) -> None:
+    def follow(self, unit: str, gate: ShownGate) -> None:
         """Change the unit or the gate of the axes."""
-        self._axes.follow(unit, acquisition)
+        self._axes.follow(unit, gate)
         if self._read_out is not None:
-            self._read_out.follow(acquisition)
+            self._read_out.follow(gate)
 
-    def draw(self, acquisition: Acquisition, curves: Sequence[Curve]) -> None:
+    def draw(self, gate: ShownGate, curves: Sequence[Curve]) -> None:
         """Draw curves (bin,), and keep them for a download; marks are only kept."""
-        self.keep(acquisition, curves)
+        self.keep(gate, curves)
         columns = {each.layer: each.y for each in curves if each.y is not None}
-        bins = plots.centres(acquisition.n_bins)
+        bins = plots.centres(gate.n_bins)
         if len(self.curve("bin")) != bins.size:
             columns["bin"] = bins
             self.source(self._curve_layer).data = {
@@ -294,7 +348,7 @@ class PixelPlots:
 
     def __init__(self) -> None:
         nowhere, upright = plots.marker_line(np.nan, 1.0)
-        self.candidates = inspect_plots.empty("x", "y", "rank")
+        self.candidates = inspect_plots.empty("x", "y", "rank", "lift")
         marks = {
             "truth": ColumnDataSource({"x": nowhere, "y": upright}),
             "estimate": ColumnDataSource({"x": nowhere, "y": upright}),
@@ -314,48 +368,51 @@ class PixelPlots:
         """Take on the colours of a mode."""
         for plot in self.plots:
             plot.paint(colors)
+        self.counts.layers["ranks"]["glyph"].background_fill_color = colors.paper
         self.cut.paint(colors)
 
     def update(self, found: Inspected, unit: str) -> None:
         """Show a pixel or a region, with positions in a unit."""
         pixel, report = found.pixel, found.report
-        acquisition = found.answer.capture.acquisition
+        gate = found.answer.gate
         for plot in self.plots:
-            plot.follow(unit, acquisition)
+            plot.follow(unit, gate)
         curves = partial(plots.bin_curves, inspect_plots.NAMES)
         positions = {"truth": pixel.truth_bin, "estimate": pixel.answer_bin}
         candidates = [each.bin for each in report.candidates]
         marks = plots.marks(inspect_plots.NAMES, **positions, candidates=candidates)
-        self._draw_counts(pixel, acquisition, marks)
-        self.rate.draw(acquisition, curves(report.rate_unit, rate=report.rate) + marks)
+        self._draw_counts(pixel, gate, marks)
+        self.rate.draw(gate, curves(report.rate_unit, rate=report.rate) + marks)
         self.rate.frame(report.rate)
         self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
         self.rate.figure.title.text = inspect_plots.RATE_TITLES[report.rate_unit]
         if pixel.signals is None:
-            self.score.draw(acquisition, curves("", score=pixel.score) + marks)
+            self.score.draw(gate, curves("", score=pixel.score) + marks)
             fit(self.score.figure, *plots.score_ends(pixel.score))
         else:
             residual = curves("counts", residual=pixel.signals.residual)
             enhanced = curves("counts × weight", enhanced=pixel.signals.enhanced)
-            self.stages.draw(acquisition, residual + enhanced + marks)
+            self.stages.draw(gate, residual + enhanced + marks)
             self.stages.frame(pixel.signals.residual)
             self.stages.frame(pixel.signals.enhanced, axis="enhanced")
         for name, position in positions.items():
             self.counts.write(name, x=np.full(2, position))
             for plot in self.plots:
                 plot.show(name, bool(np.isfinite(position)))
+        extent = self.bins.reset_end - self.bins.reset_start
         self.candidates.data = {
             "x": np.array(candidates, np.float32),
             "y": np.full(len(candidates), inspect_plots.CANDIDATE_HEIGHT, np.float32),
             "rank": [str(n + 1) for n in range(len(candidates))],
+            "lift": inspect_plots.lifts(candidates, inspect_plots.RANK_GAP * extent),
         }
 
-    def _draw_counts(self, pixel: Pixel, acquisition: Acquisition, marks: list[Curve]) -> None:
+    def _draw_counts(self, pixel: Pixel, gate: ShownGate, marks: list[Curve]) -> None:
         """Draw the counts, with those of the model and both scales where they are known."""
-        plot, lines = self.counts, plots.drawn(pixel.lines, acquisition.n_bins)
+        plot, lines = self.counts, plots.drawn(pixel.lines, gate.n_bins)
         plot.figure.title.text = inspect_plots.COUNTS_TITLES[pixel.signals is not None]
         curves = plots.bin_curves(inspect_plots.NAMES, "counts", raw=pixel.histogram, **lines)
-        plot.draw(acquisition, curves + marks)
+        plot.draw(gate, curves + marks)
         for layer, counts in pixel.lines.items():
             plot.show(layer, counts is not None)
         plot.frame(pixel.histogram, *lines.values())

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from functools import partial
 
-from app.model.colors import WHOLE, shown
+from app.model.colors import shown
 from app.model.state import REGION, Crop
 from app.model.store import Answer
 from app.pages.session import Session
 from app.pages.shared.section import Section
 from app.widgets.cards import part
 from app.widgets.controls import Sentence, SettingsPanel
-from core.geometry import Box
+from core.geometry import WHOLE, Box
 
 TITLE = "Crop the cloud"
 NO_REGION = "No region is selected: drag one on the map of Inspect."

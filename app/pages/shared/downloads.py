@@ -25,7 +25,6 @@ import param
 
 import core
 from app.model import download_text
-from app.model.colors import WHOLE
 from app.model.exports import Write, image_files, report_file
 from app.model.state import ALL, Crop, Viewing
 from app.model.store import Answer, Request
@@ -34,7 +33,7 @@ from app.tasks.scheduler import FILES
 from app.widgets.component import Component
 from app.widgets.figures import Layers
 from core import inspection
-from core.geometry import Box
+from core.geometry import WHOLE, Box
 from core.io import ColorScale, changed_settings, file_name
 
 log = logging.getLogger(__name__)

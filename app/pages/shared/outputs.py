@@ -31,7 +31,8 @@ from app.plots import elements as plots
 from app.theme import LIGHT, RANGE_COLORS, Palette
 from app.widgets.cards import card
 from app.widgets.controls import Knob, Sentence, Table
-from app.widgets.figures import Layers, paint_frame, pane_of, round_up
+from app.widgets.figures import Layers, around, paint_frame, pane_of, proportioned, round_up
+from app.widgets.image_view import CONTAINER, JOINED_BORDER_PX
 from app.widgets.method_picture import ScaleBar
 from core.io import ColorScale
 from core.parameters import Number
@@ -46,6 +47,8 @@ GRID = """
 .scroll-button { display: none !important; }
 """
 PICTURE_HEIGHT = 300
+BORDER_PX = {**JOINED_BORDER_PX, "top": 26}
+"""Room around a picture of a gallery, with its title."""
 
 FORMATS = {"SBR": "g", "ms": ".1f"}
 """Formats of columns whose numbers need no four decimals."""
@@ -220,7 +223,13 @@ class Gallery:
             files = {"csv": image_file(item.images[name], look, pane.object, Grid())}
             return Shown(subject(), f"{item.key} {name}", files, scale=look)
 
-        holder = pn.Column(pane, sizing_mode="stretch_width", height=PICTURE_HEIGHT, margin=0)
+        holder = pn.Column(
+            pane,
+            stylesheets=[CONTAINER],
+            sizing_mode="stretch_width",
+            height=PICTURE_HEIGHT,
+            margin=0,
+        )
         return downloadable(holder, session, spelled(name), show, PLOT)
 
     @property
@@ -253,8 +262,10 @@ class Gallery:
     def _build(self, item: items.Pictures) -> None:
         self._drawn = [layers_of(drawing) for drawing in plots.pictures(item)]
         panes = [pane_of(drawing) for drawing in self.figures]
-        for pane, drawing in zip(panes, self.figures, strict=True):
-            pane.sizing_mode, pane.height = "stretch_width", PICTURE_HEIGHT
+        rows, cols = next(iter(item.images.values())).shape
+        for drawing in self.figures:
+            drawing.update(**{f"min_border_{side}": px for side, px in BORDER_PX.items()})
+            drawing.stylesheets = [proportioned(cols / rows, *around(BORDER_PX))]
             paint_frame(drawing, self._colors)
             drawing.on_event(Tap, self._tapped)
         self._grid.objects = [
