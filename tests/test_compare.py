@@ -311,6 +311,8 @@ def test_a_file_has_no_oracle_no_limit_and_no_errors(stage):
     assert stage.messages["Physical limit"] == text.LIMIT_UNKNOWN
     assert "Error" not in stage.page.kind.options
     assert text.AGREEMENT_ONLY in stage.page.remarks.text
+    sentences = text.remarks(stage.session.answer.capture, 1, 1).split(". ")
+    assert len(sentences) == len(set(sentences)) > 1
 
 
 def test_all_methods_fit_in_the_table_and_the_first_six_have_pictures(stage):

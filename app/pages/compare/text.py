@@ -263,9 +263,8 @@ def legend(pictures: Mapping[str, Unseen], least_confidence: float) -> str:
 def remarks(capture: Capture, n_working: int, n_pictures: int) -> str:
     """Return remarks on the comparison; empty if there are none."""
     remarks = [AGREEMENT_ONLY] if capture.truth_range_m is None else []
-    remarks += sorted(
-        {f"{each.remark(capture).capitalize()}." for each in ESTIMATORS.values()} - {"."}
-    )
+    clauses = {part for each in ESTIMATORS.values() for part in each.remark(capture).split("; ")}
+    remarks += sorted(f"{clause.capitalize()}." for clause in clauses - {""})
     if n_pictures < n_working:
         remarks.append(
             f"Pictures show the first {n_pictures} methods; plots and table show all {n_working}."
