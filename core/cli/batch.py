@@ -100,8 +100,8 @@ def add(commands: Any) -> None:
         "batch",
         help="range many captures by one method, with one row each",
         description="Range many captures by one method. A file that fails is a row of the table "
-        "with its error, and the others are ranged. Each file of a pattern is a capture of its own; "
-        "`estimate --capture PATTERN` adds the files up as one sequence.",
+        "with its error, and the others are ranged. Each file of a pattern is a capture of its "
+        "own; `estimate --capture PATTERN` adds the files up as one sequence.",
     )
     methods = command.add_subparsers(dest="method", required=True)
     for name, estimator in ESTIMATORS.items():
