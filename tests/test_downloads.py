@@ -313,7 +313,9 @@ def test_descriptions_state_version_method_all_settings_and_source(explore, sess
     assert version == f"firstphoton {core.__version__}: range image"
     assert (method, source) == ("method: tracking", f"source: {session.answer.capture.source}")
     assert f"settings: {session.answer.request.tracking}" in settings
-    assert f"settings: {session.state.viewing}" in settings
+    width_deg = session.answer.own_field_of_view_deg
+    viewing = replace(session.state.viewing, field_of_view_deg=width_deg)
+    assert f"settings: {viewing}" in settings
 
 
 @pytest.mark.parametrize("kind", MAPS)

@@ -34,6 +34,9 @@ from core.studies.tradeoff.surrogate import Simulation, surrogate_of, window
 
 SCENES, SBRS = ("car", "uniform"), (0.04, 0.06, 0.2)
 SHORT_SCENES, SHORT_SBRS = ("car",), (0.06,)
+NOT_VARIED = (
+    "Pulses, exposure and gate are varied for first photons of a known number of pulses only."
+)
 PRINTED = ("recommendations", "fronts", "required_pulses")
 
 
@@ -109,6 +112,8 @@ def _tradeoff(chosen: argparse.Namespace) -> None:
         f"{len(points)} configurations and conditions, {len(seeds)} seeds shared by all.",
         *dict.fromkeys(f"{each.source}: {each.note}." for each in points if each.note),
     ]
+    if not simulations:
+        introduction.append(NOT_VARIED)
     if chosen.with_flux:
         points = including_flux_time(points)
         introduction.append("Times include the estimation of the flux model.")
@@ -148,7 +153,7 @@ def _of_capture(chosen: argparse.Namespace) -> tuple[plans.Plan, list[Simulation
     else:
         targets, simulation = source.window, source
     plan: plans.Plan = [(source, candidates() + variations(targets))]
-    return plan, [simulation] if capture.gated_pulses else []
+    return plan, [simulation] if simulation.holds_first_photons else []
 
 
 def _bar(what: str) -> Callable[[int, int], None]:

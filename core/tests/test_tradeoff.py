@@ -34,6 +34,7 @@ from core.studies.tradeoff import measure
 from core.studies.tradeoff import plan as plans
 from core.studies.tradeoff.acquisition import Sweep
 from core.studies.tradeoff.measure import Cancelled, Candidate, Piece, Point, scored, study
+from core.studies.tradeoff.page import acquisition_sweeps
 from core.studies.tradeoff.pareto import (
     best_within,
     by_condition,
@@ -368,7 +369,10 @@ def test_a_surrogate_has_flux_and_ranges_of_its_capture() -> None:
 def test_multi_detection_data_are_simulated_as_poisson_counts() -> None:
     acquisition = Acquisition(n_bins=10, n_pulses=None)
     scene = Scene(np.full((60, 60), acquisition.bin_to_range_m(3.5)), np.full((60, 60), 0.5))
-    capture = Simulation("wall", scene, acquisition, Flux(8.0, 4.0), detection="all").capture(1)
+    simulation = Simulation("wall", scene, acquisition, Flux(8.0, 4.0), detection="all")
+    with pytest.raises(ValueError, match=r"of wall = .* first photons of a known number of pulses"):
+        acquisition_sweeps([simulation], (1, 2))
+    capture = simulation.capture(1)
     assert capture.detection == "all"
     expected = 0.2 + 4.0 * capture.pulse.bin_probability(3.5, 10, 1e-9)
     counts = capture.cube.reshape(-1, 10)

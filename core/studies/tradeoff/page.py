@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from core.acquisition import Floats
+from core.checks import require
 from core.metrics import Interval
 from core.studies.outputs import Item, Plot, Scatter, Table, as_text, table
 from core.studies.statistics import mean_interval, median_interval
@@ -303,7 +304,17 @@ def acquisition_sweeps(
     processes: int = 1,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[AcquisitionSweeps]:
-    """Vary pulses, exposure and gate of each simulation."""
+    """Vary pulses, exposure and gate of each simulation.
+
+    Raises
+    ------
+    ValueError
+        If one does not hold the first photons of a known number of pulses.
+    """
+    for each in simulations:
+        name = f"acquisition of {each.name}"
+        what = each.detection, each.acquisition.n_pulses
+        require(name, what, each.holds_first_photons, "first photons of a known number of pulses")
     varied: list[tuple[Sequence[float], Sequence[Simulation]]] = []
     for each in simulations:
         gates = acquisition.over_gates(each)

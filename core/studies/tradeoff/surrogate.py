@@ -55,9 +55,14 @@ class Simulation:
     detection: Detection = "first"
     note: str = ""
 
+    @property
+    def holds_first_photons(self) -> bool:
+        """Whether captures hold the first photons of a known number of pulses."""
+        return self.detection == "first" and self.acquisition.n_pulses is not None
+
     def capture(self, seed: int) -> Capture:
         """Simulate one capture, with its truth."""
-        if self.detection == "first" and self.acquisition.n_pulses is not None:
+        if self.holds_first_photons:
             return simulate(self.scene, self.acquisition, self.flux, self.pulse, seed)
         truth_m = np.asarray(self.scene.range_m, float)
         reflectivity = 1.0 if self.scene.reflectivity is None else self.scene.reflectivity
