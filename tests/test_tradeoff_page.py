@@ -139,6 +139,13 @@ def test_the_page_shows_what_core_recommends(section, measured):
     np.testing.assert_allclose(section.plot.source("front").data["x"], pareto)
 
 
+def test_progress_is_on_the_page_until_there_are_results(session):
+    section = SpeedSection(session)
+    (_, progress, *_), _ = section.layout()
+    section.study.sentence.text = "1 of 9 images."
+    assert (progress.text, progress.visible) == ("1 of 9 images.", True)
+
+
 def test_the_goal_changes_the_recommendation(section):
     goal = section.goal.controls
     goal["milliseconds"].value = 1e-1

@@ -16,6 +16,8 @@ HELP = (
 )
 # Below the title, beside the label of the upper axis.
 PLACE = {"position": "absolute", "top": "12px", "right": "26px", "z-index": "3"}
+# Else as narrow as the button, since that is positioned.
+TOOLTIP = ".MuiTooltip-tooltip { width: 230px; max-width: 230px; }"
 SMALL = {"fontSize": "11px", "padding": "0 6px", "minHeight": "18px", "lineHeight": "18px"}
 
 
@@ -37,7 +39,12 @@ class EchoZoom:
         self._ends = (0.0, 1.0)
         self.button = button(LABEL, HELP, lambda: cut.toggle_zoom(*self._ends))
         self.button.param.update(
-            variant="text", min_height=18, styles=PLACE, sx=SMALL, disabled=True
+            variant="text",
+            min_height=18,
+            styles=PLACE,
+            stylesheets=[TOOLTIP],
+            sx=SMALL,
+            disabled=True,
         )
 
     def follow(self, capture: Capture, at_bin: float) -> None:

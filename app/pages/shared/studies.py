@@ -27,6 +27,11 @@ class _ControlledWork:
         Unit of the progress.
     label, help : str
         Label and description of the button that starts it.
+
+    Attributes
+    ----------
+    sentence : Sentence
+        The progress.
     """
 
     def __init__(
@@ -46,12 +51,12 @@ class _ControlledWork:
         self._bar = pmui.LinearProgress(
             variant="determinate", value=0, sizing_mode="stretch_width", margin=(4, 8)
         )
-        self._sentence = Sentence(sizing_mode="stretch_width", margin=(0, 8, 8, 8))
+        self.sentence = Sentence(sizing_mode="stretch_width", margin=(0, 8, 8, 8))
 
     @property
     def controls(self) -> list[Any]:
         """Buttons, bar and sentence."""
-        return [pn.Row(self._start, self._cancel, margin=0), self._bar, self._sentence]
+        return [pn.Row(self._start, self._cancel, margin=0), self._bar, self.sentence]
 
     def start(self) -> None:
         """Start with the present settings, in place of the present work."""
@@ -68,7 +73,7 @@ class _ControlledWork:
         work = self._work
         self._cancel.disabled = not work.is_running
         self._bar.value = round(100 * work.done / max(work.of, 1))
-        self._sentence.text = progress(work.done, work.of, self._noun, work.is_running)
+        self.sentence.text = progress(work.done, work.of, self._noun, work.is_running)
 
 
 class Study(_ControlledWork):

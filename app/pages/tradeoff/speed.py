@@ -121,6 +121,9 @@ class SpeedSection(SettingsSection[Effort]):
             Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8)) for _ in range(3)
         )
         self.subject.text = text.NOT_MEASURED
+        # Beside the sidebar, which is closed on a phone.
+        self._progress = Sentence(sizing_mode="stretch_width", margin=(4, 8))
+        self.study.sentence.link(self._progress, text="text")
         self._results = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self.plot = layers_of(plots.tradeoff(self._colors))
         self.plot.source("points").selected.on_change("indices", self._tapped)
@@ -140,7 +143,7 @@ class SpeedSection(SettingsSection[Effort]):
             part("Goal", self.goal.layout),
             part("Measurement", self.controls(*self.study.controls)),
         ]
-        return [self.subject, *self.advice, self._results], controls
+        return [self.subject, self._progress, *self.advice, self._results], controls
 
     def show(self, is_on_screen: bool) -> None:
         """Come on screen, or leave it."""
@@ -208,7 +211,7 @@ class SpeedSection(SettingsSection[Effort]):
     def draw(self, found: tuple[Request, Effort, list[Point]]) -> None:
         """Show measured points, with the request and the effort that they belong to."""
         self._measured_on, self._effort, self.measured = found
-        self._results.visible = True
+        self._results.visible, self._progress.visible = True, False
         self.follow(self.session.answer)
         self._redraw()
 

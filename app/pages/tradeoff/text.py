@@ -26,8 +26,8 @@ Tap a point, or press its button in the table, to open it.
 """
 
 NOT_MEASURED = (
-    "All methods are measured on this server, which takes some seconds. The sidebar shows the "
-    "progress; Cancel stops it, Compute starts it again."
+    "All methods are measured on this server, which takes some seconds. In the sidebar, Cancel "
+    "stops it and Compute starts it again."
 )
 
 TITLE = "Speed and accuracy"

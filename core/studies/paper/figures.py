@@ -74,7 +74,7 @@ def figure_1(flux: Flux = FIGURE_1, onset_bin: float = 50.0) -> Plot:
         np.arange(GATE.n_bins, dtype=float),
         {"with an echo": with_echo, "background alone": without},
         {"echo's onset": onset_bin},
-        f"Signal {flux.signal:g} and background {flux.background:g} photons per pulse: the echo "
+        f"Signal {flux.signal:g} and background {flux.background:.4g} photons per pulse: the echo "
         f"triggers {echo:.1%} of the pulses, background nearly all others.",
     )
 
