@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import runpy
 from dataclasses import replace
@@ -29,7 +30,7 @@ from app.pages.shared.crop import NO_REGION
 from app.plots import inspect as inspect_plots
 from app.plots.gate_cut import Cut
 from app.theme import DARK
-from app.units import scale
+from app.units import ShownGate, scale
 from core import Acquisition, TrackingParameters, coates_rate, inspection, tracking_signals
 from core.tests.captures import real_capture_path
 from tests.test_downloads import columns_of, written
@@ -91,7 +92,7 @@ def press(button):
 def test_a_position_is_shown_in_the_unit(unit):
     gate = Acquisition(n_bins=200, bin_width_s=2e-9, gate_delay_s=4430e-9)
     at = {"bins": 53.25, "ns": 4430 + 2 * 53.25, "m": float(gate.bin_to_range_m(53.25))}[unit]
-    along = scale(unit, gate)
+    along = scale(unit, ShownGate(gate))
     assert along.at(53.25) == pytest.approx(at)
     assert along.number(53.25) == f"{at:,.{along.decimals}f}"
     assert 10.0**-along.decimals <= 0.1 * along.step  # resolves a tenth of a bin, at least
@@ -333,8 +334,10 @@ def test_a_region_shows_the_sum_of_its_histograms(building):
     facts = values(section.facts)
     assert facts["Pixels"] == "20"
     image = building.answer.run.image.range_m[40:45, 30:34]
-    assert facts["Median range"] == f"{np.nanmedian(image):.4g} m"
     expected = inspect_region(building.answer, building.state.region)
+    # With two digits of the spread.
+    decimals = 1 - math.floor(math.log10(expected.region.spread_m))
+    assert facts["Median range"] == f"{np.nanmedian(image):.{decimals}f} m"
     assert facts["SBR"] == text.interval(expected.region.flux.sbr)
     building.state.region = ((0.1, 0.1), (0.1, 0.2), (0.2, 0.2))
     building.tasks.run_until(lambda: section.found is None)
