@@ -11,10 +11,10 @@ true distribution, so that the model need not be exact where signals are clear.
 Target pixels are those with an echo: the same likelihood, as a function of their mean signal
 instead of that of all pixels.
 
-The intervals cover the means of the pixels of the capture that are neither hot nor dead, for any
-width and tail of the pulse, and include the chance by which a sample differs from the image. They
-hold for the fitted pulse: what its uncertainty adds is not included, since it is small against
-the chance of the background (``python -m core calibration --only fluxes``).
+The intervals are for the means of the pixels of the capture that are neither hot nor dead, and
+include the chance by which a sample differs from the image. They hold for the fitted pulse: the
+uncertainty of the fit is not included (``python -m core calibration --only fluxes`` measures the
+coverage with wrong pulses).
 """
 
 from __future__ import annotations
