@@ -124,7 +124,7 @@ class ShownGate:
     Parameters
     ----------
     acquisition : Acquisition
-        Of the reduced capture, whose bins positions are given in.
+        The reduced capture's; positions are given in its bins.
     first : int
         Bin of the whole gate at which it opens.
     merge : int

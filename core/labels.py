@@ -127,7 +127,7 @@ def images_dataset(planes: Mapping[str, Plane], attributes: Mapping[str, Any]) -
     ----------
     planes : mapping of str to Plane
     attributes : mapping
-        Of the whole dataset.
+        Attributes of the whole dataset.
     """
     import xarray as xr  # noqa: PLC0415 - slow to import
 

@@ -28,15 +28,28 @@ def given(complaints):
     return FileInput(complaints.append, max_file_size=MAX_UPLOAD_BYTES)
 
 
+def receive(given, message):
+    """Give a file input a message as Panel does when one arrives from the browser."""
+    given._handle_msg(message)
+
+
 def send(given, **changes):
-    given._handle_msg(PART | changes)
+    receive(given, PART | changes)
+
+
+def begin(given):
+    receive(given, {"status": "initializing"})
+
+
+def finish(given):
+    receive(given, {"status": "finished"})
 
 
 def test_a_file_in_parts_arrives_whole(given, complaints):
-    given._handle_msg({"status": "initializing"})
+    begin(given)
     send(given)
     send(given, chunk=2, data=b" two")
-    given._handle_msg({"status": "finished"})
+    finish(given)
     assert (given.filename, given.value) == ("a.npz", b"one two")
     assert complaints == []
 
@@ -45,10 +58,10 @@ def test_several_files_arrive_together_within_one_limit(complaints):
     given = FileInput(complaints.append, max_file_size=10, multiple=True)
     for content, arrived in ((b"12345", [b"abcde", b"12345"]), (b"123456", None)):
         given.clear()
-        given._handle_msg({"status": "initializing"})
+        begin(given)
         send(given, name="1.npz", total_chunks=1, data=b"abcde")
         send(given, name="2.npz", total_chunks=1, data=content)
-        given._handle_msg({"status": "finished"})
+        finish(given)
         assert given.value == arrived
     assert len(complaints) == 1 and "bytes of the files = 11" in complaints[0]
     for _ in range(2):
@@ -79,9 +92,9 @@ def test_a_malformed_message_is_refused_and_the_next_file_arrives(given, complai
     assert len(complaints) == 1
     assert text in complaints[0]
     assert not given.value
-    given._handle_msg({"status": "initializing"})
+    begin(given)
     send(given, total_chunks=1, data=b"x")
-    given._handle_msg({"status": "finished"})
+    finish(given)
     assert given.value == b"x"
 
 

@@ -14,7 +14,6 @@ import pytest
 import core
 from tests.browser import ROOT
 from tests.wheel import (
-    SUPPORTED,
     build,
     describe_sample,
     install,
@@ -61,13 +60,12 @@ def _take_compiled_kernels(installed):
         shutil.copy2(cached, copy)
 
 
-@pytest.mark.parametrize("version", SUPPORTED)
-def test_every_python_of_this_machine_accepts_the_wheel(wheel, version, tmp_path):
+def test_every_python_of_this_machine_accepts_the_wheel(wheel, tmp_path):
     """Only metadata and syntax: the dependencies are installed for one Python."""
     found = pythons()
-    if version not in found:
-        pytest.skip(f"Python {version} is not on this machine")
-    commands = install(wheel, found[version], tmp_path / "env", dependencies=False)
-    (packages,) = commands.parent.glob("lib/python*/site-packages")
-    compiling = [commands / "python", "-m", "compileall", "-q", packages]
-    subprocess.run(compiling, env=outside(), check=True)
+    assert found
+    for version, python in found.items():
+        commands = install(wheel, python, tmp_path / version, dependencies=False)
+        (packages,) = commands.parent.glob("lib/python*/site-packages")
+        compiling = [commands / "python", "-m", "compileall", "-q", packages]
+        subprocess.run(compiling, env=outside(), check=True)

@@ -247,7 +247,7 @@ def report_file(answer: Answer, state: State, title: str) -> Write:
     state : State
         How it is shown.
     title : str
-        Of the report.
+        Title of the report.
     """
     viewing = state.viewing
     chosen_deg = viewing.field_of_view_deg

@@ -241,15 +241,15 @@ class _Run:
 
 
 RETURN_MS = 1000
-"""Time between two looks for the browser of a page that is away."""
+"""Interval at which a page that is away is checked for a browser."""
 
 
 class LongWork:
     """Work in steps that can be paused in between, or in one piece that reports its progress.
 
-    While the page is away nothing is computed for it: no further step is started, and one that
-    looks whether it is cancelled ends. What was drawn remains, and the work goes on with that step
-    once the page is back.
+    While the page is away, nothing is computed for it: no further step starts, and a step that can
+    be cancelled ends early. Finished steps stay on the page, and the work resumes with the
+    unfinished step once the page is back.
 
     Parameters
     ----------

@@ -111,7 +111,7 @@ class FileInput(pmui.FileInput):
         earlier = {kept["filename"] for kept in self._buffer}
         is_next = name not in earlier if self.multiple else not earlier
         is_one = is_next and all(kept == name for kept in self._file_buffer)
-        require("file name", name, is_one, "one file at a time")
+        require("file name", name, is_one, "one file at a time, each under a name of its own")
         n_files = len(earlier) + 1
         require("files at once", n_files, n_files <= MOST_FILES, f"up to {MOST_FILES}")
         size = len(data) + sum(len(kept["value"]) for kept in self._buffer)

@@ -54,7 +54,7 @@ def refused_outputs(paths: Sequence[Path], suffixes: Sequence[str], overwrite: b
     Raises
     ------
     Exception
-        Of the first file if none can be written.
+        If no file can be written: the error of the first.
     """
     found: dict[Path, Exception] = {}
     for path in paths:
@@ -89,7 +89,7 @@ def require_all(paths: Sequence[Path], refused: Refused) -> None:
     Raises
     ------
     Exception
-        Of the first file if none is written.
+        If no file is written: the error of the first.
     """
     _require_some(paths, refused)
     if refused:

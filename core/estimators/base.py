@@ -48,7 +48,7 @@ class Provenance:
     false_alarm : float, optional
         As for `core.estimate`.
     remark : str
-        What the method left out of its model, see `Estimator.remark`.
+        Limits of the method's model, see `Estimator.remark`.
     least_confidence : float, optional
         Estimates of less confidence have been removed, see `RangeImage.confident`.
     box : Box, optional
@@ -257,7 +257,7 @@ class Estimator:
         ----------
         capture : Capture
         parameters : object
-            Of type `Estimator.parameters`.
+            Instance of `Estimator.parameters`.
         false_alarm : float, optional
             As for `core.estimate`; 1 is the same as None.
 

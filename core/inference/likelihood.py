@@ -35,6 +35,7 @@ TABLE_NUMBERS = 2**22  # likelihoods of the levels and delays of a block: 16 MiB
 _FEWEST_LANES = 2  # numpy sums a single lane pairwise, which rounds differently
 FLUX_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
 _LEAST_BACKGROUND = 1e-100  # photons; without any, the likelihood ratio of one count is infinite
+_NEGLIGIBLE = 1e-12  # signal of a bin as a share of its background
 
 
 class Conditions(NamedTuple):
@@ -106,13 +107,20 @@ def log_likelihood_ratio(
     unfired = np.ones_like(histogram)
     if n_pulses is not None:
         unfired = n_pulses - np.cumsum(histogram, axis=-1)
+    b = level if rate is None else rate
+    odds = np.exp(-b) / np.expm1(-b)  # of no photon to some, negative
     ratio = np.zeros_like(histogram)
-    for at in np.flatnonzero(echo):
-        s, step = np.asarray(conditions.signal)[..., np.newaxis] * echo[at], int(at) - n_bins + 1
+    signal = np.asarray(conditions.signal)[..., np.newaxis]
+    # At ten pulse widths from an echo, its photons change no digit of a realistic background.
+    for at in np.flatnonzero(signal.max() * echo > _NEGLIGIBLE * b.min()):
+        s, step = signal * echo[at], int(at) - n_bins + 1
         delay = slice(max(-step, 0), n_bins - max(step, 0))
         met = slice(max(step, 0), n_bins - max(-step, 0))
-        b = level if rate is None else rate[..., met]
-        gain = np.log1p(s / b) if n_pulses is None else np.log(np.expm1(-(b + s)) / np.expm1(-b))
+        here = slice(None) if rate is None else met
+        if n_pulses is None:
+            gain = np.log1p(s / b[..., here])
+        else:  # of b + s to b: log (1 - exp(-b - s)) / (1 - exp(-b))
+            gain = np.log1p(odds[..., here] * np.expm1(-s))
         ratio[..., delay] += gain * histogram[..., met] - s * unfired[..., met]
     return ratio
 

@@ -96,7 +96,7 @@ def box_sum(
     Returns
     -------
     ndarray, shape (row, col, ...)
-        Of the image's type.
+        Same dtype as the image.
     """
     half = window_size // 2
     around = [(half, half), (half, half)] + [(0, 0)] * (image.ndim - 2)

@@ -66,8 +66,9 @@ def echo_free_flux(capture: Capture) -> FluxEstimate | None:
     Returns
     -------
     FluxEstimate or None
-        Of the mean pixel, hot and dead ones left out, with 95 % intervals. None unless half of the
-        echoes are found, a tenth of the gate is free of them, and pulses are left after it.
+        Fluxes of the mean pixel without hot and dead pixels, and their 95 % intervals. None unless
+        half of the echoes are found, a tenth of the gate is free of them, and pulses are left after
+        it.
     """
     window, n_bins = _window(capture), capture.acquisition.n_bins
     if window is None:
@@ -83,9 +84,9 @@ def echo_free_flux(capture: Capture) -> FluxEstimate | None:
 def darkest_flux(capture: Capture) -> FluxEstimate | None:
     """Estimate mean fluxes as `echo_free_flux` does, with the background of the darkest window.
 
-    Of ten windows that the gate is divided into. Echoes only add photons, whatever their shape and
-    number: if the background is uniform, the darkest window is an upper bound of it. The intervals
-    hold for each of the ten windows together.
+    The gate is divided into ten windows. Echoes only add photons, whatever their shape and number:
+    if the background is uniform, the darkest window is an upper bound of it. The intervals hold for
+    all ten windows together.
 
     Returns
     -------

@@ -42,11 +42,11 @@ _FITTING_STEPS = 60
 _LEAST_RATE = 1e-12
 _N_LEVELS = 8
 """Signals of one more echo, each half the one before."""
-_BRIGHT = 0.9  # quantile of the photons of the pixels, of which the first is half
+_BRIGHT = 0.9  # quantile of the pixels' photons; half of it is the strongest of these signals
 _SAMPLE = 64
 """Most pixels from which it is estimated how often there is one more echo."""
 _SAMPLE_NUMBERS = 2**20
-"""Bins of their echoes that are evaluated at most, so that long gates and pulses take no longer."""
+"""Most bins of their echoes that are evaluated, so that long gates and pulses take no longer."""
 _PRIOR_SHARE = np.array([0.5, *np.full(_N_LEVELS, 0.5 / _N_LEVELS)])
 """Share of the pixels without one more echo, and with one of each signal, before any is seen."""
 _PRIOR_PIXELS = 2
@@ -70,9 +70,10 @@ def surface_probabilities(capture: Capture, row: int, col: int, bins: Floats) ->
     windows = np.abs(np.arange(histogram.size) - bins[:, np.newaxis]) <= TOLERANCE_BINS
     left = np.ones(bins.size, bool)
     accepted: dict[int, int] = {}  # delay in bins of each accepted candidate
-    log_ratio = _log_ratio(capture, histogram, [])
     # At first, two surfaces share the probability of one.
     is_likely = likely.sum() >= _LIKELY
+    if is_likely:
+        log_ratio = _log_ratio(capture, histogram, [])
     while is_likely:
         likeliest = int(np.where(left, likely, -1.0).argmax())
         left[likeliest] = False

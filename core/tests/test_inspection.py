@@ -211,13 +211,13 @@ def test_a_candidate_has_the_probability_of_a_surface_there(
             errors = np.abs(each.bin - np.array([delay[row, col] for delay in delays]))
             probability.append(each.probability)
             is_right.append(bool(np.nanmin(errors) <= TOLERANCE_BINS))
-    told, right = np.array(probability), np.array(is_right)
-    assert np.mean(right[told > 0.9]) > 0.98
-    assert np.mean(right[told < 0.1]) < 0.05
-    between = (told >= 0.1) & (told <= 0.9)
-    chance = math.sqrt(float((told * (1 - told))[between].sum()))
-    assert abs(told[between].sum() - np.count_nonzero(right[between])) < 3 * chance
-    assert np.count_nonzero(right[told > 0.9]) > capture.counts.size + (25 if net == 10.0 else 10)
+    stated, right = np.array(probability), np.array(is_right)
+    assert np.mean(right[stated > 0.9]) > 0.98
+    assert np.mean(right[stated < 0.1]) < 0.05
+    between = (stated >= 0.1) & (stated <= 0.9)
+    chance = math.sqrt(float((stated * (1 - stated))[between].sum()))
+    assert abs(stated[between].sum() - np.count_nonzero(right[between])) < 3 * chance
+    assert np.count_nonzero(right[stated > 0.9]) > capture.counts.size + (25 if net == 10.0 else 10)
 
 
 def test_a_report_has_the_intervals_of_the_range() -> None:

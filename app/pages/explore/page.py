@@ -78,15 +78,16 @@ class Explore(Section):
     figures, numbers : Facts
         Figures of the image and numbers of the pixel.
     signals : SignalPlots
-    zoom : EchoZoom
         The pixel's plots.
+    zoom : EchoZoom
+        The button that zooms these plots to the echo.
     cards : list of pn.Column
-        These plots in their frames.
+        The plots in their frames.
     image : ImageView
     image_keys : PixelKeys
         The keyboard of the image.
     legend : Sentence
-        What is hidden in the image.
+        The number of pixels hidden in the image.
     cloud : PointCloud
     crop : CropSection
         The box to which the cloud is cropped.
@@ -210,7 +211,7 @@ class Explore(Section):
             self._requested_s = perf_counter()
             self.session.tasks.call_later(PICTURES_DELAY_MS, self._request_pictures)
         self._large.follow(answer)
-        self.crop.follow(answer)
+        self.crop.refresh()
 
     def paint(self, dark: bool) -> None:
         """Change between light and dark mode."""

@@ -75,7 +75,7 @@ class Inspect(Section):
     chips : Chips
         The pinned pixels.
     legend : Sentence
-        What is hidden on the map.
+        The number of pixels hidden on the map.
     least_confidence : Knob
         Estimates of less confidence are hidden.
     faulty : Table
@@ -231,7 +231,7 @@ class Inspect(Section):
     def follow(self, answer: Answer) -> None:
         """Show another estimate of the session."""
         self._large.follow(answer)
-        self.crop.follow(answer)
+        self.crop.refresh()
         if self.is_on_screen:
             self._enter()
             self._sections.follow(answer)

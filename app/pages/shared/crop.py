@@ -8,7 +8,6 @@ from app.model.colors import shown
 from app.model.state import REGION, Crop
 from app.model.store import Answer
 from app.pages.session import Session
-from app.pages.shared.section import Section
 from app.widgets.cards import part
 from app.widgets.controls import Sentence, SettingsPanel
 from core.geometry import WHOLE, Box
@@ -17,8 +16,12 @@ TITLE = "Crop the cloud"
 NO_REGION = "No region is selected: drag one on the map of Inspect."
 
 
-class CropSection(Section):
+class CropSection:
     """A part of the sidebar that folds.
+
+    Parameters
+    ----------
+    session : Session
 
     Attributes
     ----------
@@ -29,18 +32,23 @@ class CropSection(Section):
     """
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session, "crop", "region", "viewing")
-        state = session.state
+        self._session, self._is_on_screen, state = session, False, session.state
         self.settings = SettingsPanel(Crop(), partial(setattr, state, "crop"))
         self.note = Sentence(live=True, sizing_mode="stretch_width", margin=(0, 8, 8, 8))
         is_open = state.crop != Crop()
         self.part = part(TITLE, self.settings.layout, self.note, is_open=is_open)
+        state.param.watch(lambda *_: self.refresh(), ["crop", "region", "viewing"])
+
+    def show(self, is_on_screen: bool) -> None:
+        """Come on screen, or leave it."""
+        self._is_on_screen = is_on_screen
+        self.refresh()
 
     def refresh(self) -> None:
         """Show the box and how much is inside."""
-        if not self.is_on_screen:
+        if not self._is_on_screen:
             return
-        session, state = self.session, self.session.state
+        session, state = self._session, self._session.state
         needs_region = state.crop.pixels == REGION and not state.region
         with session.tasks.hold():
             self.settings.show(state.crop)

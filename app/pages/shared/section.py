@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -64,7 +65,7 @@ class Repetitions(Checked):
     )
 
 
-class Section:
+class Section(ABC):
     """A part of a page.
 
     Parameters
@@ -95,9 +96,9 @@ class Section:
         main, sidebar = self.layout()
         return View(main, sidebar, self.show, self.follow, self.paint)
 
+    @abstractmethod
     def layout(self) -> tuple[Any, Any]:
         """Return the content, and the section's part of the sidebar."""
-        raise NotImplementedError
 
     def show(self, is_on_screen: bool) -> None:
         """Come on screen, or leave it."""
@@ -115,7 +116,8 @@ class Section:
             each.paint(palette(dark))
 
     def refresh(self) -> None:
-        """Update what is shown, if it is on screen."""
+        """Update what is shown, if it is on screen; by default, nothing changes."""
+        return
 
     # Background work
 
@@ -234,9 +236,9 @@ class StudySection(SettingsSection[Settings]):
         super().__init__(session, settings, explanation)
         self.study = Study(session, self.steps, noun)
 
+    @abstractmethod
     def steps(self) -> list[Step[Any]]:
         """Return the steps of the study, from the present settings."""
-        raise NotImplementedError
 
     def show(self, is_on_screen: bool) -> None:
         """Come on screen, or leave it."""

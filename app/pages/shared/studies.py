@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
@@ -17,7 +18,7 @@ from app.widgets.controls import Sentence
 Result = TypeVar("Result")
 
 
-class _ControlledWork:
+class _ControlledWork(ABC):
     """Base of long work with controls.
 
     Parameters
@@ -58,9 +59,9 @@ class _ControlledWork:
         """Buttons, bar and sentence."""
         return [pn.Row(self._start, self._cancel, margin=0), self._bar, self.sentence]
 
+    @abstractmethod
     def start(self) -> None:
         """Start with the present settings, in place of the present work."""
-        raise NotImplementedError
 
     def cancel(self) -> None:
         """Cancel the work."""

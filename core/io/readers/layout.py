@@ -122,7 +122,7 @@ def stating(names: Iterable[str]) -> list[str]:
 def stated_flux(known: Mapping[str, Any]) -> StatedFlux | None:
     """Return the fluxes that the numbers of a file state; None if there are none.
 
-    What is not one finite number of at least 0 is left out.
+    Anything but a single finite number of at least 0 is ignored.
     """
     found: dict[str, float] = {}
     for name in stating(known):

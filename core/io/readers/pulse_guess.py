@@ -343,7 +343,7 @@ def _peaks(shape: Shape, tau: Floats, edges: NDArray[np.int64]) -> Floats:
     Returns
     -------
     ndarray, shape (candidate, class)
-        Of the gaps from 0 up: a little more than half in total.
+        Probabilities of the gaps from 0 up: a little more than half in total.
     """
     width = tau[:, np.newaxis] * (np.sqrt(2.0) if shape == "gaussian" else 1.0)
 

@@ -16,10 +16,10 @@ field of a record               shape                    meaning
                                                          the targets that the sensor found
 ==============================  =======================  ===========================================
 
-Of the configuration, ``bin_shift`` states that a bin is made of ``2**bin_shift`` bins of the
-sensor (``ref_bin_shift`` for the reference), and ``histogram_bins`` how many bins of the sensor are
-filled: bins that are filled in part or not at all are left out. If ``select`` is 0, distances are
-no millimetres and are left out.
+By the configuration's ``bin_shift``, a bin consists of ``2**bin_shift`` bins of the sensor
+(``ref_bin_shift`` for the reference). ``histogram_bins`` is the number of the sensor's bins that
+are filled: bins filled in part or not at all are left out. If ``select`` is 0, distances are not in
+millimetres and are left out.
 
 All records are added up, or those of ``records``. The capture's reported range is the distance of
 the peak with the highest SNR, the median over the records. Some loggers project distances onto the

@@ -41,7 +41,7 @@ def writing(path: Path) -> Iterator[None]:
     Raises
     ------
     OSError
-        Of the failure's own type and number.
+        With the type and number of the failure.
     """
     try:
         yield

@@ -42,11 +42,12 @@ def requirements(
         The parts of a scene are known: their effect is computed from the model, and from captures
         with and without them. Those of a capture are looked for in its counts.
     flux, acquisition, pulse
-        Of a scene; the default flux and the scene's own acquisition where None.
+        Conditions in which a scene is simulated; by default the default flux and the scene's own
+        acquisition.
     method : str
         A key of `core.ESTIMATORS`, whose estimates are compared.
     seeds : sequence of int
-        Of a scene's captures, at least 2; compared captures share them.
+        Seeds of a scene's captures, at least 2; compared captures share them.
     progress : callable
         ``(rows done, rows in all)``, called after each row.
     cancelled : callable

@@ -421,7 +421,7 @@ def by_place(
 def agreement(capture: Capture, name: str) -> Table:
     """Return the share of pixels in which two methods agree within 3 bins; needs no truth.
 
-    Of the pixels in which a surface is confident: elsewhere, methods agree on noise.
+    Only pixels with a confident surface are compared: elsewhere, methods agree on noise.
     """
     is_confident = likeliest(capture)[1] >= CONFIDENT
     bins = {

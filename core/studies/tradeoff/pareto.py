@@ -50,7 +50,7 @@ def pareto_front(points: Sequence[Point], tolerance_bins: int = 3) -> list[Point
     Parameters
     ----------
     points : sequence of Point
-        Of one condition.
+        Points of one condition.
     tolerance_bins : int
         Tolerance of the restoration degree: 1, 2 or 3.
 
@@ -105,7 +105,7 @@ def best_within(
     Parameters
     ----------
     points : sequence of Point
-        Of one condition.
+        Points of one condition.
     milliseconds : float
         Per image; see `including_flux_time` for what it includes.
     tolerance_bins : int
