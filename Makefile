@@ -13,7 +13,7 @@ KERNELS := blocks capture detection estimators inspection matlab more_estimators
 # Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform calibration results field large fuzz attack wheel clean
+.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform tuning calibration results field large fuzz attack wheel clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z0-9]*\):.* ## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -55,8 +55,11 @@ paper: $(VENV)/.app ## every figure and table of the paper beside ours, as one p
 table2: $(VENV)/.app ## the paper's Table 2 beside ours
 	$(BIN)/python -m core table2
 
-uniform: $(VENV)/.app ## every method on depths uniform over the gate
+uniform: $(VENV)/.app ## every method on random and smooth depths over the gate
 	$(BIN)/python -m core uniform
+
+tuning: $(VENV)/.app ## the same search for the settings of every method
+	$(BIN)/python -m core tuning
 
 calibration: $(VENV)/.app ## are confidences and intervals right as often as they say?
 	$(BIN)/python -m core calibration
@@ -64,6 +67,7 @@ calibration: $(VENV)/.app ## are confidences and intervals right as often as the
 results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core paper --repetitions 100 --results assets/results/paper.md
 	$(BIN)/python -m core uniform --results assets/results/uniform.md
+	$(BIN)/python -m core tuning --results assets/results/tuning.md
 	$(BIN)/python -m core calibration --results assets/results/calibration.md
 	$(BIN)/python -m core tradeoff --results assets/results/tradeoff.md
 	$(BIN)/python -m core speed --results assets/results/speed.md

@@ -152,7 +152,8 @@ def uniform(size: int = 64, seed: int = 0, first_bin: float = 20, last_bin: floa
     seed : int
         Random seed.
     first_bin, last_bin : float
-        Fractional bins, of the gate's 100, between which the echoes begin.
+        Fractional bins, of the gate's 100, between which the echoes begin; the same bin for a flat
+        target.
 
     Raises
     ------
@@ -163,10 +164,40 @@ def uniform(size: int = 64, seed: int = 0, first_bin: float = 20, last_bin: floa
     require(
         "first_bin, last_bin",
         (first_bin, last_bin),
-        0 <= first_bin < last_bin <= acquisition.n_bins,
-        f"two positions in rising order, from 0 to {acquisition.n_bins}",
+        0 <= first_bin <= last_bin <= acquisition.n_bins,
+        f"two positions in order, from 0 to {acquisition.n_bins}",
     )
     onset_bin = np.random.default_rng(seed).uniform(first_bin, last_bin, (size, size))
+    return Scene(acquisition.bin_to_range_m(onset_bin), acquisition=acquisition)
+
+
+_WALL_SPAN_BINS = 6.0
+
+
+def wall(size: int = 64, seed: int = 0) -> Scene:
+    """A flat wall, seen obliquely, at a random range and turned by a random angle.
+
+    Neighbouring pixels see nearly the same range, and the walls of many seeds cover bins 20 to 94
+    of the gate's 100: what methods that use neighbours assume, without edges.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns, 8 or more, over a field of view of 128 mrad.
+    seed : int
+        Random seed.
+
+    Raises
+    ------
+    ValueError
+        If `size` is below 8.
+    """
+    acquisition = replace(PAPER_GATE, pixel_angle_rad=_pixel_angle_rad(0.128, size))
+    rng = np.random.default_rng(seed)
+    half = _WALL_SPAN_BINS / 2
+    middle, angle_rad = rng.uniform(20 + half, 94 - half), rng.uniform(0, 2 * np.pi)
+    across = np.linspace(-half, half, size) / np.sqrt(2)
+    onset_bin = middle + np.add.outer(np.sin(angle_rad) * across, np.cos(angle_rad) * across)
     return Scene(acquisition.bin_to_range_m(onset_bin), acquisition=acquisition)
 
 
@@ -335,6 +366,7 @@ scenes: dict[str, Callable[..., Scene]] = {
     "building": building,
     "staircase": staircase,
     "uniform": uniform,
+    "wall": wall,
     "edges": edges,
     "fog": fog,
     "approach": approach,

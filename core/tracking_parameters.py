@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from core.parameters import Choice, Number, Settings, Zone, parameter
@@ -103,8 +103,8 @@ class TrackingParameters(Settings):
     alpha: float = parameter(
         0.15,
         Number("α", 0.1, 30.0, log=True, least=0.0, most=1e6),
-        "Strength of the weight. With the cubic weight, as printed, it scales all bins equally and "
-        "cannot change a range; with the exponential weight it can.",
+        "Strength of the weight. It scales the paper's cubic weight equally in all bins, which "
+        "changes no range; with the exponential weight it does.",
     )
     t_n: int = parameter(
         20,
@@ -116,7 +116,7 @@ class TrackingParameters(Settings):
         "exponential",
         Choice("Weight", ("none", "survival", "cubic", "exponential")),
         "Factor of the residual: none, 1 / share of armed pulses (corrects the decay by pile-up), "
-        "α·(k/N)³ as printed, or exp(α·(k/N)³).",
+        "α·(k/N)³ (printed), or exp(α·(k/N)³).",
     )
     start: Start = parameter(
         "mean",
@@ -134,7 +134,7 @@ class TrackingParameters(Settings):
         "likelihood",
         Choice("Refine", ("none", "likelihood")),
         "Range below a bin: the largest likelihood within one pulse of the bin found, or none: "
-        "that bin itself, as printed, in about half the time.",
+        "that bin itself, as in the paper, in about half the time.",
     )
 
     def joint_doubts(self) -> list[str]:
@@ -164,10 +164,19 @@ class TrackingParameters(Settings):
         return found
 
 
-PRESETS: dict[str, TrackingParameters] = {
-    "recommended": TrackingParameters(),
-    "as printed": TrackingParameters(
-        l=0.001,
+class _Presets(dict[str, TrackingParameters]):
+    """Presets by name; also under a deprecated name, to be removed after the next release."""
+
+    def __missing__(self, name: str) -> TrackingParameters:
+        if name == "as printed":
+            return replace(self["literal"], l=0.001)
+        raise KeyError(name)
+
+
+PRESETS: dict[str, TrackingParameters] = _Presets(
+    recommended=TrackingParameters(),
+    literal=TrackingParameters(
+        l=0.0004,
         n=1000.0,
         h=1.0,
         m=1.5,
@@ -177,4 +186,7 @@ PRESETS: dict[str, TrackingParameters] = {
         start="zero",
         refine="none",
     ),
-}
+)
+"""``recommended`` is the best on random depths. ``literal`` takes the paper's equations literally:
+its weight, an initial value of zero, T_n = 20, and whole bins. The paper prints no l, n, h, m or α;
+l is found by the search for the recommended preset (``python -m core tuning``)."""

@@ -118,9 +118,9 @@ def test_impossible_settings_are_refused_by_name(settings, changes):
 
 
 def test_only_what_changed_is_computed_again(car):
-    other_settings = compute(ask("car", tracking=PRESETS["as printed"]), car)
+    other_settings = compute(ask("car", tracking=PRESETS["literal"]), car)
     assert other_settings.capture is not car.capture  # another catalogue's scene is another source
-    request = replace(car.request, tracking=PRESETS["as printed"])
+    request = replace(car.request, tracking=PRESETS["literal"])
     other_settings = compute(request, car)
     assert other_settings.capture is car.capture
     assert other_settings.capture_s == car.capture_s
@@ -130,7 +130,7 @@ def test_only_what_changed_is_computed_again(car):
 
 
 def test_the_page_computes_what_is_faster_than_drawing(car):
-    other = {"tracking": PRESETS["as printed"]}
+    other = {"tracking": PRESETS["literal"]}
     assert lane_of(replace(car.request, **other), car) is PAGE
     for again in ({"light": Illumination(seed=1)}, {"less": ReductionSettings(skip=2)}):
         assert lane_of(replace(car.request, **again, **other), car) is SHORT
@@ -608,14 +608,14 @@ def test_every_source_can_be_drawn_in_every_way(layout, explore, key):
 
 def test_presets_set_all_controls_and_a_change_makes_them_custom(layout):
     preset = control(layout, "Preset")
-    preset.value = "as printed"
-    assert layout.next_answer().request.tracking == PRESETS["as printed"]
+    preset.value = "literal"
+    assert layout.next_answer().request.tracking == PRESETS["literal"]
     assert (control(layout, "m").value, control(layout, "Weight").value) == (1.5, "cubic")
     control(layout, "m").value = 2.0
     assert preset.value == CUSTOM
-    assert layout.next_answer().request.tracking == replace(PRESETS["as printed"], m=2.0)
+    assert layout.next_answer().request.tracking == replace(PRESETS["literal"], m=2.0)
     control(layout, "m").value = 1.5
-    assert preset.value == "as printed"
+    assert preset.value == "literal"
 
 
 def test_a_file_that_cannot_be_read_is_reported_and_leaves_the_page(layout, tmp_path):

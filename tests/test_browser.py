@@ -414,8 +414,8 @@ def test_controls_can_be_focused_folded_moved_by_keys_typed_into_and_preset(star
     move_sliders(start_page)
     type_values(start_page)
     show_a_doubtful_zone(start_page)
-    printed = PRESETS["as printed"]
-    choose(start_page, "Preset", "as printed")
+    printed = PRESETS["literal"]
+    choose(start_page, "Preset", "literal")
     expect_rmse(start_page, car(tracking=printed))
     for name, value in (("l", printed.l), ("n", printed.n), ("m", printed.m), ("α", printed.alpha)):
         expect(field(start_page, name)).to_have_value(f"{value:g}")

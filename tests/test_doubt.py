@@ -32,7 +32,7 @@ def test_a_doubtful_combination_is_explained_while_it_is_set():
     before = panel.doubts.text
     panel.controls["start"].value = "zero"
     assert panel.doubts.text.startswith(before) and panel.doubts.text != before
-    panel.show(PRESETS["as printed"])
+    panel.show(PRESETS["literal"])
     assert panel.doubts.text == ""
 
 

@@ -158,7 +158,7 @@ def test_a_window_is_read_once_and_has_the_flux_of_the_whole(path, building, slo
     light = core.sampled_flux_prior(core.open_capture(path))
     np.testing.assert_array_equal(flux_prior_of(answer.capture).depth, light.depth)
     slow.clear()
-    other = compute(ask(source, window=window, tracking=core.PRESETS["as printed"]), answer)
+    other = compute(ask(source, window=window, tracking=core.PRESETS["literal"]), answer)
     assert other.capture is answer.capture and slow == []
 
 

@@ -255,7 +255,8 @@ class Layout:
             "Preset",
             [*PRESETS, CUSTOM],
             _preset_of(state.tracking),
-            "recommended: best on random depths. as printed: the paper's settings, literally.",
+            "recommended: best on random depths. literal: the paper's equations, with an l chosen "
+            "here, since it prints none.",
         )
         self._method = MethodChoice(session)
         self._reading = ReadingForm(self._read, session.failures.show)

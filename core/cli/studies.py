@@ -11,7 +11,7 @@ from typing import Any
 from core.cli.options import add_processes, show_progress, whole_from_to
 from core.cli.results import CheckFailed, add_results, publish
 from core.io.readers import read_capture
-from core.studies.methods import calibration, field, uniform
+from core.studies.methods import calibration, field, tuning, uniform
 from core.studies.outputs import as_markdown
 from core.studies.paper import figures as paper
 from core.studies.paper import page, recommend
@@ -36,9 +36,12 @@ def add(commands: Any) -> None:
     command.add_argument("--preset", choices=PRESETS, default="recommended", help="(recommended)")
     add_processes(command)
 
-    command = _added(commands, "uniform", "range depths uniform over the gate", _uniform)
+    command = _added(commands, "uniform", "range random and smooth depths over the gate", _uniform)
     _add_count(command, "--seeds", 2, MAX_SEEDS, 24)
     add_processes(command)
+
+    command = _added(commands, "tuning", "search the settings of every method alike", _tuning)
+    _add_count(command, "--seeds", 2, MAX_SEEDS, 8)
 
     command = _added(
         commands, "calibration", "compare confidences and intervals with errors", _calibration
@@ -118,7 +121,13 @@ def _table2(chosen: argparse.Namespace) -> None:
 
 
 def _uniform(chosen: argparse.Namespace) -> None:
-    publish([uniform.uniform_table(_trials(uniform.PLAN, chosen.seeds, chosen))], chosen)
+    publish(uniform.tables(_trials(uniform.PLAN, chosen.seeds, chosen)), chosen)
+
+
+def _tuning(chosen: argparse.Namespace) -> None:
+    found = tuning.tuning_table(range(chosen.seeds), progress=show_progress)
+    print(file=sys.stderr)
+    publish([found], chosen)
 
 
 def _calibration(chosen: argparse.Namespace) -> None:

@@ -48,10 +48,15 @@ class Condition:
     scene: str
     sbr: float
     signal: float = 0.1041
+    depths_bin: tuple[float, float] = (20.0, 94.0)
+    """Bins between which the depths of the scene ``uniform`` lie; no other scene uses them."""
 
     def capture(self, seed: int) -> Capture:
         """Simulate one capture."""
-        scene = scenes[self.scene](**({"seed": seed} if self.scene == "uniform" else {}))
+        drawn: dict[str, Any] = {"seed": seed} if self.scene in ("uniform", "wall") else {}
+        if self.scene == "uniform":
+            drawn["first_bin"], drawn["last_bin"] = self.depths_bin
+        scene = scenes[self.scene](**drawn)
         return simulate(scene, scene.acquisition, Flux(self.signal, self.sbr), seed=seed)
 
 

@@ -30,7 +30,7 @@ THREADS = sorted({1, numba.config.NUMBA_NUM_THREADS})
 
 # Every estimator as it comes, and the tracker also as the paper prints it.
 CASES = {name: (name, estimator.parameters()) for name, estimator in ESTIMATORS.items()}
-CASES["tracking as printed"] = ("tracking", PRESETS["as printed"])
+CASES["tracking, literal"] = ("tracking", PRESETS["literal"])
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 every_estimator = pytest.mark.parametrize("method", ESTIMATORS)
@@ -307,7 +307,7 @@ def test_settings_may_be_given_field_by_field() -> None:
         (("peak",), {"width": 3}, r"width = 3 .*one of \[\]"),
         (("tracking",), {"M": 3}, r"M = 3 .*'l', 'n', 'h', 'm'"),
         (("tracking",), {"m": -1.0}, r"m = -1\.0 "),
-        (("tracking", "as printed"), {}, r"settings = 'as printed' .*TrackingParameters"),
+        (("tracking", "literal"), {}, r"settings = 'literal' .*TrackingParameters"),
         (("tracking", TrackingParameters()), {"m": 2.0}, r"settings = .*or single fields"),
         (("tracking",), {"weight": "survival"}, r"weight = 'survival' needs the number of pulses"),
     ],

@@ -24,7 +24,7 @@ from core.inspection import CONFIDENT
 from core.inspection.maps import likeliest
 from core.scene import Scene, scenes
 from core.studies import trials
-from core.studies.methods import calibration, uniform
+from core.studies.methods import calibration, tuning, uniform
 from core.studies.outputs import (
     Item,
     Pictures,
@@ -57,9 +57,9 @@ def thinned(scene: Scene, step: int) -> Scene:
 @pytest.fixture
 def small_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes of a few dozen pixels."""
-    for name in ("car", "building", "uniform"):
+    for name in ("car", "building", "uniform", "wall"):
         full = scenes[name]
-        monkeypatch.setitem(scenes, name, lambda full=full, **seed: thinned(full(**seed), 4))
+        monkeypatch.setitem(scenes, name, lambda full=full, **drawn: thinned(full(**drawn), 4))
 
 
 @pytest.mark.usefixtures("small_scenes")
@@ -271,14 +271,10 @@ def test_echo_free_shares_sum_to_the_estimates(items: dict[str, Item]) -> None:
     assert "oracle" not in plot.curves
     for name, shares in plot.curves.items():
         assert shares.sum() <= 1 + 1e-12
-        if name not in (
-            "unmixing",
-            "tracking",
-            "tracking as printed",
-        ):  # not all pixels have an estimate
+        if name not in ("unmixing", "tracking", "tracking, literal"):  # answer not all pixels
             assert shares.sum() == pytest.approx(1)
     # The paper's estimator prefers some bins, others the start of the gate.
-    assert 4 <= plot.curves["tracking as printed"].argmax() < 14
+    assert 4 <= plot.curves["tracking, literal"].argmax() < 14
     assert plot.curves["peak"].argmax() == 0
 
 
@@ -286,9 +282,9 @@ def test_the_degree_depends_on_the_position_of_the_echo(items: dict[str, Item]) 
     plot = items["by_place_0.06"]
     assert isinstance(plot, Plot)
     place = plot.x
-    printed = plot.curves["tracking as printed"]
-    assert printed[(place > 45) & (place < 60)].min() > 0.9
-    assert printed[place > 85].max() < 0.5
+    literal = plot.curves["tracking, literal"]
+    assert literal[(place > 45) & (place < 60)].min() > 0.9
+    assert literal[place > 95].max() < 0.5
     limit = plot.curves["limit: probability of the right bin"]
     expected = right_bin_probability(place, 0.1041, 0.1041 / 0.06, paper.PULSE, paper.GATE)
     np.testing.assert_allclose(limit, expected, atol=0.01)
@@ -444,7 +440,32 @@ def test_commands_print_tables(capsys: pytest.CaptureFixture[str]) -> None:
     assert printed.out.count("| recommended |") == 6
     assert main(["uniform", "--seeds", "2", "--processes", "1"]) == 0
     printed = capsys.readouterr()
-    assert all(f"| {method.name} |" in printed.out for method in paper.COMPARED)
+    assert all(printed.out.count(f"| {method.name} |") == 3 for method in paper.COMPARED)
+
+
+def test_early_echoes_are_found_where_tracking_searches_for_them() -> None:
+    conditions = (uniform.CONDITIONS[0], uniform.EARLY[0])
+    methods = (paper.RECOMMENDED, uniform.SEARCHING_EARLY)
+    results = trials.trials(dict.fromkeys(conditions, methods), range(2))
+    late, early = ({m.name: summary(results[c, m.name]).rd[2] for m in methods} for c in conditions)
+    assert early["tracking"].high < 0.5
+    assert late["tracking"].low > 0.9
+    assert early[uniform.SEARCHING_EARLY.name].low > 2 * early["tracking"].high
+
+
+@pytest.mark.usefixtures("small_scenes")
+def test_the_tuning_search_keeps_defaults_or_finds_better() -> None:
+    kde = next(each for each in tuning.METHODS if each.name == "kde")
+    wide = replace(kde, settings=replace(kde.settings, bandwidth_bins=3.0))
+    assert tuning.scene_of(kde) == "wall" and tuning.scene_of(paper.RECOMMENDED) == "uniform"
+    found = tuning.search(wide, range(1000, 1002))
+    assert found.settings.bandwidth_bins < 3.0 and found.n_tried > 6
+    literal = tuning.search(paper.LITERAL, range(1000, 1001))
+    assert replace(literal.settings, l=paper.LITERAL.settings.l) == paper.LITERAL.settings
+    table = tuning.tuning_table(range(2), [kde])
+    ((_, scene, _, changes, *degrees),) = table.rows
+    assert scene == "wall" and changes
+    assert all(0 <= each.value <= 1 for each in degrees) and len(degrees) == 6
 
 
 def test_every_setting_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:

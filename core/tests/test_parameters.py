@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any
 
@@ -92,7 +92,10 @@ def test_the_recommended_preset_is_the_default() -> None:
     assert PRESETS["recommended"] == TrackingParameters()
 
 
-def test_the_printed_preset_is_what_the_paper_prints() -> None:
-    printed = PRESETS["as printed"]
-    assert (printed.weight, printed.start, printed.sigma_from) == ("cubic", "zero", "gate")
-    assert (printed.l, printed.n, printed.m, printed.t_n) == (0.001, 1000, 1.5, 20)
+def test_the_literal_preset_takes_what_the_paper_prints() -> None:
+    literal = PRESETS["literal"]
+    assert (literal.weight, literal.start, literal.sigma_from) == ("cubic", "zero", "gate")
+    assert (literal.t_n, literal.refine) == (20, "none")
+    assert PRESETS["as printed"] == replace(literal, l=0.001)  # deprecated
+    with pytest.raises(KeyError):
+        PRESETS["printed"]

@@ -52,7 +52,7 @@ def test_restoration_degrees_use_tolerances_of_1_to_3_bins() -> None:
 
 
 def test_a_run_uses_its_settings() -> None:
-    capture, settings = simulated(), PRESETS["as printed"]
+    capture, settings = simulated(), PRESETS["literal"]
     found = run(capture, "tracking", settings).image.score
     np.testing.assert_array_equal(found, estimate(capture, "tracking", settings).score)
 

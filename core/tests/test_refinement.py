@@ -131,11 +131,11 @@ def test_refined_delays_take_all_fractions_of_a_bin() -> None:
     assert tenths.min() > 0.5 * tenths.mean()
 
 
-def test_the_printed_preset_gives_whole_bins_minus_the_lag() -> None:
+def test_the_literal_preset_gives_whole_bins_minus_the_lag() -> None:
     capture = drawn(Pulse(), 300, rows=1)
-    printed = replace(PRESETS["as printed"], t_n=5)
-    bins = estimate(capture, "tracking", printed).bin[0]
-    position = tracking_signals(capture.cube[0], printed, 300).position_bin
+    literal = replace(PRESETS["literal"], t_n=5)
+    bins = estimate(capture, "tracking", literal).bin[0]
+    position = tracking_signals(capture.cube[0], literal, 300).position_bin
     lag = position - bins
     clipped = (bins == 0) | (bins == N_BINS)
     np.testing.assert_allclose(lag[~clipped], np.median(lag), atol=1e-9)

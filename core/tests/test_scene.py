@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from core.scene import Scene, building, car, scenes, staircase, uniform
+from core.scene import Scene, building, car, scenes, staircase, uniform, wall
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
 
@@ -134,12 +134,26 @@ def test_uniform_depths_ignore_their_neighbours() -> None:
     assert abs(correlation) < 4 / np.sqrt(64 * 63)
 
 
+def test_walls_are_smooth_and_cover_the_gate() -> None:
+    found = [onset_bin(wall(seed=seed)) for seed in range(64)]
+    assert 20 <= min(map(np.min, found)) < 25
+    assert 89 < max(map(np.max, found)) <= 94
+    for bins in found:
+        assert np.ptp(bins) <= 6
+        image = bins.reshape(64, 64)
+        assert all(np.abs(np.diff(image, axis=axis)).max() < 0.1 for axis in (0, 1))
+
+
+def test_a_flat_target_has_one_range() -> None:
+    np.testing.assert_allclose(onset_bin(uniform(first_bin=53.6, last_bin=53.6)), 53.6)
+
+
 REFUSED = [
     *((car, (size,), rf"size = {size} .*64 or 256") for size in (0, 63, 128)),
-    *((build, (7,), r"size = 7 .*8 or more") for build in (building, staircase, uniform)),
+    *((build, (7,), r"size = 7 .*8 or more") for build in (building, staircase, uniform, wall)),
     *(
         (uniform, (64, 0, *bins), r"first_bin, last_bin = .*from 0 to 100")
-        for bins in ((-1, 50), (50, 50), (60, 50), (20, 101), (20, np.nan))
+        for bins in ((-1, 50), (60, 50), (20, 101), (20, np.nan))
     ),
 ]
 

@@ -289,9 +289,9 @@ def test_alpha_moves_ranges_with_the_exponential_weight_only(cube: np.ndarray) -
     def positions(preset: str, alpha: float) -> np.ndarray:
         return track(to_blocks(cube), replace(PRESETS[preset], alpha=alpha))[0]
 
-    printed = positions("as printed", 1.0)
+    literal = positions("literal", 1.0)
     for alpha in (0.125, 32.0):  # powers of two, so that ties stay ties
-        np.testing.assert_array_equal(positions("as printed", alpha), printed)
+        np.testing.assert_array_equal(positions("literal", alpha), literal)
     later = np.nanmean(positions("recommended", 30.0))
     assert later > np.nanmean(positions("recommended", 0.1))
 

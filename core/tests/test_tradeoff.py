@@ -33,7 +33,15 @@ from core.studies.tradeoff import acquisition as acquiring
 from core.studies.tradeoff import measure
 from core.studies.tradeoff import plan as plans
 from core.studies.tradeoff.acquisition import Sweep
-from core.studies.tradeoff.measure import Cancelled, Candidate, Piece, Point, scored, study
+from core.studies.tradeoff.measure import (
+    Cancelled,
+    Candidate,
+    Piece,
+    Point,
+    scored,
+    study,
+    variations,
+)
 from core.studies.tradeoff.page import acquisition_sweeps
 from core.studies.tradeoff.pareto import (
     best_within,
@@ -90,6 +98,17 @@ def test_the_front_is_what_nothing_beats(places: list[tuple[int, int]]) -> None:
     speeds = [point.milliseconds.value for point in chosen]
     degrees = [point.rd().value for point in chosen]
     assert (speeds, degrees) == (sorted(speeds), sorted(degrees))
+
+
+def test_a_gate_cut_to_the_true_ranges_is_never_chosen() -> None:
+    cut = [each for each in variations((15, 99)) if each.reduction.gate]
+    assert cut and all(each.is_bound for each in cut)
+    assert not any(each.is_bound for each in variations())
+    honest = steady(50, 4)
+    told = [replace(steady(99, 1), candidate=each) for each in cut]
+    assert pareto_front([honest, *told]) == [honest]
+    best = best_within([honest, *told], 10)
+    assert best is not None and best.point is honest
 
 
 def test_a_clear_choice_is_certain() -> None:

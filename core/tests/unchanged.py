@@ -126,7 +126,7 @@ CAPTURES: dict[str, Callable[[], core.Capture]] = {
 
 MORE_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {
     "tracking": (
-        vars(core.PRESETS["as printed"]),
+        vars(replace(core.PRESETS["literal"], l=0.001)),
         {"weight": "survival", "l": 0.01, "sigma_from": "before T_n"},
         {"weight": "none", "m": 2.0, "h": 0.8, "n": 300.0, "t_n": 5},
     ),

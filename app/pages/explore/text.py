@@ -20,7 +20,7 @@ decay, the *large scale* the sudden echo. Their positive difference, the *residu
 subtracted.
 
 **What changes the estimate.** l and h act only through (m·h)²·l counts, so they are one parameter.
-m, n, T_n, the weight, the start and σ each change estimates. With the weight as printed (cubic), α
+m, n, T_n, the weight, the start and σ each change estimates. With the printed weight (cubic), α
 scales all bins alike and changes nothing; with the *exponential* weight it does. Every weight
 assumes where targets are: the printed one that they are far, the recommended one (exponential,
 α 0.15) hardly anything.

@@ -73,7 +73,8 @@ class Scales(Checked):
     preset: str = parameter(
         "recommended",
         Choice("Preset", tuple(PRESETS)),
-        "recommended: best on random depths. as printed: the paper's text, literally.",
+        "recommended: best on random depths. literal: the paper's equations, with an l chosen "
+        "here, since it prints none.",
     )
 
 

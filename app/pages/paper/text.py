@@ -10,7 +10,7 @@ RECONSTRUCTION = "reconstructed from its abstract"
 
 TITLES_OF_PRESETS = {
     "tracking": "Tracking differentiator, recommended",
-    "tracking as printed": "Tracking differentiator, as printed",
+    "tracking, literal": "Tracking differentiator, literal",
 }
 
 JUMP = """

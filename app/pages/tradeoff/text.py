@@ -71,8 +71,7 @@ def rows(points: Sequence[Point], pareto: Sequence[Point]) -> list[dict[str, obj
 
 
 def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
-    is_bound = point.candidate.knows_flux
-    note = "Pareto front" if is_pareto else "knows the true fluxes: a bound" if is_bound else ""
+    note = "Pareto front" if is_pareto else _bound(point.candidate)
     return {
         "key": key,
         "action": "Open",
@@ -88,6 +87,13 @@ def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
             cell(point.peak_bytes / 1e6, "{:.3g}"),
         ],
     }
+
+
+def _bound(candidate: Candidate) -> str:
+    """Return what a configuration knows that no instrument knows; empty if nothing."""
+    if candidate.knows_truth:
+        return "knows the true ranges: a bound"
+    return "knows the true fluxes: a bound" if candidate.knows_flux else ""
 
 
 def _percent(found: Interval) -> Interval:

@@ -85,6 +85,8 @@ class Candidate:
         A key of `KERNELS`.
     threads : int, optional
         Threads of kernels; numba's setting where None.
+    knows_truth : bool
+        Whether its gate is cut to the true ranges of the targets.
 
     Raises
     ------
@@ -96,6 +98,7 @@ class Candidate:
     reduction: Reduction = field(default_factory=Reduction)
     kernel: str = ""
     threads: int | None = None
+    knows_truth: bool = False
 
     is_told_the_light = renamed("knows_flux")
 
@@ -117,6 +120,11 @@ class Candidate:
     def knows_flux(self) -> bool:
         """Whether it is given the true flux, which no instrument knows, as the oracle is."""
         return self.estimator.flux_model is not flux_model_of
+
+    @property
+    def is_bound(self) -> bool:
+        """Whether it knows what no instrument knows: it is never recommended."""
+        return self.knows_flux or self.knows_truth
 
     def range_m(
         self, reduced: Capture, shape: tuple[int, int], flux: FluxModel | None = None
@@ -287,14 +295,17 @@ def variations(window: tuple[int, int] | None = None) -> list[Candidate]:
     """
     reductions = [Reduction(skip=2), Reduction(skip=4), Reduction(pool=2)]
     reductions += [Reduction(merge=2, pool=2), Reduction(merge=4, pool=2)]
-    if window is not None:
-        reductions += [Reduction(gate=window), Reduction(gate=window, merge=2)]
+    cut = [Reduction(gate=window), Reduction(gate=window, merge=2)] if window else []
     chosen = [each for each in default_methods() if each.name in VARIED]
-    return [Candidate(method, each) for method in chosen for each in reductions] + [
-        Candidate(method, kernel=kernel)
-        for method in chosen
-        for kernel, of in KERNELS.items()
-        if kernel and method.estimator in of
+    return [
+        *(Candidate(method, each) for method in chosen for each in reductions),
+        *(Candidate(method, each, knows_truth=True) for method in chosen for each in cut),
+        *(
+            Candidate(method, kernel=kernel)
+            for method in chosen
+            for kernel, of in KERNELS.items()
+            if kernel and method.estimator in of
+        ),
     ]
 
 

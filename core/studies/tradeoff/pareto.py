@@ -1,7 +1,8 @@
 """Choices among measured points: the Pareto front, the best within a time, the fastest for an RD.
 
-Only points of one condition (`Point.condition`) are compared. Candidates that are given the true
-flux, such as the oracle, are never chosen: no instrument knows it.
+Only points of one condition (`Point.condition`) are compared. Candidates that know the true flux,
+such as the oracle, or the true ranges, such as a gate cut to the targets, are never chosen: no
+instrument knows either.
 """
 
 from __future__ import annotations
@@ -164,7 +165,7 @@ _Judge = Callable[[_Outcomes], tuple[Floats, NDArray[np.bool_]]]
 
 
 def _eligible(points: Sequence[Point]) -> list[Point]:
-    return [point for point in points if not point.candidate.knows_flux]
+    return [point for point in points if not point.candidate.is_bound]
 
 
 def _chosen(points: Sequence[Point], tolerance_bins: int, judge: _Judge) -> Recommendation | None:
