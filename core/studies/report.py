@@ -44,7 +44,9 @@ h2 {{ margin-top: 3rem; }}
 figure {{ margin: 0; }}
 figure img {{ max-width: 100%; height: auto; }}
 p.note {{ color: #4a5565; max-width: 75ch; }}
-div.table {{ overflow-x: auto; }}
+/* Wide tables take the width of the window, beyond that of the text. */
+div.table {{ overflow-x: auto; width: max-content; max-width: calc(100vw - 2rem);
+  margin-left: 50%; transform: translateX(-50%); }}
 table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; }}
 th, td {{ padding: 3px 10px; text-align: right; border-bottom: 1px solid #d9dee5;
   white-space: nowrap; }}

@@ -25,7 +25,9 @@ from core.estimators import ESTIMATORS, estimate
 from core.inference.posterior import posterior_of
 from core.io.readers import read_capture
 from core.io.readers.arrivals import NATIVE_BIN_S
+from core.metrics import Interval, wilson
 from core.studies.outputs import Table
+from core.studies.statistics import median_interval
 
 FACE, FACE_TRUTH = "data_face.mat", "data_mannequin_face_truth.mat"
 TMF8820 = "tmf8820_distance_data.json"
@@ -33,7 +35,7 @@ TMF8820 = "tmf8820_distance_data.json"
 _IN_SCAN = np.s_[0:340, 3:343]  # the part of the truth's 350 x 350 that the capture covers
 _FACE_BINS = 3550.0, 3700.0
 _WALL_BIN = 4000.0
-NEAR_M, FAR_M = 0.03, 0.15
+WITHIN_M = 0.03, 0.15
 
 GAUSSIAN = Pulse.gaussian(45 * NATIVE_BIN_S)
 METHODS = tuple(name for name in ESTIMATORS if name != "oracle")  # the true flux is unknown
@@ -97,8 +99,12 @@ def face_captures(folder: Path, pulse: Pulse) -> Iterator[tuple[str, Capture]]:
         yield name, with_background(everything, sbr)
 
 
-def face_table(folder: Path, pulse: Pulse, title: str, progress: Callable[[str], None]) -> Table:
-    """Return the share of the face's pixels within 30 mm and 150 mm, for each method.
+def face_tables(
+    folder: Path, pulse: Pulse, key: str, title: str, progress: Callable[[str], None]
+) -> list[Table]:
+    """Return the share of the face's pixels within 30 mm and within 150 mm, for each method.
+
+    Intervals are those of a share of as many independent pixels (95 %).
 
     Raises
     ------
@@ -106,9 +112,8 @@ def face_table(folder: Path, pulse: Pulse, title: str, progress: Callable[[str],
         If a capture is absent.
     """
     truth = face_truth(folder)
-    cells: dict[str, list[str]] = {method: [] for method in METHODS}
-    spent_s = dict.fromkeys(METHODS, 0.0)
-    known = ["", *(f"{p:.3f} {q:.3f} / {m:.3f} {n:.3f}" for p, q, m, n in KNOWN.values())]
+    cells: dict[tuple[float, str], list[Interval]] = {(w, m): [] for w in WITHIN_M for m in METHODS}
+    spent_s, has_photon = dict.fromkeys(METHODS, 0.0), []
     for condition, capture in face_captures(folder, pulse):
         posterior_of(capture)  # computed once per capture, whatever the method
         for method in METHODS:
@@ -118,13 +123,30 @@ def face_table(folder: Path, pulse: Pulse, title: str, progress: Callable[[str],
             spent_s[method] += perf_counter() - started
             error_m = (range_m - truth.range_m)[truth.is_face]
             error_m = np.abs(error_m - np.nanmedian(error_m))
-            near, far = (error_m <= NEAR_M).mean(), (error_m <= FAR_M).mean()
-            cells[method].append(f"{near:.3f} {far:.3f}")
-        seen = float((capture.counts[truth.is_face] > 0).mean())
-        known[len(cells[METHODS[0]])] += f" x {seen:.3f}"
-    rows = [(method, *cells[method], f"{spent_s[method] / 4:.1f}") for method in METHODS]
-    rows.append(("published: peak / matched filter, x share with a photon", *known[1:], ""))
-    return Table("face", title, ("method", *KNOWN, "s"), tuple(rows))
+            for within_m in WITHIN_M:
+                right = int((error_m <= within_m).sum())
+                cells[within_m, method].append(wilson(right, error_m.size))
+        has_photon.append(float((capture.counts[truth.is_face] > 0).mean()))
+    tables = []
+    for at, within_m in enumerate(WITHIN_M):
+        rows = [
+            (method, *cells[within_m, method], f"{spent_s[method] / len(KNOWN):.1f}")
+            for method in METHODS
+        ]
+        for name, first in (("peak", 0), ("matched filter", 2)):
+            known = (values[first + at] for values in KNOWN.values())
+            shares = (share * seen for share, seen in zip(known, has_photon, strict=True))
+            rows.append((f"published: {name}", *shares, ""))
+        tables.append(
+            Table(
+                f"{key}_{1e3 * within_m:.0f}_mm",
+                f"{title}: share of the pixels within {1e3 * within_m:.0f} mm",
+                ("method", *KNOWN, "s"),
+                tuple(rows),
+                "Published shares are of the pixels with a photon; here, of all pixels.",
+            )
+        )
+    return tables
 
 
 def tmf8820_table(folder: Path) -> Table:
@@ -142,16 +164,16 @@ def tmf8820_table(folder: Path) -> Table:
     rows = []
     for method in METHODS:
         error_m = (estimate(capture, method).range_m - capture.truth_range_m)[:, middle]
-        low, median, high = np.nanpercentile(error_m, [16, 50, 84])
-        estimated = float(np.isfinite(error_m).mean())
-        rows.append(
-            (method, f"{median * 1e3:.1f}", f"{(high - low) / 2e-3:.1f}", f"{estimated:.2f}")
-        )
+        found_mm = 1e3 * error_m[np.isfinite(error_m)]
+        low, high = np.percentile(found_mm, [16, 84])
+        estimated = wilson(found_mm.size, error_m.size)
+        rows.append((method, median_interval(found_mm), float(high - low) / 2, estimated))
     return Table(
         "tmf8820",
         f"TMF8820, middle zone of {capture.shape[0]} records, against the plane's distance",
         ("method", "median error, mm", "half the middle 68 %, mm", "estimated"),
         tuple(rows),
+        formats={"median error, mm": ".1f", "half the middle 68 %, mm": ".1f"},
     )
 
 
@@ -167,5 +189,7 @@ def tables(folder: Path, progress: Callable[[str], None]) -> Iterator[Table]:
         require("captures", str(folder / name), (folder / name).is_file(), "a folder with it")
     wall = wall_pulse(folder, face_truth(folder))
     yield tmf8820_table(folder)
-    yield face_table(folder, GAUSSIAN, "Face, pulse a Gaussian of 360 ps", progress)
-    yield face_table(folder, wall, "Face, pulse measured on the wall", progress)
+    yield from face_tables(
+        folder, GAUSSIAN, "face_gaussian", "Face, pulse a Gaussian of 360 ps", progress
+    )
+    yield from face_tables(folder, wall, "face_wall", "Face, pulse measured on the wall", progress)
