@@ -19,6 +19,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from core.io import OUTSIDE_COLOR, RangeColors, colors_of
+from core.metrics import Interval
 from core.studies.outputs import (
     Item,
     Pictures,
@@ -45,13 +46,12 @@ figure {{ margin: 0; }}
 figure img {{ max-width: 100%; height: auto; }}
 p.note {{ color: #4a5565; max-width: 75ch; }}
 /* Wide tables take the width of the window, beyond that of the text. */
-div.table {{ overflow-x: auto; width: max-content; max-width: calc(100vw - 2rem);
-  margin-left: 50%; transform: translateX(-50%); }}
+div.table {{ overflow-x: auto; width: max-content; min-width: 100%;
+  max-width: calc(100vw - 2rem); margin-left: 50%; transform: translateX(-50%); }}
 table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; }}
-th, td {{ padding: 3px 10px; text-align: right; border-bottom: 1px solid #d9dee5;
-  white-space: nowrap; }}
+th, td {{ padding: 3px 8px; text-align: right; border-bottom: 1px solid #d9dee5; }}
 th {{ position: sticky; top: 0; background: #f2f5f8; }}
-td.text {{ text-align: left; white-space: normal; min-width: 9em; }}
+th:first-child, td.text {{ text-align: left; }}
 </style></head><body>
 <h1>{title}</h1>
 {body}
@@ -101,7 +101,10 @@ def _html_table(table: Table) -> str:
 
 def _html_cell(value: Any, form: str) -> str:
     attribute = ' class="text"' if isinstance(value, str) else ""
-    return f"<td{attribute}>{html.escape(as_text(value, form))}</td>"
+    text = html.escape(as_text(value, form))
+    if isinstance(value, Interval):
+        text = text.replace(", ", ",&nbsp;")  # only the value may stand on a line of its own
+    return f"<td{attribute}>{text}</td>"
 
 
 def _draw(item: Plot | Scatter | Pictures) -> Figure:
