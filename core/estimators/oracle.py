@@ -1,4 +1,8 @@
-"""The exact first-photon likelihood with true fluxes: the physical limit of a single pixel."""
+"""The exact first-photon likelihood with true fluxes: a bound for methods that do not know them.
+
+It is the limit of a single pixel for the figure of its rule (`core.estimators.likelihood`), if the
+delays are uniform over the gate.
+"""
 
 from __future__ import annotations
 

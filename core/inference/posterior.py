@@ -7,7 +7,7 @@ mass around an estimate is its confidence, for any estimator.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,13 @@ from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
-from core.inference.likelihood import delay_curves, delay_densities, pixels_of, prepared_groups
+from core.inference.likelihood import (
+    LikelihoodInput,
+    delay_curves,
+    delay_densities,
+    pixels_of,
+    prepared_groups,
+)
 
 _AT_ONCE = 2**19  # numbers that fit in the cache
 TOLERANCE_BINS = 3
@@ -128,18 +134,105 @@ def most_likely(capture: Capture, flux: FluxModel, steps_per_bin: int) -> tuple[
     delay, score = np.empty((2, capture.counts.size))
     for pixels, prepared in prepared_groups(capture, flux, steps_per_bin):
         for some, curve, weighted in delay_curves(prepared):
-            at = curve.argmax(axis=1)[:, np.newaxis]
-            last = curve.shape[1] - 1
-            around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
-            # From logarithms, since the density next to a strong echo underflows to 0.
-            log = np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float)
-            log = np.logaddexp.reduce(log, axis=1) + np.log(prepared.depth[around])
-            left, middle, right = log.transpose(1, 0, 2)
-            curvature = np.minimum(left - 2 * middle + right, -1e-9)
-            inside = (at[:, 0] > 0) & (at[:, 0] < last)
-            shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
+            vertex, height = _vertex(prepared, weighted, curve.argmax(axis=1))
             here = pixels_of(some, prepared, pixels)
             size = here.stop - here.start
-            delay[here] = ((at[:, 0] + 0.5 + shift) / steps_per_bin).ravel()[:size]
-            score[here] = middle.ravel()[:size]
+            delay[here] = (vertex / steps_per_bin).ravel()[:size]
+            score[here] = height.ravel()[:size]
     return delay.reshape(capture.shape), score.reshape(capture.shape)
+
+
+Rule = Literal["density", "window", "mean", "median"]
+
+
+def least_loss(
+    capture: Capture, flux: FluxModel, steps_per_bin: int, rule: Rule
+) -> tuple[Floats, Floats]:
+    """Find the delay of the least expected loss, if there is a surface.
+
+    Parameters
+    ----------
+    capture : Capture
+    flux : FluxModel
+    steps_per_bin : int
+        Delays tried within each bin.
+    rule : str
+        The loss: an error above `TOLERANCE_BINS` ("window", which has the highest expected
+        restoration degree), the square of the error ("mean", the lowest RMSE) or its magnitude
+        ("median", the lowest MAE). "density" is `most_likely`.
+
+    Returns
+    -------
+    delay_bin, score : ndarray, shape (row, col)
+        As those of `most_likely`; the score is that of the largest density.
+    """
+    if rule == "density":
+        return most_likely(capture, flux, steps_per_bin)
+    delay, score = np.empty((2, capture.counts.size))
+    for pixels, prepared in prepared_groups(capture, flux, steps_per_bin):
+        for some, density, _, weighted in delay_densities(prepared):
+            _, height = _vertex(prepared, weighted, density.argmax(axis=1))
+            if rule == "window":
+                at = _most_in_window(density, TOLERANCE_BINS * steps_per_bin)
+                found = _vertex(prepared, weighted, at)[0]
+            elif rule == "mean":
+                steps = np.arange(density.shape[1]) + 0.5
+                found = np.einsum("bdl,d->bl", density, steps) / density.sum(axis=1, dtype=float)
+            else:
+                found = _median(density)
+            here = pixels_of(some, prepared, pixels)
+            size = here.stop - here.start
+            delay[here] = (found / steps_per_bin).ravel()[:size]
+            score[here] = height.ravel()[:size]
+    return delay.reshape(capture.shape), score.reshape(capture.shape)
+
+
+def _vertex(
+    prepared: LikelihoodInput, weighted: NDArray[np.float32], step: NDArray[np.intp]
+) -> tuple[Floats, Floats]:
+    """Refine steps (block, lane) by a parabola through the logarithm of the density.
+
+    Returns
+    -------
+    position : ndarray, shape (block, lane)
+        In steps.
+    height : ndarray, shape (block, lane)
+        Logarithm of the density at the step itself.
+    """
+    at, last = step[:, np.newaxis], weighted.shape[2] - 1
+    around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
+    # From logarithms, since the density next to a strong echo underflows to 0.
+    log = np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float)
+    log = np.logaddexp.reduce(log, axis=1) + np.log(prepared.depth[around])
+    left, middle, right = log.transpose(1, 0, 2)
+    curvature = np.minimum(left - 2 * middle + right, -1e-9)
+    inside = (step > 0) & (step < last)
+    shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
+    return np.asarray(step + 0.5 + shift, float), middle
+
+
+def _most_in_window(density: NDArray[np.float32], half: int) -> NDArray[np.intp]:
+    """Return the step with most of the density (block, step, lane) within `half` steps of it.
+
+    Around a narrow peak, windows hold the same: of those within a thousandth, the densest step.
+    """
+    below = np.zeros((density.shape[0], density.shape[1] + 1, density.shape[2]))
+    np.cumsum(density, axis=1, out=below[:, 1:])
+    steps, n = np.arange(density.shape[1]), density.shape[1]
+    first, last = steps - half, steps + half
+    mass = below[:, np.minimum(last + 1, n)] - below[:, np.maximum(first, 0)]
+    # Of the outermost steps, half is inside.
+    mass[:, first >= 0] -= 0.5 * density[:, first[first >= 0]]
+    mass[:, last < n] -= 0.5 * density[:, last[last < n]]
+    is_best = mass >= (1 - 1e-3) * mass.max(axis=1, keepdims=True)
+    return np.asarray(np.where(is_best, density, -1.0).argmax(axis=1))
+
+
+def _median(density: NDArray[np.float32]) -> Floats:
+    """Return where half the density (block, step, lane) is reached, in steps, (block, lane)."""
+    upto = np.cumsum(density, axis=1, dtype=float)
+    half = 0.5 * upto[:, -1:]
+    at = (upto >= half).argmax(axis=1)[:, np.newaxis]
+    here = np.take_along_axis(density, at, axis=1)
+    beyond = (np.take_along_axis(upto, at, axis=1) - half) / np.maximum(here, 1e-30)
+    return np.asarray((at + 1 - np.clip(beyond, 0.0, 1.0))[:, 0])

@@ -28,6 +28,7 @@ from core.inference.likelihood import (
 from core.inference.posterior import (
     TOLERANCE_BINS,
     Posterior,
+    least_loss,
     most_likely,
     posterior_of,
     tolerance_probability,
@@ -252,6 +253,32 @@ def test_kernels_are_the_equations(
     assert capture.gated_pulses == n_pulses
     flux = flux_for(*cube.shape[1:], n_pulses)
     assert_equals_twin(monkeypatch, capture, flux, steps_per_bin)
+
+
+@pulses_known
+def test_each_rule_has_the_least_expected_loss(n_pulses: int | None) -> None:
+    n_bins, steps = 20, 2
+    cube = histograms(n_bins, n_pulses, Pulse())[np.newaxis]
+    capture, flux = capture_of(cube, n_pulses), flux_for(*cube.shape[1:], n_pulses)
+    expected = twin(capture, flux, steps)
+    found = {
+        rule: least_loss(capture, flux, steps, rule)[0].ravel()
+        for rule in ("density", "window", "mean", "median")
+    }
+    np.testing.assert_array_equal(found["density"], most_likely(capture, flux, steps)[0].ravel())
+    error = np.abs(expected.delay[:, np.newaxis] - expected.delay)
+    inside = np.where(error < TOLERANCE_BINS, 1.0, np.where(error > TOLERANCE_BINS, 0.0, 0.5))
+    for i, log_density in enumerate(expected.log_density):
+        share = np.exp(log_density - np.logaddexp.reduce(log_density))
+        blur = 4 * np.expm1(2 * expected.rounding[i] + OF_SUMS)
+        mass = inside @ share
+        at = min(int(found["window"][i] * steps), mass.size - 1)
+        assert mass[at] >= (1 - 1e-3) * mass.max() - blur
+        assert found["mean"][i] == pytest.approx(share @ expected.delay, abs=n_bins * blur + 1e-6)
+        # Within its step, the density is constant.
+        edges = np.arange(share.size + 1) / steps
+        half = np.interp(found["median"][i], edges, np.append(0.0, share.cumsum()))
+        assert half == pytest.approx(0.5, abs=blur + 1e-6)
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,10 @@ COLUMN_HELP: dict[str, tuple[str, int]] = {
     "answered": ("Share of target pixels with an estimate.", -1),
     "ms": ("Median time to estimate one capture on this server.", 1),
     "scene": ("The scene.", 1),
-    "probability of the right bin": ("Largest possible probability of the true bin.", -1),
+    "probability of the right bin": (
+        "Approximate probability that the oracle finds the true bin.",
+        -1,
+    ),
     "Cramér-Rao bound m": ("Smallest possible standard deviation of unbiased estimates.", 1),
 }
 """Help and sort order of each column: 1 or -1, lowest or highest value first."""

@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from core.estimators.likelihood import LikelihoodParameters
 from core.metrics import Interval
 from core.studies.outputs import Table, table
 from core.studies.paper.figures import COMPARED, RECOMMENDED, WHOLE_BINS, in_whole_bins
@@ -31,8 +32,15 @@ SEARCHING_EARLY = Method(
 )
 FROM_BIN_1 = [RECOMMENDED, SEARCHING_EARLY, *(m for m in COMPARED if m is not RECOMMENDED)]
 
+BEST_WINDOW = [
+    Method(f"{name}, window", name, LikelihoodParameters(rule="window"))
+    for name in ("likelihood", "oracle")
+]
+"""They answer the delay with most probability within 3 bins, which this figure rewards."""
+LATE = [*COMPARED, *BEST_WINDOW]
+
 PLAN = {
-    **dict.fromkeys(CONDITIONS, COMPARED),
+    **dict.fromkeys(CONDITIONS, LATE),
     **dict.fromkeys((*WHOLE_GATE, *EARLY), FROM_BIN_1),
     **dict.fromkeys(WALLS, COMPARED),
 }
@@ -64,7 +72,7 @@ def uniform_table(results: Results) -> Table:
     return table(
         "uniform",
         "Restoration degree within 3 bins, depths uniform over bins 20 to 94",
-        [method.name for method in COMPARED],
+        [method.name for method in LATE],
         {
             "method": str,
             **_columns(results, CONDITIONS),
@@ -73,7 +81,8 @@ def uniform_table(results: Results) -> Table:
             "ns per pixel and bin": lambda name: 1e6 * ms(name) / n_counts,
         },
         f"{WHOLE_BINS} Depths begin where tracking begins to search, T_n = 20, and are independent "
-        "from pixel to pixel: no method that uses neighbours can work.",
+        "from pixel to pixel: no method that uses neighbours can work. For delays anywhere in the "
+        "gate, the row 'oracle, window' is the bound of this figure.",
         formats={"ms": ".1f", "ns per pixel and bin": ".0f"},
     )
 
