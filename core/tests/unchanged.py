@@ -177,7 +177,12 @@ def settings(method: str, _: Path) -> Answers:
 def tracking(_: Path) -> Answers:
     capture = CAPTURES["car"]()
     survival = core.TrackingParameters(weight="survival", start="zero", sigma_from="before T_n")
-    for name, parameters in {**core.PRESETS, "survival": survival}.items():
+    settings = {
+        "recommended": core.PRESETS["recommended"],
+        "as printed": replace(core.PRESETS["literal"], l=0.001),
+        "survival": survival,
+    }
+    for name, parameters in settings.items():
         yield name, core.tracking_signals(capture.cube[2, 3], parameters, 1000)
     yield "two pixels", core.tracking_signals(capture.cube[:2, 0, :40], survival, 1000)
 
