@@ -38,7 +38,11 @@ class TrackingParameters(Settings):
             least=0.0,
             most=1e6,
             doubtful=(
-                Zone(0.0, 7e-4, "The small scale is too slow: dim pixels get no estimate."),
+                Zone(
+                    0.0,
+                    7e-4,
+                    "From the mean, the small scale is too slow: dim pixels get no estimate.",
+                ),
                 Zone(0.03, 1e6, "The small scale is so fast that it follows the echo."),
             ),
         ),
