@@ -150,7 +150,9 @@ class Paper:
             label="Section",
             help=text.SECTIONS_HELP,
             orientation="vertical",
+            first=session.state.reported,
         )
+        self._sections.choice.link(session.state, value="reported", bidirectional=True)
 
     @property
     def view(self) -> View:
