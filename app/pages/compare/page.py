@@ -45,6 +45,7 @@ from app.pages.shared.downloads import (
 )
 from app.pages.shared.section import Section
 from app.pages.shared.viewing import show_own_width
+from app.tasks.scheduler import RETURN_MS
 from app.theme import method_style, palette
 from app.widgets.cards import card, part
 from app.widgets.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table, legend_line
@@ -381,8 +382,11 @@ class Compare(Section):
     def _continue(self) -> None:
         """Compute the next missing result, unless something is running or stopped."""
         missing = [task for task in self.tasks.values() if task not in self.results]
+        page = self.session.tasks
         if not (self._is_busy or self._is_stopped or not self.is_on_screen):
-            if missing:
+            if page.is_away:
+                page.call_later(RETURN_MS, partial(page.queue, self._continue))
+            elif missing:
                 self._run(partial(run_task, missing[0], self.session.answer), missing[0])
             elif self.reference is None:
                 self._run(partial(reference_of, self._capture), None)
