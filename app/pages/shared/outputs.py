@@ -366,7 +366,7 @@ def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]
         larger_is_better = names[place - 4].startswith("RD")
         is_better = (value > 0) == larger_is_better
         below = "within chance" if low <= printed <= high else "better" if is_better else "worse"
-        return [f"{value:+.4f}", value, below]
+        return [typeset(f"{value:+.4f}"), value, below]
     known = not math.isnan(value)
     return [typeset(items.as_text(value)) if known else "–", value if known else None, below]
 
