@@ -188,7 +188,8 @@ def two_scales(settings: Scales) -> list[outputs.Plot]:
     parameters, flux = PRESETS[settings.preset], Flux(sbr=settings.sbr)
     pixel = paper.figure_5_at(settings.onset_bin, parameters, flux)
     marks = {"the echo above": float(settings.onset_bin)}
-    return [pixel, replace(_figure_5(parameters, flux), marks=marks)]
+    # The note of Figure 5, below it, says the same.
+    return [replace(pixel, note=""), replace(_figure_5(parameters, flux), marks=marks)]
 
 
 def weights(settings: Weights) -> list[outputs.Plot]:
