@@ -64,10 +64,10 @@ def number(value: float, unit: str, sign: bool = False, decimals: int | None = N
     if decimals is not None:
         text = f"{value:{plus},.{decimals}f}"
     elif sign or abs(value) < 1000:
-        text = typeset(f"{value:{plus}.4g}")
+        text = f"{value:{plus}.4g}"
     else:
         text = f"{value:,.2f}"
-    return Quantity(f"{text} {unit}".strip(), value, unit)
+    return Quantity(f"{typeset(text)} {unit}".strip(), value, unit)
 
 
 def plus_minus(low: float, high: float, unit: str) -> Quantity:

@@ -15,17 +15,17 @@ def three_digits(value: float) -> str:
         return "–" if math.isnan(value) else "∞"
     if 0 < abs(value) < 1e-3:
         return typeset(f"{value:.2e}")
-    return f"{float(f'{value:.3g}'):,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return typeset(f"{float(f'{value:.3g}'):,.0f}" if abs(value) >= 1000 else f"{value:.3g}")
 
 
 def typeset(text: str) -> str:
-    """Write a number such as 1.2e-05 as 1.2×10⁻⁵, and 1.2e+03 as 1,200; others stay as they are."""
-    if "e" not in text:
-        return text
-    digits, power = text.split("e")
-    if int(power) > 0:
-        return f"{float(text):+,.0f}" if text.startswith("+") else f"{float(text):,.0f}"
-    return f"{digits}×10{str(int(power)).translate(_RAISED)}"
+    """Write a number with a minus sign, 1.2e-05 as 1.2×10⁻⁵, and 1.2e+03 as 1,200."""
+    digits, _, power = text.partition("e")
+    if power and int(power) > 0:
+        digits = f"{float(text):+,.0f}" if text.startswith("+") else f"{float(text):,.0f}"
+    elif power:
+        digits = f"{digits}×10{str(int(power)).translate(_RAISED)}"
+    return digits.replace("-", "−")
 
 
 def bounds(low: float, high: float) -> str:

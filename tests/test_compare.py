@@ -287,6 +287,19 @@ def test_cancel_stops_before_the_next_method_and_resumes(stage):
     assert not button.visible
 
 
+def test_nothing_is_computed_while_the_page_is_away(stage, monkeypatch):
+    tasks = stage.tasks
+    monkeypatch.setattr(HeldTasks, "is_away", True)
+    monkeypatch.setattr(tasks, "call_later", lambda _wait_ms, act: tasks.queue(act))
+    stage.page.show(True)
+    for _ in range(3):
+        tasks.run_one()
+    assert stage.page.results == {}
+    monkeypatch.setattr(HeldTasks, "is_away", False)
+    stage.settle()
+    assert len(stage.page.results) == 5
+
+
 def test_a_method_that_fails_shows_why_and_the_others_continue(stage, monkeypatch):
     run_task = ranking.run_task
 

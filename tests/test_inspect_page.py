@@ -361,8 +361,12 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
     lines = section.counts.source("lines").data["ys"]
     np.testing.assert_allclose(lines, [far.answer.capture.cube[pin] for pin in pins])
     assert [row["name"] for row in section.table.rows] == [f"100, {130 + n}" for n in range(4)]
-    assert re.match(r"From 100, 130: [\d.]+ ± [\d.]+ m to 100, 131, ", section.note.text)
+    assert re.match(r"Distance from 100, 130: [\d.]+ ± [\d.]+ m to 100, 131; ", section.note.text)
     assert section.note.text.endswith(text.WIDTH_GUESSED)
+    section.zoom.button.clicks += 1
+    bins = section.counts.figure.x_range
+    assert all(bins.start <= each.pixel.answer_bin <= bins.end for each in section.found)
+    assert bins.end - bins.start < far.answer.capture.acquisition.n_bins
     page.chips.removed = [[100, 131], 1]
     assert (100, 131) not in far.state.pins
     assert page.refusal.text == ""

@@ -219,6 +219,14 @@ def test_nothing_is_computed_before_the_first_visit(monkeypatch):
     assert built == []
 
 
+def test_the_open_section_is_part_of_the_state(session):
+    session.state.reported = "Figure 6: the weights"
+    choice = page_of_paper.Paper(session).view.main[0][0]
+    assert choice.value == "Figure 6: the weights"
+    choice.value = "Figures 4, 5: two scales"
+    assert session.state.reported == "Figures 4, 5: two scales"
+
+
 def test_the_sidebar_is_closed_here_and_opens_again_unless_the_window_is_narrow():
     layout = Layout(built_in_sources())
     for is_narrow in (False, True):

@@ -246,6 +246,16 @@ IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
 UNITS = ("bins", "ns", "m")
 SUBJECTS = ("Pixel", "Region", "Pins", "Profile", "A/B", "Capture")
+STUDIES = ("Speed and accuracy", "Acquisition", "Ablation", "Sensitivity")
+PAPER_SECTIONS = (
+    "Figures 1, 2: the jump",
+    "Figures 4, 5: two scales",
+    "Figure 6: the weights",
+    "Table 2: six SBRs",
+    "Table 3: all methods",
+    "Figures 8, 9, 12: images",
+    "What the paper does not report",
+)
 CLOUD_COLORS = ("Range", "Error", "Counts")
 NEED_TRUTH = ("Truth", "Error")
 
@@ -347,6 +357,12 @@ class State(param.Parameterized):
     map = param.Selector(default="Estimate", objects=list(MAPS), doc="Image of the Inspect page.")
     subject = param.Selector(
         default="Pixel", objects=list(SUBJECTS), doc="Subject of the Inspect page."
+    )
+    study = param.Selector(
+        default=STUDIES[0], objects=list(STUDIES), doc="Section of the Trade-off page."
+    )
+    reported = param.Selector(
+        default=PAPER_SECTIONS[0], objects=list(PAPER_SECTIONS), doc="Section of the Paper page."
     )
     pins: Any = Checked((), _check_pins, doc="Up to four pixels (row, col) to compare.")
     region: Any = Checked(

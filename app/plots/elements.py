@@ -48,11 +48,11 @@ HISTOGRAM_NAMES = {"raw": "raw histogram", "small": "small scale", "large": "lar
 RESIDUAL_NAMES = {"raw": "first difference of the raw histogram"}
 SCORE_NAMES = {"enhanced": "score"}
 HISTOGRAM_TITLES = {
-    True: "Histogram of the pixel, and the two scales that follow it",
+    True: "Histogram and both scales",
     False: "Histogram of the pixel",
 }
 """Titles with and without the scales."""
-SCORE_TITLE = "Score of each bin; its largest value is the echo"
+SCORE_TITLE = "Score: its largest value is the echo"
 ESTIMATES_NAME = "estimate, own lag removed"
 
 
@@ -124,7 +124,7 @@ def residual(values: Array, difference: Array, colors: Palette) -> hv.Overlay:
         _signal(values, unit, "residual", colors.residual),
         *_markers(unit, colors),
     ]
-    return _panel(layers, "Residual: large scale minus small scale, where positive")
+    return _panel(layers, "Residual: large minus small scale")
 
 
 def enhanced(values: Array, weight: Array, colors: Palette) -> hv.Overlay:
@@ -135,7 +135,7 @@ def enhanced(values: Array, weight: Array, colors: Palette) -> hv.Overlay:
         _signal(values, unit, "enhanced", colors.enhanced),
         *_markers(unit, colors),
     ]
-    return _panel(layers, "Enhanced: residual × weight; its largest value is the echo")
+    return _panel(layers, "Enhanced: residual × weight")
 
 
 def score(values: Array, colors: Palette) -> hv.Overlay:

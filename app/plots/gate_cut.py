@@ -124,12 +124,6 @@ class GateCut:
             fill_color=colors.paper, line_color=colors.text, hover_fill_color=colors.muted
         )
 
-    def toggle_zoom(self, start: float, end: float) -> None:
-        """Zoom all plots to a part of the gate that is shown; if they are, to the whole gate."""
-        if (self._bins.start, self._bins.end) == (start, end):
-            start, end = self._bins.reset_start, self._bins.reset_end
-        self._bins.update(start=start, end=end)
-
     def update(self, cut: Cut) -> None:
         """Show a cut."""
         before, self._shown = self._shown, cut

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.events import Tap
-from bokeh.models import BoxZoomTool, CustomJS, CustomJSHover, DataRange1d, HoverTool
+from bokeh.models import BasicTicker, BoxZoomTool, CustomJS, CustomJSHover, DataRange1d, HoverTool
 from numpy.typing import NDArray
 
 from app.model.large import Grid
@@ -57,6 +57,8 @@ class ImageView:
         self.pane = pane_of(self.figure)
         self.figure.match_aspect = True
         self.figure.grid.visible = False
+        for axis in self.figure.axis:
+            axis.ticker = BasicTicker(min_interval=1)
         self._reserve(BORDER_PX)
         self.figure.x_range = DataRange1d(range_padding=0, renderers=[])
         self.figure.y_range = DataRange1d(range_padding=0, flipped=True, renderers=[])

@@ -15,7 +15,7 @@ from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes
 from app.theme import LIGHT, Palette
 from app.units import ShownGate
-from app.widgets.figures import Plot, fit, paint_frame, pane_of
+from app.widgets.figures import Plot, cover, fit, paint_frame, pane_of
 
 Array = NDArray[Any]
 
@@ -88,9 +88,8 @@ class CurvePlot:
         unit: str,
     ) -> None:
         """Show a pixel: curves (bin,), estimates in bins and styles of lines, by method."""
-        plot, bins = self.plot, self.plot.figure.x_range
-        if bins.end != gate.n_bins:
-            bins.update(end=gate.n_bins, reset_end=gate.n_bins)
+        plot = self.plot
+        cover(plot.figure.x_range, gate.n_bins)
         self._axes.follow(unit, gate)
         centres = plots.centres(gate.n_bins)
         lines = {method: (centres, curve) for method, curve in curves.items()}

@@ -120,9 +120,10 @@ def _flux_remark(capture: Capture, found: MeanFlux) -> str:
     if found.free is None:
         remark = "Too few bins are known to be free of echoes to check the background."
     else:
+        dark = "The darkest bins give" if found.is_darkest else "Bins without echoes give"
         remark = (
-            f"Bins without echoes give a background of {_text(found.free.background)} {unit}, the "
-            f"likelihood of all bins {_text(found.model.background)}: "
+            f"{dark} a background of {_text(found.free.background)} {unit}, the likelihood of all "
+            f"bins {_text(found.model.background)}: "
         )
         remark += (
             "they disagree, and the intervals include both. The background may vary along the "

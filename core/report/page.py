@@ -44,6 +44,7 @@ from core.report.figures import (
     image_svg,
 )
 from core.tracking import tracking_signals
+from core.typesetting import typeset
 
 MOST_PIXELS = 2**16
 """Pixels of maps and cloud; larger images are thinned."""
@@ -76,6 +77,10 @@ style-src 'unsafe-inline'; script-src 'sha256-{digest}'">
 </html>
 """
 
+_PROBABILITY = (
+    "Probability: that of a surface at the candidate, where a pixel may have several. The map of "
+    "confidence assumes one surface, so its value may be lower."
+)
 _ERRORS = {
     "rmse_m": ("Root mean square error", "m"),
     "inlier_rmse_m": ("Root mean square error within 3 bins", "m"),
@@ -311,7 +316,8 @@ def _candidates(capture: Capture, report: PixelReport) -> str:
         for rank, each in enumerate(report.candidates, 1)
     ]
     columns = ("Candidate", "Bin", "Range", "Score", "Relative score", "Probability")
-    return _table("Candidates: highest peaks of the score", columns, rows)
+    table = _table("Candidates: highest peaks of the score", columns, rows)
+    return f'{table}<p class="note">{_PROBABILITY}</p>'
 
 
 def _cloud(
@@ -454,7 +460,7 @@ def _number(value: float, text: str = "") -> str:
         return "∞" if value > 0 else "−∞"
     if not text and abs(value) >= 1000:
         text = f"{value if isinstance(value, int) else float(f'{value:.4g}'):,.0f}"
-    return f'<data value="{value}">{text or format(value, ".4g")}</data>'
+    return f'<data value="{value}">{typeset(text or format(value, ".4g"))}</data>'
 
 
 def _metres(value_m: float, capture: Capture, decimals: int | None = None) -> str:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import partial
+from statistics import median_low
 from typing import Any
 
 import numpy as np
@@ -43,8 +44,10 @@ from app.pages.shared.downloads import (
     ranged,
     viewed,
 )
+from app.pages.shared.echo_zoom import EchoZoom
 from app.pages.shared.section import Section
 from app.pages.shared.viewing import show_own_width
+from app.tasks.scheduler import RETURN_MS
 from app.theme import method_style, palette
 from app.widgets.cards import card, part
 from app.widgets.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table, legend_line
@@ -193,6 +196,7 @@ class Compare(Section):
         self.legend = legend_line()
         self.remarks = Sentence(sizing_mode="stretch_width", margin=(2, 0))
         self._curves = CurvePlot()
+        self._zoom = EchoZoom(self._curves.plot.figure.x_range)
         self._facts = Facts(sizing_mode="stretch_width")
         self._reliability = ReliabilityPlot()
         self._reliability.pane.object.min_border_top = CORNER_PX
@@ -215,7 +219,7 @@ class Compare(Section):
             self._reliability_card, "reliability", self._reliability.plot, "reliability"
         )
         plots = pn.Column(
-            self.offer(card(self._curves.pane), "scores", self._curves_shown),
+            self.offer(card(self._curves.pane, self._zoom.button), "scores", self._curves_shown),
             self._reliability_card,
             stylesheets=[PLOTS],
             sizing_mode="stretch_width",
@@ -381,8 +385,11 @@ class Compare(Section):
     def _continue(self) -> None:
         """Compute the next missing result, unless something is running or stopped."""
         missing = [task for task in self.tasks.values() if task not in self.results]
+        page = self.session.tasks
         if not (self._is_busy or self._is_stopped or not self.is_on_screen):
-            if missing:
+            if page.is_away:
+                page.call_later(RETURN_MS, partial(page.queue, self._continue))
+            elif missing:
                 self._run(partial(run_task, missing[0], self.session.answer), missing[0])
             elif self.reference is None:
                 self._run(partial(reference_of, self._capture), None)
@@ -575,9 +582,13 @@ class Compare(Section):
         answer = next(iter(answers.values()))
         acquisition, truth_m = answer.capture.acquisition, answer.capture.truth_range_m
         truth = np.nan if truth_m is None else float(truth_m[pixel])
+        estimates = {m: float(each.run.image.bin[pixel]) for m, each in answers.items()}
+        known = [each for each in estimates.values() if not np.isnan(each)]
+        # Not to all: estimates of a method that fails may lie far off.
+        self._zoom.follow(answer.capture, median_low(known or [np.nan]))
         self._curves.update(
             {method: curve for method, curve in curves.items() if method in answers},
-            {method: float(each.run.image.bin[pixel]) for method, each in answers.items()},
+            estimates,
             float(acquisition.range_m_to_bin(truth)),
             answer.gate,
             self._styles(),

@@ -29,6 +29,7 @@ from app.pages.compare.ranking import TOLERANCES_BINS, Reference, Result, Task, 
 from app.units import count
 from core import ESTIMATORS, Capture
 from core.inspection import CONFIDENT
+from core.typesetting import typeset
 
 Column = tuple[str, str, int]
 """Title, help, and sort order of the first click: 1 ascending, -1 descending."""
@@ -211,7 +212,7 @@ def caption(answer: Answer, row: int, col: int) -> str:
     range_m, confidence = float(image.range_m[row, col]), float(image.confidence[row, col])
     error = ""
     if truth_m is not None and math.isfinite(truth_m[row, col]):
-        error = f" ({range_m - float(truth_m[row, col]):+.2f})"
+        error = f" ({typeset(f'{range_m - float(truth_m[row, col]):+.2f}')})"
     return f"{range_m:,.2f} m{error}, confidence {100 * confidence:.0f} %"
 
 

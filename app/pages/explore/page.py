@@ -111,7 +111,7 @@ class Explore(Section):
                 self.signals.plots, ("histogram", "residual", "enhanced", "score"), strict=True
             )
         ]
-        self.zoom = EchoZoom(self.signals.cut)
+        self.zoom = EchoZoom(self.signals.histogram.figure.x_range)
         self.cards[0].append(self.zoom.button)
         self._large = LargeView(session, self.image.figure)
         state = session.state

@@ -14,6 +14,7 @@ from app.pages.inspect.pixel import NARROW, framed, stage
 from app.pages.inspect.results import Inspected, inspect_pixel_with_flux
 from app.pages.inspect.views import GatePlot
 from app.pages.session import Session
+from app.pages.shared.echo_zoom import EchoZoom
 from app.pages.shared.section import Section
 from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
@@ -30,6 +31,7 @@ class PinsSection(Section):
     found : list of Inspected
         The pixels that are shown.
     counts, score : GatePlot
+    zoom : EchoZoom
     cards : list of pn.Column
         The plots in their frames, shown where there are pins.
     note : Sentence
@@ -54,6 +56,8 @@ class PinsSection(Section):
             self.offer_plot(framed(pane_of(plot.figure)), what, plot, f"pins {what}")
             for plot, what in ((self.counts, "counts"), (self.score, "scores"))
         ]
+        self.zoom = EchoZoom(self._bins)
+        self.cards[0].append(self.zoom.button)
         self.note = Sentence(text=text.NO_PINS, sizing_mode="stretch_width", margin=0)
         self.table = Table(
             title=text.PINS, stylesheets=[NARROW], sizing_mode="stretch_width", margin=0
@@ -81,6 +85,7 @@ class PinsSection(Section):
         names = [text.pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
         scales = text.both_scales(unit, answer)
         cover(self._bins, gate.n_bins)
+        self.zoom.follow(answer.capture, *(each.pixel.answer_bin for each in found))
         bins = plots.centres(gate.n_bins)
         for plot, quantity, curves in (
             (self.counts, "counts", [each.pixel.histogram for each in found]),

@@ -33,8 +33,8 @@ BREAK_PX = 1100
 """Width below which the parts of this page follow each other."""
 
 FACTS = """
-.fact-list { grid-template-columns: repeat(auto-fill, minmax(140px, 1fr)) !important; }
-.leading div:nth-child(-n + 2) { grid-column: auto !important; }
+.fact-list { display: flex !important; flex-wrap: wrap; }
+.fact-list div { flex: 0 0 max(140px, 25% - 10px); min-width: max-content; }
 .leading div:first-child dd { font-size: 16px !important; }
 """
 FILLING = ":host { flex: 1 1 0 !important; min-height: 0; min-width: 0; }" + unrolled(BREAK_PX)
@@ -115,7 +115,7 @@ class PixelSection(Section):
                 self.plots.plots, ("counts", "rate", "residual and enhanced", "score"), strict=True
             )
         ]
-        self.zoom = EchoZoom(self.plots.cut)
+        self.zoom = EchoZoom(self.plots.bins)
         self.cards[0].append(self.zoom.button)
         height = FACT_ROWS * FACTS_PX
         self.facts = Facts(

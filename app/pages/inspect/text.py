@@ -47,7 +47,7 @@ from core.inspection import (
 )
 from core.io import changed_settings
 from core.metrics import Interval
-from core.typesetting import bounds, three_digits
+from core.typesetting import bounds, three_digits, typeset
 
 EXPLANATION = """
 **Choose.** Tap the map, use the arrow keys (with Shift: eight pixels), or type a row and a column.
@@ -308,7 +308,7 @@ def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
         length = plus_minus(length_m - margin_m, length_m + margin_m, "m") if known else "not known"
         sentences.append(f"{length} to {name}")
     guessed = f" {WIDTH_GUESSED}" if answer.is_width_guessed(viewing) else ""
-    return f"From {names[0]}: {', '.join(sentences)} (95 %).{guessed}"
+    return f"Distance from {names[0]}: {'; '.join(sentences)} (95 %).{guessed}"
 
 
 def range_text(range_m: float, low_m: float, high_m: float) -> str:
@@ -425,7 +425,7 @@ def _stated_facts(report: CaptureReport) -> list[Fact]:
     facts: list[Fact] = []
     for each in report.stated:
         change = 100 * each.difference / each.stated if each.stated else math.nan
-        note = f"estimate {change:+.1f} %" if math.isfinite(change) else ""
+        note = f"estimate {typeset(f'{change:+.1f}')} %" if math.isfinite(change) else ""
         of = f"in {each.unit} of a pixel" if each.unit else "signal over background"
         estimate = interval(each.estimate)
         help = f"Stated by the file, {of}. The estimate of the mean of all pixels is {estimate}."

@@ -151,7 +151,9 @@ class Paper:
             label="Section",
             help=text.SECTIONS_HELP,
             orientation="vertical",
+            first=session.state.reported,
         )
+        self._sections.choice.link(session.state, value="reported", bidirectional=True)
 
     @property
     def view(self) -> View:
@@ -187,7 +189,8 @@ def two_scales(settings: Scales) -> list[outputs.Plot]:
     parameters, flux = PRESETS[settings.preset], Flux(sbr=settings.sbr)
     pixel = paper.figure_5_at(settings.onset_bin, parameters, flux)
     marks = {"the echo above": float(settings.onset_bin)}
-    return [pixel, replace(_figure_5(parameters, flux), marks=marks)]
+    # The note of Figure 5, below it, says the same.
+    return [replace(pixel, note=""), replace(_figure_5(parameters, flux), marks=marks)]
 
 
 def weights(settings: Weights) -> list[outputs.Plot]:

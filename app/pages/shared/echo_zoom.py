@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from app.plots.gate_cut import GateCut
+from bokeh.models import Range1d
+
 from app.widgets.cards import button
 from core import Capture
 from core.inspection import echo_view
@@ -26,7 +27,7 @@ class EchoZoom:
 
     Parameters
     ----------
-    cut : GateCut
+    bins : Range1d
         The axis along the gate of the plots.
 
     Attributes
@@ -35,9 +36,9 @@ class EchoZoom:
         Enabled where there is an estimate.
     """
 
-    def __init__(self, cut: GateCut) -> None:
-        self._ends = (0.0, 1.0)
-        self.button = button(LABEL, HELP, lambda: cut.toggle_zoom(*self._ends))
+    def __init__(self, bins: Range1d) -> None:
+        self._bins, self._ends = bins, (0.0, 1.0)
+        self.button = button(LABEL, HELP, self._toggle)
         self.button.param.update(
             variant="text",
             min_height=18,
@@ -47,8 +48,17 @@ class EchoZoom:
             disabled=True,
         )
 
-    def follow(self, capture: Capture, at_bin: float) -> None:
-        """Zoom to an estimate at a position of the gate that is shown; none if it is NaN."""
-        self.button.disabled = math.isnan(at_bin)
-        if not self.button.disabled:
-            self._ends = echo_view(capture, at_bin)
+    def follow(self, capture: Capture, *at_bins: float) -> None:
+        """Zoom to all estimates at positions of the gate that is shown; NaN stands for none."""
+        views = [echo_view(capture, each) for each in at_bins if not math.isnan(each)]
+        self.button.disabled = not views
+        if views:
+            starts, ends = zip(*views, strict=True)
+            self._ends = min(starts), max(ends)
+
+    def _toggle(self) -> None:
+        """Zoom to the estimates; if that is shown, to the whole gate."""
+        bins, (start, end) = self._bins, self._ends
+        if (bins.start, bins.end) == (start, end):
+            start, end = bins.reset_start, bins.reset_end
+        bins.update(start=start, end=end)

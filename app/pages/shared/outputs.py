@@ -26,7 +26,7 @@ from app.pages.paper.text import (
     TITLES_OF_PRESETS,
 )
 from app.pages.session import Session
-from app.pages.shared.downloads import PLOT, TABLE, Shown, Subject, downloadable
+from app.pages.shared.downloads import PLOT, TABLE, Shown, Subject, downloadable, shown_with
 from app.plots import elements as plots
 from app.theme import LIGHT, RANGE_COLORS, Palette
 from app.widgets.cards import card
@@ -79,13 +79,13 @@ class CurveCard:
         return self._plot and self._plot.figure
 
     def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
-        """Add a download button."""
+        """Add a download button, shown with the first curves."""
 
         def show() -> Shown:
             item, plot = _required(self._item), _required(self._plot)
             return Shown(subject(), item.key, {"csv": plot.csv()})
 
-        downloadable(self.card, session, "curves", show, PLOT)
+        downloadable(self.card, session, "curves", show, PLOT)[-1].visible = self._plot is not None
 
     def show(self, item: items.Plot) -> None:
         """Show curves in place of the last ones."""
@@ -135,6 +135,7 @@ class CurveCard:
         pane = pane_of(drawing)
         if self._plot is None:
             self.card.insert(0, pane)
+            self.card[-1].visible = True
         else:
             self.card[0] = pane
         return layers_of(drawing)
@@ -172,13 +173,13 @@ class TableCard:
         )
 
     def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
-        """Add a download button."""
+        """Add a download button, shown with the table."""
 
         def show() -> Shown:
             item = _required(self._item)
             return Shown(subject(), item.key, {"csv": table_file(item)})
 
-        downloadable(self.layout, session, "table", show, TABLE)
+        shown_with(downloadable(self.layout, session, "table", show, TABLE), self._table, "columns")
 
     def show(self, item: items.Table) -> None:
         """Show a table in place of the last one."""
@@ -366,7 +367,7 @@ def _cell(names: tuple[str, ...], row: tuple[Any, ...], place: int) -> list[Any]
         larger_is_better = names[place - 4].startswith("RD")
         is_better = (value > 0) == larger_is_better
         below = "within chance" if low <= printed <= high else "better" if is_better else "worse"
-        return [f"{value:+.4f}", value, below]
+        return [typeset(f"{value:+.4f}"), value, below]
     known = not math.isnan(value)
     return [typeset(items.as_text(value)) if known else "–", value if known else None, below]
 

@@ -8,6 +8,7 @@ from typing import Any
 import panel as pn
 
 from app.model.store import Answer, Request
+from app.pages.navigation import HOLDER
 from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
 from app.pages.shared.outputs import CurveCard, TableCard
@@ -29,7 +30,7 @@ from core.studies.tradeoff import (
 CURVES = """
 :host { display: grid !important; gap: 8px; flex: none !important; height: 668px !important;
   grid-template: repeat(2, 330px) / repeat(2, minmax(0, 1fr)); }
-@media screen and (max-width: 900px) {
+@media screen and (max-width: 1100px) {
   :host { grid-template: repeat(3, 330px) / minmax(0, 1fr); height: 1006px !important; }
 }
 """
@@ -60,7 +61,9 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         self.cards = [CurveCard() for _ in range(3)]
         self._painted = [*self.cards]
         self._required = TableCard(waiting="")
-        self._results = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+        self._results = pn.Column(
+            visible=False, stylesheets=[HOLDER], sizing_mode="stretch_width", margin=0
+        )
         self._simulated = session.answer.request
         for each in self.cards:
             each.offer(session, self.about)

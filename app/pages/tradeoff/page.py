@@ -28,7 +28,9 @@ class Tradeoff:
             },
             label="Study",
             help=text.SECTIONS_HELP,
+            first=session.state.study,
         )
+        self._sections.choice.link(session.state, value="study", bidirectional=True)
 
     @property
     def view(self) -> View:

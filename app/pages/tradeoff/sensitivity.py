@@ -31,7 +31,7 @@ METHODS = {METHOD_TITLES[method]: method for method, *_ in numbers()}
 CARDS = """
 :host {{ display: grid !important; gap: 8px; flex: none !important; height: {wide}px !important;
   grid-template-columns: repeat(2, minmax(0, 1fr)); grid-auto-rows: 300px; }}
-@media screen and (max-width: 900px) {{
+@media screen and (max-width: 1100px) {{
   :host {{ grid-template-columns: minmax(0, 1fr); height: {narrow}px !important; }}
 }}
 """

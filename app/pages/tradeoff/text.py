@@ -126,7 +126,7 @@ def advice(
     """Return the most accurate configuration in time, and the fastest accurate one."""
     return (
         _recommended(f"Most accurate within {milliseconds:.3g} ms", best, "is fast enough"),
-        _recommended(f"Fastest with {100 * rd:.3g} % within 3 bins", cheapest, "reaches it"),
+        _recommended(f"Fastest with {100 * rd:.3g} % within 3 bins", cheapest, "reaches the goal"),
     )
 
 
@@ -137,8 +137,8 @@ def _recommended(goal: str, found: Recommendation | None, keeps: str) -> str:
     rd, ms = point.rd(), point.milliseconds
     sentence = (
         f"{goal}: {name_of(point.candidate)}, {100 * rd.value:.1f} % within 3 bins in "
-        f"{ms.value:.3g} ms. In bootstrap samples of captures and times it is selected again in "
-        f"{100 * found.is_best:.0f} %, and {keeps} in {100 * found.keeps:.0f} %."
+        f"{ms.value:.3g} ms. In bootstrap samples of captures and times, it is selected again in "
+        f"{100 * found.is_best:.0f} % and {keeps} in {100 * found.keeps:.0f} %."
     )
     if found.runners_up:
         names = "; ".join(

@@ -70,6 +70,7 @@ PATCHES = (
     Patch("server_wins", _PANEL),
     Patch("session_ended", _BOKEH),
     Patch("unchanged_styles", _BOKEH),
+    Patch("unfinished_layout", _BOKEH),
 )
 
 
