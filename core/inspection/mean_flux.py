@@ -388,9 +388,10 @@ class _Mixture:
         def fit(share: Floats, shape: Floats) -> Floats:
             bright = signal[:, np.newaxis, np.newaxis] / (1.0 if of_target else share)
             weights = _gamma_weights(self._levels, bright, share, shape)
-            tried = weights.reshape(-1, self._levels.size).T.astype(np.float32)
+            tried = np.swapaxes(weights.reshape(signal.size, -1, self._levels.size), 1, 2)
+            tried = tried.astype(np.float32)
             found = sum(
-                np.log(np.maximum(part @ tried, _LEAST_LIKELIHOOD)).sum(axis=0, dtype=float)
+                np.log(np.maximum(part @ tried, _LEAST_LIKELIHOOD)).sum(axis=1, dtype=float)
                 for part in parts
             )
             return np.asarray(found).reshape(weights.shape[:-1])
