@@ -56,6 +56,7 @@ def add(commands: Any) -> None:
         help="measure these; --seeds holds for confidence and ranges, --captures for each regime "
         "of the fluxes (all)",
     )
+    add_processes(command)
 
     command = _added(commands, "field", "compare methods on published captures", _field)
     command.add_argument("captures", type=Path, help="the folder that holds them")
@@ -134,8 +135,8 @@ def _calibration(chosen: argparse.Namespace) -> None:
     seeds = range(chosen.seeds)
     tables = {
         "confidence": lambda: calibration.calibration_table(seeds),
-        "ranges": lambda: calibration.coverage_table(seeds),
-        "fluxes": lambda: calibration.flux_table(chosen.captures),
+        "ranges": lambda: calibration.coverage_table(seeds, chosen.processes),
+        "fluxes": lambda: calibration.flux_table(chosen.captures, chosen.processes),
     }
     publish((tables[name]() for name in chosen.only), chosen)
 

@@ -1,4 +1,8 @@
-"""Hot and dead pixels: significantly more or fewer detections than all neighbours."""
+"""Hot and dead pixels: significantly more or fewer detections than all neighbours.
+
+The excess of a hot pixel is spread over the gate. A pixel whose excess lies in an echo is not hot:
+it sees a bright surface.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +14,15 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
+from core.inference.likelihood import rate_and_n_armed, windowed_sums
 
 NEIGHBOURS = 3
 """Rows and columns that an image needs for pixels to have neighbours."""
 
 SIGNIFICANCE = 1e-6
 """Probability below which counts are not explained by chance."""
+
+_ECHO_LENGTHS = 3  # an echo, and as many bins before and behind it
 
 _AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 
@@ -26,7 +33,9 @@ class OutlierPixels(NamedTuple):
     """Pixels that differ significantly from their neighbours; each of shape (row, col)."""
 
     hot: NDArray[np.bool_]
-    """Significantly more counts than any neighbour."""
+    """Significantly more counts than any neighbour, spread over the gate."""
+    bright: NDArray[np.bool_]
+    """Significantly more counts than any neighbour, in an echo."""
     dead: NDArray[np.bool_]
     """Significantly fewer counts than any neighbour."""
     most: NDArray[np.int64]
@@ -59,7 +68,30 @@ def outlier_pixels(capture: Capture) -> OutlierPixels | None:
     hot, dead = counts > most, counts < least
     hot[hot] = probability_of_more(counts[hot], most[hot], n_pulses) < SIGNIFICANCE
     dead[dead] = probability_of_fewer(counts[dead], least[dead], n_pulses) < SIGNIFICANCE
-    return OutlierPixels(hot, dead, most, least)
+    bright = np.zeros_like(hot)
+    width = min(_ECHO_LENGTHS * capture.echo_bins, capture.acquisition.n_bins)
+    bright[hot] = _is_bright(capture.cube[hot], most[hot], width, n_pulses)
+    return OutlierPixels(hot & ~bright, bright, dead, most, least)
+
+
+def _is_bright(
+    pixels: NDArray[np.unsignedinteger], most: NDArray[np.int64], width: int, n_pulses: int | None
+) -> NDArray[np.bool_]:
+    """Return whether the excess of pixels (pixel, bin) over `most` counts lies in an echo.
+
+    The `width` bins with the largest counts hold significantly more of them than a detector fires
+    there that fires at a constant rate while it is armed, and the other bins do not hold
+    significantly more than `most`.
+    """
+    histograms = pixels.astype(float)
+    _, armed = rate_and_n_armed(histograms, n_pulses)
+    counts, inside = pixels.sum(axis=1, dtype=np.int64), windowed_sums(histograms, width)
+    every, largest = np.arange(len(pixels)), inside.argmax(axis=1)
+    echo, armed_in_echo = inside[every, largest], windowed_sums(armed, width)[every, largest]
+    expected = counts * armed_in_echo / armed.sum(axis=1)
+    has_echo = probability_of_more(echo, expected, counts) < SIGNIFICANCE
+    rest = np.maximum(counts - echo, 1)
+    return has_echo & (probability_of_more(rest, most, n_pulses) >= SIGNIFICANCE)
 
 
 def ordinary_pixels(capture: Capture) -> NDArray[np.bool_]:
@@ -78,8 +110,7 @@ def neighbour_median(capture: Capture) -> NDArray[np.int64]:
 def pixel_verdict(capture: Capture, row: int, col: int) -> PixelVerdict:
     """Compare a pixel with its neighbours.
 
-    A hot pixel next to another one is not found, and a bright surface that fills a single pixel is:
-    its photons belong to an echo, while those of a hot pixel are spread over the gate.
+    A hot pixel next to another one is not found.
     """
     found = outlier_pixels(capture)
     if found is None:
@@ -89,7 +120,9 @@ def pixel_verdict(capture: Capture, row: int, col: int) -> PixelVerdict:
     health: Health = "ordinary"
     why = "the difference is not significant"
     if found.hot[row, col]:
-        health, why = "hot", "significantly more than any of them"
+        health, why = "hot", "significantly more than any of them, spread over the gate"
+    elif found.bright[row, col]:
+        why = "significantly more than any of them, in the echo of a bright surface"
     elif found.dead[row, col]:
         health, why = "dead", "significantly fewer than any of them"
     elif counts == 0:
@@ -102,7 +135,9 @@ def pixel_verdict(capture: Capture, row: int, col: int) -> PixelVerdict:
 
 
 def probability_of_more(
-    counts: NDArray[np.int64] | int, expected: NDArray[np.int64] | int, n_pulses: int | None
+    counts: Floats | NDArray[np.int64] | int,
+    expected: Floats | NDArray[np.int64] | int,
+    n_pulses: NDArray[np.int64] | int | None,
 ) -> Floats:
     """Probability of `counts` or more detections if `expected` are expected."""
     if n_pulses is None:

@@ -55,6 +55,12 @@ class Conditions(NamedTuple):
     """`FluxModel.pile_up`."""
 
 
+def windowed_sums(values: Floats, width: int) -> Floats:
+    """Sum each window of `width` bins inside the gate; from (pixel, bin) to (pixel, window)."""
+    until = np.pad(np.cumsum(values, axis=1), ((0, 0), (1, 0)))
+    return np.asarray(until[:, width:] - until[:, :-width])
+
+
 def rate_and_n_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Floats]:
     """Rate of each bin with pile-up corrected (Coates 1968), and its number of armed pulses.
 

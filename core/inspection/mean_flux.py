@@ -51,6 +51,8 @@ METHOD = (
     "distributed, and the pulse is fitted to the echoes"
 )
 
+_Fit = Callable[[Floats, Floats], Floats]
+
 _SAMPLE = 512  # pixels
 _FEW = 24  # pixels, too few to estimate the scatter of the signals
 _DARK = 30  # photons in all, too few to separate signal and background
@@ -366,23 +368,36 @@ class _Mixture:
         """Log likelihood, shape (background, signal)."""
         if log_background[0] < self._nodes[0] or log_background[-1] > self._nodes[-1]:
             self._tabulate(log_background[0], log_background[-1])
-        return np.stack([self._of_signals(each, signal, of_target) for each in log_background])
+        least = np.zeros(signal.size) if of_target else signal / self._levels[-1]
+        least = np.clip(least, _LEAST_SHARE, 1.0)
+        rows, near = [], None
+        for each in log_background:
+            fit, top = self._fit(each, signal, of_target)
+            found, near = _largest(fit, least, near)
+            rows.append(found + top)
+        return np.stack(rows)
 
-    def _of_signals(self, log_background: float, signal: Floats, of_target: bool) -> Floats:
+    def _fit(self, log_background: float, signal: Floats, of_target: bool) -> tuple[_Fit, float]:
+        """Return the log likelihood of shares and shapes for each signal, above a constant."""
         log = np.tensordot(_lagrange(self._nodes, log_background), self._logs, axes=1)
         top = log.max(axis=1, keepdims=True)
         # A few pixels at a time: larger products start threads, which take longer.
-        parts = np.array_split(np.exp(log - top), math.ceil(len(log) / _PIXELS_AT_ONCE))
+        parts = np.array_split(
+            np.exp(log - top).astype(np.float32), math.ceil(len(log) / _PIXELS_AT_ONCE)
+        )
 
         def fit(share: Floats, shape: Floats) -> Floats:
             bright = signal[:, np.newaxis, np.newaxis] / (1.0 if of_target else share)
             weights = _gamma_weights(self._levels, bright, share, shape)
             tried = np.swapaxes(weights.reshape(signal.size, -1, self._levels.size), 1, 2)
-            found = sum(np.log(np.maximum(part @ tried, 1e-300)).sum(axis=1) for part in parts)
+            tried = tried.astype(np.float32)
+            found = sum(
+                np.log(np.maximum(part @ tried, _LEAST_LIKELIHOOD)).sum(axis=1, dtype=float)
+                for part in parts
+            )
             return np.asarray(found).reshape(weights.shape[:-1])
 
-        least = np.zeros(signal.size) if of_target else signal / self._levels[-1]
-        return np.asarray(_largest(fit, np.clip(least, _LEAST_SHARE, 1.0)) + top.sum())
+        return fit, float(top.sum())
 
 
 def _drawn(n_pixels: int) -> NDArray[np.intp]:
@@ -407,10 +422,11 @@ _DEPTH_POWERS = (1.0, 1.5, 2.0, 3.0)
 _NODES = 4
 _PIXELS_AT_ONCE = 128
 _LEAST_SHARE = 1e-6  # of pixels with an echo
+_LEAST_LIKELIHOOD = np.float32(1e-36)  # relative to the likeliest level
 _STEPS, _TRIAL_STEPS = 6.0, 3.0  # delays per width of an echo, which is its middle 80 %
 _MOST_STEPS = 8  # delays per bin
 _SHAPES = (0.3, 3000.0)  # of gamma distributions, from mostly faint pixels to equal ones
-_TRIED, _ZOOMS = 5, 7
+_TRIED, _ZOOMS, _ZOOMS_NEAR = 5, 7, 3  # zooms, and those saved near the maximum
 
 
 def _own_weight(capture: Capture, known: FluxPrior) -> float:
@@ -435,16 +451,32 @@ def _lagrange(nodes: Floats, x: float) -> Floats:
     return np.asarray((off / apart).prod(axis=1))
 
 
-def _largest(fit: Callable[[Floats, Floats], Floats], least_share: Floats) -> Floats:
-    """Maximise a function over share and shape for each signal, shape (signal,).
+def _largest(fit: _Fit, least_share: Floats, near: Floats | None) -> tuple[Floats, Floats]:
+    """Maximise a function over share and shape for each signal.
 
-    The function takes shares (signal, share, 1) and shapes (signal, 1, shape).
+    Parameters
+    ----------
+    fit : callable
+        Function of shares (signal, share, 1) and shapes (signal, 1, shape).
+    least_share : ndarray, shape (signal,)
+    near : ndarray, shape (2, signal), or None
+        Approximate place of the maximum, which shortens the search: one that was returned.
+
+    Returns
+    -------
+    maximum : ndarray, shape (signal,)
+    place : ndarray, shape (2, signal)
+        Square root of the share, and logarithm of the shape.
     """
     every, steps = np.arange(least_share.size), np.linspace(0.0, 1.0, _TRIED)
     lowest = np.stack([np.sqrt(least_share), np.full(every.size, math.log(_SHAPES[0]))])
     highest = np.stack([np.ones(every.size), np.full(every.size, math.log(_SHAPES[1]))])
-    low, high, best = lowest, highest, np.full(every.size, -np.inf)
-    for _ in range(_ZOOMS):
+    low, high, best, zooms = lowest, highest, np.full(every.size, -np.inf), _ZOOMS
+    if near is not None:
+        half = (highest - lowest) / 2 ** (_ZOOMS_NEAR + 1)
+        low, high = np.maximum(near - half, lowest), np.minimum(near + half, highest)
+        zooms -= _ZOOMS_NEAR
+    for _ in range(zooms):
         root, log = low[..., np.newaxis] + (high - low)[..., np.newaxis] * steps
         found = fit((root**2)[:, :, np.newaxis], np.exp(log)[:, np.newaxis, :])
         flat = found.reshape(every.size, -1)
@@ -452,7 +484,7 @@ def _largest(fit: Callable[[Floats, Floats], Floats], least_share: Floats) -> Fl
         centre = np.stack([root[every, at // _TRIED], log[every, at % _TRIED]])
         quarter = (high - low) / 4
         low, high = np.maximum(centre - quarter, lowest), np.minimum(centre + quarter, highest)
-    return best
+    return best, centre
 
 
 def _gamma_weights(levels: Floats, bright: Floats, share: Floats, shape: Floats) -> Floats:

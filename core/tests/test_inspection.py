@@ -273,6 +273,23 @@ def test_hot_and_dead_pixels_are_found() -> None:
     )
 
 
+@pytest.mark.parametrize("n_pulses", [None, 400])
+def test_a_bright_surface_in_one_pixel_is_not_hot(n_pulses: int | None) -> None:
+    scale = 1 if n_pulses else 400
+    acquisition, pulse = replace(ACQUISITION, n_pulses=n_pulses), Pulse.gaussian(1e-9)
+    onset, signal, dark_counts = np.full((7, 7), 30.3), np.full((7, 7), 0.02), np.zeros((7, 7))
+    signal[1, 1] = signal[5, 5] = 0.5
+    dark_counts[5, 1] = dark_counts[5, 5] = 0.5
+    rate = rate_per_bin(onset, signal, 0.02, pulse, acquisition)
+    rate = scale * (rate + dark_counts[..., np.newaxis] / acquisition.n_bins)
+    cube = draw_counts(rate, n_pulses, np.random.default_rng(0))
+    capture = Capture(cube, acquisition, pulse, detection="first" if n_pulses else "all")
+    faulty = inspection.faulty_pixels(capture)
+    assert {(each.row, each.col, each.health) for each in faulty} == {(5, 1, "hot"), (5, 5, "hot")}
+    verdict = inspection.pixel_report(capture, estimate(capture, "peak"), 1, 1, "peak").verdict
+    assert verdict.health == "ordinary" and "bright surface" in verdict.why
+
+
 def test_a_pixel_outside_the_image_is_refused() -> None:
     capture = Capture(np.ones((2, 2, 60), np.uint8), ACQUISITION)
     image = estimate(capture, "peak")

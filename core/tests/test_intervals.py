@@ -197,7 +197,7 @@ def is_covered(hits: float, trials: int, level: float) -> bool:
     ids=str,
 )
 def test_intervals_of_right_estimates_cover_the_truth(regime: Regime, method: str) -> None:
-    found = coverage(regime, method, [0])
+    found = coverage((regime, method, range(1)))
     assert found.right > 500
     for level, share in zip(COVERED, found.shares, strict=True):
         assert is_covered(round(share.value * found.right), found.right, level), share
@@ -226,7 +226,7 @@ def test_the_study_has_a_row_for_each_regime_and_method(monkeypatch: pytest.Monk
     regimes = (Regime("first", 1, 3), Regime("all", 1, 3))
     monkeypatch.setattr("core.studies.methods.calibration.REGIMES", regimes)
     monkeypatch.setattr("core.studies.methods.calibration._SIDE", 8)
-    found = coverage_table([0])
+    found = coverage_table(range(1))
     assert [row[:4] for row in found.rows] == [
         (kind, "1", "3", method)
         for kind in ("first", "all")

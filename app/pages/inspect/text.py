@@ -346,7 +346,7 @@ MOST_LISTED = 10
 
 FAULTY_COLUMNS: list[Sequence[Any]] = [
     ("Pixel", "Row and column.", 1),
-    ("Fault", "Hot: more detections than all neighbours; dead: fewer.", 1),
+    ("Fault", "Hot: more detections than all neighbours, and not in an echo; dead: fewer.", 1),
     ("Counts", "Detections; below, those of its eight neighbours.", -1),
 ]
 
@@ -414,7 +414,7 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
         ("SBR, all pixels", interval(image.sbr), f"{of_all}: signal over background."),
         ("Background", interval(image.background), f"Mean of all pixels over the gate, {per}"),
         *_stated_facts(report),
-        ("Hot pixels", hot, "Pixels with more detections than all neighbours."),
+        ("Hot pixels", hot, "Pixels with more detections than all neighbours, and not in an echo."),
         ("Dead pixels", dead, "Pixels with fewer detections than all neighbours."),
     ]
 

@@ -20,6 +20,7 @@ from core.capture import Capture, cached_per_capture
 from core.corrections import without_correction
 from core.inference import faults, resolution
 from core.inference.flux import flux_prior_of
+from core.inference.likelihood import windowed_sums
 from core.inference.posterior import TOLERANCE_BINS, tolerance_probability
 from core.inference.resolution import FEW, Difference, difference
 from core.metrics import Interval
@@ -255,20 +256,14 @@ def second_surface(capture: Capture) -> Requirement:
     # A pixel with more background than others need not have a second echo.
     factor = counts.sum(axis=1) / np.maximum(others.sum(axis=1), np.finfo(float).tiny)
     others *= np.maximum(factor, 1.0)[:, np.newaxis]
-    seen, expected = (_windows(each, width) for each in (counts, others))
-    whole = _windows(outside.astype(float), width) > width - 0.5
+    seen, expected = (windowed_sums(each, width) for each in (counts, others))
+    whole = windowed_sums(outside.astype(float), width) > width - 0.5
     chance = np.where(whole, pdtrc(np.maximum(seen - 1, 0), expected), 1.0)
     chance[seen < 1] = 1.0
     shows = chance.min(axis=1) * whole.sum(axis=1) < faults.SIGNIFICANCE
     excess = np.where(shows, (seen - expected).max(axis=1), 0.0)
     sent = capture.gated_pulses or sample.counts.sum(axis=1)
     return _found("second_surface", shows, excess / sent, f"{shows.size} of them examined")
-
-
-def _windows(values: Floats, width: int) -> Floats:
-    """Return sums of `width` neighbours along the last axis."""
-    until = np.pad(np.cumsum(values, axis=1), ((0, 0), (1, 0)))
-    return np.asarray(until[:, width:] - until[:, :-width])
 
 
 # -- Image -----------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from core.metrics import Interval, ReliabilityBin, calibration_error, reliabilit
 from core.reductions import merge_bins
 from core.studies.outputs import Table, table
 from core.studies.paper.printed import TABLE_2
-from core.studies.trials import Condition
+from core.studies.trials import Condition, mapped
 from core.trigger import draw_counts, rate_per_bin
 
 METHODS = ("likelihood", "tracking", "coates", "peak")
@@ -143,8 +143,9 @@ class Coverage:
     """One for each of `LEVELS`."""
 
 
-def coverage(regime: Regime, method: str, seeds: Sequence[int]) -> Coverage:
-    """Measure the coverage of range intervals."""
+def coverage(piece: tuple[Regime, str, range]) -> Coverage:
+    """Measure the coverage of the range intervals of a method, from some seeds."""
+    regime, method, seeds = piece
     right, hits = 0, np.zeros(len(LEVELS), int)
     for capture in map(regime.capture, seeds):
         image, truth_m = estimate(capture, method), np.asarray(capture.truth_range_m)
@@ -157,12 +158,14 @@ def coverage(regime: Regime, method: str, seeds: Sequence[int]) -> Coverage:
     return Coverage(regime, method, right, tuple(wilson(int(hit), right) for hit in hits))
 
 
-def coverage_table(seeds: Sequence[int]) -> Table:
+def coverage_table(seeds: range, processes: int = 1) -> Table:
     """Return the coverage of range intervals in each of `REGIMES`, for two methods."""
+    pieces = list(product(REGIMES, ("likelihood", "tracking"), [seeds]))
+    found = dict(mapped(coverage, pieces, processes))
     return table(
         "coverage",
         "Coverage of range intervals",
-        (coverage(*each, seeds) for each in product(REGIMES, ("likelihood", "tracking"))),
+        (found[piece] for piece in pieces),
         {
             "detection": lambda found: found.regime.detection,
             "pulse σ, bins": lambda found: f"{found.regime.sigma_bins:g}",
@@ -268,8 +271,9 @@ class FluxCoverage:
         return wilson(int(self.hits[FLUX_CHECKS.index(check)]), self.captures)
 
 
-def flux_coverage(regime: FluxRegime, seeds: Sequence[int]) -> list[FluxCoverage]:
-    """Measure the coverage of flux intervals in bins of each width."""
+def flux_coverage(piece: tuple[FluxRegime, range]) -> list[FluxCoverage]:
+    """Measure the coverage of flux intervals in bins of each width, from some seeds."""
+    regime, seeds = piece
     hits = np.zeros((len(BIN_WIDTHS_S), len(FLUX_CHECKS)), int)
     for seed in seeds:
         captures, truth = regime.captures(seed)
@@ -286,13 +290,13 @@ def flux_coverage(regime: FluxRegime, seeds: Sequence[int]) -> list[FluxCoverage
     ]
 
 
-def flux_table(captures: int) -> Table:
+def flux_table(captures: int, processes: int = 1) -> Table:
     """Return the coverage of flux intervals in each of `FLUX_REGIMES`, and in all together."""
-    found = [
-        each
-        for i, regime in enumerate(FLUX_REGIMES)
-        for each in flux_coverage(regime, range(i * captures, (i + 1) * captures))
+    pieces = [
+        (regime, range(i * captures, (i + 1) * captures)) for i, regime in enumerate(FLUX_REGIMES)
     ]
+    by_piece = dict(mapped(flux_coverage, pieces, processes))
+    found = [each for piece in pieces for each in by_piece[piece]]
     for width_s in BIN_WIDTHS_S:
         hits = [each.hits for each in found if each.bin_width_s == width_s]
         found.append(FluxCoverage(None, width_s, captures * len(hits), np.sum(hits, axis=0)))
