@@ -15,7 +15,7 @@ from tornado.httpclient import HTTPClientError
 from app.server.sessions import Bounds, Sessions
 from tests.browser import eventually, server_process, serving
 from tests.crowded import BOUNDS
-from tests.test_serving import Site
+from tests.site import Site
 from tests.wire import Wire, connected, token_in
 
 
