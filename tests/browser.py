@@ -82,15 +82,13 @@ def launched(kind: BrowserType) -> Iterator[Browser]:
 
 
 @contextmanager
-def serving(
-    *arguments: str | Path, module: str = "app", log_path: Path | None = None, **environment: str
-) -> Iterator[str]:
-    """Serve the app in a process of its own and yield its address; print to `log_path`, if any."""
+def serving(*arguments: str | Path, module: str = "app", **environment: str) -> Iterator[str]:
+    """Serve the app in a process of its own and yield its address."""
     port = free_port()
     command = [sys.executable, "-m", module, "--port", str(port), *map(str, arguments)]
     # A pipe that nobody reads would block the server when it is full.
     with (
-        TemporaryFile("w+") if log_path is None else log_path.open("w+") as log,
+        TemporaryFile("w+") as log,
         subprocess.Popen(
             command,
             cwd=ROOT,

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
+from urllib.parse import parse_qsl
 
 import numpy as np
 import param
 
-from app.model.address import defaults
+from app.model.address import Link, defaults
 from app.model.state import CLOUDS, Comparison, State
+from app.model.store import Request, Source, built_in_sources
 from core import ESTIMATORS, Window
 from core.io import ReadOptions
 from core.parameters import Choice
@@ -29,6 +31,17 @@ OTHERWISE: dict[str, list[Any]] = {
     "reading": [ReadOptions(**{name: value}) for name, value in EXAMPLES.items()],
 }
 """Other values of parameters whose kind does not tell which there are."""
+
+
+def ask(source: str | Source = "car", **chosen: Any) -> Request:
+    """Return a request for a built-in source, by its key, or another one."""
+    known = built_in_sources()
+    return Request(known[source] if isinstance(source, str) else source, **chosen)
+
+
+def link_to(query: str) -> Link:
+    """Return the link with this query."""
+    return Link(dict(parse_qsl(query)))
 
 
 def another(name: str) -> Iterator[Any]:

@@ -6,19 +6,18 @@ import runpy
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
-from urllib.parse import parse_qsl
 
 import numpy as np
 import panel as pn
 import pytest
 
 import core
-from app.model.address import Link
 from app.model.script import script_of
 from app.model.store import file_source
 from app.model.uploads import Uploads
 from app.pages.shared.truth import UNITS
 from app.widgets.cards import Part
+from tests.states import link_to
 from tests.threads import HeldLayout, control
 
 
@@ -86,7 +85,7 @@ def test_an_added_truth_is_scored_linked_and_in_the_script(
     (tmp_path / "script.py").write_text(script_of(session.answer, session.state), "utf-8")
     found = runpy.run_path("script.py")
     np.testing.assert_array_equal(found["capture"].truth_range_m, known.truth_range_m)
-    link = Link(dict(parse_qsl(session.query())))
+    link = link_to(session.query())
     again = HeldLayout({"measured": session.sources["measured"]}, link, uploads)
     assert again.session.refused == []
     assert again.session.answer.run.figures == session.answer.run.figures
@@ -110,7 +109,7 @@ def test_a_map_of_the_same_file_is_offered(known, tmp_path, monkeypatch):
     (tmp_path / "script.py").write_text(script_of(session.answer, session.state), "utf-8")
     scripted = runpy.run_path("script.py")["capture"]
     np.testing.assert_array_equal(scripted.truth_range_m, found)
-    link = Link(dict(parse_qsl(session.query())))
+    link = link_to(session.query())
     again = HeldLayout({"both": file_source(path)}, link)
     assert again.session.refused == []
     assert again.session.answer.run.figures == session.answer.run.figures

@@ -15,7 +15,7 @@ from app.model.store import built_in_sources
 from app.pages.session import Session
 from core import TrackingParameters
 from core.io import ReadOptions
-from tests.states import OTHERWISE, another, random_state
+from tests.states import OTHERWISE, another, link_to, random_state
 from tests.threads import HeldLayout, control
 
 
@@ -108,7 +108,7 @@ def test_a_bad_entry_is_refused_and_the_others_are_used(query, named):
 
 
 def opened(query: str) -> Session:
-    return Session(built_in_sources(), Link(dict(parse_qsl(query))))
+    return Session(built_in_sources(), link_to(query))
 
 
 def test_a_session_opens_on_its_link():

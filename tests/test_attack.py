@@ -41,10 +41,10 @@ def test_a_server_that_ends_has_not_held(monkeypatch, capsys):
         server.process.wait()
         return Outcome(1, "killed", True)
 
-    attacks = [Attack("deadly", deadly), Attack("harmless", harmless)]
+    attacks = [Attack("harmless", harmless), Attack("deadly", deadly)]
     monkeypatch.setattr(attack, "ATTACKS", attacks)
     assert attack.main([]) == 1
-    deadly_row, harmless_row = capsys.readouterr().out.splitlines()[2:4]
+    harmless_row, deadly_row = capsys.readouterr().out.splitlines()[2:4]
     assert "ENDED" in deadly_row and "did NOT hold" in deadly_row
     assert harmless_row.endswith("| held |")
 

@@ -11,8 +11,8 @@ import psutil
 import pytest
 
 from app.model import budget
-from app.model.state import Illumination, ReductionSettings
-from app.model.store import Request, compute, file_source
+from app.model.state import ReductionSettings
+from app.model.store import compute, file_source
 from app.pages.compare.ranking import Task, run_task
 from app.pages.inspect.results import inspect_capture, inspect_pixel_with_flux
 from app.pages.session import Session
@@ -21,8 +21,8 @@ from app.pages.tradeoff.speed import affordable
 from app.tasks.scheduler import GENERAL
 from core import ESTIMATORS, Acquisition, Capture, TrackingParameters, save_capture
 from core.cost import Cost
-from core.io import ReadOptions
 from core.studies.tradeoff.measure import candidates
+from tests.states import ask
 
 MB = 2**20
 
@@ -33,12 +33,6 @@ def source(tmp_path):
     cube = np.random.default_rng(0).poisson(0.2, (120, 120, 100)).astype(np.uint8)
     save_capture(Capture(cube, Acquisition(100, 1e-9, n_pulses=500)), tmp_path / "wide.npz")
     return file_source(tmp_path / "wide.npz")
-
-
-def ask(source, less=None):
-    return Request(
-        source, Illumination(), ReadOptions(), TrackingParameters(), less or ReductionSettings()
-    )
 
 
 @pytest.fixture
@@ -60,7 +54,7 @@ def test_a_costly_capture_opens_reduced_and_says_so(source, tight):
         if getattr(less, name) > 1:
             more = replace(less, **{name: getattr(less, name) - 1})
             with pytest.raises(ValueError, match="working memory of 'tracking'"):
-                compute(ask(source, more), answer)
+                compute(ask(source, less=more), answer)
 
 
 def test_a_capture_that_fits_is_not_reduced(source):

@@ -19,8 +19,8 @@ from app.model.store import content_key
 from app.model.uploads import safe_name
 from app.server.access import TOKEN_VARIABLE
 from tests.browser import fact, serving, upload
+from tests.site import TOKEN
 from tests.test_large import write
-from tests.test_serving import TOKEN
 from tests.test_uploads import saved
 
 pytestmark = pytest.mark.browser

@@ -49,35 +49,7 @@ from tests.load import opened as opened_wire
 from tests.test_app import opened
 from tests.threads import HeldLayout, HeldTasks, control
 
-
-@pytest.fixture(scope="module")
-def broken():
-    """Address of an app whose parts break."""
-    with serving(module="tests.broken") as running_at:
-        yield running_at
-
-
-def provoke(address, break_it, mend_it):
-    """Return the sentences that the page shows after each action."""
-
-    async def session():
-        wire, _ = await opened_wire(address, seed=0)
-        alert = wire.find("Sentence", warning=True)
-        said = []
-        for act, is_over in ((break_it, bool), (mend_it, lambda text: not text)):
-            await act(wire)
-            async with asyncio.timeout(60), wire.news:
-                await wire.news.wait_for(lambda is_over=is_over: is_over(text(wire, alert)))
-            said.append(text(wire, alert))
-        wire.close()
-        assert all(str(ROOT) not in trouble for trouble in wire.troubles)
-        return said
-
-    return asyncio.run(session())
-
-
-def text(wire, sentence):
-    return wire.values.get((sentence, "text"), "")
+# -- a served app whose parts fail -----------------------------------------------------------------
 
 
 def moving(kind, attribute, value, **attributes):
@@ -87,27 +59,54 @@ def moving(kind, attribute, value, **attributes):
     return move
 
 
-@pytest.mark.parametrize("seed", [*AT_SEED, WHEN_DRAWN])
-def test_an_estimate_that_fails_is_reported_and_the_next_move_works(broken, seed):
-    said, mended = provoke(
-        broken,
-        moving("Knob", "value", seed, label="Seed"),
-        moving("Knob", "value", 99, label="Seed"),
+def seeding(seed):
+    return moving("Knob", "value", seed, label="Seed")
+
+
+async def tap(wire):
+    """Tap on the image: a callback of Bokeh."""
+    image = next(
+        key
+        for key, model in wire.models.items()
+        if model["name"] == "Figure"
+        and model["attributes"]["title"]["attributes"]["text"].startswith("Estimated")
     )
-    assert "The page still shows" in said
-    assert str(ROOT) not in said and "Traceback" not in said
-    assert mended == ""
+    row, col = WHEN_TAPPED
+    await wire.emit("tap", image, {"x": col, "y": row, "sx": 1, "sy": 1})
 
 
-def test_a_callback_that_fails_is_reported_and_the_next_works(broken):
-    for row, col in (WHEN_INSPECTED, WHEN_TAPPED):
-        said, _ = provoke(
-            broken,
-            moving("PixelKeys", "pixel", [row, col]),
-            moving("Knob", "value", 98, label="Seed"),
-        )
-        assert "KeyError" in said
-        assert str(ROOT) not in said
+FAILING = {
+    **{f"seed {seed}": seeding(seed) for seed in (*AT_SEED, WHEN_DRAWN)},
+    "an inspected pixel": moving("PixelKeys", "pixel", [*WHEN_INSPECTED]),
+    "a chosen pixel": moving("PixelKeys", "pixel", [*WHEN_TAPPED]),
+    "a tap": tap,
+}
+
+
+def test_what_fails_on_the_server_is_reported_and_the_next_move_works():
+    async def session(address):
+        wire, _ = await opened_wire(address, seed=0)
+        alert = wire.find("Sentence", warning=True), "text"
+        said = {}
+        for number, (name, fail) in enumerate(FAILING.items()):
+            for act, is_over in ((fail, bool), (seeding(99 - number), lambda text: not text)):
+                await act(wire)
+                async with asyncio.timeout(60), wire.news:
+                    await wire.news.wait_for(
+                        lambda is_over=is_over: is_over(wire.values.get(alert, ""))
+                    )
+                said.setdefault(name, wire.values[alert])
+        wire.close()
+        return said, wire.troubles
+
+    with serving(module="tests.broken") as address:
+        said, troubles = asyncio.run(session(address))
+    assert all("The page still shows" in said[f"seed {seed}"] for seed in (*AT_SEED, WHEN_DRAWN))
+    assert all("KeyError" in said[name] for name in FAILING if not name.startswith("seed"))
+    assert not [text for text in said.values() if str(ROOT) in text or "Traceback" in text]
+    (error,) = troubles  # of Bokeh's own callback
+    assert "The error is shown in the app." in error
+    assert str(ROOT) not in error
 
 
 # -- sections of the pages, without a browser ------------------------------------------------------

@@ -6,12 +6,10 @@ import math
 import re
 import runpy
 from dataclasses import replace
-from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 
-from app.model.address import Link
 from app.model.colors import map_of
 from app.model.script import script_of
 from app.model.state import MAPS, NEED_TRUTH, Crop, Illumination, ReductionSettings, Viewing
@@ -33,8 +31,9 @@ from app.theme import DARK
 from app.units import ShownGate, scale
 from core import Acquisition, TrackingParameters, coates_rate, inspection, tracking_signals
 from core.tests.captures import real_capture_path
+from tests.states import link_to
 from tests.test_downloads import columns_of, written
-from tests.threads import HeldTasks
+from tests.threads import HeldTasks, change
 
 CAPTURE = "21km_K11_night.mat"
 
@@ -63,13 +62,6 @@ def on_screen(section, until=lambda section: section.found):
     section.show(True)
     section.session.tasks.run_until(lambda: until(section))
     return section
-
-
-def change(session, **chosen):
-    """Change the state, and wait for the estimate."""
-    before = session.answer
-    session.state.param.update(**chosen)
-    session.tasks.run_until(lambda: session.answer is not before)
 
 
 def values(facts):
@@ -147,6 +139,9 @@ def test_every_map_is_offered_where_possible_and_drawn(name, request):
     for image, look in maps.values():
         assert image.shape == capture.shape
         assert look.title and look.low < look.high
+    np.testing.assert_array_equal(maps["Counts"][0], capture.counts)
+    for kind, find in inspection.maps.items():
+        np.testing.assert_array_equal(maps[kind][0], find(capture))
     fired, look = maps["Fired"]
     if capture.gated_pulses is None:
         assert np.isnan(fired).all() and "pulses not known" in look.title
@@ -414,7 +409,7 @@ def test_a_profile_runs_through_the_pins_and_is_saved_as_shown(building):
     building.tasks.run_until(lambda: section.found is not before)
     hidden = int((answer.run.image.confidence[expected.row, expected.col] < 1).sum())
     assert f"{hidden} without a range, or hidden." in section.note.text
-    link = Link(dict(parse_qsl(building.query())))
+    link = link_to(building.query())
     again = Session(building.sources, link, tasks=HeldTasks()).state
     assert (again.subject, again.pins, again.viewing) == ("Profile", pins, wider)
     assert "core.inspection.line_profile(" in script_of(answer, building.state)
@@ -430,7 +425,7 @@ def test_lengths_rest_on_a_guess_unless_the_user_sets_the_field_of_view(far):
     assert section.note.text.endswith(text.WIDTH_GUESSED)
     # It remains a guess in the link, with other settings, and after a reload.
     change(far, tracking=TrackingParameters(l=0.02))
-    again = Session(far.sources, Link(dict(parse_qsl(far.query()))), tasks=HeldTasks())
+    again = Session(far.sources, link_to(far.query()), tasks=HeldTasks())
     for session in (far, again):
         assert session.answer.is_width_guessed(session.state.viewing)
         assert "in degrees is a guess" in script_of(session.answer, session.state)
@@ -458,7 +453,7 @@ def test_the_box_says_what_is_inside_refuses_crossed_limits_and_is_in_the_link(b
     crop.settings.controls["from_m"].value = None
     crop.settings.controls["pixels"].value = "region"
     assert crop.note.text == NO_REGION
-    link = Link(dict(parse_qsl(building.query())))
+    link = link_to(building.query())
     again = Session(building.sources, link, tasks=HeldTasks()).state
     assert again.crop == Crop("region", None, 840.0)
 
@@ -496,7 +491,7 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, mon
     np.testing.assert_array_equal(scripted["image"].range_m, image_b.range_m)
     assert script.count("core.simulate") == 1
     # Another session has only the link, and computes A again.
-    link = Link(dict(parse_qsl(building.query())))
+    link = link_to(building.query())
     again = PairSection(Session(sources, link, tasks=HeldTasks()))
     again.show(True)
     again.session.tasks.run_until(lambda: again.pair)
@@ -614,6 +609,7 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
     assert gate.gate_delay_s == pytest.approx(opens_s)
     press(apply_t_n)
     assert building.state.tracking.t_n == capture.report.suggestion.t_n
+    building.tasks.run_until(lambda: apply_t_n.disabled)
 
 
 def test_a_report_that_fails_removes_the_previous_one(capture, building, monkeypatch):

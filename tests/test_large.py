@@ -24,7 +24,8 @@ from core.io import ReadOptions
 from core.io.readers.labelled import dataset
 from core.studies.tradeoff.measure import Cancelled
 from tests.browser import ROOT
-from tests.test_app import alert_of, ask, values_of
+from tests.states import ask
+from tests.test_app import alert_of, values_of
 from tests.test_downloads import columns_of, written
 from tests.threads import HeldLayout, control
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import socket
 from urllib.parse import urlencode
 
+import psutil
 import pytest
 
 from app.__main__ import main
-from app.server.access import TOKEN_VARIABLE
 from app.server.limits import MOST_CONNECTIONS, WrongTokens
-from tests.browser import eventually, server_process, serving
-from tests.test_serving import NAME, TOKEN, Site
+from tests.browser import eventually
+from tests.crowded import BOUNDS, HTTP
+from tests.site import NAME, TOKEN, empty_site
 
 FORM = {"Content-Type": "application/x-www-form-urlencoded", "Host": NAME}
 HEAD = f"POST / HTTP/1.1\r\nHost: {NAME}\r\nContent-Type: application/x-www-form-urlencoded\r\n"
@@ -20,17 +21,13 @@ HEAD = f"POST / HTTP/1.1\r\nHost: {NAME}\r\nContent-Type: application/x-www-form
 @pytest.fixture(scope="module")
 def away():
     """A server that requires a token and waits for a short time only."""
-    options = ("--address", "0.0.0.0", "--origin", NAME)
-    chosen = {TOKEN_VARIABLE: TOKEN}
-    with serving(*options, module="tests.crowded", **chosen) as running_at:
-        yield Site(running_at)
+    with empty_site("0.0.0.0", [NAME], TOKEN, bounds=BOUNDS, http_limits=HTTP) as site:
+        yield site
 
 
-@pytest.fixture
-def resident_bytes(away):
-    """Resident memory of the server."""
-    server = server_process(away.address)
-    return lambda: server.memory_info().rss
+def resident_bytes():
+    """Return the memory of this process, which the server shares."""
+    return psutil.Process().memory_info().rss
 
 
 def sending(site, text):
@@ -54,7 +51,7 @@ def try_token(site, token):
     return site.ask("/", "POST", urlencode({"token": token}), **FORM)
 
 
-def test_a_large_body_is_refused_before_it_is_read(away, resident_bytes):
+def test_a_large_body_is_refused_before_it_is_read(away):
     before = resident_bytes()
     for _ in range(6):
         link = sending(away, f"{HEAD}Content-Length: {95 * 2**20}\r\n\r\n")

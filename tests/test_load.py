@@ -6,29 +6,19 @@ import asyncio
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from tests.browser import serving
 from tests.load import Bounds, Growth, Load, as_markdown, growth, load, server_mb, verdicts
 
 
-@pytest.fixture
-def address():
-    """A server of its own, since its memory is measured."""
-    with serving() as running_at:
-        yield running_at
-
-
-def test_all_sessions_are_answered(address):
-    used = asyncio.run(load(address, server_mb(address), sessions=3, seconds=2.0, forgotten_s=0.0))
-    assert used.troubles == []
+def test_all_sessions_are_answered_and_interactions_leave_no_memory():
+    with serving() as address:  # of its own, since its memory is measured
+        resident_mb = server_mb(address)
+        used = asyncio.run(load(address, resident_mb, sessions=3, seconds=2.0, forgotten_s=0.0))
+        grown = asyncio.run(growth(address, resident_mb, interactions=150, warm=40))
+    assert used.troubles == grown.troubles == []
     assert used.latencies_s.size > 40
     assert used.session_mb <= Bounds().session_mb
-
-
-def test_interactions_leave_no_memory(address):
-    grown = asyncio.run(growth(address, server_mb(address), interactions=150, warm=40))
-    assert grown.troubles == []
     assert grown.after_mb - grown.before_mb < 15
 
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from urllib.parse import parse_qsl
-
 import numpy as np
 import pytest
 
 import core
 from app.__main__ import readable
-from app.model.address import Link
 from app.model.store import built_in_sources, file_source
 from core.io import ReadOptions
+from tests.states import link_to
 from tests.threads import HeldLayout, control
 
 
@@ -45,7 +43,7 @@ def test_files_of_one_pattern_are_stepped_through(tmp_path):
     assert control(layout, "Record").end == 2
     control(layout, "Record").value = 1
     np.testing.assert_array_equal(layout.next_answer().whole.cube, cube + 1)
-    again = HeldLayout(files, Link(dict(parse_qsl(layout.session.query()))))
+    again = HeldLayout(files, link_to(layout.session.query()))
     assert again.session.refused == []
     np.testing.assert_array_equal(again.session.answer.whole.cube, cube + 1)
 

@@ -13,8 +13,9 @@ from bokeh.util.token import get_session_id
 from tornado.routing import PathMatches
 
 from app.server.routes import SERVED
-from tests.browser import eventually, serving
-from tests.test_serving import Site
+from tests.browser import eventually
+from tests.crowded import HTTP
+from tests.site import empty_site
 from tests.wire import token_in
 
 REMOVED = {
@@ -29,12 +30,18 @@ MARKER = "from pathlib import Path\nPath({!r}).touch()\n"
 
 @pytest.fixture(scope="module")
 def marked(tmp_path_factory):
-    """A server that finds a module which writes a file when it is run; that file, and the log."""
+    """A server that finds a module which writes a file when it is run, and that file."""
     folder = tmp_path_factory.mktemp("modules")
-    mark, log = folder / "mark", folder / "log"
+    mark = folder / "mark"
     (folder / "leaves_a_mark.py").write_text(MARKER.format(str(mark)))
-    with serving(PYTHONPATH=str(folder), log_path=log) as address:
-        yield Site(address), mark, log
+    with pytest.MonkeyPatch.context() as patched, empty_site(http_limits=HTTP) as site:
+        patched.syspath_prepend(folder)
+        yield site, mark
+
+
+@pytest.fixture
+def server(marked):
+    return marked[0]
 
 
 def routes(server) -> Iterator[tuple[str, type]]:
@@ -54,7 +61,7 @@ def test_every_route_of_the_libraries_is_known():
 @pytest.mark.parametrize("module", ["unittest.__main__", "this", "leaves_a_mark", "..", "", "core"])
 @pytest.mark.parametrize("site", [None, "cross-site"])
 def test_an_address_runs_no_module(marked, module, site):
-    server, mark, _ = marked
+    server, mark = marked
     said = {} if site is None else {"Sec_Fetch_Site": site, "Sec_Fetch_Mode": "no-cors"}
     status, _, text = server.ask(RUN.format(module), **said)
     assert status == (404 if site is None else 403)
@@ -74,11 +81,10 @@ def test_an_address_runs_no_module(marked, module, site):
         "/components/app.widgets.connection/Nothing/_stylesheets/connection.css",
     ],
 )
-def test_only_files_of_components_are_served(address, path):
-    site = Site(address)
+def test_only_files_of_components_are_served(server, path):
     file = "/components/app.widgets.connection/Connection/_stylesheets/connection.css"
-    assert site.ask(file)[0] == 200
-    status, _, text = site.ask(path)
+    assert server.ask(file)[0] == 200
+    status, _, text = server.ask(path)
     assert 400 <= status < 500
     assert "Traceback" not in text
 
@@ -106,14 +112,12 @@ def test_only_files_of_components_are_served(address, path):
         ("GET", "/ws"),
     ],
 )
-def test_other_requests_are_refused_without_a_traceback(marked, method, path):
-    server, _, log = marked
+def test_other_requests_are_refused_without_a_traceback(server, caplog, method, path):
     status = server.ask(path, method)[0]
     assert 400 <= status < 500
     assert server.ask("/favicon.ico")[0] == 200
-    printed = log.read_text()
-    assert f"{status} {method} {path}" in printed
-    assert "Traceback" not in printed
+    assert f"{status} {method} {path}" in caplog.text
+    assert "Traceback" not in caplog.text
 
 
 MALFORMED = {
@@ -130,8 +134,7 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize("name", MALFORMED)
-def test_malformed_requests_are_refused_without_a_traceback(marked, name):
-    server, _, log = marked
+def test_malformed_requests_are_refused_without_a_traceback(server, caplog, name):
     with socket.create_connection(("127.0.0.1", server.port), timeout=60) as link:
         link.sendall(MALFORMED[name].replace(b"%d", str(server.port).encode()))
         try:
@@ -140,20 +143,18 @@ def test_malformed_requests_are_refused_without_a_traceback(marked, name):
             first = b""
     assert first == b"" or 400 <= int(first.split()[1]) < 500
     assert server.ask("/favicon.ico")[0] == 200
-    assert "Traceback" not in log.read_text()
+    assert "Traceback" not in caplog.text
 
 
 @pytest.mark.parametrize("query", ["bokeh-session-id=", "bokeh-session-id=a%20b", "bokeh-token=a"])
-def test_a_session_invented_by_an_address_is_ignored(marked, query):
-    server, _, log = marked
+def test_a_session_invented_by_an_address_is_ignored(server, caplog, query):
     status, _, text = server.ask(f"/?{query}")
     assert status == 200
     assert get_session_id(token_in(text)) != "a b"
-    assert "Traceback" not in log.read_text()
+    assert "Traceback" not in caplog.text
 
 
-def test_only_its_own_page_returns_to_a_session(marked):
-    server, *_ = marked
+def test_only_its_own_page_returns_to_a_session(server):
     named = get_session_id(token_in(server.ask()[2]))
 
     def returned(session, **said):
@@ -168,12 +169,11 @@ def test_only_its_own_page_returns_to_a_session(marked):
 
 
 @pytest.mark.browser
-def test_a_foreign_page_can_neither_load_from_here_nor_connect(browser, marked):
+def test_a_foreign_page_can_neither_load_from_here_nor_connect(browser, marked, caplog):
     """A real page on another origin: an image, a script, a stylesheet and a socket."""
-    server, mark, log = marked
+    (server, mark), path = marked, RUN.format("leaves_a_mark")
     port = server.port
-    path = RUN.format("leaves_a_mark")
-    asked, before = f"http://127.0.0.1:{port}{path}", log.read_text().count(f"403 GET {path}")
+    asked = f"http://127.0.0.1:{port}{path}"
     content = f"""<!DOCTYPE html><img src="{asked}"><script src="{asked}"></script>
     <link rel="stylesheet" href="{asked}"><a id="here" href="http://127.0.0.1:{port}/">here</a>
     <script>
@@ -197,7 +197,7 @@ def test_a_foreign_page_can_neither_load_from_here_nor_connect(browser, marked):
     page = browser.contexts[0].new_page()
     page.goto(f"http://localhost:{foreign.server_port}/")
     eventually(lambda: page.title() == "refused")
-    eventually(lambda: log.read_text().count(f"403 GET {path}") == before + 3)
+    eventually(lambda: caplog.text.count(f"403 GET {path}") == 3)
     assert not mark.exists()
     with page.expect_navigation(wait_until="commit") as welcome:
         page.click("#here")

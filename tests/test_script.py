@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import ast
 import os
-import shutil
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 
 import core
-from app.model.address import Link, defaults, query_of
+from app.model.address import defaults, query_of
 from app.model.colors import image_of
 from app.model.large import LIMIT
 from app.model.script import COMMANDS, script_of
@@ -25,8 +23,9 @@ from app.pages.catalog import PAGES
 from app.pages.compare.ranking import run_task, tasks_of
 from app.pages.session import Session
 from core.io.readers.labelled import dataset
+from core.tests.captures import CAPTURES
 from tests.browser import ROOT
-from tests.states import another, random_state
+from tests.states import another, link_to, random_state
 
 PAGE_NAMES = [page.name for page in PAGES]
 
@@ -60,25 +59,37 @@ for folder in sys.argv[1:]:
 
 def opened(query: str, **files: Path) -> Session:
     sources = built_in_sources() | {name: file_source(path) for name, path in files.items()}
-    session = Session(sources, Link(dict(parse_qsl(query))))
+    session = Session(sources, link_to(query))
     assert session.refused == []
     return session
 
 
-def run(folder: Path, sessions: dict[str, Session], *files: Path) -> dict[str, dict]:
-    """Arrays that each session's script computes, all in one fresh process."""
+@dataclass(frozen=True)
+class Scripted:
+    """Sessions by name, what their scripts computed, and where."""
+
+    sessions: dict[str, Session]
+    arrays: dict[str, dict[str, np.ndarray]]
+    folder: Path
+
+    def one(self, name: str) -> tuple[Session, dict[str, np.ndarray]]:
+        return self.sessions[name], self.arrays[name]
+
+
+def run(folder: Path, sessions: dict[str, Session], *files: Path) -> Scripted:
+    """Run the scripts of all sessions in one fresh process."""
     for name, session in sessions.items():
         (folder / name).mkdir()
         (folder / name / "script.py").write_text(script_of(session.answer, session.state), "utf-8")
         for file in files:
-            copy = shutil.copytree if file.is_dir() else shutil.copy
-            copy(file, folder / name / file.name)
+            (folder / name / file.name).symlink_to(file)
     check_style(folder)
     command = [sys.executable, "-c", RUN_EACH, *(str(folder / name) for name in sessions)]
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return {name: dict(np.load(folder / name / "kept.npz")) for name in sessions}
+    arrays = {name: dict(np.load(folder / name / "kept.npz")) for name in sessions}
+    return Scripted(sessions, arrays, folder)
 
 
 def check_style(folder: Path) -> None:
@@ -130,66 +141,99 @@ STATES = {
 }
 
 
-def test_scripts_reproduce_the_screen(tmp_path):
-    sessions = {name: opened(query) for name, query in STATES.items()}
-    found = run(tmp_path, sessions, ASSETS / "sample_capture.npz")
-    for name, session in sessions.items():
+COMPARED = (
+    "page=Compare&comparison.methods=[%22peak%22,%22kde%22,%22tracking%22,%22oracle%22]"
+    "&comparison.false_alarm=0.1&settings.kde.bandwidth_bins=0.7&tracking.l=0.01"
+)
+FAR = CAPTURES / "21km_K11_night.mat"
+N_RANDOM = 4
+
+
+def random_session(seed: int) -> Session:
+    state = random_state(np.random.default_rng(seed))
+    state.param.update(source="car", page="Explore", pixel=(5, 6), region=(), pins=())
+    state.param.update(window=None, image="Counts", comparison=State().comparison)
+    return Session(built_in_sources(), link_to(query_of(state, {})))
+
+
+def window_of_a_large_capture(path: Path) -> Session:
+    scene = core.scenes["building"]()
+    whole = core.simulate(scene, scene.acquisition, core.Flux(sbr=0.5))
+    dataset(whole)[["counts"]].chunk(row=16, col=16).to_zarr(path, consolidated=False)
+    query = "source=it&page=Inspect&map=Confidence&pixel=[3,4]"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(LIMIT, "1")
+        return opened(f"{query}&window.rows=[8,40]&window.cols=[20,60]", it=path)
+
+
+@pytest.fixture(scope="module")
+def scripted(tmp_path_factory) -> Scripted:
+    """Sessions and what their scripts compute: starting a process takes seconds."""
+    files = [ASSETS / "sample_capture.npz", tmp_path_factory.mktemp("made") / "large.zarr"]
+    sessions = {
+        **{name: opened(query) for name, query in STATES.items()},
+        **{f"random {seed}": random_session(seed) for seed in range(N_RANDOM)},
+        "compared": opened(
+            COMPARED + "&comparison.kind=Error&comparison.viewing.least_confidence=0.5"
+        ),
+        "compared file": opened(COMPARED + "&source=sample"),
+        "window": window_of_a_large_capture(files[-1]),
+    }
+    if FAR.exists():
+        query = "source=it&less.pool=2&reading.n_pulses=20000&tracking.l=0.01&pixel=[60,70]"
+        sessions["far"] = opened(query, it=FAR)
+        files.append(FAR)
+    return run(tmp_path_factory.mktemp("scripts"), sessions, *files)
+
+
+def test_scripts_reproduce_the_screen(scripted):
+    for name in STATES:
+        session, found = scripted.one(name)
         answer, state = session.answer, session.state
-        same(found[name], "image", answer.run.image)
-        same_pixel(found[name], "signals", inspect(answer, *state.pixel))
+        same(found, "image", answer.run.image)
+        same_pixel(found, "signals", inspect(answer, *state.pixel))
         for file in ("range.png", "cloud.ply", "pixel.csv"):
-            assert (tmp_path / name / file).stat().st_size > 0
+            assert (scripted.folder / name / file).stat().st_size > 0
         if state.page != "Inspect":
             picture, _ = image_of(answer, state.image, state.viewing)
-            assert np.array_equal(found[name]["picture"], picture, equal_nan=True)
-    answer, more = sessions["inspected"].answer, found["inspected"]
+            assert np.array_equal(found["picture"], picture, equal_nan=True)
+
+
+def test_a_script_reproduces_pins_region_box_and_map(scripted):
+    session, found = scripted.one("inspected")
+    answer, box = session.answer, session.state.box
     for pixel in ((1, 2), (30, 41)):
-        same_pixel(more, str(pixel), inspect(answer, *pixel))
-    mask = core.inspection.pixels_in(sessions["inspected"].state.region, answer.capture.shape)
-    assert np.array_equal(more["region"].ravel(), answer.capture.cube[mask].sum(axis=0))
-    box = sessions["inspected"].state.box
+        same_pixel(found, str(pixel), inspect(answer, *pixel))
+    mask = core.inspection.pixels_in(session.state.region, answer.capture.shape)
+    assert np.array_equal(found["region"].ravel(), answer.capture.cube[mask].sum(axis=0))
     inside = answer.run.image.confident(0.9).cropped(box)
-    header = (tmp_path / "inspected" / "cloud.ply").read_bytes().partition(b"end_header")[0]
+    cloud = scripted.folder / "inspected" / "cloud.ply"
+    header = cloud.read_bytes().partition(b"end_header")[0]
     assert f"comment box: {box}\n".encode() in header
     assert f"element vertex {inside.valid.sum()}\n".encode() in header
     sbr = core.inspection.maps["SBR"](answer.capture)
-    assert np.array_equal(more["picture"], sbr, equal_nan=True)
+    assert np.array_equal(found["picture"], sbr, equal_nan=True)
 
 
-def test_scripts_of_random_states_run(tmp_path):
+def test_scripts_of_random_states_run(scripted):
     """Bad settings give an image without ranges, and a script that runs."""
-    sessions = {}
-    for seed in range(4):
-        state = random_state(np.random.default_rng(seed))
-        state.param.update(source="car", page="Explore", pixel=(5, 6), region=(), pins=())
-        state.param.update(window=None, image="Counts", comparison=State().comparison)
-        session = Session(built_in_sources(), Link(dict(parse_qsl(query_of(state, {})))))
-        sessions[str(seed)] = session
-    for name, found in run(tmp_path, sessions).items():
-        same(found, "image", sessions[name].answer.run.image)
-        same_pixel(found, "signals", inspect(sessions[name].answer, 5, 6))
+    for seed in range(N_RANDOM):
+        session, found = scripted.one(f"random {seed}")
+        same(found, "image", session.answer.run.image)
+        same_pixel(found, "signals", inspect(session.answer, 5, 6))
 
 
-def test_a_script_reproduces_a_real_capture(tmp_path, real_capture):
-    path = real_capture("21km_K11_night.mat")
-    query = "source=it&less.pool=2&reading.n_pulses=20000&tracking.l=0.01&pixel=[60,70]"
-    session = opened(query, it=path)
-    found = run(tmp_path, {"it": session}, path)["it"]
+def test_a_script_reproduces_a_real_capture(scripted, real_capture):
+    assert real_capture(FAR.name) == FAR
+    session, found = scripted.one("far")
     same(found, "image", session.answer.run.image)
     same_pixel(found, "signals", inspect(session.answer, 60, 70))
-    assert str(path.parent) not in script_of(session.answer, session.state)
+    assert str(FAR.parent) not in script_of(session.answer, session.state)
 
 
-def test_a_script_reproduces_a_window_of_a_large_capture(tmp_path, monkeypatch):
+def test_a_script_reproduces_a_window_of_a_large_capture(scripted):
     """Its confidence follows from the flux prior of the whole capture."""
-    scene = core.scenes["building"]()
-    whole = core.simulate(scene, scene.acquisition, core.Flux(sbr=0.5))
-    path = tmp_path / "large.zarr"
-    dataset(whole)[["counts"]].chunk(row=16, col=16).to_zarr(path, consolidated=False)
-    monkeypatch.setenv(LIMIT, "1")
-    query = "source=it&page=Inspect&map=Confidence&pixel=[3,4]"
-    session = opened(f"{query}&window.rows=[8,40]&window.cols=[20,60]", it=path)
-    found = run(tmp_path, {"it": session}, path)["it"]
+    session, found = scripted.one("window")
     same(found, "image", session.answer.run.image)
     same_pixel(found, "signals", inspect(session.answer, 3, 4))
     assert session.answer.capture.shape == (32, 40)
@@ -197,27 +241,18 @@ def test_a_script_reproduces_a_window_of_a_large_capture(tmp_path, monkeypatch):
     assert not np.array_equal(alone.confidence, found["image confidence"])
 
 
-def test_a_script_reproduces_the_comparison(tmp_path):
-    query = (
-        "page=Compare&comparison.methods=[%22peak%22,%22kde%22,%22tracking%22,%22oracle%22]"
-        "&comparison.false_alarm=0.1&settings.kde.bandwidth_bins=0.7&tracking.l=0.01"
-    )
-    sessions = {
-        "car": opened(query + "&comparison.kind=Error&comparison.viewing.least_confidence=0.5"),
-        "file": opened(query + "&source=sample"),
-    }
-    found = run(tmp_path, sessions, ASSETS / "sample_capture.npz")
-    for name, session in sessions.items():
-        answer, chosen = session.answer, session.state.comparison
-        for method, task in tasks_of(chosen, answer.request).items():
-            if name == "file" and method == "oracle":
-                assert "oracle range_m" not in found[name]
-                continue
-            compared = run_task(task, answer).answer
-            same(found[name], method, compared.run.image)
-            kind = "Error" if name == "car" else "Estimate"
-            picture, _ = image_of(compared, kind, chosen.viewing)
-            assert np.array_equal(found[name][f"{method} picture"], picture, equal_nan=True)
+@pytest.mark.parametrize(("name", "kind"), [("compared", "Error"), ("compared file", "Estimate")])
+def test_a_script_reproduces_the_comparison(scripted, name, kind):
+    session, found = scripted.one(name)
+    answer, chosen = session.answer, session.state.comparison
+    for method, task in tasks_of(chosen, answer.request).items():
+        if kind == "Estimate" and method == "oracle":
+            assert "oracle range_m" not in found  # the file does not state its flux
+            continue
+        compared = run_task(task, answer).answer
+        same(found, method, compared.run.image)
+        picture, _ = image_of(compared, kind, chosen.viewing)
+        assert np.array_equal(found[f"{method} picture"], picture, equal_nan=True)
 
 
 # -- text ------------------------------------------------------------------------------------------

@@ -6,8 +6,7 @@ import re
 import signal
 import subprocess
 import sys
-from contextlib import closing, contextmanager
-from http.client import HTTPConnection
+from contextlib import contextmanager
 from urllib.parse import urlencode
 
 import numpy as np
@@ -16,66 +15,26 @@ import pytest
 from app.__main__ import main
 from app.server.access import TOKEN_VARIABLE, Access
 from app.widgets.connection import serving_options
-from tests.browser import ROOT, serving
+from tests.browser import ROOT
+from tests.site import NAME, TOKEN, Site, empty_site
 from tests.wire import token_in
 
-TOKEN = "a token <b>of</b> ours"
-NAME = "lab.example.org"
 STATIC = "/static/js/bokeh.min.js"
-UPGRADE = {
-    "Connection": "Upgrade",
-    "Upgrade": "websocket",
-    "Sec_WebSocket_Version": "13",
-    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
-}
 PARTS = ("/", "/favicon.ico", STATIC, "/ws", "/metadata", "/no/such/page")
 
 
-class Site:
-    """A client of a server, which may send any header."""
-
-    def __init__(self, address):
-        self.address = address
-        self.port = int(address.rstrip("/").rpartition(":")[2])
-
-    def send(self, path="/", method="GET", body=None, **headers):
-        """Send a request, and return its connection."""
-        headers = {name.replace("_", "-"): value for name, value in headers.items()}
-        link = HTTPConnection("127.0.0.1", self.port, timeout=120)
-        link.request(method, path, body, headers)
-        return link
-
-    def ask(self, *request, **headers):
-        """Return status, headers and text of the response to a request."""
-        with closing(self.send(*request, **headers)) as link:
-            answer = link.getresponse()
-            return answer.status, answer.headers, answer.read().decode(errors="replace")
-
-    def connect(self, token, **headers):
-        """Request a session's socket; return the connection, and 101 if it was accepted."""
-        protocol = f"bokeh, {token}"
-        link = self.send("/ws", **UPGRADE, Sec_WebSocket_Protocol=protocol, **headers)
-        return link, link.getresponse().status
-
-    def socket(self, token, **headers):
-        """Return the status of a request for a session's socket, and close it."""
-        link, status = self.connect(token, **headers)
-        link.close()
-        return status
-
-
 @pytest.fixture(scope="module")
-def here(address):
-    """The app with default options."""
-    return Site(address)
+def here():
+    """A server with the app's default options."""
+    with empty_site() as site:
+        yield site
 
 
 @pytest.fixture(scope="module")
 def away():
-    """The app on a network."""
-    options = ("--address", "0.0.0.0", "--origin", NAME)
-    with serving(*options, **{TOKEN_VARIABLE: TOKEN}) as running_at:
-        yield Site(running_at)
+    """A server on a network."""
+    with empty_site("0.0.0.0", [NAME], TOKEN) as site:
+        yield site
 
 
 @pytest.fixture(scope="module")
@@ -231,16 +190,11 @@ def run(*arguments):
             started.kill()
 
 
-def start(*options):
-    return run("-m", "app", *options)
-
-
-def test_a_port_in_use_is_reported(here):
-    with start("--port", str(here.port)) as second:
-        printed = second.communicate(timeout=120)[0]
-    assert second.returncode == 1
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of tornado
+def test_a_port_in_use_is_reported(here, capsys):
+    assert main(["--port", str(here.port)]) == 1
+    printed = capsys.readouterr().out
     assert "in use" in printed and "--port" in printed
-    assert "Traceback" not in printed
 
 
 @pytest.mark.parametrize("seconds", [-1.0, 0.0, 1.0, np.nan, np.inf])
@@ -256,7 +210,7 @@ def test_a_network_address_requires_an_origin(capsys):
 
 
 def test_the_printed_link_has_a_token_and_ctrl_c_stops():
-    with start("--address", "0.0.0.0", "--origin", "127.0.0.1", "--port", "0") as server:
+    with run("-m", "app", "--address", "0.0.0.0", "--origin", "127.0.0.1", "--port", "0") as server:
         line = next(line for line in server.stdout if line.startswith("Open"))
         link = re.search(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{20,})", line)
         site = Site(f"http://127.0.0.1:{link[1]}/")

@@ -5,13 +5,11 @@ from __future__ import annotations
 import shutil
 from functools import partial
 from pathlib import Path
-from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 
 from app.__main__ import main, parser_of_arguments, readable
-from app.model.address import Link
 from app.model.reading import options_in_use
 from app.model.script import script_of
 from app.model.store import built_in_sources
@@ -19,6 +17,7 @@ from app.model.truth import with_chosen_truth
 from app.pages.session import Session
 from core.io import ReadOptions
 from tests.browser import eventually
+from tests.states import link_to
 
 CUBE = np.random.default_rng(2).poisson(0.3, (4, 6, 40))
 
@@ -93,10 +92,10 @@ def test_a_link_opens_the_same_file_or_none(paths, tmp_path):
     np.savez(tmp_path / "moved" / "first.npz", day=CUBE[:2])
     same = shutil.copy(paths[2], tmp_path / "moved")
     files = readable([tmp_path / "moved" / "first.npz", Path(same)], options) | built_in_sources()
-    again = Session(files, Link(dict(parse_qsl(linked))))
+    again = Session(files, link_to(linked))
     assert again.refused == []
     assert again.answer.request.source.title == "day.npz"
     np.savez(same, day=CUBE + 1)
     files = readable([Path(same)], options) | built_in_sources()
-    (refused,) = Session(files, Link(dict(parse_qsl(linked)))).refused
+    (refused,) = Session(files, link_to(linked)).refused
     assert "day.npz" in refused and "its content is another" in refused

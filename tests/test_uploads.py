@@ -6,18 +6,17 @@ import gc
 import re
 import tempfile
 from pathlib import Path
-from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 
-from app.model.address import Link
 from app.model.script import script_of
 from app.model.state import Illumination
 from app.model.store import built_in_sources
 from app.model.uploads import Bounds, Uploads, safe_name
 from core import Acquisition, Capture, save_capture
 from core.io import ReadOptions
+from tests.states import link_to
 from tests.threads import HeldLayout, control
 
 
@@ -77,7 +76,7 @@ def test_files_that_differ_in_numbers_open_as_one_sequence_and_others_one_by_one
     assert answer.whole.n_records == 3
     assert np.array_equal(answer.whole.cube, 3 * single.cube)
     assert "run_*_a.npz" in script_of(answer, layout.session.state)
-    again = HeldLayout(built_in_sources(), Link(dict(parse_qsl(layout.session.query()))), uploads)
+    again = HeldLayout(built_in_sources(), link_to(layout.session.query()), uploads)
     assert again.session.answer.whole.n_records == 3
     button.param.update(filename=["day.npz", "night.npz"], value=[content] * 2)
     assert layout.next_answer().request.source.title == "day.npz"

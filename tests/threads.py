@@ -10,6 +10,7 @@ from app.model.address import Link
 from app.model.store import Answer, Source
 from app.model.uploads import Uploads
 from app.pages.layout import Arrivals, Layout
+from app.pages.session import Session
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import Act
 
@@ -77,6 +78,14 @@ class HeldLayout(Layout):
         """Let the page do all that is waiting now."""
         while not self.tasks.waiting.empty():
             self.tasks.run_one()
+
+
+def change(session: Session, **chosen: Any) -> None:
+    """Change the state, and wait for the estimate."""
+    before = session.answer
+    session.state.param.update(**chosen)
+    assert isinstance(session.tasks, HeldTasks)
+    session.tasks.run_until(lambda: session.answer is not before)
 
 
 def control(layout: Layout, label: str) -> Any:

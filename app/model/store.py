@@ -192,10 +192,10 @@ class Request:
     """Everything that an estimate is computed from."""
 
     source: Source
-    light: Illumination
-    reading: ReadOptions
-    tracking: TrackingParameters
-    less: ReductionSettings
+    light: Illumination = field(default_factory=Illumination)
+    reading: ReadOptions = field(default_factory=ReadOptions)
+    tracking: TrackingParameters = field(default_factory=TrackingParameters)
+    less: ReductionSettings = field(default_factory=ReductionSettings)
     method: str = AUTOMATIC
     """Key of `core.ESTIMATORS`, or `AUTOMATIC`."""
     settings: Mapping[str, Any] = field(default_factory=default_settings, hash=False)
