@@ -41,8 +41,14 @@ from tests.browser import (
     upload,
     warning,
 )
+from tests.test_inspect_browser import Subject, expect_all, ranged
 
 pytestmark = pytest.mark.browser
+
+
+def go(page: Page, name: str) -> None:
+    """Go to the page of the app of this name."""
+    page.get_by_role("button", name=name, exact=True).click()
 
 
 # -- pictures --------------------------------------------------------------------------------------
@@ -159,8 +165,8 @@ def expect_widgets_fetched_once_and_early(page: Page) -> None:
     assert any(bundle in text for text in scripts)
 
 
-def test_a_page_opens_complete_with_names_and_plots_that_keep_their_first_size(page):
-    new = page(prepare=NOTE_SIZES)
+def expect_all_in_place(new: Page) -> None:
+    """Expect a complete page with names, and with plots that keep their first size."""
     expect_widgets_fetched_once_and_early(new)
     expect_rmse(new, car())
     expect(stage(new)).to_have_attribute("data-points", re.compile(r"^\d{4}$"))
@@ -177,8 +183,11 @@ def test_a_page_opens_complete_with_names_and_plots_that_keep_their_first_size(p
     assert count_near(shown["cloud"], WRONG_COLOR) > 10  # a few crosses
     assert new.evaluate(UNNAMED) == []
     expect_plots_of_lasting_size(new)
+
+
+def expect_inspect_in_place(new: Page) -> None:
     new.evaluate("sizes.clear()")
-    new.get_by_role("button", name="Inspect", exact=True).click()
+    go(new, "Inspect")
     expect(new.get_by_role("button", name="Pins", exact=True)).to_be_visible()
     expect_plots_of_lasting_size(new)
     assert new.evaluate(UNNAMED) == []
@@ -405,7 +414,8 @@ def show_a_doubtful_zone(page: Page) -> None:
     expect(doubt).to_be_hidden()
 
 
-def test_controls_can_be_focused_folded_moved_by_keys_typed_into_and_preset(start_page):
+def use_the_controls(start_page: Page) -> None:
+    """Focus, fold, move by keys, type, and choose a preset."""
     for part in (image(start_page), stage(start_page)):
         part.focus()
         expect(part).to_be_focused()
@@ -617,8 +627,8 @@ def change_theme(page: Page) -> None:
         drawn = [colors(picture) for picture in look(page).values()]
         return all(each[palette.paper] > each.total() / 4 and each[palette.text] for each in drawn)
 
-    page.evaluate("sent.length = 0")
     eventually(lambda: all_drawn_in(LIGHT))
+    page.evaluate("sent.length = 0")
     for palette in (DARK, LIGHT):
         page.get_by_role("button", name="Toggle theme").click()
         eventually(lambda palette=palette: all_drawn_in(palette))
@@ -628,12 +638,13 @@ def change_theme(page: Page) -> None:
     assert {event["attr"] for event in sent} == {"dark_theme"}
 
 
-def test_pictures_follow_the_theme_and_show_every_scene_in_every_way(page):
-    new = page(prepare=NOTE_SENT)
+def test_a_page_opens_complete_follows_the_theme_and_shows_scenes_in_every_way(page):
+    new = page(prepare=NOTE_SIZES + NOTE_SENT)
+    expect_all_in_place(new)
     change_theme(new)
-    shown = look(new)
-    for source in reversed(built_in_sources().values()):
-        choose(new, "Scene or capture", source.title)
+    shown, sources = look(new), built_in_sources()
+    for key in ("car_256", "sample", "car"):
+        choose(new, "Scene or capture", sources[key].title)
         shown = look_again(new, shown, "image", "cloud", least_ranges=51)
     for of_image, of_cloud in (("Error", "Error"), ("Counts", "Counts"), ("Truth", "Range")):
         new.get_by_role("button", name=of_image, exact=True).first.click()
@@ -641,6 +652,7 @@ def test_pictures_follow_the_theme_and_show_every_scene_in_every_way(page):
         shown = look_again(new, shown, "image", "cloud")
     leave_a_page_before_it_is_drawn(new)
     expect(warning(new)).to_be_hidden()
+    expect_inspect_in_place(new)
 
 
 def leave_a_page_before_it_is_drawn(page: Page) -> None:
@@ -695,15 +707,21 @@ def expect_the_building_at_21_km(page: Page) -> None:
     eventually(lambda: n_ranges(look(page)["image"]) > 50)
 
 
-def test_a_real_capture_is_ranged_and_its_reading_can_be_changed(page, real_capture):
+def test_a_real_capture_is_ranged_inspected_and_its_reading_can_be_changed(page, real_capture):
     new, path = page(), real_capture("21km_K11_night.mat")
     upload(new, path.name, path.read_bytes())
     inspect = new.get_by_role("button", name="Inspect", exact=True)
     expect(inspect).to_have_attribute("aria-pressed", "true")
-    new.get_by_role("button", name="Explore", exact=True).click()
+    go(new, "Explore")
     expect(new.get_by_text("Matched filter: the capture holds all photons")).to_be_visible()
     choose(new, "Method", "Dual-scale tracking differentiator")
     expect_the_building_at_21_km(new)
+    go(new, "Inspect")
+    capture = core.read_capture(path)
+    for name in ("Row", "Column"):  # the middle; written late, it would replace an entry
+        expect(field(new, name)).to_have_value(re.compile(r"^1\d\d$"))
+    expect_all(new, Subject(capture, ranged(capture), path.stem, (100, 190)))
+    go(new, "Explore")
     new.get_by_role("button", name="Reading options").click()
     bin_width = new.get_by_role("textbox", name="Bin width")  # its help is part of the name
     expect(bin_width).to_have_value("1 ns")  # a guess
@@ -763,8 +781,8 @@ def saved_arrays(**arrays: np.ndarray | str) -> bytes:
     return content.getvalue()
 
 
-def test_files_are_refused_or_shown_as_text_and_belong_to_their_session(page, tmp_path, troubles):
-    one, other = page(), page()
+def test_files_are_refused_or_shown_as_text(start_page, tmp_path, troubles):
+    one = start_page
     upload(one, "holiday.npz", b"nothing of the kind")
     expect(warning(one)).to_contain_text("holiday.npz")
     expect(warning(one)).to_contain_text("copy or save it again")
@@ -788,9 +806,3 @@ def test_files_are_refused_or_shown_as_text_and_belong_to_their_session(page, tm
     (trouble,) = troubles
     assert "exceeds maximum file size" in trouble  # the widget's own line in the console
     troubles.clear()
-    expect(field(other, "SBR")).to_have_value("0.06")
-    slider(other, "Seed").press("ArrowRight")
-    expect_rmse(other, car(Illumination(seed=1)))
-    chosen(other, "Scene or capture").click()
-    titles = [source.title for source in built_in_sources().values()]
-    expect(other.get_by_role("menuitem")).to_have_text(titles)

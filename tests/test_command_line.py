@@ -23,7 +23,7 @@ from tests.site import TOKEN
 from tests.test_large import write
 from tests.test_uploads import saved
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("served")]
 
 SIDE = 512
 """Rows and columns of a capture that is just too large for a preview of every pixel."""

@@ -1,14 +1,17 @@
-"""Every page opens first, by its own address, with plots that can be read in any window."""
+"""Every page opens first, by its own address, with plots that can be read, and can be used."""
 
 from __future__ import annotations
-
-import re
 
 import pytest
 from playwright.sync_api import Page, expect
 
 from app.pages.catalog import PAGES
 from tests.browser import VIEWS, eventually, slider, stage
+from tests.test_browser import use_the_controls
+from tests.test_compare import compare_the_methods
+from tests.test_inspect_browser import inspect_the_building
+from tests.test_paper_page import read_part_by_part
+from tests.test_tradeoff_page import open_a_configuration
 
 pytestmark = pytest.mark.browser
 
@@ -40,6 +43,7 @@ def expect_readable(page: Page, name: str) -> None:
 
         eventually(fit)
         expect(page.get_by_role("button", name="Toggle theme")).to_be_in_viewport(ratio=1)
+    page.set_viewport_size({"width": 1440, "height": 900})
     expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
 
 
@@ -62,19 +66,27 @@ def expect_the_sidebar_to_be_skipped(page: Page) -> None:
     expect(page.get_by_role("main").locator(":focus").first).to_be_attached()
 
 
-def test_every_page_opens_first_with_plots_that_can_be_read(page, address):
-    first, *others = [each.name for each in PAGES]
-    opened = page(f"{address}?page={first}")
-    expect_the_sidebar_to_be_skipped(opened)
-    expect_a_print_of_the_content(opened)
-    expect_readable(opened, first)
-    for name in others:
-        opened.set_viewport_size({"width": 1440, "height": 900})
-        opened.get_by_role("button", name=name, exact=True).click()
-        expect(opened).to_have_url(re.compile(f"page={name}"))
-        opened.reload()
-        expect_readable(opened, name)
-    opened.get_by_role("button", name=first, exact=True).click()  # the window has become narrow
-    expect(stage(opened)).to_be_visible()
-    expect(opened.get_by_role("button", name="Open drawer")).to_be_visible()
-    expect(slider(opened, "SBR")).not_to_be_in_viewport()
+def explore(page: Page) -> None:
+    expect_the_sidebar_to_be_skipped(page)
+    expect_a_print_of_the_content(page)
+    use_the_controls(page)
+
+
+JOURNEYS = {
+    "Explore": explore,
+    "Inspect": inspect_the_building,
+    "Compare": compare_the_methods,
+    "Trade-off": open_a_configuration,
+    "Paper": read_part_by_part,
+}
+"""What a user does on a page, which has just been opened."""
+
+OTHERWISE = {"Inspect": "&source=building&pixel=[30,20]"}
+"""What the address of a page says besides its name."""
+
+
+@pytest.mark.parametrize("name", [each.name for each in PAGES])
+def test_a_page_opens_first_has_plots_that_can_be_read_and_is_used(page, address, name):
+    opened = page(f"{address}?page={name}{OTHERWISE.get(name, '')}", ready=".bk-Figure")
+    expect_readable(opened, name)
+    JOURNEYS[name](opened)

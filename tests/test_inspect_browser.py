@@ -1,4 +1,4 @@
-"""The Inspect page in a browser, on the simulated building and on the 21 km capture.
+"""The Inspect page in a browser.
 
 Expected numbers are computed by `core`.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -17,11 +18,10 @@ from playwright.sync_api import Locator, Page, expect
 import core
 from app.model.state import Illumination
 from app.pages.inspect import text
-from app.pages.inspect.results import SHARES
 from core import Capture, RangeImage, inspection
-from tests.browser import VIEWS, choose, enter, eventually, fact, field, slider, upload
+from tests.browser import VIEWS, choose, enter, eventually, fact, field, slider
 from tests.browser import image as picture
-from tests.test_downloads import columns_of, download, rows_of
+from tests.test_downloads import columns_of, download
 from tests.test_lasting import here as address_of
 from tests.test_lasting import rests
 
@@ -30,9 +30,8 @@ pytestmark = pytest.mark.browser
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A capture, and the address of a page that shows it or to which it is uploaded."""
+    """A capture, and what is expected of it."""
 
-    address: str
     capture: Capture
     image: RangeImage
     name: str
@@ -51,14 +50,15 @@ def ranged(capture: Capture) -> RangeImage:
     return core.run(capture, "tracking", core.TrackingParameters()).image
 
 
-@pytest.fixture(scope="module")
-def facade(address: str) -> Subject:
-    """The simulated building."""
+@cache
+def simulated_building() -> Subject:
     scene, illumination = core.scenes["building"](), Illumination()
     acquisition = illumination.acquisition(scene.acquisition)
     capture = core.simulate(scene, acquisition, illumination.flux, seed=illumination.seed)
-    address = f"{address}?source=building&page=Inspect&pixel=[30,20]"
-    return Subject(address, capture, ranged(capture), "building", (30, 20))
+    return Subject(capture, ranged(capture), "building", (30, 20))
+
+
+LINK = "?source=building&page=Inspect&pixel=[30,20]"
 
 
 # -- parts of the page -----------------------------------------------------------------------------
@@ -181,12 +181,6 @@ def expect_pixel(page: Page, subject: Subject) -> None:
     report = inspection.pixel_report(capture, subject.image, row, col, "tracking", tracking)
     for name, found in zip(("Signal S", "Background B", "SBR"), report.flux, strict=True):
         expect(fact(page, name)).to_have_text(text.interval(found))
-    name, table = download(page, "numbers", "csv")
-    assert name == f"{subject.name}_tracking_numbers-row{row}-col{col}.csv"
-    saved = {row["quantity"]: row for row in rows_of(table)}["SBR"]
-    sbr = report.flux.sbr
-    ends = [float(saved[end]) for end in ("value", "low", "high")]
-    assert ends == pytest.approx([sbr.value, sbr.low, sbr.high])
     counts = re.compile(rf"^{capture.counts[row, col]:,}( \(.* %\))?$")
     expect(fact(page, "Detections")).to_have_text(counts)
     verdict = f"Verdict: {report.verdict.health}. {report.verdict.why}"
@@ -227,16 +221,15 @@ def is_mapped(page: Page, values: np.ndarray) -> bool:
 
 
 def expect_maps(page: Page, subject: Subject) -> None:
+    """Expect maps of each kind, and that of the estimate saved."""
     capture, image = subject.capture, subject.image
     expected = {
-        "Counts": capture.counts,
         "Confidence": np.where(image.valid, image.confidence, np.nan),
-        **{name: find(capture) for name, find in inspection.maps.items()},
+        "SBR": inspection.maps["SBR"](capture),
         "Estimate": subject.visible_m,
     }
     if capture.truth_range_m is not None:
-        error_m = subject.visible_m - capture.truth_range_m
-        expected = {"Truth": capture.truth_range_m, "Error": error_m, **expected}
+        expected = {"Error": subject.visible_m - capture.truth_range_m, **expected}
     for name, values in expected.items():
         choose(page, "Map", name)
         eventually(lambda values=values: is_mapped(page, values))
@@ -272,6 +265,7 @@ def expect_fewer_pulses(page: Page, capture: Capture) -> None:
 
 
 def expect_all(page: Page, subject: Subject) -> None:
+    """Expect pixel, maps and report of a capture, and fewer pulses on request."""
     expect(button(page, "Inspect")).to_have_attribute("aria-pressed", "true")
     expect_pixel(page, subject)
     expect_maps(page, subject)
@@ -280,22 +274,8 @@ def expect_all(page: Page, subject: Subject) -> None:
     expect_fewer_pulses(page, subject.capture)
 
 
-def test_a_scene_is_shown_as_core_computes_it(page, facade):
-    expect_all(page(facade.address), facade)
-
-
-def test_an_uploaded_capture_without_truth_is_shown_as_core_computes_it(
-    page, address, real_capture
-):
-    path = real_capture("21km_K11_night.mat")
-    capture = core.read_capture(path)
-    page = page(f"{address}?page=Inspect")
-    upload(page, path.name, path.read_bytes())
-    expect(page.get_by_text("Matched filter: the capture holds all photons")).to_be_visible()
-    choose(page, "Method", "Dual-scale tracking differentiator")
-    for name in ("Row", "Column"):  # the middle; written late, it would replace an entry
-        expect(field(page, name)).to_have_value(re.compile(r"^1\d\d$"))
-    expect_all(page, Subject(address, capture, ranged(capture), path.stem, (100, 190)))
+def inspect_the_building(page: Page) -> None:
+    expect_all(page, simulated_building())
 
 
 # -- the pixel -------------------------------------------------------------------------------------
@@ -317,8 +297,9 @@ def note_paints(page: Page) -> None:
     )
 
 
-def test_keys_taps_and_fields_move_the_pixel_and_the_zoom_stays(page, facade):
-    page, (row, col) = page(facade.address), facade.pixel
+def move_the_pixel(page: Page, facade: Subject) -> None:
+    """Move the pixel by keys, taps and fields; the zoom stays."""
+    row, col = facade.pixel
     eventually(lambda: is_mapped(page, facade.visible_m))  # else its paint would count
     picture(page).press("Shift+ArrowDown")
     expect(fact(page, "Pixel")).to_have_text(f"{row + 8}, {col}")
@@ -392,15 +373,10 @@ def expect_sum_of_dragged(page: Page, subject: Subject, mode: str) -> None:
         ".data_source.get_array(of)[0]])",
     )
     np.testing.assert_allclose(np.transpose(outline), region, atol=0.01)
-    name, content = download(page, "counts", "csv")
-    rows, cols = np.nonzero(inside)
-    place = f"rows{rows.min()}-{rows.max()}_cols{cols.min()}-{cols.max()}"
-    assert name == f"{subject.name}_{place}_tracking_counts-region.csv"
-    np.testing.assert_array_equal(columns_of(content)["counts"][: sum_of_all.size], sum_of_all)
 
 
-def test_regions_are_dragged_outlined_and_summed(page, facade):
-    page = page(facade.address)
+def drag_regions_and_a_line(page: Page, facade: Subject) -> None:
+    """Drag on the map; at last without the server."""
     for mode in DRAGS:
         expect_sum_of_dragged(page, facade, mode)
     clear_region(page)
@@ -429,8 +405,9 @@ def expect_every_unit(page: Page) -> None:
             assert in_figure(page, each, axes) == [title]
 
 
-def test_pixels_are_pinned_and_compared_shown_in_every_unit_and_read_out(page, facade):
-    page, (row, col) = page(facade.address), facade.pixel
+def pin_pixels(page: Page, facade: Subject) -> None:
+    """Pin pixels and compare them, and show one in every unit."""
+    row, col = facade.pixel
     picture(page).focus()
     pins = [(row, col + n) for n in range(4)]
     names = [f"{row}, {col}" for row, col in pins]
@@ -467,11 +444,23 @@ def test_pixels_are_pinned_and_compared_shown_in_every_unit_and_read_out(page, f
     tip = page.locator(".bk-Tooltip").filter(visible=True)
     for each in ("Large scale", re.compile(r"\d ns"), re.compile(r"\d m")):
         expect(tip).to_contain_text(each)
+    page.mouse.move(0, 0)
+    expect(tip).to_have_count(0)
+    expect(field(page, "Column")).to_have_value(str(col + 4))  # late, it would replace an entry
+    enter(page, "Column", str(col))
+    expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
 
 
-def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other(page, facade):
+def test_pixels_are_pinned_and_moved_and_regions_are_dragged(page, address):
+    opened, facade = page(f"{address}{LINK}"), simulated_building()
+    pin_pixels(opened, facade)
+    move_the_pixel(opened, facade)
+    drag_regions_and_a_line(opened, facade)
+
+
+def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other(page, address):
     region = "[[20,20],[20,40],[40,40],[40,20]]"
-    link = f"{facade.address}&subject=Region&region={region}&pins=[[30,20],[30,21]]"
+    link = f"{address}{LINK}&subject=Region&region={region}&pins=[[30,20],[30,21]]"
     page = page(link, width=390, height=844)
     expect(fact(page, "Pixels")).to_have_text("441")
     expect(page.get_by_text("Computing")).to_have_count(0)
@@ -501,53 +490,3 @@ def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other
     button(page, "Region").click()
     clear_region(page)
     rests(page, "pins=[[30,21]]")
-
-
-# -- the capture as a whole ------------------------------------------------------------------------
-
-
-def test_accuracy_is_studied_with_a_progress_bar_and_suggestions_are_applied(page, facade):
-    page, capture = page(f"{facade.address}&subject=Capture"), facade.capture
-    done = page.get_by_text(re.compile("^Done: 8"))
-    expect(done).to_be_visible()
-    *_, bar = page.get_by_role("progressbar").filter(visible=True).all()
-    bar.evaluate("""(bar) => {
-      window.seen = [];
-      new MutationObserver(() => seen.push(Number(bar.ariaValueNow)))
-        .observe(bar, { attributeFilter: ["aria-valuenow"] });
-    }""")
-    described_button(page, "Compute").click()
-    eventually(lambda: page.evaluate("seen.at(-1)") == 100)
-    shares = page.evaluate("seen")
-    assert shares == sorted(shares)
-    assert any(0 < each < 100 for each in shares)
-    expect(done).to_be_visible()
-    title = "Accuracy against number"
-    near, taken = (drawn(page, title, "points", column) for column in ("value", "pulses"))
-    expected = inspection.accuracy_over_pulses(
-        capture, (SHARES[4], 1.0), "tracking", core.TrackingParameters()
-    )
-    np.testing.assert_allclose(near[[4, 7]], [each.within.value for each in expected])
-    np.testing.assert_allclose(taken, np.multiply(SHARES, capture.acquisition.n_pulses or 1))
-
-    suggested = inspection.capture_report(capture).suggestion
-    first, end = suggested.gate
-    for shown in (
-        f"Suggested gate, in bins: {first} to {end}. {suggested.why_gate}",
-        f"Suggested T_n, in bins: {suggested.t_n}. {suggested.why_t_n}",
-    ):
-        expect(page.get_by_text(shown)).to_be_visible()
-    apply_t_n, apply_gate = (
-        described_button(page, f"Apply {name}") for name in ("T_n", "the gate")
-    )
-    t_n = slider(page, "T_n (bins)")
-    for _ in range(2):  # one of them is not the one that is suggested
-        t_n.press("PageUp")
-    apply_t_n.click()
-    expect(t_n).to_have_attribute("aria-valuetext", f"{suggested.t_n} bins")
-    expect(apply_t_n).to_be_disabled()
-    apply_gate.click()
-    rows, cols = capture.shape
-    expect(page.get_by_text(f"{rows} × {cols} pixels, {end - first} bins")).to_be_visible()
-    within_gate = core.reductions.cut_gate(capture, first, end)
-    expect(fact(page, "Detections")).to_have_text(f"{within_gate.counts.mean():.4g}")

@@ -1,24 +1,8 @@
-"""The stopwatch of ``python -m tests.latency`` measures; how fast the app is, is not tested."""
+"""The table of ``python -m tests.latency``; `tests.test_patches` uses its stopwatch."""
 
 from __future__ import annotations
 
-from dataclasses import astuple
-
-import numpy as np
-import pytest
-
-from tests.latency import STOPWATCH, Move, as_markdown, moves
-
-pytestmark = pytest.mark.browser
-
-
-def test_each_move_is_timed_from_the_key_to_the_last_stroke(page):
-    new = page(prepare=STOPWATCH)
-    taken = moves(new, "SBR", 3)
-    assert len(taken) == 3
-    for move in taken:
-        assert np.isfinite(astuple(move)).all()
-        assert 0 < move.server <= move.plots <= move.everything
+from tests.latency import Move, as_markdown
 
 
 def test_the_table_has_medians_and_95th_percentiles():

@@ -375,20 +375,20 @@ def compare_pictures_at_a_pixel(here: Page) -> None:
 
 
 def expect_a_phone_to_show_figure_and_sliders(here: Page) -> None:
+    """Expect the sidebar to stay closed on the next page, too."""
     here.set_viewport_size({"width": 390, "height": 844})
-    here.reload()
+    go(here, "Figures 1, 2")
     above, below = slider(here, "SBR"), figure(here, "background alone")
     expect(below).to_be_visible()
     eventually(lambda: bottom(above) <= below.bounding_box()["y"])
     here.get_by_role("button", name="Explore", exact=True).click()
     expect(here.get_by_text(re.compile("^simulated, seed 0"))).to_be_visible()
     here.wait_for_function("Bokeh.documents[0].is_idle")
-    expect(here.get_by_role("button", name="Open drawer")).to_be_visible()  # it is not open
+    expect(here.get_by_role("button", name="Open drawer")).to_be_visible()
+    expect(slider(here, "SBR")).not_to_be_in_viewport()
 
 
-@pytest.mark.browser
-def test_what_the_paper_reports_is_computed_and_shown_part_by_part(page, address):
-    here = page(f"{address}?page=Paper", ready=".bk-Figure")
+def read_part_by_part(here: Page) -> None:
     expect(figure(here, "background alone")).to_be_visible()
     assert download(here, "curves", "csv")[0] == "paper_figure_1.csv"
     move_the_slider_of_figure_5(here)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import gc
 import json
+import math
 import re
 import weakref
 from pathlib import Path
@@ -24,9 +24,8 @@ from app.server.patches import OFF_VARIABLE, PATCHES, Patch, in_use
 from app.server.patches.default_values import cached
 from app.server.patches.outgoing_messages import INLINE_BYTES, QuickSerializer
 from app.server.patches.removed_models import PartialDeserializer
-from tests.broken import WHEN_TAPPED
-from tests.browser import ROOT, fact, open_page, serving, slider
-from tests.load import opened
+from tests.browser import fact, open_page, serving
+from tests.latency import STOPWATCH, moves
 
 FOLDER = Path(app.server.patches.__file__).parent
 
@@ -62,10 +61,10 @@ def test_a_patch_for_another_version_is_left_out_with_a_warning(caplog):
 @pytest.mark.browser
 def test_the_app_works_with_all_patches_off(browser):
     with serving(**{OFF_VARIABLE: "all"}) as address:
-        page = open_page(browser, address)
+        page = open_page(browser, address, prepare=STOPWATCH)
         rmse = fact(page, "RMSE").inner_text()
-        for _ in range(5):
-            slider(page, "SBR").press("ArrowRight")
+        for move in moves(page, "SBR", 3):  # timed from the key to the last stroke
+            assert 0 < move.server <= move.plots <= move.everything < math.inf
         expect(fact(page, "RMSE")).not_to_have_text(rmse)
         for name in ("Inspect", "Compare"):
             page.get_by_role("button", name=name, exact=True).click()
@@ -161,30 +160,6 @@ def test_only_events_of_removed_models_are_dropped(document, monkeypatch):
     with pytest.raises(UnknownReferenceError, match="never-there"):
         document.apply_json_patch(patch(**{present.id: 6, "never-there": 7}))
     assert present.start == 4
-
-
-def test_an_error_in_a_callback_of_bokeh_is_shown_without_a_traceback():
-    async def tap(address):
-        wire, _ = await opened(address, seed=0)
-        image = next(
-            key
-            for key, model in wire.models.items()
-            if model["name"] == "Figure"
-            and model["attributes"]["title"]["attributes"]["text"].startswith("Estimated")
-        )
-        row, col = WHEN_TAPPED
-        alert = wire.find("Sentence", warning=True), "text"
-        await wire.emit("tap", image, {"x": col, "y": row, "sx": 1, "sy": 1})
-        async with asyncio.timeout(60), wire.news:
-            await wire.news.wait_for(lambda: wire.values.get(alert) and wire.troubles)
-        wire.close()
-        return wire.values[alert], *wire.troubles
-
-    with serving(module="tests.broken") as address:
-        sentence, error = asyncio.run(tap(address))
-    assert "KeyError" in sentence
-    assert "The error is shown in the app." in error
-    assert str(ROOT) not in error
 
 
 def test_frozen_objects_are_collected_with_all_others():

@@ -28,7 +28,7 @@ from core.scene import parts_of
 from core.studies.sensitivity import numbers
 from core.studies.tradeoff import Cancelled, best_within, cheapest_reaching, pareto_front
 from tests.browser import chosen, eventually
-from tests.threads import HeldTasks, control
+from tests.threads import HeldTasks, change, control
 
 
 def ignored(_done, _of):
@@ -43,13 +43,6 @@ def never():
 def session():
     """A session on the car, its page's thread in the hands of the test."""
     return Session(built_in_sources(), tasks=HeldTasks())
-
-
-def change(session, **chosen):
-    """Change the state, and wait for the estimate."""
-    before = session.answer
-    session.state.param.update(**chosen)
-    session.tasks.run_until(lambda: session.answer is not before)
 
 
 @pytest.fixture(scope="module")
@@ -100,11 +93,14 @@ def test_cancelled_work_is_not_drawn_and_the_next_is():
     work = Piece()
     work.piece.start()
     eventually(lambda: work.sentence == "1 of 4 steps.")
+    _, bar, _ = work.piece.controls
+    assert bar.value == 25
     work.piece.cancel()
     assert work.sentence == "Stopped after 1 of 4 steps."
     work.piece.start()
     work.leave.set()
     eventually(lambda: work.sentence == "Done: 4 steps.")
+    assert bar.value == 100
     assert work.drawn == ["result"]
     assert work.shown == []
 
@@ -308,9 +304,8 @@ def test_every_setting_of_a_method_is_swept(session):
 # -- in a browser ----------------------------------------------------------------------------------
 
 
-@pytest.mark.browser
-def test_the_page_starts_with_a_study_whose_configurations_are_opened_by_a_click(page, address):
-    here = page(f"{address}?page=Trade-off", ready="text=All methods are measured")
+def open_a_configuration(here):
+    """Open a configuration of the study with which the page starts."""
     # On the page and in the sidebar.
     done = here.get_by_text(re.compile("^Done: ")).first
     expect(done).to_be_visible(timeout=300_000)  # 120 images, on a machine that may be busy
