@@ -35,7 +35,7 @@ _GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
 _FEWEST = 5.0  # expected counts of a group, for a normal sum
 _STEPS_PER_BIN = 128  # delays at which an echo is tabulated
 _BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
-_AT_ONCE = 2**20  # counts whose residuals are computed together
+_AT_ONCE = 2**19  # counts whose residuals are computed together
 _SEED = np.uint64(0)
 
 

@@ -11,6 +11,7 @@ from scipy import stats
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture, Detection
+from core.estimators import estimate
 from core.inference.fit import SIGNIFICANCE, fit_in, fit_of, fit_p_values
 from core.trigger import draw_counts, rate_per_bin
 
@@ -83,6 +84,14 @@ def test_the_check_of_what_differs_fails(case: dict[str, object], failing: str) 
     assert getattr(found, failing).reason in found.remark
     if failing == "pixels":
         assert found.pixels.effect > 0.1
+
+
+@pytest.mark.compiled
+def test_estimates_carry_the_warning_where_the_model_does_not_hold() -> None:
+    ramp = drawn(shape=lambda x: 1 + 0.5 * x)
+    for capture, warning in ((ramp, fit_of(ramp).remark), (drawn(), "")):
+        made_by = estimate(capture, "peak").made_by
+        assert made_by is not None and made_by.remark == warning
 
 
 @pytest.mark.compiled
