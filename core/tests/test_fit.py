@@ -13,6 +13,7 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture, Detection
 from core.estimators import estimate
 from core.inference.fit import SIGNIFICANCE, fit_in, fit_of, fit_p_values
+from core.studies.methods.fit import CASES, LEAST_RIGHT, NULL_CASES, fit_table, outcome
 from core.trigger import draw_counts, rate_per_bin
 
 SIZE = 32  # rows and columns
@@ -92,6 +93,21 @@ def test_estimates_carry_the_warning_where_the_model_does_not_hold() -> None:
     for capture, warning in ((ramp, fit_of(ramp).remark), (drawn(), "")):
         made_by = estimate(capture, "peak").made_by
         assert made_by is not None and made_by.remark == warning
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("name", CASES)
+def test_confidence_is_right_or_the_capture_carries_the_warning(name: str) -> None:
+    found = outcome(name, CASES[name], range(1))
+    assert found.holds
+    assert not found.fits[0].fits or found.all_right.value >= LEAST_RIGHT
+    assert fit_table([found]).rows[0][:4] == (name, CASES[name].scene, "0.06", 1)
+
+
+@pytest.mark.compiled
+def test_warnings_are_rare_where_the_model_holds() -> None:
+    fits = [fit_of(case.capture(seed)).fits for case in NULL_CASES for seed in range(2)]
+    assert fits.count(False) <= stats.binom.isf(RARE, len(fits), SIGNIFICANCE)
 
 
 @pytest.mark.compiled
