@@ -7,6 +7,9 @@ gate are then binomial in the pulses still armed (Poisson if all photons are cou
 of earlier windows. A randomized quantile residual (Dunn & Smyth 1996) turns each into a standard
 normal number, for any number of photons, and the sum of their squares gives the p-value of a pixel.
 
+A draw leaves out the first and the last thousandth of an echo, so that echoes of 10⁷ photons never
+fit.
+
 Residuals of many pixels together show what one pixel cannot: those away from the echoes, by bin of
 the gate, the shape of the background, those around the echoes the shape of the pulse.
 """
@@ -301,10 +304,10 @@ def _check(reason: str, difference: Floats, variance: Floats, free: Floats) -> C
     """
     enough = variance >= _FEWEST
     freedom = int(np.count_nonzero(enough)) - len(free)
-    if freedom < 1:
-        return Check(reason.format(0.0), 1.0, 0.0)
     scale = np.sqrt(variance[enough])
     shapes = free[:, enough] / scale
+    if freedom < 1 or not shapes.any(axis=1).all():  # too few counts for a test
+        return Check(reason.format(0.0), 1.0, 0.0)
     basis = scipy.linalg.orth((shapes / np.linalg.norm(shapes, axis=1, keepdims=True)).T)
     normal = difference[enough] / scale
     rest = normal - basis @ (basis.T @ normal)
