@@ -7,13 +7,13 @@ BIN := $(VENV)/bin
 
 # Tests of what has kernels run as plain Python, too: there their lines count as covered, and an index
 # out of bounds is an error.
-KERNELS := blocks capture detection estimators inspection matlab more_estimators posterior \
+KERNELS := blocks capture detection estimators fit inspection matlab more_estimators posterior \
 	reductions simulate spatial speed tracking
 
 # Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform tuning calibration results field large fuzz attack wheel clean
+.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform tuning calibration fit results field large fuzz attack wheel clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z0-9]*\):.* ## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -64,11 +64,15 @@ tuning: $(VENV)/.app ## the same search for the settings of every method
 calibration: $(VENV)/.app ## are confidences and intervals right as often as they say?
 	$(BIN)/python -m core calibration
 
+fit: $(VENV)/.app ## are confidences right, or marked, where the model does not hold?
+	$(BIN)/python -m core fit
+
 results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core paper --repetitions 100 --results assets/results/paper.md
 	$(BIN)/python -m core uniform --results assets/results/uniform.md
 	$(BIN)/python -m core tuning --results assets/results/tuning.md
 	$(BIN)/python -m core calibration --results assets/results/calibration.md
+	$(BIN)/python -m core fit --results assets/results/fit.md
 	$(BIN)/python -m core tradeoff --results assets/results/tradeoff.md
 	$(BIN)/python -m core speed --results assets/results/speed.md
 	$(BIN)/python -m core stability --results assets/results/sensitivity.md

@@ -11,7 +11,7 @@ from typing import Any
 from core.cli.options import add_processes, show_progress, whole_from_to
 from core.cli.results import CheckFailed, add_results, publish
 from core.io.readers import read_capture
-from core.studies.methods import calibration, field, tuning, uniform
+from core.studies.methods import calibration, field, fit, tuning, uniform
 from core.studies.outputs import as_markdown
 from core.studies.paper import figures as paper
 from core.studies.paper import page, recommend
@@ -57,6 +57,11 @@ def add(commands: Any) -> None:
         "of the fluxes (all)",
     )
     add_processes(command)
+
+    command = _added(
+        commands, "fit", "compare confidences with errors where the model does not hold", _fit
+    )
+    _add_count(command, "--seeds", 1, MAX_SEEDS, 15)
 
     command = _added(commands, "field", "compare methods on published captures", _field)
     command.add_argument("captures", type=Path, help="the folder that holds them")
@@ -139,6 +144,13 @@ def _calibration(chosen: argparse.Namespace) -> None:
         "fluxes": lambda: calibration.flux_table(chosen.captures, chosen.processes),
     }
     publish((tables[name]() for name in chosen.only), chosen)
+
+
+def _fit(chosen: argparse.Namespace) -> None:
+    found = list(fit.outcomes(range(chosen.seeds)))
+    publish([fit.fit_table(found)], chosen)
+    if failed := [f"{each.name}: see the table." for each in found if not each.holds]:
+        raise CheckFailed("\n".join(failed))
 
 
 def _field(chosen: argparse.Namespace) -> None:

@@ -16,6 +16,7 @@ from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.deprecation import renamed
 from core.geometry import Box
+from core.inference.fit import fit_of
 from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
@@ -48,7 +49,7 @@ class Provenance:
     false_alarm : float, optional
         As for `core.estimate`.
     remark : str
-        Limits of the method's model, see `Estimator.remark`.
+        Limits of the model, see `Estimator.remark`.
     least_confidence : float, optional
         Estimates of less confidence have been removed, see `RangeImage.confident`.
     box : Box, optional
@@ -88,7 +89,8 @@ class RangeImage:
         Posterior probability of a surface within 3 bins of the estimate, from the exact
         first-photon likelihood and the fluxes estimated from the capture
         (`core.inference.posterior`). It is calibrated for every estimator: of pixels with
-        confidence 0.9, nine in ten are right. 0 where `valid` is False.
+        confidence 0.9, nine in ten are right, unless the remark of `made_by` says that the model
+        does not fit (`core.inference.fit`). 0 where `valid` is False.
     valid : ndarray of bool
         Whether the pixel has an estimate.
     made_by : Provenance, optional
@@ -269,8 +271,11 @@ class Estimator:
         return self.ranged(capture, parameters, self.calibration(capture, parameters, false_alarm))
 
     def remark(self, capture: Capture) -> str:
-        """Return which corrections the estimator leaves out for a capture; empty if none."""
-        clauses = [self.omits(capture)]
+        """Return why confidences mislead and which corrections are left out; empty if none.
+
+        Clauses are separated by semicolons.
+        """
+        clauses = [fit_of(capture).remark, self.omits(capture)]
         if self.undoes_pile_up and capture.gated_pulses is None:
             known = capture.detection == "all"
             why = "the capture holds all photons" if known else "the number of pulses is not known"

@@ -1,5 +1,6 @@
 """Inference from photon counts: signal and background fluxes, posterior, physical limits."""
 
+from core.inference.fit import Fit, fit_in, fit_of, fit_p_values
 from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_prior_of
 from core.inference.flux_model import FluxModel, FluxPrior
 from core.inference.intervals import RangeInterval, pixel_range_intervals, range_interval
@@ -16,11 +17,15 @@ from core.inference.posterior import (
 __all__ = [
     "TOLERANCE_BINS",
     "Conditions",
+    "Fit",
     "FluxModel",
     "FluxPrior",
     "Posterior",
     "RangeInterval",
     "detailed_flux_prior_of",
+    "fit_in",
+    "fit_of",
+    "fit_p_values",
     "flux_model_of",
     "flux_prior_of",
     "has_posterior",

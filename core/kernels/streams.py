@@ -30,3 +30,14 @@ def uniform_at(key, draw):  # type: ignore[no-untyped-def]
     """Uniform number in [0, 1) at position `draw` of a stream."""
     state = key + np.uint64(draw) * np.uint64(0x9E3779B97F4A7C15)
     return np.float64(_splitmix64(state) >> np.uint64(11)) * 2.0**-53
+
+
+@njit(**COMPILED)
+def uniforms(seed, pixels, first, n):  # type: ignore[no-untyped-def]
+    """Numbers at the positions from `first` of the streams of pixels (pixel,), (pixel, n)."""
+    numbers = np.empty((pixels.size, n))
+    for i in range(pixels.size):
+        key = pixel_key(seed, pixels[i])
+        for j in range(n):
+            numbers[i, j] = uniform_at(key, first + j)
+    return numbers

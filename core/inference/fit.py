@@ -1,0 +1,326 @@
+"""Goodness of fit of the model behind every confidence: one echo of the pulse, flat background.
+
+A delay and fluxes are drawn from the posterior of each pixel. If the model holds, the counts given
+such a draw are distributed as given the true values (Johnson 2004), so that no allowance is needed
+for what is estimated, nor for delays that no histogram determines. The counts of a window of the
+gate are then binomial in the pulses still armed (Poisson if all photons are counted), independently
+of earlier windows. A randomized quantile residual (Dunn & Smyth 1996) turns each into a standard
+normal number, for any number of photons, and the sum of their squares gives the p-value of a pixel.
+
+A draw leaves out the first and the last thousandth of an echo, so that echoes of 10⁷ photons never
+fit.
+
+Residuals of many pixels together show what one pixel cannot: those away from the echoes, by bin of
+the gate, the shape of the background, those around the echoes the shape of the pulse.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # loads a submodule when it is first used
+from numpy.typing import NDArray
+
+from core.acquisition import Floats
+from core.capture import Capture, cached_per_capture
+from core.inference.flux import SAMPLE, flux_model_of
+from core.inference.likelihood import LikelihoodInput, delay_densities, pixels_of, prepare
+from core.kernels.echo_draws import UNIFORMS, redraw
+from core.kernels.parallel import entering
+from core.kernels.streams import uniforms
+
+SIGNIFICANCE = 0.01
+"""Probability that a capture which the model describes is taken for one that it does not."""
+
+_WINDOWS = 16  # of the gate, at most, whose counts are tested in each pixel
+_GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
+_FEWEST = 5.0  # expected counts of a group, for a normal sum
+_STEPS_PER_BIN = 128  # delays at which an echo is tabulated
+_BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
+_AT_ONCE = 2**19  # counts whose residuals are computed together
+_SEED = np.uint64(0)
+
+
+class Check(NamedTuple):
+    """One way in which counts can contradict the model."""
+
+    reason: str
+    """The contradiction and its size, as a clause."""
+    p_value: float
+    """Probability of residuals as large if the model holds."""
+    effect: float
+    """Size of the deviation, see `Fit`."""
+
+
+class Fit(NamedTuple):
+    """Whether one echo of the pulse over a flat background describes some pixels of a capture.
+
+    Effects of `background` and `pulse` are noise-weighted root mean squares.
+    """
+
+    background: Check
+    """Effect: deviation of the background over the gate, relative to its mean."""
+    pulse: Check
+    """Effect: deviation of the echoes from the pulse, relative to the pulse."""
+    pixels: Check
+    """Effect: share of the pixels that do not fit, beyond those expected by chance."""
+
+    @property
+    def failed(self) -> tuple[Check, ...]:
+        """Checks that contradict the model; all three together do so wrongly in 1 % of captures."""
+        return tuple(each for each in self if each.p_value < SIGNIFICANCE / len(self))
+
+    @property
+    def fits(self) -> bool:
+        """Whether no check contradicts the model."""
+        return not self.failed
+
+    @property
+    def remark(self) -> str:
+        """A clause on confidences; empty if the model fits."""
+        reasons = ", and ".join(check.reason for check in self.failed)
+        return reasons and f"confidences are not to be relied on: {reasons}"
+
+
+@cached_per_capture
+def fit_of(capture: Capture) -> Fit:
+    """Test the model on the pixels from which the fluxes are estimated; on fewer in a long gate."""
+    drawn = np.random.default_rng(0).permutation(capture.counts.size)[:SAMPLE]
+    at_most = max(1, _AT_ONCE // capture.acquisition.n_bins)
+    return fit_in(capture, np.sort(drawn[:at_most]))
+
+
+def fit_in(capture: Capture, pixels: NDArray[np.intp]) -> Fit:
+    """Test the model on pixels given as flat indices (pixel,), at least one."""
+    residuals = _residuals(capture, pixels)
+    return Fit(
+        _background(capture, residuals),
+        _pulse(capture, residuals),
+        _pixels(_p_values(capture, residuals)),
+    )
+
+
+@cached_per_capture
+def fit_p_values(capture: Capture) -> Floats:
+    """P-value of each pixel, shape (row, col): uniform if the model holds."""
+    every, n_bins = np.arange(capture.counts.size), capture.acquisition.n_bins
+    parts = np.array_split(every, -(-every.size * n_bins // _AT_ONCE))
+    found = [_p_values(capture, _residuals(capture, part)) for part in parts]
+    return np.concatenate(found).reshape(capture.shape)
+
+
+class _Residuals(NamedTuple):
+    """Counts and what the model expects of them for drawn delays and fluxes; (pixel, bin)."""
+
+    pixels: NDArray[np.intp]
+    """Flat indices, (pixel,)."""
+    delay_bin: Floats
+    """(pixel,), NaN for no echo."""
+    counts: Floats
+    armed: Floats
+    """Pulses armed in each bin, 1 if the number of pulses is unknown."""
+    background: Floats
+    """Photons per pulse in each bin."""
+    signal: Floats
+    expected: Floats
+    """Counts expected of the armed pulses."""
+    variance: Floats
+
+    @property
+    def difference(self) -> Floats:
+        """Counts minus expected ones: not correlated, with mean 0 if the model holds."""
+        return self.counts - self.expected
+
+
+def _residuals(capture: Capture, pixels: NDArray[np.intp]) -> _Residuals:
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
+    cube = capture.cube.reshape(-1, n_bins)[pixels]
+    delay_bin, signals, backgrounds = _drawn(capture, pixels, cube)
+    counts, background = cube.astype(float), np.repeat(backgrounds[:, np.newaxis], n_bins, axis=1)
+    share = capture.pulse.bin_probability(delay_bin, n_bins, capture.acquisition.bin_width_s)
+    signal = signals[:, np.newaxis] * share
+    rate = signal + background
+    armed, fires = np.ones_like(counts), rate
+    if n_pulses is not None:
+        armed, fires = n_pulses - np.cumsum(counts, axis=1) + counts, -np.expm1(-rate)
+    expected = armed * fires
+    variance = expected if n_pulses is None else expected * (1 - fires)
+    return _Residuals(pixels, delay_bin, counts, armed, background, signal, expected, variance)
+
+
+def _drawn(
+    capture: Capture, pixels: NDArray[np.intp], cube: NDArray[np.unsignedinteger]
+) -> tuple[Floats, Floats, Floats]:
+    """Draw delay (NaN for no echo), signal, and background per bin of pixels, (pixel,) each."""
+    n_bins = cube.shape[1]
+    flux = flux_model_of(capture).of_pixels(pixels[np.newaxis])
+    prepared = prepare(capture, cube[np.newaxis], flux, 1)
+    delay_bin, level = _drawn_levels(prepared, uniforms(_SEED, pixels, UNIFORMS, 3))
+    every = np.arange(pixels.size)
+    signal, background = (each[level, 0, every] for each in (flux.signal, flux.background))
+    steps = np.linspace(0.0, 1.0, _STEPS_PER_BIN + 1)
+    echo, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, steps)
+    log_signal = np.log(np.where(level > 0, signal, 1.0))
+    state = np.stack([delay_bin, log_signal, np.log(background / n_bins)], axis=1)
+    with entering(cube.size):
+        redraw(
+            cube.astype(np.uint32), capture.gated_pulses or 0, pixels, echo, first, state
+        )  # compiled for one type of counts
+    return state[:, 0], np.exp(state[:, 1]), np.exp(state[:, 2])
+
+
+def _drawn_levels(prepared: LikelihoodInput, uniform: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Draw a delay from those of `delay_densities`, NaN for no echo, and its level of signal.
+
+    Takes three uniform numbers of each pixel, (pixel, 3); returns shapes (pixel,).
+    """
+    n_pixels, lanes, n_delays = len(uniform), prepared.counts.shape[2], prepared.depth.size
+    in_blocks = np.resize(uniform, (-(-n_pixels // lanes), lanes, 3))
+    delay_bin, level = np.empty(n_pixels), np.empty(n_pixels, np.intp)
+    for some, density, top, weighted in delay_densities(prepared):
+        unit = np.maximum(top, prepared.log_share[0])
+        before = np.cumsum(density, axis=1, dtype=float)
+        seen = np.exp(top - unit) * before[:, -1] / n_delays
+        for_echo, for_delay, for_level = np.moveaxis(in_blocks[some], -1, 0)
+        has_echo = for_echo * (seen + np.exp(prepared.log_share[0] - unit)) < seen
+        delay = _drawn_index(before, for_delay)
+        at = delay[:, np.newaxis, np.newaxis]
+        log = np.take_along_axis(weighted, at, axis=2)[:, :, 0].astype(float)
+        shares = np.cumsum(np.exp(log - log.max(axis=1, keepdims=True)), axis=1)
+        here = pixels_of(some, prepared, slice(0, n_pixels))
+        size = here.stop - here.start
+        delay_bin[here] = np.where(has_echo, delay + 0.5, np.nan).ravel()[:size]
+        level[here] = np.where(has_echo, 1 + _drawn_index(shares, for_level), 0).ravel()[:size]
+    return delay_bin, level
+
+
+def _drawn_index(cumulative: Floats, uniform: Floats) -> NDArray[np.intp]:
+    """Draw indices with cumulative weights (block, index, lane), shape (block, lane)."""
+    limit = (uniform * cumulative[:, -1])[:, np.newaxis]
+    return np.asarray((cumulative[:, :-1] <= limit).sum(axis=1))
+
+
+def _p_values(capture: Capture, residuals: _Residuals) -> Floats:
+    """P-value of each pixel, shape (pixel,)."""
+    n_bins = capture.acquisition.n_bins
+    n_windows = min(max(1, n_bins // capture.echo_bins), _WINDOWS)
+    first = np.arange(n_windows) * n_bins // n_windows
+    rate = residuals.signal + residuals.background
+    counts, mean = (np.add.reduceat(each, first, axis=1) for each in (residuals.counts, rate))
+    armed = None if capture.gated_pulses is None else residuals.armed[:, first]
+    uniform = uniforms(_SEED, residuals.pixels, UNIFORMS + 3, n_windows)
+    squares = _normal(counts, armed, mean, uniform) ** 2
+    return np.asarray(scipy.special.chdtrc(n_windows, squares.sum(axis=1)))
+
+
+def _normal(counts: Floats, armed: Floats | None, rate: Floats, uniform: Floats) -> Floats:
+    """Randomized quantile residuals of counts, binomial in armed pulses or Poisson if None.
+
+    From the shorter tail, so that none is infinite.
+    """
+    special = scipy.special
+    if armed is None:
+        is_low = counts < rate
+        beyond = np.where(
+            is_low, special.gammaincc(counts, rate), special.gammainc(counts + 1, rate)
+        )
+        log = special.xlogy(counts, rate) - rate - special.gammaln(counts + 1)
+    else:
+        fires, unfired = -np.expm1(-rate), armed - counts
+        is_low = counts < armed * fires
+        beyond = special.betainc(
+            np.where(is_low, unfired + 1, counts + 1),
+            np.where(is_low, counts, unfired),
+            np.where(is_low, 1 - fires, fires),
+        )
+        beyond = np.where(np.where(is_low, counts, unfired) > 0, beyond, 0.0)
+        log = special.gammaln(armed + 1) - special.gammaln(counts + 1)
+        log += special.xlogy(counts, fires) - rate * unfired - special.gammaln(unfired + 1)
+    tail = beyond + np.exp(log) * np.where(is_low, uniform, 1 - uniform)
+    normal = special.ndtri(np.clip(tail, np.finfo(float).tiny, 1.0))
+    return np.asarray(np.where(is_low, normal, -normal))
+
+
+def _background(capture: Capture, residuals: _Residuals) -> Check:
+    """Compare the background, away from echoes, with its mean over the gate."""
+    n_bins = capture.acquisition.n_bins
+    first, end = _echo_window(capture)
+    distance = (
+        np.arange(n_bins) - np.floor(residuals.delay_bin)[:, np.newaxis]
+    )  # NaN without an echo
+    away = ~((first <= distance) & (distance < end))
+    n_groups = min(n_bins, _GROUPS)
+
+    def pooled(values: Floats) -> Floats:
+        return _grouped((values * away).sum(axis=0), n_groups)
+
+    return _check(
+        "the background varies over the gate by {:.1%} of its mean",
+        pooled(residuals.difference),
+        pooled(residuals.variance),
+        pooled(residuals.expected)[np.newaxis],
+    )
+
+
+def _pulse(capture: Capture, residuals: _Residuals) -> Check:
+    """Compare the mean echo with the pulse."""
+    n_bins = capture.acquisition.n_bins
+    has_echo = np.isfinite(residuals.delay_bin)
+    offset = np.arange(*_echo_window(capture))
+    n_groups = min(offset.size, _GROUPS)
+    at = np.floor(residuals.delay_bin[has_echo]).astype(np.intp)[:, np.newaxis] + offset
+    inside, at = (at >= 0) & (at < n_bins), np.clip(at, 0, n_bins - 1)
+
+    def pooled(values: Floats) -> Floats:
+        around = np.take_along_axis(values[has_echo], at, axis=1) * inside
+        return _grouped(around.sum(axis=0), n_groups)
+
+    rate = residuals.signal + residuals.background
+    exposed = residuals.expected / rate
+    return _check(
+        "echoes differ from the pulse by {:.1%} of it (another pulse, jitter or motion)",
+        pooled(residuals.difference),
+        pooled(residuals.variance),
+        np.stack([pooled(residuals.signal * exposed), pooled(residuals.background * exposed)]),
+    )
+
+
+def _echo_window(capture: Capture) -> tuple[int, int]:
+    """First bin and end, relative to that of the delay, of echoes of the pulse or similar ones."""
+    length = capture.echo_bins
+    return -1 - _BEFORE * length, 2 + _BEHIND * length
+
+
+def _grouped(values: Floats, n_groups: int) -> Floats:
+    """Sums of neighbouring values (n,) in groups of equal size, shape (group,)."""
+    return np.asarray(np.add.reduceat(values, np.arange(n_groups) * values.size // n_groups))
+
+
+def _check(reason: str, difference: Floats, variance: Floats, free: Floats) -> Check:
+    """Test whether sums of residuals (group,) are 0 apart from multiples of `free` (n, group).
+
+    The effect is relative to the first of these, and `reason` has a place for it.
+    """
+    enough = variance >= _FEWEST
+    freedom = int(np.count_nonzero(enough)) - len(free)
+    scale = np.sqrt(variance[enough])
+    shapes = free[:, enough] / scale
+    if freedom < 1 or not shapes.any(axis=1).all():  # too few counts for a test
+        return Check(reason.format(0.0), 1.0, 0.0)
+    basis = scipy.linalg.orth((shapes / np.linalg.norm(shapes, axis=1, keepdims=True)).T)
+    normal = difference[enough] / scale
+    rest = normal - basis @ (basis.T @ normal)
+    squares = float(rest @ rest)
+    effect = float(np.sqrt(max(squares - freedom, 0.0)) / np.linalg.norm(shapes[0]))
+    p_value = float(scipy.special.chdtrc(freedom, squares))
+    return Check(reason.format(effect), p_value, effect)
+
+
+def _pixels(p_values: Floats) -> Check:
+    """Compare the number of pixels that do not fit with that expected by chance."""
+    failing, n = int(np.count_nonzero(p_values < SIGNIFICANCE)), p_values.size
+    p_value = float(scipy.stats.binom.sf(failing - 1, n, SIGNIFICANCE))
+    effect = max(failing / n - SIGNIFICANCE, 0.0)
+    reason = f"{effect:.1%} of the pixels differ from one echo, as by a second surface"
+    return Check(reason, p_value, effect)
