@@ -6,9 +6,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 # Tests of what has kernels run as plain Python, too: there their lines count as covered, and an index
-# out of bounds is an error.
-KERNELS := blocks capture detection estimators fit inspection matlab more_estimators posterior \
-	reductions simulate spatial speed tracking
+# out of bounds is an error. What is marked `compiled` is left out.
+KERNELS := blocks fit more_estimators posterior reductions refinement simulate speed tracking
 
 # Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
 unexport PYTHONDONTWRITEBYTECODE

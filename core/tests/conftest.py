@@ -61,14 +61,6 @@ def threads() -> Iterator[None]:
     numba.set_num_threads(before)
 
 
-@pytest.fixture(scope="module")
-def quick_draws() -> Iterator[None]:
-    """Draw captures with numpy's multinomial, which is fast without compiled kernels."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("core.simulation.PULSES_DRAWN_ONE_BY_ONE", 0)
-        yield
-
-
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[[str, bytes], Path]:
     """Function that writes a file with a given name and content."""

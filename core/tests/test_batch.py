@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -95,10 +96,20 @@ def test_a_failing_file_is_a_row_and_the_others_are_ranged(
     ]
 
 
-def test_files_are_ranged_in_parallel(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_are_ranged_in_parallel(
+    runs: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pools: list[int] = []
+
+    def threads(workers: int) -> ThreadPoolExecutor:
+        """Return a pool that starts no process."""
+        pools.append(workers)
+        return ThreadPoolExecutor(workers)
+
+    monkeypatch.setattr("core.cli.batch.process_pool", threads)
     given = ("runs/day/a.npz", "runs/night/*", "--json")
     one, both = (batch(capsys, *given, "--jobs", jobs) for jobs in ("1", "2"))
-    assert one[0] == both[0] == 1
+    assert one[0] == both[0] == 1 and pools == [2]
     without_times = [
         {file: {**row, "seconds": None} for file, row in json.loads(out).items()}
         for _, out, _ in (one, both)

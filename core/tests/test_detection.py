@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 from scipy import stats
@@ -20,9 +19,8 @@ from core.simulation import simulate
 
 pytestmark = pytest.mark.uncounted
 
-# Milliseconds a pixel where the kernels are plain Python.
-SIZE = 8 if numba.config.DISABLE_JIT else 40  # rows and columns of captures
-NULL_SIDE = 8 if numba.config.DISABLE_JIT else 64  # of the images on which thresholds are found
+SIZE = 40  # rows and columns of captures
+NULL_SIDE = 64  # of the images on which thresholds are found
 N_BINS = 40
 FOUR_SIGMA = float(stats.norm.sf(4))
 
@@ -37,7 +35,7 @@ def window_of(method: str) -> int:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _small_null_images(quick_draws: None) -> Iterator[None]:
+def _small_null_images() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(base, "NULL_SIDE", NULL_SIDE)
         yield
@@ -151,7 +149,7 @@ def test_a_false_alarm_rate_of_1_is_no_threshold(half: Capture, method: str) -> 
 @every_estimator
 def test_a_stricter_threshold_keeps_a_subset(half: Capture, method: str) -> None:
     looser = estimate(half, method)
-    for false_alarm in (0.5, 0.1, 0.01, 0.001):
+    for false_alarm in (0.1, 0.001):
         image = estimate(half, method, false_alarm=false_alarm)
         assert not (image.valid & ~looser.valid).any()
         for field in ("range_m", "bin", "confidence"):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import itertools
-import tracemalloc
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from core.capture import CaptureError
 from core.io.readers import frames, guards, read_capture
 from core.io.readers.frame_guess import resembles_frames
 from core.tests.captures import real_capture_path
+from core.tests.refusing import with_peak
 from core.tests.samples import CAMERA_CUBE, CUBE, frames_of, gmapd_bytes, npy_bytes, npz_bytes
 
 pytestmark = pytest.mark.files
@@ -200,13 +201,9 @@ def test_only_the_cube_must_fit(write: Write, monkeypatch: pytest.MonkeyPatch) -
         path = write(name, content)
         assert path.stat().st_size > 0.8 * limit
         options = {"no_trigger": -1} if name == "s.npy" else {}
-        read_capture(path, **options)  # imports what it needs
-        tracemalloc.start()
-        try:
-            capture = read_capture(path, **options)
-            peak = tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
+        read = partial(read_capture, path, **options)
+        read()  # imports what it needs
+        capture, peak = with_peak(read)
         assert capture.counts.sum() > 0
         assert peak < 8 * capture.cube.nbytes + 100 * 2**13
     with pytest.raises(CaptureError, match=r"bytes of frames = .* at most 524,288"):

@@ -28,7 +28,7 @@ from core.metrics import Interval, restored
 from core.reductions import cut_gate, share_of_pulses
 from core.scene import Scene, scenes
 from core.simulation import simulate
-from core.studies.methods.calibration import FLUX_REGIMES, FluxRegime
+from core.studies.methods.calibration import FLUX_REGIMES
 from core.tracking import TrackingParameters
 from core.trigger import draw_counts, rate_per_bin
 
@@ -62,9 +62,9 @@ def is_covered_often_enough(hits: int, trials: int) -> bool:
 def test_flux_intervals_cover_the_truth(signal: float, sbr: float, n_pulses: int) -> None:
     acquisition = replace(ACQUISITION, n_pulses=n_pulses)
     flux = Flux(signal, sbr) if signal else Flux(1.0, sbr)
-    scene = random_depths(12, acquisition=acquisition)
+    scene = random_depths(8, acquisition=acquisition)
     if not signal:
-        scene = replace(scene, range_m=np.full((12, 12), np.nan))
+        scene = replace(scene, range_m=np.full((8, 8), np.nan))
     capture = simulate(scene, acquisition, flux, seed=1)
     truth = (signal, flux.background, signal / flux.background)
     pixels = capture.cube.reshape(-1, acquisition.n_bins)
@@ -430,37 +430,33 @@ def _photons(scene: Scene, flux: Flux, capture: Capture, seed: int) -> Capture:
     ("scene", "flux", "n_pulses", "counting"),
     [
         (random_depths, Flux(0.2, 0.1), 400, False),
-        (random_depths, Flux(0.3, 2.0), 100, False),
-        (_reflecting, Flux(0.3, 0.5), 200, False),
         (_hot, Flux(0.3, 0.5), 200, False),
         (_reflecting, Flux(0.3, 0.5), 50, True),
     ],
-    ids=["dim", "clear", "half sky", "hot pixels", "unknown pulses"],
+    ids=["dim", "hot pixels", "half sky, unknown pulses"],
 )
 def test_mean_flux_intervals_cover_the_truth(
     scene: Callable[..., Scene], flux: Flux, n_pulses: int, counting: bool
 ) -> None:
-    acquisition, trials = replace(ACQUISITION, n_pulses=n_pulses), 16
-    hits, off = np.zeros(3, int), np.zeros(3)
-    for seed in range(trials):
+    """A few captures; ``make calibration`` measures the coverage of many regimes."""
+    acquisition = replace(ACQUISITION, n_pulses=n_pulses)
+    for seed in range(2):
         seen = scene(10, seed=seed)
         capture = simulate(seen, acquisition, flux, seed=seed)
         truth = np.array(_mean_flux_of(seen, flux))
         if counting:
             capture = _photons(seen, flux, capture, seed)
             truth[:2] *= n_pulses
-        for number, each in enumerate(inspection.estimate_mean_flux(capture)):
+        for each, true in zip(inspection.estimate_mean_flux(capture), truth, strict=True):
             assert each.low <= each.value <= each.high
-            hits[number] += covers(each, truth[number])
-            off[number] += (each.value - truth[number]) / (each.high - each.low) * 2 * 1.96
-    assert all(is_covered_often_enough(each, trials) for each in hits), hits
-    # No bias that as many captures show: each lies off by a standard deviation of 1 at most.
-    assert (np.abs(off) / math.sqrt(trials) < stats.norm.isf(SIGNIFICANCE / 2)).all(), off
+            # An interval of 95 %, made twice as long, misses once in ten thousand times.
+            below, above = each.value - each.low, each.high - each.value
+            assert each.value - 2 * below < true < each.value + 2 * above
 
 
-@pytest.mark.parametrize("regime", FLUX_REGIMES[2:4], ids=lambda regime: regime.pulse)
-def test_flux_depends_neither_on_the_pulse_nor_on_the_bins(regime: FluxRegime) -> None:
-    captures, truth = regime.captures(seed=3)
+def test_flux_depends_neither_on_the_pulse_nor_on_the_bins() -> None:
+    """Here the pulse has a tail; ``make calibration`` covers other pulses."""
+    captures, truth = FLUX_REGIMES[3].captures(seed=3)
     for of, true in zip(
         (inspection.estimate_mean_flux, inspection.estimate_target_flux), truth, strict=True
     ):
@@ -559,7 +555,7 @@ def _counts(shape: tuple[int, int, int], kind: str, n_pulses: int | None) -> np.
 
 @pytest.mark.parametrize("kind", ["empty", "full", "one"])
 @pytest.mark.parametrize("n_pulses", [1, 1000, None])
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 30), (5, 5, 1), (5, 6, 30)])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 5, 1), (5, 6, 30)])
 def test_extreme_captures_have_reports(
     shape: tuple[int, int, int], n_pulses: int | None, kind: str
 ) -> None:
@@ -596,9 +592,8 @@ def test_maps_are_of_each_pixel() -> None:
     assert inspection.maps["SBR"](capture) is inspection.maps["SBR"](capture)  # found once
 
 
-@pytest.mark.parametrize("name", ["building", "staircase"])
-def test_suggested_settings_improve_the_estimate(name: str) -> None:
-    scene = scenes[name](32)
+def test_suggested_settings_improve_the_estimate() -> None:
+    scene = scenes["building"](32)
     capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.05), seed=1)
     suggested = inspection.capture_report(capture).suggestion
     cut = cut_gate(capture, *suggested.gate)

@@ -23,6 +23,7 @@ from core.studies.methods.calibration import (
     flux_table,
 )
 from core.studies.methods.calibration import LEVELS as COVERED
+from core.tests.twins import log_likelihood
 from core.trigger import draw_counts, rate_per_bin
 
 pytestmark = pytest.mark.compiled
@@ -66,16 +67,13 @@ def twin(capture: Capture, row: int, col: int, estimate_bin: float, level: float
     counts, n_pulses = capture.cube[row, col].astype(float), capture.gated_pulses
     flux = flux_model_of(capture)
 
-    def log_likelihood(delay: np.ndarray, signal: float, background: float) -> np.ndarray:
+    def likelihood(delay: np.ndarray, signal: float, background: float) -> np.ndarray:
         echo = np.full(delay.shape, signal)
         rate = rate_per_bin(delay, echo, background, capture.pulse, capture.acquisition)
-        if n_pulses is None:
-            return (counts * np.log(rate) - rate).sum(axis=1)
-        unfired = n_pulses - np.cumsum(counts)
-        return (counts * np.log(-np.expm1(-rate)) - unfired * rate).sum(axis=1)
+        return log_likelihood(counts, rate, n_pulses)
 
     def log_density(delay: np.ndarray, levels: list[tuple[float, ...]]) -> np.ndarray:
-        of_levels = [np.log(w) + log_likelihood(delay, s, b) for w, s, b in levels]
+        of_levels = [np.log(w) + likelihood(delay, s, b) for w, s, b in levels]
         depth = flux.depth[np.minimum(delay.astype(int), N_BINS - 1)]
         return np.logaddexp.reduce(of_levels, axis=0) + np.log(depth)
 
@@ -92,7 +90,7 @@ def twin(capture: Capture, row: int, col: int, estimate_bin: float, level: float
         def loss(x: np.ndarray, start=(signal, background), sd: float = sd) -> float:
             s, b = np.exp(x) * start
             prior = ((s - start[0]) ** 2 + (b - start[1]) ** 2) / (2 * sd**2)
-            return float(prior - log_likelihood(best, s, b)[0])
+            return float(prior - likelihood(best, s, b)[0])
 
         found = optimize.minimize(loss, [0.0, 0.0], method="Nelder-Mead", tol=1e-9)
         s, b = np.exp(found.x) * (signal, background)
@@ -190,13 +188,12 @@ def is_covered(hits: float, trials: int, level: float) -> bool:
     ("regime", "method"),
     [
         (Regime("first", 1, 0.06), "tracking"),
-        (Regime("first", 5, 0.03), "likelihood"),
-        (Regime("all", 0.5, 3), "likelihood"),
-        (Regime("all", 2, 0.3), "tracking"),
+        (Regime("all", 2, 0.3), "likelihood"),
     ],
     ids=str,
 )
 def test_intervals_of_right_estimates_cover_the_truth(regime: Regime, method: str) -> None:
+    """``make calibration`` covers the other regimes."""
     found = coverage((regime, method, range(1)))
     assert found.right > 500
     for level, share in zip(COVERED, found.shares, strict=True):
@@ -244,7 +241,7 @@ def test_the_flux_study_has_a_row_for_each_regime_and_bin_width(
     monkeypatch.setattr(f"{study}.FLUX_REGIMES", FLUX_REGIMES[11:12])
     monkeypatch.setattr(f"{study}.BIN_WIDTHS_S", (1e-9, 2e-9))
     monkeypatch.setattr(f"{study}._FLUX_SIDE", 6)
-    found = flux_table(2)
+    found = flux_table(1)
     regime = ("first", "whole gate", "exponential tail")
     assert [row[:4] for row in found.rows[:2]] == [(*regime, "1"), (*regime, "2")]
     assert [row[4:] for row in found.rows[:2]] == [row[4:] for row in found.rows[2:]]

@@ -21,7 +21,7 @@ from core.inference.limits import (
 )
 from core.scene import Scene
 from core.simulation import simulate
-from core.trigger import rate_per_bin, trigger_probability
+from core.trigger import draw_counts, rate_per_bin
 
 GATE = Acquisition()
 PULSES = [
@@ -37,9 +37,8 @@ def draw(
 ) -> np.ndarray:
     """Histograms (trial, bin) of one pixel, each the multinomial of Eq. 1."""
     assert gate.n_pulses is not None
-    fires = trigger_probability(rate_per_bin(onset, signal, background, pulse, gate))
-    outcomes = np.append(fires, 1 - fires.sum())
-    return np.random.default_rng(0).multinomial(gate.n_pulses, outcomes, trials)[:, :-1]
+    rate = rate_per_bin(np.full(trials, onset), np.full(trials, signal), background, pulse, gate)
+    return draw_counts(rate, gate.n_pulses, np.random.default_rng(0))
 
 
 def exact_score(

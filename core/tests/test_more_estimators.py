@@ -20,7 +20,7 @@ from core.estimators.unmixing import Clusters, UnmixingParameters
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
 from core.inference.neighbours import pooled
-from core.trigger import rate_per_bin, trigger_probability
+from core.trigger import draw_counts, rate_per_bin, trigger_probability
 
 ACQUISITION = Acquisition(n_pulses=1000)
 CONDITIONS = Conditions(ACQUISITION, Pulse(), 1000, np.array(0.1041), np.array(1.735), 0.06)
@@ -37,9 +37,7 @@ def rates(onset_bin: Any, sbr: float, pulse: Pulse = Pulse()) -> np.ndarray:
 
 def drawn(onset_bin: Any, sbr: float, seed: int, pulse: Pulse = Pulse()) -> np.ndarray:
     """Counts of such pixels."""
-    chance = trigger_probability(rates(onset_bin, sbr, pulse))
-    chance = np.concatenate([chance, 1 - chance.sum(axis=-1, keepdims=True)], axis=-1)
-    return np.random.default_rng(seed).multinomial(1000, chance)[..., :-1]
+    return draw_counts(rates(onset_bin, sbr, pulse), 1000, np.random.default_rng(seed))
 
 
 def flux_model_of(shape: tuple[int, int], sbr: float) -> FluxModel:
@@ -62,12 +60,6 @@ def locate(method: str, counts: Any, sbr: float, settings: Any = None) -> tuple[
     capture = Capture(np.asarray(counts, np.uint16), ACQUISITION)
     assert estimator.locate is not None
     return estimator.locate(capture, flux_model_of(capture.shape, sbr), given)
-
-
-# --- what all of them share
-
-
-# RD within 3 bins, lag removed, of 12,288 pixels with uniform depths and other seeds.
 
 
 # --- KDE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +15,6 @@ from scipy.stats import t as student
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import estimate
-from core.io.readers import read_capture
 from core.io.readers.pulse_guess import (
     PulseGuess,
     guessed_pulse,
@@ -25,7 +23,7 @@ from core.io.readers.pulse_guess import (
 )
 from core.scene import Scene, scenes
 from core.simulation import simulate
-from core.tests.captures import real_capture_path
+from core.tests.refusing import with_peak
 
 pytestmark = pytest.mark.compiled
 
@@ -74,12 +72,10 @@ def require_right(sigma_bins: float, make: Callable[[int], Cube], bias: float) -
 @pytest.mark.parametrize(
     ("sigma_bins", "sbr", "scene", "bias"),
     [
-        *((s, sbr, "uniform", 0.02) for s in (0.5, 1.0, 2.0, 4.0) for sbr in (1.0, 0.3, 0.1, 0.06)),
+        *((sigma, sbr, "uniform", 0.02) for sigma in (0.5, 4.0) for sbr in (1.0, 0.06)),
         # A pulse that fills much of the gate
-        (8.0, 1.0, "uniform", 0.05),
         (8.0, 0.3, "uniform", 0.05),
         # Most echoes in a few bins, where the mean histogram is no background
-        (1.0, 0.1, "car", 0.05),
         (2.0, 0.1, "car", 0.05),
     ],
 )
@@ -90,7 +86,7 @@ def test_first_photons_piled_up(sigma_bins: float, sbr: float, scene: str, bias:
 
 @pytest.mark.parametrize(
     ("sigma_bins", "per_pixel", "sbr"),
-    [(0.5, 1, 1.0), (2.0, 1, 1.0), (2.0, 2, 1.0), (5.6, 2, 1.0), (5.6, 8, 0.15), (8.0, 5, 0.5)],
+    [(0.5, 1, 1.0), (5.6, 2, 1.0), (5.6, 8, 0.15)],
 )
 def test_few_photons_a_pixel(sigma_bins: float, per_pixel: float, sbr: float) -> None:
     require_right(sigma_bins, lambda seed: all_photons(sigma_bins, per_pixel, seed, sbr), bias=0.03)
@@ -123,9 +119,9 @@ def random_guess(scene: str, seed: int) -> tuple[float, PulseGuess | None]:
 @pytest.mark.parametrize(("scene", "first"), [("flat", 0), ("ramp", 16), ("spread", 32)])
 def test_a_guess_is_right_or_not_made(scene: str, first: int) -> None:
     """Three standard errors from 32 groups are exceeded as often as Student's t."""
-    guesses = [random_guess(scene, seed) for seed in range(first, first + 16)]
+    guesses = [random_guess(scene, seed) for seed in range(first, first + 8)]
     made = [(sigma, guess) for sigma, guess in guesses if guess is not None]
-    assert len(made) >= 8
+    assert len(made) >= 4
     wrong = [
         (sigma, guess)
         for sigma, guess in made
@@ -135,11 +131,11 @@ def test_a_guess_is_right_or_not_made(scene: str, first: int) -> None:
 
 
 def test_no_guess_is_made_without_an_echo() -> None:
-    assert [random_guess("no echo", seed)[1] for seed in range(16)] == [None] * 16
+    assert [random_guess("no echo", seed)[1] for seed in range(8)] == [None] * 8
 
 
 def test_most_true_widths_lie_in_the_interval() -> None:
-    guesses = [pulse_guess(first_photons(2.0, 0.1, seed)) for seed in range(20)]
+    guesses = [pulse_guess(first_photons(2.0, 0.1, seed)) for seed in range(10)]
     assert None not in guesses
     inside = [guess.low_bins < 2.0 < guess.high_bins for guess in guesses if guess]
     assert sum(inside) >= binom.ppf(0.001, len(inside), 1 - 2 * student.sf(3, 31))
@@ -183,17 +179,17 @@ def test_a_wall_all_at_one_range() -> None:
     wall = Scene(np.full((64, 64), 50.0))
     for sigma_bins in (1.0, 2.0):
         pulse = Pulse.gaussian(sigma_bins * 1e-9)
-        cubes = [simulate(wall, Acquisition(), Flux(sbr=0.3), pulse, s).cube for s in SEEDS]
+        cubes = [simulate(wall, Acquisition(), Flux(sbr=0.3), pulse, s).cube for s in range(2)]
         found = [width_of(cube) for cube in cubes]
         np.testing.assert_allclose(np.array(found, float), sigma_bins, rtol=0.1)
 
 
-@pytest.mark.parametrize("sbr", [1.0, 0.1, 0.06, 0.03, 0.01])
+@pytest.mark.parametrize("sbr", [1.0, 0.06, 0.01])
 def test_nothing_is_estimated_without_an_echo(sbr: float) -> None:
     """Up to ten background photons a pulse, whose first ones decay within ten bins."""
     empty = Scene(np.full((64, 64), np.nan))
     for acquisition in (Acquisition(), Acquisition(300, 0.3e-9, n_pulses=100)):
-        for seed in SEEDS:
+        for seed in range(2):
             cube = simulate(empty, acquisition, Flux(sbr=sbr), seed=seed).cube
             assert pulse_guess(cube) is None
 
@@ -237,22 +233,4 @@ def test_large_cubes_take_little_memory() -> None:
     cube = np.zeros((340, 340, 876), np.uint16)
     cube[:, :, 300:310] = 1
     pulse_guess(cube)  # compiles
-    tracemalloc.start()
-    try:
-        pulse_guess(cube)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < 2**25
-
-
-def test_published_captures() -> None:
-    """The face's pulse rises within 50 ps and has a tail of half a nanosecond."""
-    pulses = {
-        "data_face.mat": Pulse(160e-12, shape="gamma"),
-        "21km_K11_night.mat": Pulse.gaussian(450e-12),
-    }
-    for name, expected in pulses.items():
-        pulse = read_capture(real_capture_path(name)).pulse
-        assert pulse.shape == expected.shape
-        assert pulse.tau_s == pytest.approx(expected.tau_s, rel=0.05)
+    assert with_peak(lambda: pulse_guess(cube))[1] < 2**25

@@ -6,13 +6,12 @@ import gzip
 import io
 import os
 import random
-import shutil
 import struct
 import tempfile
-import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from core.io.readers import MAX_CUBE_BYTES, SUFFIXES, guards, open_capture, read
 from core.io.readers.labelled import describe
 from core.io.writers import save_capture
 from core.tests.formats import FORMATS, Format, damaged, put
-from core.tests.refusing import assert_refused
+from core.tests.refusing import assert_refused, count_refused, with_peak
 from core.tests.samples import (
     ACQUISITION,
     CELL,
@@ -183,21 +182,10 @@ def test_contract_damaged_bytes_give_nothing_but_a_capture_error(
     limit = 2**22
     monkeypatch.setattr(guards, "MAX_CUBE_BYTES", limit)
     content, path, rng = kept.build(), tmp_path / kept.name, random.Random(str(kept.needs))
-    n_refused = 0
-    read_capture(put(path, content), **kept.needs)  # loads the library
-    tracemalloc.start()
-    try:
-        for _ in range(kept.n_damaged):
-            shutil.rmtree(path, ignore_errors=True)
-            put(path, damaged(content, rng))
-            try:
-                assert read_capture(path, **kept.needs).cube.ndim == 3
-            except CaptureError as error:
-                assert str(error).startswith(f"{kept.name}: ")
-                n_refused += 1
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    read = partial(read_capture, **kept.needs)
+    read(put(path, content))  # loads the library
+    contents = (damaged(content, rng) for _ in range(kept.n_damaged))
+    n_refused, peak = with_peak(lambda: count_refused(read, path, contents, CaptureError))
     assert n_refused > kept.n_damaged / 10
     assert peak < 4 * limit
 
@@ -565,7 +553,7 @@ REFUSED: tuple[tuple[str, bytes, str], ...] = (
     ("a.mat", cell_bytes([0, 1e15]), "gate of Ts = '1000.*another time_unit_s"),
     ("a.mat", cell_bytes([0, 1e300]), r"largest time of Ts = 1e\+288"),
     # Files that crash SciPy or exhaust its memory
-    ("a.mat", cell_file((1, 1), nested_cells(50_000)), "Ts cannot be read"),
+    ("a.mat", cell_file((1, 1), nested_cells(20_000)), "Ts cannot be read"),
     ("a.mat", cell_file((10**6, 10**6), PHOTON_CELL), "more memory"),
     ("a.mat", cell_file((1000, 1000), PHOTON_CELL), "Ts cannot be read"),
     ("a.mat", claims_more_inflated(), "Ts cannot be read"),
@@ -669,6 +657,9 @@ def test_mannequin_face(real_capture: Callable[[str], Path]) -> None:
     assert np.mean(capture.counts == 0) == pytest.approx(0.016, abs=5e-4)
     assert capture.acquisition.bin_width_s == pytest.approx(64e-12, rel=1e-12)
     assert capture.acquisition.gate_delay_s == pytest.approx(8e-9, rel=1e-12)
+    # The pulse rises within 50 ps and has a tail of half a nanosecond.
+    assert capture.pulse.shape == "gamma"
+    assert capture.pulse.tau_s == pytest.approx(160e-12, rel=0.05)
     # The face in the middle and the wall at the left, in native bins.
     assert 1000 + 8 * capture.cube.sum(axis=(0, 1)).argmax() == pytest.approx(3576, abs=40)
     assert 1000 + 8 * capture.cube[:, :20].sum(axis=(0, 1)).argmax() == pytest.approx(4080, abs=40)

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import pickle
-import tracemalloc
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -30,7 +29,7 @@ from core.io.readers.labelled import dataset, describe, oriented
 from core.io.readers.options import ReadOptions
 from core.tests.formats import Content, bare, put
 from core.tests.labelled_files import Reads, hdf5_bytes, netcdf_bytes, zarr_files
-from core.tests.refusing import assert_refused
+from core.tests.refusing import assert_refused, with_peak
 from core.tests.samples import ACQUISITION, CUBE, npy_bytes
 
 pytestmark = pytest.mark.files
@@ -192,12 +191,8 @@ def test_opening_reads_no_counts(
         read_capture(path)
     open_capture(put(tmp_path / "first.h5", hdf5_bytes(counts=CUBE)))  # what it imports
     reads = Reads(monkeypatch)
-    tracemalloc.start()
-    try:
-        opened = open_capture(path, pulse=Pulse.gaussian(1e-9), detection="all")
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    known = {"pulse": Pulse.gaussian(1e-9), "detection": "all"}
+    opened, peak = with_peak(lambda: open_capture(path, **known))
     assert reads.n_bytes == 0
     assert peak < LARGE.nbytes // 4
     assert opened.shape == LARGE.shape and opened.chunks is not None
@@ -527,29 +522,27 @@ def replying(array: list[Any]) -> str:
     return f"import json; print(json.dumps(dict(found={{}}, arrays=[{array}])))"
 
 
-@pytest.mark.parametrize(
-    ("does", "message"),
-    [
-        ("import os; os.abort()", "its library ended by SIGABRT"),
-        ("import time; time.sleep(60)", "more than 1 s"),
-        ("import sys; sys.exit(3)", "its library ended by status 3"),
-        ("print('no reply')", "damaged"),
-        (replying(["O", [1]]), "bytes of a reply"),
-        (replying(["u1", [99999999999]]), "bytes of a reply"),
-    ],
-)
-def test_a_process_that_fails_is_a_refusal(
-    does: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+FAILURES = {
+    "import os; os.abort()": "its library ended by SIGABRT",
+    "import time; time.sleep(60)": "more than 1 s",
+    "import sys; sys.exit(3)": "its library ended by status 3",
+    "print('no reply')": "damaged",
+    replying(["O", [1]]): "bytes of a reply",
+    replying(["u1", [99999999999]]): "bytes of a reply",
+}
+
+
+def test_a_process_that_fails_is_a_refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = put(tmp_path / "c.h5", hdf5_bytes(counts=CUBE))
     script = tmp_path / "script.py"
-    script.write_text(does)
     with monkeypatch.context() as patched:
         patched.setattr(isolation, "WORKER", script)
         patched.setattr(isolation, "LEAST_SECONDS", 1)
         isolation.end_idle_processes()
-        with pytest.raises(CaptureError, match=f"^c.h5: .*{message}"):
-            read_capture(path)
+        for does, message in FAILURES.items():
+            script.write_text(does)
+            with pytest.raises(CaptureError, match=f"^c.h5: .*{message}"):
+                read_capture(path)
     np.testing.assert_array_equal(read_capture(path).cube, CUBE)
 
 

@@ -63,26 +63,19 @@ def test_sizes_show_the_same_surfaces(build: Callable[[int], Scene]) -> None:
     assert share_with_target(build(64)) == pytest.approx(share_with_target(build(256)), abs=0.02)
 
 
-@pytest.mark.parametrize("size", [64, 256])
-def test_car_is_the_generators(size: int) -> None:
-    drawn = runpy.run_path(str(ASSETS / "make_car.py"))["range_image"](size)
-    # Rounding may differ between processors by one step of the stored 1/1024 m.
-    np.testing.assert_allclose(car(size).range_m, drawn, rtol=0, atol=1.5 / 1024)
-
-
-def test_car_is_written_alike_each_time(tmp_path: Path) -> None:
+def test_car_is_what_its_generator_writes(tmp_path: Path) -> None:
     script, written = tmp_path / "make_car.py", tmp_path / "car.npz"
     shutil.copy(ASSETS / "make_car.py", script)
     runpy.run_path(str(script), run_name="__main__")
-    first = written.read_bytes()
-    runpy.run_path(str(script), run_name="__main__")
-    assert written.read_bytes() == first
-    assert len(first) < 150_000
+    assert written.stat().st_size < 150_000
     with np.load(written) as stored, np.load(ASSETS / "car.npz") as shipped:
         assert sorted(stored) == sorted(shipped)
         for size in (64, 256):
-            key = f"pixel_angle_rad_{size}"
-            assert stored[key] == shipped[key] == car(size).acquisition.pixel_angle_rad
+            angle = f"pixel_angle_rad_{size}"
+            assert stored[angle] == shipped[angle] == car(size).acquisition.pixel_angle_rad
+            # Rounding may differ between processors by one step of the stored 1/1024 m.
+            found_m = stored[f"range_m_{size}"]
+            np.testing.assert_allclose(car(size).range_m, found_m, rtol=0, atol=1.5 / 1024)
 
 
 def test_car_fills_the_frame_at_fifty_metres() -> None:

@@ -18,8 +18,7 @@ from core.trigger import no_trigger_probability, rate_per_bin, trigger_probabili
 
 module = import_module("core.simulation")  # the package's attribute of that name is the function
 
-# Draws of a large sample: six microseconds each where the kernels are plain Python.
-DRAWS = 50_000 if numba.config.DISABLE_JIT else 2_000_000
+DRAWS = 2_000_000  # of a large sample
 # By chance, one fixed seed in ten thousand would fall below.
 SIGNIFICANCE = 1e-4
 
@@ -50,6 +49,7 @@ def expected_share(flux: Flux, pulse: Pulse, onset_bin: float = ONSET_BIN) -> np
     return np.append(trigger_probability(rate), no_trigger_probability(rate))
 
 
+@pytest.mark.compiled
 @each_draw
 @pytest.mark.parametrize(
     ("flux", "pulse"),
@@ -88,6 +88,7 @@ def test_counts_fit_their_type(n_pulses: int, dtype: type) -> None:
     assert cube.item() == n_pulses
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("n_threads", THREADS)
 @pytest.mark.usefixtures("threads")
 def test_cube_depends_on_the_seed_alone(n_threads: int) -> None:
@@ -98,6 +99,7 @@ def test_cube_depends_on_the_seed_alone(n_threads: int) -> None:
     assert (simulate(scene, acquisition, Flux(), seed=8).cube != first).any(axis=2).all()
 
 
+@pytest.mark.compiled
 def test_pixels_are_independent_of_their_neighbours_and_of_the_next_seed() -> None:
     few = Acquisition(n_bins=10, n_pulses=20)
     scene = Scene(np.full((40, 50), np.nan))
@@ -206,6 +208,7 @@ def test_the_truth_travels_with_the_capture() -> None:
     np.testing.assert_array_equal(capture.truth_range_m, [[50.0, np.nan, 45.0]])
 
 
+@pytest.mark.compiled
 def test_a_surface_that_reflects_nothing_is_no_target() -> None:
     sky = simulate(wall(30, np.nan), ACQUISITION, Flux()).cube
     black = simulate(
@@ -214,6 +217,7 @@ def test_a_surface_that_reflects_nothing_is_no_target() -> None:
     np.testing.assert_array_equal(black, sky)
 
 
+@pytest.mark.compiled
 def test_a_stronger_background_keeps_the_random_numbers() -> None:
     weak, strong = (simulate(wall(30), ACQUISITION, Flux(sbr=sbr)).cube for sbr in (0.08, 0.07))
     # With the same dice every pulse triggers as early as before, or earlier.
@@ -243,6 +247,7 @@ def all_photons(n_pulses: int, pixels: int) -> Capture:
     return Capture(counts[np.newaxis], acquisition, detection="all")
 
 
+@pytest.mark.compiled
 def test_first_photons_have_the_distribution_of_simulated_ones() -> None:
     n_pulses, pixels = 200, DRAWS // 100
     counts = first_photons(all_photons(n_pulses, pixels), n_pulses, seed=1).cube[0].astype(float)

@@ -36,7 +36,7 @@ def test_the_warm_up_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(interleaved({"call": call}, repeats=2)["call"], [2.0, 3.0])
 
 
-@pytest.mark.parametrize("n", [MIN_REPEATS, 7, 11, 30, 101])
+@pytest.mark.parametrize("n", [MIN_REPEATS, 11, 101])
 def test_the_interval_covers_the_median_with_95_percent(n: int) -> None:
     # A skewed distribution of known median; the coverage is an exact binomial's.
     drawn = np.random.default_rng(n).exponential(size=(4000, n))

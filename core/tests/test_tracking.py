@@ -29,12 +29,13 @@ from core.tracking import (
 )
 
 # Half a millisecond a pixel where the kernels are plain Python.
-PIXELS = 2 * LANES if numba.config.DISABLE_JIT else 64 * LANES
+PIXELS = LANES if numba.config.DISABLE_JIT else 64 * LANES
 N_PULSES = 1000
 EPS_32 = float(np.finfo(np.float32).eps)
 
 Variant = tuple[Any, Any, Any]
 VARIANTS = list(product(get_args(Weight), get_args(Start), get_args(SigmaFrom)))
+WEIGHTS = [variant for variant in VARIANTS if variant[1] == "mean"]
 
 
 def settings_of(variant: Variant, **more: Any) -> TrackingParameters:
@@ -151,7 +152,7 @@ def test_signals_are_the_equations(cube: np.ndarray, variant: Variant) -> None:
         settings_of(variant),
         settings_of(variant, l=0.05, n=30.0, m=2.2, h=0.5, alpha=9.0),
     ):
-        for histogram in cube[:12].astype(float):
+        for histogram in cube[:4].astype(float):
             # Rounding of 1.1e-16 through a hundred contracting steps.
             assert_equals_twin(histogram, settings, 1e-10)
 
@@ -222,6 +223,7 @@ def test_track_finds_the_positions_of_the_signals(
     assert_track_agrees(cube, settings)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("settings", PRESETS.values(), ids=PRESETS)
 def test_presets_find_most_positions(cube: np.ndarray, settings: TrackingParameters) -> None:
     assert np.isfinite(track(to_blocks(cube), settings)[0]).mean() > 0.9
@@ -274,6 +276,7 @@ def test_scaled_counts_scale_the_signals(scale: float, start: Start) -> None:
     np.testing.assert_allclose(other.enhanced, scale * one.enhanced, rtol=0, atol=scale * 1e-8)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("factor", [0.25, 4.0])  # powers of two, so that not even rounding differs
 def test_step_and_speed_are_one_parameter(cube: np.ndarray, factor: float) -> None:
     one = PRESETS["recommended"]
@@ -285,6 +288,7 @@ def test_step_and_speed_are_one_parameter(cube: np.ndarray, factor: float) -> No
     np.testing.assert_array_equal(track(blocks, one), track(blocks, other))
 
 
+@pytest.mark.compiled
 def test_alpha_moves_ranges_with_the_exponential_weight_only(cube: np.ndarray) -> None:
     def positions(preset: str, alpha: float) -> np.ndarray:
         return track(to_blocks(cube), replace(PRESETS[preset], alpha=alpha))[0]
@@ -326,8 +330,8 @@ def test_survival_weight_without_pulses_is_refused() -> None:
 
 
 @pytest.mark.uncounted
-@pytest.mark.parametrize("variant", VARIANTS, ids=" ".join)
-@pytest.mark.parametrize("t_n", [0, 1, 20, 39, 40, 1000])
+@pytest.mark.parametrize("variant", WEIGHTS, ids=" ".join)
+@pytest.mark.parametrize("t_n", [0, 1, 39, 40, 1000])
 def test_no_position_lies_before_t_n(variant: Variant, t_n: int) -> None:
     rows = random_rows(n_bins=40)
     rows[:, 3] = 500
@@ -343,10 +347,9 @@ def test_no_position_lies_before_t_n(variant: Variant, t_n: int) -> None:
 
 @pytest.mark.uncounted
 @pytest.mark.parametrize("variant", VARIANTS, ids=" ".join)
-@pytest.mark.parametrize("count", [0, 1, 60_000])
-@pytest.mark.parametrize("n_bins", [1, 2, 7, 40])
-def test_a_histogram_without_change_has_no_echo(n_bins: int, count: int, variant: Variant) -> None:
-    rows = np.full((3, n_bins), count, np.uint16)
+@pytest.mark.parametrize("n_bins", [1, 2, 40])
+def test_a_histogram_without_change_has_no_echo(n_bins: int, variant: Variant) -> None:
+    rows = np.repeat([[0], [1], [60_000]], n_bins, axis=1).astype(np.uint16)
     settings = settings_of(variant, t_n=1)
     signals = tracking_signals(rows, settings, N_PULSES)
     assert (signals.sigma == 0).all()
@@ -375,7 +378,7 @@ EXTREMES = [0, 5e-324, 1e-310, 1e-200, 1e-40, 1e-6, 0.5, 1e6, 1e40, 1e200, 1e308
 EXTREMES += [2**31, 2**70, 10**400]  # the last exceeds float64
 
 
-@pytest.mark.uncounted
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("value", EXTREMES, ids=lambda value: str(value)[:20])
 def test_extreme_settings_are_refused_or_give_valid_positions(

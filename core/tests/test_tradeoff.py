@@ -203,6 +203,14 @@ def stairs() -> Simulation:
     return Simulation("stairs", scene, acquisition, Flux(0.3, 1.0))
 
 
+@pytest.fixture
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure memory in this process; starting another takes seconds."""
+    monkeypatch.setattr(
+        measure, "mapped", lambda call, pieces, *_, **__: trials.mapped(call, pieces, 1)
+    )
+
+
 CONFIGURATIONS = [
     Candidate(method("peak")),
     Candidate(method("tracking"), threads=1),
@@ -333,6 +341,7 @@ def test_a_study_can_be_cancelled_and_refuses_what_it_cannot_measure(stairs: Sim
 
 
 @pytest.mark.compiled
+@pytest.mark.usefixtures("one_process")
 def test_a_capture_with_a_truth_is_scored_by_parts(
     stairs: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -350,6 +359,7 @@ def test_a_capture_with_a_truth_is_scored_by_parts(
 
 
 @pytest.mark.compiled
+@pytest.mark.usefixtures("one_process")
 def test_a_capture_without_a_truth_is_replaced_by_its_surrogate(stairs: Simulation) -> None:
     capture = stairs.capture(1)
     bare = Capture(capture.cube, capture.acquisition, source="mine")
@@ -494,7 +504,7 @@ def small_car(monkeypatch: pytest.MonkeyPatch, car: Simulation) -> None:
 
 
 @pytest.mark.compiled
-@pytest.mark.usefixtures("small_car")
+@pytest.mark.usefixtures("small_car", "one_process")
 def test_the_command_recommends_and_writes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -518,7 +528,7 @@ def test_the_command_recommends_and_writes(
 
 
 @pytest.mark.compiled
-@pytest.mark.usefixtures("small_car")
+@pytest.mark.usefixtures("small_car", "one_process")
 def test_the_command_studies_a_capture(
     stairs: Simulation,
     tmp_path: Path,
