@@ -593,7 +593,7 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
     check = inspection.StatedFluxCheck("sbr", "", 2 * report.flux.sbr.value, report.flux.sbr)
     stated = text.capture_facts(building.answer, replace(report, stated=(check,)))
     (shown,) = (value for name, value, _ in stated if name == "SBR, stated")
-    assert shown.value == check.stated and shown.note == "estimate -50.0 %"
+    assert shown.value == check.stated and shown.note == "estimate −50.0 %"
     assert report.flux_method in capture.flux.text
     assert report.flux_remark in capture.flux.text
     assert report.suggestion.why_gate in capture.advice[0].text

@@ -176,5 +176,5 @@ def suggestion(capture: Capture) -> Suggestion:
         (first, end),
         why,
         t_n,
-        f"{where}: peaks more than {TOLERANCE_BINS} bins before them are noise.",
+        f"Peaks more than {TOLERANCE_BINS} bins before the confident estimates are noise.",
     )
