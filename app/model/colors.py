@@ -14,6 +14,7 @@ from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS
 from core import inspection
 from core.geometry import WHOLE, Box, pixel_angle_of
+from core.inference import fit_of
 from core.io import ColorScale, range_scale
 
 Array = NDArray[Any]
@@ -65,6 +66,8 @@ def unseen(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
 def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
     """Return why pixels of an image (row, col) of a kind of `map_of` are blank, or grey.
 
+    Where the model does not describe the capture, also that confidences are not to be relied on.
+
     Parameters
     ----------
     values, look
@@ -81,6 +84,8 @@ def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
         sentences.append("Lower “Show from confidence”.")
     if found.n_outside:
         sentences.append(f"Grey: {found.n_outside:,} beyond the colour scale.")
+    if kind in ("Estimate", "Error", "Confidence") and (misfit := fit_of(answer.capture).remark):
+        sentences.append(f"{misfit.capitalize()}.")
     return " ".join(sentences)
 
 
