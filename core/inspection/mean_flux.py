@@ -80,6 +80,8 @@ class MeanFlux(NamedTuple):
     pulse: Pulse
     """The capture's, or the one that fits the echoes clearly better
     (`core.inspection.pulse_fit`)."""
+    is_darkest: bool = False
+    """Whether `free` is that of the darkest tenth of the gate."""
 
     @classmethod
     def alike(cls, found: FluxEstimate, pulse: Pulse) -> MeanFlux:
@@ -88,12 +90,11 @@ class MeanFlux(NamedTuple):
 
     def in_longer_gate(self, factor: float) -> MeanFlux:
         """Return the fluxes of a gate `factor` times as long, with as much background per time."""
-        return MeanFlux(
-            self.image.in_longer_gate(factor),
-            self.target.in_longer_gate(factor),
-            self.model.in_longer_gate(factor),
-            self.free and self.free.in_longer_gate(factor),
-            self.pulse,
+        return self._replace(
+            image=self.image.in_longer_gate(factor),
+            target=self.target.in_longer_gate(factor),
+            model=self.model.in_longer_gate(factor),
+            free=self.free and self.free.in_longer_gate(factor),
         )
 
     @property
@@ -149,9 +150,9 @@ def _mean_flux(capture: Capture) -> MeanFlux:
         sbr = ratio_of(signal, whole.background)
         target = FluxEstimate(signal, whole.background, sbr)
     free, darkest = echo_free_flux(capture), darkest_flux(capture)
-    if free is None and darkest and darkest.background.high < whole.background.low:
-        free = darkest
-    return _combined(MeanFlux(whole, target, whole, free, mixture.pulse))
+    is_darkest = bool(free is None and darkest and darkest.background.high < whole.background.low)
+    free = darkest if is_darkest else free
+    return _combined(MeanFlux(whole, target, whole, free, mixture.pulse, is_darkest))
 
 
 def _with_total(model: FluxEstimate, total: Interval | None) -> FluxEstimate:
