@@ -64,7 +64,8 @@ calibration: $(VENV)/.app ## are confidences and intervals right as often as the
 results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core paper --repetitions 100 --results assets/results/paper.md
 	$(BIN)/python -m core uniform --results assets/results/uniform.md
-	$(BIN)/python -m core calibration --results assets/results/calibration.md
+	$(BIN)/python -m core calibration --only confidence ranges --results assets/results/calibration.md
+	$(BIN)/python -m core calibration --only fluxes --captures 20 --results assets/results/fluxes.md
 	$(BIN)/python -m core tradeoff --results assets/results/tradeoff.md
 	$(BIN)/python -m core speed --results assets/results/speed.md
 	$(BIN)/python -m core stability --results assets/results/sensitivity.md
