@@ -175,16 +175,16 @@ def stage(page: Page) -> Locator:
     return page.locator(".stage")
 
 
-def parts(page: Page) -> dict[str, Locator]:
-    """Return all pictures of Explore, once they are visible."""
-    figures = page.locator(".bk-Figure").filter(visible=True)
-    plots = figures.filter(has_text=re.compile("estimate"))
-    expect(plots).to_have_count(3)
-    found = [image(page), stage(page), *plots.all()]
-    for each in found:
-        expect(each).to_be_visible()
-    names = ("image", "cloud", "histogram", "residual", "enhanced")
-    return dict(zip(names, found, strict=True))
+PARTS = ("image", "cloud", "histogram", "residual", "enhanced")
+"""Pictures of Explore, from the top down where they are stacked."""
+
+
+def parts(page: Page) -> Locator:
+    """Return the pictures of Explore, in the order of `PARTS`, once all are visible."""
+    figures = page.locator(".bk-Figure").filter(has_text=re.compile("estimate"))
+    found = image(page).or_(stage(page)).or_(figures).filter(visible=True)
+    expect(found).to_have_count(len(PARTS))
+    return found
 
 
 def choose(page: Page, name: str, option: str) -> None:
@@ -217,17 +217,20 @@ def pixels(png: bytes) -> np.ndarray:
     return np.asarray(Image.open(BytesIO(png)).convert("RGB"))
 
 
+EDGES = """all => all.map((each) => {
+  const { left, top, right, bottom } = each.getBoundingClientRect();
+  return [left, top, right, bottom].map(Math.round);
+})"""
+
+
 def look(page: Page) -> dict[str, np.ndarray]:
     """Return a screenshot of each picture of Explore, uint8 (row, col, rgb)."""
-    whole = pixels(page.screenshot())
-    shown = {}
-    for name, part in parts(page).items():
-        box = part.bounding_box()
-        assert box is not None
-        left, top = round(box["x"]), round(box["y"])
-        right, bottom = round(box["x"] + box["width"]), round(box["y"] + box["height"])
-        shown[name] = whole[top:bottom, left:right]
-    return shown
+    found, whole = parts(page), pixels(page.screenshot())
+    edges = found.evaluate_all(EDGES)
+    return {
+        name: whole[top:bottom, left:right]
+        for name, (left, top, right, bottom) in zip(PARTS, edges, strict=True)
+    }
 
 
 def pixel_on_show(page: Page) -> tuple[int, int]:
