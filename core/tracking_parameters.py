@@ -17,6 +17,7 @@ Refine = Literal["none", "likelihood"]
 CALM_M = 0.8  # chaotic below
 LINEAR = 1.0
 STEEP_ALPHA = 1.6
+SLOW_L = 7e-4
 FEW_BINS = 4
 
 
@@ -37,14 +38,7 @@ class TrackingParameters(Settings):
             merge_power=2,  # an acceleration: counts per square bin
             least=0.0,
             most=1e6,
-            doubtful=(
-                Zone(
-                    0.0,
-                    7e-4,
-                    "From the mean, the small scale is too slow: dim pixels get no estimate.",
-                ),
-                Zone(0.03, 1e6, "The small scale is so fast that it follows the echo."),
-            ),
+            doubtful=(Zone(0.03, 1e6, "The small scale is so fast that it follows the echo."),),
         ),
         "Speed of the small scale, r_small = l·σ: smaller follows only the slow trend.",
     )
@@ -154,6 +148,11 @@ class TrackingParameters(Settings):
             found.append(
                 f"An exponential weight of α = {self.alpha:g}, {STEEP_ALPHA:g} or more, favours "
                 "the end of the gate over any echo before it."
+            )
+        if self.start == "mean" and self.l <= SLOW_L:
+            found.append(
+                f"From the mean, a small scale of l = {self.l:g}, {SLOW_L:g} or less, is too slow: "
+                "dim pixels get no estimate."
             )
         if self.start == "zero" and self.weight != "cubic":
             found.append(

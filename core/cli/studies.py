@@ -114,7 +114,7 @@ def _paper(chosen: argparse.Namespace) -> None:
     store = chosen.folder / "trials.jsonl"
     results = _trials(paper.plan(), chosen.repetitions, chosen, store)
     title = f"The paper, reproduced ({chosen.repetitions} repetitions)"
-    printed = ("table_2", "table_3")
+    printed = ("table_2", "table_3", "flat_target")
     publish(page.items(results, measured), chosen, title, page.INTRODUCTION, printed)
 
 

@@ -308,9 +308,8 @@ def _check(reason: str, difference: Floats, variance: Floats, free: Floats) -> C
     shapes = free[:, enough] / scale
     if freedom < 1 or not shapes.any(axis=1).all():  # too few counts for a test
         return Check(reason.format(0.0), 1.0, 0.0)
-    basis = scipy.linalg.orth((shapes / np.linalg.norm(shapes, axis=1, keepdims=True)).T)
     normal = difference[enough] / scale
-    rest = normal - basis @ (basis.T @ normal)
+    rest = normal - shapes.T @ np.linalg.lstsq(shapes.T, normal)[0]
     squares = float(rest @ rest)
     effect = float(np.sqrt(max(squares - freedom, 0.0)) / np.linalg.norm(shapes[0]))
     p_value = float(scipy.special.chdtrc(freedom, squares))
@@ -320,7 +319,7 @@ def _check(reason: str, difference: Floats, variance: Floats, free: Floats) -> C
 def _pixels(p_values: Floats) -> Check:
     """Compare the number of pixels that do not fit with that expected by chance."""
     failing, n = int(np.count_nonzero(p_values < SIGNIFICANCE)), p_values.size
-    p_value = float(scipy.stats.binom.sf(failing - 1, n, SIGNIFICANCE))
+    p_value = float(scipy.special.bdtrc(failing - 1, n, SIGNIFICANCE))
     effect = max(failing / n - SIGNIFICANCE, 0.0)
     reason = f"{effect:.1%} of the pixels differ from one echo, as by a second surface"
     return Check(reason, p_value, effect)

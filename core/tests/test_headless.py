@@ -31,7 +31,7 @@ def test_core_imports_no_screen_library() -> None:
 
 SLOW_TO_LOAD = ("dask", "h5py", "matplotlib", "PIL", "trimesh", "xarray", "zarr")
 SLOW_TO_LOAD += ("colorcet", "laspy", "pypcd4", "tifffile")
-SLOW_TO_LOAD += ("scipy.io", "scipy.ndimage", "scipy.optimize", "scipy.special", "scipy.stats")
+SLOW_TO_LOAD += ("scipy.io", "scipy.ndimage", "scipy.optimize", "scipy.stats")
 FIRST_IMAGE = """
 import sys, core, core.io.writers
 acquisition = core.Acquisition(n_pulses=1)

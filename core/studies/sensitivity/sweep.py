@@ -27,7 +27,14 @@ from core.parameters import Number, Zone, joint_doubts, spec_of
 from core.scene import Scene
 from core.simulation import simulate
 from core.studies.outputs import as_text
-from core.tracking import FEW_BINS, STEEP_ALPHA, TrackingParameters, track, tracking_signals
+from core.tracking import (
+    FEW_BINS,
+    SLOW_L,
+    STEEP_ALPHA,
+    TrackingParameters,
+    track,
+    tracking_signals,
+)
 
 SIGNAL = 0.1041  # the paper's photons per pulse
 
@@ -369,6 +376,7 @@ def lost_to_rounding(
 JOINT: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "(m·h)²·l": ({"l": 1.0 / 1.4**2}, {"l": 0.02}),
     "α, exponential": ({"alpha": 1.1 * STEEP_ALPHA}, {"alpha": 0.9 * STEEP_ALPHA}),
+    "l, start mean": ({"l": 0.7 * SLOW_L}, {"l": 1.4 * SLOW_L}),
     "start zero": ({"start": "zero"}, {"start": "mean"}),
     "σ before T_n": (
         {"sigma_from": "before T_n", "t_n": FEW_BINS - 1},
