@@ -29,8 +29,9 @@ from tests.states import another, link_to, random_state
 
 PAGE_NAMES = [page.name for page in PAGES]
 
-NOT_CODE = {"cloud_color", "unit", "kept"}
-"""Parameters without an effect on arrays: colours, units on axes, and the estimate kept as A."""
+NOT_CODE = {"cloud_color", "unit", "kept", "study", "reported"}
+"""Parameters without an effect on arrays: colours, units on axes, the estimate kept as A, and the
+sections of Trade-off and Paper, whose scripts name a command."""
 
 RUN_EACH = """
 import os, runpy, sys
