@@ -633,7 +633,7 @@ LOOK_AT = (
     f"([start, end]) => {{ {VIEWS}"
     + """
   const { model: figure } = views.find(({ model: { type, title } }) =>
-    type === "Figure" && title?.text?.startsWith("Histogram of the pixel"));
+    type === "Figure" && title?.text?.startsWith("Histogram and both scales"));
   figure.x_range.setv({start, end});
   const legend = figure.center.find(({type}) => type === "Legend");
   const item = legend.items.find(({label}) => label.value === "small scale");
@@ -779,7 +779,7 @@ def fail_and_continue(here):
 @pytest.mark.browser
 def test_what_is_on_screen_is_saved(start_page, browser):
     fail_and_continue(start_page)  # on a disk that is full from the beginning
-    for what, title in (("histogram", "Histogram of the pixel"), ("image", "Estimated range")):
+    for what, title in (("histogram", "Histogram and both scales"), ("image", "Estimated range")):
         save_a_plot_as_a_picture(start_page, browser, what, title)
     save_the_visible_part_of_a_plot(start_page)
     save_a_cloud_as_picture_and_points(start_page)

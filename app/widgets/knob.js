@@ -40,7 +40,7 @@ export function render({ model }) {
     const [origin, step, decimals] = model.along;
     if (decimals !== null) return (origin + step * value).toFixed(decimals);
     const size = Math.abs(value);
-    return size !== 0 && (size < 1e-3 || size >= 1e6) ? value.toExponential() : String(value);
+    return size !== 0 && (size < 1e-4 || size >= 1e6) ? value.toExponential() : String(value);
   };
 
   const zone = ([from, to, why]) => {
