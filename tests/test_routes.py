@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -171,6 +172,7 @@ def test_only_its_own_page_returns_to_a_session(server):
 @pytest.mark.browser
 def test_a_foreign_page_can_neither_load_from_here_nor_connect(browser, marked, caplog):
     """A real page on another origin: an image, a script, a stylesheet and a socket."""
+    caplog.set_level(logging.WARNING, "tornado.access")  # an import of Dask's cluster silences it
     (server, mark), path = marked, RUN.format("leaves_a_mark")
     port = server.port
     asked = f"http://127.0.0.1:{port}{path}"
