@@ -98,6 +98,11 @@ def _pixel_angle_rad(field_of_view_rad: float, size: int) -> float:
     return field_of_view_rad / size
 
 
+def _gate_of(size: int) -> Acquisition:
+    """Return the paper's gate, for images of `size` x `size` pixels over 128 mrad."""
+    return replace(PAPER_GATE, pixel_angle_rad=_pixel_angle_rad(0.128, size))
+
+
 def car(size: int = 64) -> Scene:
     """A car at 50 m, seen from its front quarter and a little above.
 
@@ -136,7 +141,7 @@ def staircase(size: int = 64) -> Scene:
     ValueError
         If `size` is below 8.
     """
-    acquisition = replace(PAPER_GATE, pixel_angle_rad=_pixel_angle_rad(0.128, size))
+    acquisition = _gate_of(size)
     tile = np.arange(size) * 8 // size
     onset_bin = np.linspace(1.0, 94.0, 64)[8 * tile[:, np.newaxis] + tile]
     return Scene(acquisition.bin_to_range_m(onset_bin), acquisition=acquisition)
@@ -160,7 +165,7 @@ def uniform(size: int = 64, seed: int = 0, first_bin: float = 20, last_bin: floa
     ValueError
         If `size` is below 8, or the bins are not in order within the gate.
     """
-    acquisition = replace(PAPER_GATE, pixel_angle_rad=_pixel_angle_rad(0.128, size))
+    acquisition = _gate_of(size)
     require(
         "first_bin, last_bin",
         (first_bin, last_bin),
@@ -192,7 +197,7 @@ def wall(size: int = 64, seed: int = 0) -> Scene:
     ValueError
         If `size` is below 8.
     """
-    acquisition = replace(PAPER_GATE, pixel_angle_rad=_pixel_angle_rad(0.128, size))
+    acquisition = _gate_of(size)
     rng = np.random.default_rng(seed)
     half = _WALL_SPAN_BINS / 2
     middle, angle_rad = rng.uniform(20 + half, 94 - half), rng.uniform(0, 2 * np.pi)

@@ -190,6 +190,6 @@ PRESETS: dict[str, TrackingParameters] = _Presets(
         refine="none",
     ),
 )
-"""``recommended`` is the best on random depths. ``literal`` takes the paper's equations literally:
-its weight, an initial value of zero, T_n = 20, and whole bins. The paper prints no l, n, h, m or α;
-l is found by the search for the recommended preset (``python -m core tuning``)."""
+"""``recommended`` is the best on random depths (``python -m core recommend``). ``literal`` is the
+paper's equations with the printed weight and T_n, an initial value of zero, and whole bins. The
+paper prints no l, n, h, m or α; this l is the best on random depths (``python -m core tuning``)."""

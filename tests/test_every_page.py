@@ -79,10 +79,10 @@ JOURNEYS = {
     "Trade-off": open_a_configuration,
     "Paper": read_part_by_part,
 }
-"""What a user does on a page, which has just been opened."""
+"""Actions of a user on a page that has just been opened, by its name."""
 
 OTHERWISE = {"Inspect": "&source=building&pixel=[30,20]"}
-"""What the address of a page says besides its name."""
+"""Further parts of the address of a page, by its name."""
 
 
 @pytest.mark.parametrize("name", [each.name for each in PAGES])

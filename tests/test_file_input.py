@@ -17,6 +17,13 @@ PART = {
 }
 
 
+class Receiver(FileInput):
+    """A file input that is given messages in place of a browser."""
+
+    def receive(self, message):
+        self._handle_msg(message)
+
+
 @pytest.fixture
 def complaints():
     return []
@@ -25,24 +32,19 @@ def complaints():
 @pytest.fixture
 def given(complaints):
     """A file input that receives messages as from a browser."""
-    return FileInput(complaints.append, max_file_size=MAX_UPLOAD_BYTES)
-
-
-def receive(given, message):
-    """Give a file input a message as Panel does when one arrives from the browser."""
-    given._handle_msg(message)
+    return Receiver(complaints.append, max_file_size=MAX_UPLOAD_BYTES)
 
 
 def send(given, **changes):
-    receive(given, PART | changes)
+    given.receive(PART | changes)
 
 
 def begin(given):
-    receive(given, {"status": "initializing"})
+    given.receive({"status": "initializing"})
 
 
 def finish(given):
-    receive(given, {"status": "finished"})
+    given.receive({"status": "finished"})
 
 
 def test_a_file_in_parts_arrives_whole(given, complaints):
@@ -55,7 +57,7 @@ def test_a_file_in_parts_arrives_whole(given, complaints):
 
 
 def test_several_files_arrive_together_within_one_limit(complaints):
-    given = FileInput(complaints.append, max_file_size=10, multiple=True)
+    given = Receiver(complaints.append, max_file_size=10, multiple=True)
     for content, arrived in ((b"12345", [b"abcde", b"12345"]), (b"123456", None)):
         given.clear()
         begin(given)

@@ -134,7 +134,7 @@ TOOLS = {
     "Line": "FreehandDrawTool",
     "Zoom": "BoxZoomTool",
 }
-"""What a drag on the map does, and Bokeh's tool that does it."""
+"""Actions of a drag on the map, and the tools of Bokeh that perform them."""
 
 
 def choose_drag(page: Page, mode: str) -> None:

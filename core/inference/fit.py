@@ -25,7 +25,13 @@ from numpy.typing import NDArray
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.inference.flux import SAMPLE, flux_model_of
-from core.inference.likelihood import LikelihoodInput, delay_densities, pixels_of, prepare
+from core.inference.likelihood import (
+    NUMBERS_AT_ONCE,
+    LikelihoodInput,
+    delay_densities,
+    pixels_of,
+    prepare,
+)
 from core.kernels.echo_draws import UNIFORMS, redraw
 from core.kernels.parallel import entering
 from core.kernels.streams import uniforms
@@ -38,7 +44,6 @@ _GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
 _FEWEST = 5.0  # expected counts of a group, for a normal sum
 _STEPS_PER_BIN = 128  # delays at which an echo is tabulated
 _BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
-_AT_ONCE = 2**19  # counts whose residuals are computed together
 _SEED = np.uint64(0)
 
 
@@ -87,7 +92,7 @@ class Fit(NamedTuple):
 def fit_of(capture: Capture) -> Fit:
     """Test the model on the pixels from which the fluxes are estimated; on fewer in a long gate."""
     drawn = np.random.default_rng(0).permutation(capture.counts.size)[:SAMPLE]
-    at_most = max(1, _AT_ONCE // capture.acquisition.n_bins)
+    at_most = max(1, NUMBERS_AT_ONCE // capture.acquisition.n_bins)
     return fit_in(capture, np.sort(drawn[:at_most]))
 
 
@@ -105,7 +110,7 @@ def fit_in(capture: Capture, pixels: NDArray[np.intp]) -> Fit:
 def fit_p_values(capture: Capture) -> Floats:
     """P-value of each pixel, shape (row, col): uniform if the model holds."""
     every, n_bins = np.arange(capture.counts.size), capture.acquisition.n_bins
-    parts = np.array_split(every, -(-every.size * n_bins // _AT_ONCE))
+    parts = np.array_split(every, -(-every.size * n_bins // NUMBERS_AT_ONCE))
     found = [_p_values(capture, _residuals(capture, part)) for part in parts]
     return np.concatenate(found).reshape(capture.shape)
 

@@ -7,6 +7,7 @@ mass around an estimate is its confidence, for any estimator.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from core.capture import Capture, cached_per_capture
 from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import (
+    NUMBERS_AT_ONCE,
     LikelihoodInput,
     delay_curves,
     delay_densities,
@@ -24,7 +26,6 @@ from core.inference.likelihood import (
     prepared_groups,
 )
 
-_AT_ONCE = 2**19  # numbers that fit in the cache
 TOLERANCE_BINS = 3
 """Tolerance within which an estimate is right; it reproduces the paper's tables."""
 
@@ -85,8 +86,8 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
         Delays in fractional bins, from 0 to n_bins; NaN gives 0.
     """
     table, found = posterior_of(capture).tolerance_probability, np.empty(bins.size)
-    for begin in range(0, bins.size, _AT_ONCE):
-        some = slice(begin, begin + _AT_ONCE)
+    for begin in range(0, bins.size, NUMBERS_AT_ONCE):
+        some = slice(begin, begin + NUMBERS_AT_ONCE)
         delay = bins.ravel()[some]
         found[some] = _interpolated(table, np.arange(begin, begin + delay.size), delay)
     return found.reshape(bins.shape)
@@ -114,39 +115,11 @@ def _interpolated(
     return np.where(np.isnan(delay_bin), 0.0, np.clip(between, 0.0, 1.0))
 
 
-def most_likely(capture: Capture, flux: FluxModel, steps_per_bin: int) -> tuple[Floats, Floats]:
-    """Find the delay of the largest posterior density.
-
-    Parameters
-    ----------
-    capture : Capture
-    flux : FluxModel
-    steps_per_bin : int
-        Delays tried within each bin.
-
-    Returns
-    -------
-    delay_bin : ndarray, shape (row, col)
-        In fractional bins, refined by a parabola through the logarithm of the density.
-    score : ndarray, shape (row, col)
-        Log likelihood ratio to no echo at that delay.
-    """
-    delay, score = np.empty((2, capture.counts.size))
-    for pixels, prepared in prepared_groups(capture, flux, steps_per_bin):
-        for some, curve, weighted in delay_curves(prepared):
-            vertex, height = _vertex(prepared, weighted, curve.argmax(axis=1))
-            here = pixels_of(some, prepared, pixels)
-            size = here.stop - here.start
-            delay[here] = (vertex / steps_per_bin).ravel()[:size]
-            score[here] = height.ravel()[:size]
-    return delay.reshape(capture.shape), score.reshape(capture.shape)
-
-
 Rule = Literal["density", "window", "mean", "median"]
 
 
 def least_loss(
-    capture: Capture, flux: FluxModel, steps_per_bin: int, rule: Rule
+    capture: Capture, flux: FluxModel, steps_per_bin: int, rule: Rule = "density"
 ) -> tuple[Floats, Floats]:
     """Find the delay of the least expected loss, if there is a surface.
 
@@ -157,34 +130,49 @@ def least_loss(
     steps_per_bin : int
         Delays tried within each bin.
     rule : str
-        The loss: an error above `TOLERANCE_BINS` ("window", which has the highest expected
-        restoration degree), the square of the error ("mean", the lowest RMSE) or its magnitude
-        ("median", the lowest MAE). "density" is `most_likely`.
+        The loss: any error ("density", the likeliest delay), an error above `TOLERANCE_BINS`
+        ("window", the highest expected restoration degree), the square of the error ("mean", the
+        lowest RMSE) or its magnitude ("median", the lowest MAE).
 
     Returns
     -------
-    delay_bin, score : ndarray, shape (row, col)
-        As those of `most_likely`; the score is that of the largest density.
+    delay_bin : ndarray, shape (row, col)
+        In fractional bins; of the first two rules, refined by a parabola through the logarithm of
+        the density.
+    score : ndarray, shape (row, col)
+        Log likelihood ratio to no echo at the likeliest delay.
     """
-    if rule == "density":
-        return most_likely(capture, flux, steps_per_bin)
     delay, score = np.empty((2, capture.counts.size))
     for pixels, prepared in prepared_groups(capture, flux, steps_per_bin):
-        for some, density, _, weighted in delay_densities(prepared):
-            _, height = _vertex(prepared, weighted, density.argmax(axis=1))
-            if rule == "window":
-                at = _most_in_window(density, TOLERANCE_BINS * steps_per_bin)
-                found = _vertex(prepared, weighted, at)[0]
-            elif rule == "mean":
-                steps = np.arange(density.shape[1]) + 0.5
-                found = np.einsum("bdl,d->bl", density, steps) / density.sum(axis=1, dtype=float)
-            else:
-                found = _median(density)
+        for some, found, height in _answers(prepared, steps_per_bin, rule):
             here = pixels_of(some, prepared, pixels)
             size = here.stop - here.start
             delay[here] = (found / steps_per_bin).ravel()[:size]
             score[here] = height.ravel()[:size]
     return delay.reshape(capture.shape), score.reshape(capture.shape)
+
+
+most_likely = least_loss  # deprecated name, to be removed after the next release
+
+
+def _answers(
+    prepared: LikelihoodInput, steps_per_bin: int, rule: Rule
+) -> Iterator[tuple[slice, Floats, Floats]]:
+    """Yield blocks, their delays in steps and their scores, (block, lane) each."""
+    if rule == "density":
+        for some, curve, weighted in delay_curves(prepared):
+            yield some, *_vertex(prepared, weighted, curve.argmax(axis=1))
+        return
+    for some, density, _, weighted in delay_densities(prepared):
+        if rule == "window":
+            at = _most_in_window(density, TOLERANCE_BINS * steps_per_bin)
+            found = _vertex(prepared, weighted, at)[0]
+        elif rule == "mean":
+            steps = np.arange(density.shape[1]) + 0.5
+            found = np.einsum("bdl,d->bl", density, steps) / density.sum(axis=1, dtype=float)
+        else:
+            found = _median(density)
+        yield some, found, _vertex(prepared, weighted, density.argmax(axis=1))[1]
 
 
 def _vertex(

@@ -72,7 +72,7 @@ def _chosen(log_weight, uniform):  # type: ignore[no-untyped-def]
 
 @njit(**PARALLEL)
 def redraw(counts, n_pulses, pixels, echo, first_tap, state):  # type: ignore[no-untyped-def]
-    """Draw the states (pixel, 3) anew, in place: delay, log signal, and log background per bin.
+    """Replace the states (pixel, 3) by other draws: delay, log signal, and log background per bin.
 
     A delay of NaN, no echo, remains. `counts` is (pixel, bin), `pixels` the numbers of their random
     streams, and `n_pulses` 0 if unknown.

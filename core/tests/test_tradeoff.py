@@ -105,9 +105,9 @@ def test_a_gate_cut_to_the_true_ranges_is_never_chosen() -> None:
     assert cut and all(each.is_bound for each in cut)
     assert not any(each.is_bound for each in variations())
     honest = steady(50, 4)
-    told = [replace(steady(99, 1), candidate=each) for each in cut]
-    assert pareto_front([honest, *told]) == [honest]
-    best = best_within([honest, *told], 10)
+    informed = [replace(steady(99, 1), candidate=each) for each in cut]
+    assert pareto_front([honest, *informed]) == [honest]
+    best = best_within([honest, *informed], 10)
     assert best is not None and best.point is honest
 
 

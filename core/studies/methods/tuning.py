@@ -45,7 +45,7 @@ METHODS = [RECOMMENDED, LITERAL] + [
 
 @dataclass(frozen=True)
 class Tuned:
-    """What the search found for one method.
+    """The result of the search for one method.
 
     Parameters
     ----------
