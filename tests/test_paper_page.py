@@ -39,7 +39,9 @@ from tests.threads import HeldTasks
 # -- plots, pictures, tables -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [paper.figure_1, paper.figure_2, paper.figure_5, paper.figure_6])
+@pytest.mark.parametrize(
+    "make", [paper.figure_1, paper.figure_2, paper.residual_by_place, paper.weights]
+)
 def test_a_figure_holds_every_curve_of_its_study(make):
     item = make()
     figure = plots.curves(item, LIGHT)
@@ -196,9 +198,9 @@ def test_a_place_alone_gives_what_it_gives_among_others():
         assert values[1] == one.curves[name][0]
 
 
-def test_figures_4_and_5_agree_on_preset_flux_and_bin():
+def test_a_pixel_and_the_residual_agree_on_preset_flux_and_bin():
     pixel, curve = two_scales(Scales(onset_bin=77, sbr=0.05, preset="literal"))
-    expected = paper.figure_5_at(77, PRESETS["literal"], Flux(sbr=0.05))
+    expected = paper.pixel_signals(77, PRESETS["literal"], Flux(sbr=0.05))
     np.testing.assert_array_equal(pixel.curves["residual"], expected.curves["residual"])
     assert curve.marks == {"the echo above": 77.0}
     assert "0.05" in curve.title
@@ -220,11 +222,11 @@ def test_nothing_is_computed_before_the_first_visit(monkeypatch):
 
 
 def test_the_open_section_is_part_of_the_state(session):
-    session.state.reported = "Figure 6: the weights"
+    session.state.reported = "The weights"
     choice = page_of_paper.Paper(session).view.main[0][0]
-    assert choice.value == "Figure 6: the weights"
-    choice.value = "Figures 4, 5: two scales"
-    assert session.state.reported == "Figures 4, 5: two scales"
+    assert choice.value == "The weights"
+    choice.value = "Figure 4: two scales"
+    assert session.state.reported == "Figure 4: two scales"
 
 
 def test_the_sidebar_is_closed_here_and_opens_again_unless_the_window_is_narrow():
@@ -308,8 +310,8 @@ def titles(page: Page) -> dict[str, str]:
     )
 
 
-def move_the_slider_of_figure_5(here: Page) -> None:
-    go(here, "Figures 4, 5")
+def move_the_slider_of_figure_4(here: Page) -> None:
+    go(here, "Figure 4")
     pixel, curve = figure(here, "small scale"), figure(here, "the echo above")
     for each in (pixel, curve):
         expect(each).to_be_visible()
@@ -325,9 +327,9 @@ def move_the_slider_of_figure_5(here: Page) -> None:
 def change_to_dark(here: Page) -> None:
     """Expect dark plots, those that are built later, too."""
     here.get_by_role("button", name="Toggle theme").click()
-    go(here, "Figure 6")
+    go(here, "The weights")
     expect(figure(here, "weight cubic")).to_be_visible()
-    figures = ("Figure 1", "Figure 2", "Figure 6")
+    figures = ("Figure 1", "Figure 2", "The weight")
     eventually(lambda: sum(text.startswith(figures) for text in titles(here)) == 3)
     colors = {color for text, color in titles(here).items() if text.startswith(figures)}
     assert colors == {DARK.text}
@@ -359,7 +361,7 @@ def expect_limits_below_each_other(here: Page) -> None:
 
 
 def compare_pictures_at_a_pixel(here: Page) -> None:
-    go(here, "Figures 8, 9, 12")
+    go(here, "Figures 8, 9, 11, 12")
     note = here.get_by_text(text.OUTSIDE_NOTE)
     expect(note).to_be_visible()
     drawn = here.locator(".bk-Figure:visible")
@@ -391,10 +393,10 @@ def expect_a_phone_to_show_figure_and_sliders(here: Page) -> None:
 def read_part_by_part(here: Page) -> None:
     expect(figure(here, "background alone")).to_be_visible()
     assert download(here, "curves", "csv")[0] == "paper_figure_1.csv"
-    move_the_slider_of_figure_5(here)
+    move_the_slider_of_figure_4(here)
     change_to_dark(here)
     cancel_table_3_at_another_sbr(here)
-    go(here, "Figures 8, 9, 12")  # left before it is done
+    go(here, "Figures 8, 9, 11, 12")  # left before it is done
     expect_limits_below_each_other(here)
     compare_pictures_at_a_pixel(here)
     expect_a_phone_to_show_figure_and_sliders(here)

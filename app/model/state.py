@@ -249,11 +249,12 @@ SUBJECTS = ("Pixel", "Region", "Pins", "Profile", "A/B", "Capture")
 STUDIES = ("Speed and accuracy", "Acquisition", "Ablation", "Sensitivity")
 PAPER_SECTIONS = (
     "Figures 1, 2: the jump",
-    "Figures 4, 5: two scales",
-    "Figure 6: the weights",
+    "Figure 4: two scales",
+    "Figures 5, 6: pile-up",
+    "The weights",
     "Table 2: six SBRs",
     "Table 3: all methods",
-    "Figures 8, 9, 12: images",
+    "Figures 8, 9, 11, 12: images",
     "What the paper does not report",
 )
 CLOUD_COLORS = ("Range", "Error", "Counts")

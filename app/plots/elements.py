@@ -52,7 +52,7 @@ HISTOGRAM_TITLES = {
     False: "Histogram of the pixel",
 }
 """Titles with and without the scales."""
-SCORE_TITLE = "Score: its largest value is the echo"
+SCORE_TITLE = "Score: its largest value is taken for the echo"
 ESTIMATES_NAME = "estimate, own lag removed"
 
 
@@ -285,7 +285,7 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "limit: probability of the right bin": ("text", [2, 4]),
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
-    "estimate, lag included": ("estimate", []),
+    ESTIMATES_NAME: ("estimate", []),
     "the echo above": ("estimate", []),
 }
 METHOD_PLACES = {method.name: n for n, method in enumerate(paper.COMPARED)}

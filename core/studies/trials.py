@@ -130,7 +130,7 @@ class Summary:
     rd: tuple[Interval, ...]
     """Restoration degree within each of `TOLERANCES_BINS`, with Wilson intervals."""
     rmse_m: Interval
-    """With Student's interval of the mean square over captures."""
+    """With Student's interval of the logarithm of the mean square over captures: never below 0."""
     mae_m: float
     bias_m: float
     inlier_rmse_m: float
@@ -152,9 +152,11 @@ def summary(scores: Sequence[Score]) -> Summary:
 
     squares = [s.square_m2 / s.answered if s.answered else np.nan for s in scores]
     mean_square = mean_interval(np.array(squares))
+    rmse_m = math.sqrt(mean_square.value)
+    ratio = math.exp((mean_square.high / mean_square.value - 1) / 2) if rmse_m else 1.0
     return Summary(
         rd=tuple(metrics.wilson(int(h), targets) for h in hits.sum(axis=0)),
-        rmse_m=Interval(*np.sqrt(np.maximum(astuple(mean_square), 0.0)).tolist()),
+        rmse_m=Interval(rmse_m, rmse_m / ratio, rmse_m * ratio),
         mae_m=mean("absolute_m", answered),
         bias_m=mean("signed_m", answered),
         inlier_rmse_m=math.sqrt(mean("inlier_square_m2", int(hits[:, -1].sum()))),

@@ -15,7 +15,7 @@ import pytest
 from scipy import stats
 
 from core import metrics
-from core.acquisition import Acquisition
+from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.cli import main
 from core.estimators import ESTIMATORS, estimate
@@ -36,7 +36,7 @@ from core.studies.outputs import (
     columns_and_rows,
 )
 from core.studies.paper import figures as paper
-from core.studies.paper import page, recommend
+from core.studies.paper import page, pile_up, recommend
 from core.studies.paper.printed import TABLE_2, TABLE_3, TABLE_5
 from core.studies.report import write
 from core.studies.trials import Condition, Method, Results, Score, summary
@@ -90,8 +90,8 @@ def test_a_summary_pools_captures() -> None:
     assert found.rd == tuple(metrics.wilson(hits, 300) for hits in (249, 252, 255))
     squares = [0.1, 0.3, 0.2]
     assert found.rmse_m.value == pytest.approx(math.sqrt(0.2))
-    interval = stats.t.interval(0.95, 2, np.mean(squares), stats.sem(squares))
-    ends = tuple(math.sqrt(max(m, 0.0)) for m in interval)
+    relative = stats.t.interval(0.95, 2, 0.0, stats.sem(squares) / 0.2)
+    ends = tuple(math.sqrt(0.2 * math.exp(end)) for end in relative)
     assert (found.rmse_m.low, found.rmse_m.high) == pytest.approx(ends)
     assert (found.mae_m, found.bias_m) == pytest.approx((0.05, -0.02))
     assert found.inlier_rmse_m == pytest.approx(math.sqrt(1.5 / 255))
@@ -230,7 +230,7 @@ def items() -> dict[str, Item]:
 
 def test_items_are_complete(items: dict[str, Item]) -> None:
     figures = {key.split("_")[1] for key in items if key.startswith("figure")}
-    assert figures == {"1", "2", "4", "5", "6", "8", "9", "11", "12"}
+    assert figures == {"1", "2", "4", "5b", "6", "8", "9", "11", "12"}
     for item in items.values():
         assert item.title
         if isinstance(item, Plot):
@@ -252,11 +252,32 @@ def test_figures_of_the_model_show_the_echo() -> None:
     assert echo[51] > background[51]
     (jump,) = paper.figure_2().curves.values()
     assert jump.argmax() == 50
-    residual = paper.figure_5().curves["largest residual, no noise"]
+    residual = paper.residual_by_place().curves["largest residual, no noise"]
     assert (np.diff(residual) < 0).all()
-    moved = paper.figure_5_at(33.0)
+    moved = paper.pixel_signals(33.0)
     assert moved.marks["echo's onset"] == 33
-    assert abs(moved.marks["estimate, lag included"] - 33) < 6
+    assert abs(moved.marks["estimate, own lag removed"] - 33) < 3
+
+
+def test_pile_up_lowers_the_peak_of_an_echo_exponentially() -> None:
+    flux = Flux(0.5, 0.1)  # so many photons that the noise of 1000 pulses hides no curve
+    item = pile_up.figure_6(flux)
+    curves = {name: values[:-3] for name, values in item.curves.items()}  # the gate cuts the last
+    expected = curves["expected (Eq. 1)"]
+    np.testing.assert_allclose(np.diff(np.log(expected)), -flux.background / 100, rtol=1e-6)
+    sd = np.sqrt(expected / pile_up.N_PULSES)
+    assert (np.abs(curves["simulated"] - expected) < 5 * sd + 2 / pile_up.N_PULSES).all()
+    # Two fitted numbers move the exponential by less than the noise of a pixel; the cubic is wrong.
+    assert (np.abs(curves["exponential"] - expected) < sd)[:40].all()
+    assert (np.abs(curves["reciprocal of the cubic weight"] - expected) > 3 * sd)[:40].any()
+
+
+def test_noise_before_the_target_does_not_depend_on_it() -> None:
+    item = pile_up.figure_5b(Flux(sbr=0.08))
+    low, high = item.bands["expected (Eq. 1)"]
+    inside = ((item.curves["simulated"] > low) & (item.curves["simulated"] < high)).sum()
+    assert np.ptp(item.curves["expected (Eq. 1)"]) < 1e-12
+    assert inside >= 68  # of 80, each with 95 %: fewer happen once in 3,000 seeds
 
 
 def test_the_arithmetic_uses_the_paper_s_tables() -> None:

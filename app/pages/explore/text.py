@@ -14,10 +14,14 @@ CLOUD_HELP = "Quantity that colours the point cloud"
 EXPLANATION = """
 **What you see.** For each pixel, pulses are sent, and only the *first* photon after each is
 recorded. In daylight, background fires most pulses before the echo arrives: the histogram piles up
-at the front of the gate. Two tracking differentiators follow it: the *small scale* follows the slow
-decay, the *large scale* the sudden echo. Their positive difference, the *residual*, times a
-*weight*, has its maximum about two bins after the echo; this lag is known from the model and
-subtracted.
+at the front of the gate. Two tracking differentiators follow it: the *large scale* a sudden echo,
+the *small scale* the trend. Their positive difference, the *residual*, times a *weight*, has its
+maximum about two bins after the echo; this lag is known from the model and subtracted.
+
+**What misleads.** With *start* zero (the literal preset) the small scale begins far below the
+histogram, and meets it only late in the gate. Until then there is a residual without any echo, and
+estimates of noise gather where the two meet: an echo there is found by luck, too. Paper shows
+[estimates without an echo](?page=Paper&reported=What+the+paper+does+not+report).
 
 **What changes the estimate.** l and h act only through (m·h)²·l counts, so they are one parameter.
 m, n, T_n, the weight, the start and σ each change estimates. With the printed weight (cubic), α
@@ -26,7 +30,8 @@ assumes where targets are: the printed one that they are far, the recommended on
 α 0.15) hardly anything.
 
 **Recommended** settings were optimized on random depths over the gate, with other seeds than the
-reported ones. **As printed** takes the paper's text literally.
+reported ones. **Literal** takes the paper's equations as they are, with an l chosen here, since it
+prints none.
 """
 
 

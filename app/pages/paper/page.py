@@ -24,6 +24,7 @@ from core import PRESETS, Flux
 from core.parameters import Choice, Number, parameter
 from core.studies import outputs
 from core.studies.paper import figures as paper
+from core.studies.paper import pile_up as figures_5_6
 from core.studies.trials import Condition, Method, Results, trials
 
 # The paper's own method before the methods that bound it.
@@ -66,7 +67,7 @@ class Jump(Checked):
 
 @dataclass(frozen=True)
 class Scales(Checked):
-    """Settings of Figures 4 and 5."""
+    """Settings of Figure 4."""
 
     onset_bin: int = parameter(50, _ECHO, "Bin of the target: 20, 50 and 90 in Figure 4.")
     sbr: float = parameter(0.08, _SBR, _SBR_HELP)
@@ -79,8 +80,15 @@ class Scales(Checked):
 
 
 @dataclass(frozen=True)
+class AtPaperSBR(Checked):
+    """Settings of Figures 5 and 6."""
+
+    sbr: float = parameter(0.08, _SBR, _SBR_HELP)
+
+
+@dataclass(frozen=True)
 class Weights(Checked):
-    """Settings of Figure 6."""
+    """Settings of the weights."""
 
     onset_bin: int = parameter(80, _ECHO, "Bin of the target.")
     sbr: float = parameter(0.08, _SBR, _SBR_HELP)
@@ -99,8 +107,9 @@ class Images(Checked):
 
     figure: str = parameter(
         "Figure 8",
-        Choice("Figure", ("Figure 8", "Figure 9", "Figure 12")),
-        "8: the car at six SBRs. 9: the car with every method. 12: the building with every method.",
+        Choice("Figure", ("Figure 8", "Figure 9", "Figure 11", "Figure 12")),
+        "8: the car at six SBRs. 9: the car with every method. 11: the building without "
+        "background, the paper's reference. 12: the building with every method.",
     )
     sbr: float = parameter(0.06, _SBR, "SBR of Figure 9. " + _SBR_HELP)
 
@@ -133,10 +142,13 @@ class Paper:
                 "Figures 1, 2: the jump": lambda: (
                     LiveFigures(session, Jump(), text.JUMP, jump, count=2).view
                 ),
-                "Figures 4, 5: two scales": lambda: (
+                "Figure 4: two scales": lambda: (
                     LiveFigures(session, Scales(), text.SCALES, two_scales, count=2).view
                 ),
-                "Figure 6: the weights": lambda: (
+                "Figures 5, 6: pile-up": lambda: (
+                    LiveFigures(session, AtPaperSBR(), text.PILE_UP, pile_up, count=2).view
+                ),
+                "The weights": lambda: (
                     LiveFigures(session, Weights(), text.WEIGHTS, weights, count=1).view
                 ),
                 "Table 2: six SBRs": lambda: (
@@ -145,7 +157,7 @@ class Paper:
                 "Table 3: all methods": lambda: (
                     RepeatedTable(session, RepeatedAt(5), text.TABLE_3, plan_3, table_3).view
                 ),
-                "Figures 8, 9, 12: images": lambda: RangeImages(session).view,
+                "Figures 8, 9, 11, 12: images": lambda: RangeImages(session).view,
                 "What the paper does not report": lambda: NotReported(session).view,
             },
             label="Section",
@@ -181,21 +193,26 @@ def jump(settings: Jump) -> list[outputs.Plot]:
 
 
 # The curve does not depend on the echo's bin, and takes three times as long as the pixel.
-_figure_5 = lru_cache(maxsize=64)(paper.figure_5)
+_residual_by_place = lru_cache(maxsize=64)(paper.residual_by_place)
 
 
 def two_scales(settings: Scales) -> list[outputs.Plot]:
-    """Return a pixel as in Figure 4, and Figure 5 with the pixel's bin marked."""
+    """Return a pixel as in Figure 4, and its residual at other bins with its own marked."""
     parameters, flux = PRESETS[settings.preset], Flux(sbr=settings.sbr)
-    pixel = paper.figure_5_at(settings.onset_bin, parameters, flux)
+    pixel = paper.pixel_signals(settings.onset_bin, parameters, flux)
     marks = {"the echo above": float(settings.onset_bin)}
-    # The note of Figure 5, below it, says the same.
-    return [replace(pixel, note=""), replace(_figure_5(parameters, flux), marks=marks)]
+    return [pixel, replace(_residual_by_place(parameters, flux), marks=marks)]
+
+
+def pile_up(settings: AtPaperSBR) -> list[outputs.Plot]:
+    """Return Figures 5 and 6."""
+    flux = Flux(sbr=settings.sbr)
+    return [figures_5_6.figure_6(flux), figures_5_6.figure_5b(flux)]
 
 
 def weights(settings: Weights) -> list[outputs.Plot]:
-    """Return Figure 6."""
-    return [paper.figure_6(Flux(sbr=settings.sbr), settings.onset_bin)]
+    """Return a pixel's enhanced signal under each weight."""
+    return [paper.weights(Flux(sbr=settings.sbr), settings.onset_bin)]
 
 
 Plan = Mapping[Condition, Sequence[Method]]
@@ -341,7 +358,7 @@ class RepeatedTable(PaperSection[Settings], StudySection[Settings]):
 
 
 class RangeImages(PaperSection[Images], StudySection[Images]):
-    """Figures 8, 9 and 12.
+    """Figures 8, 9, 11 and 12.
 
     Attributes
     ----------
@@ -370,6 +387,7 @@ class RangeImages(PaperSection[Images], StudySection[Images]):
         work: dict[str, Callable[[], outputs.Pictures]] = {
             "Figure 8": paper.figure_8,
             "Figure 9": partial(paper.figure_9, self.settings.sbr),
+            "Figure 11": paper.figure_11,
             "Figure 12": paper.figure_12,
         }
         return [Step(work[self.settings.figure], self._draw)]

@@ -18,17 +18,24 @@ Background fires most pulses before the echo arrives: the probability that a bin
 bin to bin (Figure 1). The echo is a jump in it, which the first difference shows (Figure 2).
 """
 SCALES = """
-Top: histogram of a pixel as in Figure 4; the small scale follows the trend, the large scale follows
-a jump. Bottom: Figure 5, the height of the residual against the echo's bin. Where it falls to the
-level of noise alone, the echo is lost.
+Top: histogram of a pixel as in Figure 4. The large scale follows a jump, the small scale the trend:
+with the literal preset it starts at zero, and meets the background only late in the gate. Bottom,
+not in the paper: the height of the residual against the echo's bin. Where it falls to the level of
+noise alone, the echo is lost.
+"""
+PILE_UP = """
+A target is moved from bin 20 to the end of the gate. Top: the trigger frequency at its peak (Figure
+5a), which falls, and fits of it (Figure 6). The paper takes the fall for exponential, and concludes
+that the weight should grow exponentially, but prints a cubic weight. Bottom: noise in the bins
+before the target (Figure 5b).
 """
 WEIGHTS = """
-The enhanced signal is the residual times a weight; the estimate is its maximum. The weight trades
-late echoes against early noise, and is therefore an assumption about range.
+Not in the paper. The enhanced signal is the residual times a weight; the estimate is its maximum.
+The weight trades late echoes against early noise, and is therefore an assumption about range.
 """
 TABLE_2 = """
-The paper's method on the car at six SBRs, with the recommended preset and with the settings as
-printed. Below: the likelihood, and the oracle, which knows the true fluxes.
+The paper's method on the car at six SBRs, with the recommended preset and with its literal
+equations. Below: the likelihood, and the oracle, which knows the true fluxes.
 """
 TABLE_3 = """
 All methods on the car at the chosen SBR. The paper prints this table for 0.06 only; for its five

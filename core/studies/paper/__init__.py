@@ -1,7 +1,8 @@
 """Figures and tables of the paper, reproduced."""
 
-from core.studies.paper import figures
+from core.studies.paper import figures, pile_up
 
 __all__ = [
     "figures",
+    "pile_up",
 ]

@@ -1,6 +1,6 @@
 """The paper's figures and tables as data, compared with what it prints and what it omits.
 
-Only the settings of its figures were available; their content is inferred and marked so.
+The text of the paper was available, its pictures were not: figures show what the text says of them.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from core.metrics import Interval
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies.outputs import Item, Pictures, Plot, Table, table
+from core.studies.paper.pile_up import figure_5b, figure_6
 from core.studies.paper.printed import TABLE_2, TABLE_3, TABLE_5, Printed
 from core.studies.trials import (
     Condition,
@@ -38,7 +39,7 @@ from core.studies.trials import (
 from core.tracking import PRESETS, TrackingParameters, tracking_signals
 from core.trigger import first_difference, rate_per_bin, trigger_probability
 
-INFERRED = "The content of the paper's figure is inferred from its settings."
+FROM_TEXT = "Drawn after the paper's text; its picture was not available."
 FIGURE_1 = Flux(0.5203, 0.08)
 FIGURE_4 = Flux(sbr=0.08)
 N_PULSES = 1000
@@ -46,6 +47,8 @@ GATE = Acquisition(n_pulses=N_PULSES)
 PULSE = Pulse()
 NEAR = {sbr: Condition("car", sbr) for sbr in TABLE_2}
 FAR = Condition("building", 0.038, 0.13)
+BINS = np.arange(GATE.n_bins, dtype=float) + 0.5
+"""Centres of the bins, at which counts are drawn as on the other pages."""
 PLACES = tuple(np.arange(2.5, GATE.n_bins - 2, 5.0).tolist())
 """Bins of the echo over which its position is varied."""
 
@@ -82,7 +85,7 @@ def figure_1(flux: Flux = FIGURE_1, onset_bin: float = 50.0) -> Plot:
         "Figure 1: noise triggers first",
         "Bin (1 ns)",
         "Trigger probability per pulse",
-        np.arange(GATE.n_bins, dtype=float),
+        BINS,
         {"with an echo": with_echo, "background alone": without},
         {"echo's onset": onset_bin},
         f"Signal {flux.signal:g} and background {flux.background:.4g} photons per pulse: the echo "
@@ -97,10 +100,10 @@ def figure_2(flux: Flux = FIGURE_1, onset_bin: float = 50.0) -> Plot:
         "Figure 2: the first difference shows the jump",
         "Bin (1 ns)",
         "Change of trigger probability",
-        np.arange(GATE.n_bins, dtype=float),
+        BINS,
         {"first difference": first_difference(_probability(flux, onset_bin, flux.signal))},
         {"echo's onset": onset_bin},
-        INFERRED,
+        FROM_TEXT,
     )
 
 
@@ -111,40 +114,42 @@ def figure_4(
 ) -> list[Plot]:
     """Plot histogram and both scales for a near, a middle and a far target."""
     return [
-        figure_5_at(onset, parameters, Flux(sbr=0.08), f"figure_4_bin_{onset:g}", seed)
+        pixel_signals(onset, parameters, Flux(sbr=0.08), f"figure_4_bin_{onset:g}", seed)
         for onset in onsets_bin
     ]
 
 
-def figure_5_at(
+def pixel_signals(
     onset_bin: float,
     parameters: TrackingParameters = PRESETS["recommended"],
     flux: Flux = FIGURE_4,
-    key: str = "figure_5_pixel",
+    key: str = "pixel_signals",
     seed: int = 0,
 ) -> Plot:
     """Plot the histogram and signals of one pixel with the target at one bin."""
     scene = Scene(np.full((1, 1), GATE.bin_to_range_m(onset_bin)))
-    histogram = simulate(scene, GATE, flux, PULSE, seed).cube[0, 0]
-    signals = tracking_signals(histogram, parameters, N_PULSES)
+    capture = simulate(scene, GATE, flux, PULSE, seed)
+    signals = tracking_signals(capture.cube[0, 0], parameters, N_PULSES)
+    delay_bin = _delays(capture, Method("tracking", "tracking", parameters)).item()
     return Plot(
         key,
         f"Both scales, echo at bin {onset_bin:g}, SBR {flux.sbr:g}",
         "Bin (1 ns)",
         "Counts",
-        np.arange(GATE.n_bins, dtype=float),
+        BINS,
         {
             "histogram": signals.raw,
             "small scale": signals.small,
             "large scale": signals.large,
             "residual": signals.residual,
         },
-        {"echo's onset": onset_bin, "estimate, lag included": float(signals.position_bin)},
-        INFERRED,
+        {"echo's onset": onset_bin, "estimate, own lag removed": delay_bin},
+        "The enhanced signal, the residual times the weight, has its maximum in bin "
+        f"{float(signals.position_bin):g}, the lag of the method behind its estimate. {FROM_TEXT}",
     )
 
 
-def figure_5(
+def residual_by_place(
     parameters: TrackingParameters = PRESETS["recommended"], flux: Flux = FIGURE_4
 ) -> Plot:
     """Compare the residual of an echo with that of noise, by the position of the echo."""
@@ -156,8 +161,8 @@ def figure_5(
     noise = tracking_signals(echo_free.cube, parameters, N_PULSES).residual
     highest = np.quantile(noise[..., parameters.t_n :].max(axis=-1), [0.5, 0.95])
     return Plot(
-        "figure_5",
-        f"Figure 5: the later the echo, the smaller its residual (SBR {flux.sbr:g})",
+        "residual_by_place",
+        f"The later the echo, the smaller its residual (SBR {flux.sbr:g})",
         "Bin of the echo's onset",
         "Residual (counts)",
         onset,
@@ -166,11 +171,11 @@ def figure_5(
             "largest of noise alone, median": np.full(onset.size, highest[0]),
             "largest of noise alone, 95 %": np.full(onset.size, highest[1]),
         },
-        note="Pile-up leaves fewer armed pulses for a late echo; noise stays the same. " + INFERRED,
+        note="Pile-up leaves fewer armed pulses for a late echo; noise stays the same.",
     )
 
 
-def figure_6(flux: Flux = FIGURE_4, onset_bin: float = 80.0, seed: int = 0) -> Plot:
+def weights(flux: Flux = FIGURE_4, onset_bin: float = 80.0, seed: int = 0) -> Plot:
     """Plot one pixel's residual under each weight, every curve over its maximum."""
     scene = Scene(np.full((1, 1), GATE.bin_to_range_m(onset_bin)))
     histogram = simulate(scene, GATE, flux, PULSE, seed).cube[0, 0]
@@ -180,14 +185,32 @@ def figure_6(flux: Flux = FIGURE_4, onset_bin: float = 80.0, seed: int = 0) -> P
         enhanced = tracking_signals(histogram, parameters, N_PULSES).enhanced
         curves[f"weight {weight}"] = enhanced / max(float(enhanced.max()), 1e-300)
     return Plot(
-        "figure_6",
-        f"Figure 6: the weight raises late bins (echo at bin {onset_bin:g}, SBR {flux.sbr:g})",
+        "weights",
+        f"The weight raises late bins (echo at bin {onset_bin:g}, SBR {flux.sbr:g})",
         "Bin (1 ns)",
         "Enhanced signal, over its largest value",
-        np.arange(GATE.n_bins, dtype=float),
+        BINS,
         curves,
         {"echo's onset": onset_bin},
-        "With a cubic weight α has no effect on the normalized curve. " + INFERRED,
+        "With a cubic weight α has no effect on the normalized curve.",
+    )
+
+
+def field_pixel(seed: int = 0) -> Plot:
+    """Plot one pixel of the simulated twin of the field experiment."""
+    capture = FAR.capture(seed)
+    row, col = (size // 2 for size in capture.shape)
+    signals = tracking_signals(capture.cube[row, col], PRESETS["recommended"])
+    truth_bin = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m)[row, col])
+    return Plot(
+        "field_pixel",
+        f"Pixel ({row}, {col}) of the building, simulated",
+        "Bin (1 ns)",
+        "Counts",
+        np.arange(capture.acquisition.n_bins, dtype=float) + 0.5,
+        {"histogram": signals.raw, "residual": signals.residual},
+        {"truth": float(truth_bin)},
+        f"A simulation with the field's PPP {FAR.signal} and SBR {FAR.sbr}.",
     )
 
 
@@ -209,22 +232,12 @@ def figure_9(sbr: float = 0.06, seed: int = 0) -> Pictures:
     return _pictures("figure_9", f"Figure 9: the methods at SBR {sbr:g}", images)
 
 
-def figure_11(seed: int = 0) -> Plot:
-    """Plot one pixel of the simulated twin of the field experiment."""
-    capture = FAR.capture(seed)
-    row, col = (size // 2 for size in capture.shape)
-    signals = tracking_signals(capture.cube[row, col], PRESETS["recommended"])
-    truth_bin = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m)[row, col])
-    return Plot(
-        "figure_11",
-        f"Figure 11, simulated twin: pixel ({row}, {col}) of the building",
-        "Bin (1 ns)",
-        "Counts",
-        np.arange(capture.acquisition.n_bins, dtype=float),
-        {"histogram": signals.raw, "residual": signals.residual},
-        {"truth": float(truth_bin)},
-        f"A simulation with the field's PPP {FAR.signal} and SBR {FAR.sbr}. {INFERRED}",
-    )
+def figure_11(seed: int = 0) -> Pictures:
+    """Show the paper's reference of the field experiment: its method without background."""
+    scene = scenes["building"]()
+    night = simulate(scene, scene.acquisition, Flux(FAR.signal, math.inf), PULSE, seed)
+    images = {"truth": scene.range_m, "tracking, no background": _range_image(night, RECOMMENDED)}
+    return _pictures("figure_11", "Figure 11, simulated twin: the reference image", images)
 
 
 def figure_12(seed: int = 0) -> Pictures:
@@ -523,14 +536,17 @@ def model_items(size: int = 64) -> Iterator[Item]:
     yield figure_1()
     yield figure_2()
     yield from figure_4()
-    yield figure_5()
-    yield figure_6()
+    yield figure_5b(FIGURE_4)
+    yield figure_6(FIGURE_4)
     yield figure_8()
     yield figure_9()
     yield figure_11()
     yield figure_12()
     yield limits()
     yield arithmetic()
+    yield residual_by_place()
+    yield weights()
+    yield field_pixel()
     yield flat_target(size)
     yield from map(by_speed, ("car", "uniform"))
     for sbr in (0.06, 0.03):
@@ -560,5 +576,5 @@ def _by_method(capture: Capture, names: Mapping[str, Printed]) -> dict[str, Floa
 def _pictures(key: str, title: str, images: Mapping[str, Floats]) -> Pictures:
     truth_m = images["truth"]
     low, high = float(np.nanmin(truth_m)), float(np.nanmax(truth_m))
-    note = "Pixels without a target are blank. " + INFERRED
+    note = "Pixels without a target are blank. " + FROM_TEXT
     return Pictures(key, title, "Range (m)", images, low - 0.5, high + 0.5, note)
