@@ -26,6 +26,7 @@ from app.pages.catalog import PAGES
 from app.pages.explore import text as explore_text
 from app.pages.layout import CUSTOM, Layout
 from app.pages.shared.estimate import lane_of
+from app.pages.shared.illumination import IlluminationPanel
 from app.plots import elements as plots
 from app.plots.gate_cut import Cut
 from app.tasks.scheduler import GENERAL, PAGE, SHORT
@@ -500,6 +501,37 @@ def test_every_field_has_a_control_made_from_its_metadata(settings):
         else:
             assert tuple(control.options) == spec.options
             assert control.description == each.metadata["help"]
+
+
+def test_signal_background_and_sbr_move_together():
+    state = State()
+    panel = IlluminationPanel(state)
+    state.param.watch(lambda event: panel.show(event.new), "light")
+    signal, sbr = panel.controls["ppp"], panel.controls["sbr"]
+    background = panel.background.value
+    assert background == pytest.approx(0.1041 / 0.06)
+    signal.value = 0.2082  # a target twice as bright
+    assert (sbr.value, panel.background.value) == pytest.approx((0.12, background))
+    panel.held.value = "SBR"
+    signal.value = 0.1041
+    assert (sbr.value, panel.background.value) == pytest.approx((0.12, background / 2))
+    sbr.value = 0.06
+    assert (signal.value, panel.background.value) == pytest.approx((0.1041, background))
+    panel.background.value = 1.041
+    assert state.light == Illumination(sbr=0.1)
+    panel.background.value = 0.0
+    assert state.light == Illumination(sbr=0.1)
+    assert "Background = 0.0 is not accepted: give a number above 0" in panel.doubts.text
+
+
+def test_without_a_signal_the_sbr_stays():
+    state = State(light=Illumination(ppp=0.0))
+    panel = IlluminationPanel(state)
+    panel.show(state.light)
+    panel.controls["ppp"].value = 0.1041
+    assert state.light == Illumination()
+    panel.controls["ppp"].value = 0.0
+    assert state.light == Illumination(ppp=0.0)
 
 
 def test_values_that_exclude_each_other_are_refused_in_words_of_the_form():

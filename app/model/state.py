@@ -31,7 +31,7 @@ class Illumination:
     )
     ppp: float = parameter(
         0.1041,
-        Number("PPP", 0.001, 10.0, log=True, least=0.0, unit="photons per pulse"),
+        Number("Signal (PPP)", 0.001, 10.0, log=True, least=0.0, unit="photons per pulse"),
         "Signal flux: detections per pulse if the detector were always armed.",
     )
     n_pulses: int = parameter(
@@ -52,6 +52,11 @@ class Illumination:
     def flux(self) -> Flux:
         """Signal and background."""
         return Flux(self.ppp, self.sbr)
+
+    def with_background(self, background: float) -> Illumination:
+        """Return the same signal over another background, in photons per pulse."""
+        # The SBR stands in fields and links: without the last digits, which are rounding errors.
+        return replace(self, sbr=float(f"{self.ppp / background:.12g}"))
 
     def acquisition(self, of_scene: Acquisition) -> Acquisition:
         """Return a scene's acquisition with this number of pulses."""
@@ -245,6 +250,7 @@ class Comparison:
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
 UNITS = ("bins", "ns", "m")
+HELD = ("background", "SBR")
 SUBJECTS = ("Pixel", "Region", "Pins", "Profile", "A/B", "Capture")
 STUDIES = ("Speed and accuracy", "Acquisition", "Ablation", "Sensitivity")
 PAPER_SECTIONS = (
@@ -328,6 +334,9 @@ class State(param.Parameterized):
 
     source = param.String(default="car", doc="Key of a scene or capture.")
     light = param.ClassSelector(class_=Illumination, default=Illumination())
+    held = param.Selector(
+        default=HELD[0], objects=list(HELD), doc="What stays when the signal moves."
+    )
     reading = param.ClassSelector(class_=ReadOptions, default=ReadOptions())
     window = param.ClassSelector(
         class_=Window,

@@ -28,6 +28,7 @@ from app.model.watched import Arrival
 from app.pages.catalog import PAGES
 from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
+from app.pages.shared.illumination import IlluminationPanel
 from app.pages.shared.method import MethodChoice
 from app.pages.shared.reading import ReadingForm
 from app.pages.shared.truth import TruthForm, TruthOffer
@@ -249,8 +250,9 @@ class Layout:
         )
         self._panels: dict[str, SettingsPanel[Any]] = {
             name: SettingsPanel(type(getattr(state, name))(), partial(setattr, state, name))
-            for name in ("light", "tracking", "less")
+            for name in ("tracking", "less")
         }
+        self._panels["light"] = IlluminationPanel(state)
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
