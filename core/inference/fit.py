@@ -132,8 +132,8 @@ def fit_p_values(capture: Capture) -> Floats:
 def share_below(p_values: Floats) -> str:
     """Return how many p-values of pixels are small, as a sentence."""
     share = float(np.mean(p_values < SMALL))
-    expected = f"{SMALL:.0%} are expected if the model holds"
-    return f"{share:.1%} of the pixels have a p-value below {SMALL:g}; {expected}."
+    expected = f"{100 * SMALL:g} % are expected if the model holds"
+    return f"{100 * share:.1f} % of the pixels have a p-value below {SMALL:g}; {expected}."
 
 
 def fit_p_values_of(capture: Capture, pixels: NDArray[np.intp]) -> Floats:

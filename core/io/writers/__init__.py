@@ -31,7 +31,7 @@ from core.io.writers.colors import (
     range_scale,
 )
 from core.io.writers.picture import Picture
-from core.io.writers.product import FIT_MEANING, P_VALUE, Product, guessed_angle
+from core.io.writers.product import P_VALUE, Product, guessed_angle
 from core.io.writers.table import write_columns
 from core.io.writers.whole import whole_file, whole_folder
 from core.labels import Plane
@@ -40,7 +40,6 @@ __all__ = [
     "CAPTURE_SUFFIXES",
     "CLOUD_SUFFIXES",
     "COLOR_MAPS",
-    "FIT_MEANING",
     "FOLDER_WRITERS",
     "OUTSIDE_COLOR",
     "P_VALUE",

@@ -23,8 +23,6 @@ _MOST_IN_LINE = 500  # characters
 P_VALUE = "fit_p_value"
 """Name of the p-values of the goodness of fit."""
 
-FIT_MEANING = "p-value of the goodness of fit of the model behind the confidence"
-
 COLORS = ("red", "green", "blue")
 """Columns of a cloud that has colours."""
 
@@ -118,7 +116,8 @@ class Product:
         meaning = "limit of the 95 % interval of the range, given that the estimate is right"
         limits = self.interval_columns.items()
         known |= {name: Plane(limit_m, "m", meaning) for name, limit_m in limits}
-        known |= {name: Plane(p, "1", FIT_MEANING) for name, p in self.p_value_columns.items()}
+        meaning = "p-value of the goodness of fit of the model behind the confidence"
+        known |= {name: Plane(p, "1", meaning) for name, p in self.p_value_columns.items()}
         return shown | {name: plane for name, plane in known.items() if name not in shown}
 
     @property
