@@ -85,6 +85,14 @@ def method_style(place: int, colors: Palette) -> tuple[str, list[int]]:
     return colors.methods[n_color], DASHES[n_dash % len(DASHES)]
 
 
+WRAPPED = """
+:host(:not(.bk-vertical)) { width: max-content; max-width: calc(100% - 4px); }
+:host(:not(.bk-vertical)) .bk-grid {
+  display: flex; flex-wrap: wrap; justify-content: flex-end; width: auto; row-gap: 0;
+}
+"""
+"""Style of a horizontal legend inside a plot: rows no wider than the plot."""
+
 STYLES: dict[str, dict[str, object]] = {
     # Transparent, so that the card's colour changes with the mode.
     "Plot": {

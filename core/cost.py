@@ -27,6 +27,7 @@ __all__ = [
     "cost_of",
     "needs",
     "predicted",
+    "predicted_fit_time",
     "predicted_flux_time",
     "require_memory",
 ]
@@ -52,6 +53,7 @@ _ECHO_S = 25e-9  # per bin of an expected echo
 _NULL_S = 60e-9
 _FEW_PIXELS = 24  # whose fluxes are estimated one by one (`core.inspection.mean_flux`)
 _FLUX_S, _MIXTURE_S = 20e-6, 5e-6  # per bin of a pixel
+_FIT_S, _FIT_BYTES = 0.5e-6, 80_000_000  # per bin of a pixel; of the pixels tested at once
 _ECHOES = 64  # noise-free echoes of the lag calibration
 _USUAL_LEVELS = 4  # signal levels of a capture
 
@@ -177,6 +179,11 @@ def predicted_flux_time(n_pixels: int, n_bins: int) -> Cost:
     n_sampled = min(n_pixels, SAMPLE)
     n_bytes = 20e6 + 4 * n_pixels * n_bins + _SAMPLE_COUNT_BYTES * n_sampled * n_bins
     return Cost(int(n_bytes), _MIXTURE_S * n_sampled * n_bins)
+
+
+def predicted_fit_time(n_pixels: int, n_bins: int) -> Cost:
+    """Predict memory and time of the goodness of fit (`core.inference.fit_p_values`) of pixels."""
+    return Cost(_FIT_BYTES, _FIT_S * n_pixels * n_bins)
 
 
 def _filled(n_pixels: int, lanes: int) -> int:

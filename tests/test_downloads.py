@@ -322,7 +322,7 @@ def test_descriptions_state_version_method_all_settings_and_source(explore, sess
 def test_arrays_and_pages_hold_the_map_that_is_shown(explore, session, kind):
     values, look = map_of(session.answer, kind, Viewing())
     files = image_files(session.answer, kind, Viewing(), explore.image.figure)
-    name = "range_m" if kind == "Estimate" else kind.lower()
+    name = {"Estimate": "range_m", "Goodness of fit": "fit_p_value"}.get(kind, kind.lower())
     np.testing.assert_array_equal(np.load(io.BytesIO(written(files["npz"])))[name], values)
     with tifffile.TiffFile(io.BytesIO(written(files["tif"]))) as tif:
         first = tif.pages[0]
@@ -702,7 +702,7 @@ def save_all_of_inspect(here):
     expect(here.get_by_role("rowheader", name="1", exact=True)).to_be_visible()
     for what, suffix, name in (
         ("map", "tif", "car_tracking_map-Estimate.tif"),
-        ("rate", "svg", "car_tracking_rate-row32-col32.svg"),
+        ("counts", "svg", "car_tracking_counts-row32-col32.svg"),
         ("table", "csv", "car_tracking_candidates-row32-col32.csv"),
     ):
         assert download(here, what, suffix)[0] == name

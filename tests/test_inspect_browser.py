@@ -226,6 +226,7 @@ def expect_maps(page: Page, subject: Subject) -> None:
     expected = {
         "Confidence": np.where(image.valid, image.confidence, np.nan),
         "SBR": inspection.maps["SBR"](capture),
+        "Goodness of fit": inspection.maps["Goodness of fit"](capture),
         "Estimate": subject.visible_m,
     }
     if capture.truth_range_m is not None:

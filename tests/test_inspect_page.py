@@ -21,7 +21,13 @@ from app.pages.inspect.pair import PairSection
 from app.pages.inspect.pins import PinsSection
 from app.pages.inspect.pixel import PixelSection
 from app.pages.inspect.profile import ProfileSection
-from app.pages.inspect.results import accuracy_steps, inspect_region, profile_of, with_gate
+from app.pages.inspect.results import (
+    accuracy_steps,
+    inspect_region,
+    predict,
+    profile_of,
+    with_gate,
+)
 from app.pages.inspect.views import MAX_DRAWN_CORNERS, corners_of, rectangle
 from app.pages.session import Session
 from app.pages.shared.crop import NO_REGION
@@ -334,6 +340,20 @@ def test_a_region_shows_the_sum_of_its_histograms(building):
     decimals = 1 - math.floor(math.log10(expected.region.spread_m))
     assert facts["Median range"] == f"{np.nanmedian(image):.{decimals}f} m"
     assert facts["SBR"] == text.interval(expected.region.flux.sbr)
+    assert section.remark.text.startswith(expected.region.fit.verdict)
+    visible = [each.visible for each in section.cards]
+    building.state.plot = "Fit"
+    building.tasks.run_until(lambda: section.plots.residuals.curve("deviation").size)
+    shown = [each.visible for each in section.cards]
+    assert shown[0] and sum(shown) == sum(visible) == 2 and shown != visible
+    predicted = predict(expected).counts
+    drawn = section.plots.counts.source("fit").data
+    for name, curve in (("fit", predicted.expected), ("low", predicted.low)):
+        np.testing.assert_allclose(drawn[name], curve, rtol=1e-6)
+    table, n_bins = table_of(section, "counts"), summed.size
+    np.testing.assert_array_equal(table["expected (fit) (counts)"][:n_bins], predicted.expected)
+    saved = table_of(section, "residuals of the fit")["residual"][:n_bins]
+    np.testing.assert_array_equal(saved, predicted.residual)
     building.state.region = ((0.1, 0.1), (0.1, 0.2), (0.2, 0.2))
     building.tasks.run_until(lambda: section.found is None)
     assert "0 pixels" in section.remark.text
@@ -356,6 +376,9 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
     lines = section.counts.source("lines").data["ys"]
     np.testing.assert_allclose(lines, [far.answer.capture.cube[pin] for pin in pins])
     assert [row["name"] for row in section.table.rows] == [f"100, {130 + n}" for n in range(4)]
+    assert section.note.text == "No distances: the confidence of 100, 130 is below 0.9."
+    assert section.table.rows[0]["cells"][0] == ("–", None, "not reliable")
+    far.state.viewing = replace(far.state.viewing, least_confidence=0.0)
     assert re.match(r"Distance from 100, 130: [\d.]+ ± [\d.]+ m to 100, 131; ", section.note.text)
     assert section.note.text.endswith(text.WIDTH_GUESSED)
     section.zoom.button.clicks += 1
@@ -537,7 +560,7 @@ def test_region_pins_and_capture_are_saved_as_shown(name, request):
     assert section.view.main
     is_tracking = session.answer.method == "tracking"
     hidden, shown = ("score", "residual and enhanced")[:: 1 if is_tracking else -1]
-    visible = section.downloads.keys() - {hidden}
+    visible = section.downloads.keys() - {hidden, "residuals of the fit"}
     assert visible >= {"rate", shown}
     saved = {button: section.downloads[button]() for button in visible}
     assert saved.keys() >= {"counts", "numbers", "table"}

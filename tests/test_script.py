@@ -21,6 +21,7 @@ from app.model.state import Comparison, State
 from app.model.store import ASSETS, Answer, Pixel, Request, built_in_sources, file_source, inspect
 from app.pages.catalog import PAGES
 from app.pages.compare.ranking import run_task, tasks_of
+from app.pages.inspect.results import inspect_pixel, predict
 from app.pages.session import Session
 from core.io.readers.labelled import dataset
 from core.tests.captures import CAPTURES
@@ -52,6 +53,8 @@ for folder in sys.argv[1:]:
             kept |= {f"{name} {n}": each for n, each in signals._asdict().items()}
     if "region" in found:
         kept["region"] = found["region"].summed.cube
+    if "expected" in found:
+        kept["expected"] = found["expected"].expected
     if "pictures" in found:
         kept |= {f"{name} picture": each for name, each in found["pictures"].items()}
     np.savez("kept.npz", **kept)
@@ -133,7 +136,7 @@ STATES = {
     "&tracking.start=zero&image=Error&viewing.least_confidence=0.4"
     "&viewing.color_from_m=48&viewing.color_map=viridis&difference=true&pixel=[3,17]",
     "larger": "source=car_256&less.skip=3&image=Counts&absent=[%22signal_levels%22]",
-    "inspected": "source=building&page=Inspect&map=SBR&pins=[[1,2],[30,41]]&pixel=[12,13]"
+    "inspected": "source=building&page=Inspect&map=SBR&plot=Fit&pins=[[1,2],[30,41]]&pixel=[12,13]"
     "&region=[[20,20],[20,50],[50,35.5]]&crop.pixels=region&crop.from_m=1"
     "&absent=[%22pulse_shape%22,%22reflectivity%22]",
     "another method": "source=sample&page=Inspect&method=likelihood&subject=Profile"
@@ -207,6 +210,8 @@ def test_a_script_reproduces_pins_region_box_and_map(scripted):
         same_pixel(found, str(pixel), inspect(answer, *pixel))
     mask = core.inspection.pixels_in(session.state.region, answer.capture.shape)
     assert np.array_equal(found["region"].ravel(), answer.capture.cube[mask].sum(axis=0))
+    predicted = predict(inspect_pixel(answer, *session.state.pixel)).counts
+    assert np.array_equal(found["expected"], predicted.expected)
     inside = answer.run.image.confident(0.9).cropped(box)
     cloud = scripted.folder / "inspected" / "cloud.ply"
     header = cloud.read_bytes().partition(b"end_header")[0]

@@ -8,14 +8,16 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
+from app.model.budget import spending
 from app.model.mesh import point_cloud
 from app.model.state import Viewing
 from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS
 from core import inspection
+from core.cost import predicted_fit_time
 from core.geometry import WHOLE, Box, pixel_angle_of
-from core.inference import fit_of
-from core.io import ColorScale, range_scale
+from core.inference import fit_of, fit_p_values, share_below
+from core.io import ColorScale, p_value_scale, range_scale
 
 Array = NDArray[Any]
 
@@ -26,6 +28,9 @@ MAP_TITLES = {
     "Fired": "Share of the pulses that fired",
     "SBR": "Signal over background, estimated from the counts",
 }
+FIT = "Goodness of fit"
+"""The map of the p-values of pixels."""
+
 FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"
 
 
@@ -66,7 +71,8 @@ def unseen(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
 def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
     """Return why pixels of an image (row, col) of a kind of `map_of` are blank, or grey.
 
-    Where the model does not describe the capture, also that confidences are not to be relied on.
+    Where the model does not describe the capture, also that confidences are not to be relied on. Of
+    p-values, how many are small, and whether the model fits the capture.
 
     Parameters
     ----------
@@ -86,6 +92,8 @@ def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
         sentences.append(f"Grey: {found.n_outside:,} beyond the colour scale.")
     if kind in ("Estimate", "Error", "Confidence") and (misfit := fit_of(answer.capture).remark):
         sentences.append(f"{misfit.capitalize()}.")
+    if kind == FIT:
+        sentences += [share_below(values), fit_of(answer.capture).verdict]
     return " ".join(sentences)
 
 
@@ -139,6 +147,11 @@ def map_of(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorSca
     """Return the image (row, col) of one of `MAPS`, NaN without a value, and its colour scale."""
     if kind not in inspection.maps:
         return image_of(answer, kind, viewing)
+    if kind == FIT:
+        rows, cols, n_bins = answer.capture.cube.shape
+        cost = predicted_fit_time(rows * cols, n_bins)
+        with spending((rows, cols, n_bins), FIT.lower(), cost):
+            return fit_p_values(answer.capture), p_value_scale()
     values = inspection.maps[kind](answer.capture)
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, [1, 99]).tolist() if known.size else (0.0, 1.0)

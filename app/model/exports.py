@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.model.colors import cloud_of, map_of, shown
+from app.model.colors import FIT, cloud_of, map_of, shown
 from app.model.download_text import NO_POINTS, NO_POINTS_INSIDE, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.script import script_of
@@ -26,6 +26,7 @@ from app.theme import WRONG_COLOR
 from app.units import Quantity, ShownGate, scale
 from core.geometry import WHOLE, Box, pixel_angle_of
 from core.io import (
+    P_VALUE,
     WRITERS,
     ColorScale,
     Picture,
@@ -173,7 +174,7 @@ def image_files(
     """
     values, own = map_of(answer, kind, viewing)
     look = look or own
-    name = "range_m" if kind == "Estimate" else kind.lower()
+    name = {"Estimate": "range_m", FIT: P_VALUE}.get(kind, kind.lower())
     plane = Plane(values, look.unit if look.unit == "m" else "1", look.legend)
     product = _product(answer, viewing.least_confidence, shown={name: plane})
     rows, cols = in_view(figure, answer.grid, values.shape)

@@ -185,6 +185,7 @@ def _reports(answer: Answer, state: State) -> Lines:
     if state.subject == "Pixel":
         pixel = ("capture", "image", "row", "col", *method)
         yield assign("report", "core.inspection.pixel_report", *pixel)
+        yield from _plot(state.plot, "report", "np.array([row * capture.shape[1] + col])")
     if state.subject == "Capture":
         yield "\n# Report on the capture."
         yield assign("report", "core.inspection.capture_report", "capture")
@@ -204,6 +205,17 @@ def _reports(answer: Answer, state: State) -> Lines:
         yield assign("mask", "core.inspection.pixels_in", "corners", "capture.shape")
         region = ("capture", "image", "mask", *method)
         yield assign("region", "core.inspection.region_report", *region)
+        if state.subject == "Region":
+            yield from _plot(state.plot, "region.pixel", "np.flatnonzero(mask)")
+
+
+def _plot(name: str, report: str, pixels: str) -> Lines:
+    """Compute what is plotted below the histogram, unless it is the score."""
+    if name == "Rate":
+        yield f"rate = {report}.rate"
+    if name == "Fit":
+        yield f"pixels = {pixels}"
+        yield assign("expected", "core.inference.predictive_of", "capture", "pixels")
 
 
 def _signals(method: str, name: str, pixel: str) -> str:

@@ -248,9 +248,13 @@ class Comparison:
 
 
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
-MAPS = ("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR")
+MAPS = (
+    *("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR"),
+    "Goodness of fit",
+)
 UNITS = ("bins", "ns", "m")
 HELD = ("background", "SBR")
+PLOTS = ("Score", "Rate", "Fit")
 SUBJECTS = ("Pixel", "Region", "Pins", "Profile", "A/B", "Capture")
 STUDIES = ("Speed and accuracy", "Acquisition", "Ablation", "Sensitivity")
 PAPER_SECTIONS = (
@@ -367,6 +371,11 @@ class State(param.Parameterized):
     map = param.Selector(default="Estimate", objects=list(MAPS), doc="Image of the Inspect page.")
     subject = param.Selector(
         default="Pixel", objects=list(SUBJECTS), doc="Subject of the Inspect page."
+    )
+    plot = param.Selector(
+        default=PLOTS[0],
+        objects=list(PLOTS),
+        doc="Plot below the histogram of a pixel or a region on the Inspect page.",
     )
     study = param.Selector(
         default=STUDIES[0], objects=list(STUDIES), doc="Section of the Trade-off page."

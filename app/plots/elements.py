@@ -190,7 +190,11 @@ def _panel(layers: list[Any], title: str) -> hv.Overlay:
             show_legend=True,
             legend_position="top_right",
             legend_cols=6,
-            legend_opts={"click_policy": "hide", "background_fill_alpha": 0.8},
+            legend_opts={
+                "click_policy": "hide",
+                "background_fill_alpha": 0.8,
+                "orientation": "horizontal",
+            },
         )
     )
 

@@ -28,6 +28,9 @@ RATE_TITLES = {
 }
 COUNTS_TITLES = {True: "Counts, and the two scales that follow them", False: "Counts"}
 """Titles with and without the scales."""
+FIT_TITLE = "Counts, and those that the model expects"
+RESIDUAL_TITLE = "Residuals: counts minus expected ones"
+FIT_COLUMNS = ("bin", "fit", "low", "high")
 CANDIDATE_HEIGHT = 0.05
 """Height of the candidates' marks: near the bottom, where no legend hides them."""
 RANK_GAP = 0.05
@@ -47,6 +50,10 @@ NAMES = {
     "small": "small scale",
     "large": "large scale",
     "window": "suggested gate",
+    "fit": "expected (fit)",
+    "band": "95 % band",
+    "deviation": "residual",
+    "limits": "±2",
     "t_n": "T_n",
     "suggested": "suggested T_n",
     "interval": "95 % interval",
@@ -76,13 +83,19 @@ def lifts(positions: Sequence[float], gap: float) -> list[float]:
 
 
 def counts(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
-    """Plot the counts of each bin as bars, with both scales and the expected counts."""
+    """Plot the counts of each bin as bars, with both scales and the expected counts.
+
+    ``expected`` are those of the true range and fluxes, ``fit`` those of the estimated ones.
+    """
     drawing = _over_the_gate(COUNTS_TITLES[True], "Counts", bins)
-    source = empty("bin", "raw", "expected", "small", "large")
+    source, predicted = empty("bin", "raw", "expected", "small", "large"), empty(*FIT_COLUMNS)
     _bars(drawing, source, "raw")
     _line(drawing, source, "expected", 1.5, line_dash="dotted")
     _line(drawing, source, "small")
     _line(drawing, source, "large")
+    band = {"x": "bin", "y1": "low", "y2": "high", "source": predicted}
+    drawing.varea(**band, fill_alpha=0.3, name="band", legend_label=NAMES["band"])
+    _line(drawing, predicted, "fit")
     return _marked(drawing, marks, with_ranks=True)
 
 
@@ -110,6 +123,20 @@ def score(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     """Plot the score of a method in each bin."""
     drawing = _over_the_gate(SCORE_TITLE, "Score", bins)
     _line(drawing, empty("bin", "score"), "score")
+    return _marked(drawing, marks)
+
+
+def residuals(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
+    """Plot the residuals of the counts from those that the model expects."""
+    drawing = _over_the_gate(RESIDUAL_TITLE, "Standard deviations", bins)
+    _bars(drawing, empty("bin", "deviation", *FIT_COLUMNS), "deviation")
+    drawing.hspan(
+        y=[-2.0, 2.0],
+        line_width=1.2,
+        line_dash="dashed",
+        name="limits",
+        legend_label=NAMES["limits"],
+    )
     return _marked(drawing, marks)
 
 
@@ -252,7 +279,7 @@ def _with_marks(**options: Any) -> Any:
     """Return a responsive figure with the range ``marks``."""
     drawing = figure(
         sizing_mode="stretch_both",
-        min_height=110,
+        min_height=80,  # Panel adds those of hidden plots to the height of the page
         toolbar_location=None,
         **options,
     )

@@ -15,7 +15,7 @@ from bokeh.models import ColorBar, CustomJS, Range1d
 from numpy.typing import ArrayLike
 
 from app.model.exports import Curve, Write, plot_file
-from app.theme import STYLES, Palette
+from app.theme import STYLES, WRAPPED, Palette
 from app.units import ShownGate
 
 
@@ -125,6 +125,9 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
         for kind, sizes in STYLES.items():
             if isinstance(model, getattr(bokeh.models, kind)):
                 model.update(**sizes)
+    for legend in figure.legend:
+        if legend in figure.center:
+            legend.stylesheets = [WRAPPED]
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
 
 

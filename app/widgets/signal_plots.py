@@ -21,6 +21,10 @@ from core import Signals
 Array = NDArray[Any]
 
 
+BESIDE_PX = 28
+"""Room beside a plot for the download button, which else covers the legend."""
+
+
 class SignalPlots:
     """The pixel's plots, linked along the gate.
 
@@ -45,7 +49,7 @@ class SignalPlots:
         for plot in self.plots:
             figure = plot.figure
             figure.x_range, figure.y_range = self._bins, Range1d(0, 1)
-            figure.min_border_left, figure.min_border_right = 46, 14
+            figure.min_border_left, figure.min_border_right = 46, BESIDE_PX
             figure.min_border_top = figure.min_border_bottom = 4
             figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
         self.cut = GateCut(self.histogram.figure, self._bins)

@@ -256,6 +256,11 @@ def _add_estimate(commands: Any) -> None:
             help="write the 95 %% interval of each range, too: in NPZ, netCDF, HDF5, Zarr and CSV",
         )
         method.add_argument(
+            "--fit",
+            action="store_true",
+            help="write the p-value of the goodness of fit of each pixel, in the same formats",
+        )
+        method.add_argument(
             "--scheduler", help="address of a Dask cluster to use, such as tcp://host:8786"
         )
         _add_json(method)
@@ -271,10 +276,19 @@ def _estimate(chosen: argparse.Namespace) -> None:
     colors, box = colors_given(chosen), crop_given(chosen)
     in_tiles = chosen.scheduler or _exceeds_memory(chosen)
     accepted = "False for a capture that is ranged in tiles"
-    require("intervals", chosen.intervals, not (chosen.intervals and in_tiles), accepted)
+    for name in ("intervals", "fit"):
+        given = getattr(chosen, name)
+        require(name, given, not (given and in_tiles), accepted)
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
     save = save_ranges(
-        described, image, chosen.least_confidence, chosen.overwrite, colors, chosen.intervals, box
+        described,
+        image,
+        chosen.least_confidence,
+        chosen.overwrite,
+        colors,
+        chosen.intervals,
+        chosen.fit,
+        box,
     )
     written, refused = save_each(chosen.out, refused, save)
     has_cloud = any(path.suffix.lower() in CLOUD_SUFFIXES for path in written)

@@ -11,7 +11,7 @@ from core.checks import require, shown
 from core.cli.results import Incomplete
 from core.estimators import RangeImage
 from core.geometry import WHOLE, Box
-from core.inference import range_interval
+from core.inference import fit_p_values, range_interval
 from core.io.writers import CLOUD_SUFFIXES, RangeColors, save_image
 from core.io.writers.product import guessed_view
 from core.io.writers.whole import writing
@@ -27,21 +27,24 @@ def save_ranges(
     overwrite: bool,
     colors: RangeColors | None,
     intervals: bool = False,
+    fit: bool = False,
     box: Box = WHOLE,
 ) -> Callable[[Path], None]:
     """Return a function that writes a range image without estimates of little confidence.
 
-    With `intervals`, for which the capture must be in memory, those of the ranges are written, too.
+    With `intervals` and `fit`, for which the capture must be in memory, the intervals of the ranges
+    and the p-values of the goodness of fit are written, too.
     Point clouds hold only what is inside `box`.
     """
     kept = image if least_confidence is None else image.confident(least_confidence)
     view = guessed_view(capture, image)
     interval = range_interval(capture, kept) if intervals and isinstance(capture, Capture) else None
+    p_value = fit_p_values(capture) if fit and isinstance(capture, Capture) else None
 
     def save(path: Path) -> None:
         is_cloud = path.suffix.lower() in CLOUD_SUFFIXES
         own = view if is_cloud else {}
-        known: dict[str, Any] = {"interval": interval, "colors": colors, **own}
+        known: dict[str, Any] = {"interval": interval, "p_value": p_value, "colors": colors, **own}
         inside = kept.cropped(box) if is_cloud and box != WHOLE else kept
         save_image(capture, inside, path, overwrite=overwrite, **known)
 

@@ -1,6 +1,14 @@
 """Inference from photon counts: signal and background fluxes, posterior, physical limits."""
 
-from core.inference.fit import Fit, fit_in, fit_of, fit_p_values
+from core.inference.fit import (
+    SMALL,
+    Fit,
+    fit_in,
+    fit_of,
+    fit_p_values,
+    fit_p_values_of,
+    share_below,
+)
 from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_prior_of
 from core.inference.flux_model import FluxModel, FluxPrior
 from core.inference.intervals import RangeInterval, pixel_range_intervals, range_interval
@@ -14,19 +22,23 @@ from core.inference.posterior import (
     posterior_of,
     tolerance_probability,
 )
+from core.inference.predictive import Predictive, predictive_of
 
 __all__ = [
+    "SMALL",
     "TOLERANCE_BINS",
     "Conditions",
     "Fit",
     "FluxModel",
     "FluxPrior",
     "Posterior",
+    "Predictive",
     "RangeInterval",
     "detailed_flux_prior_of",
     "fit_in",
     "fit_of",
     "fit_p_values",
+    "fit_p_values_of",
     "flux_model_of",
     "flux_prior_of",
     "has_posterior",
@@ -35,7 +47,9 @@ __all__ = [
     "most_likely",
     "pixel_range_intervals",
     "posterior_of",
+    "predictive_of",
     "range_interval",
     "rate_and_n_armed",
+    "share_below",
     "tolerance_probability",
 ]

@@ -39,6 +39,9 @@ from core.kernels.streams import uniforms
 SIGNIFICANCE = 0.01
 """Probability that a capture which the model describes is taken for one that it does not."""
 
+SMALL = 0.05
+"""P-value below which maps distinguish pixels."""
+
 _WINDOWS = 16  # of the gate, at most, whose counts are tested in each pixel
 _GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
 _FEWEST = 5.0  # expected counts of a group, for a normal sum
@@ -84,21 +87,35 @@ class Fit(NamedTuple):
     @property
     def remark(self) -> str:
         """A clause on confidences; empty if the model fits."""
-        reasons = ", and ".join(check.reason for check in self.failed)
-        return reasons and f"confidences are not to be relied on: {reasons}"
+        return "" if self.fits else f"confidences are not to be relied on: {self._reasons}"
+
+    @property
+    def verdict(self) -> str:
+        """A sentence: whether the model fits, and otherwise why not."""
+        if self.fits:
+            return "The model fits: no deviation from it is significant."
+        return f"The model does not fit: {self._reasons}."
+
+    @property
+    def _reasons(self) -> str:
+        return ", and ".join(check.reason for check in self.failed)
 
 
 @cached_per_capture
 def fit_of(capture: Capture) -> Fit:
     """Test the model on the pixels from which the fluxes are estimated; on fewer in a long gate."""
     drawn = np.random.default_rng(0).permutation(capture.counts.size)[:SAMPLE]
-    at_most = max(1, NUMBERS_AT_ONCE // capture.acquisition.n_bins)
-    return fit_in(capture, np.sort(drawn[:at_most]))
+    return fit_in(capture, np.sort(drawn[: _most_at_once(capture)]))
 
 
 def fit_in(capture: Capture, pixels: NDArray[np.intp]) -> Fit:
-    """Test the model on pixels given as flat indices (pixel,), at least one."""
-    residuals = _residuals(capture, pixels)
+    """Test the model on pixels given as flat indices (pixel,), at least one.
+
+    Of more pixels than are held in memory together, a random sample is tested.
+    """
+    if pixels.size > (most := _most_at_once(capture)):
+        pixels = np.sort(np.random.default_rng(0).permutation(pixels)[:most])
+    residuals = drawn_residuals(capture, pixels)
     return Fit(
         _background(capture, residuals),
         _pulse(capture, residuals),
@@ -109,13 +126,28 @@ def fit_in(capture: Capture, pixels: NDArray[np.intp]) -> Fit:
 @cached_per_capture
 def fit_p_values(capture: Capture) -> Floats:
     """P-value of each pixel, shape (row, col): uniform if the model holds."""
-    every, n_bins = np.arange(capture.counts.size), capture.acquisition.n_bins
-    parts = np.array_split(every, -(-every.size * n_bins // NUMBERS_AT_ONCE))
-    found = [_p_values(capture, _residuals(capture, part)) for part in parts]
-    return np.concatenate(found).reshape(capture.shape)
+    return fit_p_values_of(capture, np.arange(capture.counts.size)).reshape(capture.shape)
 
 
-class _Residuals(NamedTuple):
+def share_below(p_values: Floats) -> str:
+    """Return how many p-values of pixels are small, as a sentence."""
+    share = float(np.mean(p_values < SMALL))
+    expected = f"{100 * SMALL:g} % are expected if the model holds"
+    return f"{100 * share:.1f} % of the pixels have a p-value below {SMALL:g}; {expected}."
+
+
+def fit_p_values_of(capture: Capture, pixels: NDArray[np.intp]) -> Floats:
+    """Return the `fit_p_values` of pixels given as flat indices (pixel,), shape (pixel,)."""
+    parts = np.array_split(pixels, -(-pixels.size // _most_at_once(capture)))
+    return np.concatenate([_p_values(capture, drawn_residuals(capture, part)) for part in parts])
+
+
+def _most_at_once(capture: Capture) -> int:
+    """Return how many pixels are held in memory together."""
+    return max(1, NUMBERS_AT_ONCE // capture.acquisition.n_bins)
+
+
+class Residuals(NamedTuple):
     """Counts and what the model expects of them for drawn delays and fluxes; (pixel, bin)."""
 
     pixels: NDArray[np.intp]
@@ -138,10 +170,23 @@ class _Residuals(NamedTuple):
         return self.counts - self.expected
 
 
-def _residuals(capture: Capture, pixels: NDArray[np.intp]) -> _Residuals:
+def drawn_residuals(
+    capture: Capture, pixels: NDArray[np.intp], streams: NDArray[np.intp] | None = None
+) -> Residuals:
+    """Draw delay and fluxes of pixels, and compare their counts with what the model expects.
+
+    Parameters
+    ----------
+    capture : Capture
+    pixels : ndarray, shape (pixel,)
+        Flat indices.
+    streams : ndarray, shape (pixel,), optional
+        Numbers of the random streams, by default `pixels`; others give other draws.
+    """
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     cube = capture.cube.reshape(-1, n_bins)[pixels]
-    delay_bin, signals, backgrounds = _drawn(capture, pixels, cube)
+    streams = pixels if streams is None else streams
+    delay_bin, signals, backgrounds = _drawn(capture, pixels, cube, streams)
     counts, background = cube.astype(float), np.repeat(backgrounds[:, np.newaxis], n_bins, axis=1)
     share = capture.pulse.bin_probability(delay_bin, n_bins, capture.acquisition.bin_width_s)
     signal = signals[:, np.newaxis] * share
@@ -151,17 +196,20 @@ def _residuals(capture: Capture, pixels: NDArray[np.intp]) -> _Residuals:
         armed, fires = n_pulses - np.cumsum(counts, axis=1) + counts, -np.expm1(-rate)
     expected = armed * fires
     variance = expected if n_pulses is None else expected * (1 - fires)
-    return _Residuals(pixels, delay_bin, counts, armed, background, signal, expected, variance)
+    return Residuals(pixels, delay_bin, counts, armed, background, signal, expected, variance)
 
 
 def _drawn(
-    capture: Capture, pixels: NDArray[np.intp], cube: NDArray[np.unsignedinteger]
+    capture: Capture,
+    pixels: NDArray[np.intp],
+    cube: NDArray[np.unsignedinteger],
+    streams: NDArray[np.intp],
 ) -> tuple[Floats, Floats, Floats]:
     """Draw delay (NaN for no echo), signal, and background per bin of pixels, (pixel,) each."""
     n_bins = cube.shape[1]
     flux = flux_model_of(capture).of_pixels(pixels[np.newaxis])
     prepared = prepare(capture, cube[np.newaxis], flux, 1)
-    delay_bin, level = _drawn_levels(prepared, uniforms(_SEED, pixels, UNIFORMS, 3))
+    delay_bin, level = _drawn_levels(prepared, uniforms(_SEED, streams, UNIFORMS, 3))
     every = np.arange(pixels.size)
     signal, background = (each[level, 0, every] for each in (flux.signal, flux.background))
     steps = np.linspace(0.0, 1.0, _STEPS_PER_BIN + 1)
@@ -170,7 +218,7 @@ def _drawn(
     state = np.stack([delay_bin, log_signal, np.log(background / n_bins)], axis=1)
     with entering(cube.size):
         redraw(
-            cube.astype(np.uint32), capture.gated_pulses or 0, pixels, echo, first, state
+            cube.astype(np.uint32), capture.gated_pulses or 0, streams, echo, first, state
         )  # compiled for one type of counts
     return state[:, 0], np.exp(state[:, 1]), np.exp(state[:, 2])
 
@@ -206,7 +254,7 @@ def _drawn_index(cumulative: Floats, uniform: Floats) -> NDArray[np.intp]:
     return np.asarray((cumulative[:, :-1] <= limit).sum(axis=1))
 
 
-def _p_values(capture: Capture, residuals: _Residuals) -> Floats:
+def _p_values(capture: Capture, residuals: Residuals) -> Floats:
     """P-value of each pixel, shape (pixel,)."""
     n_bins = capture.acquisition.n_bins
     n_windows = min(max(1, n_bins // capture.echo_bins), _WINDOWS)
@@ -215,25 +263,28 @@ def _p_values(capture: Capture, residuals: _Residuals) -> Floats:
     counts, mean = (np.add.reduceat(each, first, axis=1) for each in (residuals.counts, rate))
     armed = None if capture.gated_pulses is None else residuals.armed[:, first]
     uniform = uniforms(_SEED, residuals.pixels, UNIFORMS + 3, n_windows)
-    squares = _normal(counts, armed, mean, uniform) ** 2
+    squares = quantile_residuals(counts, armed, mean[np.newaxis], uniform) ** 2
     return np.asarray(scipy.special.chdtrc(n_windows, squares.sum(axis=1)))
 
 
-def _normal(counts: Floats, armed: Floats | None, rate: Floats, uniform: Floats) -> Floats:
+def quantile_residuals(
+    counts: Floats, armed: Floats | None, rate: Floats, uniform: Floats
+) -> Floats:
     """Randomized quantile residuals of counts, binomial in armed pulses or Poisson if None.
 
-    From the shorter tail, so that none is infinite.
+    `rate` has a first axis of draws, over which the distributions are averaged. Residuals come from
+    the shorter tail, so that none is infinite.
     """
     special = scipy.special
     if armed is None:
-        is_low = counts < rate
+        is_low = counts < rate.mean(axis=0)
         beyond = np.where(
             is_low, special.gammaincc(counts, rate), special.gammainc(counts + 1, rate)
         )
         log = special.xlogy(counts, rate) - rate - special.gammaln(counts + 1)
     else:
         fires, unfired = -np.expm1(-rate), armed - counts
-        is_low = counts < armed * fires
+        is_low = counts < armed * fires.mean(axis=0)
         beyond = special.betainc(
             np.where(is_low, unfired + 1, counts + 1),
             np.where(is_low, counts, unfired),
@@ -241,13 +292,13 @@ def _normal(counts: Floats, armed: Floats | None, rate: Floats, uniform: Floats)
         )
         beyond = np.where(np.where(is_low, counts, unfired) > 0, beyond, 0.0)
         log = special.gammaln(armed + 1) - special.gammaln(counts + 1)
-        log += special.xlogy(counts, fires) - rate * unfired - special.gammaln(unfired + 1)
+        log = log + special.xlogy(counts, fires) - rate * unfired - special.gammaln(unfired + 1)
     tail = beyond + np.exp(log) * np.where(is_low, uniform, 1 - uniform)
-    normal = special.ndtri(np.clip(tail, np.finfo(float).tiny, 1.0))
+    normal = special.ndtri(np.clip(tail.mean(axis=0), np.finfo(float).tiny, 1.0))
     return np.asarray(np.where(is_low, normal, -normal))
 
 
-def _background(capture: Capture, residuals: _Residuals) -> Check:
+def _background(capture: Capture, residuals: Residuals) -> Check:
     """Compare the background, away from echoes, with its mean over the gate."""
     n_bins = capture.acquisition.n_bins
     first, end = _echo_window(capture)
@@ -268,7 +319,7 @@ def _background(capture: Capture, residuals: _Residuals) -> Check:
     )
 
 
-def _pulse(capture: Capture, residuals: _Residuals) -> Check:
+def _pulse(capture: Capture, residuals: Residuals) -> Check:
     """Compare the mean echo with the pulse."""
     n_bins = capture.acquisition.n_bins
     has_echo = np.isfinite(residuals.delay_bin)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
+from core.inference.fit import fit_p_values
 from core.inference.posterior import posterior_of
 from core.kernels.parallel import PARALLEL, entering
 
@@ -77,5 +78,10 @@ def _count(cube, begin, end, before, inside):  # type: ignore[no-untyped-def]
             inside[row, col] = total
 
 
-maps = {"Peak": peak_counts, "Fired": share_fired, "SBR": sbr}
+maps = {
+    "Peak": peak_counts,
+    "Fired": share_fired,
+    "SBR": sbr,
+    "Goodness of fit": fit_p_values,
+}
 """Functions from a capture to an image (row, col), by name on screen."""

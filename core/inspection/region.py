@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, estimate
+from core.inference.fit import Fit, fit_in
 from core.inspection.mean_flux import METHOD, mean_flux_of, selected_pixels
 from core.inspection.pixel import PixelReport, flux_unit, pixel_flux, pixel_report
 from core.inspection.profile import FluxEstimate, OldFluxNames
@@ -45,6 +46,8 @@ class RegionReport(OldFluxNames):
     """Mean signal and background of the pixels, and their ratio, with 95 % intervals."""
     flux_unit: str
     flux_method: str
+    fit: Fit
+    """Whether the model behind every confidence describes the pixels."""
 
 
 def region_report(
@@ -96,6 +99,7 @@ def region_report(
         flux=mean_flux.image,
         flux_unit=flux_unit(own),
         flux_method=METHOD,
+        fit=fit_in(capture, np.flatnonzero(mask)),
     )
 
 

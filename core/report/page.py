@@ -19,6 +19,7 @@ from core import metrics
 from core.capture import Capture
 from core.estimators import ESTIMATORS, Provenance, RangeImage
 from core.geometry import WHOLE, Box
+from core.inference import fit_of, fit_p_values, share_below
 from core.inspection import (
     CaptureReport,
     FluxEstimate,
@@ -28,7 +29,7 @@ from core.inspection import (
     echo_view,
     pixel_report,
 )
-from core.io.writers.colors import ColorScale, colors_of, range_scale
+from core.io.writers.colors import ColorScale, colors_of, p_value_scale, range_scale
 from core.io.writers.product import guessed_view, plain
 from core.labels import software
 from core.metrics import Interval
@@ -203,6 +204,7 @@ def _maps(
     beyond = scale.n_outside(range_m)
     grey = f" Grey: {beyond:,} beyond the colours." if beyond else ""
     least, most = int(counts.min()), int(counts.max())
+    p_values = fit_p_values(capture)
     colors = colors_of("inferno")
     yield _heading_2("Maps")
     if step > 1:
@@ -225,6 +227,12 @@ def _maps(
             counts,
             ColorScale("Detections", "", least, max(most, least + 1), colors),
             f"Detections of each pixel, {least:,} to {most:,}.",
+        ),
+        (
+            "Goodness of fit",
+            p_values,
+            p_value_scale(),
+            f"{share_below(p_values)} {fit_of(capture).verdict}",
         ),
     )
     drawn = [

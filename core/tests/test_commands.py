@@ -18,7 +18,7 @@ from core.capture import Capture
 from core.cli import main
 from core.estimators import estimate
 from core.geometry import Box, guessed_field_of_view_deg, pixel_angle_of
-from core.inference import range_interval
+from core.inference import fit_p_values, range_interval
 from core.io import readers
 from core.io.readers import Reader, read_capture
 from core.io.writers import CAPTURE_SUFFIXES, WRITERS, save_capture
@@ -161,7 +161,7 @@ def test_estimate_writes_what_it_reports(
     path, tif, las = tmp_path / "car.npz", tmp_path / "car.tif", tmp_path / "car.las"
     npz = tmp_path / "image.npz"
     save_capture(car, path)
-    outputs = ("--out", tif, "--out", las, "--out", npz, "--intervals")
+    outputs = ("--out", tif, "--out", las, "--out", npz, "--intervals", "--fit")
     arguments = ("--capture", path, "--false-alarm", 0.01, *outputs)
     found = facts(capsys, "estimate", "cfar", *arguments, "--guard-bins", 4)
     image = estimate(car, "cfar", false_alarm=0.01, guard_bins=4)
@@ -172,6 +172,7 @@ def test_estimate_writes_what_it_reports(
     assert las.stat().st_size > 20 * image.valid.sum()
     with np.load(npz) as archive:
         np.testing.assert_array_equal(archive["range_low_m"], range_interval(car, image).low_m)
+        np.testing.assert_array_equal(archive["fit_p_value"], fit_p_values(car))
     sure, given = tmp_path / "sure.npz", ("--least-confidence", 0.99, "--overwrite")
     cloud, crop = tmp_path / "cropped.ply", ("--crop", 50, "-", "--crop-pixels", "0,0 0,63 63,0")
     files = ("--out", sure, "--out", cloud)
@@ -260,6 +261,7 @@ def test_a_pixel_or_a_capture_is_exported(frames: Path, capsys: pytest.CaptureFi
         (("estimate", "cfar", "--guard-bins", "-1"), 2, "guard_bins = -1"),
         (("estimate", "peak", "--scheduler", "tcp://a:1"), 2, "needs a --capture"),
         (("estimate", "peak", "--scheduler", "a", "--intervals"), 2, "intervals = True"),
+        (("estimate", "peak", "--scheduler", "a", "--fit"), 2, "fit = True"),
         (("export", "{frames}", "{frames}"), 2, "suffix = '.npy'"),
         (("simulate", "--scene", "absent.stl", "--out", "a.npz"), 2, "absent.stl"),
         (("simulate", "--sbr", "0", "--out", "a.npz"), 2, "sbr = 0"),

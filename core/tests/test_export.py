@@ -31,6 +31,7 @@ from core.capture import Capture
 from core.estimators import Provenance, RangeImage
 from core.estimators.base import NoParameters
 from core.geometry import Box, sight_lines
+from core.inference import fit_p_values
 from core.io.readers.labelled import dataset
 from core.io.writers import (
     CAPTURE_SUFFIXES,
@@ -234,9 +235,9 @@ def test_every_image_is_read_back(tmp_path: Path, suffix: str, image: RangeImage
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".nc", ".h5", ".csv"])
-def test_formats_that_list_pixels_hold_intervals(tmp_path: Path, suffix: str) -> None:
-    interval = core.range_interval(CAPTURE, IMAGE)
-    path = saved(tmp_path, suffix, interval=interval)
+def test_formats_that_list_pixels_hold_intervals_and_p_values(tmp_path: Path, suffix: str) -> None:
+    interval, p_value = core.range_interval(CAPTURE, IMAGE), fit_p_values(CAPTURE)
+    path = saved(tmp_path, suffix, interval=interval, p_value=p_value)
     if suffix == ".csv":
         lines = list(without_comments(path.read_text(encoding="utf-8").splitlines()))
         table = np.genfromtxt(lines, delimiter=",", names=True)
@@ -246,6 +247,7 @@ def test_formats_that_list_pixels_hold_intervals(tmp_path: Path, suffix: str) ->
         found = READERS[suffix](path)
     for name in ("low_m", "high_m"):
         np.testing.assert_array_equal(found[f"range_{name}"], getattr(interval, name))
+    np.testing.assert_array_equal(found["fit_p_value"], p_value)
     with pytest.raises(ValueError, match=r"range_low_m = 'shape \(9, 7\)'"):
         saved(tmp_path, suffix, interval=core.RangeInterval(interval.low_m.T, interval.high_m))
 

@@ -13,6 +13,7 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture, Detection
 from core.estimators import estimate
 from core.inference.fit import SIGNIFICANCE, fit_in, fit_of, fit_p_values
+from core.inference.predictive import predictive_of
 from core.studies.methods.fit import CASES, LEAST_RIGHT, NULL_CASES, fit_table, outcome
 from core.trigger import draw_counts, rate_per_bin
 
@@ -131,3 +132,26 @@ def test_any_histogram_has_a_p_value(detection: Detection, n_bins: int, count: i
     p_values = fit_p_values(capture)
     assert ((p_values >= 0) & (p_values <= 1)).all()
     assert all(0 <= check.p_value <= 1 and check.effect >= 0 for check in fit_of(capture))
+    assert np.isfinite(predictive_of(capture, np.arange(6))).all()
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("detection", ["first", "all"])
+@pytest.mark.parametrize("n_pixels", [1, SIZE * SIZE])
+def test_predicted_counts_hold_where_the_model_does(detection: Detection, n_pixels: int) -> None:
+    capture = drawn(0.3, detection=detection)
+    pixels = np.arange(n_pixels)
+    found = predictive_of(capture, pixels)
+    total = capture.cube.reshape(capture.counts.size, -1)[pixels].sum(axis=0)
+    np.testing.assert_array_equal(found.counts, total)
+    assert (found.low <= found.expected).all() and (found.expected <= found.high).all()
+    outside = np.count_nonzero((found.counts < found.low) | (found.counts > found.high))
+    assert outside <= stats.binom.isf(RARE, total.size, 0.05)
+    assert stats.kstest(found.residual, "norm").pvalue > RARE
+
+
+@pytest.mark.compiled
+def test_residuals_of_predicted_counts_show_a_background_that_is_not_flat() -> None:
+    capture = drawn(shape=lambda x: 1 + 0.5 * x)
+    early, late = np.array_split(predictive_of(capture, np.arange(capture.counts.size)).residual, 2)
+    assert early.mean() < -1 and late.mean() > 1

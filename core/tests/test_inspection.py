@@ -324,6 +324,7 @@ def test_a_region_is_its_pixels_added_to_one() -> None:
     assert report.pixel.confidence > 0.99
     assert report.mean_counts == pytest.approx(capture.counts[mask].mean())
     assert report.median_m == pytest.approx(np.nanmedian(image.range_m[mask]))
+    assert report.fit.fits and "no deviation" in report.fit.verdict
     for flux in (report.flux, report.pixel.flux):
         assert covers(flux.signal, 0.1) and covers(flux.background, 1.0)
     with pytest.raises(ValueError, match="region = '0 pixels'"):

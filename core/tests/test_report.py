@@ -16,6 +16,7 @@ import pytest
 
 import core
 from core.cli import main
+from core.inference import fit_of, fit_p_values, share_below
 from core.inspection import capture_report, pixel_report
 from core.report import telling_pixel, write_report
 
@@ -153,6 +154,8 @@ def test_numbers_are_those_of_the_reports(page: Page, image: core.RangeImage) ->
     assert page.values["95 % interval"] == [pixel.interval_95_m.low, pixel.interval_95_m.high]
     assert page.values["Confidence"] == [pixel.confidence]
     assert f"Range: {pixel.interval_text}" in page.texts["p"]
+    fit = f"{share_below(fit_p_values(CAPTURE))} {fit_of(CAPTURE).verdict}"
+    assert fit in page.texts["figcaption"]
     assert f"{pixel.answer_m:.{pixel.interval_68_m.decimals}f}" in page.texts["data"]
     for rank, candidate in enumerate(pixel.candidates, 1):
         bin_, range_m, score, relative, probability = page.values[str(rank)]

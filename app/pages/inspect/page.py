@@ -28,7 +28,7 @@ from app.pages.shared.crop import CropSection
 from app.pages.shared.downloads import IMAGE_AND_REPORT, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.section import Section
-from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, part, unrolled
+from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, choice, part, unrolled
 from app.widgets.component import until_session_ends
 from app.widgets.controls import (
     KNOB_PX,
@@ -118,7 +118,7 @@ class Inspect(Section):
             label="Map",
             description=text.MAP_HELP,
             size="small",
-            width=118,
+            width=150,
             min_height=SELECT_PX,
             margin=(6, 0, 0, 0),
         )
@@ -155,6 +155,8 @@ class Inspect(Section):
             first=state.subject,
         )
         self._sections.choice.link(state, value="subject", bidirectional=True)
+        self._plot = choice(text.PLOT_HELP, state.param.plot)
+        self._plot.margin = (2, 0)
         self._marks = {"pixel": self._mark, "pins": self._frame_pins, "region": self._outline}
         self._write_place_soon = session.tasks.soon(self._write_place)
         self._listen()
@@ -176,6 +178,8 @@ class Inspect(Section):
             state.param.watch(lambda _, draw=draw: self._draw_mark(draw), name)
         state.param.watch(lambda *_: self._draw_mark(self._frame_pins), "subject")
         state.param.watch(lambda *_: self._request_map(), ["map", "viewing"])
+        state.param.watch(lambda *_: self._offer_plots(), "subject")
+        self._offer_plots()
 
     def layout(self) -> tuple[Any, Any]:
         """Return the two columns of the page, and its explanation."""
@@ -199,7 +203,7 @@ class Inspect(Section):
         )
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both", margin=0)
-            for content in (left, (sections.choice, *sections.mains.values()))
+            for content in (left, (_row(sections.choice, self._plot), *sections.mains.values()))
         )
         main = pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both", margin=0)
         colors = [self._viewing.controls[each.name] for each in fields(RangeColors)]
@@ -213,6 +217,9 @@ class Inspect(Section):
                 is_open=False,
             ),
         ]
+
+    def _offer_plots(self) -> None:
+        self._plot.visible = self.session.state.subject in ("Pixel", "Region")
 
     def _map_shown(self) -> Shown:
         kind = self.session.state.map

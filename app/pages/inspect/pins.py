@@ -41,7 +41,7 @@ class PinsSection(Section):
 
     def __init__(self, session: Session) -> None:
         super().__init__(session, "pins", "unit")
-        session.state.param.watch(lambda *_: self._write_note(), "viewing")
+        session.state.param.watch(lambda *_: self._write(), "viewing")
         self.found: list[Inspected] = []
         self._bins = Range1d(0, 1)
         self.counts, self.score = (
@@ -83,7 +83,6 @@ class PinsSection(Section):
         gate = answer.gate
         colors = pin_colors(self.is_dark)[: len(found)]
         names = [text.pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
-        scales = text.both_scales(unit, answer)
         cover(self._bins, gate.n_bins)
         self.zoom.follow(answer.capture, *(each.pixel.answer_bin for each in found))
         bins = plots.centres(gate.n_bins)
@@ -104,21 +103,27 @@ class PinsSection(Section):
         if found:
             lows, highs = zip(*(plots.score_ends(each.pixel.score) for each in found), strict=True)
             fit(self.score.figure, min(lows), max(highs))
-        self.table.param.update(
-            columns=text.pin_columns(scales[0]) if found else [],
-            rows=[
-                text.pin_row(each, name, color, *scales)
-                for each, name, color in zip(found, names, colors, strict=True)
-            ],
-        )
         for each in self.cards:
             each.visible = bool(found)
         self.found = found
-        self._write_note()
+        self._write()
 
-    def _write_note(self) -> None:
-        distances = text.distances(self.found, self.session.state.viewing)
-        self.note.text = distances if self.found else text.NO_PINS
+    def _write(self) -> None:
+        """Write distances and table, which leave out what is not confident enough to be shown."""
+        found, state = self.found, self.session.state
+        viewing = state.viewing
+        self.note.text = text.distances(found, viewing) if found else text.NO_PINS
+        if not found:
+            self.table.param.update(columns=[], rows=[])
+            return
+        scales = text.both_scales(state.unit, found[0].answer)
+        self.table.param.update(
+            columns=text.pin_columns(scales[0]),
+            rows=[
+                text.pin_row(each, color, *scales, viewing.least_confidence)
+                for each, color in zip(found, pin_colors(self.is_dark), strict=False)
+            ],
+        )
 
 
 def pin_colors(dark: bool) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,9 +16,11 @@ from app.model.text import COMPUTING, reason
 from app.pages.inspect import text
 from app.pages.inspect.results import (
     Inspected,
+    Prediction,
     inspect_pixel,
     inspect_pixel_with_flux,
     inspect_region,
+    predict,
 )
 from app.pages.inspect.views import PixelPlots
 from app.pages.session import Session
@@ -50,6 +53,9 @@ FACTS_ACROSS, FACT_ROWS = 4, 3
 
 TABLE_PX = 217
 """Height of the table with the largest number of candidates, reserved from the start."""
+
+BUTTONS = ("counts", "rate", "residual and enhanced", "score", "residuals of the fit")
+"""Names of the plots of `PixelPlots` on their download buttons."""
 
 IMMEDIATE_BINS = 1000
 """Gate up to which a pixel is inspected where the event arrives: 6 ms at 200 bins, 13 ms at 1000;
@@ -95,7 +101,8 @@ class PixelSection(Section):
     cards : list of pn.Column
         The plots in their frames.
     facts : Facts
-    remark : Sentence
+    remark, explanation : Sentence
+        What is to be said of the pixel or region, and of its fit while that is shown.
     table : Table
     """
 
@@ -106,14 +113,14 @@ class PixelSection(Section):
         self._is_outdated = False
         self._write_soon = session.tasks.soon(self._write)
         self._drawn: Inspected | None = None
+        self._fit_jobs = session.tasks.latest()
+        session.state.param.watch(lambda *_: self._change_plot(), "plot")
         self.plots = PixelPlots()
         self.plots.cut.dragged.subscribe(session.cut_gate)
         self._painted = [self.plots]
         self.cards = [
             self.offer_plot(framed(pane_of(plot.figure)), what, plot, what)
-            for plot, what in zip(
-                self.plots.plots, ("counts", "rate", "residual and enhanced", "score"), strict=True
-            )
+            for plot, what in zip(self.plots.plots, BUTTONS, strict=True)
         ]
         self.zoom = EchoZoom(self.plots.bins)
         self.cards[0].append(self.zoom.button)
@@ -122,6 +129,7 @@ class PixelSection(Section):
             leading=True, stylesheets=[FACTS], min_height=height, sizing_mode="stretch_width"
         )
         self.remark = Sentence(live=True, min_height=LINE_PX, sizing_mode="stretch_width", margin=0)
+        self.explanation = Sentence(visible=False, sizing_mode="stretch_width", margin=0)
         self.table = Table(
             title=text.CANDIDATES,
             stylesheets=[NARROW],
@@ -133,7 +141,7 @@ class PixelSection(Section):
     def layout(self) -> tuple[Any, Any]:
         """Return facts and plots, and the table that stands below the map."""
         facts = self.offer_facts(self.facts, lambda: "numbers")
-        main = stage(facts, self.remark, *self.cards)
+        main = stage(facts, self.remark, self.explanation, *self.cards)
         return main, self.offer_table(self.table, "candidates")
 
     def saved(self, what: str, csv: Write) -> Shown:
@@ -178,23 +186,43 @@ class PixelSection(Section):
         with self.session.tasks.hold():
             self.facts.param.update(facts=[], min_height=0)
             self.remark.text, self.table.rows = why, []
+            self.explanation.visible = False
             for each in self.cards:
                 each.visible = False
 
     def _draw(self, found: Inspected) -> None:
         state = self.session.state
+        with_fit = state.plot == "Fit"
         self.plots.cut.update(Cut.of(found.answer, state.less))
-        self.plots.update(found, state.unit)
+        self.plots.update(found, state.unit, with_fit)
         self.zoom.follow(found.answer.capture, found.pixel.answer_bin)
-        hidden = self.plots.score if found.pixel.signals is not None else self.plots.stages
+        shown = self.plots.counts, self.plots.below(found, state.plot)
         for each, plot in zip(self.cards, self.plots.plots, strict=True):
-            each.visible = plot is not hidden
+            each.visible = plot in shown
         self._drawn, self._is_outdated = found, False
+        self.explanation.visible = with_fit
+        if with_fit:
+            self.explanation.text = text.fit_explanation(math.nan)
+            self._fit_jobs.submit(
+                partial(predict, found), partial(self._draw_fit, found), self.report_error
+            )
         # Facts and table follow once the plots, which the eye follows, are on their way.
         self._write_soon()
 
+    def _draw_fit(self, found: Inspected, prediction: Prediction) -> None:
+        if found is self._drawn and self.explanation.visible:
+            with self.session.tasks.hold():
+                self.plots.draw_fit(found, prediction.counts)
+                self.explanation.text = text.fit_explanation(prediction.p_value)
+
+    def _change_plot(self) -> None:
+        """Show another plot below the histogram."""
+        if self.is_on_screen and self._drawn is not None:
+            with self.session.tasks.hold():
+                self._draw(self._drawn)
+
     def _write(self) -> None:
-        found, self._drawn = self._drawn, None
+        found = self._drawn
         if found is None:
             return
         unit = self.session.state.unit

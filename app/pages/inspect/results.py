@@ -14,8 +14,9 @@ from app.model.colors import shown
 from app.model.state import ReductionSettings, Viewing
 from app.model.store import Answer, Pixel, inspect, reduced
 from core import inspection
-from core.cost import predicted_flux_time
+from core.cost import predicted_fit_time, predicted_flux_time
 from core.geometry import pixel_angle_of
+from core.inference import Predictive, fit_p_values_of, predictive_of
 from core.inspection import (
     Accuracy,
     CaptureReport,
@@ -43,6 +44,8 @@ class Inspected:
     """The estimate that it belongs to."""
     pixel: Pixel
     report: PixelReport
+    pixels: NDArray[np.intp]
+    """Flat indices of its pixels, (pixel,)."""
     region: RegionReport | None = None
     """None for a pixel."""
 
@@ -51,7 +54,8 @@ def inspect_pixel(answer: Answer, row: int, col: int) -> Inspected:
     """Inspect one pixel; its flux is estimated when it is first used."""
     chosen = answer.method, answer.settings
     report = inspection.pixel_report(answer.capture, answer.run.image, row, col, *chosen)
-    return Inspected(answer, inspect(answer, row, col, report), report)
+    here = np.array([row * answer.capture.shape[1] + col])
+    return Inspected(answer, inspect(answer, row, col, report), report, here)
 
 
 def inspect_pixel_with_flux(answer: Answer, row: int, col: int) -> Inspected:
@@ -77,7 +81,27 @@ def inspect_region(answer: Answer, region: Corners) -> Inspected:
         chosen = answer.method, answer.settings
         report = inspection.region_report(answer.capture, answer.run.image, mask, *chosen)
     of_sum = replace(answer, run=replace(answer.run, capture=report.summed, image=report.image))
-    return Inspected(answer, inspect(of_sum, 0, 0, report.pixel), report.pixel, report)
+    summed = inspect(of_sum, 0, 0, report.pixel)
+    return Inspected(answer, summed, report.pixel, np.flatnonzero(mask), report)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Counts that the model expects of a pixel or a region."""
+
+    counts: Predictive
+    p_value: float
+    """Of a pixel; NaN for a region, of which `RegionReport.fit` tells whether the model fits."""
+
+
+def predict(found: Inspected) -> Prediction:
+    """Predict the counts of a pixel or a region, for a worker thread."""
+    capture, pixels = found.answer.capture, found.pixels
+    shape = (1, pixels.size, capture.acquisition.n_bins)
+    with spending(shape, "expected counts", predicted_fit_time(*shape[1:])):
+        is_pixel = found.region is None
+        p_value = float(fit_p_values_of(capture, pixels)[0]) if is_pixel else np.nan
+        return Prediction(predictive_of(capture, pixels), p_value)
 
 
 def profile_of(answer: Answer, pins: Sequence[tuple[int, int]], viewing: Viewing) -> LineProfile:

@@ -64,16 +64,22 @@ to both.
 
 **Judge.** Candidates are the peaks of the estimator's score. Each has the probability of a surface
 within 3 bins of it, which does not depend on the estimator. S, B and SBR are estimated from the
-counts alone, with 95 % intervals.
+counts alone, with 95 % intervals. *Fit* compares the counts with those that the model expects; the
+map *Goodness of fit* shows where it fails.
 """
 
 MAP_HELP = (
     "Quantity shown on the map. Peak: largest count of a pixel. Fired: share of pulses with a "
-    "detection. SBR: estimated from the counts."
+    "detection. SBR: estimated from the counts. Goodness of fit: p-value, below 0.05 in 5 % of the "
+    "pixels where the model holds."
 )
 MODE_HELP = (
     "What dragging on the map does: zoom, select a region by a rectangle or a lasso, or draw the "
     "line of a profile. A tap always selects a pixel."
+)
+PLOT_HELP = (
+    "Plot below the histogram: the estimator's score or its stages, the rate corrected for "
+    "pile-up, or the residuals of the counts from those that the model expects."
 )
 SUBJECT_HELP = (
     "What to inspect: one pixel, the region, the pinned pixels, the line that joins them, or the "
@@ -217,8 +223,17 @@ def remark(found: Inspected) -> str:
     if found.region is None:
         return f"Verdict: {found.report.verdict.health}. {found.report.verdict.why}"
     return (
-        "The plots show the summed histogram of the region. Mean flux of a pixel: "
-        f"{found.region.flux_method}."
+        f"{found.region.fit.verdict} The plots show the summed histogram of the region. Mean flux "
+        f"of a pixel: {found.region.flux_method}."
+    )
+
+
+def fit_explanation(p_value: float) -> str:
+    """Return how to read the fit, with the p-value of a pixel if it is known."""
+    known = "" if math.isnan(p_value) else f" Goodness of fit of the pixel: p-value {p_value:.2g}."
+    return (
+        "Expected: one echo over the background, with range and flux from the posterior. If that "
+        f"holds, 95 % of the counts are within the band and of the residuals within ±2.{known}"
     )
 
 
@@ -263,18 +278,23 @@ def pin_columns(along: Scale) -> list[Sequence[Any]]:
     ]
 
 
-def pin_row(found: Inspected, name: str, color: str, along: Scale, other: Scale) -> dict[str, Any]:
-    """Return the row of a pinned pixel."""
+def pin_row(
+    found: Inspected, color: str, along: Scale, other: Scale, least_confidence: float
+) -> dict[str, Any]:
+    """Return the row of a pinned pixel, without a place if its confidence is below the least."""
     pixel, report = found.pixel, found.report
     sbr = report.flux.sbr
-    known = not math.isnan(pixel.answer_bin)
-    below = other.place(pixel.answer_bin) if known else "no estimate"
+    at_bin, below = pixel.answer_bin, str(other.place(pixel.answer_bin))
+    if math.isnan(at_bin):
+        below = "no estimate"
+    elif pixel.confidence < least_confidence:
+        at_bin, below = math.nan, "not reliable"
     return {
-        "name": name,
+        "name": pixel_name((pixel.row, pixel.col), found.answer.grid),
         "color": color,
         "dash": [],
         "cells": [
-            (along.number(pixel.answer_bin), pixel.answer_bin if known else None, below),
+            (along.number(at_bin), None if math.isnan(at_bin) else at_bin, below),
             percent_cell(pixel.confidence),
             _sbr_cell(sbr),
             (report.verdict.health, report.verdict.health, ""),
@@ -291,15 +311,24 @@ def _sbr_cell(sbr: Interval) -> Cell:
 
 
 def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
-    """Return the distance of each pin from the first one; empty for fewer than two."""
+    """Return the distance of each pin from the first one; empty for fewer than two.
+
+    There is none to a pin of less confidence than is shown.
+    """
     if len(found) < 2:
         return ""
+    least = viewing.least_confidence
     answer = found[0].answer
     shape = answer.capture.shape
     lines = sight_lines(shape, pixel_angle_of(answer.field_of_view_deg(viewing), shape[1]))
     names = [pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
     first, sentences = found[0].pixel, []
+    if first.confidence < least:
+        return f"No distances: the confidence of {names[0]} is below {least:g}."
     for name, pixel in zip(names[1:], (each.pixel for each in found[1:]), strict=True):
+        if pixel.confidence < least:
+            sentences.append(f"none to {name}, whose confidence is below {least:g}")
+            continue
         ends_m = np.array([(p.interval_95_m.low, p.interval_95_m.high) for p in (first, pixel)])
         half_m = (ends_m[:, 1] - ends_m[:, 0]) / 2
         towards = [lines[p.row, p.col] for p in (first, pixel)]

@@ -21,7 +21,7 @@ from bokeh.models import (
 )
 from numpy.typing import NDArray
 
-from app.model.exports import Curve
+from app.model.exports import Curve, band
 from app.model.state import MOST_PINS
 from app.model.store import Pixel
 from app.pages.inspect.results import Corners, Inspected
@@ -34,6 +34,7 @@ from app.theme import Palette
 from app.units import ShownGate
 from app.widgets.figures import Layers, fit, paint_frame, round_up
 from app.widgets.image_view import ImageView
+from core.inference import Predictive
 from core.inspection import FaultyPixel
 
 Array = NDArray[Any]
@@ -241,6 +242,10 @@ PALETTE_NAMES = {
     "line": "small",
     "points": "small",
     "interval": "small",
+    "fit": "small",
+    "band": "small",
+    "deviation": "raw",
+    "limits": "text",
 }
 """Layers that the palette knows under another name."""
 
@@ -338,6 +343,8 @@ class PixelPlots:
         Residual and enhanced signal of the tracking differentiator.
     score : GatePlot
         Score of another method, in its place.
+    residuals : GatePlot
+        Residuals of the counts from those that the model expects.
     plots : tuple of GatePlot
         All, from top to bottom.
     candidates : ColumnDataSource
@@ -361,7 +368,9 @@ class PixelPlots:
         self.rate = GatePlot(inspect_plots.rate(self.bins, marks), {"Rate": "rate"})
         self.stages = GatePlot(inspect_plots.stages(self.bins, marks), stages)
         self.score = GatePlot(inspect_plots.score(self.bins, marks), {"Score": "score"})
-        self.plots = self.counts, self.rate, self.stages, self.score
+        deviation = {"Residual": "deviation", "Expected": "fit", "95 % from": "low", "to": "high"}
+        self.residuals = GatePlot(inspect_plots.residuals(self.bins, marks), deviation)
+        self.plots = self.counts, self.rate, self.stages, self.score, self.residuals
         self.cut = GateCut(self.counts.figure, self.bins)
 
     def paint(self, colors: Palette) -> None:
@@ -371,8 +380,16 @@ class PixelPlots:
         self.counts.layers["ranks"]["glyph"].background_fill_color = colors.paper
         self.cut.paint(colors)
 
-    def update(self, found: Inspected, unit: str) -> None:
-        """Show a pixel or a region, with positions in a unit."""
+    def below(self, found: Inspected, name: str) -> GatePlot:
+        """Return the plot of one of `app.model.state.PLOTS`."""
+        score = self.score if found.pixel.signals is None else self.stages
+        return {"Score": score, "Rate": self.rate, "Fit": self.residuals}[name]
+
+    def update(self, found: Inspected, unit: str, with_fit: bool) -> None:
+        """Show a pixel or a region, with positions in a unit.
+
+        `with_fit` leaves room for the counts that the model expects, which `draw_fit` draws.
+        """
         pixel, report = found.pixel, found.report
         gate = found.answer.gate
         for plot in self.plots:
@@ -380,8 +397,8 @@ class PixelPlots:
         curves = partial(plots.bin_curves, inspect_plots.NAMES)
         positions = {"truth": pixel.truth_bin, "estimate": pixel.answer_bin}
         candidates = [each.bin for each in report.candidates]
-        marks = plots.marks(inspect_plots.NAMES, **positions, candidates=candidates)
-        self._draw_counts(pixel, gate, marks)
+        marks = _marks(found)
+        self._draw_counts(pixel, gate, marks, with_fit)
         self.rate.draw(gate, curves(report.rate_unit, rate=report.rate) + marks)
         self.rate.frame(report.rate)
         self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
@@ -407,12 +424,49 @@ class PixelPlots:
             "lift": inspect_plots.lifts(candidates, inspect_plots.RANK_GAP * extent),
         }
 
-    def _draw_counts(self, pixel: Pixel, gate: ShownGate, marks: list[Curve]) -> None:
+    def draw_fit(self, found: Inspected, predicted: Predictive) -> None:
+        """Draw the counts that the model expects, and the residuals."""
+        gate, marks = found.answer.gate, _marks(found)
+        curves = partial(plots.bin_curves, inspect_plots.NAMES)
+        bins, low, high = plots.centres(gate.n_bins), predicted.low, predicted.high
+        ends = band("band", inspect_plots.NAMES["band"], bins, low, high, "counts")
+        fitted = curves("counts", raw=predicted.counts, fit=predicted.expected)
+        self.counts.keep(gate, [*fitted, *ends, *marks])
+        self.residuals.keep(gate, [*curves("", deviation=predicted.residual), *marks])
+        self.counts.frame(predicted.counts, high)
+        ends_at = max(round_up(1.1 * float(np.abs(predicted.residual).max())), 3.0)
+        fit(self.residuals.figure, -ends_at, ends_at)
+        drawn = {"bin": bins, "fit": predicted.expected, "low": low, "high": high}
+        drawn = {name: np.asarray(values, np.float32) for name, values in drawn.items()}
+        self.counts.source("fit").data = drawn
+        deviation = predicted.residual.astype(np.float32)
+        self.residuals.source("deviation").data = drawn | {"deviation": deviation}
+
+    def _draw_counts(
+        self, pixel: Pixel, gate: ShownGate, marks: list[Curve], with_fit: bool
+    ) -> None:
         """Draw the counts, with those of the model and both scales where they are known."""
-        plot, lines = self.counts, plots.drawn(pixel.lines, gate.n_bins)
-        plot.figure.title.text = inspect_plots.COUNTS_TITLES[pixel.signals is not None]
+        known: dict[str, Any] = dict.fromkeys(pixel.lines) if with_fit else pixel.lines
+        plot, lines = self.counts, plots.drawn(known, gate.n_bins)
+        titles = inspect_plots.COUNTS_TITLES[pixel.signals is not None]
+        plot.figure.title.text = inspect_plots.FIT_TITLE if with_fit else titles
         curves = plots.bin_curves(inspect_plots.NAMES, "counts", raw=pixel.histogram, **lines)
         plot.draw(gate, curves + marks)
-        for layer, counts in pixel.lines.items():
+        for layer, counts in known.items():
             plot.show(layer, counts is not None)
         plot.frame(pixel.histogram, *lines.values())
+        for layer in ("fit", "band"):
+            plot.show(layer, with_fit)
+        self.residuals.keep(gate, [])
+        for predicted in (plot.source("fit"), self.residuals.source("deviation")):
+            predicted.data = {name: np.empty(0, np.float32) for name in predicted.data}
+
+
+def _marks(found: Inspected) -> list[Curve]:
+    """State truth, estimate and candidates for a download."""
+    return plots.marks(
+        inspect_plots.NAMES,
+        truth=found.pixel.truth_bin,
+        estimate=found.pixel.answer_bin,
+        candidates=[each.bin for each in found.report.candidates],
+    )

@@ -27,10 +27,11 @@ from core.io.writers.colors import (
     ColorScale,
     RangeColors,
     colors_of,
+    p_value_scale,
     range_scale,
 )
 from core.io.writers.picture import Picture
-from core.io.writers.product import Product, guessed_angle
+from core.io.writers.product import P_VALUE, Product, guessed_angle
 from core.io.writers.table import write_columns
 from core.io.writers.whole import whole_file, whole_folder
 from core.labels import Plane
@@ -41,6 +42,7 @@ __all__ = [
     "COLOR_MAPS",
     "FOLDER_WRITERS",
     "OUTSIDE_COLOR",
+    "P_VALUE",
     "WRITERS",
     "ColorScale",
     "Picture",
@@ -49,6 +51,7 @@ __all__ = [
     "RangeColors",
     "colors_of",
     "guessed_angle",
+    "p_value_scale",
     "range_scale",
     "save_capture",
     "save_image",
@@ -127,6 +130,7 @@ def save_image(
     rgb: NDArray[np.uint8] | None = None,
     remark: str = "",
     interval: RangeInterval | None = None,
+    p_value: NDArray[np.float64] | None = None,
     colors: RangeColors | None = None,
 ) -> None:
     """Write a range image atomically; the suffix determines the format.
@@ -171,14 +175,16 @@ def save_image(
     interval : RangeInterval, optional
         95 % interval of each range (`core.range_interval`), for the formats that list pixels: NPZ,
         netCDF, HDF5, Zarr and CSV.
+    p_value : ndarray, shape (row, col), optional
+        P-value of the goodness of fit of each pixel (`core.inference.fit_p_values`), likewise.
     colors : core.io.RangeColors, optional
         Limits and colour map of a picture; by default those of the app.
 
     Raises
     ------
     ValueError
-        If the suffix is unknown, image and capture, colours or interval differ in shape, the angle
-        is not between 0 and π/2, or a cloud needs an angle that is unknown.
+        If the suffix is unknown, image and capture, colours, interval or p-values differ in shape,
+        the angle is not between 0 and π/2, or a cloud needs an angle that is unknown.
     FileExistsError
         If the file exists and is not to be replaced.
     OSError
@@ -195,6 +201,7 @@ def save_image(
         rgb,
         remark=remark,
         interval=interval,
+        p_value=p_value,
         colors=colors,
     )
     if suffix in FOLDER_WRITERS:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from core.capture import CaptureInfo
 from core.checks import require
 from core.estimators import RangeImage
+from core.inference import SMALL
 from core.parameters import Choice, Number, Settings, parameter
 
 Array = NDArray[Any]
@@ -151,6 +152,11 @@ def range_scale(
         if chosen.color_from_m is None:
             low = min(low, high - bin_m)
     return ColorScale(title, "m", low, high, colors_of(chosen.color_map), OUTSIDE_COLOR)
+
+
+def p_value_scale() -> ColorScale:
+    """Return the colour scale of p-values of pixels: the smaller one is, the brighter."""
+    return ColorScale("Goodness of fit: p-value", "", 0.0, SMALL, colors_of("inferno")[::-1])
 
 
 def _automatic_limits_m(capture: CaptureInfo, image: RangeImage) -> tuple[float, float]:

@@ -20,6 +20,9 @@ from core.labels import Plane, software
 
 _MOST_IN_LINE = 500  # characters
 
+P_VALUE = "fit_p_value"
+"""Name of the p-values of the goodness of fit."""
+
 COLORS = ("red", "green", "blue")
 """Columns of a cloud that has colours."""
 
@@ -46,14 +49,16 @@ class Product:
         Added to the fact of that name.
     interval : RangeInterval, optional
         95 % interval of each range.
+    p_value : ndarray, shape (row, col), optional
+        P-values of the goodness of fit.
     colors : RangeColors, optional
         Colours of a picture.
 
     Raises
     ------
     ValueError
-        If image and capture, or image and one of colours, interval and what is shown, differ in
-        shape, or the angle is not between 0 and π/2.
+        If image and capture, or image and one of colours, interval, p-values and what is shown,
+        differ in shape, or the angle is not between 0 and π/2.
     """
 
     capture: CaptureInfo
@@ -64,6 +69,7 @@ class Product:
     shown: Mapping[str, Plane] = field(default_factory=dict)
     remark: str = ""
     interval: RangeInterval | None = None
+    p_value: NDArray[np.float64] | None = None
     colors: RangeColors | None = None
 
     def __post_init__(self) -> None:
@@ -77,8 +83,8 @@ class Product:
         for name, plane in self.shown.items():
             of = plane.values.shape
             require(f"shown {name!r}", f"shape {of}", of == shape, f"shape {shape}, the image's")
-        for name, limit_m in self.interval_columns.items():
-            of = limit_m.shape
+        for name, values in (self.interval_columns | self.p_value_columns).items():
+            of = values.shape
             require(name, f"shape {of}", of == shape, f"shape {shape}, the image's")
         possible = angle_rad is None or 0 < angle_rad < np.pi / 2
         require("pixel_angle_rad", angle_rad, possible, "an angle between 0 and π/2 radians")
@@ -96,6 +102,11 @@ class Product:
         return {"range_low_m": self.interval.low_m, "range_high_m": self.interval.high_m}
 
     @property
+    def p_value_columns(self) -> dict[str, NDArray[np.float64]]:
+        """P-values by their name; empty if they are not given."""
+        return {} if self.p_value is None else {P_VALUE: self.p_value}
+
+    @property
     def planes(self) -> dict[str, Plane]:
         """Images by name."""
         shown, own = dict(self.shown), self.image.planes
@@ -105,6 +116,8 @@ class Product:
         meaning = "limit of the 95 % interval of the range, given that the estimate is right"
         limits = self.interval_columns.items()
         known |= {name: Plane(limit_m, "m", meaning) for name, limit_m in limits}
+        meaning = "p-value of the goodness of fit of the model behind the confidence"
+        known |= {name: Plane(p, "1", meaning) for name, p in self.p_value_columns.items()}
         return shown | {name: plane for name, plane in known.items() if name not in shown}
 
     @property

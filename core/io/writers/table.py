@@ -29,7 +29,8 @@ ROWS_AT_ONCE = 2**11
 def write(product: Product, file: BinaryIO) -> None:
     """Write row, col, range_m, confidence, counts and valid (1 or 0) of each pixel.
 
-    If the product has intervals, range_low_m and range_high_m follow range_m.
+    If the product has intervals, range_low_m and range_high_m follow range_m; if it has p-values,
+    fit_p_value is the last column.
     """
     image = product.image
     row, col = map(np.asarray, np.indices(image.range_m.shape))
@@ -41,6 +42,7 @@ def write(product: Product, file: BinaryIO) -> None:
         "confidence": image.confidence,
         "counts": product.capture.counts,
         "valid": image.valid.astype(int),
+        **product.p_value_columns,
     }
     write_columns(columns, file, product.lines)
 
