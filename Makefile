@@ -77,6 +77,7 @@ results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core speed --results assets/results/speed.md
 	$(BIN)/python -m core stability --results assets/results/sensitivity.md
 	$(BIN)/python -m core requires --scene worn --results assets/results/ablation.md
+	$(BIN)/python -m core requires --power 100 --results assets/results/power.md
 
 field: $(VENV)/.app ## published captures with a truth, in the folder CAPTURES=path
 	$(BIN)/python -m core field "$(CAPTURES)"

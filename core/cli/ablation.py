@@ -12,6 +12,7 @@ from core.cli.options import (
     FLUX_OPTIONS,
     add_capture,
     add_flux,
+    add_processes,
     flux_of,
     reading,
     require_none,
@@ -19,14 +20,14 @@ from core.cli.options import (
     show_progress,
     whole_from_to,
 )
-from core.cli.results import add_results, publish
+from core.cli.results import CheckFailed, add_results, publish
 from core.estimators import ESTIMATORS
 from core.io.readers import read_capture
 from core.io.readers.options import add_read_options
 from core.scene import scenes
-from core.studies.ablation import plain
+from core.studies.ablation import plain, power
 from core.studies.ablation.criterion import Requirement
-from core.studies.ablation.study import RULE, requirements, requirements_table
+from core.studies.ablation.study import RULE, RULE_OF_CAPTURES, requirements, requirements_table
 from core.studies.outputs import Item
 from core.studies.timing import machine
 
@@ -41,11 +42,19 @@ def add(commands: Any) -> None:
     subject = command.add_mutually_exclusive_group()
     add_capture(subject)
     subject.add_argument("--scene", choices=scenes, default="car", help="built in (car)")
+    subject.add_argument(
+        "--power",
+        type=whole_from_to(2, 10_000),
+        metavar="CAPTURES",
+        help="measure how often verdicts on captures are right, with as many simulated for each "
+        "size of each part",
+    )
     add_flux(command)
     command.add_argument("--method", choices=ESTIMATORS, default="likelihood", help="(likelihood)")
     command.add_argument(
         "--seeds", type=whole_from_to(2, 1000), help=f"simulated captures of a scene ({_SEEDS})"
     )
+    add_processes(command)
     command.add_argument("--json", action="store_true", help="one JSON object instead of tables")
     add_results(command, folder="")
     add_read_options(command)
@@ -53,6 +62,9 @@ def add(commands: Any) -> None:
 
 
 def _requires(chosen: argparse.Namespace) -> None:
+    if chosen.power is not None:
+        _measure_power(chosen)
+        return
     judge = _judge_scene if chosen.capture is None else _judge_capture
     title, rows, tables = judge(chosen)
     print(file=sys.stderr)
@@ -60,7 +72,18 @@ def _requires(chosen: argparse.Namespace) -> None:
         show({row.part: asdict(row) for row in rows}, as_json=True)
     items: list[Item] = [requirements_table(rows, title), *tables, machine()]
     printed = ("requirements", *(each.key for each in tables))
-    publish(items, chosen, title, (RULE,), printed, quiet=chosen.json)
+    rule = RULE if chosen.capture is None else RULE_OF_CAPTURES
+    publish(items, chosen, title, (rule,), printed, quiet=chosen.json)
+
+
+def _measure_power(chosen: argparse.Namespace) -> None:
+    given = (*FLUX_OPTIONS, "seeds", "json")
+    require_none({**vars(chosen), "json": chosen.json or None}, given, "power has its own captures")
+    found = list(power.outcomes(power.CASES, chosen.power, chosen.processes, show_progress))
+    print(file=sys.stderr)
+    publish([power.power_table(found)], chosen)
+    if failed := [f"{each.case.part}: see the table." for each in found if not each.holds]:
+        raise CheckFailed("\n".join(failed))
 
 
 _Judged = tuple[str, tuple[Requirement, ...], list[Item]]

@@ -43,8 +43,8 @@ SMALL = 0.05
 """P-value below which maps distinguish pixels."""
 
 _WINDOWS = 16  # of the gate, at most, whose counts are tested in each pixel
-_GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
-_FEWEST = 5.0  # expected counts of a group, for a normal sum
+GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
+FEWEST = 5.0  # expected counts of a group, for a normal sum
 _STEPS_PER_BIN = 128  # delays at which an echo is tabulated
 _BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
 _SEED = np.uint64(0)
@@ -101,6 +101,27 @@ class Fit(NamedTuple):
         return ", and ".join(check.reason for check in self.failed)
 
 
+class Deviation(NamedTuple):
+    """Sums of residuals of many pixels; if the model holds, their squares are chi-square."""
+
+    squares: float
+    """Sum of the squares of normal numbers."""
+    freedom: int
+    """Degrees of freedom; 0 if the counts are too few for a test."""
+    unit: float
+    """Square root of the squares that a deviation as large as the model itself adds."""
+
+    @property
+    def p_value(self) -> float:
+        """Probability of squares as large if the model holds."""
+        return float(scipy.special.chdtrc(self.freedom, self.squares)) if self.freedom else 1.0
+
+    @property
+    def effect(self) -> float:
+        """Size of the deviation relative to the model, without that expected by chance."""
+        return float(np.sqrt(max(self.squares - self.freedom, 0.0))) / self.unit
+
+
 @cached_per_capture
 def fit_of(capture: Capture) -> Fit:
     """Test the model on the pixels from which the fluxes are estimated; on fewer in a long gate."""
@@ -117,8 +138,14 @@ def fit_in(capture: Capture, pixels: NDArray[np.intp]) -> Fit:
         pixels = np.sort(np.random.default_rng(0).permutation(pixels)[:most])
     residuals = drawn_residuals(capture, pixels)
     return Fit(
-        _background(capture, residuals),
-        _pulse(capture, residuals),
+        _check(
+            "the background varies over the gate by {:.1%} of its mean",
+            background_deviation(capture, residuals),
+        ),
+        _check(
+            "echoes differ from the pulse by {:.1%} of it (another pulse, jitter or motion)",
+            pulse_deviation(capture, residuals),
+        ),
         _pixels(_p_values(capture, residuals)),
     )
 
@@ -298,33 +325,28 @@ def quantile_residuals(
     return np.asarray(np.where(is_low, normal, -normal))
 
 
-def _background(capture: Capture, residuals: Residuals) -> Check:
+def background_deviation(capture: Capture, residuals: Residuals) -> Deviation:
     """Compare the background, away from echoes, with its mean over the gate."""
     n_bins = capture.acquisition.n_bins
-    first, end = _echo_window(capture)
-    distance = (
-        np.arange(n_bins) - np.floor(residuals.delay_bin)[:, np.newaxis]
-    )  # NaN without an echo
-    away = ~((first <= distance) & (distance < end))
-    n_groups = min(n_bins, _GROUPS)
+    away = np.isnan(echo_offset(capture, residuals.delay_bin))
+    n_groups = min(n_bins, GROUPS)
 
     def pooled(values: Floats) -> Floats:
         return _grouped((values * away).sum(axis=0), n_groups)
 
-    return _check(
-        "the background varies over the gate by {:.1%} of its mean",
+    return _deviation(
         pooled(residuals.difference),
         pooled(residuals.variance),
         pooled(residuals.expected)[np.newaxis],
     )
 
 
-def _pulse(capture: Capture, residuals: Residuals) -> Check:
+def pulse_deviation(capture: Capture, residuals: Residuals) -> Deviation:
     """Compare the mean echo with the pulse."""
     n_bins = capture.acquisition.n_bins
     has_echo = np.isfinite(residuals.delay_bin)
     offset = np.arange(*_echo_window(capture))
-    n_groups = min(offset.size, _GROUPS)
+    n_groups = min(offset.size, GROUPS)
     at = np.floor(residuals.delay_bin[has_echo]).astype(np.intp)[:, np.newaxis] + offset
     inside, at = (at >= 0) & (at < n_bins), np.clip(at, 0, n_bins - 1)
 
@@ -334,12 +356,22 @@ def _pulse(capture: Capture, residuals: Residuals) -> Check:
 
     rate = residuals.signal + residuals.background
     exposed = residuals.expected / rate
-    return _check(
-        "echoes differ from the pulse by {:.1%} of it (another pulse, jitter or motion)",
+    return _deviation(
         pooled(residuals.difference),
         pooled(residuals.variance),
         np.stack([pooled(residuals.signal * exposed), pooled(residuals.background * exposed)]),
     )
+
+
+def echo_offset(capture: Capture, delay_bin: Floats) -> Floats:
+    """Bins from the beginning of the window around each delay (pixel,), shape (pixel, bin).
+
+    NaN outside the window, which holds echoes of the pulse or similar ones.
+    """
+    first, end = _echo_window(capture)
+    bins = np.arange(capture.acquisition.n_bins)
+    offset = bins - np.floor(delay_bin)[:, np.newaxis] - first  # NaN without an echo
+    return np.where((offset >= 0) & (offset < end - first), offset, np.nan)
 
 
 def _echo_window(capture: Capture) -> tuple[int, int]:
@@ -353,23 +385,25 @@ def _grouped(values: Floats, n_groups: int) -> Floats:
     return np.asarray(np.add.reduceat(values, np.arange(n_groups) * values.size // n_groups))
 
 
-def _check(reason: str, difference: Floats, variance: Floats, free: Floats) -> Check:
+def _deviation(difference: Floats, variance: Floats, free: Floats) -> Deviation:
     """Test whether sums of residuals (group,) are 0 apart from multiples of `free` (n, group).
 
-    The effect is relative to the first of these, and `reason` has a place for it.
+    The effect is relative to the first of these.
     """
-    enough = variance >= _FEWEST
+    enough = variance >= FEWEST
     freedom = int(np.count_nonzero(enough)) - len(free)
     scale = np.sqrt(variance[enough])
     shapes = free[:, enough] / scale
     if freedom < 1 or not shapes.any(axis=1).all():  # too few counts for a test
-        return Check(reason.format(0.0), 1.0, 0.0)
+        return Deviation(0.0, 0, 1.0)
     normal = difference[enough] / scale
     rest = normal - shapes.T @ np.linalg.lstsq(shapes.T, normal)[0]
-    squares = float(rest @ rest)
-    effect = float(np.sqrt(max(squares - freedom, 0.0)) / np.linalg.norm(shapes[0]))
-    p_value = float(scipy.special.chdtrc(freedom, squares))
-    return Check(reason.format(effect), p_value, effect)
+    return Deviation(float(rest @ rest), freedom, float(np.linalg.norm(shapes[0])))
+
+
+def _check(reason: str, deviation: Deviation) -> Check:
+    """Return a check whose `reason` has a place for the effect."""
+    return Check(reason.format(deviation.effect), deviation.p_value, deviation.effect)
 
 
 def _pixels(p_values: Floats) -> Check:

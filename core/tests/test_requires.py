@@ -10,6 +10,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
@@ -17,14 +18,22 @@ from core.cli import ACCEPTED, REFUSED, main
 from core.corrections import moments_s, without_correction
 from core.effects import Backscatter, FaultyPixels, Motion, SecondSurface
 from core.estimators import ESTIMATORS
+from core.inference.fit import Deviation
 from core.inference.flux import detailed_flux_prior_of, flux_prior_of
 from core.inference.limits import cramer_rao_bins
-from core.inference.resolution import HIDDEN, RESOLVED, Difference
+from core.inference.resolution import FEW, HIDDEN, RESOLVED, Difference
 from core.metrics import Interval
 from core.scene import Scene
 from core.simulation import simulate
-from core.studies.ablation import corrections, plain
+from core.studies.ablation import corrections, plain, power
 from core.studies.ablation.criterion import UNKNOWN, judged
+from core.studies.ablation.evidence import (
+    POWER,
+    SIZE,
+    Evidence,
+    evidence_of_deviation,
+    evidence_of_share,
+)
 from core.studies.ablation.study import requirements, requirements_table
 
 GATE = Acquisition(n_bins=100, n_pulses=1000)
@@ -168,10 +177,7 @@ def verdicts(capture: Capture) -> dict[str, str]:
 @pytest.mark.compiled
 def test_a_capture_with_echoes_alone_needs_no_parts() -> None:
     found = verdicts(replace(seen(Flux(0.1, 2.0), size=64), truth_range_m=None, signal=None))
-    for part in ("second_surface", "backscatter", "faulty_pixels"):
-        assert found[part] == "not needed"
-    assert found["pulse_shape"] != "needed"
-    assert found["motion"] == found["jitter"] == "cannot tell"
+    assert set(found.values()) == {"not needed"}
 
 
 def parts_of_walls() -> dict[str, Scene]:
@@ -211,6 +217,86 @@ def test_without_certain_pixels_parts_are_unknown() -> None:
     found = verdicts(Capture(noise, GATE))
     for part in ("pulse_shape", "second_surface", "backscatter", "faulty_pixels"):
         assert found[part] == "cannot tell"
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("second_surface", 1.0),  # in every pixel, as strong as the first
+        ("pulse_shape", 0.5),
+        ("pulse_shape", 3.0),
+        ("backscatter", 0.5),
+        ("signal_levels", 0.5),
+        ("pile_up", 0.5),
+    ],
+)
+def test_pixels_together_reveal_what_single_ones_do_not(part: str, value: float) -> None:
+    capture = power.Case(part, value, 0.06).capture(0)
+    found = {row.part: row for row in requirements(capture)}
+    assert found[part].verdict == "needed"
+    assert found[part].p_value < SIZE
+    assert found[part].effect > found[part].smallest_effect or value == 1
+    if part in ("second_surface", "pulse_shape"):
+        others = {"second_surface", "pulse_shape"} - {part}
+        assert "needed" not in {found[each].verdict for each in others}
+
+
+@pytest.mark.compiled
+def test_a_part_that_could_not_have_been_seen_is_not_excluded() -> None:
+    bright, faint = (power.Case("second_surface", 0.0, sbr).capture(0) for sbr in (0.3, 0.03))
+    assert verdicts(bright)["second_surface"] == "not needed"
+    found = {row.part: row for row in requirements(faint)}
+    assert found["second_surface"].verdict == "cannot tell"
+    assert found["second_surface"].smallest_effect > FEW
+    assert found["signal_levels"].verdict == "cannot tell"  # few pixels are certain
+
+
+@pytest.mark.parametrize(
+    ("p_value", "effect", "smallest", "largest", "verdict"),
+    [
+        (0.001, 0.3, 0.05, 0.4, "needed"),
+        (0.001, 0.05, 0.02, 0.08, "not needed"),  # seen, but too small to matter
+        (0.001, 0.08, 0.08, 0.12, "cannot tell"),
+        (0.3, 0.01, 0.08, 0.05, "not needed"),
+        (0.3, 0.01, 0.2, 0.05, "cannot tell"),  # an effect that matters may have been missed
+        (0.3, 0.3, 0.5, 0.8, "cannot tell"),
+    ],
+)
+def test_a_verdict_needs_an_effect_that_was_or_would_have_been_seen(
+    p_value: float, effect: float, smallest: float, largest: float, verdict: str
+) -> None:
+    evidence = Evidence(p_value, effect, smallest, largest)
+    assert evidence.verdict(margin=0.1) == verdict
+    if verdict == "needed":
+        assert evidence.verdict(margin=0.1, explained=0.25) == "cannot tell"
+
+
+@pytest.mark.parametrize("freedom", [1, 20])
+def test_the_smallest_deviation_is_seen_with_the_stated_probability(freedom: int) -> None:
+    unit = 40.0
+    smallest = evidence_of_deviation(Deviation(0.0, freedom, unit)).smallest
+    squares = stats.ncx2(freedom, (smallest * unit) ** 2).rvs(4000, random_state=0)
+    seen = [evidence_of_deviation(Deviation(each, freedom, unit)).is_seen for each in squares]
+    assert np.mean(seen) == pytest.approx(POWER, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("n_pixels", "false_alarm", "chance"), [(256, 0.001, 0.9), (2000, 0.01, 0.3)]
+)
+def test_the_smallest_share_is_seen_with_the_stated_probability(
+    n_pixels: int, false_alarm: float, chance: float
+) -> None:
+    evidence = [evidence_of_share(found, n_pixels, false_alarm, chance) for found in range(200)]
+    seen = np.array([each.is_seen for each in evidence])
+    found = np.arange(seen.size)
+    absent, smallest = (
+        stats.binom.pmf(found, n_pixels, false_alarm + share * (chance - false_alarm)) @ seen
+        for share in (0.0, evidence[0].smallest)
+    )
+    assert absent <= SIZE
+    assert smallest == pytest.approx(POWER, abs=0.01)
+    assert evidence_of_share(0, n_pixels, 0.01, 0.005).smallest == math.inf
 
 
 # -- Simplified models -----------------------------------------------------------------------------
@@ -296,3 +382,16 @@ def test_the_command_judges_a_capture(capsys: pytest.CaptureFixture[str]) -> Non
     assert found["motion"]["total_variation"] is None
     assert main(["requires", "--capture", sample, "--sbr", "1"]) == REFUSED
     assert main(["requires", "--scene", "car", "--bins", "7"]) == REFUSED
+
+
+@pytest.mark.compiled
+def test_the_command_measures_size_and_power(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cases = (power.Case("pulse_shape", 1.0, 0.06), power.Case("pulse_shape", 2.0, 0.06))
+    monkeypatch.setattr(power, "CASES", cases)
+    assert main(["requires", "--power", "2", "--processes", "1"]) == ACCEPTED
+    absent, wide = capsys.readouterr().out.splitlines()[-3:-1]
+    assert absent.startswith("| shape of the pulse | 1 (absent) | 0.06 | 2 | 0.00")
+    assert wide.startswith("| shape of the pulse | 2 | 0.06 | 2 | 1.00")
+    assert main(["requires", "--power", "2", "--sbr", "1"]) == REFUSED

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 
-from app.model.text import cell, interval_cell, percent_cell
+from app.model.text import Cell, cell, interval_cell, percent_cell
 from core.studies.ablation import NOTE, TITLES, Requirement
 
 __all__ = ["COLUMNS", "EXPLANATION", "NOTE", "TITLE", "row", "subject"]
@@ -14,14 +14,26 @@ TITLE = "Parts and corrections: whether the model needs them."
 
 EXPLANATION = """
 Each part of the scene and each correction of the likelihood is left out in turn, and the change is
-compared with what the pulses can resolve. A button switches a part off, or on again, on all pages.
+compared with what the pulses can resolve. A capture is tested for them on all its pixels together:
+"not needed" means that an effect large enough to matter would have been seen. A button switches a
+part off, or on again, on all pages.
 """
 
 COLUMNS = (
     ("Part or correction", "Part of the model, and why it is needed or not.", 1),
     ("Verdict", "Whether the model needs it.", 1),
-    ("Change", "Total variation of the trigger probabilities, mean over the pixels.", -1),
-    ("Resolvable", "Smallest total variation that the pulses of one pixel resolve.", -1),
+    (
+        "Change",
+        "Total variation of the trigger probabilities, mean over the pixels; of a capture, the "
+        "effect that the reason states.",
+        -1,
+    ),
+    (
+        "Resolvable",
+        "Smallest total variation that the pulses of one pixel resolve; of a capture, the effect "
+        "that would have been seen with a probability of 80 %.",
+        -1,
+    ),
     ("Pixels", "Share of pixels whose pulses resolve the change.", -1),
     ("RD", "Share of targets within 3 bins: with minus without; 95 % interval.", -1),
     ("RMSE (m)", "With minus without; 95 % interval.", 1),
@@ -47,16 +59,22 @@ def row(name: str, found: Requirement | None, can_switch: bool, is_off: bool) ->
     }
     if found is None:
         return made | {"message": "Not studied yet."}
-    worst = "" if math.isnan(found.worst) else f"at most {found.worst:.2g}"
     return made | {
         "note": f"{made['note']}; {found.why}".removeprefix("; "),
         "cells": [
             (found.verdict, found.verdict, ""),
-            cell(found.total_variation, "{:.2g}", worst),
-            cell(found.resolvable, "{:.2g}"),
+            *_sizes(found),
             percent_cell(found.detectable_share),
             interval_cell(found.rd_change, "{:+.4f}"),
             interval_cell(found.rmse_change_m, "{:+.3f}"),
             interval_cell(found.time_ratio, "{:.2f}"),
         ],
     }
+
+
+def _sizes(found: Requirement) -> tuple[Cell, Cell]:
+    """Return the cells of the change and of the smallest one that is seen."""
+    if math.isfinite(found.p_value):
+        return percent_cell(found.effect), percent_cell(found.smallest_effect)
+    worst = "" if math.isnan(found.worst) else f"at most {found.worst:.2g}"
+    return cell(found.total_variation, "{:.2g}", worst), cell(found.resolvable, "{:.2g}")

@@ -8,13 +8,16 @@ compare with, it is judged like a part.
 Neither is needed if hardly a histogram could reveal it, or if the whole 95 % interval of the change
 lies within the margins (the equivalence test of Schuirmann 1987; a correction may do harm, too).
 Otherwise the data do not decide.
+
+A part of a capture is tested on all pixels together (`core.studies.ablation.pooled`). It is needed
+if an effect is seen that is large enough to matter, and not needed only where such an effect would
+have been seen.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -23,8 +26,7 @@ from core.deprecation import renamed
 from core.inference.resolution import ERROR, FEW, Difference
 from core.metrics import Interval
 from core.scene import PARTS
-
-Verdict = Literal["needed", "not needed", "cannot tell"]
+from core.studies.ablation.evidence import POWER, Evidence, Verdict
 
 MARGIN_RD = 0.005
 """Smallest relevant change of the restoration degree within 3 bins: one pixel in 200."""
@@ -33,6 +35,8 @@ MARGIN_BINS = 0.5
 """Smallest relevant change of the RMSE, in bins: the largest error of rounding to whole bins."""
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
+
+_LEAST_P = 1e-6  # smaller p-values are not distinguished
 
 TITLES = CORRECTIONS | PARTS
 
@@ -59,6 +63,12 @@ class Requirement:
     """RMSE with it minus without it, paired."""
     time_ratio: Interval = UNKNOWN
     """With it over without it: time of simulating for a part, of ranging for a correction."""
+    effect: float = math.nan
+    """Size in a capture, tested on all pixels together, in the unit that `why` states."""
+    smallest_effect: float = math.nan
+    """Effect that would have been seen with a probability of `evidence.POWER`."""
+    p_value: float = math.nan
+    """Probability of as much evidence of an effect if there is none."""
 
     told_share = renamed("detectable_share")
 
@@ -98,6 +108,45 @@ def judged(
         rmse_change_m,
         time_ratio,
     )
+
+
+def tested(
+    part: str, evidence: Evidence, margin: float, found: str, explained: float = 0.0, note: str = ""
+) -> Requirement:
+    """Decide whether a capture needs a part by the evidence of an effect.
+
+    Parameters
+    ----------
+    margin : float
+        Smallest effect that matters.
+    found : str
+        What was found, with a place for the effect.
+    explained : float
+        Largest effect that second surfaces may cause, if they are seen.
+    note : str
+        Added to the reason.
+    """
+    verdict, smallest = evidence.verdict(margin, explained), evidence.smallest
+    chance = f"p = {evidence.p_value:.2g}" if evidence.p_value >= _LEAST_P else f"p < {_LEAST_P:g}"
+    seen = "no effect" if math.isinf(smallest) else _percent(smallest)
+    clauses = (
+        f"{found.format(_percent(evidence.effect))} ({chance}); {seen} would have been seen with a "
+        f"probability of {_percent(POWER)}, and {_percent(margin)} matters",
+        f"up to {_percent(explained)} may come from second surfaces" if explained else "",
+        note,
+    )
+    return Requirement(
+        part,
+        verdict,
+        "; ".join(filter(None, clauses)),
+        effect=evidence.effect,
+        smallest_effect=smallest,
+        p_value=evidence.p_value,
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
 
 
 def _in_margins(change: Interval, margin: float) -> Interval:

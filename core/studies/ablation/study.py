@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -15,10 +16,12 @@ from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS
 from core.inference import resolution
 from core.inference.resolution import Difference, difference
+from core.metrics import Interval
 from core.scene import Scene, parts_of, without
 from core.simulation import cumulative_trigger_probability, simulate
 from core.studies.ablation import capture_parts, corrections
 from core.studies.ablation.criterion import MARGIN_RD, TITLES, Requirement, judged
+from core.studies.ablation.evidence import POWER, SIZE
 from core.studies.outputs import Table, table
 from core.studies.timing import time_ratio
 
@@ -40,7 +43,7 @@ def requirements(
     ----------
     subject : Scene or Capture
         The parts of a scene are known: their effect is computed from the model, and from captures
-        with and without them. Those of a capture are looked for in its counts.
+        with and without them. Those of a capture are tested on the counts of all its pixels.
     flux, acquisition, pulse
         Conditions in which a scene is simulated; by default the default flux and the scene's own
         acquisition.
@@ -154,25 +157,30 @@ def _correction(study: _Study, correction: str) -> Requirement:
 
 
 def requirements_table(rows: Sequence[Requirement], title: str) -> Table:
-    """Return one row per part and correction."""
+    """Return one row per part and correction, without columns that are unknown in all rows."""
+    columns: dict[str, Callable[[Requirement], str | float | Interval]] = {
+        "part or correction": lambda row: TITLES[row.part],
+        "verdict": lambda row: row.verdict,
+        "p": lambda row: row.p_value,
+        "effect": lambda row: row.effect,
+        "seen from": lambda row: row.smallest_effect,
+        "total variation": lambda row: row.total_variation,
+        "worst": lambda row: row.worst,
+        "detectable from": lambda row: row.resolvable,
+        "pixels": lambda row: row.detectable_share,
+        "RD": lambda row: row.rd_change,
+        "RMSE m": lambda row: row.rmse_change_m,
+        "time": lambda row: row.time_ratio,
+        "reason": lambda row: row.why,
+    }
     return table(
         "requirements",
         title,
         rows,
-        {
-            "part or correction": lambda row: TITLES[row.part],
-            "verdict": lambda row: row.verdict,
-            "total variation": lambda row: row.total_variation,
-            "worst": lambda row: row.worst,
-            "detectable from": lambda row: row.resolvable,
-            "pixels": lambda row: row.detectable_share,
-            "RD": lambda row: row.rd_change,
-            "RMSE m": lambda row: row.rmse_change_m,
-            "time": lambda row: row.time_ratio,
-            "reason": lambda row: row.why,
-        },
+        {name: cell for name, cell in columns.items() if any(map(_is_known, map(cell, rows)))},
         NOTE,
         {
+            **dict.fromkeys(("p", "effect", "seen from"), ".2g"),
             **dict.fromkeys(("total variation", "worst", "detectable from"), ".2g"),
             "pixels": ".0%",
             "RD": "+.4f",
@@ -180,6 +188,11 @@ def requirements_table(rows: Sequence[Requirement], title: str) -> Table:
             "time": ".2f",
         },
     )
+
+
+def _is_known(value: str | float | Interval) -> bool:
+    number = value.value if isinstance(value, Interval) else value
+    return isinstance(number, str) or not math.isnan(number)
 
 
 RULE = (
@@ -191,10 +204,20 @@ RULE = (
     "margins. Otherwise the data do not decide."
 )
 
+RULE_OF_CAPTURES = (
+    "A capture is tested on all its pixels together. A part or a correction is needed if an effect "
+    f"is seen (p < {SIZE:g}) that is large enough to matter. It is not needed if an effect that "
+    f"matters would have been seen with a probability of {POWER:.0%}, but was not, or is seen to "
+    "be smaller. Otherwise the data do not decide. Where the truth is known, a correction is "
+    f"needed if it improves estimates by more than {MARGIN_RD:g} in RD or half a bin in RMSE."
+)
+
 NOTE = (
     "Total variation: how far the part, or what the correction corrects, changes the trigger "
     "probabilities of a pulse, mean over the pixels and in the worst. Detectable from: total "
-    "variation that the pulses of one pixel reveal with errors of 5 %. RD within 3 bins, RMSE and "
-    "time compare with and without it, with 95 % intervals; time is that of ranging for a "
-    "correction, of simulating for a part."
+    "variation that the pulses of one pixel reveal with errors of 5 %. Effect: estimated from all "
+    "pixels of a capture, in the unit that the reason states. Seen from: effect that would have "
+    f"been seen with a probability of {POWER:.0%}. RD within 3 bins, RMSE and time compare with "
+    "and without it, with 95 % intervals; time is that of ranging for a correction, of simulating "
+    "for a part."
 )
