@@ -1,0 +1,98 @@
+"""Kernel of the posterior mass near given delays.
+
+The likelihood of a block of pixels stays in the cache. Signal levels are added one by one, in units
+of the largest term so far (Milakov & Gimelshein 2018).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from core.kernels.blocks import lane_rows
+from core.kernels.elementary import exp32
+from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.posterior import counts_of, fill_flat, fill_level
+
+
+@njit(**COMPILED)
+def _add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
+    """Add ``exp(ratio + offset)`` (delay, lane) to `density`, which is in units of ``exp(top)``.
+
+    `offset` and `top` are of shape (lane,); `top` becomes that of all terms so far.
+    """
+    n_delays, lanes = density.shape
+    highest = np.full(lanes, -np.inf, np.float32)
+    kept, added = np.empty((2, lanes), np.float32)
+    for d in range(n_delays):
+        for i in range(lanes):
+            highest[i] = ratio[d, i] if ratio[d, i] > highest[i] else highest[i]
+    for i in range(lanes):
+        previous, here = top[i], highest[i] + offset[i]
+        top[i] = max(previous, here)
+        kept[i], added[i] = math.exp(previous - top[i]), math.exp(here - top[i])
+    for d in range(n_delays):
+        for i in range(lanes):
+            density[d, i] = kept[i] * density[d, i] + added[i] * exp32(ratio[d, i] - highest[i])
+
+
+@njit(**COMPILED)
+def _fill_density(b, prepared, density, top):  # type: ignore[no-untyped-def]
+    """Fill `density` (delay, lane) with the likelihood ratio of each delay to no echo.
+
+    In units of ``exp(top)``, averaged over the levels and multiplied by the prior of the delay.
+    """
+    n_delays, lanes = density.shape
+    fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
+    ratio, offset = lane_rows(n_delays, lanes).reshape(1, n_delays, lanes), np.empty(lanes)
+    density[:], top[:] = 0.0, -np.inf
+    for level in range(1, len(prepared.signal)):
+        fill_level(b, level, prepared, fired, unfired_echo, ratio)
+        fill_flat(b, level, prepared, all_fired, all_unfired, offset)
+        for i in range(lanes):
+            offset[i] += prepared.log_share[level]
+        _add_level(ratio[0], offset, density, top)
+    for d in range(n_delays):
+        for i in range(lanes):
+            density[d, i] *= prepared.depth[d]
+
+
+@njit(**COMPILED)
+def _fill_windows(half, density, window):  # type: ignore[no-untyped-def]
+    """Fill `window` with sums of `half` numbers on either side of the beginning of each delay."""
+    n_delays, lanes = density.shape
+    window[:] = 0.0
+    for d in range(n_delays):
+        for near in range(max(d - half, 0), min(d + half, n_delays)):
+            for i in range(lanes):
+                window[d, i] += density[near, i]
+
+
+@njit(**PARALLEL)
+def fill_masses(prepared, half, first, mass, surface):  # type: ignore[no-untyped-def]
+    """Fill the posterior mass of windows of delays, and of all delays, of each pixel.
+
+    `mass` (block, lane, window) is that of the `half` delays on either side of the beginning of the
+    delays from ``first[block, lane]``, and `surface` (block, lane) that of a surface anywhere.
+    """
+    n_delays, lanes = prepared.depth.size, first.shape[1]
+    none = prepared.log_share[0]
+    for b in prange(len(first)):
+        density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+        window = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+        top, total = np.empty(lanes), np.zeros(lanes)
+        _fill_density(b, prepared, density, top)
+        _fill_windows(half, density, window)
+        for d in range(n_delays):
+            for i in range(lanes):
+                total[i] += density[d, i]
+        for i in range(lanes):
+            # Relative to the larger of the two, so that neither overflows.
+            unit = max(top[i], none)
+            seen = math.exp(top[i] - unit) * total[i] / n_delays
+            surface[b, i] = seen / (seen + math.exp(none - unit))
+            share = np.float32(surface[b, i] / total[i])
+            for j in range(mass.shape[2]):
+                mass[b, i, j] = share * window[first[b, i] + j, i]
