@@ -1,4 +1,4 @@
-"""Kernel of the posterior mass near given delays.
+"""Kernels that average likelihoods over delays or signal levels.
 
 The likelihood of a block of pixels stays in the cache. Signal levels are added one by one, in units
 of the largest term so far (Milakov & Gimelshein 2018).
@@ -18,17 +18,53 @@ from core.kernels.posterior import counts_of, fill_flat, fill_level
 
 
 @njit(**COMPILED)
+def _fill_highest(ratio, highest):  # type: ignore[no-untyped-def]
+    """Fill `highest` (lane,) with the maximum over the rows of `ratio` (row, lane)."""
+    highest[:] = -np.inf
+    for d in range(len(ratio)):
+        for i in range(highest.size):
+            here, most = ratio[d, i], highest[i]
+            highest[i] = here if here > most else most
+
+
+@njit(**PARALLEL)
+def fill_evidence(prepared, depth, evidence):  # type: ignore[no-untyped-def]
+    """Fill the log likelihood ratio of each level to no echo, (block, lane, level).
+
+    `depth` is the prior of the delay relative to uniform, (step, bin).
+    """
+    n_steps, n_bins = depth.shape
+    n_blocks, lanes, n_levels = evidence.shape
+    for b in prange(n_blocks):
+        fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
+        ratio = lane_rows(depth.size, lanes).reshape(n_steps, n_bins, lanes)
+        (highest, row), offset = np.empty((2, lanes), np.float32), np.empty(lanes)
+        evidence[b, :, 0] = 0.0
+        for level in range(1, n_levels):
+            fill_level(b, level, prepared, fired, unfired_echo, ratio)
+            fill_flat(b, level, prepared, all_fired, all_unfired, offset)
+            _fill_highest(ratio.reshape(-1, lanes), highest)
+            total = np.zeros(lanes)
+            for step in range(n_steps):
+                for k in range(n_bins):
+                    for i in range(lanes):
+                        row[i] = depth[step, k] * exp32(ratio[step, k, i] - highest[i])
+                    for i in range(lanes):
+                        total[i] += row[i]
+            for i in range(lanes):
+                mean = total[i] / depth.size
+                evidence[b, i, level] = offset[i] + highest[i] + math.log(mean)
+
+
+@njit(**COMPILED)
 def _add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
     """Add ``exp(ratio + offset)`` (delay, lane) to `density`, which is in units of ``exp(top)``.
 
     `offset` and `top` are of shape (lane,); `top` becomes that of all terms so far.
     """
     n_delays, lanes = density.shape
-    highest = np.full(lanes, -np.inf, np.float32)
-    kept, added = np.empty((2, lanes), np.float32)
-    for d in range(n_delays):
-        for i in range(lanes):
-            highest[i] = ratio[d, i] if ratio[d, i] > highest[i] else highest[i]
+    highest, kept, added = np.empty((3, lanes), np.float32)
+    _fill_highest(ratio, highest)
     for i in range(lanes):
         previous, here = top[i], highest[i] + offset[i]
         top[i] = max(previous, here)

@@ -149,15 +149,20 @@ def counts_of(b, prepared):  # type: ignore[no-untyped-def]
     unfired_echo = lane_rows(n_steps * n_bins, lanes).reshape(n_steps, n_bins, lanes)
     taps = lane_rows(n_taps, lanes).reshape(n_taps, lanes)
     armed = np.full(lanes, float(prepared.n_pulses))
-    all_fired, all_unfired = np.zeros((2, lanes))
+    all_unfired = np.zeros(lanes)
     for k in range(n_bins):
+        # Separate loops, since those of several types are not vectorised.
         for i in range(lanes):
-            count = prepared.counts[b, k, i]
-            armed[i] -= count
-            fired[k, i] = count
-            unfired[k, i] = armed[i] if prepared.n_pulses > 0 else 1.0
-            all_fired[i] += fired[k, i]
-            all_unfired[i] += unfired[k, i]
+            fired[k, i] = prepared.counts[b, k, i]
+        for i in range(lanes):
+            armed[i] -= prepared.counts[b, k, i]
+        for i in range(lanes):
+            unfired[k, i] = armed[i]
+        for i in range(lanes):
+            all_unfired[i] += armed[i]
+    all_fired = prepared.n_pulses - armed
+    if prepared.n_pulses == 0:
+        unfired[:], all_unfired[:] = 1.0, n_bins
     unfired_echo[:] = 0.0
     for step in range(n_steps):
         for tap in range(n_taps):
