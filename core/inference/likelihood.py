@@ -26,7 +26,7 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
 from core.inference.flux_model import FluxModel
 from core.kernels.blocks import LANES, lane_counts
-from core.kernels.confidence import fill_evidence
+from core.kernels.confidence import fill_evidence, fill_peaks
 from core.kernels.parallel import entering
 from core.kernels.posterior import fill_blocks
 
@@ -326,21 +326,20 @@ def delay_densities(
         yield some, density, top[:, 0, 0].astype(float), weighted
 
 
-def delay_curves(
-    prepared: LikelihoodInput,
-) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.float32]]]:
-    """Yield a curve with the maximum of the density of `delay_densities`, and its contributions.
+def likeliest_delays(prepared: LikelihoodInput) -> tuple[NDArray[np.intp], Floats]:
+    """Find the maximum of the density of `delay_densities` of each pixel.
 
-    With one level of signal, the curve is the logarithm, which saves the exponentials.
+    Returns
+    -------
+    delay : ndarray, shape (block, lane)
+    log : ndarray, shape (block, lane, 3)
+        Logarithm of the density before, at and after it; at the edges of the gate, at it.
     """
-    if len(prepared.signal) > 2:
-        for some, density, _, weighted in delay_densities(prepared):
-            yield some, density, weighted
-        return
-    depth = np.log(prepared.depth)[:, np.newaxis]
-    for some, log in _log_likelihoods(prepared):
-        weighted = log[:, 1:] + np.float32(prepared.log_share[1])
-        yield some, weighted[:, 0] + depth, weighted
+    shape = prepared.signal.shape[1:]
+    best, around = np.empty(shape, np.intp), np.empty((*shape, 3))
+    with entering(prepared.n_counts):
+        fill_peaks(prepared, best, around)
+    return best, around
 
 
 def _log_likelihoods(prepared: LikelihoodInput) -> Iterator[tuple[slice, NDArray[np.float32]]]:

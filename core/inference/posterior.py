@@ -20,9 +20,9 @@ from core.inference.flux_model import FluxModel
 from core.inference.likelihood import (
     NUMBERS_AT_ONCE,
     LikelihoodInput,
-    delay_curves,
     delay_densities,
     lanes_of,
+    likeliest_delays,
     pixels_of,
     prepared_groups,
 )
@@ -184,43 +184,41 @@ def _answers(
 ) -> Iterator[tuple[slice, Floats, Floats]]:
     """Yield blocks, their delays in steps and their scores, (block, lane) each."""
     if rule == "density":
-        for some, curve, weighted in delay_curves(prepared):
-            yield some, *_vertex(prepared, weighted, curve.argmax(axis=1))
+        step, around = likeliest_delays(prepared)
+        found = _vertex(step, prepared.depth.size - 1, np.moveaxis(around, 2, 0))
+        yield slice(0, len(step)), found, around[:, :, 1]
         return
     for some, density, _, weighted in delay_densities(prepared):
         if rule == "window":
-            at = _most_in_window(density, TOLERANCE_BINS * steps_per_bin)
-            found = _vertex(prepared, weighted, at)[0]
+            step = _most_in_window(density, TOLERANCE_BINS * steps_per_bin)
+            found = _vertex(step, prepared.depth.size - 1, _log_around(prepared, weighted, step))
         elif rule == "mean":
             steps = np.arange(density.shape[1]) + 0.5
             found = np.einsum("bdl,d->bl", density, steps) / density.sum(axis=1, dtype=float)
         else:
             found = _median(density)
-        yield some, found, _vertex(prepared, weighted, density.argmax(axis=1))[1]
+        yield some, found, _log_around(prepared, weighted, density.argmax(axis=1))[1]
 
 
-def _vertex(
+def _log_around(
     prepared: LikelihoodInput, weighted: NDArray[np.float32], step: NDArray[np.intp]
-) -> tuple[Floats, Floats]:
-    """Refine steps (block, lane) by a parabola through the logarithm of the density.
-
-    Returns
-    -------
-    position : ndarray, shape (block, lane)
-        In steps.
-    height : ndarray, shape (block, lane)
-        Logarithm of the density at the step itself.
-    """
+) -> Floats:
+    """Logarithm of the density before, at and after steps (block, lane), (3, block, lane)."""
     at, last = step[:, np.newaxis], weighted.shape[2] - 1
     around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
     # From logarithms, since the density next to a strong echo underflows to 0.
     log = np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float)
     log = np.logaddexp.reduce(log, axis=1) + np.log(prepared.depth[around])
-    left, middle, right = log.transpose(1, 0, 2)
+    return np.asarray(log.transpose(1, 0, 2))
+
+
+def _vertex(step: NDArray[np.intp], last: int, log: Floats) -> Floats:
+    """Refine steps from 0 to `last` by a parabola through the logarithms before, at and after."""
+    left, middle, right = log
     curvature = np.minimum(left - 2 * middle + right, -1e-9)
     inside = (step > 0) & (step < last)
     shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
-    return np.asarray(step + 0.5 + shift, float), middle
+    return np.asarray(step + 0.5 + shift, float)
 
 
 def _most_in_window(density: NDArray[np.float32], half: int) -> NDArray[np.intp]:

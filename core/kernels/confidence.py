@@ -58,41 +58,73 @@ def fill_evidence(prepared, depth, evidence):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def _add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
-    """Add ``exp(ratio + offset)`` (delay, lane) to `density`, which is in units of ``exp(top)``.
+    """Add ``exp(ratio + offset)`` (step, bin, lane) to `density`, in units of ``exp(top)``.
 
-    `offset` and `top` are of shape (lane,); `top` becomes that of all terms so far.
+    `density` is of shape (delay, lane), `offset` and `top` of shape (lane,); `top` becomes that of
+    all terms so far.
     """
     n_delays, lanes = density.shape
     highest, kept, added = np.empty((3, lanes), np.float32)
-    _fill_highest(ratio, highest)
+    _fill_highest(ratio.reshape(-1, lanes), highest)
     for i in range(lanes):
         previous, here = top[i], highest[i] + offset[i]
         top[i] = max(previous, here)
         kept[i], added[i] = math.exp(previous - top[i]), math.exp(here - top[i])
     for d in range(n_delays):
+        row = ratio[d % len(ratio), d // len(ratio)]
         for i in range(lanes):
-            density[d, i] = kept[i] * density[d, i] + added[i] * exp32(ratio[d, i] - highest[i])
+            density[d, i] = kept[i] * density[d, i] + added[i] * exp32(row[i] - highest[i])
 
 
 @njit(**COMPILED)
-def _fill_density(b, prepared, density, top):  # type: ignore[no-untyped-def]
+def _fill_density(b, prepared, ratio, offset, density, top):  # type: ignore[no-untyped-def]
     """Fill `density` (delay, lane) with the likelihood ratio of each delay to no echo.
 
-    In units of ``exp(top)``, averaged over the levels and multiplied by the prior of the delay.
+    In units of ``exp(top)``, averaged over the levels and multiplied by the prior of the delay. The
+    logarithm of the contribution of a level is left in `ratio` (level, step, bin, lane) and
+    `offset` (level, lane), or that of the last level if there is room for one.
     """
     n_delays, lanes = density.shape
     fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
-    ratio, offset = lane_rows(n_delays, lanes).reshape(1, n_delays, lanes), np.empty(lanes)
     density[:], top[:] = 0.0, -np.inf
     for level in range(1, len(prepared.signal)):
-        fill_level(b, level, prepared, fired, unfired_echo, ratio)
-        fill_flat(b, level, prepared, all_fired, all_unfired, offset)
-        for i in range(lanes):
-            offset[i] += prepared.log_share[level]
-        _add_level(ratio[0], offset, density, top)
+        at = (level - 1) % len(ratio)
+        fill_level(b, level, prepared, fired, unfired_echo, ratio[at])
+        fill_flat(b, level, prepared, all_fired, all_unfired, offset[at])
+        offset[at] += prepared.log_share[level]
+        _add_level(ratio[at], offset[at], density, top)
     for d in range(n_delays):
         for i in range(lanes):
             density[d, i] *= prepared.depth[d]
+
+
+@njit(**PARALLEL)
+def fill_peaks(prepared, best, around):  # type: ignore[no-untyped-def]
+    """Fill the likeliest delay of each pixel, (block, lane).
+
+    And the logarithms of the densities before, at and after it, (block, lane, 3): densities next to
+    a strong echo underflow to 0.
+    """
+    n_blocks, lanes = best.shape
+    n_steps, n_delays, n_levels = len(prepared.echo), prepared.depth.size, len(prepared.signal) - 1
+    for b in prange(n_blocks):
+        ratio = lane_rows(n_levels * n_delays, lanes).reshape(n_levels, n_steps, -1, lanes)
+        density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+        top, offset = np.empty(lanes), np.empty((n_levels, lanes))
+        _fill_density(b, prepared, ratio, offset, density, top)
+        highest, at = np.full(lanes, -1.0, np.float32), np.zeros(lanes, np.int32)
+        for d in range(n_delays):
+            for i in range(lanes):
+                here, most, before = density[d, i], highest[i], at[i]
+                at[i] = d if here > most else before
+                highest[i] = here if here > most else most
+        for i in range(lanes):
+            best[b, i] = at[i]
+            for j in range(3):
+                d = min(max(at[i] + j - 1, 0), n_delays - 1)
+                log = ratio[:, d % n_steps, d // n_steps, i] + offset[:, i]
+                most = log.max()
+                around[b, i, j] = most + math.log(np.exp(log - most).sum() * prepared.depth[d])
 
 
 @njit(**COMPILED)
@@ -118,8 +150,9 @@ def fill_masses(prepared, half, first, mass, surface):  # type: ignore[no-untype
     for b in prange(len(first)):
         density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
         window = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
-        top, total = np.empty(lanes), np.zeros(lanes)
-        _fill_density(b, prepared, density, top)
+        ratio = lane_rows(n_delays, lanes).reshape(1, 1, n_delays, lanes)
+        top, total, offset = np.empty(lanes), np.zeros(lanes), np.empty((1, lanes))
+        _fill_density(b, prepared, ratio, offset, density, top)
         _fill_windows(half, density, window)
         for d in range(n_delays):
             for i in range(lanes):
