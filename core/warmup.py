@@ -7,6 +7,7 @@ import numpy as np
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
+from core.inference import fit_of
 from core.inspection import pixel_report
 from core.kernels.parallel import SERIAL_BELOW
 from core.scene import Scene
@@ -25,6 +26,7 @@ def warm_up() -> None:
     pixels = SERIAL_BELOW // acquisition.n_bins + 1
     large = Capture(np.zeros((pixels, 1, acquisition.n_bins), np.uint16), acquisition)
     images = {method: estimate(small, method) for method in ESTIMATORS}
+    fit_of(small)
     pixel_report(small, images["tracking"], 0, 0)  # `scipy.signal` takes a second to import
     track(large.blocks, PRESETS["recommended"])
     tracking_signals(small.cube, PRESETS["recommended"])

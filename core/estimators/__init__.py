@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from core.capture import Capture
@@ -89,7 +90,7 @@ def estimate(
     settings = settings_of(method, settings, **parameters)
     require_memory(capture, method, settings, false_alarm)
     estimator = ESTIMATORS[method]
-    made_by = Provenance(method, settings, false_alarm, estimator.remark(capture))
+    made_by = Provenance(method, settings, false_alarm, partial(estimator.remark, capture))
     return replace(estimator(capture, settings, false_alarm), made_by=made_by)
 
 

@@ -36,6 +36,24 @@ class NoParameters:
     """Settings of a method that has none."""
 
 
+class _Deferred:
+    """Field for a text, or for a function that returns it and is called at the first access."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, holder: object, owner: type | None = None) -> str:
+        if holder is None:
+            return ""  # default of the field
+        text = vars(holder)[self._name]
+        if callable(text):
+            text = vars(holder)[self._name] = text()
+        return str(text)
+
+    def __set__(self, holder: object, text: str | Callable[[], str]) -> None:
+        vars(holder)[self._name] = text
+
+
 @dataclass(frozen=True)
 class Provenance:
     """How the estimates of a range image were made.
@@ -49,7 +67,8 @@ class Provenance:
     false_alarm : float, optional
         As for `core.estimate`.
     remark : str
-        Limits of the model, see `Estimator.remark`.
+        Limits of the model, see `Estimator.remark`. May be given as a function that returns it: the
+        goodness of fit takes longer than an estimate.
     least_confidence : float, optional
         Estimates of less confidence have been removed, see `RangeImage.confident`.
     box : Box, optional
@@ -59,9 +78,13 @@ class Provenance:
     method: str
     settings: Any
     false_alarm: float | None = None
-    remark: str = ""
+    remark: _Deferred = _Deferred()
     least_confidence: float | None = None
     box: Box | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields, with `remark` as text, for another process."""
+        return vars(self) | {"remark": self.remark}
 
     @property
     def facts(self) -> dict[str, str | float]:

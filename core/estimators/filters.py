@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy  # loads a submodule when it is first used
 
 from core.acquisition import Floats
 from core.inference.likelihood import Conditions
+from core.kernels.filters import correlate_rows
 
 
 def echo_shape(conditions: Conditions) -> tuple[Floats, int]:
@@ -29,11 +29,9 @@ def correlate(values: Floats, taps: Floats, first: int | None = None) -> Floats:
     -------
     ndarray, shape (..., bin)
     """
-    if first is None:
-        first = -(len(taps) // 2)
-    # SciPy needs a filter that is centred on its middle tap.
-    last = first + len(taps) - 1
-    half = max(-first, last, 0)
-    centred = np.zeros(2 * half + 1)
-    centred[half + first : half + last + 1] = taps
-    return np.asarray(scipy.ndimage.correlate1d(values, centred, axis=-1, mode="constant"))
+    first = -(len(taps) // 2) if first is None else first
+    rows = np.ascontiguousarray(values, float).reshape(-1, values.shape[-1])
+    rows.setflags(write=False)  # writability is part of a numba type: compile for one
+    sums = np.zeros(values.shape)
+    correlate_rows(rows, taps.astype(float), first, sums.reshape(rows.shape))
+    return sums

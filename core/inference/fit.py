@@ -243,7 +243,7 @@ def _drawn(
     echo, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, steps)
     log_signal = np.log(np.where(level > 0, signal, 1.0))
     state = np.stack([delay_bin, log_signal, np.log(background / n_bins)], axis=1)
-    with entering(cube.size):
+    with entering(cube.size * UNIFORMS):  # a pass over the counts for every number drawn
         redraw(
             cube.astype(np.uint32), capture.gated_pulses or 0, streams, echo, first, state
         )  # compiled for one type of counts

@@ -140,7 +140,7 @@ def level_likelihoods(
     flux = flux_prior.model(_totals(capture)[0].ravel()[some], least)
     cube = capture.cube.reshape(-1, n_bins)[some]
     prepared = prepare(capture, cube, flux, steps_per_bin)
-    evidence = level_evidence(prepared, prepared.depth[:, np.newaxis])
+    evidence = level_evidence(prepared, prepared.depth)
     b = flux.background[0, 0] / n_bins
     fires = b if n_pulses is None else -np.expm1(-b)
     fired, unfired = np.empty((2, pixels.size))

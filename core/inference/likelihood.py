@@ -26,6 +26,7 @@ from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
 from core.inference.flux_model import FluxModel
 from core.kernels.blocks import LANES, lane_counts
+from core.kernels.confidence import fill_evidence, fill_peaks
 from core.kernels.parallel import entering
 from core.kernels.posterior import fill_blocks
 
@@ -272,31 +273,17 @@ def _in_lanes(image: Floats, pixels: slice, lanes: int) -> Floats:
     return np.ascontiguousarray(filled.reshape(len(image), -1, lanes))
 
 
-def level_evidence(prepared: LikelihoodInput, depth: NDArray[np.float32] | float = 1.0) -> Floats:
+def level_evidence(prepared: LikelihoodInput, depth: NDArray[np.float32] | None = None) -> Floats:
     """Log likelihood ratio of each level to no echo, (pixel, level).
 
-    `depth` is the prior density of the delay relative to uniform, of shape (delay, 1).
+    `depth` is the prior density of the delay relative to uniform, shape (delay,); uniform if None.
     """
     n_levels, n_blocks, lanes = prepared.signal.shape
     evidence = np.empty((n_blocks, lanes, n_levels))
-    # Some levels at a time, together with the first, to which the others are compared.
-    table = prepared.depth.size * lanes
-    at_once = max(1, TABLE_NUMBERS // table - 1)
-    evidence[..., 0] = 0.0
-    for first in range(1, n_levels, at_once):
-        levels = [0, *range(first, min(first + at_once, n_levels))]
-        few = prepared
-        if len(levels) < n_levels:
-            few = prepared._replace(
-                signal=prepared.signal[levels], background=prepared.background[levels]
-            )
-        for some, log in _log_likelihoods(few):
-            top = log.max(axis=2)
-            np.subtract(log, top[:, :, np.newaxis], out=log)
-            density = np.exp(log, out=log)
-            density *= depth
-            mean = density.mean(axis=2)
-            evidence[some, :, levels] = (top + np.log(mean)).transpose(0, 2, 1)
+    depth = np.ones_like(prepared.depth) if depth is None else depth
+    in_steps = np.ascontiguousarray(depth.reshape(-1, len(prepared.echo)).T)
+    with entering(prepared.n_counts):
+        fill_evidence(prepared, in_steps, evidence)
     return evidence.reshape(-1, n_levels)[: prepared.n_pixels]
 
 
@@ -339,21 +326,20 @@ def delay_densities(
         yield some, density, top[:, 0, 0].astype(float), weighted
 
 
-def delay_curves(
-    prepared: LikelihoodInput,
-) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.float32]]]:
-    """Yield a curve with the maximum of the density of `delay_densities`, and its contributions.
+def likeliest_delays(prepared: LikelihoodInput) -> tuple[NDArray[np.intp], Floats]:
+    """Find the maximum of the density of `delay_densities` of each pixel.
 
-    With one level of signal, the curve is the logarithm, which saves the exponentials.
+    Returns
+    -------
+    delay : ndarray, shape (block, lane)
+    log : ndarray, shape (block, lane, 3)
+        Logarithm of the density before, at and after it; at the edges of the gate, at it.
     """
-    if len(prepared.signal) > 2:
-        for some, density, _, weighted in delay_densities(prepared):
-            yield some, density, weighted
-        return
-    depth = np.log(prepared.depth)[:, np.newaxis]
-    for some, log in _log_likelihoods(prepared):
-        weighted = log[:, 1:] + np.float32(prepared.log_share[1])
-        yield some, weighted[:, 0] + depth, weighted
+    shape = prepared.signal.shape[1:]
+    best, around = np.empty(shape, np.intp), np.empty((*shape, 3))
+    with entering(prepared.n_counts):
+        fill_peaks(prepared, best, around)
+    return best, around
 
 
 def _log_likelihoods(prepared: LikelihoodInput) -> Iterator[tuple[slice, NDArray[np.float32]]]:

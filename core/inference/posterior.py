@@ -20,11 +20,14 @@ from core.inference.flux_model import FluxModel
 from core.inference.likelihood import (
     NUMBERS_AT_ONCE,
     LikelihoodInput,
-    delay_curves,
     delay_densities,
+    lanes_of,
+    likeliest_delays,
     pixels_of,
     prepared_groups,
 )
+from core.kernels.confidence import fill_masses
+from core.kernels.parallel import entering
 
 TOLERANCE_BINS = 3
 """Tolerance within which an estimate is right; it reproduces the paper's tables."""
@@ -48,27 +51,38 @@ class Posterior(NamedTuple):
 @cached_per_capture
 def posterior_of(capture: Capture) -> Posterior:
     """Compute the posterior of a capture with the fluxes of `flux_model_of`."""
-    n_pixels, n_bins = capture.counts.size, capture.cube.shape[2]
-    within, surface = np.empty((n_pixels, n_bins), np.float32), np.empty(n_pixels)
-    for pixels, prepared in prepared_groups(capture, flux_model_of(capture), 1):
-        for some, density, top, _ in delay_densities(prepared):
-            # Cumulative density, extended by the tolerance on both sides of the gate.
-            before = np.zeros((len(top), n_bins + 2 * TOLERANCE_BINS + 1, top.shape[1]), np.float32)
-            behind = TOLERANCE_BINS + n_bins
-            np.cumsum(density, axis=1, out=before[:, TOLERANCE_BINS + 1 : behind + 1])
-            everything = before[:, behind]
-            before[:, behind + 1 :] = everything[:, np.newaxis]
-            # Relative to the larger of the two, so that neither overflows.
-            unit = np.maximum(top, prepared.log_share[0])
-            seen = np.exp(top - unit) * everything / n_bins
-            present = seen / (seen + np.exp(prepared.log_share[0] - unit))
-            mass = before[:, 2 * TOLERANCE_BINS : -1] - before[:, :n_bins]
-            mass *= (present / everything)[:, np.newaxis].astype(np.float32)
-            here = pixels_of(some, prepared, pixels)
-            size = here.stop - here.start
-            within[here] = mass.transpose(0, 2, 1).reshape(-1, n_bins)[:size]
-            surface[here] = present.ravel()[:size]
+    n_bins = capture.cube.shape[2]
+    within, surface = _masses(capture, np.zeros(capture.counts.size, np.intp), n_bins)
     return Posterior(within.reshape(capture.cube.shape), surface.reshape(capture.shape))
+
+
+def _masses(
+    capture: Capture, first: NDArray[np.intp], n_windows: int
+) -> tuple[NDArray[np.float32], Floats]:
+    """Compute parts of `posterior_of`, the same to the last bit.
+
+    Parameters
+    ----------
+    capture : Capture
+    first : ndarray, shape (pixel,)
+        First bin of each pixel.
+    n_windows : int
+        Number of bins.
+
+    Returns
+    -------
+    tolerance_probability : ndarray, shape (pixel, window)
+    surface : ndarray, shape (pixel,)
+    """
+    flux, n_pixels = flux_model_of(capture), first.size
+    lanes = lanes_of(flux.share.size, capture.cube.shape[2])
+    first = np.pad(first, (0, -n_pixels % lanes)).reshape(-1, lanes)
+    within, surface = np.empty((*first.shape, n_windows), np.float32), np.empty(first.shape)
+    for pixels, prepared in prepared_groups(capture, flux, 1):
+        some = slice(pixels.start // lanes, -(-pixels.stop // lanes))
+        with entering(prepared.n_counts):
+            fill_masses(prepared, TOLERANCE_BINS, first[some], within[some], surface[some])
+    return within.reshape(-1, n_windows)[:n_pixels], surface.ravel()[:n_pixels]
 
 
 def has_posterior(capture: Capture) -> bool:
@@ -85,33 +99,43 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
     bins : ndarray, shape (row, col)
         Delays in fractional bins, from 0 to n_bins; NaN gives 0.
     """
-    table, found = posterior_of(capture).tolerance_probability, np.empty(bins.size)
+    last = capture.cube.shape[2] - 1
+    below, found = _bin_below(bins.ravel(), last), np.empty(bins.size)
+    if has_posterior(capture):
+        table = posterior_of(capture).tolerance_probability
+        # Flat indices: `numpy.take_along_axis` takes longer than everything else.
+        first = np.arange(bins.size)[:, np.newaxis] * (last + 1)
+        ends = table.take(first + _both(below, last))
+    else:
+        ends, _ = _masses(capture, below, min(2, last + 1))
     for begin in range(0, bins.size, NUMBERS_AT_ONCE):
         some = slice(begin, begin + NUMBERS_AT_ONCE)
-        delay = bins.ravel()[some]
-        found[some] = _interpolated(table, np.arange(begin, begin + delay.size), delay)
+        found[some] = _interpolated(bins.ravel()[some], below[some], ends[some])
     return found.reshape(bins.shape)
 
 
 def tolerance_probability_at(capture: Capture, row: int, col: int, bins: Floats) -> Floats:
     """Return `tolerance_probability` of one pixel at several delays (n,), shape (n,)."""
-    pixel = row * capture.shape[1] + col
-    table = posterior_of(capture).tolerance_probability
-    return _interpolated(table, np.full(bins.size, pixel), bins)
+    table = posterior_of(capture).tolerance_probability[row, col]
+    below = _bin_below(bins, table.size - 1)
+    return _interpolated(bins, below, table[_both(below, table.size - 1)])
 
 
-def _interpolated(
-    table: NDArray[np.float32], pixels: NDArray[np.intp], delay_bin: Floats
-) -> Floats:
-    """Interpolate a table (row, col, bin) at the delays (n,) of pixels given as flat indices."""
-    last = table.shape[2] - 1
+def _bin_below(delay_bin: Floats, last: int) -> NDArray[np.intp]:
+    """First of the two bins, up to the `last`, between which to interpolate at delays (n,)."""
     at = np.clip(np.nan_to_num(delay_bin), 0, last)
-    below = np.minimum(at.astype(np.intp), max(last - 1, 0))
-    above = np.minimum(below + 1, last)
-    # Flat indices: `numpy.take_along_axis` takes longer than everything else.
-    first = pixels * table.shape[2]
-    low, high = table.take(first + below), table.take(first + above)
-    between = low + (at - below) * (high - low)
+    return np.minimum(at.astype(np.intp), max(last - 1, 0))
+
+
+def _both(below: NDArray[np.intp], last: int) -> NDArray[np.intp]:
+    """The two bins between which to interpolate, from the first one, shape (n, 2)."""
+    return np.stack([below, np.minimum(below + 1, last)], axis=1)
+
+
+def _interpolated(delay_bin: Floats, below: NDArray[np.intp], ends: NDArray[np.float32]) -> Floats:
+    """Interpolate at delays (n,) between numbers (n, 2) at the bins from `below`; 0 for NaN."""
+    part = np.clip(np.nan_to_num(delay_bin) - below, 0.0, 1.0)
+    between = ends[:, 0] + part * (ends[:, -1] - ends[:, 0])
     return np.where(np.isnan(delay_bin), 0.0, np.clip(between, 0.0, 1.0))
 
 
@@ -160,43 +184,41 @@ def _answers(
 ) -> Iterator[tuple[slice, Floats, Floats]]:
     """Yield blocks, their delays in steps and their scores, (block, lane) each."""
     if rule == "density":
-        for some, curve, weighted in delay_curves(prepared):
-            yield some, *_vertex(prepared, weighted, curve.argmax(axis=1))
+        step, around = likeliest_delays(prepared)
+        found = _vertex(step, prepared.depth.size - 1, np.moveaxis(around, 2, 0))
+        yield slice(0, len(step)), found, around[:, :, 1]
         return
     for some, density, _, weighted in delay_densities(prepared):
         if rule == "window":
-            at = _most_in_window(density, TOLERANCE_BINS * steps_per_bin)
-            found = _vertex(prepared, weighted, at)[0]
+            step = _most_in_window(density, TOLERANCE_BINS * steps_per_bin)
+            found = _vertex(step, prepared.depth.size - 1, _log_around(prepared, weighted, step))
         elif rule == "mean":
             steps = np.arange(density.shape[1]) + 0.5
             found = np.einsum("bdl,d->bl", density, steps) / density.sum(axis=1, dtype=float)
         else:
             found = _median(density)
-        yield some, found, _vertex(prepared, weighted, density.argmax(axis=1))[1]
+        yield some, found, _log_around(prepared, weighted, density.argmax(axis=1))[1]
 
 
-def _vertex(
+def _log_around(
     prepared: LikelihoodInput, weighted: NDArray[np.float32], step: NDArray[np.intp]
-) -> tuple[Floats, Floats]:
-    """Refine steps (block, lane) by a parabola through the logarithm of the density.
-
-    Returns
-    -------
-    position : ndarray, shape (block, lane)
-        In steps.
-    height : ndarray, shape (block, lane)
-        Logarithm of the density at the step itself.
-    """
+) -> Floats:
+    """Logarithm of the density before, at and after steps (block, lane), (3, block, lane)."""
     at, last = step[:, np.newaxis], weighted.shape[2] - 1
     around = np.concatenate([np.maximum(at - 1, 0), at, np.minimum(at + 1, last)], axis=1)
     # From logarithms, since the density next to a strong echo underflows to 0.
     log = np.take_along_axis(weighted, around[:, np.newaxis], axis=2).astype(float)
     log = np.logaddexp.reduce(log, axis=1) + np.log(prepared.depth[around])
-    left, middle, right = log.transpose(1, 0, 2)
+    return np.asarray(log.transpose(1, 0, 2))
+
+
+def _vertex(step: NDArray[np.intp], last: int, log: Floats) -> Floats:
+    """Refine steps from 0 to `last` by a parabola through the logarithms before, at and after."""
+    left, middle, right = log
     curvature = np.minimum(left - 2 * middle + right, -1e-9)
     inside = (step > 0) & (step < last)
     shift = np.where(inside, np.clip(0.5 * (left - right) / curvature, -0.5, 0.5), 0.0)
-    return np.asarray(step + 0.5 + shift, float), middle
+    return np.asarray(step + 0.5 + shift, float)
 
 
 def _most_in_window(density: NDArray[np.float32], half: int) -> NDArray[np.intp]:

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from core.kernels.blocks import lane_rows
+from core.kernels.blocks import LANES, lane_rows
+from core.kernels.elementary import log1p32
 from core.kernels.parallel import COMPILED, PARALLEL, SUMMING
 
 _STEPS = 100  # of expectation and maximisation
@@ -85,62 +86,133 @@ def smoothed(density):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _fill_counts(b, prepared, fired, unfired, unfired_echo):  # type: ignore[no-untyped-def]
-    """Fill counts, unfired pulses ``A_k - n_k`` and ``Σ_k (A_k - n_k) p_k(d)`` of a block."""
-    n_bins, lanes = fired.shape
-    n_steps, n_taps = prepared.echo.shape
-    armed = np.full(lanes, float(prepared.n_pulses))
-    for k in range(n_bins):
-        for i in range(lanes):
-            count = prepared.counts[b, k, i]
-            armed[i] -= count
-            fired[k, i] = count
-            unfired[k, i] = armed[i] if prepared.n_pulses > 0 else 1.0
-    for d in range(n_bins * n_steps):
-        step, first = d % n_steps, d // n_steps + prepared.first_tap
-        unfired_echo[d, :] = 0.0
-        for tap in range(max(0, -first), min(n_taps, n_bins - first)):
-            p = prepared.echo[step, tap]
+def _correlate(taps, values, first, sums):  # type: ignore[no-untyped-def]
+    """Add ``Σ_j taps[j] values[d + first + j]`` to the sums of each d; (tap or bin, lane) each."""
+    n_bins, lanes = values.shape
+    begin, end = max(0, -first), n_bins - first - len(taps) + 1
+    if lanes == LANES and begin < end:
+        end = begin + (end - begin) // 4 * 4
+        _correlate_inside(taps.reshape(-1), values.reshape(-1), first, begin, end, sums)
+    else:
+        end = begin
+    for d in range(n_bins):
+        if begin <= d < end:
+            continue
+        for j in range(max(0, -d - first), min(len(taps), n_bins - d - first)):
             for i in range(lanes):
-                unfired_echo[d, i] += p * unfired[first + tap, i]
+                sums[d, i] += taps[j, i] * values[d + first + j, i]
 
 
 @njit(**COMPILED)
-def _fill_level(b, level, prepared, fired, unfired_echo, gain, ratio):  # type: ignore[no-untyped-def]
-    """Fill `ratio` (delay, lane) with ``T(d)`` of one level (`core.inference.likelihood`)."""
-    n_bins, lanes = fired.shape
+def _correlate_inside(taps, values, first, begin, end, sums):  # type: ignore[no-untyped-def]
+    """As `_correlate` from `begin` to `end`, a multiple of four apart, all of whose bins exist.
+
+    Four by four, so that most operands stay in registers. One dimension and constant distances,
+    since the compiler vectorises what it knows not to overlap.
+    """
+    n_taps = taps.size // LANES
+    for d in range(begin, end, 4):
+        s = sums[d : d + 4].reshape(-1)
+        for j in range(0, n_taps - 3, 4):
+            t, k = taps[j * LANES : (j + 4) * LANES], d + first + j
+            v = values[k * LANES : (k + 7) * LANES]
+            for i in range(LANES):
+                t0, t1, t2, t3 = t[i], t[LANES + i], t[2 * LANES + i], t[3 * LANES + i]
+                v1, v2, v3 = v[LANES + i], v[2 * LANES + i], v[3 * LANES + i]
+                v4, v5, v6 = v[4 * LANES + i], v[5 * LANES + i], v[6 * LANES + i]
+                s[i] = s[i] + t0 * v[i] + t1 * v1 + t2 * v2 + t3 * v3
+                s[LANES + i] = s[LANES + i] + t0 * v1 + t1 * v2 + t2 * v3 + t3 * v4
+                s[2 * LANES + i] = s[2 * LANES + i] + t0 * v2 + t1 * v3 + t2 * v4 + t3 * v5
+                s[3 * LANES + i] = s[3 * LANES + i] + t0 * v3 + t1 * v4 + t2 * v5 + t3 * v6
+        for j in range(n_taps // 4 * 4, n_taps):
+            t, k = taps[j * LANES : (j + 1) * LANES], d + first + j
+            v = values[k * LANES : (k + 4) * LANES]
+            for i in range(LANES):
+                s[i] += t[i] * v[i]
+                s[LANES + i] += t[i] * v[LANES + i]
+                s[2 * LANES + i] += t[i] * v[2 * LANES + i]
+                s[3 * LANES + i] += t[i] * v[3 * LANES + i]
+
+
+@njit(**COMPILED)
+def counts_of(b, prepared):  # type: ignore[no-untyped-def]
+    """Return the parts of ``T(d)`` of a block that all levels share.
+
+    Counts (bin, lane) and their sums (lane,), sums of unfired pulses ``A_k - n_k`` (lane,), and
+    ``Σ_k (A_k - n_k) p_k(d)`` (step, bin, lane).
+    """
+    n_bins, lanes = prepared.counts.shape[1:]
     n_steps, n_taps = prepared.echo.shape
-    previous_signal, previous_background = 0.0, 0.0
+    # Aligned to cache lines: vectors that straddle them cost twice.
+    fired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
+    unfired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
+    unfired_echo = lane_rows(n_steps * n_bins, lanes).reshape(n_steps, n_bins, lanes)
+    taps = lane_rows(n_taps, lanes).reshape(n_taps, lanes)
+    armed = np.full(lanes, float(prepared.n_pulses))
+    all_unfired = np.zeros(lanes)
+    for k in range(n_bins):
+        # Separate loops, since those of several types are not vectorised.
+        for i in range(lanes):
+            fired[k, i] = prepared.counts[b, k, i]
+        for i in range(lanes):
+            armed[i] -= prepared.counts[b, k, i]
+        for i in range(lanes):
+            unfired[k, i] = armed[i]
+        for i in range(lanes):
+            all_unfired[i] += armed[i]
+    all_fired = prepared.n_pulses - armed
+    if prepared.n_pulses == 0:
+        unfired[:], all_unfired[:] = 1.0, n_bins
+    unfired_echo[:] = 0.0
+    for step in range(n_steps):
+        for tap in range(n_taps):
+            taps[tap, :] = prepared.echo[step, tap]
+        _correlate(taps, unfired, prepared.first_tap, unfired_echo[step])
+    return fired, all_fired, all_unfired, unfired_echo
+
+
+@njit(**COMPILED)
+def _fill_gain(b, level, prepared, gain):  # type: ignore[no-untyped-def]
+    """Fill `gain` (step, tap, lane) with the logarithm that each count adds to ``T(d)``."""
+    n_bins, lanes = prepared.counts.shape[1:]
+    n_steps, n_taps = prepared.echo.shape
+    unit, previous = np.empty(lanes, np.float32), 0.0
     for i in range(lanes):
-        signal = prepared.signal[level, b, i]
         background = prepared.background[level, b, i] / n_bins
-        if i > 0 and signal == previous_signal and background == previous_background:
-            for step in range(n_steps):  # logarithms are slow, and neighbours often equal
-                for tap in range(n_taps):
-                    gain[step, tap, i] = gain[step, tap, i - 1]
-            continue
-        previous_signal, previous_background = signal, background
-        bare = -math.expm1(-background)
+        unit[i] = 1.0 / (math.expm1(background) if prepared.n_pulses > 0 else background)
+        signal = prepared.signal[level, b, i]
         for step in range(n_steps):
             for tap in range(n_taps):
                 s = signal * prepared.echo[step, tap]
-                if prepared.n_pulses > 0:
-                    # (1 - exp(-b - s)) / (1 - exp(-b)), without cancellation.
-                    odds = 1.0 - math.expm1(-s) * (1.0 - bare) / bare
-                    gain[step, tap, i] = math.log(odds)
+                if i > 0 and signal == previous:
+                    gain[step, tap, i] = gain[step, tap, i - 1]
                 else:
-                    gain[step, tap, i] = math.log1p(s / background)
-    for d in range(n_bins * n_steps):
-        step, first = d % n_steps, d // n_steps + prepared.first_tap
-        for i in range(lanes):
-            ratio[d, i] = -np.float32(prepared.signal[level, b, i]) * unfired_echo[d, i]
-        for tap in range(max(0, -first), min(n_taps, n_bins - first)):
+                    gain[step, tap, i] = -math.expm1(-s) if prepared.n_pulses > 0 else s
+        previous = signal
+    for step in range(n_steps):
+        for tap in range(n_taps):
             for i in range(lanes):
-                ratio[d, i] += gain[step, tap, i] * fired[first + tap, i]
+                # (1 - exp(-b - s)) / (1 - exp(-b)), without cancellation.
+                gain[step, tap, i] = log1p32(gain[step, tap, i] * unit[i])
 
 
 @njit(**COMPILED)
-def _flat_likelihood(b, level, prepared, fired, unfired, flat):  # type: ignore[no-untyped-def]
+def fill_level(b, level, prepared, fired, unfired_echo, ratio):  # type: ignore[no-untyped-def]
+    """Fill `ratio` (step, bin, lane) with ``T(d)`` of one level (`core.inference.likelihood`)."""
+    n_bins, lanes = fired.shape
+    n_steps, n_taps = prepared.echo.shape
+    gain = lane_rows(n_steps * n_taps, lanes).reshape(n_steps, n_taps, lanes)
+    _fill_gain(b, level, prepared, gain)
+    for step in range(n_steps):
+        for k in range(n_bins):
+            for i in range(lanes):
+                signal = np.float32(prepared.signal[level, b, i])
+                ratio[step, k, i] = -signal * unfired_echo[step, k, i]
+        _correlate(gain[step], fired, prepared.first_tap, ratio[step])
+
+
+@njit(**COMPILED)
+def fill_flat(b, level, prepared, fired, unfired, flat):  # type: ignore[no-untyped-def]
     """Fill `flat` with the log likelihood ratio of the level's background to the first level's.
 
     `fired` and `unfired` are sums over the bins.
@@ -149,6 +221,9 @@ def _flat_likelihood(b, level, prepared, fired, unfired, flat):  # type: ignore[
     for i in range(lanes):
         here = prepared.background[level, b, i] / n_bins
         bare = prepared.background[0, b, i] / n_bins
+        flat[i] = 0.0
+        if here == bare:
+            continue
         odds = math.expm1(-here) / math.expm1(-bare) if prepared.n_pulses > 0 else here / bare
         flat[i] = fired[i] * math.log(odds) - unfired[i] * (here - bare)
 
@@ -157,27 +232,16 @@ def _flat_likelihood(b, level, prepared, fired, unfired, flat):  # type: ignore[
 def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
     """Fill log likelihood ratios of each level and delay to no echo, (level, delay, lane)."""
     n_levels, n_delays, lanes = log.shape
-    n_bins = prepared.counts.shape[1]
-    n_steps, n_taps = prepared.echo.shape
-    # Aligned to cache lines: vectors that straddle them cost twice.
-    fired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
-    unfired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
-    unfired_echo = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
-    ratio = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
-    gain = lane_rows(n_steps * n_taps, lanes).reshape(n_steps, n_taps, lanes)
-    all_fired, all_unfired, flat = np.zeros((3, lanes))
-    _fill_counts(b, prepared, fired, unfired, unfired_echo)
-    for k in range(n_bins):
-        for i in range(lanes):
-            all_fired[i] += fired[k, i]
-            all_unfired[i] += unfired[k, i]
+    fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
+    n_steps = len(prepared.echo)
+    ratio, flat = lane_rows(n_delays, lanes).reshape(n_steps, -1, lanes), np.empty(lanes)
     log[0] = 0.0
     for level in range(1, n_levels):
-        _fill_level(b, level, prepared, fired, unfired_echo, gain, ratio)
-        _flat_likelihood(b, level, prepared, all_fired, all_unfired, flat)
+        fill_level(b, level, prepared, fired, unfired_echo, ratio)
+        fill_flat(b, level, prepared, all_fired, all_unfired, flat)
         for d in range(n_delays):
             for i in range(lanes):
-                log[level, d, i] = ratio[d, i] + np.float32(flat[i])
+                log[level, d, i] = ratio[d % n_steps, d // n_steps, i] + np.float32(flat[i])
 
 
 @njit(**PARALLEL)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -93,7 +94,8 @@ def test_estimates_carry_the_warning_where_the_model_does_not_hold() -> None:
     ramp = drawn(shape=lambda x: 1 + 0.5 * x)
     for capture, warning in ((ramp, fit_of(ramp).remark), (drawn(), "")):
         made_by = estimate(capture, "peak").made_by
-        assert made_by is not None and made_by.remark == warning
+        sent = pickle.loads(pickle.dumps(made_by))  # to another process, before it is read here
+        assert made_by is not None and made_by.remark == sent.remark == warning
 
 
 @pytest.mark.compiled

@@ -56,6 +56,7 @@ def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     if numba.config.DISABLE_JIT:
         monkeypatch.setattr(import_module("core.kernels.blocks"), "LANES", 16)
         monkeypatch.setattr("core.inference.likelihood.LANES", 16)
+        monkeypatch.setattr("core.kernels.posterior.LANES", 16)
 
 
 def capture_of(cube: Any, n_pulses: int | None = 1000, pulse: Pulse = Pulse()) -> Capture:
@@ -422,8 +423,29 @@ def test_tolerance_probability_interpolates_the_posterior(
     table = np.asarray(rows, np.float32)[np.newaxis]
     known = Posterior(table, np.ones(table.shape[:2]))
     monkeypatch.setattr("core.inference.posterior.posterior_of", lambda _: known)
+    monkeypatch.setattr("core.inference.posterior.has_posterior", lambda _: True)
     found = tolerance_probability(capture_of(np.zeros(table.shape)), np.array([bins]))
     np.testing.assert_array_equal(found, [expected])
+
+
+@pytest.mark.parametrize("n_bins", [1, 12])
+def test_confidences_are_those_of_the_posterior_to_the_last_bit(
+    monkeypatch: pytest.MonkeyPatch, n_bins: int
+) -> None:
+    one = histograms(n_bins, 200, Pulse())
+    cube = np.concatenate([np.roll(one, shift, axis=1) for shift in range(8)]).reshape(8, 9, -1)
+    flux, capture = in_rows(flux_for(72, n_bins, 200), 8), capture_of(cube, 200)
+    bins = np.random.default_rng(5).uniform(0, n_bins, capture.shape)
+    monkeypatch.setattr("core.inference.posterior.flux_model_of", lambda _: flux)
+    alone = tolerance_probability(capture, bins)
+    monkeypatch.setattr("core.kernels.parallel.SERIAL_BELOW", 0)  # on all threads
+    posterior_of(capture)
+    np.testing.assert_array_equal(tolerance_probability(capture, bins), alone)
+    rows = slice(3, 6)  # pixels in other lanes, of another block
+    part = flux.of_pixels(np.arange(72).reshape(8, 9)[rows])
+    monkeypatch.setattr("core.inference.posterior.flux_model_of", lambda _: part)
+    found = tolerance_probability(capture_of(cube[rows], 200), bins[rows])
+    np.testing.assert_array_equal(found, alone[rows])
 
 
 def test_without_detections_the_posterior_is_uniform(monkeypatch: pytest.MonkeyPatch) -> None:

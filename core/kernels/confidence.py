@@ -1,0 +1,167 @@
+"""Kernels that average likelihoods over delays or signal levels.
+
+The likelihood of a block of pixels stays in the cache. Signal levels are added one by one, in units
+of the largest term so far (Milakov & Gimelshein 2018).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from core.kernels.blocks import lane_rows
+from core.kernels.elementary import exp32
+from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.posterior import counts_of, fill_flat, fill_level
+
+
+@njit(**COMPILED)
+def _fill_highest(ratio, highest):  # type: ignore[no-untyped-def]
+    """Fill `highest` (lane,) with the maximum over the rows of `ratio` (row, lane)."""
+    highest[:] = -np.inf
+    for d in range(len(ratio)):
+        for i in range(highest.size):
+            here, most = ratio[d, i], highest[i]
+            highest[i] = here if here > most else most
+
+
+@njit(**PARALLEL)
+def fill_evidence(prepared, depth, evidence):  # type: ignore[no-untyped-def]
+    """Fill the log likelihood ratio of each level to no echo, (block, lane, level).
+
+    `depth` is the prior of the delay relative to uniform, (step, bin).
+    """
+    n_steps, n_bins = depth.shape
+    n_blocks, lanes, n_levels = evidence.shape
+    for b in prange(n_blocks):
+        fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
+        ratio = lane_rows(depth.size, lanes).reshape(n_steps, n_bins, lanes)
+        (highest, row), offset = np.empty((2, lanes), np.float32), np.empty(lanes)
+        evidence[b, :, 0] = 0.0
+        for level in range(1, n_levels):
+            fill_level(b, level, prepared, fired, unfired_echo, ratio)
+            fill_flat(b, level, prepared, all_fired, all_unfired, offset)
+            _fill_highest(ratio.reshape(-1, lanes), highest)
+            total = np.zeros(lanes)
+            for step in range(n_steps):
+                for k in range(n_bins):
+                    for i in range(lanes):
+                        row[i] = depth[step, k] * exp32(ratio[step, k, i] - highest[i])
+                    for i in range(lanes):
+                        total[i] += row[i]
+            for i in range(lanes):
+                mean = total[i] / depth.size
+                evidence[b, i, level] = offset[i] + highest[i] + math.log(mean)
+
+
+@njit(**COMPILED)
+def _add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
+    """Add ``exp(ratio + offset)`` (step, bin, lane) to `density`, in units of ``exp(top)``.
+
+    `density` is of shape (delay, lane), `offset` and `top` of shape (lane,); `top` becomes that of
+    all terms so far.
+    """
+    n_delays, lanes = density.shape
+    highest, kept, added = np.empty((3, lanes), np.float32)
+    _fill_highest(ratio.reshape(-1, lanes), highest)
+    for i in range(lanes):
+        previous, here = top[i], highest[i] + offset[i]
+        top[i] = max(previous, here)
+        kept[i], added[i] = math.exp(previous - top[i]), math.exp(here - top[i])
+    for d in range(n_delays):
+        row = ratio[d % len(ratio), d // len(ratio)]
+        for i in range(lanes):
+            density[d, i] = kept[i] * density[d, i] + added[i] * exp32(row[i] - highest[i])
+
+
+@njit(**COMPILED)
+def _fill_density(b, prepared, ratio, offset, density, top):  # type: ignore[no-untyped-def]
+    """Fill `density` (delay, lane) with the likelihood ratio of each delay to no echo.
+
+    In units of ``exp(top)``, averaged over the levels and multiplied by the prior of the delay. The
+    logarithm of the contribution of a level is left in `ratio` (level, step, bin, lane) and
+    `offset` (level, lane), or that of the last level if there is room for one.
+    """
+    n_delays, lanes = density.shape
+    fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
+    density[:], top[:] = 0.0, -np.inf
+    for level in range(1, len(prepared.signal)):
+        at = (level - 1) % len(ratio)
+        fill_level(b, level, prepared, fired, unfired_echo, ratio[at])
+        fill_flat(b, level, prepared, all_fired, all_unfired, offset[at])
+        offset[at] += prepared.log_share[level]
+        _add_level(ratio[at], offset[at], density, top)
+    for d in range(n_delays):
+        for i in range(lanes):
+            density[d, i] *= prepared.depth[d]
+
+
+@njit(**PARALLEL)
+def fill_peaks(prepared, best, around):  # type: ignore[no-untyped-def]
+    """Fill the likeliest delay of each pixel, (block, lane).
+
+    And the logarithms of the densities before, at and after it, (block, lane, 3): densities next to
+    a strong echo underflow to 0.
+    """
+    n_blocks, lanes = best.shape
+    n_steps, n_delays, n_levels = len(prepared.echo), prepared.depth.size, len(prepared.signal) - 1
+    for b in prange(n_blocks):
+        ratio = lane_rows(n_levels * n_delays, lanes).reshape(n_levels, n_steps, -1, lanes)
+        density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+        top, offset = np.empty(lanes), np.empty((n_levels, lanes))
+        _fill_density(b, prepared, ratio, offset, density, top)
+        highest, at = np.full(lanes, -1.0, np.float32), np.zeros(lanes, np.int32)
+        for d in range(n_delays):
+            for i in range(lanes):
+                here, most, before = density[d, i], highest[i], at[i]
+                at[i] = d if here > most else before
+                highest[i] = here if here > most else most
+        for i in range(lanes):
+            best[b, i] = at[i]
+            for j in range(3):
+                d = min(max(at[i] + j - 1, 0), n_delays - 1)
+                log = ratio[:, d % n_steps, d // n_steps, i] + offset[:, i]
+                most = log.max()
+                around[b, i, j] = most + math.log(np.exp(log - most).sum() * prepared.depth[d])
+
+
+@njit(**COMPILED)
+def _fill_windows(half, density, window):  # type: ignore[no-untyped-def]
+    """Fill `window` with sums of `half` numbers on either side of the beginning of each delay."""
+    n_delays, lanes = density.shape
+    window[:] = 0.0
+    for d in range(n_delays):
+        for near in range(max(d - half, 0), min(d + half, n_delays)):
+            for i in range(lanes):
+                window[d, i] += density[near, i]
+
+
+@njit(**PARALLEL)
+def fill_masses(prepared, half, first, mass, surface):  # type: ignore[no-untyped-def]
+    """Fill the posterior mass of windows of delays, and of all delays, of each pixel.
+
+    `mass` (block, lane, window) is that of the `half` delays on either side of the beginning of the
+    delays from ``first[block, lane]``, and `surface` (block, lane) that of a surface anywhere.
+    """
+    n_delays, lanes = prepared.depth.size, first.shape[1]
+    none = prepared.log_share[0]
+    for b in prange(len(first)):
+        density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+        window = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+        ratio = lane_rows(n_delays, lanes).reshape(1, 1, n_delays, lanes)
+        top, total, offset = np.empty(lanes), np.zeros(lanes), np.empty((1, lanes))
+        _fill_density(b, prepared, ratio, offset, density, top)
+        _fill_windows(half, density, window)
+        for d in range(n_delays):
+            for i in range(lanes):
+                total[i] += density[d, i]
+        for i in range(lanes):
+            # Relative to the larger of the two, so that neither overflows.
+            unit = max(top[i], none)
+            seen = math.exp(top[i] - unit) * total[i] / n_delays
+            surface[b, i] = seen / (seen + math.exp(none - unit))
+            share = np.float32(surface[b, i] / total[i])
+            for j in range(mass.shape[2]):
+                mass[b, i, j] = share * window[first[b, i] + j, i]
