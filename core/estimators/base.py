@@ -424,6 +424,7 @@ def conditions_of(capture: Capture, flux: FluxModel, window_size: int = 1) -> Co
         background * more,
         flux.contrast,
         flux.pile_up,
+        flux.background_shape,
     )
 
 
@@ -431,6 +432,8 @@ def _expected(onset_bin: Floats, given: Conditions) -> Floats:
     """Expected counts of echoes at given delays, shape (delay, bin)."""
     signal = np.full(onset_bin.size, given.signal)
     rate = rate_per_bin(onset_bin, signal, float(given.background), given.pulse, given.acquisition)
+    if given.background_shape is not None:
+        rate += given.background / given.acquisition.n_bins * (given.background_shape - 1)
     return rate if given.n_pulses is None else trigger_probability(rate) * given.n_pulses
 
 
@@ -467,10 +470,10 @@ def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     rng = np.random.default_rng(1)
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     pixels = null_pixels(capture)
-    background = flux_model_of(capture).of_pixels(pixels).typical_background
+    flux = flux_model_of(capture).of_pixels(pixels)
     cubes = []
     rows_at_once = max(1, NUMBERS_AT_ONCE // (pixels.shape[1] * n_bins))
     for first in range(0, len(pixels), rows_at_once):
-        rate = background[first : first + rows_at_once, :, np.newaxis] / n_bins
-        cubes.append(draw_counts(np.repeat(rate, n_bins, axis=2), n_pulses, rng))
+        mean = flux.typical_background[first : first + rows_at_once, :, np.newaxis] / n_bins
+        cubes.append(draw_counts(mean * flux.relative_background, n_pulses, rng))
     return np.concatenate(cubes)

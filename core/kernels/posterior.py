@@ -86,15 +86,19 @@ def smoothed(density):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def _fill_counts(b, prepared, fired, unfired, unfired_echo):  # type: ignore[no-untyped-def]
-    """Fill counts, unfired pulses ``A_k - n_k`` and ``Σ_k (A_k - n_k) p_k(d)`` of a block."""
-    n_bins, lanes = fired.shape
+    """Fill counts, unfired pulses ``A_k - n_k`` and ``Σ_k (A_k - n_k) p_k(d)`` of a block.
+
+    Counts (node, bin, lane) are shared out among the nodes of the background.
+    """
+    n_nodes, n_bins, lanes = fired.shape
     n_steps, n_taps = prepared.echo.shape
     armed = np.full(lanes, float(prepared.n_pulses))
     for k in range(n_bins):
         for i in range(lanes):
             count = prepared.counts[b, k, i]
             armed[i] -= count
-            fired[k, i] = count
+            for node in range(n_nodes):
+                fired[node, k, i] = prepared.node_weight[node, k] * count
             unfired[k, i] = armed[i] if prepared.n_pulses > 0 else 1.0
     for d in range(n_bins * n_steps):
         step, first = d % n_steps, d // n_steps + prepared.first_tap
@@ -106,71 +110,85 @@ def _fill_counts(b, prepared, fired, unfired, unfired_echo):  # type: ignore[no-
 
 
 @njit(**COMPILED)
+def _fill_gain(signal, background, prepared, gain):  # type: ignore[no-untyped-def]
+    """Fill `gain` (step, tap) with the logarithm that each count adds to ``T(d)``."""
+    bare = -math.expm1(-background)
+    n_steps, n_taps = gain.shape
+    for step in range(n_steps):
+        for tap in range(n_taps):
+            s = signal * prepared.echo[step, tap]
+            if prepared.n_pulses > 0:
+                # (1 - exp(-b - s)) / (1 - exp(-b)), without cancellation.
+                odds = 1.0 - math.expm1(-s) * (1.0 - bare) / bare
+                gain[step, tap] = math.log(odds)
+            else:
+                gain[step, tap] = math.log1p(s / background)
+
+
+@njit(**COMPILED)
 def _fill_level(b, level, prepared, fired, unfired_echo, gain, ratio):  # type: ignore[no-untyped-def]
     """Fill `ratio` (delay, lane) with ``T(d)`` of one level (`core.inference.likelihood`)."""
-    n_bins, lanes = fired.shape
+    n_nodes, n_bins, lanes = fired.shape
     n_steps, n_taps = prepared.echo.shape
-    previous_signal, previous_background = 0.0, 0.0
+    previous_signal, previous_mean = 0.0, 0.0
     for i in range(lanes):
         signal = prepared.signal[level, b, i]
-        background = prepared.background[level, b, i] / n_bins
-        if i > 0 and signal == previous_signal and background == previous_background:
-            for step in range(n_steps):  # logarithms are slow, and neighbours often equal
-                for tap in range(n_taps):
-                    gain[step, tap, i] = gain[step, tap, i - 1]
+        mean = prepared.background[level, b, i] / n_bins
+        if i > 0 and signal == previous_signal and mean == previous_mean:
+            gain[:, :, :, i] = gain[:, :, :, i - 1]  # logarithms are slow, neighbours often equal
             continue
-        previous_signal, previous_background = signal, background
-        bare = -math.expm1(-background)
-        for step in range(n_steps):
-            for tap in range(n_taps):
-                s = signal * prepared.echo[step, tap]
-                if prepared.n_pulses > 0:
-                    # (1 - exp(-b - s)) / (1 - exp(-b)), without cancellation.
-                    odds = 1.0 - math.expm1(-s) * (1.0 - bare) / bare
-                    gain[step, tap, i] = math.log(odds)
-                else:
-                    gain[step, tap, i] = math.log1p(s / background)
+        previous_signal, previous_mean = signal, mean
+        for node in range(n_nodes):
+            _fill_gain(signal, mean * prepared.node[node], prepared, gain[node, :, :, i])
     for d in range(n_bins * n_steps):
         step, first = d % n_steps, d // n_steps + prepared.first_tap
         for i in range(lanes):
             ratio[d, i] = -np.float32(prepared.signal[level, b, i]) * unfired_echo[d, i]
-        for tap in range(max(0, -first), min(n_taps, n_bins - first)):
-            for i in range(lanes):
-                ratio[d, i] += gain[step, tap, i] * fired[first + tap, i]
+        for node in range(n_nodes):
+            for tap in range(max(0, -first), min(n_taps, n_bins - first)):
+                for i in range(lanes):
+                    ratio[d, i] += gain[node, step, tap, i] * fired[node, first + tap, i]
 
 
 @njit(**COMPILED)
 def _flat_likelihood(b, level, prepared, fired, unfired, flat):  # type: ignore[no-untyped-def]
     """Fill `flat` with the log likelihood ratio of the level's background to the first level's.
 
-    `fired` and `unfired` are sums over the bins.
+    `fired` (node, lane) are sums over the bins, `unfired` (lane,) those weighted with the shape of
+    the background.
     """
     n_bins, lanes = prepared.counts.shape[1:]
     for i in range(lanes):
         here = prepared.background[level, b, i] / n_bins
         bare = prepared.background[0, b, i] / n_bins
-        odds = math.expm1(-here) / math.expm1(-bare) if prepared.n_pulses > 0 else here / bare
-        flat[i] = fired[i] * math.log(odds) - unfired[i] * (here - bare)
+        flat[i] = -unfired[i] * (here - bare)
+        for node in range(len(fired)):
+            factor = prepared.node[node]
+            odds = here / bare
+            if prepared.n_pulses > 0:
+                odds = math.expm1(-here * factor) / math.expm1(-bare * factor)
+            flat[i] += fired[node, i] * math.log(odds)
 
 
 @njit(**COMPILED)
 def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
     """Fill log likelihood ratios of each level and delay to no echo, (level, delay, lane)."""
     n_levels, n_delays, lanes = log.shape
-    n_bins = prepared.counts.shape[1]
+    n_nodes, n_bins = prepared.node_weight.shape
     n_steps, n_taps = prepared.echo.shape
     # Aligned to cache lines: vectors that straddle them cost twice.
-    fired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
+    fired = lane_rows(n_nodes * n_bins, lanes).reshape(n_nodes, n_bins, lanes)
     unfired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
     unfired_echo = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
     ratio = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
-    gain = lane_rows(n_steps * n_taps, lanes).reshape(n_steps, n_taps, lanes)
-    all_fired, all_unfired, flat = np.zeros((3, lanes))
+    gain = lane_rows(n_nodes * n_steps * n_taps, lanes).reshape(n_nodes, n_steps, n_taps, lanes)
+    all_fired, (all_unfired, flat) = np.zeros((n_nodes, lanes)), np.zeros((2, lanes))
     _fill_counts(b, prepared, fired, unfired, unfired_echo)
     for k in range(n_bins):
         for i in range(lanes):
-            all_fired[i] += fired[k, i]
-            all_unfired[i] += unfired[k, i]
+            for node in range(n_nodes):
+                all_fired[node, i] += fired[node, k, i]
+            all_unfired[i] += prepared.background_shape[k] * unfired[k, i]
     log[0] = 0.0
     for level in range(1, n_levels):
         _fill_level(b, level, prepared, fired, unfired_echo, gain, ratio)
