@@ -346,7 +346,7 @@ ESTIMATOR = Estimator(
     _locate,
     finds_delay=True,
     reconstructed="public descriptions of IEEE Transactions on Computational Imaging 3, 445 (2017)",
-    null_side=64,
+    own_threshold="clusters are kept by τ_FA, and superpixels share one",
     undoes_pile_up=True,
     whole_image=True,
 )

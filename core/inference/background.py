@@ -103,14 +103,16 @@ def echo_free(
         First bin and end, relative to that of a delay, that an echo may fill.
     """
     n_bins = mass.shape[2]
-    bins, whole = np.arange(n_bins), mass.sum(axis=2, dtype=float)
-    upto = np.pad(np.cumsum(mass[:, 1:], axis=2, dtype=float), ((0, 0), (0, 0), (1, 0)))
+    bins, share = np.arange(n_bins), np.ones((len(mass), n_bins))
+    photons = share * np.vecdot(mass.sum(axis=2, dtype=float), background)[:, np.newaxis]
     # Echoes of these delays fill the bin.
     begin, end = (np.clip(bins + 1 - at, 0, n_bins) for at in reversed(echo_window))
-    near = upto[..., end] - upto[..., begin]
-    share = np.maximum(1 - near.sum(axis=1), 0.0)
-    photons = np.vecdot(whole, background)[:, np.newaxis]
-    photons = photons - np.einsum("plk,pl->pk", near, background[:, 1:])
+    upto = np.zeros((len(mass), n_bins + 1))
+    for level in range(1, mass.shape[1]):
+        np.cumsum(mass[:, level], axis=1, out=upto[:, 1:])
+        near = upto[:, end] - upto[:, begin]
+        share -= near
+        photons -= near * background[:, level : level + 1]
     mean = np.divide(photons, share, out=np.zeros_like(share), where=share > _LEAST_SHARE)
     return EchoFree(np.where(share > _LEAST_SHARE, share, 0.0), np.maximum(mean, 0.0) / n_bins)
 

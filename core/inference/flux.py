@@ -74,8 +74,6 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     shape and the other parameters are estimated in turn (`core.inference.background`).
     """
     found, shape = _flux_prior(capture, None)
-    if capture.counts.size < _FEWEST_OF_SHAPE:
-        return found
     for _ in range(_SHAPE_ROUNDS):
         if shape is None and found.background_shape is None:
             break
@@ -86,12 +84,18 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
 def _background_shape(
     capture: Capture, known: FluxPrior, pixels: NDArray[np.intp], density: NDArray[np.float32]
 ) -> Floats | None:
-    """Estimate `FluxPrior.background_shape` from pixels with `level_densities`, flat indices."""
+    """Estimate `FluxPrior.background_shape` from pixels, given as flat indices.
+
+    `density` is that of `level_densities`, and is overwritten.
+    """
+    if pixels.size < _FEWEST_OF_SHAPE:
+        return None
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     few = slice(None, None, math.ceil(pixels.size * n_bins / _AT_ONCE))
     pixels, total = pixels[few], _totals(capture)[0].ravel()[pixels[few]]
     background = known.model(total[np.newaxis], _least_background(capture)).background[:, 0].T
-    mass = density[few] * (known.share[:, np.newaxis] * known.depth).astype(np.float32)
+    mass = density[few]
+    mass *= (known.share[:, np.newaxis] * known.depth).astype(np.float32)
     mass /= mass.sum(axis=(1, 2), keepdims=True)
     counts = capture.cube.reshape(-1, n_bins)[pixels].astype(float)
     armed = np.ones_like(counts)
