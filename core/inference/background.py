@@ -15,7 +15,8 @@ distributed as background, wherever the surfaces lie and however many pixels hav
 of the shape is a sum of Legendre polynomials of the time in the gate, fitted to the counts of all
 pixels (iteratively reweighted least squares). Its degree maximises the likelihood minus a penalty
 for each polynomial (Ledwina 1994, "Data-driven version of Neyman's smooth test of fit"), so that a
-uniform background is found uniform but for `SIZE` of the captures.
+uniform background is found uniform but for `SIZE` of the captures. If every pixel has a second
+surface, part of it is taken for background; the goodness of fit (`core.inference.fit`) then warns.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ _FITTING_STEPS = 8
 _RANGE = 3.0  # largest logarithm of the shape, on either side of 0
 _ERROR = 1e-5  # of the interpolation, relative
 _BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
+_NOISE = 3.0  # standard deviations of a sum of squares
 _LEAST_SHARE = 1e-6
 _WIGGLES = 0.1  # of a slope, that are no second direction
 
@@ -135,7 +137,8 @@ def fitted_shape(
     Returns
     -------
     ndarray, shape (bin,), or None
-        None if the counts do not contradict a uniform background.
+        None if the counts do not contradict a uniform background, or if the shape explains less of
+        the contradiction than it leaves: echoes of another kind, not background.
     """
     rate = free.background * guess
     fires = -np.expm1(-rate) if is_first else rate
@@ -157,7 +160,12 @@ def fitted_shape(
         n = 2 + int(gain.argmax())
         log = basis[:, :n] @ scipy.linalg.solve_triangular(r[:n, :n], found[:n])
         log = np.clip(log, -_RANGE, _RANGE)
-    return np.asarray(np.exp(log) / np.exp(log).mean())
+    shape, is_seen = np.exp(log), expected > 0
+    mean = (expected * shape)[is_seen]
+    left = float(((seen[is_seen] - mean) ** 2 / mean - 1).sum())
+    noise = _NOISE * math.sqrt(2 * mean.size)
+    is_smooth = left - noise < float((found[1:n] ** 2).sum())
+    return np.asarray(shape / shape.mean()) if is_smooth else None
 
 
 def _polynomials(n_bins: int) -> Floats:

@@ -8,9 +8,12 @@ from scipy import stats
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture
+from core.estimators.base import histogram_numbers
 from core.inference.background import SIZE, nodes_of, shape_text
 from core.inference.fit import fit_of
 from core.inference.flux import flux_prior_of
+from core.inspection import capture_report
+from core.studies.methods import alarms
 from core.studies.methods.fit import NULL_CASES
 from core.trigger import draw_counts, rate_per_bin
 
@@ -18,6 +21,7 @@ SIDE = 24  # rows and columns of captures
 TIME = np.linspace(0, 1, 100)  # in the gate
 
 SHAPES = {
+    "is uniform": np.ones(100),
     "rises by 50 %": 1 + 0.5 * TIME,
     "falls by 20 %": 1 - 0.2 * TIME,
     "decays": 1 + 0.5 * np.exp(-10 * TIME),
@@ -84,6 +88,36 @@ def test_a_uniform_background_is_found_uniform_and_changes_no_bit() -> None:
 @pytest.mark.compiled
 def test_no_warning_remains_where_the_shape_explains_the_background() -> None:
     assert fit_of(drawn(SHAPES["decays"], DELAYS["whole gate"])).remark == ""
+
+
+@pytest.mark.compiled
+def test_the_report_on_the_capture_names_the_shape() -> None:
+    falling, uniform = (drawn(SHAPES[x], DELAYS["car"]) for x in ("falls by 20 %", "is uniform"))
+    found = flux_prior_of(falling).background_shape
+    assert shape_text(found).startswith("the background falls by ")
+    assert shape_text(found) in capture_report(falling).flux_remark
+    assert "background is" not in capture_report(uniform).flux_remark
+
+
+@pytest.mark.compiled
+def test_false_alarms_are_those_asked_for_whatever_the_background(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(alarms, "METHODS", ("coates",))
+    (few, many) = found = alarms.alarms(("falls by 50 %", range(1)))
+    assert few.holds and many.holds
+    assert many.if_uniform > 5 * many.reported
+    assert [row[-3] for row in alarms.alarms_table(found).rows] == ["0.01", "0.1"]
+
+
+@pytest.mark.parametrize("photons", [1, 400])
+def test_numbers_of_histograms_are_even(photons: int) -> None:
+    rng = np.random.default_rng(0)
+    histograms = rng.multinomial(photons, np.full(100, 0.01), size=4000).astype(np.uint16)
+    numbers = histogram_numbers(histograms)
+    np.testing.assert_array_equal(numbers, histogram_numbers(histograms.copy()))
+    shares = np.histogram(numbers, bins=10, range=(0, 1))[0] / len(numbers)
+    np.testing.assert_allclose(shares, 0.1, atol=0.02)
 
 
 def test_nodes_interpolate_the_gain_of_a_count() -> None:
