@@ -72,6 +72,7 @@ results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core tuning --results assets/results/tuning.md
 	$(BIN)/python -m core calibration --only confidence ranges --results assets/results/calibration.md
 	$(BIN)/python -m core calibration --only fluxes --captures 40 --results assets/results/fluxes.md
+	$(BIN)/python -m core calibration --only alarms --captures 10 --results assets/results/alarms.md
 	$(BIN)/python -m core fit --results assets/results/fit.md
 	$(BIN)/python -m core tradeoff --results assets/results/tradeoff.md
 	$(BIN)/python -m core speed --results assets/results/speed.md

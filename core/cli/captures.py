@@ -324,7 +324,7 @@ def _range_at_once(
     print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
     found = run(capture, chosen.method, settings, chosen.false_alarm)
     facts: dict[str, Any] = found.figures | {
-        "remark": ESTIMATORS[chosen.method].remark(capture),
+        "remark": ESTIMATORS[chosen.method].remark(capture, chosen.false_alarm),
         "flux_s": found.flux_time_s,
         "estimate_s": found.estimate_s,
     }

@@ -94,7 +94,8 @@ def add_false_alarm(command: Any) -> None:
         "--false-alarm",
         type=float,
         help="accepted share of echo-free pixels with an estimate, "
-        f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one",
+        f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one; without "
+        "effect on the method unmixing, which has --false-acceptance instead",
     )
 
 

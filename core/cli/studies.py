@@ -11,7 +11,7 @@ from typing import Any
 from core.cli.options import add_processes, show_progress, whole_from_to
 from core.cli.results import CheckFailed, add_results, publish
 from core.io.readers import read_capture
-from core.studies.methods import calibration, field, fit, tuning, uniform
+from core.studies.methods import alarms, calibration, field, fit, tuning, uniform
 from core.studies.outputs import as_markdown
 from core.studies.paper import figures as paper
 from core.studies.paper import page, recommend
@@ -50,11 +50,11 @@ def add(commands: Any) -> None:
     _add_count(command, "--captures", 1, 1000, 8)
     command.add_argument(
         "--only",
-        choices=("confidence", "ranges", "fluxes"),
+        choices=("confidence", "ranges", "fluxes", "alarms"),
         nargs="+",
-        default=("confidence", "ranges", "fluxes"),
+        default=("confidence", "ranges", "fluxes", "alarms"),
         help="measure these; --seeds holds for confidence and ranges, --captures for each regime "
-        "of the fluxes (all)",
+        "of the fluxes and each background of false alarms (all)",
     )
     add_processes(command)
 
@@ -137,13 +137,18 @@ def _tuning(chosen: argparse.Namespace) -> None:
 
 
 def _calibration(chosen: argparse.Namespace) -> None:
-    seeds = range(chosen.seeds)
+    seeds, counted = range(chosen.seeds), list[alarms.Alarms]()
     tables = {
         "confidence": lambda: calibration.calibration_table(seeds),
         "ranges": lambda: calibration.coverage_table(seeds, chosen.processes),
         "fluxes": lambda: calibration.flux_table(chosen.captures, chosen.processes),
+        "alarms": lambda: alarms.alarms_table(counted),
     }
+    if "alarms" in chosen.only:
+        counted = list(alarms.outcomes(chosen.captures, chosen.processes))
     publish((tables[name]() for name in chosen.only), chosen)
+    if wrong := [f"{x.background}, {x.method}, {x.asked:g}" for x in counted if not x.holds]:
+        raise CheckFailed(f"False alarms differ from those asked for: {'; '.join(wrong)}.")
 
 
 def _fit(chosen: argparse.Namespace) -> None:

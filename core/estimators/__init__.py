@@ -71,7 +71,8 @@ def estimate(
         Settings of the method, of type ``ESTIMATORS[method].parameters``.
     false_alarm : float, optional
         Give a range only where the score exceeds the threshold that this share of echo-free pixels
-        exceeds. If None, every pixel with a detection gets one.
+        exceeds. If None, every pixel with a detection gets one. The method "unmixing" has a
+        threshold of its own, ``false_acceptance``, and ignores this one.
     **parameters
         Settings as single fields, instead of `settings`.
 
@@ -90,7 +91,9 @@ def estimate(
     settings = settings_of(method, settings, **parameters)
     require_memory(capture, method, settings, false_alarm)
     estimator = ESTIMATORS[method]
-    made_by = Provenance(method, settings, false_alarm, partial(estimator.remark, capture))
+    made_by = Provenance(
+        method, settings, false_alarm, partial(estimator.remark, capture, false_alarm)
+    )
     return replace(estimator(capture, settings, false_alarm), made_by=made_by)
 
 

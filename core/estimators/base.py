@@ -210,6 +210,8 @@ class Calibration(NamedTuple):
     """`Estimator.lag_bins`."""
     least_score: float | None
     """`Estimator.threshold`; None for no threshold."""
+    kept_ties: float = 0.0
+    """Share of the estimates with just this score that are kept."""
 
 
 @dataclass(frozen=True)
@@ -239,8 +241,8 @@ class Estimator:
         ``capture -> FluxModel`` for the estimator; raises ``ValueError`` if it is unknown.
     reconstructed : str
         If the original was not available: the source of the reconstruction.
-    null_side : int
-        Rows and columns of the echo-free image from which a detection threshold is found.
+    own_threshold : str
+        If the share of false alarms cannot be chosen: a clause on what is reported instead.
     undoes_pile_up : bool
         Whether the estimator corrects pile-up of first photons if the number of pulses is known.
     omits : callable
@@ -263,7 +265,7 @@ class Estimator:
     finds_delay: bool = False
     flux_model: Callable[[Capture], FluxModel] = flux_model_of
     reconstructed: str = ""
-    null_side: int = NULL_SIDE
+    own_threshold: str = ""
     undoes_pile_up: bool = False
     omits: Callable[[Capture], str] = lambda _: ""
     whole_image: bool = False
@@ -293,29 +295,31 @@ class Estimator:
         """
         return self.ranged(capture, parameters, self.calibration(capture, parameters, false_alarm))
 
-    def remark(self, capture: Capture) -> str:
-        """Return why confidences mislead and which corrections are left out; empty if none.
+    def remark(self, capture: Capture, false_alarm: float | None = None) -> str:
+        """Return why confidences mislead and what is left out of the model; empty if nothing.
 
-        Clauses are separated by semicolons.
+        Also whether `false_alarm` of the call has no effect. Clauses are separated by semicolons.
         """
         clauses = [fit_of(capture).remark, self.omits(capture)]
         if self.undoes_pile_up and capture.gated_pulses is None:
             known = capture.detection == "all"
             why = "the capture holds all photons" if known else "the number of pulses is not known"
             clauses.append(f"no pile-up is undone: {why}")
+        if self.own_threshold and false_alarm not in (None, 1):
+            clauses.append(f"the share of false alarms is not controlled: {self.own_threshold}")
         return "; ".join(filter(None, clauses))
 
     def calibration(
         self, capture: Capture, parameters: Any, false_alarm: float | None = None
     ) -> Calibration:
         """Compute lag and threshold from a capture or a sample of it; arguments as for a call."""
-        least = None
+        least, kept_ties = None, 0.0
         if false_alarm is not None:
             FALSE_ALARM.check("false_alarm", false_alarm)
-            if false_alarm < 1:
-                least = self.threshold(capture, parameters, false_alarm)
+            if false_alarm < 1 and not self.own_threshold:
+                least, kept_ties = self._threshold(capture, parameters, false_alarm)
         lag = 0.0 if self.finds_delay else self.lag_bins(capture, parameters)
-        return Calibration(lag, least)
+        return Calibration(lag, least, kept_ties)
 
     def ranged(self, capture: Capture, parameters: Any, calibration: Calibration) -> RangeImage:
         """Estimate the range of every pixel of a capture, or of a part of the calibrated one."""
@@ -340,7 +344,9 @@ class Estimator:
         flux = self.flux_model(capture)
         position, score = self.positions(capture, flux, parameters)
         if calibration.least_score is not None:
-            position = np.where(score > calibration.least_score, position, np.nan)
+            kept, tied = score > calibration.least_score, score == calibration.least_score
+            kept[tied] = histogram_numbers(capture.cube[tied]) < calibration.kept_ties
+            position = np.where(kept, position, np.nan)
         delay = np.clip(position - calibration.lag_bins, 0.0, capture.acquisition.n_bins)
         if self.refine is not None:
             delay = self.refine(capture, flux, delay, parameters)
@@ -359,15 +365,25 @@ class Estimator:
     def threshold(self, capture: Capture, parameters: Any, false_alarm: float) -> float:
         """Score that a share `false_alarm` of echo-free pixels exceeds.
 
-        The scores are those of an image drawn from the background of the capture alone.
+        The scores are those of an image drawn from the background of the capture alone. Scores
+        that are counts are often equal: of those equal to the threshold, as many are kept as are
+        missing to the share (the randomized test of Neyman & Pearson 1933), by a number that
+        depends on the histogram alone (`histogram_numbers`).
         """
-        whole = tuple(whole_patches(self.null_side, size) for size in capture.shape)
-        some = np.s_[: whole[0], : whole[1]]
-        cube = _null_cube(capture)[some].copy()
+        return self._threshold(capture, parameters, false_alarm)[0]
+
+    def _threshold(
+        self, capture: Capture, parameters: Any, false_alarm: float
+    ) -> tuple[float, float]:
+        """Return `threshold` and `Calibration.kept_ties`."""
+        cube = _null_cube(capture)
         null = Capture(cube, capture.acquisition, capture.pulse, detection=capture.detection)
-        flux = self.flux_model(capture).of_pixels(null_pixels(capture)[some])
-        _, score = self.positions(null, flux, parameters)
-        return float(np.quantile(score, 1 - false_alarm))
+        flux = self.flux_model(capture).of_pixels(null_pixels(capture))
+        position, score = self.positions(null, flux, parameters)
+        least, found = float(np.quantile(score, 1 - false_alarm)), np.isfinite(position)
+        missing = false_alarm * score.size - np.count_nonzero(found & (score > least))
+        tied = np.count_nonzero(found & (score == least))
+        return least, float(np.clip(missing / tied, 0.0, 1.0)) if tied else 0.0
 
     def lag_bins(self, capture: Capture, parameters: Any) -> float:
         """Distance in bins from the surface's delay to the maximum of a noise-free echo's score.
@@ -434,6 +450,17 @@ class Estimator:
         return position, score
 
 
+def histogram_numbers(histograms: NDArray[np.unsignedinteger]) -> Floats:
+    """Numbers from 0 to 1 that appear random, the same for equal histograms (..., bin).
+
+    The fractional part of the golden ratio times the first moment, which is evenly distributed over
+    the bins even for a single photon.
+    """
+    bins = np.arange(1, histograms.shape[-1] + 1)
+    moment = np.einsum("...k,k->...", histograms, bins)
+    return np.asarray(moment * _GOLDEN % 1.0)
+
+
 def conditions_of(capture: Capture, flux: FluxModel, window_size: int = 1) -> Conditions:
     """Conditions of a capture's histograms, summed over windows of `window_size` squared pixels."""
     n_pulses, n_pixels = capture.gated_pulses, window_size * window_size
@@ -447,6 +474,7 @@ def conditions_of(capture: Capture, flux: FluxModel, window_size: int = 1) -> Co
         background * more,
         flux.contrast,
         flux.pile_up,
+        flux.background_shape,
     )
 
 
@@ -454,11 +482,14 @@ def _expected(onset_bin: Floats, given: Conditions) -> Floats:
     """Expected counts of echoes at given delays, shape (delay, bin)."""
     signal = np.full(onset_bin.size, given.signal)
     rate = rate_per_bin(onset_bin, signal, float(given.background), given.pulse, given.acquisition)
+    if given.background_shape is not None:
+        rate += given.background / given.acquisition.n_bins * (given.background_shape - 1)
     return rate if given.n_pulses is None else trigger_probability(rate) * given.n_pulses
 
 
 NUMBERS_AT_ONCE = 2**20  # float64 numbers of a temporary: 8 MiB
 _IN_CACHE = 2**16
+_GOLDEN = (math.sqrt(5) - 1) / 2
 _PATCH = 64  # rows and columns that stay together, for methods that use neighbours
 
 
@@ -490,10 +521,10 @@ def _null_cube(capture: Capture) -> NDArray[np.unsignedinteger]:
     rng = np.random.default_rng(1)
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     pixels = null_pixels(capture)
-    background = flux_model_of(capture).of_pixels(pixels).typical_background
+    flux = flux_model_of(capture).of_pixels(pixels)
     cubes = []
     rows_at_once = max(1, NUMBERS_AT_ONCE // (pixels.shape[1] * n_bins))
     for first in range(0, len(pixels), rows_at_once):
-        rate = background[first : first + rows_at_once, :, np.newaxis] / n_bins
-        cubes.append(draw_counts(np.repeat(rate, n_bins, axis=2), n_pulses, rng))
+        mean = flux.typical_background[first : first + rows_at_once, :, np.newaxis] / n_bins
+        cubes.append(draw_counts(mean * flux.relative_background, n_pulses, rng))
     return np.concatenate(cubes)

@@ -102,9 +102,16 @@ def window_sums(values: Floats, window: int) -> Floats:
     return sums
 
 
-def exposures(histogram: Floats, background: Floats, n_pulses: int | None) -> Floats:
-    """Length of each bin in which noise is uniform, ``e_i = b A_i``; shape (..., bin)."""
+def exposures(
+    histogram: Floats, background: Floats, n_pulses: int | None, shape: Floats | None = None
+) -> Floats:
+    """Length of each bin in which noise is uniform, ``e_i = b_i A_i``; shape (..., bin).
+
+    `background` is that of a pixel, and `shape` its `FluxModel.background_shape`.
+    """
     _, armed = rate_and_n_armed(histogram, n_pulses)
+    if shape is not None:
+        armed = armed * shape
     return np.asarray(np.asarray(background)[..., np.newaxis] * armed)
 
 
@@ -249,7 +256,9 @@ def find_clusters(capture: Capture, flux: FluxModel, parameters: UnmixingParamet
     for here in patches((rows, cols, n_bins + _LAGS), NUMBERS_AT_ONCE):
         around, inner = widened(here, growth)  # with a margin for superpixels
         counts = capture.cube[around].astype(float)
-        exposure = exposures(counts, background[around], capture.gated_pulses)
+        exposure = exposures(
+            counts, background[around], capture.gated_pulses, flux.background_shape
+        )
         for size in range(1, 2 * growth + 2, 2):
             open_pixels = np.isnan(found[0][here]) & (capture.counts[here] > 0)
             if open_pixels.any():
@@ -323,7 +332,9 @@ def _locate(
 
 def _curve(histogram: Floats, conditions: Conditions, parameters: UnmixingParameters) -> Floats:
     """Return the score of the window that begins at each bin, for a single pixel."""
-    exposure = exposures(histogram, conditions.background, conditions.n_pulses)
+    exposure = exposures(
+        histogram, conditions.background, conditions.n_pulses, conditions.background_shape
+    )
     window = window_bins(conditions.pulse, conditions.acquisition)
     return scan(histogram, exposure, window).score
 
@@ -335,7 +346,7 @@ ESTIMATOR = Estimator(
     _locate,
     finds_delay=True,
     reconstructed="public descriptions of IEEE Transactions on Computational Imaging 3, 445 (2017)",
-    null_side=64,
+    own_threshold="clusters are kept by τ_FA, and superpixels share one",
     undoes_pile_up=True,
     whole_image=True,
 )

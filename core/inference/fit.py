@@ -1,4 +1,4 @@
-"""Goodness of fit of the model behind every confidence: one echo of the pulse, flat background.
+"""Goodness of fit of the model behind every confidence: one echo of the pulse, smooth background.
 
 A delay and fluxes are drawn from the posterior of each pixel. If the model holds, the counts given
 such a draw are distributed as given the true values (Johnson 2004), so that no allowance is needed
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
+from core.inference.background import echo_window, nodes_of
 from core.inference.flux import SAMPLE, flux_model_of
 from core.inference.likelihood import (
     NUMBERS_AT_ONCE,
@@ -46,7 +47,6 @@ _WINDOWS = 16  # of the gate, at most, whose counts are tested in each pixel
 GROUPS = 32  # of bins, at most, over which residuals of all pixels are added
 FEWEST = 5.0  # expected counts of a group, for a normal sum
 _STEPS_PER_BIN = 128  # delays at which an echo is tabulated
-_BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
 _SEED = np.uint64(0)
 
 
@@ -62,13 +62,13 @@ class Check(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Whether one echo of the pulse over a flat background describes some pixels of a capture.
+    """Whether one echo of the pulse over the background describes some pixels of a capture.
 
     Effects of `background` and `pulse` are noise-weighted root mean squares.
     """
 
     background: Check
-    """Effect: deviation of the background over the gate, relative to its mean."""
+    """Effect: deviation of the background from its shape over the gate, relative to it."""
     pulse: Check
     """Effect: deviation of the echoes from the pulse, relative to the pulse."""
     pixels: Check
@@ -139,7 +139,7 @@ def fit_in(capture: Capture, pixels: NDArray[np.intp]) -> Fit:
     residuals = drawn_residuals(capture, pixels)
     return Fit(
         _check(
-            "the background varies over the gate by {:.1%} of its mean",
+            "the background over the gate differs by {:.1%} from a smooth shape",
             background_deviation(capture, residuals),
         ),
         _check(
@@ -214,7 +214,8 @@ def drawn_residuals(
     cube = capture.cube.reshape(-1, n_bins)[pixels]
     streams = pixels if streams is None else streams
     delay_bin, signals, backgrounds = _drawn(capture, pixels, cube, streams)
-    counts, background = cube.astype(float), np.repeat(backgrounds[:, np.newaxis], n_bins, axis=1)
+    counts = cube.astype(float)
+    background = backgrounds[:, np.newaxis] * flux_model_of(capture).relative_background
     share = capture.pulse.bin_probability(delay_bin, n_bins, capture.acquisition.bin_width_s)
     signal = signals[:, np.newaxis] * share
     rate = signal + background
@@ -245,7 +246,13 @@ def _drawn(
     state = np.stack([delay_bin, log_signal, np.log(background / n_bins)], axis=1)
     with entering(cube.size * UNIFORMS):  # a pass over the counts for every number drawn
         redraw(
-            cube.astype(np.uint32), capture.gated_pulses or 0, streams, echo, first, state
+            cube.astype(np.uint32),
+            capture.gated_pulses or 0,
+            streams,
+            echo,
+            first,
+            (flux.relative_background, *nodes_of(flux.relative_background)),
+            state,
         )  # compiled for one type of counts
     return state[:, 0], np.exp(state[:, 1]), np.exp(state[:, 2])
 
@@ -326,7 +333,7 @@ def quantile_residuals(
 
 
 def background_deviation(capture: Capture, residuals: Residuals) -> Deviation:
-    """Compare the background, away from echoes, with its mean over the gate."""
+    """Compare the background, away from echoes, with its shape over the gate."""
     n_bins = capture.acquisition.n_bins
     away = np.isnan(echo_offset(capture, residuals.delay_bin))
     n_groups = min(n_bins, GROUPS)
@@ -345,7 +352,7 @@ def pulse_deviation(capture: Capture, residuals: Residuals) -> Deviation:
     """Compare the mean echo with the pulse."""
     n_bins = capture.acquisition.n_bins
     has_echo = np.isfinite(residuals.delay_bin)
-    offset = np.arange(*_echo_window(capture))
+    offset = np.arange(*echo_window(capture))
     n_groups = min(offset.size, GROUPS)
     at = np.floor(residuals.delay_bin[has_echo]).astype(np.intp)[:, np.newaxis] + offset
     inside, at = (at >= 0) & (at < n_bins), np.clip(at, 0, n_bins - 1)
@@ -368,16 +375,10 @@ def echo_offset(capture: Capture, delay_bin: Floats) -> Floats:
 
     NaN outside the window, which holds echoes of the pulse or similar ones.
     """
-    first, end = _echo_window(capture)
+    first, end = echo_window(capture)
     bins = np.arange(capture.acquisition.n_bins)
     offset = bins - np.floor(delay_bin)[:, np.newaxis] - first  # NaN without an echo
     return np.where((offset >= 0) & (offset < end - first), offset, np.nan)
-
-
-def _echo_window(capture: Capture) -> tuple[int, int]:
-    """First bin and end, relative to that of the delay, of echoes of the pulse or similar ones."""
-    length = capture.echo_bins
-    return -1 - _BEFORE * length, 2 + _BEHIND * length
 
 
 def _grouped(values: Floats, n_groups: int) -> Floats:

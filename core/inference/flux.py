@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
+from core.inference.background import echo_free, echo_window, fitted_shape, nodes_of
 from core.inference.flux_model import FluxModel, FluxPrior
 from core.inference.likelihood import (
     level_densities,
@@ -23,6 +24,7 @@ from core.inference.likelihood import (
     prepare,
     rate_and_n_armed,
     sampled_numbers,
+    windowed_sums,
 )
 from core.inference.neighbours import weighted_median
 from core.inference.resolution import FEW, Difference, difference, pile_up
@@ -35,6 +37,8 @@ SAMPLE = 512  # pixels from which the fluxes are estimated
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
 _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
+_SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
+_FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
 _RARE = 1e-3  # levels with a smaller share are left out
 
 
@@ -66,6 +70,44 @@ def flux_prior_of(capture: Capture) -> FluxPrior:
 def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     """Estimate `flux_prior_of` with all signal levels that the pixels together resolve.
 
+    The background is uniform over the gate unless bins without echoes contradict that. Then its
+    shape and the other parameters are estimated in turn (`core.inference.background`).
+    """
+    found, shape = _flux_prior(capture, None)
+    for _ in range(_SHAPE_ROUNDS):
+        if shape is None and found.background_shape is None:
+            break
+        found, shape = _flux_prior(capture, shape)
+    return found
+
+
+def _background_shape(
+    capture: Capture, known: FluxPrior, pixels: NDArray[np.intp], density: NDArray[np.float32]
+) -> Floats | None:
+    """Estimate `FluxPrior.background_shape` from pixels, given as flat indices.
+
+    `density` is that of `level_densities`, and is overwritten.
+    """
+    if pixels.size < _FEWEST_OF_SHAPE:
+        return None
+    n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
+    few = slice(None, None, math.ceil(pixels.size * n_bins / _AT_ONCE))
+    pixels, total = pixels[few], _totals(capture)[0].ravel()[pixels[few]]
+    background = known.model(total[np.newaxis], _least_background(capture)).background[:, 0].T
+    mass = density[few]
+    mass *= (known.share[:, np.newaxis] * known.depth).astype(np.float32)
+    mass /= mass.sum(axis=(1, 2), keepdims=True)
+    counts = capture.cube.reshape(-1, n_bins)[pixels].astype(float)
+    armed = np.ones_like(counts)
+    if n_pulses is not None:
+        armed = n_pulses - np.cumsum(counts, axis=1) + counts
+    free = echo_free(mass, background, echo_window(capture))
+    return fitted_shape(counts, armed, free, n_pulses is not None, known.relative_background)
+
+
+def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floats | None]:
+    """Estimate `detailed_flux_prior_of` with a shape of the background, and a better shape.
+
     The total rate of a pixel (Coates 1968) is signal plus background. The total minus a signal
     level is shrunk towards the mean background of the image as far as its scatter is explained by
     chance (James & Stein 1961, with the variance of Greenwood 1926). If all pixels see the same
@@ -76,7 +118,7 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     # At random, since a regular step could miss columns.
     drawn = np.random.default_rng(0).permutation(total.size)[:SAMPLE]
     pixels, least = np.sort(drawn)[np.newaxis], _least_background(capture)
-    levels = _levels(flat[pixels[0]], capture)
+    levels = _levels(flat[pixels[0]], capture, shape)
     # Initially each level is the signal of all pixels.
     guess = FluxPrior(
         levels,
@@ -84,6 +126,7 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
         depth=np.ones(flat.shape[1]),
         background=total.mean() - levels[:, np.newaxis, np.newaxis],
         own_weight=_own_weight(total, chance),
+        background_shape=shape,
     )
     flux = guess.model(total.ravel()[pixels], least)
     share = _shares(level_evidence(prepare(capture, flat[pixels], flux, 1)))
@@ -104,10 +147,11 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     most = sampled_numbers(found.share.size, flat.shape[1]) // each
     pixels = np.sort(drawn[:most])[np.newaxis]
     flux = found.model(total.ravel()[pixels], least)
-    prepared = prepare(capture, flat[pixels], flux, 1)
-    share, depth = shares_and_depths(level_densities(prepared), found.share)
+    density = level_densities(prepare(capture, flat[pixels], flux, 1))
+    share, depth = shares_and_depths(density, found.share)
     found = found._replace(share=share, depth=depth)
-    return found._replace(contrast=found.model(total, least).contrast)
+    better_shape = _background_shape(capture, found, pixels[0], density)
+    return found._replace(contrast=found.model(total, least).contrast), better_shape
 
 
 def total_rates(capture: Capture) -> Floats:
@@ -141,14 +185,17 @@ def level_likelihoods(
     cube = capture.cube.reshape(-1, n_bins)[some]
     prepared = prepare(capture, cube, flux, steps_per_bin)
     evidence = level_evidence(prepared, prepared.depth)
-    b = flux.background[0, 0] / n_bins
-    fires = b if n_pulses is None else -np.expm1(-b)
-    fired, unfired = np.empty((2, pixels.size))
+    b, (node, node_weight) = flux.background[0, 0] / n_bins, nodes_of(flux.relative_background)
+    at_nodes = b[:, np.newaxis] * node
+    fires = at_nodes if n_pulses is None else -np.expm1(-at_nodes)
+    fired, unfired = np.empty(fires.shape), np.empty(pixels.size)
     for rows in _some_rows(cube[0]):
         counts = cube[0, rows].astype(float)
         left = np.ones_like(counts) if n_pulses is None else n_pulses - np.cumsum(counts, axis=1)
-        fired[rows], unfired[rows] = counts.sum(axis=1), left.sum(axis=1)
-    return np.asarray(evidence + (fired * np.log(fires) - b * unfired)[:, np.newaxis])
+        fired[rows] = counts @ node_weight.T
+        unfired[rows] = left @ flux.relative_background
+    without = (fired * np.log(fires)).sum(axis=1) - b * unfired
+    return np.asarray(evidence + without[:, np.newaxis])
 
 
 def level_differences(flux_prior: FluxPrior, capture: Capture) -> Difference:
@@ -223,21 +270,25 @@ def _own_weight(total: Floats, unrelated: float) -> float:
     )  # it is known no better
 
 
-def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture) -> Floats:
+def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture, shape: Floats | None) -> Floats:
     """Signal levels: 0, and a geometric grid up to the strongest echoes of (pixel, bin)."""
-    top = _strongest(pixels, capture)
+    top = _strongest(pixels, capture, shape)
     return np.concatenate([[0.0], np.geomspace(top / LEVEL_SPAN, top, LEVELS)])
 
 
-def _strongest(pixels: NDArray[np.unsignedinteger], capture: Capture) -> float:
+def _strongest(
+    pixels: NDArray[np.unsignedinteger], capture: Capture, shape: Floats | None
+) -> float:
     """Signal of the strongest echoes of pixels (pixel, bin), at least one detection."""
     n_bins = pixels.shape[1]
     excess, width = np.empty(len(pixels)), min(capture.echo_bins, n_bins)
     for some in _some_rows(pixels):
         rate, _ = rate_and_n_armed(pixels[some].astype(float), capture.gated_pulses)
         until = np.pad(np.cumsum(rate, axis=1), ((0, 0), (1, 0)))
-        inside = (until[:, width:] - until[:, :-width]).max(axis=1)
-        excess[some] = inside - until[:, -1] * width / n_bins
+        inside = until[:, width:] - until[:, :-width]
+        if shape is not None:  # the background of each window, above the mean one
+            inside -= until[:, -1:] * (windowed_sums(shape[np.newaxis], width) - width) / n_bins
+        excess[some] = inside.max(axis=1) - until[:, -1] * width / n_bins
     return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.gated_pulses or 1))
 
 

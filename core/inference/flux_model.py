@@ -30,6 +30,8 @@ class FluxModel:
         `contrast` of the image that these pixels belong to; None if they are all of it.
     pile_up : bool
         Whether the pulses resolve that early photons hide later ones.
+    background_shape : ndarray, shape (bin,), optional
+        Background of each bin relative to its mean over the gate; None if it is uniform.
     """
 
     signal: Floats
@@ -38,6 +40,7 @@ class FluxModel:
     depth: Floats
     image_contrast: float | None = None
     pile_up: bool = True
+    background_shape: Floats | None = None
 
     @cached_property
     def typical_signal(self) -> Floats:
@@ -50,6 +53,11 @@ class FluxModel:
     def typical_background(self) -> Floats:
         """Mean background, shape (row, col)."""
         return _weighted_sum(self.share, self.background)
+
+    @property
+    def relative_background(self) -> Floats:
+        """`background_shape`, or 1 in each bin."""
+        return _ones_unless(self.background_shape, self.depth)
 
     @property
     def contrast(self) -> float:
@@ -68,6 +76,7 @@ class FluxModel:
             self.depth,
             self.contrast,
             self.pile_up,
+            self.background_shape,
         )
 
 
@@ -88,6 +97,13 @@ class FluxPrior(NamedTuple):
     """`FluxModel.contrast` of the image."""
     pile_up: bool = True
     """`FluxModel.pile_up`."""
+    background_shape: Floats | None = None
+    """`FluxModel.background_shape`."""
+
+    @property
+    def relative_background(self) -> Floats:
+        """`background_shape`, or 1 in each bin."""
+        return _ones_unless(self.background_shape, self.depth)
 
     def with_one_level(self) -> FluxPrior:
         """Return the prior with all signal levels replaced by their mean."""
@@ -113,7 +129,12 @@ class FluxPrior(NamedTuple):
             self.depth,
             self.contrast,
             self.pile_up,
+            self.background_shape,
         )
+
+
+def _ones_unless(shape: Floats | None, depth: Floats) -> Floats:
+    return np.ones(depth.size) if shape is None else shape
 
 
 def _weighted_sum(weights: Floats, images: Floats) -> Floats:

@@ -140,7 +140,8 @@ def _inverse(mass: Floats, delay: Floats, share: float) -> Floats:
 class _Window(NamedTuple):
     """Counts and fluxes of some pixels in the bins that an echo near their estimates can fill.
 
-    The rest of the gate is added up in one further bin, in which there is no echo.
+    The rest of the gate is added up in one further bin, in which there is no echo, and pulses count
+    by the background that they meet, relative to that of the window.
     """
 
     pulse: Pulse
@@ -184,22 +185,25 @@ def _window(capture: Capture, pixels: NDArray[np.intp], estimate_bin: Floats) ->
     bins = first[:, np.newaxis] + np.arange(_n_window_bins(capture))
     inside = (bins >= 0) & (bins < n_bins)
     some = np.arange(pixels.size)[:, np.newaxis], np.clip(bins, 0, n_bins - 1)
+    # A window is short: its background is that at the estimate.
+    at = np.clip(estimate_bin, 0, n_bins - 1).astype(np.intp)
+    here = flux.relative_background[at]
 
-    def in_window(values: Floats) -> Floats:
-        found = np.where(inside, values[some], 0.0)
-        rest = values.sum(axis=1, keepdims=True) - found.sum(axis=1, keepdims=True)
-        return np.concatenate([found, rest], axis=1)
+    def in_window(values: Floats, weight: Floats | float) -> Floats:
+        found, beyond = np.where(inside, values[some], 0.0), values * weight
+        rest = beyond.sum(axis=1) - np.where(inside, beyond[some], 0.0).sum(axis=1)
+        return np.concatenate([found, rest[:, np.newaxis]], axis=1)
 
     log_share = np.log(np.maximum(flux.share[1:, np.newaxis], np.finfo(float).tiny))
     return _Window(
         capture.pulse,
         capture.acquisition.bin_width_s,
         np.concatenate([bins, bins[:, -1:] + 1], axis=1).astype(float),
-        in_window(counts),
-        in_window(unfired),
+        in_window(counts, 1.0),
+        in_window(unfired, flux.relative_background / here[:, np.newaxis]),
         n_pulses is not None,
         signal,
-        background / n_bins,
+        background / n_bins * here,
         np.broadcast_to(log_share, signal.shape),
         flux.depth,
     )

@@ -6,7 +6,8 @@ is ::
 
     T(d) = Σ_k [ n_k ln((1 - exp(-b - s_k)) / (1 - exp(-b))) - (A_k - n_k) s_k ]
 
-which is exact for the trigger probabilities of Eq. 1. If the number of pulses is unknown, or a
+which is exact for the trigger probabilities of Eq. 1. Where the background varies over the gate, it
+is ``b_k``, that of the bin (`core.inference.background`). If the number of pulses is unknown, or a
 pulse may fire more than once, counts are Poisson: the terms are ``n_k ln(1 + s_k / b)`` and
 ``-s_k``, with photons per pixel instead of per pulse.
 
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
+from core.inference.background import nodes_of
 from core.inference.flux_model import FluxModel
 from core.kernels.blocks import LANES, lane_counts
 from core.kernels.confidence import fill_evidence, fill_peaks
@@ -54,6 +56,8 @@ class Conditions(NamedTuple):
     """Mean signal over mean background of the image."""
     pile_up: bool = True
     """`FluxModel.pile_up`."""
+    background_shape: Floats | None = None
+    """`FluxModel.background_shape`."""
 
 
 def windowed_sums(values: Floats, width: int) -> Floats:
@@ -114,6 +118,8 @@ def log_likelihood_ratio(
     unfired = np.ones_like(histogram)
     if n_pulses is not None:
         unfired = n_pulses - np.cumsum(histogram, axis=-1)
+    if rate is None and conditions.background_shape is not None:
+        rate = level * conditions.background_shape
     b = level if rate is None else rate
     odds = np.exp(-b) / np.expm1(-b)  # of no photon to some, negative
     ratio = np.zeros_like(histogram)
@@ -171,6 +177,12 @@ class LikelihoodInput(NamedTuple):
     """Bins from a delay to the first tap of its echo."""
     n_pulses: int
     """0 if unknown."""
+    background_shape: Floats
+    """`FluxModel.relative_background`, shape (bin,)."""
+    node: Floats
+    """`core.inference.background.Nodes`, shape (node,)."""
+    node_weight: Floats
+    """Likewise, shape (node, bin)."""
     n_pixels: int
     n_counts: int
     """Counts in the cube of the whole image."""
@@ -261,6 +273,8 @@ def _with_echo(
         echo.astype(np.float32),
         first,
         capture.gated_pulses or 0,
+        flux.relative_background,
+        *nodes_of(flux.relative_background),
         part.pixels.stop - part.pixels.start,
         part.n_counts,
     )

@@ -45,13 +45,17 @@ def refined(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
             -1, LANES
         )
 
+    # An echo is short: over it, the background is that at its delay.
+    last = acquisition.n_bins - 1
+    at = np.clip(np.nan_to_num(delay_bin), 0, last).astype(np.intp)
+    background = flux.typical_background / acquisition.n_bins * flux.relative_background[at]
     delay = in_blocks(delay_bin)
     with entering(capture.cube.size):
         refine_delays(
             capture.blocks.counts,
             capture.gated_pulses or 0,
             in_blocks(flux.typical_signal),
-            in_blocks(flux.typical_background / acquisition.n_bins),
+            in_blocks(background),
             echo,
             STEPS_PER_BIN,
             first,

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.capture import Capture, cached_per_capture
+from core.inference.background import shape_text
 from core.inference.faults import outlier_pixels
+from core.inference.flux import flux_prior_of
 from core.inference.posterior import TOLERANCE_BINS
 from core.inspection.echoes import FEWEST, echoes_of
 from core.inspection.mean_flux import METHOD, MeanFlux, mean_flux_of
@@ -65,8 +67,8 @@ class CaptureReport(OldFluxNames):
     """Background in the bins before and after all echoes, likewise over the whole gate; None if
     there are too few such bins. Where it contradicts the fluxes, their intervals include it."""
     flux_remark: str
-    """Whether the background is confirmed by bins without echoes, and how long the echoes are
-    where they differ from the pulse."""
+    """Whether the background is confirmed by bins without echoes, how long the echoes are where
+    they differ from the pulse, and how the background varies over the gate if it does."""
     flux_unit: str
     """``"photons per pulse"``, or ``"photons"``."""
     flux_method: str
@@ -133,6 +135,8 @@ def _flux_remark(capture: Capture, found: MeanFlux) -> str:
         )
     if found.pulse != capture.pulse:
         remark += f" The echoes are {wide} times as long as the pulse, which does not fit."
+    if (shape := flux_prior_of(capture).background_shape) is not None:
+        remark += f" According to bins without echoes, {shape_text(shape)}; estimates allow for it."
     return remark
 
 

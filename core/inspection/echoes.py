@@ -10,10 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.inference.faults import ordinary_pixels
+from core.inference.flux import flux_prior_of
 from core.inference.posterior import TOLERANCE_BINS, posterior_of
 from core.inspection.maps import likeliest
 from core.inspection.profile import LEVEL, FluxEstimate, difference_of, ratio_of
@@ -76,7 +78,7 @@ def echo_free_flux(capture: Capture) -> FluxEstimate | None:
     parts = _photons_between(capture, [0, *window, n_bins])
     if parts is None:
         return None
-    free = 1 - (window[1] - window[0]) / n_bins
+    free = 1 - float(_background_shares(capture, window)[0])
     return _flux_of(capture, parts[1], parts[0] + parts[2], free, LEVEL)
 
 
@@ -85,8 +87,8 @@ def darkest_flux(capture: Capture) -> FluxEstimate | None:
     """Estimate mean fluxes as `echo_free_flux` does, with the background of the darkest window.
 
     The gate is divided into ten windows. Echoes only add photons, whatever their shape and number:
-    if the background is uniform, the darkest window is an upper bound of it. The intervals hold for
-    all ten windows together.
+    with the background shape of the capture, the darkest window is an upper bound of it. The
+    intervals hold for all ten windows together.
 
     Returns
     -------
@@ -98,7 +100,7 @@ def darkest_flux(capture: Capture) -> FluxEstimate | None:
     parts = _photons_between(capture, ends.tolist()) if n_bins >= _WINDOWS else None
     if parts is None:
         return None
-    level, shares = 1 - (1 - LEVEL) / _WINDOWS, np.diff(ends) / n_bins
+    level, shares = 1 - (1 - LEVEL) / _WINDOWS, _background_shares(capture, ends)
     highest = [part.interval(level).high / share for part, share in zip(parts, shares, strict=True)]
     darkest = int(np.argmin(highest))
     rest = sum(parts[:darkest] + parts[darkest + 1 :], _Photons(0.0, 0.0, 0.0))
@@ -137,6 +139,12 @@ def _window(capture: Capture) -> tuple[int, int] | None:
     end = math.ceil(echoes.last) + max(tap, 0) + TOLERANCE_BINS + _BEHIND * echo.size
     first, end = max(first, 0), min(end, n_bins)
     return (first, end) if end - first <= (1 - _FREE) * n_bins else None
+
+
+def _background_shares(capture: Capture, ends: ArrayLike) -> Floats:
+    """Share of the background between successive bins."""
+    upto = np.pad(np.cumsum(flux_prior_of(capture).relative_background), (1, 0))
+    return np.asarray(np.diff(upto[np.asarray(ends)]) / capture.acquisition.n_bins)
 
 
 class _Photons(NamedTuple):

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
+from core.inference.flux import flux_model_of
 from core.inference.likelihood import (
     Conditions,
     log_likelihood_ratio,
@@ -175,13 +176,15 @@ def _log_ratios(capture: Capture, histograms: Floats, delays: Floats) -> Floats:
         Plus the log probability of the bin, if there is such an echo.
     """
     acquisition, n_pulses, n_bins = capture.acquisition, capture.gated_pulses, histograms.shape[1]
-    flat = np.full((len(histograms), 1, n_bins), 1 / n_bins)
+    shape = flux_model_of(capture).relative_background
+    flat = np.broadcast_to(shape / n_bins, (len(histograms), 1, n_bins))
     echoes = capture.pulse.bin_probability(delays, n_bins, acquisition.bin_width_s)
     flux = _fitted_flux(histograms, np.concatenate([flat, echoes], axis=1), n_pulses)
     signal, least = _levels(capture), 0.5 / (n_pulses or 1)  # half a count
     # The photons of one more echo are taken from the background.
     background = np.maximum(flux[:, :1] - np.append(0.0, signal), least)
-    rate = background[..., np.newaxis] / n_bins + np.vecmat(flux[:, 1:], echoes)[:, np.newaxis]
+    rate = background[..., np.newaxis] / n_bins * shape
+    rate += np.vecmat(flux[:, 1:], echoes)[:, np.newaxis]
     rest, counts = rate[:, 1:], np.broadcast_to(histograms[:, np.newaxis], rate[:, 1:].shape)
     conditions = Conditions(
         acquisition, capture.pulse, n_pulses, signal, background[:, 1:], contrast=1.0

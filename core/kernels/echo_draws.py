@@ -29,17 +29,21 @@ UNIFORMS = 2 * len(_WIDTHS) * _MOST_ROUNDS
 
 
 @njit(**COMPILED)
-def _log_density(at, start, is_first, fired, unfired, sums, echo, first_tap):  # type: ignore[no-untyped-def]
+def _log_density(at, start, is_first, fired, unfired, sums, echo, first_tap, shape, node):  # type: ignore[no-untyped-def]
     """Logarithm of the posterior density at a delay, a log signal and a log background.
 
     ``T(d)`` of `core.inference.likelihood`, the log likelihood of the background alone, and normal
-    densities of the logarithms around their values in `start`. `sums` are those of `fired` and
-    `unfired`. `echo` holds its shares in bins for delays at equal fractions of a bin, (step, tap).
+    densities of the logarithms around their values in `start`. `sums` are those of `fired`, for
+    each node of the background, and of `unfired`, weighted with the `shape` of the background
+    (`core.inference.background`). `echo` holds its shares in bins for delays at equal fractions of
+    a bin, (step, tap).
     """
     delay, signal, background = at[0], math.exp(at[1]), math.exp(at[2])
     unit = math.expm1(background) if is_first else background
     total = -0.5 * ((at[2] - start[2]) / _LOG_BACKGROUND_SIGMA) ** 2
-    total += sums[0] * math.log(-math.expm1(-background) if is_first else background)
+    for j in range(node.size):
+        here = background * node[j]
+        total += sums[0][j] * math.log(-math.expm1(-here) if is_first else here)
     total -= sums[1] * background
     if math.isnan(delay):
         return total
@@ -54,6 +58,9 @@ def _log_density(at, start, is_first, fired, unfired, sums, echo, first_tap):  #
         s, k = signal * share, first + tap
         total -= s * unfired[k]
         if fired[k] > 0.0:
+            if node.size > 1:
+                here = background * shape[k]
+                unit = math.expm1(here) if is_first else here
             total += fired[k] * math.log1p((-math.expm1(-s) if is_first else s) / unit)
     return total
 
@@ -71,19 +78,20 @@ def _chosen(log_weight, uniform):  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def redraw(counts, n_pulses, pixels, echo, first_tap, state):  # type: ignore[no-untyped-def]
+def redraw(counts, n_pulses, pixels, echo, first_tap, background, state):  # type: ignore[no-untyped-def]
     """Replace the states (pixel, 3) by other draws: delay, log signal, and log background per bin.
 
     A delay of NaN, no echo, remains. `counts` is (pixel, bin), `pixels` the numbers of their random
-    streams, and `n_pulses` 0 if unknown.
+    streams, and `n_pulses` 0 if unknown. `background` holds the shape (bin,) and its nodes.
     """
+    shape, node, node_weight = background
     for pixel in prange(len(counts)):
         key, draw, scale = pixel_key(np.uint64(0), pixels[pixel]), 0, 1.0
         fired = counts[pixel].astype(np.float64)
         unfired = n_pulses - np.cumsum(fired) if n_pulses > 0 else np.ones(fired.size)
-        sums = fired.sum(), unfired.sum()
+        sums = (node_weight * fired).sum(axis=1), (shape * unfired).sum()
         at, start, log_weight = state[pixel], state[pixel].copy(), np.empty(_VALUES)
-        least_scale = 1.0 / math.sqrt(1.0 + sums[0])  # the posterior is hardly narrower
+        least_scale = 1.0 / math.sqrt(1.0 + fired.sum())  # the posterior is hardly narrower
         for _ in range(_MOST_ROUNDS):
             is_inside = True
             for part in range(2 if math.isnan(at[0]) else 0, len(_WIDTHS)):
@@ -92,7 +100,16 @@ def redraw(counts, n_pulses, pixels, echo, first_tap, state):  # type: ignore[no
                 for i in range(_VALUES):
                     at[part] = lowest + i * step
                     log_weight[i] = _log_density(
-                        at, start, n_pulses > 0, fired, unfired, sums, echo, first_tap
+                        at,
+                        start,
+                        n_pulses > 0,
+                        fired,
+                        unfired,
+                        sums,
+                        echo,
+                        first_tap,
+                        shape,
+                        node,
                     )
                 chosen = _chosen(log_weight, uniform_at(key, draw + 1))
                 at[part] = lowest + chosen * step

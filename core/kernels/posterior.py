@@ -138,29 +138,34 @@ def _correlate_inside(taps, values, first, begin, end, sums):  # type: ignore[no
 def counts_of(b, prepared):  # type: ignore[no-untyped-def]
     """Return the parts of ``T(d)`` of a block that all levels share.
 
-    Counts (bin, lane) and their sums (lane,), sums of unfired pulses ``A_k - n_k`` (lane,), and
-    ``Σ_k (A_k - n_k) p_k(d)`` (step, bin, lane).
+    Counts, shared out among the nodes of the background (node, bin, lane), and their sums (node,
+    lane), sums of unfired pulses ``A_k - n_k``, weighted with the shape of the background (lane,),
+    and ``Σ_k (A_k - n_k) p_k(d)`` (step, bin, lane).
     """
     n_bins, lanes = prepared.counts.shape[1:]
+    n_nodes = len(prepared.node)
     n_steps, n_taps = prepared.echo.shape
     # Aligned to cache lines: vectors that straddle them cost twice.
-    fired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
+    fired = lane_rows(n_nodes * n_bins, lanes).reshape(n_nodes, n_bins, lanes)
     unfired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
     unfired_echo = lane_rows(n_steps * n_bins, lanes).reshape(n_steps, n_bins, lanes)
     taps = lane_rows(n_taps, lanes).reshape(n_taps, lanes)
     armed = np.full(lanes, float(prepared.n_pulses))
-    all_unfired = np.zeros(lanes)
+    all_fired, all_unfired = np.zeros((n_nodes, lanes)), np.zeros(lanes)
     for k in range(n_bins):
         # Separate loops, since those of several types are not vectorised.
-        for i in range(lanes):
-            fired[k, i] = prepared.counts[b, k, i]
+        for node in range(n_nodes):
+            weight = prepared.node_weight[node, k]
+            for i in range(lanes):
+                fired[node, k, i] = weight * prepared.counts[b, k, i]
+            for i in range(lanes):
+                all_fired[node, i] += weight * prepared.counts[b, k, i]
         for i in range(lanes):
             armed[i] -= prepared.counts[b, k, i]
         for i in range(lanes):
             unfired[k, i] = armed[i]
         for i in range(lanes):
-            all_unfired[i] += armed[i]
-    all_fired = prepared.n_pulses - armed
+            all_unfired[i] += prepared.background_shape[k] * armed[i]
     if prepared.n_pulses == 0:
         unfired[:], all_unfired[:] = 1.0, n_bins
     unfired_echo[:] = 0.0
@@ -172,13 +177,16 @@ def counts_of(b, prepared):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _fill_gain(b, level, prepared, gain):  # type: ignore[no-untyped-def]
-    """Fill `gain` (step, tap, lane) with the logarithm that each count adds to ``T(d)``."""
+def _fill_gain(b, level, node, prepared, gain):  # type: ignore[no-untyped-def]
+    """Fill `gain` (step, tap, lane) with the logarithm that each count adds to ``T(d)``.
+
+    `node` is the background relative to its mean.
+    """
     n_bins, lanes = prepared.counts.shape[1:]
     n_steps, n_taps = prepared.echo.shape
     unit, previous = np.empty(lanes, np.float32), 0.0
     for i in range(lanes):
-        background = prepared.background[level, b, i] / n_bins
+        background = node * prepared.background[level, b, i] / n_bins
         unit[i] = 1.0 / (math.expm1(background) if prepared.n_pulses > 0 else background)
         signal = prepared.signal[level, b, i]
         for step in range(n_steps):
@@ -199,23 +207,26 @@ def _fill_gain(b, level, prepared, gain):  # type: ignore[no-untyped-def]
 @njit(**COMPILED)
 def fill_level(b, level, prepared, fired, unfired_echo, ratio):  # type: ignore[no-untyped-def]
     """Fill `ratio` (step, bin, lane) with ``T(d)`` of one level (`core.inference.likelihood`)."""
-    n_bins, lanes = fired.shape
+    n_nodes, n_bins, lanes = fired.shape
     n_steps, n_taps = prepared.echo.shape
     gain = lane_rows(n_steps * n_taps, lanes).reshape(n_steps, n_taps, lanes)
-    _fill_gain(b, level, prepared, gain)
     for step in range(n_steps):
         for k in range(n_bins):
             for i in range(lanes):
                 signal = np.float32(prepared.signal[level, b, i])
                 ratio[step, k, i] = -signal * unfired_echo[step, k, i]
-        _correlate(gain[step], fired, prepared.first_tap, ratio[step])
+    for node in range(n_nodes):
+        _fill_gain(b, level, prepared.node[node], prepared, gain)
+        for step in range(n_steps):
+            _correlate(gain[step], fired[node], prepared.first_tap, ratio[step])
 
 
 @njit(**COMPILED)
 def fill_flat(b, level, prepared, fired, unfired, flat):  # type: ignore[no-untyped-def]
     """Fill `flat` with the log likelihood ratio of the level's background to the first level's.
 
-    `fired` and `unfired` are sums over the bins.
+    `fired` (node, lane) are sums over the bins, `unfired` (lane,) those weighted with the shape of
+    the background.
     """
     n_bins, lanes = prepared.counts.shape[1:]
     for i in range(lanes):
@@ -224,8 +235,12 @@ def fill_flat(b, level, prepared, fired, unfired, flat):  # type: ignore[no-unty
         flat[i] = 0.0
         if here == bare:
             continue
-        odds = math.expm1(-here) / math.expm1(-bare) if prepared.n_pulses > 0 else here / bare
-        flat[i] = fired[i] * math.log(odds) - unfired[i] * (here - bare)
+        flat[i] = -unfired[i] * (here - bare)
+        for node in range(len(fired)):
+            factor, odds = prepared.node[node], here / bare
+            if prepared.n_pulses > 0:
+                odds = math.expm1(-here * factor) / math.expm1(-bare * factor)
+            flat[i] += fired[node, i] * math.log(odds)
 
 
 @njit(**COMPILED)

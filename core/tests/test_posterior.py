@@ -96,18 +96,23 @@ def twin(capture: Capture, flux: FluxModel, steps_per_bin: int) -> Twin:
         for level in range(len(flux.share)):
             signal = flux.signal.reshape(len(flux.share), -1)[level, i]
             background = flux.background.reshape(len(flux.share), -1)[:, i] / n_bins
-            nothing = log_likelihood(counts, np.full(n_bins, background[0]), n_pulses)
+            shape = flux.relative_background
+            nothing = log_likelihood(counts, background[0] * shape, n_pulses)
             for j, d in enumerate(delay):
                 echo = capture.pulse.bin_probability(d, n_bins, BIN_S)
                 since = np.arange(n_bins) - math.floor(d)
                 echo[(since < first) | (since > last)] = 0.0
-                rate = background[level] + signal * echo
+                rate = background[level] * shape + signal * echo
                 of_levels[i, level, j] = log_likelihood(counts, rate, n_pulses) - nothing
                 # A product and a sum for each tap of the echo, and some roundings besides.
                 unfired = 1.0 if n_pulses is None else n_pulses - np.cumsum(counts)
-                terms = counts @ np.log(rate / background[level]) + signal * (unfired * echo).sum()
+                gained = counts @ np.log(rate / (background[level] * shape))
+                terms = gained + signal * (unfired * echo).sum()
                 roundings = 2 * (last - first + 1) + 8
-                rounding[i] = max(rounding[i], roundings * EPS_32 * terms)
+                error = roundings * EPS_32 * terms
+                if flux.background_shape is not None:
+                    error += INTERPOLATED * gained
+                rounding[i] = max(rounding[i], error)
         rounding[i] += 4 * EPS_32 * np.abs(of_levels[i]).max()  # level and offset, put together
     with np.errstate(divide="ignore"):
         log_share = np.log(flux.share)[1:, np.newaxis]
@@ -121,6 +126,7 @@ def twin(capture: Capture, flux: FluxModel, steps_per_bin: int) -> Twin:
     )
 
 
+INTERPOLATED = 1e-4  # relative error of a logarithm between nodes of the background
 OF_SUMS = 64 * EPS_32  # sums of up to so many float32, none of them negative
 
 
@@ -232,6 +238,19 @@ def test_kernels_are_the_equations(
 
 
 @pulses_known
+def test_kernels_are_the_equations_over_any_background(
+    monkeypatch: pytest.MonkeyPatch, n_pulses: int | None
+) -> None:
+    n_bins = 12
+    cube = histograms(n_bins, n_pulses, Pulse())[np.newaxis]
+    shape = 0.5 + np.exp(-np.arange(n_bins) / 2)
+    flux = replace(
+        flux_for(*cube.shape[1:], n_pulses), background_shape=np.asarray(shape / shape.mean())
+    )
+    assert_equals_twin(monkeypatch, capture_of(cube, n_pulses), flux, 1)
+
+
+@pulses_known
 def test_each_rule_has_the_least_expected_loss(n_pulses: int | None) -> None:
     n_bins, steps = 20, 2
     cube = histograms(n_bins, n_pulses, Pulse())[np.newaxis]
@@ -335,8 +354,9 @@ def test_full_counters_give_probabilities(dtype: type, n_pulses: int | None) -> 
 
 @any_pulse
 @pulses_known
+@pytest.mark.parametrize("rise", [None, 0.8])
 def test_log_likelihood_ratio_is_that_of_the_distribution(
-    pulse: Pulse, n_pulses: int | None
+    pulse: Pulse, n_pulses: int | None, rise: float | None
 ) -> None:
     n_bins = 15
     acquisition = Acquisition(n_bins=n_bins, n_pulses=n_pulses)
@@ -344,12 +364,17 @@ def test_log_likelihood_ratio_is_that_of_the_distribution(
     photons = 200 if n_pulses is None else 1
     signal = np.linspace(0.02, 0.6, len(counts)) * photons
     background = np.linspace(2.0, 0.2, len(counts)) * photons
-    conditions = Conditions(acquisition, pulse, n_pulses, signal, background, 0.1)
+    shape = None if rise is None else 1 + rise * np.linspace(-1, 1, n_bins)
+    conditions = Conditions(
+        acquisition, pulse, n_pulses, signal, background, 0.1, background_shape=shape
+    )
     found = log_likelihood_ratio(counts.astype(float), conditions)
     for i, histogram in enumerate(counts):
 
         def log_probability(onset_bin: float, histogram: np.ndarray = histogram, i: int = i) -> Any:
             rate = rate_per_bin(onset_bin, signal[i], background[i], pulse, acquisition)
+            if shape is not None:
+                rate += background[i] / n_bins * (shape - 1)
             if n_pulses is None:
                 return stats.poisson.logpmf(histogram, rate).sum()
             chance = trigger_probability(rate)

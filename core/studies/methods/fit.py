@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from core.acquisition import Floats, Flux, Pulse
+from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.effects import Jitter, Motion
 from core.estimators import estimate
@@ -33,7 +33,7 @@ _SIGNAL, _PULSE = 0.1041, Pulse(1e-9)
 
 @dataclass(frozen=True)
 class Case:
-    """A scene whose captures are ranged with one echo of a 1 ns pulse over a flat background."""
+    """A scene whose captures are ranged with one echo of a 1 ns pulse over a smooth background."""
 
     scene: str
     sbr: float = 0.06
@@ -57,23 +57,39 @@ class Case:
 
     def _shaped(self, shape: Callable[[Floats], Floats], seed: int) -> Capture:
         scene = scenes[self.scene]()
-        acquisition, truth_m = scene.acquisition, scene.range_m
-        onset = acquisition.range_m_to_bin(truth_m)
-        echo = rate_per_bin(onset, np.full(onset.shape, _SIGNAL), 0.0, _PULSE, acquisition)
-        background = shape(np.arange(float(acquisition.n_bins)))
-        rate = echo + _SIGNAL / self.sbr * background / background.sum()
-        counts = draw_counts(rate, acquisition.n_pulses, np.random.default_rng(seed))
-        return Capture(counts, acquisition, _PULSE, truth_m)
+        return shaped_capture(scene.range_m, scene.acquisition, self.sbr, shape, seed)
 
 
-def _ramp(rise: float) -> Callable[[Floats], Floats]:
+def shaped_capture(
+    range_m: Floats,
+    acquisition: Acquisition,
+    sbr: float,
+    shape: Callable[[Floats], Floats],
+    seed: int,
+) -> Capture:
+    """Draw a capture whose background is a function of the bin, for ranges that may be NaN."""
+    onset = acquisition.range_m_to_bin(range_m)
+    echo = rate_per_bin(onset, np.full(onset.shape, _SIGNAL), 0.0, _PULSE, acquisition)
+    background = shape(np.arange(float(acquisition.n_bins)))
+    rate = echo + _SIGNAL / sbr * background / background.sum()
+    counts = draw_counts(rate, acquisition.n_pulses, np.random.default_rng(seed))
+    return Capture(counts, acquisition, _PULSE, range_m)
+
+
+def ramp(rise: float) -> Callable[[Floats], Floats]:
+    """Return a background that changes linearly over the gate, by `rise` of its first bin."""
     return lambda k: 1 + rise * k / k[-1]
 
 
+def decay(k: Floats) -> Floats:
+    """Return a background that is half as large again at first, and decays over 10 bins."""
+    return np.asarray(1 + 0.5 * np.exp(-k / 10))
+
+
 CASES = {
-    "background rises by 50 %": Case("car", background=_ramp(0.5)),
-    "background falls by 50 %": Case("car", background=_ramp(-0.5)),
-    "+50 % that decays over 10 bins": Case("car", background=lambda k: 1 + 0.5 * np.exp(-k / 10)),
+    "background rises by 50 %": Case("car", background=ramp(0.5)),
+    "background falls by 50 %": Case("car", background=ramp(-0.5)),
+    "+50 % that decays over 10 bins": Case("car", background=decay),
     "fog": Case("fog"),
     "pulse × 3": Case("car", pulse=Pulse(3e-9)),
     "jitter of 3 ns": Case("car", parts={"jitter": Jitter(3e-9)}),

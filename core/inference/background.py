@@ -1,0 +1,191 @@
+"""Shape of the background over the gate: how the likelihood uses it, and how it is estimated.
+
+The background of a pixel is its own total times a shape that all pixels share, 1 on average over
+the bins. A slope, the decay of an afterglow at the opening of the gate, or backscatter differ from
+the uniform background of ambient light and dark counts.
+
+**Likelihood.** The gain ``ln((1 - exp(-b - s)) / (1 - exp(-b)))`` of a count is no longer the same
+in all bins. It is a smooth function of ``ln b``, and so a sum ``Σ_j ℓ_j(ln b) gain(b_j)`` over a
+few backgrounds ``b_j``, the nodes of a polynomial interpolation. The likelihood is then that of a
+uniform background with as many histograms, ``ℓ_j(ln b_k) n_k``. A uniform background has one node.
+
+**Estimate.** From a sample of the pixels, with the posterior of their delays: a bin of a pixel
+counts with the probability that no echo is near it. If the model holds, what is counted is
+distributed as background, wherever the surfaces lie and however many pixels have one. The logarithm
+of the shape is a sum of Legendre polynomials of the time in the gate, fitted to the counts of all
+pixels (iteratively reweighted least squares). Its degree maximises the likelihood minus a penalty
+for each polynomial (Ledwina 1994, "Data-driven version of Neyman's smooth test of fit"), so that a
+uniform background is found uniform but for `SIZE` of the captures. If every pixel has a second
+surface, part of it is taken for background; the goodness of fit (`core.inference.fit`) then warns.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # loads a submodule when it is first used
+from numpy.typing import NDArray
+
+from core.acquisition import Floats
+from core.capture import Capture
+
+SIZE = 1e-3
+"""Bound on the probability that a uniform background is taken for another."""
+
+_PENALTY = 12.0  # of a polynomial in twice the log likelihood: 1 in 1900 of the first exceed it
+_DEGREE = 12  # highest
+_FITTING_STEPS = 8
+_RANGE = 3.0  # largest logarithm of the shape, on either side of 0
+_ERROR = 1e-5  # of the interpolation, relative
+_BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
+_NOISE = 3.0  # standard deviations of a sum of squares
+_LEAST_SHARE = 1e-6
+_WIGGLES = 0.1  # of a slope, that are no second direction
+
+
+class Nodes(NamedTuple):
+    """Interpolation between a few backgrounds."""
+
+    node: Floats
+    """Backgrounds relative to the mean, shape (node,)."""
+    weight: Floats
+    """Weight of each in each bin, shape (node, bin)."""
+
+
+def nodes_of(shape: Floats) -> Nodes:
+    """Return the interpolation for the background shape of bins (bin,), 1 on average.
+
+    Chebyshev nodes in the logarithm. The nearest singularities of the gain lie at ±iπ from real
+    logarithms, which determines how fast the error falls with the number of nodes.
+    """
+    log = np.log(shape)
+    middle, half = (log.max() + log.min()) / 2, (log.max() - log.min()) / 2
+    if half == 0:
+        return Nodes(np.ones(1), np.ones((1, shape.size)))
+    ratio = math.pi / half
+    n_nodes = math.ceil(-math.log(_ERROR) / math.asinh(ratio))
+    at = middle + half * np.cos(math.pi * (np.arange(n_nodes) + 0.5) / n_nodes)
+    apart = at[:, np.newaxis] - at
+    np.fill_diagonal(apart, 1.0)
+    off = log - np.repeat(at[np.newaxis], n_nodes, axis=0)[..., np.newaxis]
+    off[np.arange(n_nodes), np.arange(n_nodes)] = 1.0
+    weight = off.prod(axis=1) / apart.prod(axis=1)[:, np.newaxis]
+    return Nodes(np.exp(at), weight)
+
+
+def echo_window(capture: Capture) -> tuple[int, int]:
+    """First bin and end, relative to that of the delay, of echoes of the pulse or similar ones."""
+    length = capture.echo_bins
+    return -1 - _BEFORE * length, 2 + _BEHIND * length
+
+
+class EchoFree(NamedTuple):
+    """Where pixels see background alone, each of shape (pixel, bin)."""
+
+    share: Floats
+    """Probability that no echo is near the bin."""
+    background: Floats
+    """Mean background per pulse of a bin, if there is none."""
+
+
+def echo_free(
+    mass: NDArray[np.float32], background: Floats, echo_window: tuple[int, int]
+) -> EchoFree:
+    """Find the bins of pixels that hold no echo.
+
+    Parameters
+    ----------
+    mass : ndarray, shape (pixel, level, bin)
+        Probability of each signal level and of a delay in each bin. The first level is no echo.
+    background : ndarray, shape (pixel, level)
+        Background per pulse over the gate for each level.
+    echo_window : (int, int)
+        First bin and end, relative to that of a delay, that an echo may fill.
+    """
+    n_bins = mass.shape[2]
+    bins, share = np.arange(n_bins), np.ones((len(mass), n_bins))
+    photons = share * np.vecdot(mass.sum(axis=2, dtype=float), background)[:, np.newaxis]
+    # Echoes of these delays fill the bin.
+    begin, end = (np.clip(bins + 1 - at, 0, n_bins) for at in reversed(echo_window))
+    upto = np.zeros((len(mass), n_bins + 1))
+    for level in range(1, mass.shape[1]):
+        np.cumsum(mass[:, level], axis=1, out=upto[:, 1:])
+        near = upto[:, end] - upto[:, begin]
+        share -= near
+        photons -= near * background[:, level : level + 1]
+    mean = np.divide(photons, share, out=np.zeros_like(share), where=share > _LEAST_SHARE)
+    return EchoFree(np.where(share > _LEAST_SHARE, share, 0.0), np.maximum(mean, 0.0) / n_bins)
+
+
+def fitted_shape(
+    counts: Floats, armed: Floats, free: EchoFree, is_first: bool, guess: Floats
+) -> Floats | None:
+    """Fit the background shape to the counts in bins without an echo.
+
+    Parameters
+    ----------
+    counts, armed : ndarray, shape (pixel, bin)
+        Counts, and pulses armed in each bin; 1 if all photons are counted.
+    free : EchoFree
+    is_first : bool
+        Whether only the first photon of a pulse is detected.
+    guess : ndarray, shape (bin,)
+        Shape for which `free` was found.
+
+    Returns
+    -------
+    ndarray, shape (bin,), or None
+        None if the counts do not contradict a uniform background, or if the shape explains less of
+        the contradiction than it leaves: echoes of another kind, not background.
+    """
+    rate = free.background * guess
+    fires = -np.expm1(-rate) if is_first else rate
+    seen = (free.share * counts).sum(axis=0)
+    expected = (free.share * armed * fires).sum(axis=0) / guess
+    basis = _polynomials(guess.size)
+    # A weak prior of smooth logarithms, for gaps that echoes leave in the gate.
+    prior = np.diag(np.arange(basis.shape[1], dtype=float))
+    log = np.zeros(guess.size)
+    for _ in range(_FITTING_STEPS):
+        mean = expected * np.exp(log)
+        root = np.sqrt(mean)
+        residual = np.divide(seen - mean, root, out=np.zeros_like(root), where=root > 0)
+        q, r = np.linalg.qr(np.concatenate([root[:, np.newaxis] * basis, prior]))
+        found = q[: root.size].T @ (root * log + residual)
+        gain = np.cumsum(found[1:] ** 2 - _PENALTY)
+        if not gain.max(initial=0.0) > 0:
+            return None
+        n = 2 + int(gain.argmax())
+        log = basis[:, :n] @ scipy.linalg.solve_triangular(r[:n, :n], found[:n])
+        log = np.clip(log, -_RANGE, _RANGE)
+    shape, is_seen = np.exp(log), expected > 0
+    mean = (expected * shape)[is_seen]
+    left = float(((seen[is_seen] - mean) ** 2 / mean - 1).sum())
+    noise = _NOISE * math.sqrt(2 * mean.size)
+    is_smooth = left - noise < float((found[1:n] ** 2).sum())
+    return np.asarray(shape / shape.mean()) if is_smooth else None
+
+
+def _polynomials(n_bins: int) -> Floats:
+    """Orthonormal Legendre polynomials of the time in the gate, shape (bin, degree)."""
+    degree = min(_DEGREE, n_bins - 1)
+    time = (2 * np.arange(n_bins) + 1) / n_bins - 1
+    norm = np.sqrt(2 * np.arange(degree + 1.0) + 1)
+    return np.asarray(np.polynomial.legendre.legvander(time, degree) * norm, float)
+
+
+def shape_text(shape: Floats | None) -> str:
+    """Describe a background shape (bin,), None for a uniform one, by a clause."""
+    if shape is None:
+        return "the background is uniform over the gate"
+    first, last = float(shape[0]), float(shape[-1])
+    low, high = float(shape.min()), float(shape.max())
+    if high - low <= (1 + _WIGGLES) * abs(last - first):
+        direction = "rises" if last > first else "falls"
+        return f"the background {direction} by {abs(last / first - 1) * 100:.0f} % over the gate"
+    return (
+        f"the background varies over the gate, from {low:.2g} of its mean in bin "
+        f"{shape.argmin()} to {high:.2g} in bin {shape.argmax()}"
+    )

@@ -1,0 +1,145 @@
+"""Tests of the background shape: found where there is one, uniform where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from core.acquisition import Acquisition, Pulse
+from core.capture import Capture
+from core.estimators.base import histogram_numbers
+from core.inference.background import SIZE, nodes_of, shape_text
+from core.inference.fit import fit_of
+from core.inference.flux import flux_prior_of
+from core.inspection import capture_report
+from core.studies.methods import alarms
+from core.studies.methods.fit import NULL_CASES
+from core.trigger import draw_counts, rate_per_bin
+
+SIDE = 24  # rows and columns of captures
+TIME = np.linspace(0, 1, 100)  # in the gate
+
+SHAPES = {
+    "is uniform": np.ones(100),
+    "rises by 50 %": 1 + 0.5 * TIME,
+    "falls by 20 %": 1 - 0.2 * TIME,
+    "decays": 1 + 0.5 * np.exp(-10 * TIME),
+    "is largest in the middle": 1 + 0.5 * np.sin(np.pi * TIME),
+}
+
+DELAYS = {
+    "whole gate": (0.0, 99.0),
+    "wall": (50.0, 50.5),
+    "car": (48.0, 60.0),
+    "nowhere": (np.nan, np.nan),
+}
+
+
+def drawn(shape: np.ndarray, delays: tuple[float, float], n_pulses: int | None = 1000) -> Capture:
+    """Capture with echoes of 0.1 photons per pulse over 1.7 of background."""
+    rng, acquisition = np.random.default_rng(0), Acquisition(n_pulses=n_pulses)
+    onset = (
+        rng.uniform(*delays, (SIDE, SIDE))
+        if np.isfinite(delays[0])
+        else np.full((SIDE, SIDE), np.nan)
+    )
+    rate = rate_per_bin(onset, np.full(onset.shape, 0.1), 0.0, Pulse(), acquisition)
+    rate += 1.7 * shape / shape.sum()
+    detection = "all" if n_pulses is None else "first"
+    counts = draw_counts(rate if n_pulses else 1000 * rate, n_pulses, rng)
+    truth_m = acquisition.bin_to_range_m(onset)
+    return Capture(counts, acquisition, Pulse(), truth_m, detection=detection)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    ("shape", "delays", "n_pulses"),
+    [
+        ("rises by 50 %", "whole gate", 1000),
+        ("falls by 20 %", "wall", 1000),
+        ("decays", "car", 1000),
+        ("decays", "whole gate", None),
+        ("is largest in the middle", "nowhere", None),
+    ],
+)
+def test_the_shape_is_found_wherever_the_surfaces_are(
+    shape: str, delays: str, n_pulses: int | None
+) -> None:
+    true = SHAPES[shape] / SHAPES[shape].mean()
+    found = flux_prior_of(drawn(true, DELAYS[delays], n_pulses)).background_shape
+    assert found is not None
+    error = found / true - 1
+    # 512 pixels with 4 to 17 photons in each bin, and a dozen parameters.
+    assert np.sqrt((error**2).mean()) < 0.025
+    assert found.mean() == pytest.approx(1)
+
+
+@pytest.mark.compiled
+def test_a_uniform_background_is_found_uniform_and_changes_no_bit() -> None:
+    captures = [case.capture(seed) for case in NULL_CASES for seed in (100, 101)]
+    captures += [drawn(np.ones(100), delays, n) for delays in DELAYS.values() for n in (1000, None)]
+    found = [flux_prior_of(capture).background_shape for capture in captures]
+    others = sum(shape is not None for shape in found)
+    assert others <= stats.binom.isf(1e-4, len(captures), SIZE)
+    assert nodes_of(np.ones(7)).weight.tolist() == [[1.0] * 7]  # the likelihood of one background
+
+
+@pytest.mark.compiled
+def test_no_warning_remains_where_the_shape_explains_the_background() -> None:
+    assert fit_of(drawn(SHAPES["decays"], DELAYS["whole gate"])).remark == ""
+
+
+@pytest.mark.compiled
+def test_the_report_on_the_capture_names_the_shape() -> None:
+    falling, uniform = (drawn(SHAPES[x], DELAYS["car"]) for x in ("falls by 20 %", "is uniform"))
+    found = flux_prior_of(falling).background_shape
+    assert shape_text(found).startswith("the background falls by ")
+    assert shape_text(found) in capture_report(falling).flux_remark
+    assert "background is" not in capture_report(uniform).flux_remark
+
+
+@pytest.mark.compiled
+def test_false_alarms_are_those_asked_for_whatever_the_background(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(alarms, "METHODS", ("coates",))
+    (few, many) = found = alarms.alarms(("falls by 50 %", range(1)))
+    assert few.holds and many.holds
+    assert many.if_uniform > 5 * many.reported
+    assert [row[-3] for row in alarms.alarms_table(found).rows] == ["0.01", "0.1"]
+
+
+@pytest.mark.parametrize("photons", [1, 400])
+def test_numbers_of_histograms_are_even(photons: int) -> None:
+    rng = np.random.default_rng(0)
+    histograms = rng.multinomial(photons, np.full(100, 0.01), size=4000).astype(np.uint16)
+    numbers = histogram_numbers(histograms)
+    np.testing.assert_array_equal(numbers, histogram_numbers(histograms.copy()))
+    shares = np.histogram(numbers, bins=10, range=(0, 1))[0] / len(numbers)
+    np.testing.assert_allclose(shares, 0.1, atol=0.02)
+
+
+def test_nodes_interpolate_the_gain_of_a_count() -> None:
+    shape = np.geomspace(0.2, 3, 50)
+    node, weight = nodes_of(shape)
+    for signal in (1e-3, 0.1, 10.0):
+        gain = np.log1p(signal / node) @ weight
+        np.testing.assert_allclose(gain, np.log1p(signal / shape), rtol=1e-4)
+    assert np.abs(weight).sum(axis=0).max() < 3
+    np.testing.assert_allclose(weight.sum(axis=0), 1)
+
+
+def test_a_capture_without_photons_has_a_uniform_background() -> None:
+    for n_bins in (1, 2, 30):
+        empty = Capture(np.zeros((3, 4, n_bins), np.uint16), Acquisition(n_bins))
+        assert flux_prior_of(empty).background_shape is None
+
+
+def test_shapes_are_described_by_what_they_do() -> None:
+    assert shape_text(None) == "the background is uniform over the gate"
+    assert shape_text(SHAPES["rises by 50 %"]) == "the background rises by 50 % over the gate"
+    assert shape_text(SHAPES["falls by 20 %"]) == "the background falls by 20 % over the gate"
+    middle = SHAPES["is largest in the middle"]
+    middle_text = shape_text(middle / middle.mean())
+    assert middle_text.startswith("the background varies over the gate, from 0.76 of its mean in")
