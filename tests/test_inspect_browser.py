@@ -19,6 +19,7 @@ import core
 from app.model.state import Illumination
 from app.pages.inspect import text
 from core import Capture, RangeImage, inspection
+from core.inference import predictive_of
 from tests.browser import VIEWS, choose, enter, eventually, fact, field, slider
 from tests.browser import image as picture
 from tests.test_downloads import columns_of, download
@@ -195,12 +196,22 @@ def expect_pixel(page: Page, subject: Subject) -> None:
         (COUNTS, "raw", "small", signals.small),
         (COUNTS, "raw", "large", signals.large),
         (COUNTS, "candidates", "x", [each.bin for each in report.candidates]),
-        (RATE, "rate", "rate", report.rate),
         (STAGES, "residual", "residual", signals.residual),
         (STAGES, "residual", "enhanced", signals.enhanced),
     ):
         seen = drawn(page, title, layer, column)
         np.testing.assert_allclose(seen, expected, rtol=1e-6, err_msg=column)  # as 32-bit floats
+    button(page, "Rate").click()
+    np.testing.assert_allclose(drawn(page, RATE, "rate", "rate"), report.rate, rtol=1e-6)
+    button(page, "Fit").click()
+    expect(
+        page.get_by_text("Goodness of fit of the pixel: p-value").filter(visible=True)
+    ).to_be_visible()
+    fit = predictive_of(capture, np.array([row * capture.shape[1] + col]))
+    for column, expected in (("deviation", fit.residual), ("fit", fit.expected)):
+        seen = drawn(page, "Residuals", "deviation", column)
+        np.testing.assert_allclose(seen, expected, rtol=1e-5, atol=1e-6, err_msg=column)
+    button(page, "Score").click()
 
 
 EACH = 17
@@ -309,7 +320,7 @@ def move_the_pixel(page: Page, facade: Subject) -> None:
     expect(fact(page, "Pixel")).to_have_text(f"{row + 8}, {col + 1}")
     *painted, last = page.evaluate("seen")
     assert last == "numbers"
-    assert len(painted) == len(set(painted)) == 4  # the picture, and three plots
+    assert len(painted) == len(set(painted)) == 3  # the picture, and two plots
     (down, across), middle = place_at(page, 0.5, 0.4), within(page, 0.5, 0.4)
     page.mouse.click(*middle)
     expect(fact(page, "Pixel")).to_have_text(f"{down:.0f}, {across:.0f}")
@@ -402,8 +413,7 @@ def expect_every_unit(page: Page) -> None:
         header = page.get_by_role("columnheader", name=title).filter(visible=True)
         expect(header).to_be_visible()
         assert in_figure(page, COUNTS, axes) == [title, other]
-        for each in (RATE, STAGES):
-            assert in_figure(page, each, axes) == [title]
+        assert in_figure(page, STAGES, axes) == [title]
 
 
 def pin_pixels(page: Page, facade: Subject) -> None:
