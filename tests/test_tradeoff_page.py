@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 from dataclasses import replace
@@ -25,6 +26,7 @@ from app.plots import elements as plots
 from app.theme import DARK, LIGHT
 from core import ESTIMATORS
 from core.scene import parts_of
+from core.studies.ablation import Requirement
 from core.studies.sensitivity import numbers
 from core.studies.tradeoff import Cancelled, best_within, cheapest_reaching, pareto_front
 from tests.browser import chosen, eventually
@@ -281,6 +283,16 @@ def test_verdicts_are_those_of_the_scene_with_its_flux(ablation, session):
     assert all("message" in row for row in ablation.table.rows)
     ablation.draw(verdicts)  # of the scene before: it ends late
     assert all("message" in row for row in ablation.table.rows)
+
+
+def test_a_row_of_a_capture_shows_the_effect_and_the_smallest_that_is_seen():
+    seen = Requirement("jitter", "needed", "why", effect=0.5, smallest_effect=0.1, p_value=1e-3)
+    missed = replace(seen, verdict="cannot tell", smallest_effect=math.inf)
+    rows = [ablation_text.row("jitter", each, False, False) for each in (seen, missed)]
+    assert [[cell[0] for cell in row["cells"][1:3]] for row in rows] == [
+        ["50.0 %", "10.0 %"],
+        ["50.0 %", "–"],
+    ]
 
 
 # -- sensitivity -----------------------------------------------------------------------------------

@@ -75,6 +75,8 @@ def row(name: str, found: Requirement | None, can_switch: bool, is_off: bool) ->
 def _sizes(found: Requirement) -> tuple[Cell, Cell]:
     """Return the cells of the change and of the smallest one that is seen."""
     if math.isfinite(found.p_value):
-        return percent_cell(found.effect), percent_cell(found.smallest_effect)
+        none = math.isinf(found.smallest_effect)
+        smallest = math.nan if none else found.smallest_effect
+        return percent_cell(found.effect), percent_cell(smallest)
     worst = "" if math.isnan(found.worst) else f"at most {found.worst:.2g}"
     return cell(found.total_variation, "{:.2g}", worst), cell(found.resolvable, "{:.2g}")

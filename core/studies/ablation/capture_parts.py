@@ -6,6 +6,7 @@ property. "Not needed" means that an effect large enough to matter would have be
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -99,7 +100,9 @@ def signal_levels(capture: Capture, method: str) -> Requirement:
     apart, evidence = corrections.level_deviation(capture), signal_evidence(capture)
     if evidence is None:
         return _unknown("signal_levels", "too few pixels have a certain estimate")
-    found = "the signal scatters by {} of its mean from pixel to pixel"
+    found = "the signal scatters by {} of its mean over the pixels with a certain estimate"
+    if math.isinf(evidence.smallest):
+        found += ", which are too few to stand for all"
     return _corrected(capture, method, "signal_levels", apart, evidence, MARGIN_SIGNAL, found)
 
 

@@ -128,11 +128,17 @@ def tested(
     """
     verdict, smallest = evidence.verdict(margin, explained), evidence.smallest
     chance = f"p = {evidence.p_value:.2g}" if evidence.p_value >= _LEAST_P else f"p < {_LEAST_P:g}"
-    seen = "no effect" if math.isinf(smallest) else _percent(smallest)
+    seen = f"would have been seen with a probability of {_percent(POWER)}"
+    if math.isfinite(smallest):
+        seen = f"{_percent(smallest)} {seen}, and {_percent(margin)} matters"
+    elif evidence.is_seen:
+        seen = f"{_percent(margin)} matters"
+    else:
+        seen = f"no effect {seen}"
+    doubt = f"up to {_percent(explained)} may come from second surfaces"
     clauses = (
-        f"{found.format(_percent(evidence.effect))} ({chance}); {seen} would have been seen with a "
-        f"probability of {_percent(POWER)}, and {_percent(margin)} matters",
-        f"up to {_percent(explained)} may come from second surfaces" if explained else "",
+        f"{found.format(_percent(evidence.effect))} ({chance}); {seen}",
+        doubt if explained and verdict == "cannot tell" else "",
         note,
     )
     return Requirement(

@@ -1,13 +1,16 @@
-"""Tests of a whole capture: of what its pixels share, and of the share of them with a second echo.
+"""Tests of a whole capture: of what its pixels share, and of the share with a second surface.
 
-Background, pulse and second surface. Delays and fluxes are drawn from the posterior of each pixel,
-as in `core.inference.fit`, so that pixels whose estimates are uncertain need not be left out.
+Delays and fluxes are drawn from the posterior of each pixel, as in `core.inference.fit`, so that
+pixels whose estimates are uncertain need not be left out.
 
-Counts of windows of one pulse length are compared with what the echo and the
+Second surface. Counts of windows of one pulse length are compared with what the echo and the
 background explain, both with the mean shape that they have in all pixels, so that neither another
 pulse nor a background that varies resembles a second surface. The p-value of a pixel is that of its
 most unusual window. How often pixels with a second surface have a small p-value is found from
 simulated ones, in which half the signal comes from a second delay.
+
+Signal. Its scatter over the pixels is compared with that by chance. This needs pixels whose
+estimates are certain.
 """
 
 from __future__ import annotations
@@ -46,6 +49,7 @@ _MOST_PIXELS = 2**14
 _CERTAIN = 0.95  # confidence of estimates that are taken for the surface
 _MOSTLY = 0.8  # least share of them that stands for all pixels
 _LEAST_SHARE = 1e-3  # of an echo within the gate
+_LEAST_RATE = 1e-12  # photons in a bin
 _UNUSUAL = 0.001  # p-value of pixels that seem to have a second surface
 _SEED = np.uint64(1)
 
@@ -66,8 +70,12 @@ class PooledEvidence(NamedTuple):
 
 @cached_per_capture
 def pooled_evidence(capture: Capture) -> PooledEvidence:
-    """Test the pixels that are neither hot nor dead; some of them if there are many."""
-    parts = _parts(capture, np.flatnonzero(faults.ordinary_pixels(capture)))
+    """Test the pixels together, but for hot, dead and bright ones.
+
+    Among the bright ones are hot pixels that use up the pulses when the gate opens.
+    """
+    usual, outliers = faults.ordinary_pixels(capture), faults.outlier_pixels(capture)
+    parts = _parts(capture, usual if outliers is None else usual & ~outliers.bright)
     residuals = drawn_residuals(capture, parts[0])
     background, pulse = (
         evidence_of_deviation(deviation(capture, residuals))
@@ -97,9 +105,12 @@ def _second_surfaces(capture: Capture, residuals: Residuals) -> NDArray[np.intp]
     return np.array([np.count_nonzero(has_echo), found, seen])
 
 
-def _parts(capture: Capture, pixels: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Divide pixels (pixel,) into random parts that bound the memory; some if there are many."""
-    some = np.random.default_rng(0).permutation(pixels)[:_MOST_PIXELS]
+def _parts(capture: Capture, usual: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Divide pixels (row, col) into random parts that bound the memory; some of them if many.
+
+    Returns flat indices.
+    """
+    some = np.random.default_rng(0).permutation(np.flatnonzero(usual))[:_MOST_PIXELS]
     at_once = max(1, NUMBERS_AT_ONCE // capture.acquisition.n_bins)
     return [np.sort(part) for part in np.array_split(some, -(-some.size // at_once))]
 
@@ -183,7 +194,7 @@ def signal_evidence(capture: Capture) -> Evidence | None:
     None if they are too few. If many others are not certain, the scatter of all may be larger.
     """
     acquisition, n_pulses, n_bins = capture.acquisition, capture.gated_pulses, capture.cube.shape[2]
-    pixels = _parts(capture, np.flatnonzero(faults.ordinary_pixels(capture)))[0]
+    pixels = _parts(capture, faults.ordinary_pixels(capture))[0]
     some = _with_counts(capture, capture.cube.reshape(-1, n_bins)[pixels])
     found = corrections.delays(some, "likelihood")
     certain = tolerance_probability(some, found)[0] >= _CERTAIN
@@ -199,7 +210,7 @@ def signal_evidence(capture: Capture) -> Evidence | None:
 
     def variance(mean: float) -> Floats:
         """Variance of the signals by chance if all are equal (Greenwood 1926)."""
-        expected = mean * share + background
+        expected = np.maximum(mean * share + background, _LEAST_RATE)
         of_bins = expected if n_pulses is None else np.expm1(expected) / np.maximum(armed, 1.0)
         return np.asarray((of_bins * inside).sum(axis=1) / exposure**2)
 
