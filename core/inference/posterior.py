@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,8 +91,15 @@ def has_posterior(capture: Capture) -> bool:
     return posterior_of.is_cached(capture)
 
 
+_estimated: WeakSet[Capture] = WeakSet()
+"""Captures with one estimate, whose table would save time from the second one on."""
+
+
 def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
     """Probability of a surface within `TOLERANCE_BINS` of a delay, shape (row, col).
+
+    The first call for a capture computes no more than these numbers; the second one computes
+    `posterior_of`, from which later ones take them, the same to the last bit.
 
     Parameters
     ----------
@@ -101,13 +109,14 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
     """
     last = capture.cube.shape[2] - 1
     below, found = _bin_below(bins.ravel(), last), np.empty(bins.size)
-    if has_posterior(capture):
+    if has_posterior(capture) or capture in _estimated:
         table = posterior_of(capture).tolerance_probability
         # Flat indices: `numpy.take_along_axis` takes longer than everything else.
         first = np.arange(bins.size)[:, np.newaxis] * (last + 1)
         ends = table.take(first + _both(below, last))
     else:
         ends, _ = _masses(capture, below, min(2, last + 1))
+        _estimated.add(capture)
     for begin in range(0, bins.size, NUMBERS_AT_ONCE):
         some = slice(begin, begin + NUMBERS_AT_ONCE)
         found[some] = _interpolated(bins.ravel()[some], below[some], ends[some])

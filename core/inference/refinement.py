@@ -41,9 +41,9 @@ def refined(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
     echo = np.pad(taps[:, ::-1].T.ravel(), 2 * reach * STEPS_PER_BIN)
 
     def in_blocks(image: Floats) -> Floats:
-        return np.pad(image.ravel(), (0, -n_pixels % LANES), constant_values=np.nan).reshape(
-            -1, LANES
-        )
+        filled = np.full(-(-n_pixels // LANES) * LANES, np.nan)
+        filled[:n_pixels] = image.ravel()
+        return filled.reshape(-1, LANES)
 
     # An echo is short: over it, the background is that at its delay.
     last = acquisition.n_bins - 1

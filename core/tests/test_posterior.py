@@ -27,6 +27,7 @@ from core.inference.likelihood import (
 from core.inference.posterior import (
     TOLERANCE_BINS,
     Posterior,
+    has_posterior,
     least_loss,
     posterior_of,
     tolerance_probability,
@@ -464,8 +465,8 @@ def test_confidences_are_those_of_the_posterior_to_the_last_bit(
     monkeypatch.setattr("core.inference.posterior.flux_model_of", lambda _: flux)
     alone = tolerance_probability(capture, bins)
     monkeypatch.setattr("core.kernels.parallel.SERIAL_BELOW", 0)  # on all threads
-    posterior_of(capture)
     np.testing.assert_array_equal(tolerance_probability(capture, bins), alone)
+    assert has_posterior(capture)  # from the second call on
     rows = slice(3, 6)  # pixels in other lanes, of another block
     part = flux.of_pixels(np.arange(72).reshape(8, 9)[rows])
     monkeypatch.setattr("core.inference.posterior.flux_model_of", lambda _: part)

@@ -16,7 +16,15 @@ from core.studies.performance.reference_implementations import (
     plain_loop,
     take_roots,
 )
-from core.studies.performance.speed import MOVE, ONE_SHOT, PLAIN, PUBLIC, SIMULATION, regressions
+from core.studies.performance.speed import (
+    MOVE,
+    NEW,
+    ONE_SHOT,
+    PLAIN,
+    PUBLIC,
+    SIMULATION,
+    regressions,
+)
 from core.tracking import TrackingParameters, tracking_signals
 
 ROUNDS = 6
@@ -45,7 +53,7 @@ def test_reference_implementations_agree_with_the_signals(changed: dict[str, flo
 
 def times(**ms: float) -> dict[str, np.ndarray]:
     spread = np.linspace(0.9, 1.1, 21)
-    known = {PLAIN: 14.0, ONE_SHOT: 0.4, PUBLIC: 1.1, MOVE: 0.3, SIMULATION: 8.0} | ms
+    known = {PLAIN: 14.0, ONE_SHOT: 0.4, PUBLIC: 1.1, MOVE: 0.3, NEW: 2.0, SIMULATION: 8.0} | ms
     return {name: 1e-3 * each * spread for name, each in known.items()}
 
 
