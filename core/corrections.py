@@ -10,7 +10,7 @@ import numpy as np
 from core.acquisition import Pulse
 from core.capture import Capture
 from core.checks import require
-from core.inference.flux import detailed_flux_prior_of
+from core.inference.flux import detailed_flux_prior_of, flux_prior_over
 
 __all__ = ["CORRECTIONS", "moments_s", "without_correction"]
 
@@ -36,7 +36,10 @@ def without_correction(capture: Capture, correction: str) -> Capture:
     """
     require("correction", correction, correction in CORRECTIONS, " or ".join(CORRECTIONS))
     if correction == "pile_up":
-        return replace(capture, detection="all", flux_prior=None)
+        less = replace(capture, detection="all", flux_prior=None)
+        # Or the fewer photons late in the gate would be taken for a background that falls.
+        shape = detailed_flux_prior_of(capture).background_shape
+        return replace(less, flux_prior=flux_prior_over(less, shape))
     if correction == "pulse_shape":
         mean_s, sigma_s = moments_s(capture.pulse)
         # The time zero of a Gaussian is its centre, so the gate opens earlier after it.

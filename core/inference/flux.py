@@ -58,7 +58,17 @@ def flux_prior_of(capture: Capture) -> FluxPrior:
     """
     if capture.flux_prior is not None:
         return capture.flux_prior
-    found, n_pulses = detailed_flux_prior_of(capture), capture.gated_pulses
+    return _simplified(detailed_flux_prior_of(capture), capture)
+
+
+def flux_prior_over(capture: Capture, background_shape: Floats | None) -> FluxPrior:
+    """Estimate `flux_prior_of` over a background of known shape, uniform if None."""
+    return _simplified(_flux_prior(capture, background_shape)[0], capture)
+
+
+def _simplified(found: FluxPrior, capture: Capture) -> FluxPrior:
+    """Leave out of a detailed prior what the pulses of the capture do not resolve."""
+    n_pulses = capture.gated_pulses
     if n_pulses is not None:
         is_hidden = pile_up(capture.counts / n_pulses, n_pulses).is_hidden
         found = found._replace(pile_up=not is_hidden)
