@@ -716,7 +716,9 @@ def test_a_real_capture_is_ranged_inspected_and_its_reading_can_be_changed(page,
     inspect = new.get_by_role("button", name="Inspect", exact=True)
     expect(inspect).to_have_attribute("aria-pressed", "true")
     go(new, "Explore")
-    expect(new.get_by_text("Matched filter: the capture holds all photons")).to_be_visible()
+    expect(
+        new.get_by_text("Likelihood, fluxes estimated: the capture holds all photons")
+    ).to_be_visible()
     choose(new, "Method", "Dual-scale tracking differentiator")
     expect_the_building_at_21_km(new)
     go(new, "Inspect")

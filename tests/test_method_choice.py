@@ -94,12 +94,12 @@ def test_the_tracking_differentiator_has_its_own_part_where_it_is_shown(layout):
     assert [card.visible for card in explore.cards] == [True, True, True, False]
 
 
-def test_counted_photons_start_with_a_matched_filter_and_say_why(counted):
+def test_counted_photons_start_with_the_likelihood_and_say_why(counted):
     layout = HeldLayout({"file": file_source(counted)} | built_in_sources())
     assert layout.session.state.method == AUTOMATIC
-    assert layout.session.answer.method == "matched_filter"
+    assert layout.session.answer.method == "likelihood"
     note = layout.page.select(lambda each: "all photons" in str(getattr(each, "text", "")))
-    assert any("Matched filter" in each.text for each in note)
+    assert any("Likelihood, fluxes estimated" in each.text for each in note)
     assert "method" not in layout.session.query()
     control(layout, "Scene or capture").value = "car"
     assert layout.next_answer().method == "tracking"

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from core import ESTIMATORS, Capture
+from core.inference import flux_model_of
+
+_MOST_SBR = 0.2  # of the sweeps, but for that of the peak
 
 OTHERS = tuple(name for name in ESTIMATORS if name != "tracking")
 """All estimators but the tracking differentiator, whose settings the state holds by themselves."""
