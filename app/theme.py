@@ -93,6 +93,9 @@ WRAPPED = """
 """
 """Style of a horizontal legend inside a plot: rows no wider than the plot."""
 
+RAISED = ":host { padding-bottom: 7px !important; }"
+"""Style of a legend above a plot, which else touches the uppermost label of the axis."""
+
 STYLES: dict[str, dict[str, object]] = {
     # Transparent, so that the card's colour changes with the mode.
     "Plot": {

@@ -27,6 +27,16 @@ PLOTS = f"""() => {{
 """Places of the plots on screen, without the figure that holds the colour bar of Compare."""
 
 
+LEGENDS_FIT = f"""() => {{
+  {VIEWS}
+  const inside = ({{ model, plot_view }}) =>
+    model.type === "Legend" && plot_view.model.center.includes(model);
+  return views.filter(inside).every(({{ el, plot_view }}) =>
+    el.getBoundingClientRect().left >= plot_view.el.getBoundingClientRect().left);
+}}"""
+"""Whether legends inside plots are as narrow as these."""
+
+
 def expect_readable(page: Page, name: str) -> None:
     """Expect the page of this name with plots that can be read, in windows of all sizes."""
     button = page.get_by_role("button", name=name, exact=True)
@@ -39,7 +49,7 @@ def expect_readable(page: Page, name: str) -> None:
             plots = page.evaluate(PLOTS)
             inside = all(each["left"] >= 0 and each["right"] <= width for each in plots)
             least = min((each["height"] for each in plots), default=0)
-            return inside and least >= LEAST_HEIGHT_PX
+            return inside and least >= LEAST_HEIGHT_PX and page.evaluate(LEGENDS_FIT)
 
         eventually(fit)
         expect(page.get_by_role("button", name="Toggle theme")).to_be_in_viewport(ratio=1)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import json
 import math
 import re
 import weakref
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from bokeh.document import Document
 from bokeh.models import ColumnDataSource, Line, Range1d
 from bokeh.plotting import figure
 from playwright.sync_api import expect
+from tornado.websocket import WebSocketClosedError
 
 import app.server.patches
 from app.server.garbage import collect_all, freeze_all
@@ -24,6 +27,7 @@ from app.server.patches import OFF_VARIABLE, PATCHES, Patch, in_use
 from app.server.patches.default_values import cached
 from app.server.patches.outgoing_messages import INLINE_BYTES, QuickSerializer
 from app.server.patches.removed_models import PartialDeserializer
+from app.server.patches.whole_messages import send_whole
 from tests.browser import fact, open_page, serving
 from tests.latency import STOPWATCH, moves
 
@@ -109,6 +113,34 @@ def test_short_arrays_are_part_of_the_message():
     assert np.array_equal(Deserializer().decode(message), few)
     serializer.encode(many)
     assert [each.data.nbytes for each in serializer.buffers] == [many.nbytes]
+
+
+def test_a_page_that_closes_during_a_message_leaves_no_error():
+    parts = dict.fromkeys(("header_json", "metadata_json", "content_json"), "")
+    errors, message = [], SimpleNamespace(buffers=[], **parts)
+
+    class Closing:
+        """A connection that is closed once it is written to."""
+
+        parts = 0
+
+        def is_closing(self):
+            return self.parts > 0
+
+        def write_message(self, part, binary):
+            self.parts += 1
+            return asyncio.get_running_loop().create_task(self.fail())
+
+        async def fail(self):
+            raise WebSocketClosedError
+
+    async def send():
+        asyncio.get_running_loop().set_exception_handler(lambda _, found: errors.append(found))
+        await send_whole(SimpleNamespace(ws_connection=Closing()), message)
+        gc.collect()
+
+    asyncio.run(send())
+    assert not errors
 
 
 def test_a_default_is_computed_once_for_a_class(document):

@@ -15,7 +15,7 @@ from bokeh.models import ColorBar, CustomJS, Range1d
 from numpy.typing import ArrayLike
 
 from app.model.exports import Curve, Write, plot_file
-from app.theme import STYLES, WRAPPED, Palette
+from app.theme import RAISED, STYLES, WRAPPED, Palette
 from app.units import ShownGate
 
 
@@ -128,6 +128,8 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
     for legend in figure.legend:
         if legend in figure.center:
             legend.stylesheets = [WRAPPED]
+        elif legend in figure.above:
+            legend.stylesheets = [RAISED]
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
 
 

@@ -311,24 +311,26 @@ def _sbr_cell(sbr: Interval) -> Cell:
 
 
 def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
-    """Return the distance of each pin from the first one; empty for fewer than two.
+    """Return the distances of pins from the first one; empty for fewer than two.
 
-    There is none to a pin of less confidence than is shown.
+    Pins of less confidence than is shown are left out.
     """
     if len(found) < 2:
         return ""
-    least = viewing.least_confidence
-    answer = found[0].answer
+    answer, least = found[0].answer, viewing.least_confidence
+    pixels = [each.pixel for each in found]
+    names = [pixel_name((each.row, each.col), answer.grid) for each in pixels]
+    named = list(zip(names, pixels, strict=True))
+    left_out = " and ".join(name for name, pixel in named if pixel.confidence < least)
+    reason = f"confidence below {least:g} at {left_out}."
+    kept = [(name, pixel) for name, pixel in named if pixel.confidence >= least]
+    if len(kept) < 2:
+        return f"No distances: {reason}"
     shape = answer.capture.shape
     lines = sight_lines(shape, pixel_angle_of(answer.field_of_view_deg(viewing), shape[1]))
-    names = [pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
-    first, sentences = found[0].pixel, []
-    if first.confidence < least:
-        return f"No distances: the confidence of {names[0]} is below {least:g}."
-    for name, pixel in zip(names[1:], (each.pixel for each in found[1:]), strict=True):
-        if pixel.confidence < least:
-            sentences.append(f"none to {name}, whose confidence is below {least:g}")
-            continue
+    (origin, first), *others = kept
+    sentences = []
+    for name, pixel in others:
         ends_m = np.array([(p.interval_95_m.low, p.interval_95_m.high) for p in (first, pixel)])
         half_m = (ends_m[:, 1] - ends_m[:, 0]) / 2
         towards = [lines[p.row, p.col] for p in (first, pixel)]
@@ -336,8 +338,9 @@ def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
         known = math.isfinite(length_m)
         length = plus_minus(length_m - margin_m, length_m + margin_m, "m") if known else "not known"
         sentences.append(f"{length} to {name}")
+    without = f" Left out: {reason}" if left_out else ""
     guessed = f" {WIDTH_GUESSED}" if answer.is_width_guessed(viewing) else ""
-    return f"Distance from {names[0]}: {'; '.join(sentences)} (95 %).{guessed}"
+    return f"Distance from {origin}: {'; '.join(sentences)} (95 %).{without}{guessed}"
 
 
 def range_text(range_m: float, low_m: float, high_m: float) -> str:

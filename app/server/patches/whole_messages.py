@@ -22,7 +22,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 def apply() -> None:
     """Replace how a socket is opened and written to."""
     WSHandler.open = _without_delay(WSHandler.open)
-    WSHandler.send_message = _send_whole
+    WSHandler.send_message = send_whole
 
 
 def _without_delay(open_: Any) -> Any:
@@ -33,7 +33,8 @@ def _without_delay(open_: Any) -> Any:
     return open_now
 
 
-async def _send_whole(socket: WSHandler, message: Message[Any]) -> None:
+async def send_whole(socket: WSHandler, message: Message[Any]) -> None:
+    """Write all parts of a message; nothing happens if the page is closed."""
     parts: list[tuple[str | bytes, bool]] = [
         (message.header_json, False),
         (message.metadata_json, False),
@@ -41,7 +42,9 @@ async def _send_whole(socket: WSHandler, message: Message[Any]) -> None:
     ]
     for buffer in message.buffers:
         parts += [(json.dumps(buffer.ref), False), (buffer.to_bytes(), True)]
+    writes: list[Any] = []
     with suppress(WebSocketClosedError):  # the page is closed
-        await asyncio.gather(
-            *(WebSocketHandler.write_message(socket, part, binary) for part, binary in parts)
-        )
+        for part, binary in parts:
+            writes.append(WebSocketHandler.write_message(socket, part, binary))
+    with suppress(WebSocketClosedError):  # it was closed while these were sent
+        await asyncio.gather(*writes)
