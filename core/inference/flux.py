@@ -31,11 +31,13 @@ from core.trigger import rate_per_bin, trigger_probability
 
 _AT_ONCE = 2**19  # numbers that fit in the cache
 LEVELS = 12  # of signal, without "no echo"
-SAMPLE = 512  # pixels from which the fluxes are estimated
+SAMPLE = 512  # pixels from which the levels of signal are estimated
+DEPTH_SAMPLE = 1024  # pixels from which their shares and the distribution of delays are estimated
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
 _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _RARE = 1e-3  # levels with a smaller share are left out
+_TINY = 1e-30  # likelihood of a level relative to the likeliest, whose logarithm is finite
 
 
 @cached_per_capture
@@ -74,8 +76,8 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     total, chance = _totals(capture)
     flat = capture.cube.reshape(total.size, -1)
     # At random, since a regular step could miss columns.
-    drawn = np.random.default_rng(0).permutation(total.size)[:SAMPLE]
-    pixels, least = np.sort(drawn)[np.newaxis], _least_background(capture)
+    drawn = np.random.default_rng(0).permutation(total.size)[:DEPTH_SAMPLE]
+    pixels, least = np.sort(drawn[:SAMPLE])[np.newaxis], _least_background(capture)
     levels = _levels(flat[pixels[0]], capture)
     # Initially each level is the signal of all pixels.
     guess = FluxPrior(
@@ -89,13 +91,11 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     share = _shares(level_evidence(prepare(capture, flat[pixels], flux, 1)))
     mean = np.asarray(share @ levels)
     variance = float(share @ (levels - mean) ** 2)
-    kept = share > _RARE
-    kept[0] = True
-    if not kept[1:].any():  # echoes so rare that the sample has none
-        kept[-1], share[-1] = True, _RARE
+    kept = _kept(share)
+    levels, share = _halved(levels[kept], share[kept] / share[kept].sum())
     found = guess._replace(
-        levels=levels[kept],
-        share=share[kept] / share[kept].sum(),
+        levels=levels,
+        share=share,
         background=total.mean() - mean,
         own_weight=_own_weight(total, chance + variance),
     )
@@ -104,9 +104,15 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     most = sampled_numbers(found.share.size, flat.shape[1]) // each
     pixels = np.sort(drawn[:most])[np.newaxis]
     flux = found.model(total.ravel()[pixels], least)
-    prepared = prepare(capture, flat[pixels], flux, 1)
-    share, depth = shares_and_depths(level_densities(prepared), found.share)
-    found = found._replace(share=share, depth=depth)
+    density = level_densities(prepare(capture, flat[pixels], flux, 1))
+    share, depth = shares_and_depths(density, found.share)
+    # Given the delays, and one background for all levels, faint levels are less plausible.
+    share = _shares(np.log(np.maximum(density @ depth.astype(np.float32), _TINY)))
+    levels, share = _joined(found.levels, share)
+    kept = _kept(share)
+    levels, share = levels[kept], share[kept] / share[kept].sum()
+    background = np.asarray(total.mean() - share @ levels)
+    found = found._replace(levels=levels, share=share, depth=depth, background=background)
     return found._replace(contrast=found.model(total, least).contrast)
 
 
@@ -241,10 +247,40 @@ def _strongest(pixels: NDArray[np.unsignedinteger], capture: Capture) -> float:
     return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.gated_pulses or 1))
 
 
+def _halved(levels: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Replace each level, except no echo, by two, which together form a grid of half the spacing.
+
+    The mean of a coarse grid of levels is biased: the signal of an image lies between two of them.
+    """
+    quarter = LEVEL_SPAN ** (0.25 / (LEVELS - 1))
+    pairs = levels[1:, np.newaxis] * [1 / quarter, quarter]
+    return np.append(0.0, pairs), np.append(share[0], np.repeat(share[1:] / 2, 2))
+
+
+def _joined(levels: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Join pairs of levels from `_halved` in their means."""
+    shares = share[1:].reshape(-1, 2)
+    weights = np.maximum(shares, np.finfo(float).tiny)
+    pairs = levels[1:].reshape(-1, 2)
+    return np.append(0.0, np.average(pairs, 1, weights)), np.append(share[0], shares.sum(axis=1))
+
+
+def _kept(share: Floats) -> NDArray[np.bool_]:
+    """Return which levels to keep: no echo and others that are not rare, or else the strongest.
+
+    If echoes are so rare that the sample has none, the strongest level gets a share.
+    """
+    kept = share > _RARE
+    kept[0] = True
+    if not kept[1:].any():
+        kept[-1], share[-1] = True, _RARE
+    return kept
+
+
 def _shares(evidence: Floats) -> Floats:
     """Estimate the shares of levels from the evidence (pixel, level), in logarithms.
 
-    One additional pixel counts as having no echo, so that its share is never 0. The faintest levels
+    A tenth of an additional pixel has no echo, so that its share is never 0. The faintest levels
     cannot be distinguished from no echo; they are merged with it as long as the likelihood
     decreases little.
     """
@@ -268,7 +304,7 @@ def shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Floa
 
     The first level, no echo, has the same density at all delays. There are too few pixels for an
     independent share of each bin: delays start uniform, take few steps, are smoothed in each, and
-    keep a uniform part.
+    keep a uniform part, as large as the pixels require.
     """
     n_bins = density.shape[2]
     share, depth = share.copy(), np.full(n_bins, 1 / n_bins)
