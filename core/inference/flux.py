@@ -183,16 +183,16 @@ def _least_background(capture: Capture) -> float:
 def _totals(capture: Capture) -> tuple[Floats, float]:
     """Total rate of each pixel (row, col), and the mean variance due to chance.
 
-    With M pulses sent, Coates' rates add up to ``ln(M / (M - Σ n))`` over the gate, and Greenwood's
-    variances to ``1 / (M - Σ n) - 1 / M``. The mean of the logarithm is biased by half its
-    variance, which is subtracted.
+    If u of M pulses do not fire, Coates' rates add up to ``ln(M / u)`` over the gate,
+    and Greenwood's variances to ``1 / u - 1 / M``. The mean of the logarithm is biased; that of
+    ``ln((M + 1/2) / (u + 1/2))`` much less (Anscombe 1956), also with few pulses.
     """
     n_pulses = capture.gated_pulses
     if n_pulses is None:
         return capture.counts.astype(float), float(capture.counts.mean())  # Poisson
-    unfired = np.maximum(n_pulses - capture.counts, 0.5)
-    variance = 1 / unfired - 1 / n_pulses
-    total = np.log(n_pulses / unfired) - variance / 2
+    unfired = np.maximum(n_pulses - capture.counts, 0)
+    variance = 1 / np.maximum(unfired, 0.5) - 1 / n_pulses
+    total = np.log((n_pulses + 0.5) / (unfired + 0.5))
     spent = capture.counts > n_pulses - _TOO_FEW
     if spent.any():
         total[spent] = np.maximum(total[spent], _background_of(capture.cube[spent], n_pulses))
