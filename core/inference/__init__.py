@@ -1,4 +1,4 @@
-"""Inference from photon counts: signal and background fluxes, posterior, physical limits."""
+"""Inference from photon counts: signal and background fluxes, posterior, limits of a pixel."""
 
 from core.inference.fit import Fit, fit_in, fit_of, fit_p_values
 from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_prior_of
