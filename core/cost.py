@@ -17,7 +17,7 @@ import psutil
 
 from core.capture import Capture
 from core.checks import require
-from core.inference.flux import LEVELS, SAMPLE
+from core.inference.flux import DEPTH_SAMPLE, LEVELS, SAMPLE
 from core.inference.likelihood import lanes_of, sampled_numbers
 from core.inference.posterior import has_posterior
 from core.kernels.blocks import LANES
@@ -139,7 +139,8 @@ def predicted(
     if not posterior_is_cached:
         learned = min(sampled_numbers(levels, n_bins), n_sampled * levels * n_bins)
         table = 4 * lanes * levels * n_bins * min(1.0, n_pixels / 4)
-        n_bytes += 4 * n_counts + max(table, 4 * learned + _SAMPLE_COUNT_BYTES * n_sampled * n_bins)
+        sampled = _SAMPLE_COUNT_BYTES * min(n_pixels, DEPTH_SAMPLE) * n_bins
+        n_bytes += 4 * n_counts + max(table, 4 * learned + sampled)
         seconds += _LEARNED_S * learned
         seconds += (entry_s + _LANE_S / lanes) * n_bins * levels * _filled(n_sampled, lanes)
         seconds += (entry_s + _LANE_S / lanes) * n_bins * _USUAL_LEVELS * _filled(n_pixels, lanes)

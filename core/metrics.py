@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -263,6 +263,16 @@ class ReliabilityBin:
     right: Interval
     """Share within 3 bins of a surface."""
     count: int
+
+    @property
+    def tenth(self) -> int:
+        """Index of the tenth, 0 to 9."""
+        return min(int(self.confidence * 10), 9)
+
+    @property
+    def gap(self) -> Interval:
+        """Share of right estimates minus mean confidence; positive if confidence is too low."""
+        return Interval(*(each - self.confidence for each in astuple(self.right)))
 
 
 # Deprecated names, to be removed after the next release.

@@ -183,7 +183,7 @@ def test_nothing_is_computed_before_the_page_is_seen(stage):
     stage.page.show(True)
     stage.settle()
     titles = [ESTIMATORS[m].title for m in ESTIMATORS if m in FIRST_METHODS]
-    assert list(stage.figures) == [*titles, "Physical limit"]
+    assert list(stage.figures) == [*titles, "Single-pixel limit"]
     assert stage.page.status.text == "5 methods compared"
 
 
@@ -242,7 +242,7 @@ def test_another_capture_makes_everything_outdated(shown):
     change(shown.session, light=Illumination(seed=5))
     shown.settle()
     changed = {name for name in before if shown.figures[name] != before[name]}
-    assert changed == before.keys() - {"Physical limit"}  # of the same scene with the same flux
+    assert changed == before.keys() - {"Single-pixel limit"}  # of the same scene with the same flux
 
 
 def test_cancel_stops_before_the_next_method_and_resumes(stage):
@@ -300,7 +300,7 @@ def test_a_file_has_no_oracle_no_limit_and_no_errors(stage):
     stage.page.show(True)
     stage.settle()
     assert "true signal" in stage.messages[ESTIMATORS["oracle"].title]
-    assert stage.messages["Physical limit"] == text.LIMIT_UNKNOWN
+    assert stage.messages["Single-pixel limit"] == text.LIMIT_UNKNOWN
     assert "Error" not in stage.page.kind.options
     assert text.AGREEMENT_ONLY in stage.page.remarks.text
     sentences = text.remarks(stage.session.answer.capture, 1, 1).split(". ")
@@ -387,7 +387,7 @@ def save_pictures_and_table(here):
     np.testing.assert_array_equal(np.load(BytesIO(arrays))["range_m"], peak.range_m)
     name, table = download(here, "table", "csv")
     assert name == "car_methods.csv"
-    assert b"Physical limit" in table
+    assert b"Single-pixel limit" in table
 
 
 def choose_the_pixel_of_all(here):
@@ -430,7 +430,7 @@ def sort_by_click_and_by_key(here):
     here.keyboard.press("Enter")
     expect(here.locator("th[aria-sort=ascending]")).to_have_text("Within 3 bins")
     expect(first_row(here)).to_contain_text("Peak of the histogram")
-    expect(here.locator("tbody").last).to_contain_text("Physical limit")
+    expect(here.locator("tbody").last).to_contain_text("Single-pixel limit")
 
 
 def compare_the_methods(here):

@@ -333,7 +333,7 @@ def test_a_limit_that_fails_is_reported_and_not_called_unknown(monkeypatch, sess
     raised = breaking(monkeypatch, "app.pages.compare.page.reference_of")
     raised[:] = ERRORS[2:]
     compare.show(True)
-    limit = "Physical limit"
+    limit = "Single-pixel limit"
     session.tasks.run_until(lambda: messages(compare)[limit] not in ("", model_text.NOT_COMPUTED))
     check_sentence(messages(compare)[limit], raised[0])
     raised.clear()

@@ -29,14 +29,15 @@ def default_settings() -> Mapping[str, Any]:
 def suitable_method(capture: Capture) -> str:
     """Return the estimator to begin with: the paper's, unless all photons were counted.
 
-    Then a matched filter finds more surfaces; the likelihood needs a better guess of the pulse.
+    Then the likelihood finds more surfaces, and ranges them below a bin.
     """
-    return "matched_filter" if capture.detection == "all" else "tracking"
+    return "likelihood" if capture.detection == "all" else "tracking"
 
 
 def doubts_hold(capture: Capture) -> bool:
     """Return whether doubtful settings are those of this kind of data.
 
-    They were measured on simulated first photons (`python -m core stability`).
+    They were measured on simulated first photons in daylight (`python -m core stability`). In a
+    capture without much background, other settings find the echoes, too.
     """
-    return capture.detection == "first"
+    return capture.detection == "first" and flux_model_of(capture).contrast <= _MOST_SBR

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from core.cli.options import add_processes, show_progress, whole_from_to
 from core.cli.results import CheckFailed, add_results, publish
 from core.io.readers import read_capture
 from core.studies.methods import alarms, calibration, field, fit, tuning, uniform
-from core.studies.outputs import as_markdown
+from core.studies.outputs import Table, as_markdown
 from core.studies.paper import figures as paper
 from core.studies.paper import page, recommend
 from core.studies.paper.printed import TABLE_2
@@ -138,15 +138,15 @@ def _tuning(chosen: argparse.Namespace) -> None:
 
 def _calibration(chosen: argparse.Namespace) -> None:
     seeds, counted = range(chosen.seeds), list[alarms.Alarms]()
-    tables = {
-        "confidence": lambda: calibration.calibration_table(seeds),
-        "ranges": lambda: calibration.coverage_table(seeds, chosen.processes),
-        "fluxes": lambda: calibration.flux_table(chosen.captures, chosen.processes),
-        "alarms": lambda: alarms.alarms_table(counted),
+    tables: dict[str, Callable[[], Iterable[Table]]] = {
+        "confidence": lambda: calibration.calibration_tables(seeds),
+        "ranges": lambda: [calibration.coverage_table(seeds, chosen.processes)],
+        "fluxes": lambda: [calibration.flux_table(chosen.captures, chosen.processes)],
+        "alarms": lambda: [alarms.alarms_table(counted)],
     }
     if "alarms" in chosen.only:
         counted = list(alarms.outcomes(chosen.captures, chosen.processes))
-    publish((tables[name]() for name in chosen.only), chosen)
+    publish((each for name in chosen.only for each in tables[name]()), chosen)
     if wrong := [f"{x.background}, {x.method}, {x.asked:g}" for x in counted if not x.holds]:
         raise CheckFailed(f"False alarms differ from those asked for: {'; '.join(wrong)}.")
 

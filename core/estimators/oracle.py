@@ -1,7 +1,7 @@
-"""The exact first-photon likelihood with true fluxes: a bound for methods that do not know them.
+"""The exact first-photon likelihood with true fluxes.
 
-It is the limit of a single pixel for the figure of its rule (`core.estimators.likelihood`), if the
-delays are uniform over the gate.
+It bounds the figure of its rule (`core.estimators.likelihood`) for methods that look at single
+pixels, if the delays are uniform over the gate.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Inference from photon counts: signal and background fluxes, posterior, physical limits."""
+"""Inference from photon counts: signal and background fluxes, posterior, limits of a pixel."""
 
 from core.inference.fit import (
     SMALL,

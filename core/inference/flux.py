@@ -33,13 +33,15 @@ from core.trigger import rate_per_bin, trigger_probability
 
 _AT_ONCE = 2**19  # numbers that fit in the cache
 LEVELS = 12  # of signal, without "no echo"
-SAMPLE = 512  # pixels from which the fluxes are estimated
+SAMPLE = 512  # pixels from which the levels of signal are estimated
+DEPTH_SAMPLE = 1024  # pixels from which their shares and the distribution of delays are estimated
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
 _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
 _RARE = 1e-3  # levels with a smaller share are left out
+_TINY = 1e-30  # likelihood of a level relative to the likeliest, whose logarithm is finite
 
 
 @cached_per_capture
@@ -126,8 +128,8 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     total, chance = _totals(capture)
     flat = capture.cube.reshape(total.size, -1)
     # At random, since a regular step could miss columns.
-    drawn = np.random.default_rng(0).permutation(total.size)[:SAMPLE]
-    pixels, least = np.sort(drawn)[np.newaxis], _least_background(capture)
+    drawn = np.random.default_rng(0).permutation(total.size)[:DEPTH_SAMPLE]
+    pixels, least = np.sort(drawn[:SAMPLE])[np.newaxis], _least_background(capture)
     levels = _levels(flat[pixels[0]], capture, shape)
     # Initially each level is the signal of all pixels.
     guess = FluxPrior(
@@ -142,13 +144,11 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     share = _shares(level_evidence(prepare(capture, flat[pixels], flux, 1)))
     mean = np.asarray(share @ levels)
     variance = float(share @ (levels - mean) ** 2)
-    kept = share > _RARE
-    kept[0] = True
-    if not kept[1:].any():  # echoes so rare that the sample has none
-        kept[-1], share[-1] = True, _RARE
+    kept = _kept(share)
+    levels, share = _halved(levels[kept], share[kept] / share[kept].sum())
     found = guess._replace(
-        levels=levels[kept],
-        share=share[kept] / share[kept].sum(),
+        levels=levels,
+        share=share,
         background=total.mean() - mean,
         own_weight=_own_weight(total, chance + variance),
     )
@@ -159,8 +159,15 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     flux = found.model(total.ravel()[pixels], least)
     density = level_densities(prepare(capture, flat[pixels], flux, 1))
     share, depth = shares_and_depths(density, found.share)
+    # Given the delays, and one background for all levels, faint levels are less plausible.
+    evidence = np.log(np.maximum(density @ depth.astype(np.float32), _TINY))
     found = found._replace(share=share, depth=depth)
     better_shape = _background_shape(capture, found, pixels[0], density)
+    levels, share = _joined(found.levels, _shares(evidence))
+    kept = _kept(share)
+    levels, share = levels[kept], share[kept] / share[kept].sum()
+    background = np.asarray(total.mean() - share @ levels)
+    found = found._replace(levels=levels, share=share, background=background)
     return found._replace(contrast=found.model(total, least).contrast), better_shape
 
 
@@ -234,16 +241,16 @@ def _least_background(capture: Capture) -> float:
 def _totals(capture: Capture) -> tuple[Floats, float]:
     """Total rate of each pixel (row, col), and the mean variance due to chance.
 
-    With M pulses sent, Coates' rates add up to ``ln(M / (M - Σ n))`` over the gate, and Greenwood's
-    variances to ``1 / (M - Σ n) - 1 / M``. The mean of the logarithm is biased by half its
-    variance, which is subtracted.
+    If u of M pulses do not fire, Coates' rates add up to ``ln(M / u)`` over the gate,
+    and Greenwood's variances to ``1 / u - 1 / M``. The mean of the logarithm is biased; that of
+    ``ln((M + 1/2) / (u + 1/2))`` much less (Anscombe 1956), also with few pulses.
     """
     n_pulses = capture.gated_pulses
     if n_pulses is None:
         return capture.counts.astype(float), float(capture.counts.mean())  # Poisson
-    unfired = np.maximum(n_pulses - capture.counts, 0.5)
-    variance = 1 / unfired - 1 / n_pulses
-    total = np.log(n_pulses / unfired) - variance / 2
+    unfired = np.maximum(n_pulses - capture.counts, 0)
+    variance = 1 / np.maximum(unfired, 0.5) - 1 / n_pulses
+    total = np.log((n_pulses + 0.5) / (unfired + 0.5))
     spent = capture.counts > n_pulses - _TOO_FEW
     if spent.any():
         total[spent] = np.maximum(total[spent], _background_of(capture.cube[spent], n_pulses))
@@ -302,10 +309,40 @@ def _strongest(
     return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.gated_pulses or 1))
 
 
+def _halved(levels: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Replace each level, except no echo, by two, which together form a grid of half the spacing.
+
+    The mean of a coarse grid of levels is biased: the signal of an image lies between two of them.
+    """
+    quarter = LEVEL_SPAN ** (0.25 / (LEVELS - 1))
+    pairs = levels[1:, np.newaxis] * [1 / quarter, quarter]
+    return np.append(0.0, pairs), np.append(share[0], np.repeat(share[1:] / 2, 2))
+
+
+def _joined(levels: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Join pairs of levels from `_halved` in their means."""
+    shares = share[1:].reshape(-1, 2)
+    weights = np.maximum(shares, np.finfo(float).tiny)
+    pairs = levels[1:].reshape(-1, 2)
+    return np.append(0.0, np.average(pairs, 1, weights)), np.append(share[0], shares.sum(axis=1))
+
+
+def _kept(share: Floats) -> NDArray[np.bool_]:
+    """Return which levels to keep: no echo and others that are not rare, or else the strongest.
+
+    If echoes are so rare that the sample has none, the strongest level gets a share.
+    """
+    kept = share > _RARE
+    kept[0] = True
+    if not kept[1:].any():
+        kept[-1], share[-1] = True, _RARE
+    return kept
+
+
 def _shares(evidence: Floats) -> Floats:
     """Estimate the shares of levels from the evidence (pixel, level), in logarithms.
 
-    One additional pixel counts as having no echo, so that its share is never 0. The faintest levels
+    A tenth of an additional pixel has no echo, so that its share is never 0. The faintest levels
     cannot be distinguished from no echo; they are merged with it as long as the likelihood
     decreases little.
     """
@@ -329,7 +366,7 @@ def shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Floa
 
     The first level, no echo, has the same density at all delays. There are too few pixels for an
     independent share of each bin: delays start uniform, take few steps, are smoothed in each, and
-    keep a uniform part.
+    keep a uniform part, as large as the pixels require.
     """
     n_bins = density.shape[2]
     share, depth = share.copy(), np.full(n_bins, 1 / n_bins)

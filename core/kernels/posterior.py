@@ -13,8 +13,8 @@ from core.kernels.parallel import COMPILED, PARALLEL, SUMMING
 
 _STEPS = 100  # of expectation and maximisation
 _DEPTH_STEPS = 30
-UNIFORM_SHARE = 0.1
-"""Share of the surfaces whose delay is taken as uniform over the gate."""
+_DARK_PIXELS = 0.1  # additional pixels without an echo, so that their share is never 0
+_UNIFORM_SHARE = 0.1  # initial share of the surfaces with a delay that is uniform over the gate
 
 _SMOOTHING_BINS = 2.0
 _SMOOTHING = np.exp(-0.5 * (np.arange(-8, 9) / _SMOOTHING_BINS) ** 2)  # to four sigmas
@@ -30,7 +30,7 @@ def learn_shares(likelihood, share):  # type: ignore[no-untyped-def]
     n_pixels, n_levels = likelihood.shape
     for _ in range(_STEPS):
         found = np.zeros(n_levels)
-        found[0] = 1.0
+        found[0] = _DARK_PIXELS
         for pixel in range(n_pixels):
             mixture = 0.0
             for level in range(n_levels):
@@ -38,18 +38,23 @@ def learn_shares(likelihood, share):  # type: ignore[no-untyped-def]
             for level in range(n_levels):
                 found[level] += share[level] * likelihood[pixel, level] / mixture
         for level in range(n_levels):
-            share[level] = found[level] / (n_pixels + 1)
+            share[level] = found[level] / (n_pixels + _DARK_PIXELS)
 
 
 @njit(**SUMMING)
 def learn_shares_and_depths(density, share, depth):  # type: ignore[no-untyped-def]
-    """Estimate the shares of levels and the probabilities of delays likewise, in place."""
+    """Estimate the shares of levels and the probabilities of delays likewise, in place.
+
+    Some delays are uniform over the gate, the others distributed smoothly. The share of the uniform
+    ones is estimated, too; one additional surface counts as uniform, so that it is never 0.
+    """
     n_pixels, n_levels, n_bins = density.shape
-    mass = np.empty(n_levels)
+    mass, some = np.empty(n_levels), depth.copy()
+    uniform = _UNIFORM_SHARE
     for _ in range(_DEPTH_STEPS):
         likely = depth.astype(np.float32)
         found, reweighted = np.zeros(n_levels), np.zeros(n_bins, np.float32)
-        found[0] = 1.0
+        found[0] = _DARK_PIXELS
         for pixel in range(n_pixels):
             mass[0] = share[0] * density[pixel, 0, 0]
             for level in range(1, n_levels):
@@ -65,13 +70,19 @@ def learn_shares_and_depths(density, share, depth):  # type: ignore[no-untyped-d
                 for k in range(n_bins):
                     reweighted[k] += weight * density[pixel, level, k]
         for level in range(n_levels):
-            share[level] = max(found[level] / (n_pixels + 1), 1e-12)  # never 0
-        smooth = smoothed(depth * reweighted)
+            share[level] = max(found[level] / (n_pixels + _DARK_PIXELS), 1e-12)  # never 0
+        surfaces, anywhere = 0.0, 0.0
+        for k in range(n_bins):
+            surfaces += depth[k] * reweighted[k]
+            anywhere += uniform / n_bins * reweighted[k]
+        smooth = smoothed(some * reweighted)
         whole = smooth.sum()
         if whole == 0:  # certainly no pixel has an echo
             break
+        uniform = (anywhere + 1) / (surfaces + 1)
         for k in range(n_bins):
-            depth[k] = (1 - UNIFORM_SHARE) * smooth[k] / whole + UNIFORM_SHARE / n_bins
+            some[k] = smooth[k] / whole
+            depth[k] = (1 - uniform) * some[k] + uniform / n_bins
 
 
 @njit(**COMPILED)

@@ -7,7 +7,7 @@ import math
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -50,6 +50,7 @@ class Condition:
     signal: float = 0.1041
     depths_bin: tuple[float, float] = (20.0, 94.0)
     """Bins between which the depths of the scene ``uniform`` lie; no other scene uses them."""
+    n_pulses: int = 1000
 
     def capture(self, seed: int) -> Capture:
         """Simulate one capture."""
@@ -57,7 +58,8 @@ class Condition:
         if self.scene == "uniform":
             drawn["first_bin"], drawn["last_bin"] = self.depths_bin
         scene = scenes[self.scene](**drawn)
-        return simulate(scene, scene.acquisition, Flux(self.signal, self.sbr), seed=seed)
+        acquisition = replace(scene.acquisition, n_pulses=self.n_pulses)
+        return simulate(scene, acquisition, Flux(self.signal, self.sbr), seed=seed)
 
 
 @dataclass(frozen=True)

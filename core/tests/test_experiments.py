@@ -408,14 +408,19 @@ def test_scatter_plots_and_bands_are_written_with_their_intervals(tmp_path: Path
 
 
 def test_confidence_is_calibrated_over_the_six_sbrs() -> None:
-    found = list(calibration.reports(range(1)))
-    overall = [r for r in found if r.sbr is None and r.method in ("likelihood", "tracking")]
+    conditions = [Condition(scene, sbr) for scene in ("uniform", "car") for sbr in TABLE_2]
+    found = list(calibration.reports(range(1), conditions))
+    overall = [r for r in found if r.condition is None and r.method in ("likelihood", "tracking")]
     assert len(overall) == 4
     for report in overall:
         assert report.error <= 0.03, report
     for report in found:
         # At a single SBR all pixels share the error of one flux estimate.
         assert report.error <= 0.06, report
+        # So does each tenth of confidence, in addition to chance.
+        gaps = [each.gap for each in report.tenths if each.count >= calibration.LEAST_COUNT]
+        assert all(gap.low <= 0.05 and gap.high >= -0.05 for gap in gaps), report
+        assert report.widest is None or report.widest.gap in gaps
     capture = Capture(np.ones((2, 2, 9), np.uint16), Acquisition(n_bins=9))
     with pytest.raises(ValueError, match="truth_range_m = None is not accepted"):
         calibration.confidence_and_right(capture, estimate(capture, "peak"))

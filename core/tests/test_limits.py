@@ -130,11 +130,12 @@ def test_right_place_where_it_is_likely(sbr: float, published: float | None) -> 
 @pytest.mark.parametrize(
     ("n_pulses", "sbr", "too_high"),
     [
-        (1000, 0.03, 0.055),
-        (1000, 0.02, 0.055),
+        (1000, 0.03, 0.015),
+        (1000, 0.02, 0.015),
+        (300, 0.06, 0.015),
         (100, 1.0, 0.01),
-        (100, 0.06, 0.09),
-        (30, 0.1, 0.12),
+        (100, 0.06, 0.07),
+        (30, 0.1, 0.1),
     ],
 )
 def test_right_place_is_no_worse_than_it_says(n_pulses: int, sbr: float, too_high: float) -> None:
@@ -207,7 +208,7 @@ def test_many_pixels_are_interpolated_to_what_each_has_alone(one_signal: bool) -
     many = right_bin_probability(onset, signal, 2.0, Pulse(), GATE)
     some = (slice(None), slice(0, 3))
     each = right_bin_probability(onset[some], signal[some], 2.0, Pulse(), GATE)
-    np.testing.assert_allclose(many[some], each, rtol=0, atol=0.002 if one_signal else 0.01)
+    np.testing.assert_allclose(many[some], each, rtol=0, atol=0.003 if one_signal else 0.01)
 
 
 def test_limits_of_a_capture() -> None:

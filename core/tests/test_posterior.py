@@ -501,14 +501,19 @@ def any_densities(n_levels: int, n_bins: int) -> np.ndarray:
 @pytest.mark.parametrize("n_bins", [1, 7, 40])
 def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None:
     density, initial = any_densities(n_levels, n_bins), np.full(n_levels, 1 / n_levels)
-    share, depth = initial, np.full(n_bins, 1 / n_bins)
+    share, uniform, learned = initial, 0.1, np.full(n_bins, 1 / n_bins)
+    depth = learned
     for _ in range(30):
         joint = density * share[:, np.newaxis] * depth
         joint /= joint.sum(axis=(1, 2), keepdims=True)
-        share = (np.eye(n_levels)[0] + joint.sum(axis=(0, 2))) / (len(density) + 1)
+        share = (0.1 * np.eye(n_levels)[0] + joint.sum(axis=(0, 2))) / (len(density) + 0.1)
         share = np.maximum(share, 1e-12)
-        learned = ndimage.gaussian_filter1d(joint[:, 1:].sum(axis=(0, 1)), 2.0, mode="nearest")
-        depth = 0.9 * learned / learned.sum() + 0.1 / n_bins
+        echoes = joint[:, 1:].sum(axis=(0, 1))
+        anywhere = (echoes * uniform / n_bins / depth).sum()
+        learned = ndimage.gaussian_filter1d(echoes * learned / depth, 2.0, mode="nearest")
+        learned /= learned.sum()
+        uniform = (anywhere + 1) / (echoes.sum() + 1)
+        depth = (1 - uniform) * learned + uniform / n_bins
     found = shares_and_depths(density, initial)
     np.testing.assert_allclose(found[0], share, rtol=1e-4)
     np.testing.assert_allclose(found[1], depth * n_bins, rtol=1e-4)
@@ -529,7 +534,7 @@ def test_shares_are_the_equations() -> None:
     for _ in range(100):
         joint = np.exp(evidence) * share
         joint /= joint.sum(axis=1, keepdims=True)
-        share = (np.eye(5)[0] + joint.sum(axis=0)) / (len(evidence) + 1)
+        share = (0.1 * np.eye(5)[0] + joint.sum(axis=0)) / (len(evidence) + 0.1)
     learned = np.full(5, 0.2)
     learn_shares(np.exp(evidence), learned)
     np.testing.assert_allclose(learned, share, rtol=1e-9)

@@ -69,7 +69,7 @@ class Reference:
     """Reference that methods are compared with, besides the truth."""
 
     limit: limits.Limit | None
-    """The physical limit; None where truth, flux or number of pulses is not known."""
+    """The single-pixel limit; None where truth, flux or number of pulses is not known."""
     likelihood: RangeImage | None
     """The likelihood's confident estimates, for captures without truth."""
     failure: str = ""

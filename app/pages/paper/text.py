@@ -46,8 +46,8 @@ Estimated range images. Tap an image, or choose a row and a column, to compare a
 them.
 """
 NOT_REPORTED = """
-What each method estimates without an echo, how its accuracy depends on the echo's bin, the physical
-limit, and statements of the paper that its own tables contradict.
+What each method estimates without an echo, how its accuracy depends on the echo's bin, the limit
+of a single pixel, and statements of the paper that its own tables contradict.
 """
 READING_TRIALS = (
     "Below each number: its 95 % interval. Difference: computed here minus printed, marked as "

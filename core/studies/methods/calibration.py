@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
-from typing import get_args
+from itertools import groupby, product
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,22 @@ from core.studies.trials import Condition, mapped
 from core.trigger import draw_counts, rate_per_bin
 
 METHODS = ("likelihood", "tracking", "coates", "peak")
-SCENES = ("uniform", "car")
+
+_FEW_PULSES = 100
+CONDITIONS = tuple(
+    condition
+    for scene in ("uniform", "car", "building", "staircase")
+    for condition in (
+        *(Condition(scene, sbr) for sbr in TABLE_2),
+        Condition(scene, 0.1, signal=0.3, n_pulses=_FEW_PULSES),
+        Condition(scene, 0.3, signal=0.3, n_pulses=30),
+        Condition(scene, 1.0, signal=1.0, n_pulses=10),
+    )
+)
+"""What confidences are measured under, by scene."""
+
+LEAST_COUNT = 200
+"""Estimates in a tenth of confidence whose gap is judged."""
 
 LEVELS = (0.68, 0.95)
 """Levels of the intervals whose coverage is measured."""
@@ -50,10 +66,10 @@ def confidence_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, N
 
 @dataclass(frozen=True)
 class Report:
-    """One method on one scene at one SBR, or at all of them (``sbr`` is None)."""
+    """One method under one condition, or under all of a scene's in `CONDITIONS` (None)."""
 
     scene: str
-    sbr: float | None
+    condition: Condition | None
     method: str
     tenths: list[ReliabilityBin]
     """Estimates by tenths of confidence, from `core.metrics.reliability`."""
@@ -63,20 +79,30 @@ class Report:
         """Expected calibration error."""
         return calibration_error(self.tenths)
 
+    @property
+    def count(self) -> int:
+        """Number of estimates."""
+        return sum(each.count for each in self.tenths)
 
-def reports(seeds: Sequence[int]) -> Iterator[Report]:
-    """Yield a report per scene, SBR and method, and last of each scene one over all SBRs."""
-    for scene in SCENES:
-        found: dict[tuple[float, str], tuple[Floats, NDArray[np.bool_]]] = {}
-        for sbr in TABLE_2:
-            captures = [Condition(scene, sbr).capture(seed) for seed in seeds]
+    @property
+    def widest(self) -> ReliabilityBin | None:
+        """The tenth with the largest gap, of those with at least `LEAST_COUNT` estimates."""
+        full = [each for each in self.tenths if each.count >= LEAST_COUNT]
+        return max(full, key=lambda each: abs(each.gap.value), default=None)
+
+
+def reports(seeds: Sequence[int], conditions: Sequence[Condition] = CONDITIONS) -> Iterator[Report]:
+    """Yield a report per condition and method, and last of each scene one over all conditions."""
+    for scene, group in groupby(conditions, lambda condition: condition.scene):
+        found: dict[str, list[tuple[Floats, NDArray[np.bool_]]]] = {name: [] for name in METHODS}
+        for condition in group:
+            captures = [condition.capture(seed) for seed in seeds]
             for method in METHODS:
                 pairs = [confidence_and_right(c, estimate(c, method)) for c in captures]
-                found[sbr, method] = _joined(pairs)
-                yield Report(scene, sbr, method, reliability(*found[sbr, method]))
+                found[method].append(_joined(pairs))
+                yield Report(scene, condition, method, reliability(*found[method][-1]))
         for method in METHODS:
-            pooled = _joined([found[sbr, method] for sbr in TABLE_2])
-            yield Report(scene, None, method, reliability(*pooled))
+            yield Report(scene, None, method, reliability(*_joined(found[method])))
 
 
 def _joined(
@@ -86,21 +112,44 @@ def _joined(
     return confidence, right
 
 
-def calibration_table(seeds: Sequence[int]) -> Table:
-    """Return calibration error and share of right estimates by confidence of each report."""
-    return table(
+def calibration_tables(seeds: Sequence[int]) -> Iterator[Table]:
+    """Yield calibration error and largest gap of each report, and the gaps of all tenths."""
+    found = list(reports(seeds))
+    named: dict[str, Callable[[Report], Any]] = {
+        "scene": lambda report: report.scene,
+        "pulses": lambda report: report.condition.n_pulses if report.condition else "all",
+        "SBR": lambda report: f"{report.condition.sbr:g}" if report.condition else "all",
+        "method": lambda report: report.method,
+    }
+    yield table(
         "calibration",
         "Calibration of confidence",
-        reports(seeds),
-        {
-            "scene": lambda report: report.scene,
-            "SBR": lambda report: "all six" if report.sbr is None else f"{report.sbr:g}",
-            "method": lambda report: report.method,
+        found,
+        named
+        | {
+            "estimates": lambda report: report.count,
             "calibration error": lambda report: report.error,
-            "confidence: share right (estimates)": lambda report: ", ".join(
-                f"{t.confidence:.2f}: {t.right.value:.2f} ({t.count})" for t in report.tenths
-            ),
+            "largest gap": lambda report: report.widest.gap if report.widest else math.nan,
+            "at confidence": lambda report: report.widest.confidence if report.widest else math.nan,
         },
+        note="Gap: share of right estimates minus mean confidence, in a tenth of confidence. The "
+        f"largest is that of the tenths with at least {LEAST_COUNT} estimates, with its 95 % "
+        "interval (Wilson); the largest of ten gaps is some two standard deviations by chance "
+        f"alone. With {_FEW_PULSES} pulses or fewer, more signal is sent per pulse.",
+        formats={"largest gap": "+.3f", "at confidence": ".2f"},
+    )
+    shown = [report for report in found if report.method in ("likelihood", "tracking")]
+
+    def gap(tenth: int) -> Callable[[Report], str]:
+        return lambda report: next(
+            (f"{t.gap.value:+.2f} ({t.count})" for t in report.tenths if t.tenth == tenth), "–"
+        )
+
+    yield table(
+        "reliability",
+        "Gap of each tenth of confidence (estimates)",
+        shown,
+        named | {f"{k / 10:.1f} to {(k + 1) / 10:.1f}": gap(k) for k in range(10)},
     )
 
 

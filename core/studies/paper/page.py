@@ -18,9 +18,9 @@ INTRODUCTION = (
     "reproduce its tables: 1000 pulses, 1 ns, 3 bins.",
     "Printed values are shown with the difference and a 95 % interval. A difference within the "
     "interval is chance. Methods marked as reconstructions were rebuilt from abstracts.",
-    "Start with the limits (what a single pixel allows), the estimates without an echo (which "
-    "ranges a method prefers) and the restoration degree against the position of the echo (which "
-    "a target at 50 m alone does not show).",
+    "Start with the limits (what the likelihood of a single pixel finds), the estimates without "
+    "an echo (which ranges a method prefers) and the restoration degree against the position of "
+    "the echo (which a target at 50 m alone does not show).",
 )
 
 

@@ -1,8 +1,8 @@
 """Pulses, exposure and gate length required for a restoration degree.
 
-Two predictions side by side: the theoretical limit (`core.limits`) with known signal and
-background, in milliseconds per image, and simulated captures, ranged by the exact likelihood with
-known flux (oracle) and with estimated flux.
+Two predictions side by side: theory (`core.limits`) for the likeliest delay with known signal and
+background and uniform depths, in milliseconds per image, and simulated captures, ranged by the
+exact likelihood with known flux (oracle) and with estimated flux.
 """
 
 from __future__ import annotations
