@@ -56,8 +56,8 @@ MAP_DELAY_MS = 60
 LISTED = ".scroll { max-height: 232px; overflow-y: auto; }"
 """Style of a list in the sidebar: it scrolls."""
 
-SELECT = ":host { width: min(150px, 100vw - 250px) !important; }"
-"""Style of the list of maps: on a phone, the buttons stay beside it."""
+SELECT = {"flex": "1 1 118px", "max-width": "150px"}
+"""Style of the list of maps: on a phone it is narrower, so that the buttons stay beside it."""
 
 ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 4px 6px; }"
 
@@ -121,8 +121,8 @@ class Inspect(Section):
             label="Map",
             description=text.MAP_HELP,
             size="small",
-            width=150,
-            stylesheets=[SELECT],
+            sizing_mode="stretch_width",
+            styles=SELECT,
             min_height=SELECT_PX,
             margin=(6, 0, 0, 0),
         )
