@@ -42,6 +42,7 @@ _ERROR = 1e-5  # of the interpolation, relative
 _BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
 _NOISE = 3.0  # standard deviations of a sum of squares
 _LEAST_SHARE = 1e-6
+_FEWEST_COUNTS = 0.5
 _WIGGLES = 0.1  # of a slope, that are no second direction
 
 
@@ -117,6 +118,20 @@ def echo_free(
         photons -= near * background[:, level : level + 1]
     mean = np.divide(photons, share, out=np.zeros_like(share), where=share > _LEAST_SHARE)
     return EchoFree(np.where(share > _LEAST_SHARE, share, 0.0), np.maximum(mean, 0.0) / n_bins)
+
+
+def mean_background(
+    counts: Floats, armed: Floats, free: EchoFree, is_first: bool, shape: Floats
+) -> float:
+    """Estimate the mean background per pulse over the gate from bins without an echo.
+
+    Takes the parameters of `fitted_shape`. NaN if no bin is free of echoes.
+    """
+    exposed = float((free.share * armed * shape).sum())
+    if exposed == 0:
+        return math.nan
+    rate = max(float((free.share * counts).sum()), _FEWEST_COUNTS) / exposed
+    return shape.size * (-math.log1p(-min(rate, 0.5)) if is_first else rate)
 
 
 def fitted_shape(

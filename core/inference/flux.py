@@ -9,14 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
-from core.inference.background import echo_free, echo_window, fitted_shape, nodes_of
+from core.inference.background import (
+    echo_free,
+    echo_window,
+    fitted_shape,
+    mean_background,
+    nodes_of,
+)
 from core.inference.flux_model import FluxModel, FluxPrior
 from core.inference.likelihood import (
     level_densities,
@@ -93,28 +99,37 @@ def detailed_flux_prior_of(capture: Capture) -> FluxPrior:
     return found
 
 
-def _background_shape(
+class _Background(NamedTuple):
+    """Background in bins without an echo."""
+
+    mean: float
+    """Photons per pulse over the gate; NaN if no bin is free of echoes."""
+    shape: Floats | None
+    """`FluxPrior.background_shape`."""
+
+
+def _background(
     capture: Capture, known: FluxPrior, pixels: NDArray[np.intp], density: NDArray[np.float32]
-) -> Floats | None:
-    """Estimate `FluxPrior.background_shape` from pixels, given as flat indices.
+) -> _Background:
+    """Estimate the background from pixels, given as flat indices.
 
     `density` is that of `level_densities`, and is overwritten.
     """
-    if pixels.size < _FEWEST_OF_SHAPE:
-        return None
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
     few = slice(None, None, math.ceil(pixels.size * n_bins / _AT_ONCE))
-    pixels, total = pixels[few], _totals(capture)[0].ravel()[pixels[few]]
+    some, total = pixels[few], _totals(capture)[0].ravel()[pixels[few]]
     background = known.model(total[np.newaxis], _least_background(capture)).background[:, 0].T
     mass = density[few]
     mass *= (known.share[:, np.newaxis] * known.depth).astype(np.float32)
     mass /= mass.sum(axis=(1, 2), keepdims=True)
-    counts = capture.cube.reshape(-1, n_bins)[pixels].astype(float)
+    counts = capture.cube.reshape(-1, n_bins)[some].astype(float)
     armed = np.ones_like(counts)
     if n_pulses is not None:
         armed = n_pulses - np.cumsum(counts, axis=1) + counts
     free = echo_free(mass, background, echo_window(capture))
-    return fitted_shape(counts, armed, free, n_pulses is not None, known.relative_background)
+    seen = counts, armed, free, n_pulses is not None, known.relative_background
+    shape = fitted_shape(*seen) if pixels.size >= _FEWEST_OF_SHAPE else None
+    return _Background(mean_background(*seen), shape)
 
 
 def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floats | None]:
@@ -162,13 +177,17 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     # Given the delays, and one background for all levels, faint levels are less plausible.
     evidence = np.log(np.maximum(density @ depth.astype(np.float32), _TINY))
     found = found._replace(share=share, depth=depth)
-    better_shape = _background_shape(capture, found, pixels[0], density)
+    free = _background(capture, found, pixels[0], density)
     levels, share = _joined(found.levels, _shares(evidence))
     kept = _kept(share)
     levels, share = levels[kept], share[kept] / share[kept].sum()
-    background = np.asarray(total.mean() - share @ levels)
-    found = found._replace(levels=levels, share=share, background=background)
-    return found._replace(contrast=found.model(total, least).contrast), better_shape
+    background = float(total.mean() - share @ levels)
+    if background < share @ levels and not math.isnan(free.mean):
+        # A small difference of large numbers, while the echoes stand out clearly.
+        background = min(free.mean, float(total.mean()))
+        levels = levels * ((total.mean() - background) / (share @ levels))
+    found = found._replace(levels=levels, share=share, background=np.asarray(background))
+    return found._replace(contrast=found.model(total, least).contrast), free.shape
 
 
 def total_rates(capture: Capture) -> Floats:
