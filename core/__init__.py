@@ -38,7 +38,13 @@ from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError, StatedFlux
 from core.corrections import CORRECTIONS, without_correction
 from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
-from core.inference import RangeInterval, limits, pixel_range_intervals, range_interval
+from core.inference import (
+    RangeInterval,
+    limits,
+    pixel_range_intervals,
+    range_interval,
+    range_intervals,
+)
 from core.io import (
     SceneError,
     open_capture,
@@ -127,6 +133,7 @@ __all__ = [
     "parts_of",
     "pixel_range_intervals",
     "range_interval",
+    "range_intervals",
     "rate_per_bin",
     "read_capture",
     "read_scene",

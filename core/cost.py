@@ -19,7 +19,7 @@ from core.capture import Capture
 from core.checks import require
 from core.inference.flux import DEPTH_SAMPLE, LEVELS, SAMPLE
 from core.inference.likelihood import lanes_of, sampled_numbers
-from core.inference.posterior import has_posterior
+from core.inference.posterior import TOLERANCE_BINS, has_posterior
 from core.kernels.blocks import LANES
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "predicted",
     "predicted_fit_time",
     "predicted_flux_time",
+    "predicted_interval_time",
     "require_memory",
 ]
 
@@ -54,6 +55,8 @@ _NULL_S = 60e-9
 _FEW_PIXELS = 24  # whose fluxes are estimated one by one (`core.inspection.mean_flux`)
 _FLUX_S, _MIXTURE_S = 20e-6, 5e-6  # per bin of a pixel
 _FIT_S, _FIT_BYTES = 0.5e-6, 80_000_000  # per bin of a pixel; of the pixels tested at once
+_INTERVAL_S, _INTERVAL_BYTES = 6e-6, 50_000_000  # per bin near an estimate; of pixels at once
+_WINDOW_ECHOES = 4  # width of nearly all of an echo, in `Capture.echo_bins`
 _ECHOES = 64  # noise-free echoes of the lag calibration
 _USUAL_LEVELS = 4  # signal levels of a capture
 
@@ -185,6 +188,20 @@ def predicted_flux_time(n_pixels: int, n_bins: int) -> Cost:
 def predicted_fit_time(n_pixels: int, n_bins: int) -> Cost:
     """Predict memory and time of the goodness of fit (`core.inference.fit_p_values`) of pixels."""
     return Cost(_FIT_BYTES, _FIT_S * n_pixels * n_bins)
+
+
+def predicted_interval_time(n_pixels: int, echo_bins: int) -> Cost:
+    """Predict memory and time of range intervals (`core.range_intervals`) of pixels.
+
+    Parameters
+    ----------
+    n_pixels : int
+        Pixels with an estimate.
+    echo_bins : int
+        Bins that an echo fills (`Capture.echo_bins`).
+    """
+    n_bins = _WINDOW_ECHOES * echo_bins + 2 * TOLERANCE_BINS + 1
+    return Cost(_INTERVAL_BYTES, _INTERVAL_S * n_bins * n_pixels)
 
 
 def _filled(n_pixels: int, lanes: int) -> int:

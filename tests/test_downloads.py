@@ -28,6 +28,7 @@ from playwright.sync_api import expect
 
 import core
 from app.model.colors import image_of, map_of, shown
+from app.model.download_text import NO_INTERVALS
 from app.model.exports import (
     Curve,
     band,
@@ -49,6 +50,7 @@ from app.theme import RANGE_COLORS
 from app.units import count, interval, number, share
 from core import TrackingParameters
 from core.cli import main
+from core.inference import range_intervals
 from core.inspection import pixels_in
 from core.io import MOST_LETTERS
 from core.studies.outputs import Table
@@ -320,17 +322,35 @@ def test_descriptions_state_version_method_all_settings_and_source(explore, sess
 
 @pytest.mark.parametrize("kind", MAPS)
 def test_arrays_and_pages_hold_the_map_that_is_shown(explore, session, kind):
-    values, look = map_of(session.answer, kind, Viewing())
-    files = image_files(session.answer, kind, Viewing(), explore.image.figure)
+    viewing = Viewing(least_confidence=1 - 1e-9)
+    values, look = map_of(session.answer, kind, viewing)
+    files = image_files(session.answer, kind, viewing, explore.image.figure)
     name = {"Estimate": "range_m", "Goodness of fit": "fit_p_value"}.get(kind, kind.lower())
-    np.testing.assert_array_equal(np.load(io.BytesIO(written(files["npz"])))[name], values)
+    arrays = np.load(io.BytesIO(written(files["npz"])))
+    np.testing.assert_array_equal(arrays[name], values)
+    image, limits = session.answer.run.image.confident(viewing.least_confidence), {}
+    inner, outer = range_intervals(session.answer.capture, image)
+    for level, ends in (("68_", inner), ("", outer)):
+        limits |= {f"range_low_{level}m": ends.low_m, f"range_high_{level}m": ends.high_m}
+    for limit, expected in limits.items():
+        np.testing.assert_array_equal(arrays[limit], expected)
     with tifffile.TiffFile(io.BytesIO(written(files["tif"]))) as tif:
         first = tif.pages[0]
         np.testing.assert_array_equal(first.asarray(), values.astype(np.float32))
         assert first.description.startswith(f"{name} [{look.unit if look.unit == 'm' else 1}]: ")
         assert look.legend in first.description
         names = {page.description.split(" ")[0] for page in tif.pages}
-    assert names == {name, "range_m", "confidence", "counts"}
+    assert names == {name, "range_m", "confidence", "counts", *limits}
+
+
+def test_intervals_that_would_take_too_long_are_left_out_and_the_file_says_so(
+    explore, session, monkeypatch
+):
+    monkeypatch.setattr("app.model.budget.REQUEST_S", 1e-9)
+    files = image_files(session.answer, "Counts", Viewing(), explore.image.figure)
+    arrays = np.load(io.BytesIO(written(files["npz"])))
+    assert "range_low_m" not in arrays
+    assert str(arrays["remark"]) == NO_INTERVALS
 
 
 @pytest.mark.parametrize("kind", ["Range", "Error", "Counts"])

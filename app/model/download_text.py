@@ -10,8 +10,8 @@ FORMATS = {
     "png": "picture",
     "svg": "picture, to enlarge and edit",
     "csv": "the numbers on screen, as text",
-    "npz": "image and arrays of the estimate, for NumPy",
-    "tif": "image, range, confidence and counts, for GIS",
+    "npz": "image and arrays of the estimate with intervals, for NumPy",
+    "tif": "image, range with intervals, confidence and counts, for GIS",
     "html": "report: maps, cloud, numbers and script on one page",
     "ply": "the points on screen, with colours",
     "las": "the points on screen, for survey software",
@@ -19,6 +19,11 @@ FORMATS = {
 }
 
 NOTHING_DRAWN = "There is nothing to save: nothing is drawn here yet. Try again later."
+
+NO_INTERVALS = (
+    "the intervals of the ranges are left out, since they take too long on this server; "
+    "python -m core estimate --intervals writes them"
+)
 
 NO_POINTS = (
     "There is nothing to save: no estimate is confident enough to be shown. Lower “Show from "

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from app.model.budget import fits
 from app.model.colors import FIT, cloud_of, map_of, shown
-from app.model.download_text import NO_POINTS, NO_POINTS_INSIDE, NOTHING_DRAWN
+from app.model.download_text import NO_INTERVALS, NO_POINTS, NO_POINTS_INSIDE, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.script import script_of
 from app.model.state import UNITS, State, Viewing
@@ -24,7 +25,9 @@ from app.model.store import Answer
 from app.model.text import Fact
 from app.theme import WRONG_COLOR
 from app.units import Quantity, ShownGate, scale
+from core.cost import predicted_interval_time
 from core.geometry import WHOLE, Box, pixel_angle_of
+from core.inference import range_intervals
 from core.io import (
     P_VALUE,
     WRITERS,
@@ -145,6 +148,9 @@ def _view(axis_range: Any) -> tuple[float, float]:
 
 # Images
 
+ARRAYS = ("npz", "tif")
+"""Formats that hold the arrays of an estimate."""
+
 
 def image_files(
     answer: Answer,
@@ -156,6 +162,7 @@ def image_files(
 ) -> dict[str, Write]:
     """Return an image (row, col) as shown, with the estimate that it belongs to.
 
+    Arrays and pages include the 68 and 95 % intervals of the ranges.
     Pictures are those that `core.save_image` makes of the pixels in view, in the light mode.
 
     Parameters
@@ -189,9 +196,20 @@ def image_files(
     )
     return {
         "csv": image_file(values, look, figure, answer.grid),
-        **{suffix: partial(WRITERS[f".{suffix}"], product) for suffix in ("npz", "tif")},
+        **{suffix: partial(_write_with_intervals, answer, product, suffix) for suffix in ARRAYS},
         **{suffix: partial(picture.write, suffix=suffix) for suffix in ("png", "svg")},
     }
+
+
+def _write_with_intervals(answer: Answer, product: Product, suffix: str, file: BinaryIO) -> None:
+    """Write a range image with its intervals, or the remark that they would take too long."""
+    n_pixels = int(product.image.valid.sum())
+    if fits(predicted_interval_time(n_pixels, answer.capture.echo_bins)):
+        inner, outer = range_intervals(answer.capture, product.image, (0.68, 0.95))
+        product = replace(product, interval_68=inner, interval=outer)
+    else:
+        product = replace(product, remark=NO_INTERVALS)
+    WRITERS[f".{suffix}"](product, file)
 
 
 def in_view(figure: Any, grid: Grid, shape: tuple[int, int]) -> tuple[slice, slice]:

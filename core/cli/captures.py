@@ -253,12 +253,14 @@ def _add_estimate(commands: Any) -> None:
         method.add_argument(
             "--intervals",
             action="store_true",
-            help="write the 95 %% interval of each range, too: in NPZ, netCDF, HDF5, Zarr and CSV",
+            help="write the 68 %% and 95 %% intervals of each range, too: in NPZ, netCDF, HDF5, "
+            "Zarr, CSV and TIFF; in point clouds half the width of the former, range_sd_m",
         )
         method.add_argument(
             "--fit",
             action="store_true",
-            help="write the p-value of the goodness of fit of each pixel, in the same formats",
+            help="write the p-value of the goodness of fit of each pixel, too: in NPZ, netCDF, "
+            "HDF5, Zarr and CSV",
         )
         method.add_argument(
             "--scheduler", help="address of a Dask cluster to use, such as tcp://host:8786"

@@ -11,7 +11,7 @@ from core.checks import require, shown
 from core.cli.results import Incomplete
 from core.estimators import RangeImage
 from core.geometry import WHOLE, Box
-from core.inference import fit_p_values, range_interval
+from core.inference import fit_p_values, range_intervals
 from core.io.writers import CLOUD_SUFFIXES, RangeColors, save_image
 from core.io.writers.product import guessed_view
 from core.io.writers.whole import writing
@@ -38,15 +38,17 @@ def save_ranges(
     """
     kept = image if least_confidence is None else image.confident(least_confidence)
     view = guessed_view(capture, image)
-    interval = range_interval(capture, kept) if intervals and isinstance(capture, Capture) else None
-    p_value = fit_p_values(capture) if fit and isinstance(capture, Capture) else None
+    known: dict[str, Any] = {"colors": colors}
+    if intervals and isinstance(capture, Capture):
+        known["interval_68"], known["interval"] = range_intervals(capture, kept, (0.68, 0.95))
+    if fit and isinstance(capture, Capture):
+        known["p_value"] = fit_p_values(capture)
 
     def save(path: Path) -> None:
         is_cloud = path.suffix.lower() in CLOUD_SUFFIXES
         own = view if is_cloud else {}
-        known: dict[str, Any] = {"interval": interval, "p_value": p_value, "colors": colors, **own}
         inside = kept.cropped(box) if is_cloud and box != WHOLE else kept
-        save_image(capture, inside, path, overwrite=overwrite, **known)
+        save_image(capture, inside, path, overwrite=overwrite, **known, **own)
 
     return save
 

@@ -11,7 +11,12 @@ from core.inference.fit import (
 )
 from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_prior_of
 from core.inference.flux_model import FluxModel, FluxPrior
-from core.inference.intervals import RangeInterval, pixel_range_intervals, range_interval
+from core.inference.intervals import (
+    RangeInterval,
+    pixel_range_intervals,
+    range_interval,
+    range_intervals,
+)
 from core.inference.likelihood import Conditions, log_likelihood_ratio, rate_and_n_armed
 from core.inference.posterior import (
     TOLERANCE_BINS,
@@ -49,6 +54,7 @@ __all__ = [
     "posterior_of",
     "predictive_of",
     "range_interval",
+    "range_intervals",
     "rate_and_n_armed",
     "share_below",
     "tolerance_probability",

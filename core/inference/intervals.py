@@ -48,36 +48,44 @@ class RangeInterval(NamedTuple):
 
 
 def range_interval(capture: Capture, image: RangeImage, level: float = 0.95) -> RangeInterval:
-    """Compute the central posterior interval of the range of each pixel.
+    """Compute the central posterior interval of the range of each pixel, see `range_intervals`."""
+    return range_intervals(capture, image, (level,))[0]
 
-    It is calibrated: of the estimates within `TOLERANCE_BINS` of the surface, a share `level` have
-    an interval that contains the range of the surface. Whether a surface is there is what
-    `RangeImage.confidence` says.
+
+def range_intervals(
+    capture: Capture, image: RangeImage, levels: Sequence[float] = (0.68, 0.95)
+) -> tuple[RangeInterval, ...]:
+    """Compute central posterior intervals of the range of each pixel, together for all levels.
+
+    They are calibrated: of the estimates within `TOLERANCE_BINS` of the surface, a share of each
+    level have an interval that contains the range of the surface. Whether a surface is there is
+    what `RangeImage.confidence` says.
 
     Parameters
     ----------
     capture : Capture
     image : RangeImage
         Estimate of the capture by any method.
-    level : float
-        Probability of the interval.
+    levels : sequence of float
+        Probability of each interval.
 
     Raises
     ------
     ValueError
-        If the level is not between 0 and 1, or the shapes differ.
+        If a level is not between 0 and 1, or the shapes differ.
     """
     shape = image.bin.shape
     require("image", f"shape {shape}", shape == capture.shape, f"shape {capture.shape}")
-    limits = np.full((2, capture.counts.size), np.nan)
+    tails = _all_tails(levels)
+    limits = np.full((tails.size, capture.counts.size), np.nan)
     pixels = np.flatnonzero(image.valid)
     n_bins = max(_NODES * _n_window_bins(capture), capture.acquisition.n_bins)
     at_once = max(1, _AT_ONCE // n_bins)
     for first in range(0, pixels.size, at_once):
         some = pixels[first : first + at_once]
-        limits[:, some] = _quantiles_bins(capture, some, image.bin.ravel()[some], _tails(level))
-    low_m, high_m = capture.acquisition.bin_to_range_m(limits.reshape(2, *shape))
-    return RangeInterval(low_m, high_m)
+        limits[:, some] = _quantiles_bins(capture, some, image.bin.ravel()[some], tails)
+    limits_m = capture.acquisition.bin_to_range_m(limits.reshape(-1, 2, *shape))
+    return tuple(RangeInterval(*each) for each in limits_m)
 
 
 def pixel_range_intervals(
@@ -95,7 +103,7 @@ def pixel_range_intervals(
         The estimate and its limits in metres; NaN without an estimate.
     """
     estimate_m = float(image.range_m[row, col])
-    tails = np.ravel([_tails(level) for level in levels])
+    tails = _all_tails(levels)
     limits_m = np.full((tails.size, 1), np.nan)
     if image.valid[row, col]:
         pixel = np.array([row * capture.shape[1] + col])
@@ -104,10 +112,11 @@ def pixel_range_intervals(
     return tuple(Interval(estimate_m, *each) for each in limits_m.reshape(-1, 2).tolist())
 
 
-def _tails(level: float) -> Floats:
-    """Probabilities below the lower and the upper limit of a central interval."""
-    require("level", level, 0 < level < 1, "between 0 and 1")
-    return np.array([(1 - level) / 2, (1 + level) / 2])
+def _all_tails(levels: Sequence[float]) -> Floats:
+    """Probabilities below the lower and the upper limit of each central interval in turn."""
+    for level in levels:
+        require("level", level, 0 < level < 1, "between 0 and 1")
+    return np.array([tail for level in levels for tail in ((1 - level) / 2, (1 + level) / 2)])
 
 
 def _quantiles_bins(

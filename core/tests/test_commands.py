@@ -18,7 +18,7 @@ from core.capture import Capture
 from core.cli import main
 from core.estimators import estimate
 from core.geometry import Box, guessed_field_of_view_deg, pixel_angle_of
-from core.inference import fit_p_values, range_interval
+from core.inference import fit_p_values, range_intervals
 from core.io import readers
 from core.io.readers import Reader, read_capture
 from core.io.writers import CAPTURE_SUFFIXES, WRITERS, save_capture
@@ -171,7 +171,9 @@ def test_estimate_writes_what_it_reports(
     np.testing.assert_allclose(tifffile.imread(tif)[0], image.range_m, rtol=1e-6)
     assert las.stat().st_size > 20 * image.valid.sum()
     with np.load(npz) as archive:
-        np.testing.assert_array_equal(archive["range_low_m"], range_interval(car, image).low_m)
+        inner, outer = range_intervals(car, image)
+        np.testing.assert_array_equal(archive["range_low_m"], outer.low_m)
+        np.testing.assert_array_equal(archive["range_high_68_m"], inner.high_m)
         np.testing.assert_array_equal(archive["fit_p_value"], fit_p_values(car))
     sure, given = tmp_path / "sure.npz", ("--least-confidence", 0.99, "--overwrite")
     cloud, crop = tmp_path / "cropped.ply", ("--crop", 50, "-", "--crop-pixels", "0,0 0,63 63,0")

@@ -236,20 +236,33 @@ def test_every_image_is_read_back(tmp_path: Path, suffix: str, image: RangeImage
 
 @pytest.mark.parametrize("suffix", [".npz", ".nc", ".h5", ".csv"])
 def test_formats_that_list_pixels_hold_intervals_and_p_values(tmp_path: Path, suffix: str) -> None:
-    interval, p_value = core.range_interval(CAPTURE, IMAGE), fit_p_values(CAPTURE)
-    path = saved(tmp_path, suffix, interval=interval, p_value=p_value)
+    (inner, outer), p_value = core.range_intervals(CAPTURE, IMAGE), fit_p_values(CAPTURE)
+    path = saved(tmp_path, suffix, interval=outer, interval_68=inner, p_value=p_value)
     if suffix == ".csv":
         lines = list(without_comments(path.read_text(encoding="utf-8").splitlines()))
         table = np.genfromtxt(lines, delimiter=",", names=True)
-        assert table.dtype.names[:5] == ("row", "col", "range_m", "range_low_m", "range_high_m")
+        assert table.dtype.names[2:5] == ("range_m", "range_low_m", "range_high_m")
         found = {name: table[name].reshape(ROWS, COLS) for name in table.dtype.names}
     else:
         found = READERS[suffix](path)
     for name in ("low_m", "high_m"):
-        np.testing.assert_array_equal(found[f"range_{name}"], getattr(interval, name))
+        np.testing.assert_array_equal(found[f"range_{name}"], getattr(outer, name))
+        name_68 = name.replace("_m", "_68_m")
+        np.testing.assert_array_equal(found[f"range_{name_68}"], getattr(inner, name))
     np.testing.assert_array_equal(found["fit_p_value"], p_value)
     with pytest.raises(ValueError, match=r"range_low_m = 'shape \(9, 7\)'"):
-        saved(tmp_path, suffix, interval=core.RangeInterval(interval.low_m.T, interval.high_m))
+        saved(tmp_path, suffix, interval=core.RangeInterval(outer.low_m.T, outer.high_m))
+
+
+@pytest.mark.parametrize("suffix", [".tif", *sorted(CLOUDS)])
+def test_pages_and_clouds_hold_the_intervals(tmp_path: Path, suffix: str) -> None:
+    inner, outer = core.range_intervals(CAPTURE, IMAGE)
+    found = READERS[suffix](saved(tmp_path, suffix, interval=outer, interval_68=inner))
+    expected = {"range_sd_m": (inner.high_m - inner.low_m) / 2}
+    if suffix == ".tif":
+        expected = {"range_low_m": outer.low_m, "range_high_68_m": inner.high_m}
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, rtol=SINGLE)
 
 
 @every_cloud

@@ -130,6 +130,7 @@ def save_image(
     rgb: NDArray[np.uint8] | None = None,
     remark: str = "",
     interval: RangeInterval | None = None,
+    interval_68: RangeInterval | None = None,
     p_value: NDArray[np.float64] | None = None,
     colors: RangeColors | None = None,
 ) -> None:
@@ -142,7 +143,7 @@ def save_image(
     ``.nc``, ``.h5``    netCDF-4, which is HDF5: the same, with units
     ``.zarr``           Zarr, a folder: the same
     ``.csv``            one line a pixel
-    ``.tif``, ``.tiff`` three pages of 32-bit floats: ``range_m``, ``confidence``, ``counts``
+    ``.tif``, ``.tiff`` pages of 32-bit floats: ``range_m``, ``confidence``, ``counts``, intervals
     ``.ply``, ``.pcd``  point cloud; coordinates as 32-bit floats
     ``.las``, ``.laz``  point cloud, LAS 1.4; coordinates in steps of a thousandth of a bin or less
     ``.png``, ``.svg``  picture of the range image
@@ -173,10 +174,14 @@ def save_image(
     remark : str
         Text that the file states next to that of the method, such as `core.io.guessed_angle`.
     interval : RangeInterval, optional
-        95 % interval of each range (`core.range_interval`), for the formats that list pixels: NPZ,
-        netCDF, HDF5, Zarr and CSV.
+        95 % interval of each range (`core.range_intervals`), for the formats that hold pixels: NPZ,
+        netCDF, HDF5, Zarr, CSV and TIFF, as ``range_low_m`` and ``range_high_m``.
+    interval_68 : RangeInterval, optional
+        68 % interval, likewise as ``range_low_68_m`` and ``range_high_68_m``. Point clouds hold
+        half its width, ``range_sd_m``.
     p_value : ndarray, shape (row, col), optional
-        P-value of the goodness of fit of each pixel (`core.inference.fit_p_values`), likewise.
+        P-value of the goodness of fit of each pixel (`core.inference.fit_p_values`), for NPZ,
+        netCDF, HDF5, Zarr and CSV.
     colors : core.io.RangeColors, optional
         Limits and colour map of a picture; by default those of the app.
 
@@ -201,6 +206,7 @@ def save_image(
         rgb,
         remark=remark,
         interval=interval,
+        interval_68=interval_68,
         p_value=p_value,
         colors=colors,
     )

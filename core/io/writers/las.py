@@ -25,6 +25,7 @@ DESCRIPTIONS = {
     "range_m": "range of the surface, m",
     "counts": "detections of the pixel",
     "confidence": "probability within 3 bins, 0-1",
+    "range_sd_m": "half the 68 % interval, m",
     "row": "row of the pixel, 0 on top",
     "col": "column of the pixel",
 }

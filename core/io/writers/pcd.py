@@ -15,7 +15,10 @@ from core.io.writers.product import Product
 
 
 def write(product: Product, file: BinaryIO) -> None:
-    """Write x, y, z, range_m, counts, confidence, row and col of each point, and its colour."""
+    """Write x, y, z, range_m, counts, confidence, row and col of each point.
+
+    Where they are known, range_sd_m, half the 68 % interval, and the colour follow.
+    """
     from pypcd4 import Encoding, PointCloud  # noqa: PLC0415 - slow to import
 
     points = product.points()

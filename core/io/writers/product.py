@@ -49,6 +49,8 @@ class Product:
         Added to the fact of that name.
     interval : RangeInterval, optional
         95 % interval of each range.
+    interval_68 : RangeInterval, optional
+        68 % interval of each range.
     p_value : ndarray, shape (row, col), optional
         P-values of the goodness of fit.
     colors : RangeColors, optional
@@ -69,6 +71,7 @@ class Product:
     shown: Mapping[str, Plane] = field(default_factory=dict)
     remark: str = ""
     interval: RangeInterval | None = None
+    interval_68: RangeInterval | None = None
     p_value: NDArray[np.float64] | None = None
     colors: RangeColors | None = None
 
@@ -96,10 +99,14 @@ class Product:
 
     @property
     def interval_columns(self) -> dict[str, NDArray[np.float64]]:
-        """Limits of the 95 % interval by name; empty if it is not given."""
-        if self.interval is None:
-            return {}
-        return {"range_low_m": self.interval.low_m, "range_high_m": self.interval.high_m}
+        """Limits of the intervals that are given, by name."""
+        given = {"": self.interval, "68_": self.interval_68}
+        return {
+            f"range_{end}_{level}m": limit_m
+            for level, interval in given.items()
+            if interval is not None
+            for end, limit_m in (("low", interval.low_m), ("high", interval.high_m))
+        }
 
     @property
     def p_value_columns(self) -> dict[str, NDArray[np.float64]]:
@@ -113,9 +120,10 @@ class Product:
         counts = Plane(self.capture.counts, "1", "detections of the pixel")
         known = {name: own.pop(name) for name in ("range_m", "confidence")}
         known |= {"counts": counts, **own}
-        meaning = "limit of the 95 % interval of the range, given that the estimate is right"
-        limits = self.interval_columns.items()
-        known |= {name: Plane(limit_m, "m", meaning) for name, limit_m in limits}
+        for name, limit_m in self.interval_columns.items():
+            level = 68 if "68" in name else 95
+            meaning = f"limit of the {level} % interval of the range, if the estimate is right"
+            known[name] = Plane(limit_m, "m", meaning)
         meaning = "p-value of the goodness of fit of the model behind the confidence"
         known |= {name: Plane(p, "1", meaning) for name, p in self.p_value_columns.items()}
         return shown | {name: plane for name, plane in known.items() if name not in shown}
@@ -176,11 +184,16 @@ class Product:
     def point_columns(self, points: Points) -> dict[str, NDArray[Any]]:
         """Return the columns of a point cloud other than coordinates; each of shape (point,)."""
         here = points.row, points.col
+        deviation = {}
+        if self.interval_68 is not None:
+            width_m = self.interval_68.high_m - self.interval_68.low_m
+            deviation["range_sd_m"] = (width_m[here] / 2).astype(np.float32)
         rgb = {} if self.rgb is None else dict(zip(COLORS, self.rgb[here].T, strict=True))
         return {
             "range_m": self.image.range_m[here],
             "counts": np.minimum(self.capture.counts[here], 2**32 - 1).astype(np.uint32),
             "confidence": self.image.confidence[here].astype(np.float32),
+            **deviation,
             "row": points.row,
             "col": points.col,
             **rgb,

@@ -29,8 +29,8 @@ ROWS_AT_ONCE = 2**11
 def write(product: Product, file: BinaryIO) -> None:
     """Write row, col, range_m, confidence, counts and valid (1 or 0) of each pixel.
 
-    If the product has intervals, range_low_m and range_high_m follow range_m; if it has p-values,
-    fit_p_value is the last column.
+    If the product has intervals, range_low_m, range_high_m and those with 68 follow range_m; if it
+    has p-values, fit_p_value is the last column.
     """
     image = product.image
     row, col = map(np.asarray, np.indices(image.range_m.shape))
