@@ -12,7 +12,7 @@ import pytest
 
 from app.model.colors import map_of
 from app.model.script import script_of
-from app.model.state import MAPS, NEED_TRUTH, Crop, Illumination, ReductionSettings, Viewing
+from app.model.state import MAPS, NEEDED, Crop, Illumination, ReductionSettings, Viewing
 from app.model.store import built_in_sources, file_source
 from app.pages.inspect import text
 from app.pages.inspect.capture import CaptureSection
@@ -140,7 +140,8 @@ def test_every_map_is_offered_where_possible_and_drawn(name, request):
     capture = session.answer.capture
     offered = session.state.param.map.objects
     has_truth = capture.truth_range_m is not None
-    assert offered == [each for each in MAPS if has_truth or each not in NEED_TRUTH]
+    absent = {"Reported"} if has_truth else NEEDED.keys()
+    assert offered == [each for each in MAPS if each not in absent]
     maps = {kind: map_of(session.answer, kind, Viewing()) for kind in offered}
     for image, look in maps.values():
         assert image.shape == capture.shape

@@ -7,7 +7,12 @@ import pytest
 
 import core
 from app.__main__ import readable
-from app.model.store import built_in_sources, file_source
+from app.model.capture_defaults import possible_kinds
+from app.model.colors import map_of
+from app.model.state import Viewing
+from app.model.store import Request, built_in_sources, compute, file_source
+from app.pages.inspect import text
+from app.pages.inspect.results import inspect_pixel
 from core.io import ReadOptions
 from tests.states import link_to
 from tests.threads import HeldLayout, control
@@ -58,3 +63,18 @@ def test_the_player_is_shown_for_sequences_alone(log):
         control(layout, "Scene or capture").value = source
         layout.next_answer()
         assert holder.visible == is_sequence
+
+
+def test_distances_of_the_sensor_are_shown_beside_the_estimates(log):
+    answer = compute(Request(file_source(log)), None)
+    assert "Reported" in possible_kinds(answer)["map"]
+    values, look = map_of(answer, "Reported", Viewing())
+    np.testing.assert_array_equal(values, answer.capture.reported_range_m)
+    assert look.legend == "Distance reported by the sensor (m)"
+    facts = {name: value for name, value, _ in text.facts(inspect_pixel(answer, 0, 3), "m")}
+    assert facts["Reported"].value == values[0, 3]
+    difference_m = answer.run.image.range_m[0, 3] - values[0, 3]
+    assert facts["Estimate − reported"].value == pytest.approx(difference_m)
+    assert abs(difference_m) < answer.capture.acquisition.bin_length_m
+    sample = compute(Request(built_in_sources()["sample"]), None)
+    assert "Reported" not in possible_kinds(sample)["map"]

@@ -10,7 +10,7 @@ from app.model.state import (
     CLOUD_COLORS,
     IMAGES,
     MAPS,
-    NEED_TRUTH,
+    NEEDED,
     Crop,
     State,
 )
@@ -19,7 +19,7 @@ from core.inspection import pixels_in
 from core.report import telling_pixel
 
 KINDS = {"image": IMAGES, "map": MAPS, "cloud_color": CLOUD_COLORS}
-"""Parameters of which some values require a truth, with all values."""
+"""Parameters of which some values require an image of the capture, with all values."""
 
 FROM_CAPTURE = ("pixel", "pins", "region", "crop", "viewing", "comparison", *KINDS)
 """Parameters of the state whose default or possible values depend on the capture."""
@@ -27,11 +27,11 @@ FROM_CAPTURE = ("pixel", "pins", "region", "crop", "viewing", "comparison", *KIN
 
 def possible_kinds(answer: Answer) -> dict[str, list[str]]:
     """Return the possible values of the parameters `KINDS`; the first is the default."""
-    has_truth = answer.capture.truth_range_m is not None
-    return {
-        name: [kind for kind in kinds if has_truth or kind not in NEED_TRUTH]
-        for name, kinds in KINDS.items()
-    }
+
+    def exists(kind: str) -> bool:
+        return kind not in NEEDED or getattr(answer.capture, NEEDED[kind]) is not None
+
+    return {name: [kind for kind in kinds if exists(kind)] for name, kinds in KINDS.items()}
 
 
 def defaults_of(answer: Answer) -> dict[str, Any]:

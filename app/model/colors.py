@@ -31,6 +31,7 @@ MAP_TITLES = {
 FIT = "Goodness of fit"
 """The map of the p-values of pixels."""
 
+REPORTED_TITLE = "Distance reported by the sensor"
 FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"
 
 
@@ -45,6 +46,7 @@ NO_VALUE = {
     "Estimate": "without an estimate",
     "Truth": "without a target",
     "Error": "without an estimate or truth",
+    "Reported": "without a reported distance",
     "Confidence": "without an estimate",
 }
 """Pixels that are blank in images of a kind, hidden estimates aside."""
@@ -113,8 +115,8 @@ def image_of(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorS
 
     Parameters
     ----------
-    kind : {"Estimate", "Truth", "Error", "Counts", "Confidence"}
-        Without a truth, "Truth" and "Error" return the estimate.
+    kind : {"Estimate", "Truth", "Error", "Reported", "Counts", "Confidence"}
+        Without a truth, "Truth" and "Error" return the estimate; likewise "Reported".
     viewing : Viewing
     """
     capture, image = answer.capture, answer.run.image
@@ -140,6 +142,8 @@ def image_of(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorS
     kept = image.confident(viewing.least_confidence)
     if kind == "Truth" and truth_m is not None:
         return truth_m, range_scale(capture, kept, viewing, "True range")
+    if kind == "Reported" and capture.reported_range_m is not None:
+        return capture.reported_range_m, range_scale(capture, kept, viewing, REPORTED_TITLE)
     return kept.range_m, range_scale(capture, kept, viewing)
 
 

@@ -22,6 +22,7 @@ IMAGES = {
     "Estimate": "shown.range_m",
     "Truth": "capture.truth_range_m",
     "Error": "shown.range_m - capture.truth_range_m",
+    "Reported": "capture.reported_range_m",
     "Confidence": "np.where(image.valid, image.confidence, np.nan)",
     "Counts": "capture.counts",
     **{name: f'core.inspection.maps["{name}"](capture)' for name in inspection.maps},

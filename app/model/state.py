@@ -249,7 +249,7 @@ class Comparison:
 
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 MAPS = (
-    *("Estimate", "Truth", "Error", "Confidence", "Counts", "Peak", "Fired", "SBR"),
+    *("Estimate", "Truth", "Error", "Reported", "Confidence", "Counts", "Peak", "Fired", "SBR"),
     "Goodness of fit",
 )
 UNITS = ("bins", "ns", "m")
@@ -268,7 +268,12 @@ PAPER_SECTIONS = (
     "What the paper does not report",
 )
 CLOUD_COLORS = ("Range", "Error", "Counts")
-NEED_TRUTH = ("Truth", "Error")
+NEEDED = {
+    "Truth": "truth_range_m",
+    "Error": "truth_range_m",
+    "Reported": "reported_range_m",
+}
+"""Image of the capture without which a kind of image does not exist."""
 
 
 MOST_PINS = 4

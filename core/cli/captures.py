@@ -49,6 +49,7 @@ from core.inspection import (
     capture_report,
     faulty_pixels,
     pixel_report,
+    reported_check,
 )
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
@@ -174,6 +175,7 @@ def _capture_facts(capture: Capture) -> dict[str, Any]:
         **({} if free is None else _interval("echo_free_background", free)),
         "flux_remark": report.flux_remark,
         **_stated_facts(report),
+        **_reported_facts(capture),
         "hot_pixels": report.n_hot,
         "hot_pixels_at": hot,
         "dead_pixels": report.n_dead,
@@ -195,6 +197,19 @@ def _stated_facts(report: CaptureReport) -> dict[str, float]:
     return facts
 
 
+def _reported_facts(capture: Capture) -> dict[str, Any]:
+    """Return how estimates by the likelihood differ from the ranges that the file reports."""
+    if capture.reported_range_m is None:
+        return {}
+    found = reported_check(capture, estimate(capture, "likelihood"))
+    assert found is not None
+    return {
+        "reported_range_pixels_compared": found.n_pixels,
+        "reported_range_median_difference_m": found.median_m,
+        "reported_range_difference_spread_m": found.spread_m,
+    }
+
+
 def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
     report = pixel_report(capture, estimate(capture, "tracking"), row, col)
     facts: dict[str, Any] = {
@@ -206,6 +221,7 @@ def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
         "confidence": report.confidence,
         "interval": report.interval_text,
         **_interval_facts(report),
+        **_reported_pixel_facts(capture, report),
         **_flux_facts(report),
         "verdict": report.verdict.health,
         "why_verdict": report.verdict.why,
@@ -213,6 +229,14 @@ def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
     for rank, candidate in enumerate(report.candidates, 1):
         facts |= {f"candidate_{rank}_{name}": value for name, value in vars(candidate).items()}
     return facts
+
+
+def _reported_pixel_facts(capture: Capture, report: PixelReport) -> dict[str, float]:
+    if capture.reported_range_m is None:
+        return {}
+    reported_m = float(capture.reported_range_m[report.row, report.col])
+    difference_m = report.answer_m - reported_m
+    return {"reported_range_m": reported_m, "reported_range_difference_m": difference_m}
 
 
 def _interval_facts(report: PixelReport) -> dict[str, float]:

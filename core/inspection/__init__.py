@@ -17,6 +17,7 @@ from core.inspection.pixel import PixelReport, RangeCandidate, echo_view, pixel_
 from core.inspection.profile import LEVEL, FluxEstimate
 from core.inspection.pulses import Accuracy, accuracy_over_pulses
 from core.inspection.region import RegionReport, region_report
+from core.inspection.reported import ReportedCheck, reported_check
 
 # Deprecated names, to be removed after the next release.
 LightFound, light_found, mean_light = FluxEstimate, estimate_flux, estimate_mean_flux
@@ -35,6 +36,7 @@ __all__ = [
     "PixelReport",
     "RangeCandidate",
     "RegionReport",
+    "ReportedCheck",
     "StatedFluxCheck",
     "Suggestion",
     "accuracy_over_pulses",
@@ -51,4 +53,5 @@ __all__ = [
     "pixel_report",
     "pixels_in",
     "region_report",
+    "reported_check",
 ]

@@ -6,7 +6,7 @@ import math
 import platform
 from base64 import b64encode
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from hashlib import sha256
 from html import escape
 from importlib.metadata import version
@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 
 from core import metrics
+from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators import ESTIMATORS, Provenance, RangeImage
 from core.geometry import WHOLE, Box
 from core.inference import fit_of, fit_p_values, share_below
 from core.inspection import (
+    CONFIDENT,
     CaptureReport,
     FluxEstimate,
     PixelReport,
@@ -28,6 +30,7 @@ from core.inspection import (
     capture_report,
     echo_view,
     pixel_report,
+    reported_check,
 )
 from core.io.writers.colors import ColorScale, colors_of, p_value_scale, range_scale
 from core.io.writers.product import guessed_view, plain
@@ -120,6 +123,7 @@ def page_of(
         *_all_pixels(capture, capture_found),
         *_pixel(capture, made_by, pixel_found),
         *_cloud(capture, image, shown, scale, pixel_angle_rad, box, step),
+        *_reported(capture, image),
         *_accuracy(capture, image),
         *_settings(made_by, least_confidence),
         *_script(script),
@@ -216,6 +220,7 @@ def _maps(
             scale,
             f"{_hidden(image, shown)}{grey} The square marks the pixel below.",
         ),
+        *_map_reported(capture, scale),
         (
             "Confidence",
             confidence,
@@ -240,6 +245,17 @@ def _maps(
         for name, values, colors, caption in plots
     ]
     yield f'<div class="plots">{"".join(drawn)}</div>'
+
+
+def _map_reported(
+    capture: Capture, scale: ColorScale
+) -> Iterator[tuple[str, Floats, ColorScale, str]]:
+    if capture.reported_range_m is None:
+        return
+    n_blank = int(np.isnan(capture.reported_range_m).sum())
+    caption = f"Distance that the sensor itself found; {n_blank:,} pixels without one."
+    of_sensor = replace(scale, title="Reported distance")
+    yield "Reported distance", capture.reported_range_m, of_sensor, caption
 
 
 def _all_pixels(capture: Capture, report: CaptureReport) -> Iterator[str]:
@@ -283,6 +299,13 @@ def _pixel(capture: Capture, made_by: Provenance, report: PixelReport) -> Iterat
     if truth_m is not None:
         known = "no target" if math.isnan(truth_m) else _metres(truth_m, capture, decimals)
         facts.insert(3, ("Truth", known))
+    if capture.reported_range_m is not None:
+        reported_m = float(capture.reported_range_m[row, col])
+        difference = _metres(report.answer_m - reported_m, capture, decimals)
+        facts[3:3] = [
+            ("Reported by the sensor", _metres(reported_m, capture, decimals)),
+            ("Estimate minus reported", difference),
+        ]
     yield _facts(facts)
     yield (
         '<p class="note">The intervals are those of the range of the surface, given that there is '
@@ -361,6 +384,22 @@ def _cloud(
         "arrows, + and −, 0 for the first view.</figcaption></figure>"
     )
     yield "<noscript><p>The cloud needs JavaScript.</p></noscript>"
+
+
+def _reported(capture: Capture, image: RangeImage) -> Iterator[str]:
+    found = reported_check(capture, image)
+    if found is None:
+        return
+    rows = [
+        ("Median difference", _metres(found.median_m, capture)),
+        ("Half the central 68 % range", _metres(found.spread_m, capture)),
+    ]
+    yield _heading_2("Distances reported by the sensor")
+    yield _paragraph(
+        f"Estimate minus reported distance, in the {found.n_pixels:,} pixels that have both and a "
+        f"confidence of {CONFIDENT:g} or more."
+    )
+    yield _facts(rows)
 
 
 def _accuracy(capture: Capture, image: RangeImage) -> Iterator[str]:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -100,9 +101,16 @@ def test_info_lists_hot_and_dead_pixels(tmp_path: Path, capsys: pytest.CaptureFi
 def test_info_reports_on_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = scenes["staircase"](8)
     capture = simulate(scene, Acquisition(n_pulses=200), Flux(0.3, sbr=1.0), seed=3)
+    assert capture.truth_range_m is not None
+    only_here = np.arange(64).reshape(8, 8) == 2 * 8 + 3
+    reported_m = np.where(only_here, capture.truth_range_m - 1.0, np.nan)
+    capture = replace(capture, reported_range_m=reported_m)
     path = tmp_path / "stairs.npz"
     save_capture(capture, path)
     found = facts(capsys, "info", path)
+    assert found["reported_range_pixels_compared"] == 1
+    assert found["reported_range_median_difference_m"] == pytest.approx(1.0, abs=0.1)
+    assert found["reported_range_difference_spread_m"] == 0
     assert found["signal_low"] < 0.3 < found["signal_high"]
     assert found["sbr_low"] <= found["sbr"] <= found["sbr_high"]
     for name in ("target_signal", "target_sbr"):
@@ -118,6 +126,9 @@ def test_info_reports_on_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert pixel["range_low_m"] < pixel["range_low_68_m"] < pixel["range_high_68_m"]
     assert pixel["interval"].endswith(f"{pixel['range_high_m']:.3f} m (95 %)")
     assert pixel["verdict"] == "ordinary"
+    assert pixel["reported_range_m"] == pytest.approx(reported_m[2, 3])
+    difference_m = pixel["range_m"] - reported_m[2, 3]
+    assert pixel["reported_range_difference_m"] == pytest.approx(difference_m)
     code, _, err = ran(capsys, "info", path, "--pixel", 8, 0)
     assert code == 2 and "row, col = (8, 0)" in err
 

@@ -17,7 +17,7 @@ import pytest
 import core
 from core.cli import main
 from core.inference import fit_of, fit_p_values, share_below
-from core.inspection import capture_report, pixel_report
+from core.inspection import capture_report, pixel_report, reported_check
 from core.report import telling_pixel, write_report
 
 pytestmark = pytest.mark.files
@@ -85,6 +85,8 @@ def simulated(sbr: float = 1.0) -> core.Capture:
 
 
 CAPTURE = simulated()
+REPORTED_M = np.asarray(CAPTURE.truth_range_m) - 0.02
+CAPTURE = replace(CAPTURE, reported_range_m=REPORTED_M)
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +126,7 @@ def test_each_plot_has_a_heading_and_a_text_of_its_own(page: Page) -> None:
         "Histogram of all pixels",
         "Pixel in row 5, column 6",
         "Point cloud",
+        "Distances reported by the sensor",
         "Accuracy",
         "Settings and versions",
         "Python script",
@@ -157,6 +160,12 @@ def test_numbers_are_those_of_the_reports(page: Page, image: core.RangeImage) ->
     fit = f"{share_below(fit_p_values(CAPTURE))} {fit_of(CAPTURE).verdict}"
     assert fit in page.texts["figcaption"]
     assert f"{pixel.answer_m:.{pixel.interval_68_m.decimals}f}" in page.texts["data"]
+    check = reported_check(CAPTURE, image)
+    assert check is not None and check.n_pixels > 0
+    assert page.values["Reported by the sensor"] == [REPORTED_M[PIXEL]]
+    assert page.values["Estimate minus reported"] == [pixel.answer_m - REPORTED_M[PIXEL]]
+    assert page.values["Median difference"] == [check.median_m]
+    assert page.values["Half the central 68 % range"] == [check.spread_m]
     for rank, candidate in enumerate(pixel.candidates, 1):
         bin_, range_m, score, relative, probability = page.values[str(rank)]
         assert (bin_, range_m, score) == (candidate.bin, candidate.range_m, candidate.score)

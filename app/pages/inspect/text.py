@@ -11,7 +11,7 @@ import numpy as np
 from app.model.large import Grid
 from app.model.methods import method_title
 from app.model.state import Viewing
-from app.model.store import Answer
+from app.model.store import Answer, Pixel
 from app.model.text import (
     CONFIDENCE_HELP,
     Cell,
@@ -44,6 +44,7 @@ from core.inspection import (
     FaultyPixel,
     FluxEstimate,
     LineProfile,
+    reported_check,
 )
 from core.io import changed_settings
 from core.metrics import Interval
@@ -71,7 +72,7 @@ map *Goodness of fit* shows where it fails.
 MAP_HELP = (
     "Quantity shown on the map. Peak: largest count of a pixel. Fired: share of pulses with a "
     "detection. SBR: estimated from the counts. Goodness of fit: p-value, below 0.05 in 5 % of the "
-    "pixels where the model holds."
+    "pixels where the model holds. Reported: distance that the sensor itself found."
 )
 MODE_HELP = (
     "What dragging on the map does: zoom, select a region by a rectangle or a lasso, or draw the "
@@ -128,12 +129,29 @@ def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
     place = pixel_name((pixel.row, pixel.col), answer.grid)
     along = scale(unit, answer.gate)
     has_truth = answer.capture.truth_range_m is not None
-    facts = [*estimate_facts(pixel, along, has_truth), ("Pixel", place, "Row and column.")]
+    facts = [
+        *estimate_facts(pixel, along, has_truth),
+        *_reported_facts(answer, pixel),
+        ("Pixel", place, "Row and column."),
+    ]
     counts, help = count(pixel.counts), "Counts in the histogram of this pixel"
     if answer.capture.gated_pulses is not None:
         counts = count(pixel.counts, share(pixel.counts / answer.capture.gated_pulses))
         help += ", and as a share of the pulses"
     return [*facts, ("Detections", counts, f"{help}."), *_flux(found.report)]
+
+
+def _reported_facts(answer: Answer, pixel: Pixel) -> list[Fact]:
+    """Return the range that the instrument reported of a pixel, compared with the estimate."""
+    if answer.capture.reported_range_m is None:
+        return []
+    reported_m = float(answer.capture.reported_range_m[pixel.row, pixel.col])
+    decimals = pixel.interval_68_m.decimals
+    difference = number(pixel.range_m - reported_m, "m", sign=True, decimals=decimals)
+    return [
+        ("Reported", number(reported_m, "m", decimals=decimals), "Distance that the sensor found."),
+        ("Estimate − reported", difference, "Estimate minus the distance that the sensor found."),
+    ]
 
 
 def _region_facts(found: Inspected, unit: str) -> list[Fact]:
@@ -446,6 +464,7 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
         ("SBR, all pixels", interval(image.sbr), f"{of_all}: signal over background."),
         ("Background", interval(image.background), f"Mean of all pixels over the gate, {per}"),
         *_stated_facts(report),
+        *_reported_check_facts(answer),
         ("Hot pixels", hot, "Pixels with more detections than all neighbours, and not in an echo."),
         ("Dead pixels", dead, "Pixels with fewer detections than all neighbours."),
     ]
@@ -463,6 +482,23 @@ def _stated_facts(report: CaptureReport) -> list[Fact]:
         help = f"Stated by the file, {of}. The estimate of the mean of all pixels is {estimate}."
         facts.append((titles[each.name], noted(each.stated, note), help))
     return facts
+
+
+def _reported_check_facts(answer: Answer) -> list[Fact]:
+    """Return how confident estimates differ from the ranges that the instrument reported."""
+    found = reported_check(answer.capture, answer.run.image)
+    if found is None:
+        return []
+    low_m, high_m = found.median_m - found.spread_m, found.median_m + found.spread_m
+    decimals = Interval(found.median_m, low_m, high_m).decimals
+    median = number(found.median_m, "m", sign=True, decimals=decimals)
+    of_pixels = f"over the {found.n_pixels:,} pixels confident by {CONFIDENT:g} that have both."
+    help = f"Estimate minus the distance that the sensor found, median {of_pixels}"
+    spread = f"Half the central 68 % range of this difference {of_pixels}"
+    return [
+        ("Estimate − reported", median, help),
+        ("Spread of it", number(found.spread_m, "m", decimals=decimals), spread),
+    ]
 
 
 def flux_sentence(report: CaptureReport) -> str:
