@@ -182,9 +182,9 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     kept = _kept(share)
     levels, share = levels[kept], share[kept] / share[kept].sum()
     background = float(total.mean() - share @ levels)
-    if background < share @ levels and not math.isnan(free.mean):
+    if background < share @ levels and free.mean < total.mean():
         # A small difference of large numbers, while the echoes stand out clearly.
-        background = min(free.mean, float(total.mean()))
+        background = free.mean
         levels = levels * ((total.mean() - background) / (share @ levels))
     found = found._replace(levels=levels, share=share, background=np.asarray(background))
     return found._replace(contrast=found.model(total, least).contrast), free.shape

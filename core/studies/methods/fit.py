@@ -99,7 +99,7 @@ CASES = {
 """Captures that the model does not describe, by name."""
 
 NULL_CASES = tuple(
-    Case(scene, sbr) for scene in ("car", "building", "uniform") for sbr in (0.03, 0.06, 0.3)
+    Case(scene, sbr) for scene in ("car", "building", "uniform") for sbr in (0.03, 0.06, 0.3, 30.0)
 )
 """Captures that the model describes."""
 
