@@ -27,7 +27,13 @@ from tornado.ioloop import IOLoop, PeriodicCallback
 import core
 from app import THRESHOLD
 from app.model import text
-from app.model.store import Source, built_in_sources, content_key, file_source
+from app.model.store import (
+    Source,
+    built_in_sources,
+    content_key,
+    file_source,
+    is_ambiguous,
+)
 from app.model.truth import with_chosen_truth
 from app.model.uploads import Uploads
 from app.model.watched import LOOK_MS, WatchedFolder
@@ -169,6 +175,8 @@ def readable(
 ) -> dict[str, Source]:
     """Return the files that can be read, by their key, and report the others.
 
+    Last come the files of which the user must choose an array: the page asks for it.
+
     Parameters
     ----------
     paths : sequence of Path
@@ -181,19 +189,29 @@ def readable(
     ValueError
         If none can be read.
     """
-    found, refused = {}, []
+    found: dict[str, Source] = {}
+    asked: dict[str, Source] = {}
+    refused: list[ValueError] = []
     for path in paths:
         try:
             source = change(file_source(path, given=options, shared=True))
             print(source.read().source, flush=True)
             found[content_key(path)] = source
-        except ValueError as error:  # unreadable or too large
-            refused.append(error)
-    if refused and not found:
+        except ValueError as error:  # unreadable, too large, or of several arrays
+            if is_ambiguous(error):
+                asked[content_key(path)] = source
+                _report(f"The page asks: {error}")
+            else:
+                refused.append(error)
+    if refused and not (found or asked):
         raise ValueError("\n".join(map(str, refused)))
     for why in refused:
-        print(f"Not opened: {with_flags(str(why), *TRUTH_OPTIONS)}", file=sys.stderr, flush=True)
-    return found
+        _report(f"Not opened: {why}")
+    return found | asked
+
+
+def _report(why: str) -> None:
+    print(with_flags(why, *TRUTH_OPTIONS), file=sys.stderr, flush=True)
 
 
 async def look(watched: WatchedFolder, sources: dict[str, Source], arrivals: Arrivals) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
+from scipy.sparse import csc_array
 
 from app.__main__ import main, parser_of_arguments, readable
 from app.model.reading import options_in_use
@@ -18,6 +20,7 @@ from app.pages.session import Session
 from core.io import ReadOptions
 from tests.browser import eventually
 from tests.states import link_to
+from tests.threads import HeldLayout, control
 
 CUBE = np.random.default_rng(2).poisson(0.3, (4, 6, 40))
 
@@ -49,6 +52,27 @@ def test_options_hold_until_others_are_chosen(paths):
     session.state.reading = ReadOptions(bin_width_s=1e-9)
     eventually(lambda: session.answer.capture.acquisition.bin_width_s == 1e-9)
     assert "variable day" in session.answer.capture.source
+
+
+def test_a_file_of_several_arrays_is_served_and_the_page_asks_for_one(tmp_path, capsys):
+    path = tmp_path / "two.mat"
+    sparse = csc_array(CUBE.reshape(24, 40).astype(float))
+    savemat(path, {"spad": sparse, "rates": CUBE / 7.0})
+    files = readable([path], ReadOptions())
+    said = capsys.readouterr().err
+    assert "The page asks: two.mat: --variable is missing: give spad or rates" in said
+    layout = HeldLayout(files | built_in_sources())
+    assert layout.session.answer.request.source.title == "Car at 50 m"
+    assert "Several arrays of two.mat" in layout.alert.text
+    assert "source" not in layout.session.query()  # a reload asks again
+    control(layout, "spad").clicks += 1
+    answer = layout.next_answer()
+    assert answer.request.source.title == "two.mat"
+    assert answer.capture.counts.sum() == CUBE.sum()
+    assert layout.session.state.page == "Inspect"
+    again = HeldLayout(files | built_in_sources(), link_to(layout.session.query()))
+    assert again.session.answer.request.source.title == "two.mat"
+    assert again.alert.text == ""
 
 
 def test_without_a_readable_file_each_is_reported_and_nothing_is_served(paths, capsys):

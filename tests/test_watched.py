@@ -60,6 +60,13 @@ def test_a_capture_is_found_once_when_it_is_written(tmp_path):
     assert folder.look() is None
 
 
+def test_a_capture_of_several_arrays_is_offered_since_the_page_asks_for_one(tmp_path):
+    folder = WatchedFolder(tmp_path)
+    cube = capture(1.0).cube
+    np.savez(tmp_path / "two.npz", day=cube, night=cube)
+    assert titles(folder.look() or folder.look()) == ["two.npz"]
+
+
 def test_a_folder_that_does_not_exist_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"watch = .*nowhere"):
         WatchedFolder(tmp_path / "nowhere")

@@ -11,7 +11,15 @@ from app.model import text
 from app.model.address import Link, defaults
 from app.model.capture_defaults import FROM_CAPTURE, defaults_of, enter, possible_kinds
 from app.model.state import State
-from app.model.store import COMPUTED_FROM, Answer, Refused, Request, Source, compute
+from app.model.store import (
+    COMPUTED_FROM,
+    Answer,
+    Refused,
+    Request,
+    Source,
+    compute,
+    is_ambiguous,
+)
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +30,7 @@ def restore(
     """Set a state as its link says, and compute the estimate.
 
     Each setting that cannot be restored is described in ``link.refused``; a file that cannot be
-    read is returned, too.
+    read is returned, too. A scene is shown where the session's own file is such a file.
 
     Parameters
     ----------
@@ -73,15 +81,17 @@ def _first_answer(
     plain = {name: value for name, value in changed.items() if name not in COMPUTED_FROM}
     source = {name: value for name, value in changed.items() if name == "source"}
     refused: Refused | None = None
-    for attempt in (changed, plain | source, plain):
+    scenes = [{"source": key} for key, each in sources.items() if each.is_scene]
+    for attempt in (changed, plain | source, plain, *(plain | scene for scene in scenes[:1])):
         state.param.update(before | attempt)
         request = request_of(state, sources)
         try:
             answer = compute(request, None)
         except Exception as error:  # the page reports any failure
-            log.warning("could not restore the link", exc_info=error)
-            why = text.reason(error)
-            link.refused += [] if why in link.refused else [why]
+            if not is_ambiguous(error):  # the page asks for the array
+                log.warning("could not restore the link", exc_info=error)
+                why = text.reason(error)
+                link.refused += [] if why in link.refused else [why]
             if refused is None and not request.source.is_scene:
                 refused = Refused.of(request, error)
         else:

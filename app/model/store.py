@@ -235,7 +235,17 @@ class Refused:
     @classmethod
     def of(cls, request: Request, error: Exception) -> Refused:
         """Return what an error says about the file of a request."""
-        return cls(request, getattr(error, "variables", ()))
+        return cls(request, _variables(error))
+
+
+def is_ambiguous(error: Exception) -> bool:
+    """Return whether a file was refused because the user must choose one of its arrays."""
+    return bool(_variables(error))
+
+
+def _variables(error: Exception) -> tuple[str, ...]:
+    """Return the arrays of which the user must choose one."""
+    return getattr(error, "variables", ())
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from stat import S_ISREG
 
-from app.model.store import NO_OPTIONS, Source, content_key, file_source
+from app.model.store import NO_OPTIONS, Source, content_key, file_source, is_ambiguous
 from app.model.uploads import cached_while_used
 from core.checks import require
 from core.io import SUFFIXES, ReadOptions
@@ -97,9 +97,10 @@ class WatchedFolder:
                 source = replace(source, load=cached_while_used(source.load))
                 source.read()
             except (ValueError, OSError) as error:
-                log.warning("not opened: %s", error)
-            else:
-                found[key] = source
+                if not is_ambiguous(error):
+                    log.warning("not opened: %s", error)
+                    continue
+            found[key] = source  # of several arrays, the page asks for one
         keys = [key for key in self._keys if key not in found] + list(found)
         self._keys = keys[-MOST_CAPTURES:]
         return Arrival(found, tuple(keys[:-MOST_CAPTURES])) if found else None

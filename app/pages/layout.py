@@ -30,7 +30,7 @@ from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
 from app.pages.shared.illumination import IlluminationPanel
 from app.pages.shared.method import MethodChoice
-from app.pages.shared.reading import ReadingForm
+from app.pages.shared.reading import QUESTION, ReadingForm
 from app.pages.shared.truth import TruthForm, TruthOffer
 from app.tasks.page import PageTasks
 from app.tasks.signals import Signal
@@ -215,6 +215,8 @@ class Layout:
         self._listen()
         if session.refused:
             session.failures.show(text.not_restored(session.refused))
+        elif (refused := session.estimate.refused) is not None:
+            session.failures.show(QUESTION.format(file=refused.request.source.title))
 
     def _view_of(self, page: Page) -> View:
         content = self.contents[page.name] = page.build(self.session)

@@ -84,6 +84,9 @@ class Session:
         own = self._own | defaults_of(self.answer)
         if not self.answer.request.source.is_scene:
             own["source"] = ""  # always in the link: another server may have another file
+        refused = self.estimate.refused
+        if refused is not None and refused.request.source is self.sources.get(self._own["source"]):
+            own["source"] = self.state.source  # not in the link: a reload asks again
         return query_of(self.state, own)
 
     def request_query(self) -> str:

@@ -163,7 +163,9 @@ def require_counts(array: NDArray[Any], name: str, axes: str | None) -> None:
             what = f"{value} if {name} holds {frames}: more than half of its values are {value}"
             require("no_trigger", None, False, what)
     if axes is None and least == 0 and resembles_frames(array):
-        what = f"0 if {name} holds {frames}, as it seems, or axes if it holds counts"
+        what = (
+            f"0 if {name} holds {frames}, as it seems, or axes = 'row col bin' if it holds counts"
+        )
         require("no_trigger", None, False, what)
 
 

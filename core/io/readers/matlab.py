@@ -235,8 +235,11 @@ def _opened(path: Path) -> _Version5 | _Version73:
     if _is_hdf5(start):
         return _Version73(path)
     # SciPy takes a zero in the first four bytes for version 4.
-    known = start[124:128] in _VERSIONS_5 and 0 not in start[:4]
-    require("version", start[124:128], known, "a MATLAB file, saved with -v6, -v7 or -v7.3")
+    if start[124:128] not in _VERSIONS_5 or 0 in start[:4]:
+        raise ValueError(
+            "the header is not that of a MATLAB file: give one that was saved with -v6, -v7 or "
+            "-v7.3."
+        )
     return _Version5(path)
 
 

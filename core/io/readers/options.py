@@ -401,11 +401,18 @@ def read_options_from(chosen: Any) -> ReadOptions:
 def with_flags(message: str, *others: str) -> str:
     """Return a message with the options of the command line instead of the arguments' names.
 
-    `others` are names of arguments that are no fields of `ReadOptions`.
+    One that was not given is called missing: nobody has written its value, None.
+
+    Parameters
+    ----------
+    message : str
+    others : str
+        Names of arguments that are no fields of `ReadOptions`.
     """
     flags = {name: option.flag for name, option in reading_options().items()}
     flags |= {name: name.replace("_", "-") for name in others}
-    return _renamed(message, {name: f"--{flag}" for name, flag in flags.items()})
+    found = _renamed(message, {name: f"--{flag}" for name, flag in flags.items()})
+    return re.sub(r"(--[\w-]+) = None is not accepted", r"\1 is missing", found)
 
 
 def with_labels(message: str, others: Mapping[str, str] = MappingProxyType({})) -> str:
