@@ -505,6 +505,13 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, mon
     assert numbers["In both"] == f"{np.isfinite(difference_m).sum():,}"
     assert numbers["Only in A"] == f"{(shown[0] & ~shown[1]).sum():,}"
     assert "SBR0.3" in section.a.title.text and "Coates" in section.b.title.text
+    for picture, image, visible in zip(
+        (section.a, section.b), (image_a, image_b), shown, strict=True
+    ):
+        n_valid = image.valid.sum()
+        hidden = f"{n_valid - visible.sum():,} of {n_valid:,} estimates hidden below confidence 0.9"
+        assert hidden in picture.caption.text
+    assert f"{np.isnan(difference_m).sum():,} pixels" in section.difference.caption.text
     # The script computes both.
     building.state.param.update(page="Inspect", subject="A/B")
     monkeypatch.chdir(tmp_path)

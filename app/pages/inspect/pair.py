@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import panel as pn
 
-from app.model.colors import ERROR_SCALE_BINS, image_of
+from app.model.colors import ERROR_SCALE_BINS, image_of, legend
 from app.model.exports import image_file, image_files
 from app.model.state import Viewing
 from app.model.store import Answer, Request, compute
@@ -25,7 +25,7 @@ from app.widgets.controls import Facts, Sentence
 from app.widgets.method_picture import Picture, ScaleBar
 from core.io import ColorScale
 
-HEIGHT_PX = 260
+HEIGHT_PX = 240
 GRID = f"""
 :host {{ display: grid !important; gap: 8px; grid-template-columns: repeat(2, minmax(0, 1fr)); }}
 @media screen and (max-width: {BREAK_PX}px) {{
@@ -55,6 +55,7 @@ class PairSection(Section):
         ]
         for picture in self._pictures:
             picture.image.join(self.a.image)
+            picture.caption.stylesheets = []  # a legend has two lines, or three
         self._scale, self._difference_scale = ScaleBar(), ScaleBar()
         self._painted = [self._scale, self._difference_scale]
         self._painted += [picture.image for picture in self._pictures]
@@ -128,13 +129,16 @@ class PairSection(Section):
         values_b, look = image_of(pair.b, "Estimate", viewing)
         values_a, _ = image_of(pair.a, "Estimate", viewing)
         of_difference = difference_scale(pair)
+        why_a = legend(pair.a, "Estimate", viewing, values_a, look)
+        why_b = legend(pair.b, "Estimate", viewing, values_b, look)
+        blank = text.difference_legend(pair)
         drawn = (
-            (self.a, f"A: {names[0]}", values_a, look),
-            (self.b, f"B: {names[1]}", values_b, look),
-            (self.difference, text.DIFFERENCE_TITLE, pair.difference_m, of_difference),
+            (self.a, f"A: {names[0]}", why_a, values_a, look),
+            (self.b, f"B: {names[1]}", why_b, values_b, look),
+            (self.difference, text.DIFFERENCE_TITLE, blank, pair.difference_m, of_difference),
         )
-        for picture, title, values, scale in drawn:
-            picture.title.text = title
+        for picture, title, caption, values, scale in drawn:
+            picture.title.text, picture.caption.text = title, caption
             picture.image.fit(*pair.b.capture.shape, pair.b.grid)
             picture.draw_image(values, scale)
         self._scale.update(look)

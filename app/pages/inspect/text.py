@@ -197,6 +197,12 @@ def estimate_name(answer: Answer) -> str:
     return ", ".join(names)
 
 
+def difference_legend(pair: Pair) -> str:
+    """Return why pixels of the difference of two estimates are blank."""
+    n_blank = int(np.isnan(pair.difference_m).sum())
+    return f"Blank: {n_blank:,} pixels that A, B or both do not show." if n_blank else ""
+
+
 def pair_facts(pair: Pair) -> list[Fact]:
     """Return name, value and help of each number of two estimates."""
     (in_a, in_b), known = pair.shown, pair.difference_m[np.isfinite(pair.difference_m)]
