@@ -237,6 +237,15 @@ def test_only_what_is_missing_is_computed(shown, monkeypatch):
     assert len(ran) == 2 + 6
 
 
+def test_captions_have_intervals_where_the_confidence_suffices(car):
+    row, col = np.argwhere(np.isfinite(car.capture.truth_range_m) & car.run.image.valid)[0]
+    with_margin, without = (text.caption(car, row, col, least) for least in (0.0, 1.1))
+    number = r"[\d,.]+"
+    error = rf"\(error [+−]{number} m\), confidence \d+ %"
+    assert re.fullmatch(rf"{number} ± {number} m {error}", with_margin)
+    assert re.fullmatch(rf"{number} m {error}", without)
+
+
 def test_another_capture_makes_everything_outdated(shown):
     before = shown.figures
     change(shown.session, light=Illumination(seed=5))
