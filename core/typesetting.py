@@ -31,6 +31,8 @@ def typeset(text: str) -> str:
 def value_and_bounds(value: float, low: float, high: float) -> tuple[str, str]:
     """Format a number with three digits, and the ends of its interval with as many decimals.
 
+    The digits count from the larger of the number and half the width of its interval.
+
     Returns
     -------
     tuple of str
@@ -41,7 +43,8 @@ def value_and_bounds(value: float, low: float, high: float) -> tuple[str, str]:
     >>> value_and_bounds(0.03, 0.0273, 0.03261)
     ('0.0300', '[0.0273–0.0326]')
     """
-    scale = abs(value or high)
+    half = (high - low) / 2
+    scale = max(abs(value), half if math.isfinite(half) else 0.0)
     texts = [_like(scale, each) for each in (value, low, high)]
     return texts[0], "" if math.isnan(low) else f"[{texts[1]}–{texts[2]}]"
 

@@ -238,12 +238,16 @@ def test_only_what_is_missing_is_computed(shown, monkeypatch):
 
 
 def test_captions_have_intervals_where_the_confidence_suffices(car):
-    row, col = np.argwhere(np.isfinite(car.capture.truth_range_m) & car.run.image.valid)[0]
-    with_margin, without = (text.caption(car, row, col, least) for least in (0.0, 1.1))
+    image = car.run.image
+    known = image.valid & np.isfinite(car.capture.truth_range_m)
     number = r"[\d,.]+"
-    error = rf"\(error [+−]{number} m\), confidence \d+ %"
-    assert re.fullmatch(rf"{number} ± {number} m {error}", with_margin)
-    assert re.fullmatch(rf"{number} m {error}", without)
+    for among, margin in (
+        (known & (image.confidence >= CONFIDENT), f" ± {number}"),
+        (known & (image.confidence < CONFIDENT), ""),
+    ):
+        found = text.caption(car, *np.argwhere(among)[0])
+        expected = rf"{number}{margin} m \([+−]{number}\), confidence \d+ %"
+        assert re.fullmatch(expected, found)
 
 
 def test_another_capture_makes_everything_outdated(shown):

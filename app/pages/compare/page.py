@@ -314,7 +314,6 @@ class Compare(Section):
     def _change_view(self, viewing: Viewing) -> None:
         self.session.state.comparison = replace(self._chosen, viewing=viewing)
         self._draw_pictures()
-        self._mark_pixel()
 
     def _toggle_stopped(self) -> None:
         self._is_stopped = not self._is_stopped
@@ -562,7 +561,7 @@ class Compare(Section):
 
     def _mark_pixel(self) -> None:
         row, col = self.session.state.pixel
-        answers, least = self.answers, self._chosen.viewing.least_confidence
+        answers = self.answers
         with self.session.tasks.hold():
             self._keys.pixel = [row, col]
             self._facts.facts = text.pixel_facts(self.session.answer, self.reference, row, col)
@@ -570,7 +569,7 @@ class Compare(Section):
                 picture.image.mark(row, col)
                 answer = answers.get(method)
                 if answer is not None:
-                    picture.caption.text = text.caption(answer, row, col, least)
+                    picture.caption.text = text.caption(answer, row, col)
                 if picture.cloud is not None:
                     picture.cloud.selected = row * self._capture.shape[1] + col
 

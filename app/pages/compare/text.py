@@ -205,10 +205,10 @@ def pixel_facts(answer: Answer, reference: Reference | None, row: int, col: int)
     ]
 
 
-def caption(answer: Answer, row: int, col: int, least_confidence: float) -> str:
-    """Return a method's estimate of a pixel with its 95 % interval, for the line under its picture.
+def caption(answer: Answer, row: int, col: int) -> str:
+    """Return a method's estimate of a pixel, for the line under its picture.
 
-    Estimates of less confidence than is shown have no interval.
+    The 95 % interval is that of a surface: only a confident estimate has one.
     """
     image, truth_m = answer.run.image, answer.capture.truth_range_m
     if not image.valid[row, col]:
@@ -218,8 +218,8 @@ def caption(answer: Answer, row: int, col: int, least_confidence: float) -> str:
     error = ""
     if truth_m is not None and math.isfinite(truth_m[row, col]):
         error_m = range_m.value - float(truth_m[row, col])
-        error = f" (error {number(error_m, 'm', sign=True, decimals=range_m.decimals)})"
-    estimate = estimate_text(range_m, confidence, least_confidence)
+        error = f" ({number(error_m, '', sign=True, decimals=range_m.decimals)})"
+    estimate = estimate_text(range_m, confidence, CONFIDENT)
     return f"{estimate}{error}, confidence {100 * confidence:.0f} %"
 
 
