@@ -80,6 +80,20 @@ def plus_minus(low: float, high: float, unit: str) -> Quantity:
     return Quantity(text, middle, unit, low, high)
 
 
+def with_margin(found: Interval, unit: str) -> Quantity:
+    """Format an estimate with a margin that includes its interval; without one as `number`.
+
+    The estimate of a method need not be the middle of the interval: the margin is the distance to
+    the farther end.
+    """
+    margin = max(found.high - found.value, found.value - found.low)
+    decimals = Interval(found.value, found.value - margin, found.value + margin).decimals
+    if decimals is None:
+        return number(found.value, unit)
+    text = typeset(f"{found.value:,.{decimals}f} ± {margin:.{decimals}f}")
+    return Quantity(f"{text} {unit}".strip(), found.value, unit, found.low, found.high)
+
+
 def between(low: float, high: float, unit: str) -> Quantity:
     """Format the ends of an interval; a dash for NaN."""
     decimals = Interval((low + high) / 2, low, high).decimals
@@ -186,9 +200,19 @@ class Scale:
 
     def place(self, position_bin: float) -> Quantity:
         """Format a position with its unit; a dash for NaN."""
-        number = self.number(position_bin)
+        return self._named(self.number(position_bin))
+
+    def number_with_margin(self, found: Interval) -> Quantity:
+        """Format a position with its interval, given in bins, without the unit."""
+        return with_margin(Interval(*map(self.at, (found.value, found.low, found.high))), "")
+
+    def place_with_margin(self, found: Interval) -> Quantity:
+        """Format a position with its interval, given in bins, with the unit."""
+        return self._named(self.number_with_margin(found))
+
+    def _named(self, number: Quantity) -> Quantity:
         text = f"bin {number}" if self.name == "bins" else f"{number} {self.name}"
-        return Quantity(text, number.value, self.name)
+        return Quantity(text, number.value, self.name, number.low, number.high)
 
 
 def scale(unit: str, gate: ShownGate) -> Scale:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["bounds", "interval_text", "three_digits", "typeset"]
+__all__ = ["interval_text", "three_digits", "typeset", "value_and_bounds"]
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -28,9 +28,35 @@ def typeset(text: str) -> str:
     return digits.replace("-", "−")
 
 
-def bounds(low: float, high: float) -> str:
-    """Format the ends of an interval; empty for NaN."""
-    return "" if math.isnan(low) else f"[{three_digits(low)}–{three_digits(high)}]"
+def value_and_bounds(value: float, low: float, high: float) -> tuple[str, str]:
+    """Format a number with three digits, and the ends of its interval with as many decimals.
+
+    The digits count from the larger of the number and half the width of its interval.
+
+    Returns
+    -------
+    tuple of str
+        The number; the ends in brackets, empty for NaN.
+
+    Examples
+    --------
+    >>> value_and_bounds(0.03, 0.0273, 0.03261)
+    ('0.0300', '[0.0273–0.0326]')
+    """
+    half = (high - low) / 2
+    scale = max(abs(value), half if math.isfinite(half) else 0.0)
+    texts = [_like(scale, each) for each in (value, low, high)]
+    return texts[0], "" if math.isnan(low) else f"[{texts[1]}–{texts[2]}]"
+
+
+def _like(scale: float, value: float) -> str:
+    """Format a number with the decimals that give a number of another size three digits."""
+    if not math.isfinite(value) or not 0 < scale < math.inf or abs(value) >= 1000:
+        return three_digits(value)
+    if scale < 1e-3:
+        return typeset(f"{value:.2e}")
+    exponent = int(f"{scale:.2e}".partition("e")[2])  # after rounding
+    return typeset(f"{value:.{max(0, 2 - exponent)}f}")
 
 
 def interval_text(value: float, low: float, high: float) -> str:
@@ -43,6 +69,6 @@ def interval_text(value: float, low: float, high: float) -> str:
     >>> interval_text(float("inf"), 9.69, float("inf"))
     '> 9.69'
     """
-    is_open = math.isinf(value) and math.isfinite(low)
-    text = f"> {three_digits(low)}" if is_open else f"{three_digits(value)} {bounds(low, high)}"
-    return text.strip()
+    if math.isinf(value) and math.isfinite(low):
+        return f"> {three_digits(low)}"
+    return " ".join(value_and_bounds(value, low, high)).strip()

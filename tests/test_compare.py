@@ -237,6 +237,19 @@ def test_only_what_is_missing_is_computed(shown, monkeypatch):
     assert len(ran) == 2 + 6
 
 
+def test_captions_have_intervals_where_the_confidence_suffices(car):
+    image = car.run.image
+    known = image.valid & np.isfinite(car.capture.truth_range_m)
+    number = r"[\d,.]+"
+    for among, margin in (
+        (known & (image.confidence >= CONFIDENT), f" ± {number}"),
+        (known & (image.confidence < CONFIDENT), ""),
+    ):
+        found = text.caption(car, *np.argwhere(among)[0])
+        expected = rf"{number}{margin} m \([+−]{number}\), confidence \d+ %"
+        assert re.fullmatch(expected, found)
+
+
 def test_another_capture_makes_everything_outdated(shown):
     before = shown.figures
     change(shown.session, light=Illumination(seed=5))

@@ -110,7 +110,9 @@ def test_axes_facts_and_table_follow_the_unit_without_new_curves(far):
         far.tasks.run_until(lambda title=title: section.table.columns[1][0] == title)
         assert (figure.below[0].axis_label, figure.above[0].axis_label) == (title, opposite)
         along = scale(unit, far.answer.gate)
-        assert section.table.rows[0]["cells"][0][0] == along.number(best.bin)
+        position = section.table.rows[0]["cells"][0][0]
+        assert position.value == pytest.approx(along.at(best.bin))
+        assert re.fullmatch(r"[\d,.]+ ± [\d.]+", position)
         assert ("Position" in values(section.facts)) == (unit != "m")
         np.testing.assert_array_equal(section.plots.counts.curve("raw"), curve)
 
@@ -502,6 +504,10 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, mon
     assert section.pair.a is a
     np.testing.assert_array_equal(section.pair.difference_m, difference_m)
     numbers = values(section.facts)
+    pixel = building.state.pixel
+    for name, image in (("A here", image_a), ("B here", image_b)):
+        assert numbers[name].value == image.range_m[pixel]
+        assert (" ± " in numbers[name]) == (image.confidence[pixel] >= 0.9)
     assert numbers["In both"] == f"{np.isfinite(difference_m).sum():,}"
     assert numbers["Only in A"] == f"{(shown[0] & ~shown[1]).sum():,}"
     assert "SBR0.3" in section.a.title.text and "Coates" in section.b.title.text

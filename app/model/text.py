@@ -10,7 +10,7 @@ from concurrent.futures import BrokenExecutor
 from app.model.methods import METHOD_TITLES
 from app.model.state import AUTOMATIC
 from app.model.store import Answer, Pixel
-from app.units import Scale, between, plus_minus
+from app.units import Quantity, Scale, between, plus_minus, with_margin
 from app.units import milliseconds as milliseconds  # noqa: PLC0414
 from app.units import number as number  # noqa: PLC0414
 from app.units import share as share  # noqa: PLC0414
@@ -188,6 +188,13 @@ def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
             ("Error", error, "Estimate minus truth."),
         ]
     return [*facts, ("Confidence", share(pixel.confidence), CONFIDENCE_HELP)]
+
+
+def estimate_text(range_m: Interval, confidence: float, least_confidence: float) -> Quantity:
+    """Format an estimate in metres with its interval, of little confidence without a margin."""
+    if confidence >= least_confidence:
+        return with_margin(range_m, "m")
+    return number(range_m.value, "m", decimals=range_m.decimals)
 
 
 def target(truth_m: float, decimals: int | None = None) -> str:

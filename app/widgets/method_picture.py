@@ -32,10 +32,8 @@ STAGE = CONTAINER + ":host { transition: opacity 0.2s 0.25s }"
 
 # Titles of one to three lines: the pictures below them are aligned.
 TITLE = ":host { flex: 1 !important } .note { font-weight: 600 }"
-CAPTION = """
-.note { white-space: nowrap; overflow: hidden; text-overflow: ellipsis }
-@media screen and (max-width: 500px) { .note { white-space: normal } }
-"""
+# Captions of one or two lines, likewise.
+CAPTION = ".note { min-height: 2lh }"
 
 
 class Picture:

@@ -112,6 +112,15 @@ def pixel_range_intervals(
     return tuple(Interval(estimate_m, *each) for each in limits_m.reshape(-1, 2).tolist())
 
 
+def delay_range_interval(
+    capture: Capture, row: int, col: int, delay_bins: Floats, level: float = 0.95
+) -> RangeInterval:
+    """Return the interval of a surface near each of some delays (delay,) of a pixel, in metres."""
+    pixels = np.full(delay_bins.size, row * capture.shape[1] + col)
+    limits = _quantiles_bins(capture, pixels, delay_bins, _all_tails([level]))
+    return RangeInterval(*capture.acquisition.bin_to_range_m(limits))
+
+
 def _all_tails(levels: Sequence[float]) -> Floats:
     """Probabilities below the lower and the upper limit of each central interval in turn."""
     for level in levels:

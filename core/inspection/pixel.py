@@ -16,7 +16,7 @@ from core.checks import require
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
 from core.inference.faults import PixelVerdict, pixel_verdict
-from core.inference.intervals import pixel_range_intervals
+from core.inference.intervals import delay_range_interval, pixel_range_intervals
 from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import same_echo_bins
 from core.inspection.flux import METHOD, estimate_flux
@@ -40,6 +40,10 @@ class RangeCandidate:
     """Delay in fractional bins, corrected for the lag of the estimator; that of the estimate for
     the candidate that is the estimate."""
     range_m: float
+    range_low_m: float
+    """Lower limit of the 95 % interval of the range, if there is a surface within 3 bins."""
+    range_high_m: float
+    """Upper limit, likewise."""
     score: float
     relative: float
     """Score over that of the best candidate; 1 for that one."""
@@ -221,7 +225,8 @@ def _candidates(
     if estimate_bin in bins:
         confidence = float(probability[bins == estimate_bin][0])
     range_m = capture.acquisition.bin_to_range_m(bins)
-    columns = (bins, range_m, score, score / score[0], probability)
+    interval_m = delay_range_interval(capture, row, col, bins)
+    columns = (bins, range_m, *interval_m, score, score / score[0], probability)
     found = tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
     return found, confidence
 

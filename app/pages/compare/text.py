@@ -19,6 +19,7 @@ from app.model.text import (
     Fact,
     cause,
     cell,
+    estimate_text,
     number,
     percent_cell,
     reason,
@@ -27,9 +28,8 @@ from app.model.text import (
 )
 from app.pages.compare.ranking import TOLERANCES_BINS, Reference, Result, Task, agreement
 from app.units import count
-from core import ESTIMATORS, Capture
+from core import ESTIMATORS, Capture, pixel_range_intervals
 from core.inspection import CONFIDENT
-from core.typesetting import typeset
 
 Column = tuple[str, str, int]
 """Title, help, and sort order of the first click: 1 ascending, -1 descending."""
@@ -214,15 +214,21 @@ def pixel_facts(answer: Answer, reference: Reference | None, row: int, col: int)
 
 
 def caption(answer: Answer, row: int, col: int) -> str:
-    """Return a method's estimate of a pixel, for the line under its picture."""
+    """Return a method's estimate of a pixel, for the line under its picture.
+
+    The 95 % interval is that of a surface: only a confident estimate has one.
+    """
     image, truth_m = answer.run.image, answer.capture.truth_range_m
     if not image.valid[row, col]:
         return "no estimate"
-    range_m, confidence = float(image.range_m[row, col]), float(image.confidence[row, col])
+    confidence = float(image.confidence[row, col])
+    (range_m,) = pixel_range_intervals(answer.capture, image, row, col, (0.95,))
     error = ""
     if truth_m is not None and math.isfinite(truth_m[row, col]):
-        error = f" ({typeset(f'{range_m - float(truth_m[row, col]):+.2f}')})"
-    return f"{range_m:,.2f} m{error}, confidence {100 * confidence:.0f} %"
+        error_m = range_m.value - float(truth_m[row, col])
+        error = f" ({number(error_m, '', sign=True, decimals=range_m.decimals)})"
+    estimate = estimate_text(range_m, confidence, CONFIDENT)
+    return f"{estimate}{error}, confidence {100 * confidence:.0f} %"
 
 
 def progress(done: int, total: int, method: str | None) -> str:

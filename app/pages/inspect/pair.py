@@ -154,7 +154,10 @@ class PairSection(Section):
         with self.session.tasks.hold():
             for picture in self._pictures:
                 picture.image.mark(*pixel)
-            self.facts.facts = text.pair_pixel_facts(pair, *pixel) + self._of_images
+            least = self.session.state.viewing.least_confidence
+            row, col = pixel
+            here = text.pair_pixel_facts(pair, row, col, least)
+            self.facts.facts = here + self._of_images
 
     # Downloads
 

@@ -234,6 +234,8 @@ class PixelSection(Section):
             self.remark.text = text.remark(found)
             self.table.param.update(
                 columns=text.candidate_columns(scales[0]),
-                rows=text.candidate_rows(found.report.candidates, *scales),
+                rows=text.candidate_rows(
+                    found.report.candidates, found.answer.capture.acquisition, *scales
+                ),
             )
         self.found = found

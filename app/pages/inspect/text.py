@@ -18,6 +18,7 @@ from app.model.text import (
     Fact,
     cell,
     estimate_facts,
+    estimate_text,
     milliseconds,
     number,
     percent_cell,
@@ -35,7 +36,7 @@ from app.units import (
     scale,
 )
 from app.units import interval as format_interval
-from core import Capture
+from core import Acquisition, Capture, pixel_range_intervals
 from core.geometry import distance_m, pixel_angle_of, sight_lines
 from core.inspection import (
     CONFIDENT,
@@ -48,7 +49,7 @@ from core.inspection import (
 )
 from core.io import changed_settings
 from core.metrics import Interval
-from core.typesetting import bounds, three_digits, typeset
+from core.typesetting import typeset, value_and_bounds
 
 EXPLANATION = """
 **Choose.** Tap the map, use the arrow keys (with Shift: eight pixels), or type a row and a column.
@@ -231,14 +232,22 @@ def pair_facts(pair: Pair) -> list[Fact]:
     return facts
 
 
-def pair_pixel_facts(pair: Pair, row: int, col: int) -> list[Fact]:
+def pair_pixel_facts(pair: Pair, row: int, col: int, least_confidence: float) -> list[Fact]:
     """Return name, value and help of each number of one pixel of two estimates."""
-    here_m = [float(each.run.image.range_m[row, col]) for each in (pair.a, pair.b)]
+    here_m, texts = [], []
+    for each in (pair.a, pair.b):
+        (range_m,) = pixel_range_intervals(each.capture, each.run.image, row, col, (0.95,))
+        confidence = float(each.run.image.confidence[row, col])
+        here_m.append(range_m)
+        texts.append(estimate_text(range_m, confidence, least_confidence))
+    a_m, b_m = here_m
+    coarser = min((each.decimals for each in here_m if each.decimals is not None), default=None)
+    difference = number(b_m.value - a_m.value, "m", sign=True, decimals=coarser)
     return [
         ("Pixel", pixel_name((row, col), pair.b.grid), "Row and column."),
-        ("A here", number(here_m[0], "m"), "Estimate of A, shown or not."),
-        ("B here", number(here_m[1], "m"), "Estimate of B, shown or not."),
-        ("B − A here", number(here_m[1] - here_m[0], "m", sign=True), "Difference of the two."),
+        ("A here", texts[0], "Estimate of A, shown or not; ± 95 % where it is shown."),
+        ("B here", texts[1], "Estimate of B, shown or not; ± 95 % where it is shown."),
+        ("B − A here", difference, "Difference of the two."),
     ]
 
 
@@ -265,25 +274,39 @@ def candidate_columns(along: Scale) -> list[Sequence[Any]]:
     """Return title, help and sort order of the candidates' columns."""
     return [
         ("Rank", "Rank by score.", 1),
-        (along.title, "Position along the gate, the estimator's lag removed.", 1),
+        (along.title, "Position along the gate, the estimator's lag removed, ± 95 %.", 1),
         ("Score", "The estimator's score; below, relative to the best.", -1),
         ("Probability", "Probability of a surface within 3 bins.", -1),
     ]
 
 
-def candidate_rows(candidates: Sequence[Candidate], along: Scale, other: Scale) -> list[Any]:
+def candidate_rows(
+    candidates: Sequence[Candidate], acquisition: Acquisition, along: Scale, other: Scale
+) -> list[Any]:
     """Return a row for each candidate, best first."""
     return [
         {
             "name": str(n + 1),
             "cells": [
-                (along.number(each.bin), each.bin, other.place(each.bin)),
+                _position_cell(
+                    Interval(each.range_m, each.range_low_m, each.range_high_m),
+                    acquisition,
+                    along,
+                    other,
+                ),
                 cell(each.score, below=share(each.relative)),
                 percent_cell(each.probability),
             ],
         }
         for n, each in enumerate(candidates)
     ]
+
+
+def _position_cell(range_m: Interval, acquisition: Acquisition, along: Scale, other: Scale) -> Cell:
+    """Return a range with its 95 % interval in two units."""
+    ends = (range_m.value, range_m.low, range_m.high)
+    found = Interval(*acquisition.range_m_to_bin(ends).tolist())
+    return along.number_with_margin(found), found.value, other.place_with_margin(found)
 
 
 def both_scales(unit: str, answer: Answer) -> tuple[Scale, Scale]:
@@ -295,7 +318,7 @@ def pin_columns(along: Scale) -> list[Sequence[Any]]:
     """Return title, help and sort order of the pins' columns."""
     return [
         ("Pixel", "Row and column.", 1),
-        (along.title, "The estimate along the gate.", 1),
+        (along.title, "The estimate along the gate, ± 95 %.", 1),
         ("Confidence", CONFIDENCE_HELP, -1),
         ("SBR", "Signal divided by background; below, its 95 % interval.", -1),
         ("Verdict", "Whether the pixel is hot or dead.", 1),
@@ -308,17 +331,18 @@ def pin_row(
     """Return the row of a pinned pixel, without a place if its confidence is below the least."""
     pixel, report = found.pixel, found.report
     sbr = report.flux.sbr
-    at_bin, below = pixel.answer_bin, str(other.place(pixel.answer_bin))
-    if math.isnan(at_bin):
-        below = "no estimate"
+    acquisition = found.answer.capture.acquisition
+    position = _position_cell(pixel.interval_95_m, acquisition, along, other)
+    if math.isnan(pixel.range_m):
+        position = ("–", None, "no estimate")
     elif pixel.confidence < least_confidence:
-        at_bin, below = math.nan, "not reliable"
+        position = ("–", None, "not reliable")
     return {
         "name": pixel_name((pixel.row, pixel.col), found.answer.grid),
         "color": color,
         "dash": [],
         "cells": [
-            (along.number(at_bin), None if math.isnan(at_bin) else at_bin, below),
+            position,
             percent_cell(pixel.confidence),
             _sbr_cell(sbr),
             (report.verdict.health, report.verdict.health, ""),
@@ -331,7 +355,8 @@ def _sbr_cell(sbr: Interval) -> Cell:
     if math.isinf(sbr.value):
         return interval(sbr), sbr.low if math.isfinite(sbr.low) else None, ""
     known = sbr.value if math.isfinite(sbr.value) else None
-    return three_digits(sbr.value), known, bounds(sbr.low, sbr.high)
+    value, ends = value_and_bounds(sbr.value, sbr.low, sbr.high)
+    return value, known, ends
 
 
 def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
