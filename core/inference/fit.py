@@ -218,13 +218,27 @@ def drawn_residuals(
     background = backgrounds[:, np.newaxis] * flux_model_of(capture).relative_background
     share = capture.pulse.bin_probability(delay_bin, n_bins, capture.acquisition.bin_width_s)
     signal = signals[:, np.newaxis] * share
-    rate = signal + background
-    armed, fires = np.ones_like(counts), rate
+    armed = np.ones_like(counts)
     if n_pulses is not None:
-        armed, fires = n_pulses - np.cumsum(counts, axis=1) + counts, -np.expm1(-rate)
-    expected = armed * fires
-    variance = expected if n_pulses is None else expected * (1 - fires)
+        armed = n_pulses - np.cumsum(counts, axis=1) + counts
+    expected, variance = _moments(capture, armed, signal + background)
     return Residuals(pixels, delay_bin, counts, armed, background, signal, expected, variance)
+
+
+def over_uniform_background(capture: Capture, residuals: Residuals) -> Residuals:
+    """Return the residuals of the same draws over a background of the same mean, but uniform."""
+    mean = residuals.background.mean(axis=1, keepdims=True)
+    background = np.broadcast_to(mean, residuals.background.shape)
+    expected, variance = _moments(capture, residuals.armed, residuals.signal + background)
+    return residuals._replace(background=background, expected=expected, variance=variance)
+
+
+def _moments(capture: Capture, armed: Floats, rate: Floats) -> tuple[Floats, Floats]:
+    """Mean and variance of counts of armed pulses."""
+    if capture.gated_pulses is None:
+        return armed * rate, armed * rate
+    fires = -np.expm1(-rate)
+    return armed * fires, armed * fires * (1 - fires)
 
 
 def _drawn(

@@ -492,7 +492,7 @@ REFUSED: tuple[tuple[str, bytes, str], ...] = (
     ("a.npy.gz", gzip.compress(npy_bytes(CUBE))[:-9], "gzip file .*damaged"),
     ("a.gz", gzip.compress(gzip.compress(b"")), "like binary data"),
     ("a.npz", bytes(200), "archive cannot be read.*damaged"),
-    ("a.mat", bytes(200), "version.*-v7"),
+    ("a.mat", bytes(200), "header.*-v7"),
     ("a.mat", b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF", "saved with -v"),
     ("a.mat", bytes(512) + b"\x89HDF\r\n\x1a\n", "file cannot be read"),
     # NumPy

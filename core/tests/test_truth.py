@@ -246,7 +246,7 @@ def test_a_capture_with_a_truth_gets_the_figures_of_a_simulated_one(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--capture", "wall.npz", "--truth", "truth.npy"), "--truth-unit = None"),
+        (("--capture", "wall.npz", "--truth", "truth.npy"), "--truth-unit is missing"),
         (("--capture", "wall.npz", "--truth-unit", "m"), "there is no --truth"),
         (("--truth", "truth.npy"), "a scene has its own truth"),
         (("--capture", "wal*.npz", "--truth-variable", "a"), "a sequence has no file of its own"),

@@ -33,6 +33,7 @@ from core.inference.fit import (
     background_deviation,
     drawn_residuals,
     echo_offset,
+    over_uniform_background,
     pulse_deviation,
     quantile_residuals,
 )
@@ -77,10 +78,9 @@ def pooled_evidence(capture: Capture) -> PooledEvidence:
     usual, outliers = faults.ordinary_pixels(capture), faults.outlier_pixels(capture)
     parts = _parts(capture, usual if outliers is None else usual & ~outliers.bright)
     residuals = drawn_residuals(capture, parts[0])
-    background, pulse = (
-        evidence_of_deviation(deviation(capture, residuals))
-        for deviation in (background_deviation, pulse_deviation)
-    )
+    uniform = over_uniform_background(capture, residuals)
+    background = evidence_of_deviation(background_deviation(capture, uniform))
+    pulse = evidence_of_deviation(pulse_deviation(capture, residuals))
     if capture.acquisition.n_bins < 2 * same_echo_bins(capture):
         return PooledEvidence(background, pulse, None)
     counts = _second_surfaces(capture, residuals)
