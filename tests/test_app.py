@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, fields, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from app.model.store import (
 from app.pages.catalog import PAGES
 from app.pages.explore import text as explore_text
 from app.pages.layout import CUSTOM, Layout
+from app.pages.shared import measure
 from app.pages.shared.estimate import lane_of
 from app.pages.shared.illumination import IlluminationPanel
 from app.plots import elements as plots
@@ -855,6 +857,28 @@ def test_hidden_estimates_leave_the_cloud_but_not_the_figures(layout, explore):
         layout.settle()
         assert len(explore.cloud.positions) / 12 == (confidence >= least).sum()
         assert values_of(explore.figures) == figures
+
+
+def test_points_of_the_cloud_are_pinned_and_measured(layout, explore):
+    session, cloud, note = layout.session, explore.cloud, explore.measure.note
+    explore.measure.part.collapsed = False
+    places = np.argwhere(session.answer.run.image.confidence > 0.99)[[0, -1]]
+    for row, col in places:
+        cloud.selected = int(row * 64 + col)
+        layout.settle()
+        control(layout, "Pin").clicks += 1
+    layout.tasks.run_until(lambda: "Distance from" in note.text)
+    assert cloud.pinned == [row * 64 + col for row, col in places]
+    one, other = (session.answer.run.image.range_m[row, col] for row, col in places)
+    told = float(re.search(r": ([0-9.]+)", note.text)[1])
+    assert abs(one - other) <= told < abs(one - other) + 20
+    assert "±" in note.text and model_text.WIDTH_GUESSED not in note.text
+    control(layout, "Profile").clicks += 1
+    assert (session.state.page, session.state.subject) == ("Inspect", "Profile")
+    session.state.page = "Explore"
+    control(layout, "Clear").clicks += 1
+    layout.tasks.run_until(lambda: note.text == measure.HOW)
+    assert (session.state.pins, cloud.pinned) == ((), [])
 
 
 def test_controls_fit_the_capture_they_are_for(layout, small_file):

@@ -18,6 +18,7 @@ from playwright.sync_api import Locator, Page, expect
 import core
 from app.model.state import Illumination
 from app.pages.inspect import text
+from app.pages.shared.measure import TOO_MANY_PINS
 from core import Capture, RangeImage, inspection
 from core.inference import predictive_of
 from tests.browser import VIEWS, choose, enter, eventually, fact, field, slider
@@ -428,7 +429,7 @@ def pin_pixels(page: Page, facade: Subject) -> None:
         page.keyboard.press("ArrowRight")
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col + 4}")
     page.keyboard.press("p")
-    expect(page.get_by_text(text.TOO_MANY_PINS)).to_be_visible()
+    expect(page.get_by_text(TOO_MANY_PINS)).to_be_visible()
     button(page, "Pins").click()
     headers = page.get_by_role("rowheader").filter(visible=True)
     expect(headers).to_have_text(names)

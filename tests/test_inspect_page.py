@@ -31,6 +31,7 @@ from app.pages.inspect.results import (
 from app.pages.inspect.views import MAX_DRAWN_CORNERS, corners_of, rectangle
 from app.pages.session import Session
 from app.pages.shared.crop import NO_REGION
+from app.pages.shared.measure import TOO_MANY_PINS
 from app.plots import inspect as inspect_plots
 from app.plots.gate_cut import Cut
 from app.theme import DARK
@@ -372,7 +373,7 @@ def test_four_pixels_are_pinned_compared_and_removed_and_a_fifth_refused(page, f
         page.keys.pressed = ["p", n]
     pins = tuple((100, 130 + n) for n in range(4))
     assert far.state.pins == pins
-    assert page.refusal.text == text.TOO_MANY_PINS
+    assert page.refusal.text == TOO_MANY_PINS
     assert [chip[0] for chip in page.chips.chips] == [list(pin) for pin in pins]
     assert len({color for *_, color in page.chips.chips}) == 4
     section = on_screen(PinsSection(far))

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable
 from concurrent.futures import BrokenExecutor
 
+from app.model.large import Grid
 from app.model.methods import METHOD_TITLES
 from app.model.state import AUTOMATIC
 from app.model.store import Answer, Pixel
@@ -58,6 +59,8 @@ NO_PAGE = (
     "This page could not be built. Reload it. If that does not help, the server's log states the "
     "cause."
 )
+
+WIDTH_GUESSED = "Lengths across the line of sight follow from the field of view, which is a guess."
 
 
 def provenance(answer: Answer) -> str:
@@ -255,3 +258,9 @@ def not_kept(error: ValueError | OSError) -> str:
         f"Could not store the uploaded file ({error.strerror}). Free space in the system's "
         "temporary folder, or start the server with the file's path."
     )
+
+
+def pixel_name(pixel: tuple[int, int], grid: Grid) -> str:
+    """Return row and column of a pixel in its file."""
+    row, col = grid.place(*pixel)
+    return f"{row}, {col}"

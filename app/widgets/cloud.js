@@ -492,8 +492,9 @@ class CloudView {
   }
 
   placeRing() {
-    const at = this.pixels.indexOf(this.model.selected)
-    this.ring.set(at < 0 ? new Float32Array(0) : this.xyz.slice(3 * at, 3 * at + 3))
+    const marked = [this.model.selected, ...this.model.pinned]
+    const at = marked.map((pixel) => this.pixels.indexOf(pixel)).filter((k) => k >= 0)
+    this.ring.set(new Float32Array(at.flatMap((k) => [...this.xyz.slice(3 * k, 3 * k + 3)])))
   }
 
   goHome(width, height) {
@@ -745,7 +746,7 @@ export function render({model}) {
   model.on(["label", "caption", "ink", "paper"], write)
   model.on(["ink", "paper", "wrong_color"], () => view.mark("look"))
   model.on(["positions", "colors", "pixels", "wrong"], () => view.mark("data"))
-  model.on("selected", () => view.mark("selected"))
+  model.on(["selected", "pinned"], () => view.mark("selected"))
   model.on(["point_size", "spacing_m"], () => view.schedule())
   model.on("bounds", () => view.mark("box"))
   model.on(["scene_id", "home"], () => view.mark("home"))

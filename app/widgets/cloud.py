@@ -36,6 +36,7 @@ class PointCloud(Component):
         default=-1,
         doc="Index of the pixel marked by a ring, -1 for none; a click on a point sets it.",
     )
+    pinned = param.List(default=[], item_type=int, doc="Indices of further pixels with a ring.")
     point_size = param.Number(
         default=1.4,
         bounds=(0.2, 5.0),

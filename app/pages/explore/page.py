@@ -31,6 +31,7 @@ from app.pages.shared.downloads import (
 )
 from app.pages.shared.echo_zoom import EchoZoom
 from app.pages.shared.large_view import LargeView
+from app.pages.shared.measure import MeasureSection
 from app.pages.shared.section import Section
 from app.pages.shared.viewing import show_own_width
 from app.plots.gate_cut import Cut
@@ -91,6 +92,8 @@ class Explore(Section):
     cloud : PointCloud
     crop : CropSection
         The box to which the cloud is cropped.
+    measure : MeasureSection
+        Distances of pinned points.
     """
 
     def __init__(self, session: Session) -> None:
@@ -123,13 +126,14 @@ class Explore(Section):
             state.param.difference, label="First difference", size="small", margin=(0, 8)
         )
         self.crop = CropSection(session)
+        self.measure = MeasureSection(session)
         self._is_outdated, self._pictures_are_due = True, False
         self._requested_s = 0.0
         self._show_sidebar()
         self.image_keys.param.watch(lambda event: session.choose_pixel(*event.new), "pixel")
         self.cloud.param.watch(lambda event: session.pick(event.new), "selected")
         draw_pixel = session.tasks.soon(self._draw_pixel)
-        state.param.watch(draw_pixel, ["pixel", "difference", "unit"])
+        state.param.watch(draw_pixel, ["pixel", "pins", "difference", "unit"])
         draw_pictures = partial(session.tasks.queue, self._draw_pictures)
         state.param.watch(
             lambda *_: draw_pictures(), ["image", "cloud_color", "viewing", "crop", "region"]
@@ -162,6 +166,7 @@ class Explore(Section):
         main = [pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both"), self.figures]
         return main, [
             part("View", self._viewing.without("least_confidence"), self._difference),
+            self.measure.part,
             self.crop.part,
             part("About this page", pmui.Typography(text.EXPLANATION, margin=8), is_open=False),
         ]
@@ -199,6 +204,7 @@ class Explore(Section):
             self._draw_pictures()
         self._large.show(is_on_screen)
         self.crop.show(is_on_screen)
+        self.measure.show(is_on_screen)
 
     def follow(self, answer: Answer) -> None:
         """Show another estimate of the session."""
@@ -212,6 +218,7 @@ class Explore(Section):
             self.session.tasks.call_later(PICTURES_DELAY_MS, self._request_pictures)
         self._large.follow(answer)
         self.crop.refresh()
+        self.measure.follow(answer)
 
     def paint(self, dark: bool) -> None:
         """Change between light and dark mode."""
@@ -243,7 +250,9 @@ class Explore(Section):
             self.image.mark(row, col)
             self.image_keys.shape = list(answer.capture.shape)
             self.image_keys.pixel = [row, col]
-            self.cloud.selected = row * answer.capture.shape[1] + col
+            n_cols = answer.capture.shape[1]
+            self.cloud.selected = row * n_cols + col
+            self.cloud.pinned = [r * n_cols + c for r, c in state.pins]
             self.numbers.facts = numbers
             self.figures.facts = text.figure_strip(answer)
 

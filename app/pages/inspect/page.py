@@ -12,8 +12,9 @@ import panel as pn
 import panel_material_ui as pmui
 
 from app.model.colors import legend, map_of
-from app.model.state import MOST_PINS, Viewing
+from app.model.state import Viewing
 from app.model.store import Answer
+from app.model.text import pixel_name
 from app.pages.inspect import text
 from app.pages.inspect.capture import CaptureSection
 from app.pages.inspect.pair import PairSection
@@ -27,6 +28,7 @@ from app.pages.session import Session
 from app.pages.shared.crop import CropSection
 from app.pages.shared.downloads import IMAGE_AND_REPORT, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
+from app.pages.shared.measure import pin_pixel
 from app.pages.shared.section import Section
 from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, choice, part, unrolled
 from app.widgets.component import until_session_ends
@@ -308,15 +310,7 @@ class Inspect(Section):
         self.session.state.subject = "Pixel"
 
     def _pin_pixel(self) -> None:
-        state = self.session.state
-
-        def pin() -> None:
-            if state.pixel not in state.pins:
-                if len(state.pins) >= MOST_PINS:
-                    raise ValueError(text.TOO_MANY_PINS)
-                state.pins = (*state.pins, state.pixel)
-
-        self._attempt(pin)
+        self._attempt(partial(pin_pixel, self.session))
 
     def _unpin(self, pixel: list[int]) -> None:
         state = self.session.state
@@ -361,7 +355,7 @@ class Inspect(Section):
         self.navigator.pin(pins, colors)
         self.navigator.join_pins(pins if self.session.state.subject == "Profile" else ())
         self.chips.chips = [
-            [list(pin), text.pixel_name(pin, self.session.answer.grid), color]
+            [list(pin), pixel_name(pin, self.session.answer.grid), color]
             for pin, color in zip(pins, colors, strict=False)
         ]
 

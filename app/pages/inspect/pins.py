@@ -9,12 +9,14 @@ from bokeh.models import Range1d
 
 from app.model.exports import Curve
 from app.model.state import MOST_PINS
+from app.model.text import pixel_name
 from app.pages.inspect import text
 from app.pages.inspect.pixel import NARROW, framed, stage
 from app.pages.inspect.results import Inspected, inspect_pixel_with_flux
 from app.pages.inspect.views import GatePlot
 from app.pages.session import Session
 from app.pages.shared.echo_zoom import EchoZoom
+from app.pages.shared.measure import distances
 from app.pages.shared.section import Section
 from app.plots import elements as plots
 from app.plots import inspect as inspect_plots
@@ -82,7 +84,7 @@ class PinsSection(Section):
         unit, answer = self.session.state.unit, self.session.answer
         gate = answer.gate
         colors = pin_colors(self.is_dark)[: len(found)]
-        names = [text.pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
+        names = [pixel_name((each.pixel.row, each.pixel.col), answer.grid) for each in found]
         cover(self._bins, gate.n_bins)
         self.zoom.follow(answer.capture, *(each.pixel.answer_bin for each in found))
         bins = plots.centres(gate.n_bins)
@@ -112,7 +114,8 @@ class PinsSection(Section):
         """Write distances and table, which leave out what is not confident enough to be shown."""
         found, state = self.found, self.session.state
         viewing = state.viewing
-        self.note.text = text.distances(found, viewing) if found else text.NO_PINS
+        pixels = [each.pixel for each in found]
+        self.note.text = distances(found[0].answer, pixels, viewing) if found else text.NO_PINS
         if not found:
             self.table.param.update(columns=[], rows=[])
             return

@@ -14,6 +14,7 @@ from app.model.state import Viewing
 from app.model.store import Answer, Pixel
 from app.model.text import (
     CONFIDENCE_HELP,
+    WIDTH_GUESSED,
     Cell,
     Fact,
     cell,
@@ -22,6 +23,7 @@ from app.model.text import (
     milliseconds,
     number,
     percent_cell,
+    pixel_name,
     share,
 )
 from app.pages.inspect.results import Inspected, Pair
@@ -32,12 +34,10 @@ from app.units import (
     between,
     count,
     noted,
-    plus_minus,
     scale,
 )
 from app.units import interval as format_interval
 from core import Acquisition, Capture, pixel_range_intervals
-from core.geometry import distance_m, pixel_angle_of, sight_lines
 from core.inspection import (
     CONFIDENT,
     Candidate,
@@ -90,9 +90,7 @@ SUBJECT_HELP = (
 PIN_HELP = "Pin this pixel: keep it for comparison (key P on the map)."
 SELECT_HELP = "Select region: all pixels in these rows and columns."
 CLEAR_HELP = "Clear region: remove the selected region."
-TOO_MANY_PINS = "Four pixels are pinned already: remove one first."
 NO_PINS = "No pixels are pinned. Select a pixel and press “Pin this pixel”, or P on the map."
-WIDTH_GUESSED = "Lengths across the line of sight follow from the field of view, which is a guess."
 NO_PROFILE = (
     "Choose “Line” above the map and drag on the map: the profile runs along the line that you "
     "draw. It also runs along the line that joins two or more pinned pixels."
@@ -359,39 +357,6 @@ def _sbr_cell(sbr: Interval) -> Cell:
     return value, known, ends
 
 
-def distances(found: Sequence[Inspected], viewing: Viewing) -> str:
-    """Return the distances of pins from the first one; empty for fewer than two.
-
-    Pins of less confidence than is shown are left out.
-    """
-    if len(found) < 2:
-        return ""
-    answer, least = found[0].answer, viewing.least_confidence
-    pixels = [each.pixel for each in found]
-    names = [pixel_name((each.row, each.col), answer.grid) for each in pixels]
-    named = list(zip(names, pixels, strict=True))
-    left_out = " and ".join(name for name, pixel in named if pixel.confidence < least)
-    reason = f"confidence below {least:g} at {left_out}."
-    kept = [(name, pixel) for name, pixel in named if pixel.confidence >= least]
-    if len(kept) < 2:
-        return f"No distances: {reason}"
-    shape = answer.capture.shape
-    lines = sight_lines(shape, pixel_angle_of(answer.field_of_view_deg(viewing), shape[1]))
-    (origin, first), *others = kept
-    sentences = []
-    for name, pixel in others:
-        ends_m = np.array([(p.interval_95_m.low, p.interval_95_m.high) for p in (first, pixel)])
-        half_m = (ends_m[:, 1] - ends_m[:, 0]) / 2
-        towards = [lines[p.row, p.col] for p in (first, pixel)]
-        length_m, margin_m = distance_m(towards, ends_m.mean(axis=1), half_m)
-        known = math.isfinite(length_m)
-        length = plus_minus(length_m - margin_m, length_m + margin_m, "m") if known else "not known"
-        sentences.append(f"{length} to {name}")
-    without = f" Left out: {reason}" if left_out else ""
-    guessed = f" {WIDTH_GUESSED}" if answer.is_width_guessed(viewing) else ""
-    return f"Distance from {origin}: {'; '.join(sentences)} (95 %).{without}{guessed}"
-
-
 def range_text(range_m: float, low_m: float, high_m: float) -> str:
     """Format a range and its interval with the digits that the interval supports."""
     decimals = Interval(range_m, low_m, high_m).decimals
@@ -411,12 +376,6 @@ def profile_sentence(answer: Answer, profile: LineProfile, viewing: Viewing) -> 
     if n_hidden:
         line += f" {n_hidden:,} without a range, or hidden."
     return f"{line} {WIDTH_GUESSED}" if answer.is_width_guessed(viewing) else line
-
-
-def pixel_name(pixel: tuple[int, int], grid: Grid) -> str:
-    """Return row and column of a pixel in its file."""
-    row, col = grid.place(*pixel)
-    return f"{row}, {col}"
 
 
 # Hot and dead pixels
