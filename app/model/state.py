@@ -31,8 +31,8 @@ class Illumination:
     )
     ppp: float = parameter(
         0.1041,
-        Number("Signal (PPP)", 0.001, 10.0, log=True, least=0.0, unit="photons per pulse"),
-        "Signal flux: detections per pulse if the detector were always armed.",
+        Number("Signal", 0.001, 10.0, log=True, least=0.0, unit="per pulse"),
+        "Signal flux (PPP): photons detected per pulse if the detector were always armed.",
     )
     n_pulses: int = parameter(
         1000,

@@ -11,9 +11,11 @@ from app.widgets.controls import Knob, SettingsPanel
 from core.parameters import Number
 
 _BACKGROUND = Number(
-    "Background", 0.01, 1000.0, log=True, least=0.0, open_below=True, unit="photons per pulse"
+    "Background", 0.01, 1000.0, log=True, least=0.0, open_below=True, unit="per pulse"
 )
-_BACKGROUND_HELP = "Background flux over the whole gate: signal over SBR. A move changes the SBR."
+_BACKGROUND_HELP = (
+    "Background photons detected per pulse over the gate: signal over SBR. A move changes the SBR."
+)
 _HELD_HELP = (
     "What stays when the signal moves: the background, as if targets were brighter, or the SBR, as "
     "if the exposure were longer."
