@@ -488,9 +488,9 @@ def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other
         )
 
     for subject, n_plots in (
-        ("Region", 4),
+        ("Region", 3),
         ("Capture", 3),
-        ("Pixel", 4),
+        ("Pixel", 3),
         ("Pins", 3),
         ("Profile", 2),
     ):
