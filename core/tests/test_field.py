@@ -10,6 +10,8 @@ import pytest
 
 from core.acquisition import Acquisition
 from core.capture import Capture
+from core.estimators import estimate
+from core.io.readers import read_capture
 from core.studies.methods import field
 
 pytestmark = pytest.mark.compiled
@@ -55,3 +57,16 @@ def test_background_is_added_at_the_given_sbr() -> None:
     added = field.with_background(capture, 0.25).counts - capture.counts
     expected = 5 / 0.25
     assert abs(added.mean() - expected) < 5 * np.sqrt(expected / added.size)
+
+
+def test_the_likelihood_with_the_estimated_pulse_finds_more_than_a_matched_filter(
+    folder: Path,
+) -> None:
+    truth = field.face_truth(folder)
+    capture = read_capture(folder / field.FACE, first_detections=3)
+    found = {}
+    for method in ("likelihood", "matched_filter"):
+        error_m = (estimate(capture, method).range_m - truth.range_m)[truth.is_face]
+        found[method] = float((np.abs(error_m - np.nanmedian(error_m)) <= 0.03).mean())
+    assert found["likelihood"] >= 0.83
+    assert found["likelihood"] > found["matched_filter"]
