@@ -46,6 +46,7 @@ _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
+_MOST_AT_ECHOES = 1.5  # of the mean background; more is light of echoes longer than the pulse
 _RARE = 1e-3  # levels with a smaller share are left out
 _TINY = 1e-30  # likelihood of a level relative to the likeliest, whose logarithm is finite
 
@@ -129,6 +130,8 @@ def _background(
     free = echo_free(mass, background, echo_window(capture))
     seen = counts, armed, free, n_pulses is not None, known.relative_background
     shape = fitted_shape(*seen) if pixels.size >= _FEWEST_OF_SHAPE else None
+    if shape is not None and np.average(shape, weights=known.depth) > _MOST_AT_ECHOES:
+        shape = None
     return _Background(mean_background(*seen), shape)
 
 

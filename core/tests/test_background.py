@@ -14,6 +14,7 @@ from core.inference.fit import fit_of
 from core.inference.flux import flux_prior_of
 from core.inspection import capture_report
 from core.studies.methods import alarms
+from core.studies.methods.calibration import FluxRegime
 from core.studies.methods.fit import NULL_CASES
 from core.trigger import draw_counts, rate_per_bin
 
@@ -143,3 +144,10 @@ def test_shapes_are_described_by_what_they_do() -> None:
     middle = SHAPES["is largest in the middle"]
     middle_text = shape_text(middle / middle.mean())
     assert middle_text.startswith("the background varies over the gate, from 0.76 of its mean in")
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_echoes_longer_than_the_pulse_are_not_taken_for_background(seed: int) -> None:
+    captures, _ = FluxRegime("all", "middle", "twice as long").captures(seed)
+    assert flux_prior_of(captures[0]).background_shape is None
