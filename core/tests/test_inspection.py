@@ -515,27 +515,19 @@ def test_fluxes_of_a_dim_car_are_those_of_all_its_pixels() -> None:
     assert abs(found.signal.value - signal) < 0.06 * signal
 
 
-def fogged(regime: int, n_fog: int) -> inspection.CaptureReport:
-    """Return the report of a capture with photons that return from the first bins."""
+@pytest.mark.parametrize(("regime", "n_fog"), [(0, 20), (4, 120)], ids=["known", "darkest"])
+def test_a_report_says_where_bins_without_echoes_contradict_the_model(
+    regime: int, n_fog: int
+) -> None:
     captures, _ = FLUX_REGIMES[regime].captures(seed=4)
     capture, rng = captures[-1], np.random.default_rng(4)
+    # Fog: photons that return from the first bins.
     cube = capture.cube + rng.poisson(0.5, capture.cube.shape) * (np.arange(150) < n_fog)
-    return inspection.capture_report(replace(capture, cube=cube.astype(np.uint32)))
-
-
-def test_a_report_names_the_shape_of_a_background_that_varies() -> None:
-    report = fogged(0, 20)
-    free, found = report.echo_free_background, report.flux.background
-    assert "the background varies over the gate" in report.flux_remark
-    assert free is not None and found.overlaps(free)
-
-
-def test_a_report_says_where_bins_without_echoes_contradict_the_model() -> None:
-    report = fogged(4, 120)
-    free, found = report.echo_free_background, report.flux.background
+    report = inspection.capture_report(replace(capture, cube=cube.astype(np.uint32)))
+    free = report.echo_free_background
     assert free is not None and "disagree" in report.flux_remark
-    assert found.high > 1.5 * found.low
-    assert found.low <= free.low and free.high <= found.high
+    assert report.flux.background.high > 1.5 * report.flux.background.low
+    assert report.flux.background.low <= free.low and free.high <= report.flux.background.high
 
 
 def test_intervals_of_differences_and_ratios_cover_the_truth() -> None:
