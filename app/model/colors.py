@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from app.model.budget import spending
 from app.model.mesh import point_cloud
-from app.model.state import Viewing
+from app.model.state import FIT, Viewing
 from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS
 from core import inspection
@@ -28,9 +28,6 @@ MAP_TITLES = {
     "Fired": "Share of the pulses that fired",
     "SBR": "Signal over background, estimated from the counts",
 }
-FIT = "Goodness of fit"
-"""The map of the p-values of pixels."""
-
 REPORTED_TITLE = "Distance reported by the sensor"
 FIRED_UNKNOWN = "Share of pulses that fired: pulses not known"
 

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from app.model.budget import fits
-from app.model.colors import FIT, cloud_of, map_of, shown
+from app.model.colors import cloud_of, map_of, shown
 from app.model.download_text import NO_INTERVALS, NO_POINTS, NO_POINTS_INSIDE, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.script import script_of
-from app.model.state import UNITS, State, Viewing
+from app.model.state import FIT, UNITS, State, Viewing
 from app.model.store import Answer
 from app.model.text import Fact
 from app.theme import WRONG_COLOR

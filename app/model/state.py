@@ -248,9 +248,12 @@ class Comparison:
 
 
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
+FIT = "Goodness of fit"
+"""The map of the p-values of pixels."""
+
 MAPS = (
     *("Estimate", "Truth", "Error", "Reported", "Confidence", "Counts", "Peak", "Fired", "SBR"),
-    "Goodness of fit",
+    FIT,
 )
 UNITS = ("bins", "ns", "m")
 HELD = ("background", "SBR")

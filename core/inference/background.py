@@ -83,7 +83,7 @@ def echo_window(capture: Capture) -> tuple[int, int]:
 
 
 class EchoFree(NamedTuple):
-    """Where pixels see background alone, each of shape (pixel, bin)."""
+    """Bins in which pixels see background alone, each of shape (pixel, bin)."""
 
     share: Floats
     """Probability that no echo is near the bin."""

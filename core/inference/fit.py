@@ -165,8 +165,13 @@ def share_below(p_values: Floats) -> str:
 
 def fit_p_values_of(capture: Capture, pixels: NDArray[np.intp]) -> Floats:
     """Return the `fit_p_values` of pixels given as flat indices (pixel,), shape (pixel,)."""
-    parts = np.array_split(pixels, -(-pixels.size // _most_at_once(capture)))
+    parts = in_parts(capture, pixels)
     return np.concatenate([_p_values(capture, drawn_residuals(capture, part)) for part in parts])
+
+
+def in_parts(capture: Capture, pixels: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Divide pixels (pixel,) into parts that are held in memory together."""
+    return np.array_split(pixels, -(-pixels.size // _most_at_once(capture)))
 
 
 def _most_at_once(capture: Capture) -> int:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture
-from core.inference.fit import drawn_residuals, quantile_residuals
-from core.inference.likelihood import NUMBERS_AT_ONCE
+from core.inference.fit import drawn_residuals, in_parts, quantile_residuals
 
 _DRAWS = 400  # at least, of the sum of all pixels
 _NUMBERS = 2**21  # counts that are drawn; fewer draws in a long gate
@@ -61,7 +60,7 @@ def _expected(capture: Capture, pixels: NDArray[np.intp], n_draws: int) -> Float
     n_bins = capture.acquisition.n_bins
     expected = np.zeros((n_draws, n_bins))
     every = np.arange(n_draws * pixels.size)
-    for some in np.array_split(every, -(-every.size * n_bins // NUMBERS_AT_ONCE)):
+    for some in in_parts(capture, every):
         draw, at = np.divmod(some, pixels.size)
         found = drawn_residuals(capture, pixels[at], pixels[at] + draw * capture.counts.size)
         np.add.at(expected, draw, found.expected)

@@ -20,7 +20,7 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators import ESTIMATORS, Provenance, RangeImage
 from core.geometry import WHOLE, Box
-from core.inference import fit_of, fit_p_values, share_below
+from core.inference import fit_of, fit_p_values_of, share_below
 from core.inspection import (
     CONFIDENT,
     CaptureReport,
@@ -208,7 +208,11 @@ def _maps(
     beyond = scale.n_outside(range_m)
     grey = f" Grey: {beyond:,} beyond the colours." if beyond else ""
     least, most = int(counts.min()), int(counts.max())
-    p_values = fit_p_values(capture)
+    drawn_pixels = np.arange(counts.size).reshape(counts.shape)[::step, ::step]
+    p_values = np.full(counts.shape, np.nan)
+    p_values[::step, ::step] = fit_p_values_of(capture, drawn_pixels.ravel()).reshape(
+        drawn_pixels.shape
+    )
     colors = colors_of("inferno")
     yield _heading_2("Maps")
     if step > 1:
@@ -237,7 +241,7 @@ def _maps(
             "Goodness of fit",
             p_values,
             p_value_scale(),
-            f"{share_below(p_values)} {fit_of(capture).verdict}",
+            f"{share_below(p_values[::step, ::step])} {fit_of(capture).verdict}",
         ),
     )
     drawn = [

@@ -91,7 +91,7 @@ class Prediction:
 
     counts: Predictive
     p_value: float
-    """Of a pixel; NaN for a region, of which `RegionReport.fit` tells whether the model fits."""
+    """Goodness of fit of a pixel; NaN for a region, which has `RegionReport.fit` instead."""
 
 
 def predict(found: Inspected) -> Prediction:

@@ -80,13 +80,6 @@ class Scales(Checked):
 
 
 @dataclass(frozen=True)
-class AtPaperSBR(Checked):
-    """Settings of Figures 5 and 6."""
-
-    sbr: float = parameter(0.08, _SBR, _SBR_HELP)
-
-
-@dataclass(frozen=True)
 class Weights(Checked):
     """Settings of the weights."""
 
@@ -116,7 +109,7 @@ class Images(Checked):
 
 @dataclass(frozen=True)
 class AtSBR(Checked):
-    """Settings of what the paper does not report."""
+    """Settings of sections in which only the SBR varies."""
 
     sbr: float = parameter(0.06, _SBR, _SBR_HELP)
 
@@ -146,7 +139,7 @@ class Paper:
                     LiveFigures(session, Scales(), text.SCALES, two_scales, count=2).view
                 ),
                 "Figures 5, 6: pile-up": lambda: (
-                    LiveFigures(session, AtPaperSBR(), text.PILE_UP, pile_up, count=2).view
+                    LiveFigures(session, AtSBR(0.08), text.PILE_UP, pile_up, count=2).view
                 ),
                 "The weights": lambda: (
                     LiveFigures(session, Weights(), text.WEIGHTS, weights, count=1).view
@@ -204,7 +197,7 @@ def two_scales(settings: Scales) -> list[outputs.Plot]:
     return [pixel, replace(_residual_by_place(parameters, flux), marks=marks)]
 
 
-def pile_up(settings: AtPaperSBR) -> list[outputs.Plot]:
+def pile_up(settings: AtSBR) -> list[outputs.Plot]:
     """Return Figures 5 and 6."""
     flux = Flux(sbr=settings.sbr)
     return [figures_5_6.figure_6(flux), figures_5_6.figure_5b(flux)]

@@ -55,8 +55,8 @@ class IlluminationPanel(SettingsPanel[Illumination]):
     def _change(self, settings: Illumination) -> None:
         before = self._state.light
         # Without signal there is no background that an SBR could state.
-        if self._state.held == "background" and settings.ppp != before.ppp and settings.ppp > 0:
-            settings = settings.with_background(before.flux.background or settings.flux.background)
+        if self._state.held == "background" and 0 < settings.ppp != before.ppp > 0:
+            settings = settings.with_background(before.flux.background)
         self._state.light = settings
 
     def _change_background(self, event: param.parameterized.Event) -> None:

@@ -57,9 +57,16 @@ class MeasureSection(Section):
             return
         answer, state = self.session.answer, self.session.state
         viewing, pins = state.viewing, state.pins
+        if len(pins) < 2:
+            self.note.text = HOW
+            return
+
+        def write(measured: str) -> None:
+            if pins == state.pins:  # no pin has been removed since
+                self.note.text = measured
+
         self.submit(
-            lambda: distances(answer, [inspect(answer, *pin) for pin in pins], viewing) or HOW,
-            partial(setattr, self.note, "text"),
+            lambda: distances(answer, [inspect(answer, *pin) for pin in pins], viewing), write
         )
 
     def _pin(self) -> None:

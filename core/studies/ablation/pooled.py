@@ -33,12 +33,13 @@ from core.inference.fit import (
     background_deviation,
     drawn_residuals,
     echo_offset,
+    in_parts,
     over_uniform_background,
     pulse_deviation,
     quantile_residuals,
 )
 from core.inference.flux import flux_model_of, flux_prior_of, total_rates
-from core.inference.likelihood import NUMBERS_AT_ONCE, rate_and_n_armed
+from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import same_echo_bins, tolerance_probability
 from core.kernels.streams import uniforms
 from core.studies.ablation import corrections
@@ -111,8 +112,7 @@ def _parts(capture: Capture, usual: NDArray[np.bool_]) -> list[NDArray[np.intp]]
     Returns flat indices.
     """
     some = np.random.default_rng(0).permutation(np.flatnonzero(usual))[:_MOST_PIXELS]
-    at_once = max(1, NUMBERS_AT_ONCE // capture.acquisition.n_bins)
-    return [np.sort(part) for part in np.array_split(some, -(-some.size // at_once))]
+    return [np.sort(part) for part in in_parts(capture, some)]
 
 
 def _second_surface_p_values(capture: Capture, residuals: Residuals) -> Floats:

@@ -38,7 +38,7 @@ CONDITIONS = tuple(
         Condition(scene, 1.0, signal=1.0, n_pulses=10),
     )
 )
-"""What confidences are measured under, by scene."""
+"""Conditions under which confidences are measured, by scene."""
 
 LEAST_COUNT = 200
 """Estimates in a tenth of confidence whose gap is judged."""
