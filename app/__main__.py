@@ -45,7 +45,6 @@ from app.server.ports import free_port, port_number
 from app.server.serve import server_of
 from app.server.tuning import tune
 from app.tasks.scheduler import STUDIES
-from app.tasks.signals import Signal
 from app.widgets.connection import LINGER_S
 from app.widgets.controls import Sentence
 from core.io import (
@@ -79,7 +78,9 @@ def main(arguments: list[str] | None = None) -> int:
     # Files come first: the page opens on the first source.
     sources = {**(newest.found if newest else {}), **files, **built_in_sources()}
     uploads = Uploads()
-    arrivals: Arrivals | None = None if watched is None else Signal()
+    arrivals = None if watched is None else Arrivals()
+    if arrivals is not None and newest is not None:
+        arrivals.emit(newest)
     pn.extension("vtk")
     try:
         port = chosen.port or free_port(chosen.address)

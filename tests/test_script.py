@@ -30,9 +30,10 @@ from tests.states import another, link_to, random_state
 
 PAGE_NAMES = [page.name for page in PAGES]
 
-NOT_CODE = {"cloud_color", "unit", "kept", "study", "reported", "held"}
-"""Parameters without an effect on arrays: colours, units on axes, the estimate kept as A, the
-sections of Trade-off and Paper, whose scripts name a command, and what a slider leaves alone."""
+NOT_CODE = {"cloud_color", "unit", "kept", "unread", "study", "reported", "held"}
+"""Parameters without an effect on arrays: colours, units on axes, the estimate kept as A, a file
+that could not be read, the sections of Trade-off and Paper, whose scripts name a command, and what
+a slider leaves alone."""
 
 RUN_EACH = """
 import os, runpy, sys

@@ -14,6 +14,7 @@ from app.model.script import script_of
 from app.model.state import Illumination
 from app.model.store import built_in_sources
 from app.model.uploads import Bounds, Uploads, safe_name
+from app.pages.shared.reading import QUESTION
 from core import Acquisition, Capture, save_capture
 from core.io import ReadOptions
 from tests.states import link_to
@@ -82,6 +83,33 @@ def test_files_that_differ_in_numbers_open_as_one_sequence_and_others_one_by_one
     assert layout.next_answer().request.source.title == "day.npz"
     titles = [source.title for source in layout.session.sources.values()]
     assert titles[-3:] == ["run_*_a.npz", "day.npz", "night.npz"]
+
+
+def test_the_question_about_an_upload_is_asked_again_after_a_reload(tmp_path):
+    cube = np.ones((4, 6, 37), np.uint8)
+    np.savez(tmp_path / "two.npz", spad=cube, rates=cube / 7)
+    uploads = Uploads()
+    layout = HeldLayout(built_in_sources(), uploads=uploads)
+    session, before = layout.session, layout.session.query()
+    content = (tmp_path / "two.npz").read_bytes()
+    button = control(layout, "Open a capture file")
+    button.param.update(filename=["two.npz"], value=[content])
+    layout.tasks.run_until(lambda: session.estimate.refused)
+    link = session.query()
+    again = HeldLayout(built_in_sources(), link_to(link), uploads)
+    assert again.alert.text == QUESTION.format(file="two.npz")
+    control(again, "spad").clicks += 1
+    answer = again.next_answer()
+    assert (answer.request.source.title, answer.capture.counts.sum()) == ("two.npz", cube.sum())
+    assert (again.session.state.page, again.session.state.unread) == ("Inspect", "")
+    session.recall(before)  # as by Undo
+    assert (session.query(), layout.alert.text) == (before, "")
+    session.recall(link)
+    assert session.query() == link and control(layout, "rates")
+    for user in (layout, again):
+        uploads.leave(user)
+    gone = HeldLayout(built_in_sources(), link_to(link), uploads)
+    assert "upload the file again" in gone.alert.text
 
 
 @pytest.mark.parametrize("collected", ["session", "uploads"])

@@ -11,7 +11,7 @@ import pytest
 import core
 from app.model.store import built_in_sources
 from app.model.watched import MOST_CAPTURES, WatchedFolder
-from app.tasks.signals import Signal
+from app.pages.layout import Arrivals
 from tests.threads import HeldLayout, control
 
 
@@ -47,7 +47,10 @@ def test_a_capture_is_found_once_when_it_is_written(tmp_path):
     assert folder.look() is None  # they may still grow
     half.write_bytes(whole[: len(whole) * 2 // 3])
     assert titles(folder.look()) == ["next.npz"]
-    assert folder.look() is None  # two thirds of a file cannot be read
+    arrival = folder.look()  # two thirds of a file cannot be read
+    assert (titles(arrival), len(arrival.refused)) == ([], 1)
+    assert arrival.refused[0].startswith("half.npz")
+    assert folder.look() is None
     half.write_bytes(whole)
     assert folder.look() is None
     ((key, source),) = folder.look().found.items()
@@ -73,7 +76,7 @@ def test_a_folder_that_does_not_exist_is_refused(tmp_path):
 
 
 def test_an_open_page_follows_with_its_settings_unless_it_should_not(tmp_path):
-    arrivals, folder = Signal(), WatchedFolder(tmp_path)
+    arrivals, folder = Arrivals(), WatchedFolder(tmp_path)
     served = dict(
         arriving(folder, tmp_path, 0).found
     )  # what a page that is opened later is offered
@@ -92,12 +95,21 @@ def test_an_open_page_follows_with_its_settings_unless_it_should_not(tmp_path):
     layout.tasks.run_until(lambda: session.answer.request.source is second)
     assert (state.pixel, state.method, state.less.merge) == ((2, 5), "coates", 2)
     assert session.answer.capture.cube.shape == (6, 7, 20)
+    (tmp_path / "bad.npz").write_bytes(b"no archive")
+    arrivals.emit(folder.look() or folder.look())
+    layout.settle()
+    told = layout.alert.text
+    assert "watched folder. bad.npz" in told and str(tmp_path) not in told
+    assert session.answer.request.source is second
+    assert HeldLayout(served | built_in_sources(), arrivals=arrivals).alert.text == told
+    session.choose_pixel(0, 0)  # the page goes on, and so does the sentence
+    assert layout.alert.text == told
     control(layout, "Follow new captures").value = False
     shown = state.source
     for number in range(2, MOST_CAPTURES + 3):
         arrive(number)
     layout.settle()
-    assert state.source == shown
+    assert (state.source, layout.alert.text) == (shown, "")
     newest = {f"capture {number}.npz" for number in range(3, MOST_CAPTURES + 3)}
     offered = {*control(layout, "Scene or capture").options}
     assert {title for title in offered if title.startswith("capture")} == newest | {second.title}

@@ -102,14 +102,11 @@ class Link:
         self.refused: list[str] = []
 
     @property
-    def source(self) -> str:
-        """Key of the scene or capture that the link names, or an empty string."""
-        return self._entries.get("source", "")
-
-    @property
-    def kept_source(self) -> str:
-        """Key of the scene or capture of the estimate that was kept as A, or an empty string."""
-        return dict(parse_qsl(self._entries.get("kept", ""))).get("source", "")
+    def sources(self) -> list[str]:
+        """Keys of the scenes and captures that the link names; empty strings for none."""
+        queries = (self._entries.get(name, "") for name in ("kept", "unread"))
+        within = (dict(parse_qsl(query)) for query in queries)
+        return [each.get("source", "") for each in (self._entries, *within)]
 
     def of(self, bases: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters that the link changes, by name.

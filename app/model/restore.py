@@ -44,7 +44,34 @@ def restore(
     enter(state, answer, None)
     state.param.update(places(link, answer))
     link.refuse_others()
+    if refused is None and state.unread:
+        refused = _still_refused(state.unread, sources, link, own)
     return answer, refused
+
+
+def _still_refused(
+    query: str, sources: Mapping[str, Source], link: Link, own: Mapping[str, Any]
+) -> Refused | None:
+    """Return the file of a query that could not be read before, unless it can be or is gone."""
+    try:
+        request = described(query, sources, own)
+    except ValueError as error:
+        link.refused.append(str(error))
+        return None
+    try:
+        compute(request, None)
+    except Exception as error:  # the page reports any failure
+        _report(error, link)
+        return Refused.of(request, error)
+    return None
+
+
+def _report(error: Exception, link: Link) -> None:
+    """Describe why a link could not be restored, unless the page asks for an array instead."""
+    if not is_ambiguous(error):
+        log.warning("could not restore the link", exc_info=error)
+        why = text.reason(error)
+        link.refused += [] if why in link.refused else [why]
 
 
 def places(link: Link, answer: Answer) -> dict[str, Any]:
@@ -88,10 +115,7 @@ def _first_answer(
         try:
             answer = compute(request, None)
         except Exception as error:  # the page reports any failure
-            if not is_ambiguous(error):  # the page asks for the array
-                log.warning("could not restore the link", exc_info=error)
-                why = text.reason(error)
-                link.refused += [] if why in link.refused else [why]
+            _report(error, link)
             if refused is None and not request.source.is_scene:
                 refused = Refused.of(request, error)
         else:
@@ -115,6 +139,19 @@ def parsed(
     if chosen["source"] not in sources:
         raise ValueError(text.source_is_gone(chosen["source"]))
     return link, chosen
+
+
+def described(query: str, sources: Mapping[str, Source], own: Mapping[str, Any]) -> Request:
+    """Return the request that a query describes.
+
+    Raises
+    ------
+    ValueError
+        If its scene or capture is not among the sources.
+    """
+    _, chosen = parsed(query, sources, own)
+    values = {name: chosen[name] for name in COMPUTED_FROM}
+    return Request(**values | {"source": sources[chosen["source"]]})
 
 
 def request_of(state: State, sources: Mapping[str, Source]) -> Request:

@@ -398,6 +398,9 @@ class State(param.Parameterized):
         doc="Corners (row, col) of a polygon of pixels whose counts are added.",
     )
     kept = param.String(default="", doc="Query of the estimate that was kept as A.")
+    unread = param.String(
+        default="", doc="Query of the file that was requested last and could not be read."
+    )
     comparison = param.ClassSelector(class_=Comparison, default=Comparison())
 
     @property

@@ -139,6 +139,12 @@ def cause(error: Exception) -> str:
     return kind
 
 
+def cause_in(name: str, error: Exception) -> str:
+    """Return the `cause` of an error with a file, named once."""
+    why = cause(error)
+    return why if name in why else f"{name}: {why}"
+
+
 def reason(error: Exception) -> str:
     """Return why something could not be computed, as a sentence."""
     is_message = isinstance(error, ValueError)
@@ -248,6 +254,12 @@ def not_uploaded(reason: str, most_bytes: int) -> str:
         f"Could not upload the file: {reason.rstrip('.')}. The limit is {most_bytes >> 20} MiB. To "
         "open a larger file, start the server with its path."
     )
+
+
+def not_opened(refused: Iterable[str]) -> str:
+    """Return which files of a watched folder could not be opened, and why; empty without any."""
+    why = " ".join(f"{each.rstrip('.')}." for each in refused)
+    return f"Could not open a new file of the watched folder. {why}" if why else ""
 
 
 def not_kept(error: ValueError | OSError) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from stat import S_ISREG
 
+from app.model import text
 from app.model.store import NO_OPTIONS, Source, content_key, file_source, is_ambiguous
 from app.model.uploads import cached_while_used
 from core.checks import require
@@ -26,12 +27,14 @@ _State = tuple[int, int]  # size in bytes, and time of the last change in ns
 
 @dataclass(frozen=True)
 class Arrival:
-    """Captures that have just been written, and older ones that are no longer offered."""
+    """Files that have just been written, and older captures that are no longer offered."""
 
     found: Mapping[str, Source]
-    """By key, the newest last."""
+    """Captures by key, the newest last."""
     outdated: tuple[str, ...]
     """Keys."""
+    refused: tuple[str, ...] = ()
+    """Name of each file that could not be opened, and why."""
 
     @property
     def newest(self) -> str:
@@ -89,6 +92,7 @@ class WatchedFolder:
         ]
         self._seen = states
         found: dict[str, Source] = {}
+        refused = []
         for path in sorted(written, key=lambda path: states[path][1]):
             self._handled[path] = states[path]
             try:
@@ -99,11 +103,14 @@ class WatchedFolder:
             except (ValueError, OSError) as error:
                 if not is_ambiguous(error):
                     log.warning("not opened: %s", error)
+                    refused.append(text.cause_in(path.name, error))
                     continue
             found[key] = source  # of several arrays, the page asks for one
         keys = [key for key in self._keys if key not in found] + list(found)
         self._keys = keys[-MOST_CAPTURES:]
-        return Arrival(found, tuple(keys[:-MOST_CAPTURES])) if found else None
+        if not (found or refused):
+            return None
+        return Arrival(found, tuple(keys[:-MOST_CAPTURES]), tuple(refused))
 
     def _states(self) -> dict[Path, _State]:
         """Return size and time of each file that may be a capture."""

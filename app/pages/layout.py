@@ -140,8 +140,23 @@ class Template(pmui.Page):
         return root
 
 
-Arrivals = Signal[Arrival]
-"""Notification of captures that have just been written."""
+class Arrivals(Signal[Arrival]):
+    """Notification of files that have just been written to a watched folder.
+
+    Attributes
+    ----------
+    refused : tuple of str
+        Those of the latest arrival that could not be opened, for pages that are opened later.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.refused: tuple[str, ...] = ()
+
+    def emit(self, value: Arrival) -> None:
+        """Send an arrival."""
+        self.refused = value.refused
+        super().emit(value)
 
 
 def build_page(
@@ -170,7 +185,7 @@ class Layout:
         Where uploaded files are stored.
     tasks : PageTasks, optional
         The page's thread; by default that of the page being built.
-    arrivals : Signal, optional
+    arrivals : Arrivals, optional
         Captures to follow.
 
     Attributes
@@ -193,8 +208,9 @@ class Layout:
     ) -> None:
         self._arrivals = arrivals
         link, self._uploads = link or Link({}), uploads or Uploads()
-        known = self._with_uploads(sources, link.source)
-        known = self._with_uploads(known, link.kept_source)
+        known = dict(sources)
+        for key in link.sources:
+            known = self._with_uploads(known, key)
         session = self.session = Session(known, link, tasks)
         state = session.state
         self._pages = {each.name: each for each in PAGES}
@@ -213,6 +229,8 @@ class Layout:
         self.page = self._template()
         self._show_answer(session.answer)
         self._listen()
+        if arrivals is not None:
+            session.failures.remark(text.not_opened(arrivals.refused))
         if session.refused:
             session.failures.show(text.not_restored(session.refused))
         elif (refused := session.estimate.refused) is not None:
@@ -271,7 +289,8 @@ class Layout:
             label="Gate axes in", sx=UNIT_BUTTONS, sizing_mode="stretch_width", margin=(4, 8)
         )
         self._make_parts(unit)
-        self._uploaded = ""
+        refused = session.estimate.refused
+        self._uploaded = "" if refused is None else session.key(refused.request.source)
         self._link = AddressBar()
         session_id = session.page.session_context.id if session.tasks.is_served else ""
         self._connection = Connection(session_id)
@@ -406,7 +425,7 @@ class Layout:
             is_new = refused.request.source is not answer.request.source
             self._reading.show_refused(refused.request, refused.variables, is_new)
         elif answer.request.source.is_scene:
-            self._reading.records.visible = False
+            self._reading.question.visible = self._reading.records.visible = False
         else:
             n_records = answer.whole.n_records
             self._reading.show(answer.request.reading, options_in_use(answer), n_records)
@@ -473,11 +492,15 @@ class Layout:
         self.session.tasks.queue(partial(self._receive, arrival))
 
     def _receive(self, arrival: Arrival) -> None:
-        """Offer captures that have just been written, and show the last one if it is wanted."""
+        """Offer captures that have just been written, and show the last one if it is wanted.
+
+        Files that could not be opened are named until the next arrival.
+        """
         session = self.session
+        session.failures.remark(text.not_opened(arrival.refused))
         arrival.update(session.sources, kept=session.state.source)
         self._source.options = self._titles()
-        if self._follow.value:
+        if self._follow.value and arrival.found:
             session.go_on_with(arrival.newest)
 
     def _close(self) -> None:

@@ -10,9 +10,9 @@ from urllib.parse import parse_qsl, urlencode
 
 from app.model.address import Link, query_of
 from app.model.capture_defaults import defaults_of
-from app.model.restore import parameters_of, parsed, places, restore
+from app.model.restore import described, parameters_of, parsed, places, restore
 from app.model.state import State
-from app.model.store import COMPUTED_FROM, Answer, Request, Source
+from app.model.store import Answer, Refused, Request, Source
 from app.pages.shared.estimate import CurrentEstimate
 from app.pages.shared.failures import FailureLog
 from app.plots.gate_cut import Cut
@@ -67,6 +67,9 @@ class Session:
         )
         self._recalled: Link | None = None
         self._kept: tuple[str, Answer] | None = None
+        self._unread: dict[str, Refused | None] = {}
+        self._note_unread()
+        self.estimate.changed.subscribe(lambda _: self._note_unread())
         self.estimate.changed.subscribe(lambda _: self._find_places())
 
     @property
@@ -84,15 +87,15 @@ class Session:
         own = self._own | defaults_of(self.answer)
         if not self.answer.request.source.is_scene:
             own["source"] = ""  # always in the link: another server may have another file
-        refused = self.estimate.refused
-        if refused is not None and refused.request.source is self.sources.get(self._own["source"]):
-            own["source"] = self.state.source  # not in the link: a reload asks again
         return query_of(self.state, own)
 
     def request_query(self) -> str:
         """Return the part of the link from which the estimate on screen is computed."""
-        # The source is always named: an empty query means that nothing was kept.
-        return query_of(State(**parameters_of(self.answer.request, self.sources)), {"source": ""})
+        return self._query_of(self.answer.request)
+
+    def _query_of(self, request: Request) -> str:
+        # The source is always named: an empty query stands for none.
+        return query_of(State(**parameters_of(request, self.sources)), {"source": ""})
 
     def described(self, query: str) -> Request:
         """Return the request that a query of `request_query` describes.
@@ -102,9 +105,7 @@ class Session:
         ValueError
             If its scene or capture is not here.
         """
-        _, chosen = parsed(query, self.sources, self._own)
-        values = {name: chosen[name] for name in COMPUTED_FROM}
-        return Request(**values | {"source": self.sources[chosen["source"]]})
+        return described(query, self.sources, self._own)
 
     @property
     def kept_answer(self) -> Answer | None:
@@ -134,6 +135,7 @@ class Session:
             self.failures.show(str(error))
             return
         self._recalled = link
+        self._recall_unread(chosen["unread"])
         try:
             self.state.param.update(chosen)
         except Exception:
@@ -141,6 +143,19 @@ class Session:
             raise
         if not self.is_settled() and self.estimate.is_settled:  # nothing has to be computed
             self.estimate.changed.emit(self.answer)
+
+    def _note_unread(self) -> None:
+        """Keep in the state which file could not be read: a reloaded page asks again."""
+        refused = self.estimate.refused
+        query = "" if refused is None else self._query_of(refused.request)
+        self._unread[query] = refused
+        self.state.unread = query
+
+    def _recall_unread(self, query: str) -> None:
+        """Return to the file that could not be read, or to the page before it was requested."""
+        self.estimate.refused = self._unread.get(query)
+        if self.estimate.refused is None:
+            self.failures.resolve(None)
 
     def go_on_with(self, key: str) -> None:
         """Show another capture with the present settings, pixel and views."""

@@ -23,7 +23,7 @@ class FailureLog:
     def __init__(self) -> None:
         self.shown: Signal[str] = Signal()
         self._sentences: dict[object, str] = {}
-        self._otherwise = ""
+        self._otherwise = self._remark = ""
 
     def report(
         self,
@@ -40,14 +40,23 @@ class FailureLog:
     def resolve(self, part: object) -> None:
         """Remove the failure of a part that works again, or is tried again."""
         if self._sentences.pop(part, None) is not None:
-            self.shown.emit(next(reversed(self._sentences.values()), self._otherwise))
+            self._show_latest()
 
     def clear(self, otherwise: str = "") -> None:
         """Remove all failures; show another sentence as long as there are none."""
         self._sentences.clear()
         self._otherwise = otherwise
-        self.shown.emit(otherwise)
+        self._show_latest()
+
+    def remark(self, sentence: str) -> None:
+        """Show a sentence whenever there is no other one, until the next remark."""
+        self._remark = sentence
+        self._show_latest()
 
     def show(self, sentence: str) -> None:
         """Show a sentence that belongs to no part, until the next one."""
         self.shown.emit(sentence)
+
+    def _show_latest(self) -> None:
+        otherwise = self._otherwise or self._remark
+        self.shown.emit(next(reversed(self._sentences.values()), otherwise))
