@@ -1,7 +1,7 @@
 """The exact first-photon likelihood with true fluxes.
 
 It bounds the figure of its rule (`core.estimators.likelihood`) for methods that look at single
-pixels, if the delays are uniform over the gate.
+pixels, if delays and background are uniform over the gate.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 An echo may be found at a wrong delay altogether (`right_bin_probability`), and an echo that is
 found has a finite precision (`cramer_rao_bins`). Both are for single pixels with known signal and
-background: the first for the likeliest of delays that are uniform over the gate, the second for the
-square of the error of unbiased estimates. Other losses, neighbours or a prior of the depth may
-exceed them.
+background, which is uniform over the gate: the first for the likeliest of delays that are uniform
+over the gate, the second for the square of the error of unbiased estimates. Other losses,
+neighbours or a prior of the depth may exceed them.
 
 Functions of the delay ``onset_bin`` in fractional bins (array_like of any shape, NaN for no echo)
 and the ``signal`` in photons per pulse (broadcast with it) return arrays of the common shape, NaN

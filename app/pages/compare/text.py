@@ -45,12 +45,14 @@ from the model.
 surface within 3 bins of the estimate. In the *reliability diagram*, a line on the diagonal means
 that nine of ten estimates with confidence 0.9 are correct. Pixels without a target count as wrong.
 
-**The oracle** is the likelihood with known fluxes. **The single-pixel limit** has two parts: the
-probability that the oracle's likeliest delay is that of the echo, if depths are uniform over the
-gate, and the smallest standard deviation of an unbiased estimate. The probability is an
-approximation, within 0.015 of simulations with 300 pulses or more and up to 0.1 too high with
-fewer. It does not bound other methods: the rule *window* is right within 3 bins slightly more
-often, and those that use neighbouring pixels, or know where targets are, may do better.
+**The oracle** is the likelihood with known signal and background. **The single-pixel limit** has
+two parts: the probability that the oracle's likeliest delay is that of the echo, if depths are
+uniform over the gate, and the smallest standard deviation of an unbiased estimate. Both assume a
+background that is uniform over the gate; for a scene with another one, such as *fog*, neither is
+shown. The probability is an approximation, within 0.015 of simulations with 300 pulses or more and
+up to 0.1 too high with fewer. It does not bound other methods: the rule *window* is right within
+3 bins slightly more often, and those that use neighbouring pixels, or know where targets are, may
+do better.
 
 **Reconstruction** marks a method whose original code was not available.
 """

@@ -76,9 +76,10 @@ COLUMN_HELP: dict[str, tuple[str, int]] = {
     "ms": ("Median time to estimate one capture on this server.", 1),
     "scene": ("The scene.", 1),
     "probability of the right bin": (
-        "Approximate probability that the oracle finds the true bin.",
+        "Approximate probability that the likeliest delay, with known fluxes and uniform depths, "
+        "is that of the echo. It does not bound other rules or priors.",
         -1,
     ),
-    "Cramér-Rao bound m": ("Smallest possible standard deviation of unbiased estimates.", 1),
+    "Cramér-Rao bound m": ("Smallest standard deviation of unbiased estimates.", 1),
 }
 """Help and sort order of each column: 1 or -1, lowest or highest value first."""

@@ -92,8 +92,8 @@ def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
 def _bound(candidate: Candidate) -> str:
     """Return what a configuration knows that no instrument knows; empty if nothing."""
     if candidate.knows_truth:
-        return "knows the true ranges: a bound"
-    return "knows the true fluxes: a bound" if candidate.knows_flux else ""
+        return "knows the true ranges: reference only"
+    return "knows the true fluxes: reference only" if candidate.knows_flux else ""
 
 
 def _percent(found: Interval) -> Interval:

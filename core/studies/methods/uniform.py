@@ -81,8 +81,9 @@ def uniform_table(results: Results) -> Table:
             "ns per pixel and bin": lambda name: 1e6 * ms(name) / n_counts,
         },
         f"{WHOLE_BINS} Depths begin where tracking begins to search, T_n = 20, and are independent "
-        "from pixel to pixel: no method that uses neighbours can work. For delays anywhere in the "
-        "gate, the row 'oracle, window' is the bound of this figure.",
+        "from pixel to pixel: no method that uses neighbours can work. Of methods that look at "
+        "single pixels and expect delays anywhere in the gate, none exceeds 'oracle, window' in "
+        "this figure on average; expecting them in bins 20 to 94 alone adds up to 0.012.",
         formats={"ms": ".1f", "ns per pixel and bin": ".0f"},
     )
 
