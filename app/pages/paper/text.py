@@ -79,6 +79,7 @@ COLUMN_HELP: dict[str, tuple[str, int]] = {
         "Approximate probability that the oracle finds the true bin.",
         -1,
     ),
+    "approximated to": ("Largest error of the probability found in simulations.", 1),
     "Cramér-Rao bound m": ("Smallest possible standard deviation of unbiased estimates.", 1),
 }
 """Help and sort order of each column: 1 or -1, lowest or highest value first."""
