@@ -60,10 +60,10 @@ from core.studies import outputs
 
 # Where the numbers of the pixel need more rows, the plots keep their height.
 BOARD = (
-    board(780, 125, BREAK_PX)
+    board(820, 125, BREAK_PX)
     + f"""
 @media (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
-  :host {{ height: max(900px, calc(100vh - 125px)) !important;
+  :host {{ height: max(940px, calc(100vh - 125px)) !important;
     grid-template-columns: repeat(2, minmax(0, 1fr)) !important; }}
 }}
 """
