@@ -34,7 +34,7 @@ class Palette:
     truth: str
     estimate: str
     methods: tuple[str, ...]
-    """Colours of methods, none of them that of the truth; `method_style` adds dashes."""
+    """Colours of lines, none of them that of the truth; `line_style` adds dashes."""
 
 
 LIGHT = Palette(
@@ -79,8 +79,8 @@ def palette(dark: bool) -> Palette:
 DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2])
 
 
-def method_style(place: int, colors: Palette) -> tuple[str, list[int]]:
-    """Return colour and dashes of the n-th method's line, counted from 0."""
+def line_style(place: int, colors: Palette) -> tuple[str, list[int]]:
+    """Return colour and dashes of the n-th line, counted from 0."""
     n_dash, n_color = divmod(place, len(colors.methods))
     return colors.methods[n_color], DASHES[n_dash % len(DASHES)]
 

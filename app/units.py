@@ -193,6 +193,10 @@ class Scale:
         """Number of decimals that resolves a tenth of a bin; none for whole bins."""
         return 0 if self.name == "bins" else max(0, self.decimals - 1)
 
+    def length(self, bins: float) -> str:
+        """Format a distance, given in bins, with the unit."""
+        return f"{abs(self.step) * bins:.{max(0, self.decimals - 1)}f} {self.name}"
+
     def number(self, position_bin: float) -> Quantity:
         """Format a position without its unit; a dash for NaN."""
         value = self.at(position_bin)

@@ -302,6 +302,7 @@ class Flux:
     ----------
     signal : float
         Signal photons per pulse from a surface of reflectivity 1 (the paper's PPP), non-negative.
+        PPP is photons per pulse in all texts here; for others it is often photons per pixel.
     sbr : float
         Signal divided by the background over the *whole* gate, positive. It depends on the width of
         the gate, so quote it with the number of bins. Infinity means no background.

@@ -27,18 +27,21 @@ class Scene:
         Factor on the signal, finite and non-negative; None means 1 everywhere.
     acquisition : Acquisition
         Acquisition that suits this scene; `simulate` takes its own.
+    ambient : ndarray, shape (row, col), optional
+        Factor on the background, finite and non-negative; None means 1 everywhere.
     second_surface, backscatter, faulty_pixels, motion, jitter : optional
         Parts of `core.effects`; None for an absent one.
 
     Raises
     ------
     ValueError
-        If the shapes differ, or a reflectivity is negative.
+        If the shapes differ, or a factor is negative.
     """
 
     range_m: Floats
     reflectivity: Floats | None = None
     acquisition: Acquisition = field(default_factory=Acquisition)
+    ambient: Floats | None = None
     second_surface: SecondSurface | None = None
     backscatter: Backscatter | None = None
     faulty_pixels: FaultyPixels | None = None
@@ -50,17 +53,20 @@ class Scene:
         require("range_m", f"shape {shape}", len(shape) == 2 and min(shape) > 0, "(row, col)")
         infinite = int(np.count_nonzero(np.isinf(self.range_m)))
         require("range_m", f"{infinite} infinite", infinite == 0, "metres, or NaN for no target")
-        for name in ("reflectivity", "second_surface", "faulty_pixels"):
+        for name in ("reflectivity", "ambient", "second_surface", "faulty_pixels"):
             part = getattr(self, name)
             found = shape if part is None else np.shape(part)
             require(name, f"shape {found}", found == shape, f"shape {shape}, that of range_m")
-        if self.reflectivity is not None:
-            low, high = float(np.min(self.reflectivity)), float(np.max(self.reflectivity))
-            require("reflectivity", (low, high), 0 <= low <= high < np.inf, "finite factors >= 0")
+        for name in ("reflectivity", "ambient"):
+            factor = getattr(self, name)
+            if factor is not None:
+                low, high = float(np.min(factor)), float(np.max(factor))
+                require(name, (low, high), 0 <= low <= high < np.inf, "finite factors >= 0")
 
 
 PARTS = {
     "reflectivity": "reflectivity",
+    "ambient": "uneven background",
     "second_surface": "second surface",
     "backscatter": "backscatter of fog",
     "faulty_pixels": "hot and dead pixels",
@@ -411,6 +417,61 @@ def worn(size: int = 64) -> Scene:
     return replace(new, faulty_pixels=faulty, jitter=Jitter(1.5e-9))
 
 
+# Of the field capture: ranges in metres, and places as shares of the image from its top left.
+_WALL_M, _GROUND_M, _NET_M = 33.0, 22.0, 26.0
+_SKYLINE, _FOOT = 0.25, 0.8
+_NET_ROWS, _NET_COLS = (0.4, 0.75), (0.1, 0.6)
+_CORD_EVERY, _NET_SHARE = 8, 0.4
+
+
+def field_capture(size: int = 64) -> Scene:
+    """A generated field capture: a net before a wall, sky, hot pixels, an uneven background.
+
+    It has what captures outdoors have, and a known truth. Above the skyline no pixel has a target;
+    below the wall is ground. Every eighth row and column of the net is a cord that fills the pixel;
+    elsewhere its threads fill 40 % of it, and two echoes return. Dark panels hang on the wall. The
+    sky is the brightest background, the left half of the rest lies in shadow. One pixel in a
+    hundred is hot, with 10⁷ to 10⁹ dark counts per second, and one in two hundred is dead.
+
+    The gate is 100 to 300 ns (15 to 45 m) in 1 ns bins.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns, 8 or more, over a field of view of 128 mrad.
+
+    Raises
+    ------
+    ValueError
+        If `size` is below 8.
+    """
+    pixel_angle_rad = _pixel_angle_rad(0.128, size)
+    place = (np.arange(size) + 0.5) / size
+    row, col = np.meshgrid(place, place, indexing="ij")
+    is_sky, is_ground = row < _SKYLINE, row > _FOOT
+    down = (row - _FOOT) / (1 - _FOOT)
+    behind_m = np.where(is_ground, _WALL_M + (_GROUND_M - _WALL_M) * down, _WALL_M)
+    is_net = _is_between(row, *_NET_ROWS) & _is_between(col, *_NET_COLS)
+    is_cord = is_net & np.logical_or.outer(*2 * [np.arange(size) % _CORD_EVERY == 0])
+    is_panel = _is_between(row, 0.4, 0.6) & _is_between(col, 0.7, 0.9)
+    drawn = np.random.default_rng(0).uniform(size=behind_m.shape)
+    hot_hz = np.where(drawn < 0.01, 10 ** (7 + 2 * np.minimum(drawn / 0.01, 1.0)), 0.0)
+    return Scene(
+        np.where(is_sky, np.nan, np.where(is_cord, _NET_M, behind_m)),
+        np.where(is_panel, 0.4, 1.0),
+        Acquisition(200, 1e-9, 100e-9, n_pulses=1000, pixel_angle_rad=pixel_angle_rad),
+        second_surface=SecondSurface(
+            np.where(is_net & ~is_cord, _NET_M, np.nan), np.full(behind_m.shape, _NET_SHARE)
+        ),
+        ambient=np.where(is_sky, 1.6, np.where(col < 0.5, 0.5, 1.2)),
+        faulty_pixels=FaultyPixels(hot_hz, drawn > 0.995),
+    )
+
+
+def _is_between(place: Floats, low: float, high: float) -> NDArray[np.bool_]:
+    return (place > low) & (place < high)
+
+
 scenes: dict[str, Callable[..., Scene]] = {
     "car": car,
     "building": building,
@@ -422,5 +483,6 @@ scenes: dict[str, Callable[..., Scene]] = {
     "fog": fog,
     "approach": approach,
     "worn": worn,
+    "field": field_capture,
 }
 """Built-in scenes by name; the first line of each docstring describes the scene."""

@@ -179,6 +179,8 @@ def cumulative_trigger_probability(
     n_edges = acquisition.n_bins + 1
     share_of_gate = np.linspace(0.0, 1.0, n_edges)
     steady = flux.background * share_of_gate
+    if scene.ambient is not None:
+        steady = np.ravel(scene.ambient)[:, np.newaxis] * steady
     if scene.backscatter is not None:
         steady += scene.backscatter.photons_before(flux.signal, pulse, acquisition)
     shifts_bins = np.zeros(1)

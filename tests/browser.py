@@ -200,6 +200,13 @@ def choose(page: Page, name: str, option: str) -> None:
     expect(page.locator(".MuiMenu-root")).to_have_count(0)
 
 
+def unfold(page: Page, title: str) -> None:
+    """Unfold a part of the sidebar by key."""
+    head = page.get_by_role("button", name=title, exact=True).filter(visible=True)
+    head.press("Enter")
+    expect(head).to_have_attribute("aria-expanded", "true")
+
+
 def enter(page: Page, name: str, text: str) -> None:
     field(page, name).fill(text)
     field(page, name).press("Enter")

@@ -14,6 +14,7 @@ from app.model import colors as looks
 from app.model import text as model_text
 from app.model.address import Link, query_of
 from app.model.capture_defaults import enter
+from app.model.range_prior import range_prior_of
 from app.model.script import script_of
 from app.model.state import Illumination, ReductionSettings, State, Viewing
 from app.model.store import (
@@ -25,10 +26,10 @@ from app.model.store import (
 )
 from app.pages.catalog import PAGES
 from app.pages.explore import text as explore_text
-from app.pages.layout import CUSTOM, Layout
+from app.pages.layout import CUSTOM, HELP, MORE_TRACKING, Layout
 from app.pages.shared import measure
 from app.pages.shared.estimate import lane_of
-from app.pages.shared.illumination import IlluminationPanel
+from app.pages.shared.illumination import MORE, IlluminationPanel
 from app.plots import elements as plots
 from app.plots.gate_cut import Cut
 from app.tasks.scheduler import GENERAL, PAGE, SHORT
@@ -638,6 +639,7 @@ def test_a_source_with_or_without_truth_is_drawn_in_every_way(layout, explore, k
 
 
 def test_presets_set_all_controls_and_a_change_makes_them_custom(layout):
+    opened(layout, MORE_TRACKING)
     preset = control(layout, "Preset")
     preset.value = "literal"
     assert layout.next_answer().request.tracking == PRESETS["literal"]
@@ -675,9 +677,26 @@ def test_a_failure_keeps_the_reading_options_of_the_present_file(layout, small_f
     assert layout.next_answer().capture.acquisition.bin_width_s == 3e-9
 
 
+def test_the_score_is_explained_where_it_is_drawn(car):
+    views, titles = SignalPlots(), {}
+    for name, place in (("target", (32, 30)), ("none", (0, 0))):
+        for method in ("tracking", "likelihood"):
+            answer = compute(replace(car.request, method=method), car)
+            pixel = inspect(answer, *place)
+            views.update(pixel, answer.gate, with_difference=False, unit="ns")
+            plot = views.score if pixel.signals is None else views.enhanced
+            titles[name, method] = plot.figure.title.text
+    lag_ns = inspect(car, 32, 30).peak_lag_bins  # bins of 1 ns
+    assert 1 < lag_ns < 5
+    assert f"maximum − lag ({lag_ns:.1f} ns)" in titles["target", "tracking"]
+    assert "its maximum is the estimate" in titles["target", "likelihood"]
+    assert all("no target" in titles["none", method] for method in ("tracking", "likelihood"))
+
+
 def test_a_weight_that_needs_pulses_is_refused_without_them(layout, small_file):
     open_file(layout, small_file)
     before = layout.next_answer()
+    opened(layout, MORE_TRACKING)
     control(layout, "Weight").value = "survival"
     assert layout.next_answer() is before
     assert "weight = 'survival' needs the number of pulses" in alert_of(layout)
@@ -888,10 +907,45 @@ def test_controls_fit_the_capture_they_are_for(layout, small_file):
     open_file(layout, small_file)
     answer = layout.next_answer()
     assert control(layout, "T_n").high == 36
+    opened(layout, "View")
     field_of_view = control(layout, "Field of view")
     width_deg = np.degrees(answer.capture.shape[1] * answer.capture.acquisition.pixel_angle_rad)
     assert (field_of_view.value, field_of_view.empty) == (None, "")
     assert field_of_view.substitute == pytest.approx(width_deg, rel=0.01)
+
+
+def test_a_link_unfolds_the_rarely_used_settings_that_it_changes():
+    folded = {"tracking.l": "0.006"}, {"light.seed": "3"}, {"tracking.alpha": "0.3"}
+    for entries, expected in zip(folded, (set(), {MORE}, {MORE_TRACKING}), strict=True):
+        parts = HeldLayout(built_in_sources(), Link(entries)).page.select(Part)
+        found = {each.title for each in parts if not each.collapsed}
+        assert found & {MORE, MORE_TRACKING} == expected
+
+
+def test_each_page_has_its_own_help_at_the_top_of_the_sidebar(layout):
+    layout.session.state.page = "Compare"
+    helps = [each for each in layout.page.sidebar if getattr(each, "title", "") == HELP]
+    assert layout.page.sidebar[: len(helps)] == helps
+    assert [each.visible for each in helps] == [False, False, True]
+
+
+def test_estimates_without_an_echo_are_shown_in_place_of_the_stages(layout, explore):
+    state = layout.session.state
+    state.tracking = PRESETS["literal"]
+    layout.next_answer()
+    assert "counts below" in explore.remark.text
+    state.echo_free = True
+    layout.tasks.run_until(lambda: explore.prior.figure)
+    assert [each.visible for each in explore.cards] == [True, False, False, False]
+    assert explore.prior.card.visible
+    assert explore.prior.figure.x_range is explore.signals.histogram.figure.x_range
+    expected = range_prior_of(layout.session.answer)
+    drawn = {each.name: each.data_source.data["y"] for each in explore.prior.figure.renderers}
+    for name, values in expected.curves.items():
+        np.testing.assert_allclose(drawn[name], values, rtol=1e-6)
+    state.param.update(method="oracle")
+    layout.next_answer()
+    assert not explore.prior.card.visible  # it is told that there is no echo
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

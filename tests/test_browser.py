@@ -19,6 +19,8 @@ from app.model.mesh import point_cloud
 from app.model.state import Illumination
 from app.model.store import built_in_sources
 from app.model.uploads import MAX_UPLOAD_BYTES
+from app.pages.layout import MORE_TRACKING
+from app.pages.shared.illumination import MORE
 from app.theme import DARK, LIGHT, RANGE_COLORS, WRONG_COLOR, Palette
 from core import PRESETS, TrackingParameters
 from core.io.readers.npz import FORMAT
@@ -38,6 +40,7 @@ from tests.browser import (
     pixels,
     slider,
     stage,
+    unfold,
     upload,
     warning,
 )
@@ -291,6 +294,7 @@ def turn_the_camera(page: Page) -> None:
         view.press(key)
         expect(view).not_to_have_attribute("data-camera", before)
     rotated, shown = view.get_attribute("data-camera"), look(page)
+    unfold(page, MORE)
     slider(page, "Seed").press("ArrowRight")
     look_again(page, shown, "cloud")
     expect(view).to_have_attribute("data-camera", rotated)
@@ -310,9 +314,9 @@ def turn_the_camera(page: Page) -> None:
 
 def fold(page: Page) -> None:
     """Fold a part of the sidebar by its title, and unfold it by key."""
+    unfold(page, "View")
     view = page.get_by_role("button", name="View", exact=True)
     title = page.locator(".MuiCardHeader-root", has_text=re.compile("^View$"))
-    expect(view).to_have_attribute("aria-expanded", "true")
     title.click(position={"x": 20, "y": 20})
     expect(view).to_have_attribute("aria-expanded", "false")
     view.press("Enter")
@@ -328,6 +332,7 @@ def move_sliders(page: Page) -> None:
     assert light.sbr > 0.06
     expect_rmse(page, car(light))
     before = look_again(page, before)
+    unfold(page, MORE_TRACKING)
     # One step moves too few pixels, and by too little, to change each picture.
     for _ in range(10):
         slider(page, "m").press("ArrowRight")
@@ -738,6 +743,7 @@ def test_a_real_capture_is_ranged_inspected_and_its_reading_can_be_changed(page,
     new.get_by_role("button", name="Read again").click()
     expect(new.get_by_role("alert").filter(has_text="“Bin width” = 'wide'")).to_be_visible()
     # The number of pulses is unknown, and so is the share of them that survives.
+    unfold(new, MORE_TRACKING)
     choose(new, "Weight", "survival")
     expect(warning(new)).to_contain_text("needs the number of pulses")
     choose(new, "Weight", "exponential")

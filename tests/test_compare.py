@@ -13,17 +13,19 @@ from playwright.sync_api import expect
 
 import core
 from app.model.colors import Unseen
-from app.model.methods import METHOD_TITLES
-from app.model.state import CLOUDS, FIRST_METHODS, Illumination
+from app.model.methods import FIRST_METHODS, METHOD_TITLES, method_style
+from app.model.state import CLOUDS, Illumination
 from app.model.store import built_in_sources, compute
 from app.model.text import COMPUTING
 from app.pages.compare import ranking, text
 from app.pages.compare.page import MAX_PICTURES, Compare
 from app.pages.compare.ranking import Task
 from app.pages.session import Session
-from app.theme import DARK, LIGHT, RANGE_COLORS, method_style
+from app.plots import elements as plots
+from app.theme import DARK, LIGHT, RANGE_COLORS
 from core import ESTIMATORS
 from core.inspection import CONFIDENT
+from core.studies import outputs
 from tests.browser import choose, eventually, fact
 from tests.states import ask
 from tests.test_downloads import columns_of, download, written
@@ -51,7 +53,7 @@ def rows_of(answer, methods, reference):
     """Return the rows of the table, the methods being run if there is a reference."""
     tasks = {method: task_of(method) for method in methods}
     ran = {} if reference is None else {t: ranking.run_task(t, answer) for t in tasks.values()}
-    styles = {method: method_style(place, LIGHT) for place, method in enumerate(tasks)}
+    styles = {method: method_style(method, LIGHT) for method in tasks}
     return text.rows(answer.capture, tasks, ran, reference, styles)
 
 
@@ -124,8 +126,12 @@ def test_reconstructions_are_marked(car):
 
 def test_every_method_has_a_style_of_its_own():
     for colors in (LIGHT, DARK):
-        styles = [str(method_style(place, colors)) for place in range(len(ESTIMATORS))]
+        styles = [str(method_style(method, colors)) for method in ESTIMATORS]
         assert len(set(styles)) == len(styles)
+        assert len({method_style(m, colors)[0] for m in FIRST_METHODS}) == len(FIRST_METHODS)
+        on_paper = dict.fromkeys(ESTIMATORS, np.zeros(1))
+        item = outputs.Plot("", "", "", "", np.zeros(1), on_paper)
+        assert list(map(str, plots.curve_styles(item, colors).values())) == styles
 
 
 # -- the page --------------------------------------------------------------------------------------
@@ -390,13 +396,13 @@ def first_row(page):
 def save_pictures_and_table(here):
     expect(here.get_by_text(re.compile(r", confidence \d+ %")).nth(1)).to_be_visible()
     name, png = download(here, "Peak of the histogram", "png")
-    assert name == "car_peak_least-confidence0_range-image.png"
+    assert name == "car_peak_range-image.png"
     assert Image.open(BytesIO(png)).height > 216  # with heading and colour scale
     name, arrays = download(here, "Peak of the histogram", "npz")
-    assert name == "car_peak_least-confidence0_range-image.npz"
+    assert name == "car_peak_range-image.npz"
     light, scene = Illumination(), core.scenes["car"]()
     capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
-    peak = core.estimate(capture, "peak")
+    peak = core.estimate(capture, "peak").confident(0.9)  # as on Explore
     np.testing.assert_array_equal(np.load(BytesIO(arrays))["range_m"], peak.range_m)
     name, table = download(here, "table", "csv")
     assert name == "car_methods.csv"
@@ -415,10 +421,10 @@ def choose_the_pixel_of_all(here):
     here.keyboard.press("ArrowDown")
     expect(fact(here, "Pixel")).to_have_text(f"row {row + 1}, col {col}")
     curves = here.locator(".bk-Figure").filter(has_text="estimate, own lag removed")
-    hues = {method_style(place, LIGHT)[0] for place in range(5)}
+    hues = {method_style(method, LIGHT)[0] for method in FIRST_METHODS}
     eventually(lambda: hues <= colors_of(curves))
     press(here, "Toggle theme")
-    eventually(lambda: {method_style(0, DARK)[0], DARK.paper} <= colors_of(curves))
+    eventually(lambda: {method_style("peak", DARK)[0], DARK.paper} <= colors_of(curves))
 
 
 def turn_all_clouds(here):

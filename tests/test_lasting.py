@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 import core
 from app.model.script import script_of
+from app.pages.shared.illumination import MORE
 from tests.browser import (
     chosen,
     enter,
@@ -26,6 +27,7 @@ from tests.browser import (
     pixel_on_show,
     serving,
     slider,
+    unfold,
     upload,
     warning,
 )
@@ -265,6 +267,7 @@ def recover(browser: Browser, page: Page) -> None:
         re.compile("offers no WebGL 2. It is tried again at the next change.")
     )
     page.evaluate("refused = undefined")
+    unfold(page, MORE)
     slider(page, "Seed").press("ArrowRight")
     expect(problem).to_have_count(0)
     slider(page, "Seed").press("ArrowLeft")

@@ -9,7 +9,7 @@ from typing import Any
 
 import param
 
-from app.model.methods import OTHERS, default_settings
+from app.model.methods import FIRST_METHODS, OTHERS, default_settings
 from core import ESTIMATORS, Acquisition, Flux, TrackingParameters, Window
 from core.checks import require
 from core.estimators import FALSE_ALARM
@@ -32,7 +32,8 @@ class Illumination:
     ppp: float = parameter(
         0.1041,
         Number("Signal", 0.001, 10.0, log=True, least=0.0, unit="per pulse"),
-        "Signal flux (PPP): photons detected per pulse if the detector were always armed.",
+        "Signal flux (PPP, photons per pulse), detected if the detector were always armed. Others "
+        "call photons per pixel PPP: those of all pulses together.",
     )
     n_pulses: int = parameter(
         1000,
@@ -223,8 +224,6 @@ class ReductionSettings:
 AUTOMATIC = "automatic"
 """Stands for the method that suits the capture."""
 
-FIRST_METHODS = ("peak", "coates", "likelihood", "tracking", "oracle")
-
 CLOUDS = "3D clouds"
 
 KINDS = ("Range", "Error", "Confidence", CLOUDS)
@@ -238,7 +237,7 @@ class Comparison:
     methods: tuple[str, ...] = tuple(each for each in ESTIMATORS if each in FIRST_METHODS)
     false_alarm: float = 1.0
     kind: str = KINDS[0]
-    viewing: Viewing = Viewing(0.0)
+    viewing: Viewing = Viewing()
 
     def __post_init__(self) -> None:
         known = isinstance(self.methods, tuple) and all(each in ESTIMATORS for each in self.methods)
@@ -374,6 +373,9 @@ class State(param.Parameterized):
     viewing = param.ClassSelector(class_=Viewing, default=Viewing())
     crop = param.ClassSelector(class_=Crop, default=Crop())
     difference = param.Boolean(default=False, doc="Whether the first difference is drawn.")
+    echo_free = param.Boolean(
+        default=False, doc="Whether Explore shows where estimates lie without an echo."
+    )
     page: Any = Checked("Explore", _check_page, doc="Name of a page of `app.pages.catalog`.")
     unit = param.Selector(default="bins", objects=list(UNITS), doc="Unit of axes along the gate.")
     map = param.Selector(default="Estimate", objects=list(MAPS), doc="Image of the Inspect page.")

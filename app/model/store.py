@@ -184,6 +184,7 @@ def built_in_sources() -> dict[str, Source]:
         "fog": scene_source("Car in fog", "fog"),
         "approach": scene_source("Car approached at 20 m/s", "approach"),
         "worn": scene_source("Car, worn instrument", "worn"),
+        "field": scene_source("Generated field capture", "field"),
         "sample": file_source(ASSETS / "sample_capture.npz", "Sample capture (file)"),
     }
 
@@ -475,8 +476,15 @@ class Pixel:
     """The estimate with the 68 % interval of the range of the surface (`core.range_interval`)."""
     interval_95_m: Interval
     truth_m: float
+    has_target: bool | None
+    """None where the truth is unknown."""
     confidence: float
     counts: int
+
+    @property
+    def peak_lag_bins(self) -> float:
+        """Distance from the estimate to the middle of the bin of the largest score."""
+        return float(np.argmax(self.score)) + 0.5 - self.answer_bin
 
     @property
     def lines(self) -> dict[str, np.ndarray[Any, Any] | None]:
@@ -516,6 +524,7 @@ def inspect(answer: Answer, row: int, col: int, report: PixelReport | None = Non
         inner,
         outer,
         truth_m,
+        None if capture.truth_range_m is None else bool(np.isfinite(truth_m)),
         float(image.confidence[row, col]),
         int(capture.counts[row, col]),
     )

@@ -43,6 +43,10 @@ RANGE_HELP = (
     "estimate: {} of such intervals contain it."
 )
 
+PER_PULSE, PER_PIXEL = "PPP", "Photons per pixel"
+"""Signal flux per pulse, and of all pulses together where their number is not known. Elsewhere PPP
+often stands for photons per pixel; here it never does."""
+
 TRUTH_HELP = "True range of the surface."
 
 AUTOMATIC_TITLE = "Automatic, by the capture"

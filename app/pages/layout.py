@@ -47,6 +47,11 @@ from core.io import SUFFIXES, ReadOptions, pattern_of
 
 CUSTOM = "custom"
 
+HELP = "About this page"
+MORE_TRACKING = "More tracking settings"
+COMMON = ("l", "t_n")
+"""Settings of the tracking differentiator that are not folded; the others are rarely changed."""
+
 THEME = {
     mode: {
         "palette": {"primary": {"main": main}, "background": {"default": page, "paper": paper}},
@@ -300,11 +305,25 @@ class Layout:
         self._light_part = part("Simulation", self._panels["light"].layout, is_shown=False)
         if self.session.answer.request.reading != ReadOptions():
             self._reading.part.collapsed = False
+        self._helps = {
+            each.name: part(HELP, pmui.Typography(each.explanation, margin=8), is_open=False)
+            for each in PAGES
+            if each.explanation
+        }
         tracking = self._panels["tracking"]
+        rare = [name for name in tracking.controls if name not in COMMON]
+        chosen = self.session.state.tracking
+        is_open = _preset_of(chosen) == CUSTOM and any(
+            getattr(chosen, name) != getattr(TrackingParameters(), name) for name in rare
+        )
         self._shared = {
             Shared.UNIT: unit,
             Shared.METHOD: self._method.part,
-            Shared.TRACKING: part("Tracking differentiator", self._preset, tracking.layout),
+            Shared.TRACKING: part(
+                "Tracking differentiator",
+                self._preset,
+                tracking.folded(MORE_TRACKING, *rare, is_open=is_open),
+            ),
             Shared.REDUCTION: part("Data reduction", self._panels["less"].layout, is_open=False),
         }
 
@@ -333,6 +352,7 @@ class Layout:
         session, asides = self.session, self.pages.asides
         share = Share(lambda: script_of(session.answer, session.state, session.kept_answer))
         return [
+            *self._helps.values(),
             self._source,
             self._file,
             *([] if self._arrivals is None else [self._follow]),
@@ -381,6 +401,8 @@ class Layout:
         """Show the controls that affect the open page."""
         page = self._pages[self.pages.choice.value]
         shows_other = Shared.METHOD in page.shared and self.session.answer.method != "tracking"
+        for name, explanation in self._helps.items():
+            explanation.visible = name == page.name
         for each, content in self._shared.items():
             is_other = each is Shared.TRACKING and shows_other
             content.visible = each in page.shared and not is_other

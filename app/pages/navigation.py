@@ -74,6 +74,8 @@ class Page:
     """Called when the page is first visited."""
     help: str
     """Purpose of the page: the rest of a sentence that begins with its name."""
+    explanation: str = ""
+    """How to read the page, as Markdown; empty where the page itself says it."""
     shared: frozenset[Shared] = frozenset(Shared)
     """Shared parts of the sidebar that affect this page."""
     is_standalone: bool = False

@@ -24,7 +24,10 @@ from bokeh.plotting import figure
 from numpy.typing import ArrayLike, NDArray
 
 from app.model.exports import Curve
-from app.theme import RANGE_COLORS, Palette, method_style
+from app.model.methods import METHOD_PLACES
+from app.model.store import Pixel
+from app.theme import RANGE_COLORS, Palette, line_style
+from app.units import Scale
 from core.io import OUTSIDE_COLOR
 from core.studies import outputs as items
 from core.studies.paper import figures as paper
@@ -52,8 +55,28 @@ HISTOGRAM_TITLES = {
     False: "Histogram of the pixel",
 }
 """Titles with and without the scales."""
-SCORE_TITLE = "Score: its largest value is taken for the echo"
+ENHANCED_TITLE, SCORE_TITLE = "Enhanced", "Score"
 ESTIMATES_NAME = "estimate, own lag removed"
+
+
+MOST_LAG = 0.1
+"""Share of the gate above which a distance from estimate to maximum is no lag."""
+
+
+def score_title(what: str, pixel: Pixel, along: Scale) -> str:
+    """Return the title of a plot of a pixel's score: what its maximum has to do with the estimate.
+
+    The estimate of a method is this maximum minus the method's lag, unless the estimate was then
+    replaced by another, as some methods do.
+    """
+    if pixel.has_target is False:
+        return f"{what}: no target here, its maximum is noise"
+    lag = pixel.peak_lag_bins
+    if abs(lag) < 1:
+        return f"{what}: its maximum is the estimate"
+    if not 0 < lag < MOST_LAG * pixel.score.size:
+        return what
+    return f"{what}: estimate = maximum − lag ({along.length(lag)})"
 
 
 def bin_curves(names: Mapping[str, str], unit: str, **values: Array) -> list[Curve]:
@@ -135,7 +158,7 @@ def enhanced(values: Array, weight: Array, colors: Palette) -> hv.Overlay:
         _signal(values, unit, "enhanced", colors.enhanced),
         *_markers(unit, colors),
     ]
-    return _panel(layers, "Enhanced: residual × weight")
+    return _panel(layers, f"{ENHANCED_TITLE}: residual × weight")
 
 
 def score(values: Array, colors: Palette) -> hv.Overlay:
@@ -287,12 +310,18 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "largest of noise alone, median": ("muted", [6, 3]),
     "largest of noise alone, 95 %": ("text", [6, 3]),
     "limit: probability of the right bin": ("text", [2, 4]),
+    "theory, flux known": ("text", [2, 4]),
+    "estimates, no echo": ("estimate", []),
+    "even": ("muted", [6, 3]),
+    "echoes found": ("truth", []),
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
     ESTIMATES_NAME: ("estimate", []),
     "the echo above": ("estimate", []),
 }
-METHOD_PLACES = {method.name: n for n, method in enumerate(paper.COMPARED)}
+CURVE_PLACES = {**METHOD_PLACES, paper.LITERAL.name: len(METHOD_PLACES)}
+SIMULATED = ", simulated"
+"""End of the names of curves that are a method's."""
 BARS = "histogram"
 """The curve that is drawn as bars."""
 
@@ -351,7 +380,8 @@ def curve_styles(item: items.Plot, colors: Palette) -> dict[str, tuple[str, list
             color, dash = STUDY_COLORS[name]
             styles[name] = (getattr(colors, color), dash)
         else:
-            styles[name] = method_style(METHOD_PLACES.get(name, n), colors)
+            method = name.removesuffix(SIMULATED)
+            styles[name] = line_style(CURVE_PLACES.get(method, n), colors)
     return styles
 
 

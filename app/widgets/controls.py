@@ -22,7 +22,7 @@ import param
 from panel.custom import Child
 
 from app.units import Scale
-from app.widgets.cards import select
+from app.widgets.cards import part, select
 from app.widgets.component import Component
 from core.parameters import Number, joint_doubts, spec_of
 
@@ -146,6 +146,11 @@ class SettingsPanel(Generic[Settings]):
         """Return the layout without some controls, which stand elsewhere."""
         kept = (each for name, each in self.controls.items() if name not in names)
         return pn.Column(*kept, self.doubts, sizing_mode="stretch_width", margin=0)
+
+    def folded(self, title: str, *names: str, is_open: bool = False) -> pn.Column:
+        """Return the layout with some controls in a part that folds, below the others."""
+        rare = part(title, *(self.controls[name] for name in names), is_open=is_open)
+        return pn.Column(self.without(*names), rare, sizing_mode="stretch_width", margin=0)
 
     def show(self, settings: Settings) -> None:
         """Set every control without reporting a change."""

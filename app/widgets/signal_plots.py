@@ -14,15 +14,15 @@ from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.plots.gate_cut import GateCut
 from app.theme import LIGHT, Palette
-from app.units import ShownGate
+from app.units import ShownGate, scale
 from app.widgets.figures import Plot, fit, round_up
 from core import Signals
 
 Array = NDArray[Any]
 
 
-BESIDE_PX = 28
-"""Room beside a plot for the download button, which else covers the legend."""
+LEFT_PX, BESIDE_PX = 46, 28
+"""Room for the labels of the axis, and for the download button, which else covers the legend."""
 
 
 class SignalPlots:
@@ -49,7 +49,7 @@ class SignalPlots:
         for plot in self.plots:
             figure = plot.figure
             figure.x_range, figure.y_range = self._bins, Range1d(0, 1)
-            figure.min_border_left, figure.min_border_right = 46, BESIDE_PX
+            figure.min_border_left, figure.min_border_right = LEFT_PX, BESIDE_PX
             figure.min_border_top = figure.min_border_bottom = 4
             figure.yaxis.ticker = BasicTicker(desired_num_ticks=4)
         self.cut = GateCut(self.histogram.figure, self._bins)
@@ -96,9 +96,12 @@ class SignalPlots:
         if self.histogram.source("raw").data["top"].size != gate.n_bins:
             self._lay_out(gate.n_bins)
         self._draw_histogram(pixel, gate)
+        along = scale(unit, gate)
         if pixel.signals is None:
+            self.score.figure.title.text = plots.score_title(plots.SCORE_TITLE, pixel, along)
             self._draw_score(pixel, gate)
         else:
+            self.enhanced.figure.title.text = plots.score_title(plots.ENHANCED_TITLE, pixel, along)
             self._draw_stages(pixel, pixel.signals, gate, with_difference)
 
     def _draw_histogram(self, pixel: Pixel, gate: ShownGate) -> None:

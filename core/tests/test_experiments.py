@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -23,7 +24,8 @@ from core.inference.limits import right_bin_probability
 from core.inspection import CONFIDENT
 from core.inspection.maps import likeliest
 from core.scene import Scene, scenes
-from core.studies import trials
+from core.simulation import simulate
+from core.studies import range_prior, trials
 from core.studies.methods import calibration, tuning, uniform
 from core.studies.outputs import (
     Item,
@@ -270,6 +272,35 @@ def test_pile_up_lowers_the_peak_of_an_echo_exponentially() -> None:
     # Two fitted numbers move the exponential by less than the noise of a pixel; the cubic is wrong.
     assert (np.abs(curves["exponential"] - expected) < sd)[:40].all()
     assert (np.abs(curves["reciprocal of the cubic weight"] - expected) > 3 * sd)[:40].any()
+
+
+def test_the_fits_of_figure_6_are_judged() -> None:
+    note = pile_up.figure_6(Flux(0.5, 0.1)).note
+    for name, verdict in (("expected (Eq. 1)", "fits"), ("cubic weight", "does not fit")):
+        assert re.search(rf"{re.escape(name)} [\d.e+]+ \({verdict}\)", note)
+
+
+def test_a_method_s_hidden_prior_is_where_its_estimates_lie_without_an_echo() -> None:
+    def simulated(range_m: float) -> Capture:
+        return simulate(Scene(np.full((24, 24), range_m)), paper.GATE, Flux(sbr=0.06))
+
+    slow = replace(PRESETS["literal"], l=0.001)
+    plot = range_prior.range_prior(simulated, "tracking", slow)
+    share, even, found = plot.curves.values()
+    assert share[plot.x < slow.t_n - 5].sum() == 0
+    assert share[(plot.x >= 35) & (plot.x <= 55)].sum() > 0.8  # of .2 without a preference
+    assert share.sum() == pytest.approx(even.sum()) == pytest.approx(1)
+    place = {at: float(rd) for at, rd in zip(plot.x, found, strict=True)}
+    assert place[50] > 0.97
+    assert place[80] < 0.6
+    first, end, most = range_prior.densest(np.array([3.0, 41.0, 42.0, 60.5]), 100)
+    assert (end - first, most) == (20, 0.75)
+    assert first <= 41 and end > 60
+
+    uneven = range_prior.slow_start(slow, paper.GATE, Flux(sbr=0.06))
+    gap = float((re.search(r"begins (\d+) counts below", uneven) or [0, "0"])[1])
+    assert gap == pytest.approx(1000 * 0.1041 / 0.06 / 100, abs=1)
+    assert range_prior.slow_start(PRESETS["recommended"], paper.GATE, Flux(sbr=0.06)) == ""
 
 
 def test_noise_before_the_target_does_not_depend_on_it() -> None:

@@ -56,6 +56,7 @@ def test_absent_parts_leave_the_plain_model_bit_for_bit(name: str) -> None:
 @pytest.mark.parametrize(
     "nothing",
     [
+        {"ambient": np.ones(SCENE.range_m.shape)},
         {"second_surface": second(60.0, 0.0)},
         {"second_surface": second(np.nan, 0.7)},
         {"backscatter": Backscatter(0.0)},
@@ -63,7 +64,15 @@ def test_absent_parts_leave_the_plain_model_bit_for_bit(name: str) -> None:
         {"motion": Motion(0.0, 1e3)},
         {"jitter": Jitter(0.0)},
     ],
-    ids=["no share", "no second surface", "clear air", "good pixels", "standing", "no jitter"],
+    ids=[
+        "even background",
+        "no share",
+        "no second surface",
+        "clear air",
+        "good pixels",
+        "standing",
+        "no jitter",
+    ],
 )
 def test_a_part_that_does_nothing_changes_no_bit(nothing: dict[str, Any]) -> None:
     np.testing.assert_array_equal(edges(replace(SCENE, **nothing)), edges(SCENE))
@@ -93,6 +102,15 @@ def test_probabilities_are_probabilities(name: str) -> None:
     assert (triggered[:, 0] == 0).all()
     assert triggered.max() <= 1 + 1e-12  # what is left of 1 is that of no trigger
     assert np.diff(triggered).min() >= -1e-12
+
+
+def test_each_pixel_has_its_own_background() -> None:
+    factors = np.array([[0.0, 0.5, 3.0]])
+    found = edges(replace(SCENE, ambient=factors))
+    for pixel, factor in enumerate(factors[0]):
+        flux = Flux(FLUX.signal, FLUX.signal / (factor * FLUX.background) if factor else math.inf)
+        np.testing.assert_allclose(found[pixel], edges(SCENE, flux=flux)[pixel], atol=1e-14)
+    assert simulate(replace(SCENE, ambient=factors), GATE, FLUX).background is None
 
 
 def test_a_pixel_that_sees_two_surfaces_mixes_their_echoes() -> None:

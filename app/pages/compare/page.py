@@ -17,7 +17,7 @@ from app.model.colors import Unseen, cloud_of, image_of, n_below, unseen
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import cloud_files, image_files
 from app.model.mesh import view_bounds
-from app.model.methods import doubts_hold, method_title
+from app.model.methods import doubts_hold, method_style, method_title
 from app.model.state import CLOUDS, KINDS, Comparison, Viewing
 from app.model.store import Answer
 from app.pages.compare import text
@@ -48,7 +48,7 @@ from app.pages.shared.echo_zoom import EchoZoom
 from app.pages.shared.section import Section
 from app.pages.shared.viewing import show_own_width
 from app.tasks.scheduler import RETURN_MS
-from app.theme import method_style, palette
+from app.theme import palette
 from app.widgets.cards import card, part
 from app.widgets.controls import Facts, Knob, PixelKeys, Sentence, SettingsPanel, Table, legend_line
 from app.widgets.method_picture import Picture, ScaleBar
@@ -236,12 +236,10 @@ class Compare(Section):
             plots,
             self.offer_table(self.table, "methods"),
         ]
-        explanation = pmui.Typography(text.EXPLANATION, margin=8)
         return main, [
             part("Methods", self.picks, self._false_alarm),
             *self._folds.values(),
             part("View", self._viewing.without("least_confidence"), is_open=False),
-            part("How to read this page", explanation, is_open=False),
         ]
 
     # Notifications
@@ -483,7 +481,7 @@ class Compare(Section):
 
     def _styles(self) -> dict[str, Style]:
         colors = palette(self.is_dark)
-        return {method: method_style(place, colors) for place, method in enumerate(self.tasks)}
+        return {method: method_style(method, colors) for method in self.tasks}
 
     def _draw_pictures(self) -> None:
         answers, methods, is_clouds = self.answers, self.pictured, self.kind.value == CLOUDS
@@ -600,5 +598,6 @@ PAGE = Page(
     "Compare",
     Compare,
     "shows methods side by side",
+    text.EXPLANATION,
     shared=frozenset({Shared.UNIT, Shared.TRACKING, Shared.REDUCTION}),
 )

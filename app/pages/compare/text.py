@@ -28,7 +28,7 @@ from app.model.text import (
 )
 from app.pages.compare.ranking import TOLERANCES_BINS, Reference, Result, Task, agreement
 from app.units import count
-from core import ESTIMATORS, Capture, pixel_range_intervals
+from core import ESTIMATORS, Capture, limits, pixel_range_intervals
 from core.inspection import CONFIDENT
 
 Column = tuple[str, str, int]
@@ -49,10 +49,10 @@ that nine of ten estimates with confidence 0.9 are correct. Pixels without a tar
 two parts: the probability that the oracle's likeliest delay is that of the echo, if depths are
 uniform over the gate, and the smallest standard deviation of an unbiased estimate. Both assume a
 background that is uniform over the gate; for a scene with another one, such as *fog*, neither is
-shown. The probability is an approximation, within 0.015 of simulations with 300 pulses or more and
-up to 0.1 too high with fewer. It does not bound other methods: the rule *window* is right within
-3 bins slightly more often, and those that use neighbouring pixels, or know where targets are, may
-do better.
+shown. The probability is an approximation; below it stands its largest error found in simulations.
+It does not bound other methods: the rule *window* is right within 3 bins slightly more often, and
+those that use neighbouring pixels, or know where targets are, may do better. The shares of the
+methods also have a sampling error, which is the interval below them.
 
 **Reconstruction** marks a method whose original code was not available.
 """
@@ -147,7 +147,12 @@ def rows(
         rows.append(row)
     return [
         *rows,
-        {"name": "Single-pixel limit", "last": True, **_limit_row(capture, reference)},
+        {
+            "name": "Single-pixel limit",
+            "note": f"Of {limits.ASSUMES}; others may exceed it",
+            "last": True,
+            **_limit_row(capture, reference),
+        },
     ]
 
 
@@ -185,8 +190,9 @@ def _limit_row(capture: Capture, reference: Reference | None) -> dict[str, Any]:
     finite = spread[np.isfinite(spread)]
     floor = math.sqrt(float(np.mean(finite**2))) if finite.size else math.nan
     mean = float(np.nanmean(right)) if np.isfinite(right).any() else math.nan
+    error = limits.approximation_error(mean, capture.acquisition.n_pulses or 1)
     known = {
-        "Within 3 bins": percent_cell(mean, "oracle, approximate"),
+        "Within 3 bins": percent_cell(mean, f"approximated to {100 * error:g}"),
         "Inlier RMSE (m)": cell(floor, below="Cramér–Rao"),
     }
     return {"cells": [known.get(title, ("", None, "")) for title, *_ in columns(capture)[1:]]}
@@ -208,7 +214,7 @@ def pixel_facts(answer: Answer, reference: Reference | None, row: int, col: int)
         (
             "Limit: found",
             found,
-            "Probability, about, that the oracle finds this echo.",
+            "Approximate probability that the oracle's likeliest delay is that of this echo.",
         ),
         ("Limit: spread", spread, "Cramér–Rao bound: smallest possible standard deviation."),
         ("Detections", count(int(capture.counts[row, col])), "Counts in this pixel's histogram."),

@@ -11,8 +11,10 @@ import panel_material_ui as pmui
 
 from app.model.colors import cloud_of, color_values, image_of, legend
 from app.model.exports import cloud_files, facts_file
+from app.model.range_prior import has_range_prior, range_prior_of, slow_start
 from app.model.state import Viewing
 from app.model.store import Answer, inspect
+from app.model.text import COMPUTING
 from app.pages.explore import text
 from app.pages.navigation import Page
 from app.pages.session import Session
@@ -32,8 +34,10 @@ from app.pages.shared.downloads import (
 from app.pages.shared.echo_zoom import EchoZoom
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.measure import MeasureSection
+from app.pages.shared.outputs import CurveCard
 from app.pages.shared.section import Section
 from app.pages.shared.viewing import show_own_width
+from app.plots.gate_axes import GateAxes
 from app.plots.gate_cut import Cut
 from app.tasks.turns import TURNS
 from app.theme import WRONG_COLOR
@@ -45,24 +49,27 @@ from app.widgets.controls import (
     KNOB_PX,
     Facts,
     PixelKeys,
+    Sentence,
     SettingsPanel,
     legend_line,
 )
 from app.widgets.figures import pane_of
 from app.widgets.image_view import CONTAINER, ImageView
-from app.widgets.signal_plots import SignalPlots
+from app.widgets.signal_plots import BESIDE_PX, LEFT_PX, SignalPlots
+from core.studies import outputs
 
 # Where the numbers of the pixel need more rows, the plots keep their height.
 BOARD = (
-    board(780, 125, BREAK_PX)
+    board(820, 125, BREAK_PX)
     + f"""
 @media (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
-  :host {{ height: max(900px, calc(100vh - 125px)) !important;
+  :host {{ height: max(940px, calc(100vh - 125px)) !important;
     grid-template-columns: repeat(2, minmax(0, 1fr)) !important; }}
 }}
 """
 )
 COLUMN = column(8, BREAK_PX)
+ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 0 12px; }"
 
 PICTURES_DELAY_MS = 60
 """Image and cloud are drawn this long after the pixel's plots, which the eye follows."""
@@ -82,6 +89,10 @@ class Explore(Section):
         The pixel's plots.
     zoom : EchoZoom
         The button that zooms these plots to the echo.
+    prior : CurveCard
+        Where estimates lie without an echo, in place of the stages or the score.
+    remark : Sentence
+        What is misleading about the small scale.
     cards : list of pn.Column
         The plots in their frames.
     image : ImageView
@@ -116,8 +127,19 @@ class Explore(Section):
         ]
         self.zoom = EchoZoom(self.signals.histogram.figure.x_range)
         self.cards[0].append(self.zoom.button)
-        self._large = LargeView(session, self.image.figure)
         state = session.state
+        self.prior = CurveCard(self.signals.histogram.figure.x_range, COMPUTING)
+        self.prior.offer(session, self.about)
+        self._prior_axes: GateAxes | None = None
+        self._painted.append(self.prior)
+        self.remark = Sentence(margin=0)
+        switch = pmui.Switch.from_param(
+            state.param.echo_free, label=text.ECHO_FREE, size="small", margin=(0, 4)
+        )
+        self._prior_row = pn.Row(
+            switch, self.remark, stylesheets=[ROW], sizing_mode="stretch_width", margin=0
+        )
+        self._large = LargeView(session, self.image.figure)
         self._viewing = SettingsPanel(Viewing(), partial(setattr, state, "viewing"))
         self._least_confidence = self._viewing.controls["least_confidence"]
         self._least_confidence.min_height = KNOB_PX
@@ -133,7 +155,8 @@ class Explore(Section):
         self.image_keys.param.watch(lambda event: session.choose_pixel(*event.new), "pixel")
         self.cloud.param.watch(lambda event: session.pick(event.new), "selected")
         draw_pixel = session.tasks.soon(self._draw_pixel)
-        state.param.watch(draw_pixel, ["pixel", "pins", "difference", "unit"])
+        state.param.watch(draw_pixel, ["pixel", "pins", "difference", "unit", "echo_free"])
+        state.param.watch(lambda *_: self._request_prior(), ["echo_free", "unit"])
         draw_pictures = partial(session.tasks.queue, self._draw_pictures)
         state.param.watch(
             lambda *_: draw_pictures(), ["image", "cloud_color", "viewing", "crop", "region"]
@@ -158,17 +181,20 @@ class Explore(Section):
                 CLOUD,
             ),
         )
-        right = (downloadable_facts(self.numbers, self.session, self.numbers_shown), *self.cards)
+        histogram, *others = self.cards
+        facts = downloadable_facts(self.numbers, self.session, self.numbers_shown)
+        right = (facts, histogram, self._prior_row, self.prior.card, *others)
         columns = (
             pn.Column(*content, stylesheets=[COLUMN], sizing_mode="stretch_both")
             for content in (left, right)
         )
         main = [pn.Column(*columns, stylesheets=[BOARD], sizing_mode="stretch_both"), self.figures]
         return main, [
-            part("View", self._viewing.without("least_confidence"), self._difference),
+            part(
+                "View", self._viewing.without("least_confidence"), self._difference, is_open=False
+            ),
             self.measure.part,
             self.crop.part,
-            part("About this page", pmui.Typography(text.EXPLANATION, margin=8), is_open=False),
         ]
 
     # Downloads
@@ -202,6 +228,7 @@ class Explore(Section):
             self._is_outdated = False
             self._draw_pixel()
             self._draw_pictures()
+            self._request_prior()
         self._large.show(is_on_screen)
         self.crop.show(is_on_screen)
         self.measure.show(is_on_screen)
@@ -210,6 +237,7 @@ class Explore(Section):
         """Show another estimate of the session."""
         self._show_sidebar()
         self._draw_pixel()
+        self._request_prior()
         if not self.session.tasks.is_served:
             self._draw_pictures()
         elif not self._pictures_are_due:
@@ -247,6 +275,7 @@ class Explore(Section):
             self.signals.update(pixel, answer.gate, state.difference, state.unit)
             self.zoom.follow(answer.capture, pixel.answer_bin)
             self._show_cards(is_tracking=pixel.signals is not None)
+            self.remark.text = slow_start(answer) if self._prior_row.visible else ""
             self.image.mark(row, col)
             self.image_keys.shape = list(answer.capture.shape)
             self.image_keys.pixel = [row, col]
@@ -259,8 +288,28 @@ class Explore(Section):
     def _show_cards(self, is_tracking: bool) -> None:
         """Show the stages of the tracking differentiator, or the score of another method."""
         _, residual, enhanced, score = self.cards
-        residual.visible = enhanced.visible = self._difference.visible = is_tracking
-        score.visible = not is_tracking
+        self._difference.visible = is_tracking
+        self._prior_row.visible = has_range_prior(self.session.answer)
+        self.prior.card.visible = is_prior = self._shows_prior
+        residual.visible = enhanced.visible = is_tracking and not is_prior
+        score.visible = not is_tracking and not is_prior
+
+    @property
+    def _shows_prior(self) -> bool:
+        return self.session.state.echo_free and has_range_prior(self.session.answer)
+
+    def _request_prior(self) -> None:
+        """Compute where estimates lie without an echo, if that is on show."""
+        if self.is_on_screen and self._shows_prior:
+            self.submit(partial(range_prior_of, self.session.answer), self._draw_prior)
+
+    def _draw_prior(self, plot: outputs.Plot) -> None:
+        self.prior.show(plot)
+        if self._prior_axes is None:
+            figure = self.prior.figure
+            figure.min_border_left, figure.min_border_right = LEFT_PX, BESIDE_PX
+            self._prior_axes = GateAxes(figure, has_top=False)
+        self._prior_axes.follow(self.session.state.unit, self.session.answer.gate)
 
     def _request_pictures(self) -> None:
         """Draw image and cloud, unless other pages wait to draw their plots."""
@@ -291,4 +340,4 @@ class Explore(Section):
             )
 
 
-PAGE = Page("Explore", Explore, "shows one method in detail", sidebar_last=True)
+PAGE = Page("Explore", Explore, "shows one method in detail", text.EXPLANATION, sidebar_last=True)

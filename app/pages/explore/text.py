@@ -11,6 +11,8 @@ IMAGE_HELP = "Quantity shown in the image"
 
 CLOUD_HELP = "Quantity that colours the point cloud"
 
+ECHO_FREE = "Estimates without an echo"
+
 EXPLANATION = """
 **What you see.** For each pixel, pulses are sent, and only the *first* photon after each is
 recorded. In daylight, background fires most pulses before the echo arrives: the histogram piles up
@@ -20,8 +22,9 @@ maximum about two bins after the echo; this lag is known from the model and subt
 
 **What misleads.** With *start* zero (the literal preset) the small scale begins far below the
 histogram, and meets it only late in the gate. Until then there is a residual without any echo, and
-estimates of noise gather where the two meet: an echo there is found by luck, too. Paper shows
-[estimates without an echo](?page=Paper&reported=What+the+paper+does+not+report).
+estimates of noise gather where the two meet: an echo there is found by luck, too. *Estimates
+without an echo*, below the histogram, shows where. Paper compares
+[all methods](?page=Paper&reported=What+the+paper+does+not+report).
 
 **What changes the estimate.** l and h act only through (m·h)²·l counts, so they are one parameter.
 m, n, T_n, the weight, the start and σ each change estimates. With the printed weight (cubic), α

@@ -188,7 +188,7 @@ class Inspect(Section):
         self._offer_plots()
 
     def layout(self) -> tuple[Any, Any]:
-        """Return the two columns of the page, and its explanation."""
+        """Return the two columns of the page, and its part of the sidebar."""
         sections = self._sections
         framed_map = framed(self.navigator.pane, self.keys)
         framed_map.stylesheets = [*framed_map.stylesheets, CONTAINER]
@@ -217,11 +217,6 @@ class Inspect(Section):
             self._faulty_part,
             part("View", *colors, self._viewing.doubts, is_open=False),
             self.crop.part,
-            part(
-                "How to read this page",
-                pmui.Typography(text.EXPLANATION, margin=8),
-                is_open=False,
-            ),
         ]
 
     def _offer_plots(self) -> None:
@@ -424,4 +419,9 @@ def _span(name: str, text: str, first: int, last: int) -> tuple[int, int]:
     return min(ends), max(ends)
 
 
-PAGE = Page("Inspect", Inspect, "shows everything known about a pixel, a region or the capture")
+PAGE = Page(
+    "Inspect",
+    Inspect,
+    "shows everything known about a pixel, a region or the capture",
+    text.EXPLANATION,
+)

@@ -14,6 +14,8 @@ from app.model.state import Viewing
 from app.model.store import Answer, Pixel
 from app.model.text import (
     CONFIDENCE_HELP,
+    PER_PIXEL,
+    PER_PULSE,
     WIDTH_GUESSED,
     Cell,
     Fact,
@@ -441,6 +443,7 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
     n_pulses = answer.capture.acquisition.n_pulses
     image, target = report.flux, report.target_flux
     per = f"in {report.flux_unit}, with 95 % interval."
+    signal = PER_PIXEL if n_pulses is None else PER_PULSE
     of_targets = "Mean of the target pixels, those with an echo"
     of_all = "Mean of all pixels; those without an echo have no signal"
     hot, dead = ("–" if n is None else count(n) for n in (report.n_hot, report.n_dead))
@@ -448,9 +451,9 @@ def capture_facts(answer: Answer, report: CaptureReport) -> list[Fact]:
         ("Pixels", f"{rows} × {cols}", "Rows and columns."),
         ("Pulses", "not known" if n_pulses is None else count(n_pulses), "Pulses per pixel."),
         ("Detections", number(float(answer.capture.counts.mean()), ""), "Mean of a pixel."),
-        ("PPP, target pixels", interval(target.signal), f"{of_targets}: signal flux {per}"),
+        (f"{signal}, target pixels", interval(target.signal), f"{of_targets}: signal flux {per}"),
         ("SBR, target pixels", interval(target.sbr), f"{of_targets}: signal over background."),
-        ("PPP, all pixels", interval(image.signal), f"{of_all}: signal flux {per}"),
+        (f"{signal}, all pixels", interval(image.signal), f"{of_all}: signal flux {per}"),
         ("SBR, all pixels", interval(image.sbr), f"{of_all}: signal over background."),
         ("Background", interval(image.background), f"Mean of all pixels over the gate, {per}"),
         *_stated_facts(report),
@@ -467,7 +470,7 @@ def _stated_facts(report: CaptureReport) -> list[Fact]:
     for each in report.stated:
         change = 100 * each.difference / each.stated if each.stated else math.nan
         note = f"estimate {typeset(f'{change:+.1f}')} %" if math.isfinite(change) else ""
-        of = f"in {each.unit} of a pixel" if each.unit else "signal over background"
+        of = f"in {each.unit} per pixel" if each.unit else "signal over background"
         estimate = interval(each.estimate)
         help = f"Stated by the file, {of}. The estimate of the mean of all pixels is {estimate}."
         facts.append((titles[each.name], noted(each.stated, note), help))

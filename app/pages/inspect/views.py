@@ -31,7 +31,7 @@ from app.plots import inspect as inspect_plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.plots.gate_cut import GateCut
 from app.theme import Palette
-from app.units import ShownGate
+from app.units import ShownGate, scale
 from app.widgets.figures import Layers, fit, paint_frame, round_up
 from app.widgets.image_view import ImageView
 from core.inference import Predictive
@@ -403,10 +403,14 @@ class PixelPlots:
         self.rate.frame(report.rate)
         self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
         self.rate.figure.title.text = inspect_plots.RATE_TITLES[report.rate_unit]
+        along = scale(unit, gate)
         if pixel.signals is None:
+            self.score.figure.title.text = plots.score_title(plots.SCORE_TITLE, pixel, along)
             self.score.draw(gate, curves("", score=pixel.score) + marks)
             fit(self.score.figure, *plots.score_ends(pixel.score))
         else:
+            title = plots.score_title(inspect_plots.STAGES_TITLE, pixel, along)
+            self.stages.figure.title.text = title
             residual = curves("counts", residual=pixel.signals.residual)
             enhanced = curves("counts × weight", enhanced=pixel.signals.enhanced)
             self.stages.draw(gate, residual + enhanced + marks)

@@ -80,6 +80,7 @@ COLUMN_HELP: dict[str, tuple[str, int]] = {
         "is that of the echo. It does not bound other rules or priors.",
         -1,
     ),
+    "approximated to": ("Largest error of the probability found in simulations.", 1),
     "Cramér-Rao bound m": ("Smallest standard deviation of unbiased estimates.", 1),
 }
 """Help and sort order of each column: 1 or -1, lowest or highest value first."""

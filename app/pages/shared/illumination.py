@@ -6,9 +6,11 @@ import panel as pn
 import param
 
 from app.model.state import HELD, Illumination, State
-from app.widgets.cards import select
+from app.widgets.cards import part, select
 from app.widgets.controls import Knob, SettingsPanel
 from core.parameters import Number
+
+MORE = "More simulation settings"
 
 _BACKGROUND = Number(
     "Background", 0.01, 1000.0, log=True, least=0.0, open_below=True, unit="per pulse"
@@ -42,10 +44,12 @@ class IlluminationPanel(SettingsPanel[Illumination]):
 
     @property
     def layout(self) -> pn.Column:
-        """All controls; those of the fluxes first."""
-        sbr, signal, *others = self.controls.values()
-        fluxes = (signal, self.background, sbr, self.held)
-        return pn.Column(*fluxes, *others, self.doubts, sizing_mode="stretch_width", margin=0)
+        """All controls; those of the fluxes first, and those that are rarely used folded."""
+        sbr, signal, pulses, seed = self.controls.values()
+        shown = (signal, self.background, sbr, pulses, self.doubts)
+        is_open = self._state.held != HELD[0] or self._state.light.seed != Illumination().seed
+        rare = part(MORE, self.held, seed, is_open=is_open)
+        return pn.Column(*shown, rare, sizing_mode="stretch_width", margin=0)
 
     def show(self, settings: Illumination) -> None:
         """Set every control without reporting a change."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from app.model.budget import fits, require_fitting
 from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import table_file
+from app.model.methods import METHOD_PLACES, method_style
 from app.model.restore import parameters_of
 from app.model.state import ReductionSettings
 from app.model.store import Answer, Request, bare, same_capture
@@ -24,11 +25,10 @@ from app.pages.shared.studies import OnePiece
 from app.pages.tradeoff import text
 from app.plots import elements as plots
 from app.tasks.scheduler import Work
-from app.theme import LIGHT, method_style, palette
+from app.theme import LIGHT, palette
 from app.widgets.cards import card, part
 from app.widgets.controls import Sentence, SettingsPanel, Table
 from app.widgets.figures import paint_frame, pane_of
-from core import ESTIMATORS
 from core.cost import predicted
 from core.metrics import Interval
 from core.parameters import Choice, Number, parameter
@@ -237,17 +237,17 @@ class SpeedSection(SettingsSection[Effort]):
             )
 
     def _draw_points(self, points: Sequence[Point], pareto: Sequence[Point]) -> None:
-        methods = list(ESTIMATORS)
-        places = [methods.index(point.candidate.method.estimator) for point in points]
-        color = [method_style(place, self._colors)[0] for place in places]
+        methods = [point.candidate.method.estimator for point in points]
+        color = [method_style(method, self._colors)[0] for method in methods]
+        markers = [plots.MARKERS[METHOD_PLACES[m] // len(self._colors.methods)] for m in methods]
         ms = _ends([point.milliseconds for point in points])
         errors = _error_rates(points)
         self.plot.source("points").data = {
             "x": ms["value"],
             "y": errors["value"],
             "color": color,
-            "marker": [plots.MARKERS[place // len(self._colors.methods)] for place in places],
-            "method": [spelled(methods[place]) for place in places],
+            "marker": markers,
+            "method": [spelled(method) for method in methods],
             "way": [text.name_of(point.candidate) for point in points],
             "tip": [text.tip(point) for point in points],
         }

@@ -71,7 +71,7 @@ def rows(points: Sequence[Point], pareto: Sequence[Point]) -> list[dict[str, obj
 
 
 def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
-    note = "Pareto front" if is_pareto else _bound(point.candidate)
+    note = "Pareto front" if is_pareto else _knowledge(point.candidate)
     return {
         "key": key,
         "action": "Open",
@@ -89,7 +89,7 @@ def _row(point: Point, key: int, is_pareto: bool) -> dict[str, object]:
     }
 
 
-def _bound(candidate: Candidate) -> str:
+def _knowledge(candidate: Candidate) -> str:
     """Return what a configuration knows that no instrument knows; empty if nothing."""
     if candidate.knows_truth:
         return "knows the true ranges: reference only"
@@ -152,8 +152,8 @@ def _recommended(goal: str, found: Recommendation | None, keeps: str) -> str:
 
 ACQUISITION = """
 Number of pulses, flux and length of the gate that reach a restoration degree: from theory, for
-the likeliest delay with known fluxes (up to 0.1 too high below 300 pulses); and from simulation,
-for the likelihood with known and with estimated fluxes. Bands: 95 % intervals.
+the likeliest delay with known fluxes; and from simulation, for the likelihood with known and with
+estimated fluxes. Below each plot: how far the theory is exact, and what it assumes.
 """
 NOT_SIMULATED = (
     "25 acquisitions of this scene are simulated, which takes up to half a minute. The sidebar "

@@ -18,6 +18,9 @@ GATE = Acquisition(n_pulses=N_PULSES)
 ONSETS = np.arange(20, 100)
 """Bins of the target; the bins before them hold noise alone."""
 
+LEAST_P = 0.05
+"""p-value from which on a curve is said to fit."""
+
 _N_NOISE = 19  # bins at the front of the gate whose mean is Figure 5b
 
 
@@ -44,7 +47,7 @@ def figure_6(flux: Flux, seed: int = 0) -> Plot:
     """Plot the trigger frequency at the target's peak against its bin, and fits of this curve.
 
     The paper fits an exponential, concludes that the weight should grow exponentially, and prints
-    the cubic weight of Eq. 7, whose reciprocal is fitted here beside it. By Eq. 1 the peak falls
+    the cubic weight of Eq. 13, whose reciprocal is fitted here beside it. By Eq. 1 the peak falls
     with the probability that a pulse is still armed, which is exponential in the target's bin.
     """
     frequency, expected = _frequencies(flux, seed)
@@ -57,10 +60,10 @@ def figure_6(flux: Flux, seed: int = 0) -> Plot:
         "exponential": (_fitted(_exponential, peak, (float(peak[0]), 0.01)), 2),
         "reciprocal of the cubic weight": (_fitted(_reciprocal_cubic, peak, (0.1,)), 1),
     }
-    misfit = {
-        name: float((((peak - curve) / sd) ** 2).sum() / (peak.size - n_fitted))
+    verdicts = "; ".join(
+        f"{name} {_verdict(((peak - curve) / sd) ** 2, n_fitted)}"
         for name, (curve, n_fitted) in fits.items()
-    }
+    )
     armed = GATE.n_bins / flux.background
     return Plot(
         "figure_6",
@@ -69,9 +72,9 @@ def figure_6(flux: Flux, seed: int = 0) -> Plot:
         "Trigger frequency",
         ONSETS.astype(float),
         {"simulated": peak, **{name: curve for name, (curve, _) in fits.items()}},
-        note="Squared deviation per degree of freedom, 1 by chance: "
-        + ", ".join(f"{name} {value:.3g}" for name, value in misfit.items())
-        + f". The probability that a pulse is still armed falls by 1/e in {armed:.3g} bins.",
+        note="Squared deviation per degree of freedom, about 1 for the right curve: "
+        f"{verdicts}. The probability that a pulse is still armed falls by 1/e in {armed:.3g} "
+        "bins.",
     )
 
 
@@ -81,6 +84,13 @@ def _frequencies(flux: Flux, seed: int) -> tuple[Floats, Floats]:
     counts = simulate(scene, GATE, flux, Pulse(), seed).cube[0]
     rate = rate_per_bin(ONSETS.astype(float), flux.signal, flux.background, Pulse(), GATE)
     return counts / N_PULSES, trigger_probability(rate)
+
+
+def _verdict(squares: Floats, n_fitted: int) -> str:
+    """Return the reduced chi-square of a fit, and whether chance exceeds it in 5 % of cases."""
+    free, total = squares.size - n_fitted, float(squares.sum())
+    fits = scipy.stats.chi2.sf(total, free) >= LEAST_P
+    return f"{total / free:.3g} ({'fits' if fits else 'does not fit'})"
 
 
 def _fitted(curve: Callable[..., Floats], values: Floats, start: tuple[float, ...]) -> Floats:

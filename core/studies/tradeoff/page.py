@@ -14,6 +14,7 @@ import numpy as np
 
 from core.acquisition import Floats
 from core.checks import require
+from core.inference.limits import ASSUMES
 from core.metrics import Interval
 from core.studies.outputs import Item, Plot, Scatter, Table, as_text, table
 from core.studies.statistics import mean_interval, median_interval
@@ -359,6 +360,12 @@ def acquisition_items(sweeps: Sequence[AcquisitionSweeps]) -> Iterator[Item]:
 acquired, acquiring_items = acquisition_sweeps, acquisition_items
 
 
+_THEORY = (
+    f"Theory: {ASSUMES}, approximated to 0.015, or to 0.005 above 0.9; with fewer than 300 pulses "
+    "up to 0.1 too high. Other methods may exceed it."
+)
+
+
 def _sweep_plot(
     name: str, simulation: Simulation, sweep: Sweep, x_label: str, marks: dict[str, float]
 ) -> Plot:
@@ -375,6 +382,7 @@ def _sweep_plot(
         sweep.x,
         {"theory, flux known": sweep.theory, **{key: each[0] for key, each in ends.items()}},
         marks,
+        f"{_THEORY} Bands: 95 % sampling error.",
         bands={key: (each[1], each[2]) for key, each in ends.items()},
         x_is_log=True,
     )
@@ -408,9 +416,7 @@ def _required_pulses(sweeps: Sequence[AcquisitionSweeps]) -> Table:
             ),
             **{f"{name}, simulated [95 %]": simulated(name) for name in acquisition.METHODS},
         },
-        "Theory: probability that the exact likelihood with known flux peaks within 3.2 bins, in a "
-        "Gaussian approximation that is too high below 0.9. Simulated: interpolated between the "
-        "numbers of pulses of the sweep.",
+        f"{_THEORY} Simulated: interpolated between the numbers of pulses of the sweep.",
     )
 
 

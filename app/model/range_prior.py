@@ -1,0 +1,51 @@
+"""Where the estimator of an answer has its estimates without an echo, by simulation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from app.model.state import ReductionSettings
+from app.model.store import Answer, reduced
+from core import ESTIMATORS, Capture, Scene, simulate
+from core.inference import flux_model_of
+from core.studies import outputs, range_prior
+
+SIDE, ECHO_SIDE = 64, 32
+"""Rows and columns of the image without an echo, and of one for each position of an echo."""
+
+
+def has_range_prior(answer: Answer) -> bool:
+    """Return whether there is one: the flux is known, and the estimator is not told it."""
+    is_told = ESTIMATORS[answer.method].flux_model is not flux_model_of
+    return answer.request.source.is_scene and not is_told
+
+
+def range_prior_of(answer: Answer) -> outputs.Plot:
+    """Plot the range prior of an answer's estimator, with its settings and its reduction."""
+    request, light = answer.request, answer.request.light
+    acquisition = answer.whole.acquisition
+
+    def simulated(range_m: float) -> Capture:
+        side = SIDE if math.isnan(range_m) else ECHO_SIDE
+        scene = Scene(np.full((side, side), range_m))
+        return reduced(simulate(scene, acquisition, light.flux, seed=light.seed), request)
+
+    plot = range_prior.range_prior(simulated, answer.method, answer.settings)
+    about = (
+        "Simulated with the fluxes and settings on show, pixels of one surface over a uniform "
+        f"background: {SIDE**2:,} without an echo, {ECHO_SIDE**2:,} for each position of one."
+    )
+    return replace(plot, note=f"{plot.note} {about}")
+
+
+def slow_start(answer: Answer) -> str:
+    """Return how far the small scale begins below the background; empty where it does not."""
+    request = answer.request
+    if answer.method != "tracking" or request.less != ReductionSettings():
+        return ""
+    return range_prior.slow_start(
+        answer.settings, answer.whole.acquisition, request.light.flux, answer.whole.pulse
+    )
