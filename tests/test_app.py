@@ -915,7 +915,7 @@ def test_controls_fit_the_capture_they_are_for(layout, small_file):
 
 
 def test_a_link_unfolds_the_rarely_used_settings_that_it_changes():
-    folded = {"tracking.l": "0.006"}, {"light.seed": "3"}, {"tracking.alpha": "0.3"}
+    folded = {"tracking.l": "0.006"}, {"light.seed": "3"}, {"tracking.m": "1.6"}
     for entries, expected in zip(folded, (set(), {MORE}, {MORE_TRACKING}), strict=True):
         parts = HeldLayout(built_in_sources(), Link(entries)).page.select(Part)
         found = {each.title for each in parts if not each.collapsed}

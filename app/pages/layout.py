@@ -49,7 +49,7 @@ CUSTOM = "custom"
 
 HELP = "About this page"
 MORE_TRACKING = "More tracking settings"
-COMMON = ("l", "t_n")
+COMMON = ("l", "n", "alpha", "t_n")
 """Settings of the tracking differentiator that are not folded; the others are rarely changed."""
 
 THEME = {
