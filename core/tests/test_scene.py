@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from core.scene import Scene, building, car, scenes, staircase, uniform, wall
+from core.scene import Scene, building, car, piecewise, scenes, staircase, uniform, wall
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
 
@@ -137,13 +137,28 @@ def test_walls_are_smooth_and_cover_the_gate() -> None:
         assert all(np.abs(np.diff(image, axis=axis)).max() < 0.1 for axis in (0, 1))
 
 
+def test_planes_are_smooth_but_for_a_fifth_of_edges() -> None:
+    bins = onset_bin(piecewise()).reshape(64, 64)
+    steps = [np.abs(np.diff(bins, axis=axis)) > 3 for axis in (0, 1)]
+    at_edge = np.zeros(bins.shape, bool)
+    for below, axis in zip(steps, (0, 1), strict=True):
+        around = [(1, 1) if each == axis else (0, 0) for each in (0, 1)]
+        wide = np.pad(below, around)
+        at_edge |= wide[1:] | wide[:-1] if axis == 0 else wide[:, 1:] | wide[:, :-1]
+    assert 0.17 < at_edge.mean() < 0.21
+    np.testing.assert_allclose(np.diff(bins[56:, 10]), -2.5)  # the ground
+
+
 def test_a_flat_target_has_one_range() -> None:
     np.testing.assert_allclose(onset_bin(uniform(first_bin=53.6, last_bin=53.6)), 53.6)
 
 
 REFUSED = [
     *((car, (size,), rf"size = {size} .*64 or 256") for size in (0, 63, 128)),
-    *((build, (7,), r"size = 7 .*8 or more") for build in (building, staircase, uniform, wall)),
+    *(
+        (build, (7,), r"size = 7 .*8 or more")
+        for build in (building, staircase, uniform, wall, piecewise)
+    ),
     *(
         (uniform, (64, 0, *bins), r"first_bin, last_bin = .*from 0 to 100")
         for bins in ((-1, 50), (60, 50), (20, 101), (20, np.nan))
