@@ -215,16 +215,16 @@ def wall(size: int = 64, seed: int = 0) -> Scene:
 # Planes of `piecewise`, in 64ths of the image: first and last row, first and last column, the bin
 # of the echo in the middle, and its change from row to row and from column to column.
 _PLANES: tuple[tuple[float, ...], ...] = (
-    (0, 63, 0, 63, 84.0, 0.0, 0.1),  # wall
-    (38, 63, 0, 63, 59.25, -2.5, 0.0),  # ground
-    (16, 54, 5, 17, 51.0, 0.0, -0.3),  # front of a house
-    (16, 50, 18, 24, 54.0, 0.0, 1.5),  # its side
-    (16, 58, 29, 30, 40.0, 0.0, 0.0),  # pole
-    (5, 18, 36, 50, 62.0, 0.8, -0.5),  # boards
-    (23, 32, 34, 41, 70.0, -0.4, 0.6),
-    (21, 35, 46, 49, 45.0, 0.3, 0.0),
-    (25, 37, 53, 61, 66.0, -0.6, 0.4),
-    (43, 60, 38, 51, 35.0, 0.0, 0.4),  # low wall
+    (0, 63, 0, 63, 80.0, 0.0, 0.1),  # wall
+    (38, 63, 0, 63, 55.25, -2.5, 0.0),  # ground
+    (16, 54, 5, 17, 47.0, 0.0, -0.3),  # front of a house
+    (16, 50, 18, 24, 50.0, 0.0, 1.5),  # its side
+    (16, 58, 29, 30, 36.0, 0.0, 0.0),  # pole
+    (5, 18, 36, 50, 58.0, 0.8, -0.5),  # boards
+    (23, 32, 34, 41, 66.0, -0.4, 0.6),
+    (21, 35, 46, 49, 41.0, 0.3, 0.0),
+    (25, 37, 53, 61, 62.0, -0.6, 0.4),
+    (43, 60, 38, 51, 31.0, 0.0, 0.4),  # low wall
 )
 
 
@@ -232,7 +232,7 @@ def piecewise(size: int = 64) -> Scene:
     """Planes before a wall, over a ground that recedes by 2.5 bins from row to row.
 
     Neighbouring pixels agree, except at the edges of the planes, to which one in five pixels is
-    next: a test of methods that use neighbours. The depths cover bins 28 to 88 of the gate's 100.
+    next: a test of methods that use neighbours. The depths cover bins 23 to 83 of the gate's 100.
 
     Parameters
     ----------
