@@ -33,6 +33,8 @@ class Quantity(str):
         Ends of an interval.
     note : str
         Remark in the text.
+    decimals : int, optional
+        Decimals that the interval of the number supports.
     """
 
     value: float
@@ -40,6 +42,7 @@ class Quantity(str):
     low: float | None
     high: float | None
     note: str
+    decimals: int | None
 
     def __new__(
         cls,
@@ -49,12 +52,17 @@ class Quantity(str):
         low: float | None = None,
         high: float | None = None,
         note: str = "",
+        decimals: int | None = None,
     ) -> Quantity:
         """Attach a number to its text."""
         quantity = super().__new__(cls, "–" if math.isnan(value) else text)
         quantity.value, quantity.unit, quantity.note = value, unit, note
-        quantity.low, quantity.high = low, high
+        quantity.low, quantity.high, quantity.decimals = low, high, decimals
         return quantity
+
+    def rounded(self, value: float | None) -> float | None:
+        """Return the number, or an end of its interval, with the decimals that these support."""
+        return value if value is None or self.decimals is None else round(value, self.decimals)
 
 
 def number(value: float, unit: str, sign: bool = False, decimals: int | None = None) -> Quantity:
@@ -67,7 +75,7 @@ def number(value: float, unit: str, sign: bool = False, decimals: int | None = N
         text = f"{value:{plus}.4g}"
     else:
         text = f"{value:,.2f}"
-    return Quantity(f"{typeset(text)} {unit}".strip(), value, unit)
+    return Quantity(f"{typeset(text)} {unit}".strip(), value, unit, decimals=decimals)
 
 
 def plus_minus(low: float, high: float, unit: str) -> Quantity:
@@ -77,7 +85,7 @@ def plus_minus(low: float, high: float, unit: str) -> Quantity:
     if decimals is None:
         return Quantity("", math.nan, unit)
     text = f"{middle:,.{decimals}f} ± {half:.{decimals}f} {unit}"
-    return Quantity(text, middle, unit, low, high)
+    return Quantity(text, middle, unit, low, high, decimals=decimals)
 
 
 def with_margin(found: Interval, unit: str) -> Quantity:
@@ -91,7 +99,8 @@ def with_margin(found: Interval, unit: str) -> Quantity:
     if decimals is None:
         return number(found.value, unit)
     text = typeset(f"{found.value:,.{decimals}f} ± {margin:.{decimals}f}")
-    return Quantity(f"{text} {unit}".strip(), found.value, unit, found.low, found.high)
+    text = f"{text} {unit}".strip()
+    return Quantity(text, found.value, unit, found.low, found.high, decimals=decimals)
 
 
 def between(low: float, high: float, unit: str) -> Quantity:
@@ -100,7 +109,7 @@ def between(low: float, high: float, unit: str) -> Quantity:
     if decimals is None:
         return Quantity("", math.nan, unit)
     text = f"{low:,.{decimals}f}–{high:,.{decimals}f} {unit}"
-    return Quantity(text, (low + high) / 2, unit, low, high)
+    return Quantity(text, (low + high) / 2, unit, low, high, decimals=decimals)
 
 
 def count(value: int, note: str = "") -> Quantity:
@@ -200,7 +209,7 @@ class Scale:
     def number(self, position_bin: float) -> Quantity:
         """Format a position without its unit; a dash for NaN."""
         value = self.at(position_bin)
-        return Quantity(f"{value:,.{self.decimals}f}", value)
+        return Quantity(f"{value:,.{self.decimals}f}", value, decimals=self.decimals)
 
     def place(self, position_bin: float) -> Quantity:
         """Format a position with its unit; a dash for NaN."""
@@ -216,7 +225,8 @@ class Scale:
 
     def _named(self, number: Quantity) -> Quantity:
         text = f"bin {number}" if self.name == "bins" else f"{number} {self.name}"
-        return Quantity(text, number.value, self.name, number.low, number.high)
+        ends = number.low, number.high
+        return Quantity(text, number.value, self.name, *ends, decimals=number.decimals)
 
 
 def scale(unit: str, gate: ShownGate) -> Scale:

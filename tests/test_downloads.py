@@ -47,15 +47,19 @@ from app.pages.layout import Layout
 from app.pages.shared import downloads
 from app.pages.shared.downloads import Download, Shown, Subject
 from app.theme import RANGE_COLORS
-from app.units import count, interval, number, share
+from app.units import count, interval, number, share, with_margin
 from core import TrackingParameters
 from core.cli import main
 from core.inference import range_intervals
 from core.inspection import pixels_in
 from core.io import MOST_LETTERS
+from core.metrics import Interval
 from core.studies.outputs import Table
 from core.tests.test_export import drawn_pixels
 from tests.browser import VIEWS, eventually, fact, server_process
+
+BIN_M = 0.15
+"""Length of a bin of the first scene."""
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +251,11 @@ def test_an_images_table_holds_its_pixels(explore, session, kind):
     found = columns_of(written(explore.image_shown().files["csv"]))
     values, look = image_of(session.answer, kind, session.state.viewing)
     np.testing.assert_array_equal(found["row"] * 64 + found["col"], np.arange(64 * 64))
-    np.testing.assert_array_equal(found[look.legend], values.ravel())
+    if look.unit != "m":
+        np.testing.assert_array_equal(found[look.legend], values.ravel())
+        return
+    np.testing.assert_allclose(found[look.legend], values.ravel(), atol=BIN_M / 20)
+    assert ("range_low_68_m" in found) == (kind == "Estimate")
 
 
 def test_an_images_table_and_picture_hold_the_pixels_in_view(explore):
@@ -372,14 +380,15 @@ def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(explore, sess
     for points, colors in (
         (ply.vertices, ply.colors[:, :3]),
         (las.xyz, np.stack([las.red, las.green, las.blue], -1) // 256),
-        (
-            np.stack([table[name] for name in ("x_m", "y_m", "z_m")], -1),
-            np.stack([table[name] for name in ("red", "green", "blue")], -1),
-        ),
     ):
         np.testing.assert_allclose(points, xyz_m, atol=2e-4)
         np.testing.assert_array_equal(colors, rgb)
     np.testing.assert_array_equal(ply.vertices.astype(np.float32), xyz_m)
+    points = np.stack([table[name] for name in ("x_m", "y_m", "z_m")], -1)
+    np.testing.assert_allclose(points, xyz_m, atol=BIN_M / 20)
+    np.testing.assert_array_equal(
+        np.stack([table[name] for name in ("red", "green", "blue")], -1), rgb
+    )
 
 
 def test_a_cropped_cloud_and_its_files_hold_what_is_inside_and_state_the_box(explore, session):
@@ -410,6 +419,21 @@ def test_a_cropped_cloud_and_its_files_hold_what_is_inside_and_state_the_box(exp
     session.state.crop = Crop(to_m=1.0)
     with pytest.raises(ValueError, match="no estimate that is shown lies inside the box"):
         explore.cloud_shown()
+
+
+def test_a_clouds_files_hold_the_columns_of_the_command_lines(explore, session, tmp_path):
+    files = explore.cloud_shown().files
+    path = tmp_path / "cloud.laz"
+    options = ["--least-confidence", "0.9", "--intervals", "--out", str(path)]
+    assert not main(["estimate", "tracking", "--scene", "car", *options])
+    one, other = laspy.read(path), laspy.read(io.BytesIO(written(files["laz"])))
+    names = list(one.point_format.extra_dimension_names)
+    assert names == list(other.point_format.extra_dimension_names)
+    for name in names:
+        np.testing.assert_array_equal(one[name], other[name])
+    table = columns_of(written(files["csv"]))
+    assert set(names) < set(table)
+    np.testing.assert_allclose(table["range_sd_m"], one["range_sd_m"], atol=BIN_M / 20)
 
 
 @pytest.mark.parametrize("angle_rad", [None, 1e-3])
@@ -445,7 +469,7 @@ def test_a_methods_picture_is_saved_as_its_estimate(layout, kind):
     np.testing.assert_array_equal(arrays["range_m"], image.range_m)
     values = columns_of(written(found.files["csv"]))[found.scale.legend]
     if kind == "Range":
-        np.testing.assert_array_equal(values, image.range_m.ravel())
+        np.testing.assert_allclose(values, image.range_m.ravel(), atol=BIN_M / 20)
 
 
 def test_tables_hold_every_digit_and_no_units_in_their_cells():
@@ -473,6 +497,7 @@ def test_facts_hold_the_ends_of_their_intervals():
         ("Estimate", number(math.nan, "m"), ""),
         ("Truth", "–", ""),
         ("Error", number(-0.0123, "m", sign=True), ""),
+        ("Range", with_margin(Interval(50.12345, 50.1, 50.14), "m"), ""),
         ("Detections", count(1234, "12.3 %"), ""),
         ("Confidence", share(0.125), ""),
     ]
@@ -483,6 +508,7 @@ def test_facts_hold_the_ends_of_their_intervals():
         "Estimate,,,,m,,",
         "Truth,,,,,,",
         "Error,-0.0123,,,m,,",
+        "Range,50.123,50.1,50.14,m,,",
         "Detections,1234,,,,12.3 %,",
         "Confidence,12.5,,,%,,",
     ]
@@ -613,12 +639,14 @@ def size_of(page, what):
     )
 
 
-def as_seen(browser, content):
-    """Return a picture as the browser draws it."""
+def as_seen(browser, content, width):
+    """Return a picture as the browser draws it in this width."""
     page = browser.new_page()
     kind = "svg+xml" if content.startswith(b"<svg") else "png"
     data = b64encode(content).decode()
-    page.set_content(f'<body style="margin:0"><img src="data:image/{kind};base64,{data}">')
+    page.set_content(
+        f'<body style="margin:0"><img width={width} src="data:image/{kind};base64,{data}">'
+    )
     shot = page.locator("img").screenshot()
     page.close()
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)
@@ -642,8 +670,10 @@ def save_a_plot_as_a_picture(here, browser, what, title):
     if what == "image":  # drawn by the server, as the command line does
         assert picture.width >= 1200
         return
-    assert list(picture.size) == size_of(here, what)
-    one, other = as_seen(browser, png), as_seen(browser, svg)
+    width, height = size_of(here, what)
+    assert picture.width == 1200  # the plot is narrower
+    assert picture.height == pytest.approx(1200 * height / width, abs=2)
+    one, other = (as_seen(browser, each, width) for each in (png, svg))
     assert one.shape == other.shape
     assert np.ptp(one) > 200  # something is drawn
     assert np.abs(one - other).mean() < 6  # letters may be of another font
@@ -678,8 +708,9 @@ def save_a_cloud_as_picture_and_points(here):
     name, png = download(here, "3D cloud", "png")
     assert name == "car_tracking_cloud.png"
     picture = Image.open(io.BytesIO(png)).convert("RGB")
-    assert picture.width == round(box["width"])
-    assert picture.height > box["height"]  # with heading and colour scale
+    assert picture.width == 1200  # the card is narrower
+    # With heading and colour scale.
+    assert picture.height > 1200 * box["height"] / box["width"]
     colors = {f"#{r:02x}{g:02x}{b:02x}" for _, (r, g, b) in picture.getcolors(2**24)}
     assert len(colors & set(RANGE_COLORS)) > 100
     name, content = download(here, "3D cloud", "laz")

@@ -35,8 +35,10 @@ from core.io import (
     Picture,
     Plane,
     Product,
+    decimals_of,
     guessed_angle,
     write_columns,
+    write_points,
 )
 from core.report import write_report
 from core.studies import Table, as_csv, without_nan
@@ -162,7 +164,7 @@ def image_files(
 ) -> dict[str, Write]:
     """Return an image (row, col) as shown, with the estimate that it belongs to.
 
-    Arrays and pages include the 68 and 95 % intervals of the ranges.
+    Arrays and pages include the 68 and 95 % intervals of the ranges, a table those of an estimate.
     Pictures are those that `core.save_image` makes of the pixels in view, in the light mode.
 
     Parameters
@@ -194,22 +196,31 @@ def image_files(
         first=answer.grid.place(rows.start, cols.start),
         step=answer.grid.step,
     )
+    prepare = partial(_with_intervals, answer, product)
+    listed = prepare if kind == "Estimate" else lambda: product
     return {
-        "csv": image_file(values, look, figure, answer.grid),
-        **{suffix: partial(_write_with_intervals, answer, product, suffix) for suffix in ARRAYS},
+        "csv": image_file(values, look, figure, answer.grid, listed),
+        **_written_by(prepare, ARRAYS),
         **{suffix: partial(picture.write, suffix=suffix) for suffix in ("png", "svg")},
     }
 
 
-def _write_with_intervals(answer: Answer, product: Product, suffix: str, file: BinaryIO) -> None:
-    """Write a range image with its intervals, or the remark that they would take too long."""
+def _with_intervals(answer: Answer, product: Product) -> Product:
+    """Add the intervals of the ranges, or the remark that they would take too long."""
     n_pixels = int(product.image.valid.sum())
     if fits(predicted_interval_time(n_pixels, answer.capture.echo_bins)):
         inner, outer = range_intervals(answer.capture, product.image, (0.68, 0.95))
-        product = replace(product, interval_68=inner, interval=outer)
-    else:
-        product = replace(product, remark=NO_INTERVALS)
-    WRITERS[f".{suffix}"](product, file)
+        return replace(product, interval_68=inner, interval=outer)
+    return replace(product, remark="; ".join(filter(None, (product.remark, NO_INTERVALS))))
+
+
+def _written_by(prepare: Callable[[], Product], suffixes: Sequence[str]) -> dict[str, Write]:
+    """Return the files that `core.io.writers` makes of a product, which is prepared on a thread."""
+
+    def write(suffix: str, file: BinaryIO) -> None:
+        WRITERS[f".{suffix}"](prepare(), file)
+
+    return {suffix: partial(write, suffix) for suffix in suffixes}
 
 
 def in_view(figure: Any, grid: Grid, shape: tuple[int, int]) -> tuple[slice, slice]:
@@ -226,17 +237,37 @@ def in_view(figure: Any, grid: Grid, shape: tuple[int, int]) -> tuple[slice, sli
     return rows, cols
 
 
-def image_file(values: Array, look: ColorScale, figure: Any, grid: Grid) -> Write:
+def image_file(
+    values: Array,
+    look: ColorScale,
+    figure: Any,
+    grid: Grid,
+    prepare: Callable[[], Product] | None = None,
+) -> Write:
     """Return the pixels in view of an image (row, col), one line each, as CSV.
 
     Rows and columns are those of the file, as on the axes.
+
+    Parameters
+    ----------
+    values, look, figure, grid
+        Image, its colours, its plot, and the place of its pixels in the file.
+    prepare : callable, optional
+        Returns the estimate to which an image in metres belongs. It determines the decimals, and
+        its intervals, if it has any, are added.
     """
     rows, cols = in_view(figure, grid, values.shape)
 
     def write(file: BinaryIO) -> None:
         place = grid.place(*(np.arange(each.start, each.stop) for each in (rows, cols)))
         row, col = np.meshgrid(*place, indexing="ij")
-        write_columns({"row": row, "col": col, look.legend: values[rows, cols]}, file)
+        columns, decimals = {"row": row, "col": col, look.legend: values[rows, cols]}, {}
+        if prepare is not None and look.unit == "m":
+            product = prepare()
+            limits = {name: each[rows, cols] for name, each in product.interval_columns.items()}
+            places = decimals_of(product.range_step_m[rows, cols])
+            columns, decimals = columns | limits, dict.fromkeys((look.legend, *limits), places)
+        write_columns(columns, file, decimals=decimals)
 
     return write
 
@@ -279,6 +310,7 @@ def report_file(answer: Answer, state: State, title: str) -> Write:
         least_confidence=viewing.least_confidence,
         pixel_angle_rad=chosen_rad,  # `core` states whether its own is a guess
         box=state.box,
+        colors=viewing,
         title=title,
         script=script_of(answer, state),
     )
@@ -310,19 +342,13 @@ def cloud_files(answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE) -
     prepare = partial(_cloud, answer, kind, viewing, box, remark)
 
     def table(file: BinaryIO) -> None:
-        product = prepare()
-        points = product.points()
-        xyz_m = dict(zip(("x_m", "y_m", "z_m"), points.xyz_m.T, strict=True))
-        write_columns(xyz_m | product.point_columns(points), file)
+        write_points(prepare(), file)
 
-    def points(suffix: str, file: BinaryIO) -> None:
-        WRITERS[f".{suffix}"](prepare(), file)
-
-    return {suffix: partial(points, suffix) for suffix in ("ply", "las", "laz")} | {"csv": table}
+    return {"csv": table, **_written_by(prepare, ("ply", "las", "laz"))}
 
 
 def _cloud(answer: Answer, kind: str, viewing: Viewing, box: Box, remark: str) -> Product:
-    """Return the pixels inside a box with an image of their colours."""
+    """Return the pixels inside a box with their intervals and an image of their colours."""
     cloud, rgb, wrong = cloud_of(answer, kind, viewing, box)
     rgb = rgb.copy()
     if wrong is not None:
@@ -330,9 +356,8 @@ def _cloud(answer: Answer, kind: str, viewing: Viewing, box: Box, remark: str) -
     image = np.zeros((*answer.capture.shape, 3), np.uint8)
     image[shown(answer, viewing.least_confidence, box)] = rgb
     angle_rad = float(cloud.field_data["pixel_angle_rad"][0])
-    return _product(
-        answer, viewing.least_confidence, box, pixel_angle_rad=angle_rad, rgb=image, remark=remark
-    )
+    more = {"pixel_angle_rad": angle_rad, "rgb": image, "remark": remark}
+    return _with_intervals(answer, _product(answer, viewing.least_confidence, box, **more))
 
 
 # Tables
@@ -373,14 +398,15 @@ def facts_file(facts: Sequence[Fact]) -> Write:
     for name, text, help in facts:
         more: Sequence[Any] = [""] * 4
         if isinstance(text, Quantity):
-            more = [text.low, text.high, text.unit, text.note]
+            ends = (text.rounded(end) for end in (text.low, text.high))
+            more = [*ends, text.unit, text.note]
         rows.append([name, _value(text), *more, help])
     return _csv(("quantity", "value", "low", "high", "unit", "more", "meaning"), rows)
 
 
 def _value(text: str) -> Any:
-    """Return the number of a text that keeps one; a dash is an empty cell."""
-    return text.value if isinstance(text, Quantity) else "" if text == "–" else text
+    """Return the number of a text that keeps one, as exact as it is; a dash is an empty cell."""
+    return text.rounded(text.value) if isinstance(text, Quantity) else "" if text == "–" else text
 
 
 def _csv(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Write:

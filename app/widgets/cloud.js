@@ -591,11 +591,24 @@ class CloudView {
     this.moved()
   }
 
-  /* Return the picture with tick labels and caption as a canvas, and its size. The WebGL
-   * canvas is copied in the task that drew it, before the browser may clear it. */
-  picture() {
+  /* Return the picture with tick labels and caption as a canvas with `ratio` pixels for each of
+   * the page's, and its size on the page. */
+  picture(ratio) {
     this.draw()
     if (!this.window) throw new Error(this.problem.textContent || "the cloud is not drawn yet")
+    const own = this.ratio
+    this.ratio = ratio
+    try {
+      return this.drawn()
+    } finally {
+      this.ratio = own
+      this.draw()
+    }
+  }
+
+  /* The WebGL canvas is copied in the task that drew it, before the browser may clear it. */
+  drawn() {
+    this.draw()
     const source = this.surface.getCanvas()
     const canvas = element("canvas", {width: source.width, height: source.height})
     const pen = canvas.getContext("2d")
@@ -731,7 +744,7 @@ export function render({model}) {
     button("Home view (0)", HOME_ICON, () => view.homeByHand()))
   const root = element("div", {class: "cloud"}, element("style", {}, STYLE),
     stage, caption, tools, problem)
-  root.picture = () => view.picture() // for downloads.js
+  root.picture = (ratio) => view.picture(ratio) // for downloads.js
   views.set(model, view)
   listenToPointers(stage, view)
   listenToKeys(stage, view)

@@ -10,10 +10,12 @@ from typing import Any
 
 from core.checks import printable
 from core.cli.options import (
+    add_colors,
     add_crop,
     add_false_alarm,
     add_pixel,
     add_settings,
+    colors_given,
     crop_given,
     probability,
     reading,
@@ -57,6 +59,7 @@ def add(commands: Any) -> None:
         )
         add_false_alarm(method)
         add_crop(method)
+        add_colors(method)
         method.add_argument("--overwrite", action="store_true", help="replace the file")
         method.add_argument("--json", action="store_true", help="one JSON object instead of lines")
         add_truth_options(method)
@@ -68,7 +71,8 @@ def add(commands: Any) -> None:
 def _report(chosen: argparse.Namespace) -> None:
     refused_outputs([chosen.out], (".html",), chosen.overwrite)
     truth = truth_options_from(chosen, chosen.capture)
-    settings, box = settings_given(chosen, ESTIMATORS[chosen.method].parameters), crop_given(chosen)
+    settings = settings_given(chosen, ESTIMATORS[chosen.method].parameters)
+    box, colors = crop_given(chosen), colors_given(chosen)
     capture = read_capture(chosen.capture, **reading(chosen))
     if truth:
         capture = read_truth(capture=capture, **truth)
@@ -82,6 +86,7 @@ def _report(chosen: argparse.Namespace) -> None:
         pixel=chosen.pixel and tuple(chosen.pixel),
         least_confidence=chosen.least_confidence,
         box=box,
+        colors=colors,
         title=chosen.capture.name,
         script=_script(chosen, settings),
     )
@@ -112,5 +117,7 @@ def _lines(chosen: argparse.Namespace, settings: Any) -> Iterator[str]:
         view["pixel"] = literal(tuple(chosen.pixel))
     if (box := crop_given(chosen)) != WHOLE:
         view["box"] = call("core.geometry.Box", **changed_fields(box))
+    if colors := changed_fields(colors_given(chosen)):
+        view["colors"] = call("core.io.RangeColors", **colors)
     out, title = literal(chosen.out.name), literal(chosen.capture.name)
     yield assign("", "core.save_report", "capture", "image", out, title=title, **view)

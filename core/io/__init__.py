@@ -33,6 +33,7 @@ from core.io.writers import (
     Product,
     RangeColors,
     colors_of,
+    decimals_of,
     guessed_angle,
     p_value_scale,
     range_scale,
@@ -40,6 +41,7 @@ from core.io.writers import (
     save_image,
     save_pixel,
     write_columns,
+    write_points,
 )
 
 __all__ = [
@@ -66,6 +68,7 @@ __all__ = [
     "bytes_of",
     "changed_settings",
     "colors_of",
+    "decimals_of",
     "distinct_names",
     "file_name",
     "files_of",
@@ -87,4 +90,5 @@ __all__ = [
     "with_flags",
     "with_labels",
     "write_columns",
+    "write_points",
 ]

@@ -12,6 +12,7 @@ from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, require_capture
 from core.geometry import WHOLE, Box
+from core.io.writers.colors import RangeColors
 from core.io.writers.whole import whole_file
 
 __all__ = ["LEAST_CONFIDENCE", "save_report", "telling_pixel", "write_report"]
@@ -30,6 +31,7 @@ def save_report(
     least_confidence: float = LEAST_CONFIDENCE,
     pixel_angle_rad: float | None = None,
     box: Box = WHOLE,
+    colors: RangeColors | None = None,
     title: str = "",
     script: str = "",
 ) -> None:
@@ -59,6 +61,8 @@ def save_report(
         None, or a guess, which the report mentions.
     box : Box
         Part of the scene that the cloud shows.
+    colors : core.io.RangeColors, optional
+        Limits and colour map of ranges; by default those of the app.
     title : str
         Such as the name of the capture's file.
     script : str
@@ -85,6 +89,7 @@ def save_report(
             least_confidence=least_confidence,
             pixel_angle_rad=pixel_angle_rad,
             box=box,
+            colors=colors,
             title=title,
             script=script,
         )
@@ -99,6 +104,7 @@ def write_report(
     least_confidence: float = LEAST_CONFIDENCE,
     pixel_angle_rad: float | None = None,
     box: Box = WHOLE,
+    colors: RangeColors | None = None,
     title: str = "",
     script: str = "",
 ) -> None:
@@ -118,7 +124,15 @@ def write_report(
     require("image.made_by", made_by, made_by is not None, "an image that core.estimate returned")
     known = telling_pixel(capture, image) if pixel is None else pixel
     page = page_of(
-        capture, image, known, least_confidence, pixel_angle_rad, box, title=title, script=script
+        capture,
+        image,
+        known,
+        least_confidence,
+        pixel_angle_rad,
+        box,
+        colors,
+        title=title,
+        script=script,
     )
     file.write(page.encode("utf-8", "backslashreplace"))
 

@@ -32,7 +32,13 @@ from core.inspection import (
     pixel_report,
     reported_check,
 )
-from core.io.writers.colors import ColorScale, colors_of, p_value_scale, range_scale
+from core.io.writers.colors import (
+    ColorScale,
+    RangeColors,
+    colors_of,
+    p_value_scale,
+    range_scale,
+)
 from core.io.writers.product import guessed_view, plain
 from core.labels import software
 from core.metrics import Interval
@@ -102,6 +108,7 @@ def page_of(
     least_confidence: float,
     pixel_angle_rad: float | None,
     box: Box,
+    colors: RangeColors | None,
     *,
     title: str,
     script: str,
@@ -114,7 +121,7 @@ def page_of(
     pixel_found = pixel_report(capture, image, *pixel, made_by.method, made_by.settings)
     capture_found = capture_report(capture)
     shown = image.confident(least_confidence)
-    scale = range_scale(capture, shown)
+    scale = range_scale(capture, shown, colors)
     body = [
         *_heading(capture, image, title, method),
         *_recording(capture),

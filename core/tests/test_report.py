@@ -255,6 +255,7 @@ def test_the_command_and_its_script_write_the_same_report(
     command = ["report", "cfar", "a 'b' <c>.npz", "report.html", "--pixel", "3", "4"]
     options = ["--truth", "truth.npy", "--truth-unit", "m", "--least-confidence", "0.5"]
     more = ["--guard-bins", "2", "--pulses", "400"]
+    more += ["--color-from", "40", "--color-map", "viridis"]
     more += ["--crop", "-", "1e5", "--crop-pixels", "-1,-1 -1,20 20,20"]
     assert main([*command, *options, *more]) == 0
     first = Path("report.html").read_text(encoding="utf-8")
@@ -265,6 +266,7 @@ def test_the_command_and_its_script_write_the_same_report(
     assert "Pixel in row 3, column 4" in page.texts["h2"]
     assert "guard_bins=2" in page.texts["code"][0]
     assert "n_pulses=400" in page.texts["code"][0]
+    assert 'RangeColors(color_from_m=40.0, color_map="viridis")' in page.texts["code"][0]
     (label,) = page.of("canvas", "aria-label")
     assert label.endswith(
         " in the box (pixels in the polygon of corners row,col -1,-1 -1,20 20,20; "

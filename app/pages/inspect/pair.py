@@ -23,7 +23,7 @@ from app.theme import ERROR_COLORS
 from app.widgets.cards import BREAK_PX, button
 from app.widgets.controls import Facts, Sentence
 from app.widgets.method_picture import Picture, ScaleBar
-from core.io import ColorScale
+from core.io import ColorScale, Product
 
 HEIGHT_PX = 240
 GRID = f"""
@@ -175,7 +175,8 @@ class PairSection(Section):
             files = image_files(answer, "Estimate", viewing, figure, look, f"{what}: {name}")
             return Shown(subject, f"estimate {what}", files)
         look = difference_scale(pair)
-        file = image_file(pair.difference_m, look, self.difference.image.figure, pair.b.grid)
+        figure, of_b = self.difference.image.figure, Product(pair.b.capture, pair.b.run.image)
+        file = image_file(pair.difference_m, look, figure, pair.b.grid, lambda: of_b)
         return Shown(subject, f"minus {text.estimate_name(pair.a)}", {"csv": file}, scale=look)
 
 

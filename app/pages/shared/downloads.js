@@ -4,6 +4,7 @@
 
 const ICON = "M12 3v12m-5-5l5 5 5-5M4 20h16";
 const FONT = "Roboto, system-ui, sans-serif";
+const PICTURE_PX = 1200; // least width of a PNG
 const HEADING_PX = 26;
 const SCALE_PX = 44;
 const MARGIN_PX = 10;
@@ -109,22 +110,41 @@ function keepWidths(root) {
   }
 }
 
+// Plots drawn with this number of pixels for each of the page's, which Bokeh takes from the window.
+// The signs of a legend are copied from the screen: they are painted before and afterwards, too.
+function exported(plots, suffix, ratio) {
+  const own = Object.getOwnPropertyDescriptor(window, "devicePixelRatio");
+  const parts = plots.flatMap((plot) => [...plot.renderer_views.values()]);
+  const paintLegends = () => parts.forEach((part) => part._paint_glyphs?.());
+  Object.defineProperty(window, "devicePixelRatio", { value: ratio, configurable: true });
+  try {
+    paintLegends();
+    return plots.map((plot) => plot.export(suffix));
+  } finally {
+    Object.defineProperty(window, "devicePixelRatio", own);
+    paintLegends();
+  }
+}
+
 // The picture of a card, with the heading and the colour scale that the page shows elsewhere.
 async function pictureOf(card, { suffix, name, about, heading, scale }) {
   const { plots, clouds } = contentOf(card);
-  const layers = plots.map((plot) => plot.export(suffix));
+  const widths = [...plots.map(({ bbox }) => bbox.width), ...clouds.map((each) => each.clientWidth)];
+  if (widths.length === 0) throw new Error("nothing is drawn here yet");
+  const width = Math.max(...widths);
+  const least = suffix === "png" ? PICTURE_PX / width : 1;
+  const ratio = Math.max(window.devicePixelRatio, least);
+  const layers = exported(plots, suffix, ratio);
   const parts = [
     ...layers.map(({ canvas, bbox: { width, height } }) => ({ canvas, width, height })),
-    ...clouds.map((cloud) => cloud.picture()),
+    ...clouds.map((cloud) => cloud.picture(ratio)),
   ];
-  if (parts.length === 0) throw new Error("nothing is drawn here yet");
-  const width = Math.max(...parts.map((part) => part.width));
   const [above, below] = [heading ? HEADING_PX : 0, scale ? SCALE_PX : 0];
   const height = parts.reduce((sum, part) => sum + part.height, above + below);
   const { pen, blob } =
     suffix === "svg"
       ? svgSheet(layers[0].constructor, width, height, { title: name, desc: about })
-      : canvasSheet(width, height, parts[0].canvas.width / parts[0].width);
+      : canvasSheet(width, height, ratio);
   const { backgroundColor: paper, color: ink } = getComputedStyle(card.el);
   pen.fillStyle = paper;
   pen.fillRect(0, 0, width, height);

@@ -69,6 +69,7 @@ PATCHES = (
     Patch("narrow_window", _PANEL),
     Patch("server_wins", _PANEL),
     Patch("session_ended", _BOKEH),
+    Patch("theme_at_once", _PANEL),
     Patch("unchanged_styles", _BOKEH),
     Patch("unfinished_layout", _BOKEH),
 )

@@ -32,7 +32,7 @@ from core.io.writers.colors import (
 )
 from core.io.writers.picture import Picture
 from core.io.writers.product import P_VALUE, Product, guessed_angle
-from core.io.writers.table import write_columns
+from core.io.writers.table import decimals_of, write_columns, write_points
 from core.io.writers.whole import whole_file, whole_folder
 from core.labels import Plane
 
@@ -50,6 +50,7 @@ __all__ = [
     "Product",
     "RangeColors",
     "colors_of",
+    "decimals_of",
     "guessed_angle",
     "p_value_scale",
     "range_scale",
@@ -57,6 +58,7 @@ __all__ = [
     "save_image",
     "save_pixel",
     "write_columns",
+    "write_points",
 ]
 
 WRITERS: dict[str, Callable[[Product, BinaryIO], None]] = {
@@ -142,7 +144,7 @@ def save_image(
     ``.npz``            NumPy: every array as it is, the acquisition, the source
     ``.nc``, ``.h5``    netCDF-4, which is HDF5: the same, with units
     ``.zarr``           Zarr, a folder: the same
-    ``.csv``            one line a pixel
+    ``.csv``            one line a pixel; ranges in steps of a tenth of a bin or less
     ``.tif``, ``.tiff`` pages of 32-bit floats: ``range_m``, ``confidence``, ``counts``, intervals
     ``.ply``, ``.pcd``  point cloud; coordinates as 32-bit floats
     ``.las``, ``.laz``  point cloud, LAS 1.4; coordinates in steps of a thousandth of a bin or less

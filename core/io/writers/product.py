@@ -109,6 +109,23 @@ class Product:
         }
 
     @property
+    def range_sd_m(self) -> NDArray[np.float64] | None:
+        """Half the width of the 68 % intervals, if they are given."""
+        known = self.interval_68
+        return None if known is None else np.asarray((known.high_m - known.low_m) / 2)
+
+    @property
+    def range_step_m(self) -> NDArray[np.float64]:
+        """Step (row, col) that texts of the ranges resolve.
+
+        A tenth of `range_sd_m`, but at most a tenth of a bin; where that is not known, a hundredth
+        of a bin.
+        """
+        bin_m, known = self.capture.acquisition.bin_length_m, self.range_sd_m
+        sd_m = np.full(self.image.range_m.shape, np.nan) if known is None else known
+        return np.where(np.isnan(sd_m), bin_m / 100, np.minimum(sd_m, bin_m) / 10)
+
+    @property
     def p_value_columns(self) -> dict[str, NDArray[np.float64]]:
         """P-values by their name; empty if they are not given."""
         return {} if self.p_value is None else {P_VALUE: self.p_value}
@@ -184,10 +201,8 @@ class Product:
     def point_columns(self, points: Points) -> dict[str, NDArray[Any]]:
         """Return the columns of a point cloud other than coordinates; each of shape (point,)."""
         here = points.row, points.col
-        deviation = {}
-        if self.interval_68 is not None:
-            width_m = self.interval_68.high_m - self.interval_68.low_m
-            deviation["range_sd_m"] = (width_m[here] / 2).astype(np.float32)
+        sd_m = self.range_sd_m
+        deviation = {} if sd_m is None else {"range_sd_m": sd_m[here].astype(np.float32)}
         rgb = {} if self.rgb is None else dict(zip(COLORS, self.rgb[here].T, strict=True))
         return {
             "range_m": self.image.range_m[here],
