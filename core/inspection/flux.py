@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.inspection.profile import Box, FluxEstimate, spans, zoomed
@@ -29,7 +30,11 @@ _FEW_BINS, _MANY_BINS = 8, 8  # that remain; width of an echo for which one dela
 
 
 def estimate_flux(
-    histograms: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
+    histograms: Floats,
+    acquisition: Acquisition,
+    pulse: Pulse,
+    n_pulses: int | None,
+    left_out: NDArray[np.bool_] | None = None,
 ) -> FluxEstimate:
     """Estimate signal, background and their ratio, with 95 % intervals.
 
@@ -42,14 +47,18 @@ def estimate_flux(
     n_pulses : int or None
         Pulses sent, for first photons. If None, counts are Poisson, and fluxes are in photons
         instead of photons per pulse.
+    left_out : ndarray of bool, shape (bin,), optional
+        Bins whose counts are not used, and in which no echo is looked for: those of other surfaces.
+        The background is still that over the whole gate.
 
     Returns
     -------
     FluxEstimate
     """
     counts = np.atleast_2d(np.asarray(histograms, float))
-    box = _whole_range(counts, n_pulses)
-    pixels = [_Pixel(each, acquisition, pulse, n_pulses) for each in counts]
+    used = np.full(counts.shape[1], True) if left_out is None else ~left_out
+    box = _whole_range(counts * used, n_pulses)
+    pixels = [_Pixel(each, acquisition, pulse, n_pulses, used) for each in counts]
 
     def together(root: Floats, angle: Floats) -> Floats:
         signal, background = _flux_at(root, angle)
@@ -105,13 +114,18 @@ class _Pixel:
     """Likelihood of signal and background of a pixel, averaged over delays."""
 
     def __init__(
-        self, counts: Floats, acquisition: Acquisition, pulse: Pulse, n_pulses: int | None
+        self,
+        counts: Floats,
+        acquisition: Acquisition,
+        pulse: Pulse,
+        n_pulses: int | None,
+        used: NDArray[np.bool_],
     ) -> None:
-        self._counts, self._n_pulses = counts, n_pulses
+        self._counts, self._n_pulses = counts * used, n_pulses
         self._acquisition, self._pulse = acquisition, pulse
-        n_bins = counts.size
-        self._unfired = np.ones(n_bins) if n_pulses is None else n_pulses - np.cumsum(counts)
-        self._bins = np.arange(n_bins)
+        # Given the pulses armed in a bin, its counts are independent of those before.
+        self._unfired = used * (1.0 if n_pulses is None else n_pulses - np.cumsum(counts))
+        self._bins = np.flatnonzero(used)
         wide = pulse.span_s[1] - pulse.span_s[0] > _MANY_BINS * acquisition.bin_width_s
         self._take_steps(1 if wide else _STEPS)
 

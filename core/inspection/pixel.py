@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
+from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
@@ -21,10 +22,11 @@ from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import same_echo_bins
 from core.inspection.flux import METHOD, estimate_flux
 from core.inspection.profile import FluxEstimate, OldFluxNames
-from core.inspection.surfaces import surface_probabilities
+from core.inspection.surfaces import LIKELY, surface_probabilities
 from core.metrics import Interval
 
 MOST_CANDIDATES = 5
+SEVERAL = "the echoes of other surfaces of the pixel count as neither signal nor background"
 _FEWEST_BINS = 5  # of an echo in a plot around it
 
 
@@ -84,6 +86,9 @@ class PixelReport(OldFluxNames):
     """Estimate with the 95 % interval, likewise."""
     candidates: tuple[RangeCandidate, ...]
     """Highest peaks of the score, in descending order; empty without detections."""
+    surfaces_bin: tuple[float, ...]
+    """Delays of the candidates that are likelier than not. The first is the surface whose signal
+    `flux` states: the estimate if it is one of them, otherwise that of the highest score."""
     find_flux: Callable[[], FluxEstimate] = field(repr=False)
     """Function that estimates `flux`."""
     flux_unit: str
@@ -103,6 +108,9 @@ class PixelReport(OldFluxNames):
         of the capture, as its estimates: one pixel does not show that another fits better, and the
         fit to all pixels (`CaptureReport.flux`) takes as long as an estimate. `RegionReport.pixel`
         uses the pulse that fits the pixels of the region.
+
+        Where the pixel has several surfaces, the signal is that of the first of `surfaces_bin`; the
+        echoes of the others count as neither signal nor background.
         """
         return self.find_flux()
 
@@ -157,6 +165,9 @@ def pixel_report(
     lag = lag_bins(capture, method, settings)
     interval_68_m, interval_95_m = pixel_range_intervals(capture, image, row, col, (0.68, 0.95))
     candidates, confidence = _candidates(capture, image, row, col, curve, lag)
+    answer_bin = float(image.bin[row, col])
+    likely = [each.bin for each in candidates if each.probability >= LIKELY]
+    surfaces_bin = tuple(sorted(likely, key=lambda at: at != answer_bin))
     return PixelReport(
         row=row,
         col=col,
@@ -166,24 +177,42 @@ def pixel_report(
         method=method,
         curve=curve,
         lag_bins=lag,
-        answer_bin=float(image.bin[row, col]),
+        answer_bin=answer_bin,
         answer_m=float(image.range_m[row, col]),
         confidence=confidence,
         interval_68_m=interval_68_m,
         interval_95_m=interval_95_m,
         candidates=candidates,
-        find_flux=partial(pixel_flux, capture, row, col),
+        surfaces_bin=surfaces_bin,
+        find_flux=partial(pixel_flux, capture, row, col, surfaces_bin),
         flux_unit=flux_unit(capture),
-        flux_method=METHOD,
+        flux_method=METHOD if len(surfaces_bin) < 2 else f"{METHOD}; {SEVERAL}",
         verdict=pixel_verdict(capture, row, col),
     )
 
 
-def pixel_flux(capture: Capture, row: int, col: int) -> FluxEstimate:
-    """Estimate the fluxes of one pixel as `PixelReport.flux`."""
+def pixel_flux(capture: Capture, row: int, col: int, surfaces_bin: Sequence[float]) -> FluxEstimate:
+    """Estimate the fluxes of one pixel with these surfaces as `PixelReport.flux`."""
     counts = capture.cube[row, col].astype(float)
-    found = estimate_flux(counts, capture.acquisition, capture.pulse, capture.gated_pulses)
-    return found.of(capture)
+    known = capture.acquisition, capture.pulse, capture.gated_pulses
+    return estimate_flux(counts, *known, _other_echoes(capture, surfaces_bin)).of(capture)
+
+
+def _other_echoes(capture: Capture, surfaces_bin: Sequence[float]) -> NDArray[np.bool_] | None:
+    """Find the bins of all echoes but the first, except the middle 80 % of that one, (bin,).
+
+    None without other surfaces, and if they leave no bin.
+    """
+    if len(surfaces_bin) < 2:
+        return None
+    n_bins, width_s = capture.acquisition.n_bins, capture.acquisition.bin_width_s
+    echo, first = capture.pulse.taps(n_bins, width_s, 0.5)
+    after = np.arange(n_bins) - np.floor(surfaces_bin)[:, np.newaxis]
+    is_near = (after >= first - 1) & (after <= first + echo.size)
+    begin, end = (surfaces_bin[0] + each_s / width_s for each_s in capture.pulse.span_s)
+    bins = np.arange(n_bins)
+    is_other = is_near[1:].any(axis=0) & ((bins + 1 <= begin) | (bins >= end))
+    return None if is_other.all() else is_other
 
 
 def flux_unit(capture: Capture) -> str:

@@ -90,7 +90,7 @@ def region_report(
         n_pixels=n_pixels,
         summed=summed,
         image=of_sum,
-        pixel=replace(pixel, find_flux=partial(pixel_flux, fitted, 0, 0)),
+        pixel=replace(pixel, find_flux=partial(pixel_flux, fitted, 0, 0, pixel.surfaces_bin)),
         share_answered=range_m.size / n_pixels,
         median_m=float(median_m),
         spread_m=float(high_m - low_m) / 2,

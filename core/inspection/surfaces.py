@@ -39,7 +39,9 @@ from core.inference.likelihood import (
 )
 from core.inference.posterior import TOLERANCE_BINS, same_echo_bins, tolerance_probability_at
 
-_LIKELY = 0.5
+LIKELY = 0.5
+"""Probability from which a surface is accepted."""
+
 _FITTING_STEPS = 60
 _LEAST_RATE = 1e-12
 _N_LEVELS = 8
@@ -73,7 +75,7 @@ def surface_probabilities(capture: Capture, row: int, col: int, bins: Floats) ->
     left = np.ones(bins.size, bool)
     accepted: dict[int, int] = {}  # delay in bins of each accepted candidate
     # At first, two surfaces share the probability of one.
-    is_likely = likely.sum() >= _LIKELY
+    is_likely = likely.sum() >= LIKELY
     if is_likely:
         log_ratio = _log_ratio(capture, histogram, [])
     while is_likely:
@@ -84,7 +86,7 @@ def surface_probabilities(capture: Capture, row: int, col: int, bins: Floats) ->
         log_ratio = _log_ratio(capture, histogram, list(accepted.values()))
         likely = _within(log_ratio, windows)
         probability[left] = np.maximum(alone, likely)[left]
-        is_likely = likely[left].max(initial=0.0) >= _LIKELY
+        is_likely = likely[left].max(initial=0.0) >= LIKELY
     if len(accepted) > 1:
         for i in accepted:
             others = [delay for j, delay in accepted.items() if j != i]

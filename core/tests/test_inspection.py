@@ -220,6 +220,23 @@ def test_a_candidate_has_the_probability_of_a_surface_there(
     assert np.count_nonzero(right[stated > 0.9]) > capture.counts.size + (25 if net == 10.0 else 10)
 
 
+@pytest.mark.parametrize("n_pulses", [300, None])
+def test_the_echo_of_another_surface_is_no_background(n_pulses: int | None) -> None:
+    """The first four pixels see a net before the wall, the others the wall alone."""
+    capture, walls, _ = net_before_wall(n_pulses, 1.5)
+    image, unit = estimate(capture, "likelihood"), 1 / (n_pulses or 1)
+    hits, trials = np.zeros(2, int), 0
+    for row, col in product((0, 3, 6), range(8)):
+        report = inspection.pixel_report(capture, image, row, col, "likelihood")
+        has_net = row < 4
+        if len(report.surfaces_bin) == 1 + has_net and abs(report.answer_bin - walls[row, col]) < 3:
+            assert ("other surfaces" in report.flux_method) == has_net
+            hits += covers(report.flux.signal, 30 * unit), covers(report.flux.background, 10 * unit)
+            trials += 1
+    assert trials >= 16
+    assert all(is_covered_often_enough(each, trials) for each in hits), (hits, trials)
+
+
 def test_a_report_has_the_intervals_of_the_range() -> None:
     capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)
     image = estimate(capture, "tracking")

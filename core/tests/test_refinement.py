@@ -97,28 +97,35 @@ FAINT = [("first", 5.0, 0.03), ("first", 5.0, 0.06)]
 @pytest.mark.compiled
 @pytest.mark.parametrize("regime", [Regime(*each) for each in REGIMES + FAINT], ids=str)
 def test_tracking_is_as_precise_as_the_likelihood(regime: Regime) -> None:
-    capture = regime.capture(0)
-    truth = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
-    found = {
-        name: estimate(capture, method, **more).bin - truth
+    """Bias is measured where refined delay and likelihood are right, whatever the whole bins are.
+
+    The whole bins of tracking are biased by up to half a bin and correlated with the refined delay,
+    so that where they, too, are within the tolerance, the refined delay is biased.
+    """
+    is_faint = (regime.detection, regime.sigma_bins, regime.sbr) in FAINT
+    captures = [regime.capture(seed) for seed in range(4 if is_faint else 1)]
+    error = {
+        name: np.concatenate(
+            [
+                estimate(capture, method, **more).bin.ravel()
+                - capture.acquisition.range_m_to_bin(np.ravel(capture.truth_range_m))
+                for capture in captures
+            ]
+        )
         for name, method, more in (
             ("printed", "tracking", {"refine": "none"}),
             ("refined", "tracking", {}),
             ("likelihood", "likelihood", {}),
         )
     }
-    right = np.all([np.abs(error) <= TOLERANCE_BINS for error in found.values()], axis=0)
-    rms = {name: math.sqrt(np.mean(error[right] ** 2)) for name, error in found.items()}
-    bias = {name: abs(np.mean(error[right])) for name, error in found.items()}
-    assert rms["refined"] <= 1.02 * rms["likelihood"] < rms["printed"]
-    if (regime.detection, regime.sigma_bins, regime.sbr) in FAINT:
-        # Estimates right by chance dominate: their mean error is that of the likelihood.
-        assert rms["likelihood"] > 0.4 * TOLERANCE_BINS
-        assert bias["refined"] == pytest.approx(bias["likelihood"], abs=0.02)
-    else:
-        assert right.sum() > 900
-        assert bias["refined"] <= 0.1
-        assert rms["likelihood"] < 0.9 * rms["printed"]
+    is_right = {name: np.abs(each) <= TOLERANCE_BINS for name, each in error.items()}
+    both = is_right["refined"] & is_right["likelihood"]
+    assert abs(np.mean(error["refined"][both])) <= 0.1
+    right = both & is_right["printed"]
+    rms = {name: math.sqrt(np.mean(each[right] ** 2)) for name, each in error.items()}
+    assert rms["refined"] <= 1.02 * rms["likelihood"]
+    assert rms["likelihood"] < (1.0 if is_faint else 0.9) * rms["printed"]
+    assert is_faint or right.sum() > 900
 
 
 @pytest.mark.compiled

@@ -254,7 +254,10 @@ def pair_pixel_facts(pair: Pair, row: int, col: int, least_confidence: float) ->
 def remark(found: Inspected) -> str:
     """Return the sentence below the facts of a pixel or a region."""
     if found.region is None:
-        return f"Verdict: {found.report.verdict.health}. {found.report.verdict.why}"
+        verdict = found.report.verdict
+        several = len(found.report.surfaces_bin) > 1
+        others = " Several surfaces: S is that of one, and B is without the echoes of the others."
+        return f"Verdict: {verdict.health}. {verdict.why}{others if several else ''}"
     return (
         f"{found.region.fit.verdict} The plots show the summed histogram of the region. Mean flux "
         f"of a pixel: {found.region.flux_method}."

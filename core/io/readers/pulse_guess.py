@@ -18,26 +18,32 @@ floor. In between, the sum is still the pairs of an echo.
 
 Evidence. Gaussian and gamma pulses compete, with standard deviations from a fifth of a bin to a
 tenth of the gate. Each predicts a peak, blurred by the bins, on a parabola for what remains of the
-floor; it holds at least the pairs of the pooled peaks. The smallest weighted misfit wins. The error
-of a difference between two misfits comes from the scatter between 32 groups of pixels, from the
-level below the pooled peaks, taken to be known to 2 %, and from the model, taken to be right to
-1 % of the peak. Candidates within three errors of the best form the interval. A gamma pulse is
-chosen only if every Gaussian is rejected.
+floor; it holds at least the pairs of the pooled peaks. Each of 32 groups of pixels is held out in
+turn: the peak fitted to the pairs of the others predicts its pairs. The highest likelihood of the
+pairs held out wins; that of no echo is 0 (composite likelihood, with the variance of counts: pairs
+share photons). The error of a difference between two candidates comes from the scatter between the
+groups, from the level below the pooled peaks, taken to be known to 2 %, and from the model, taken
+to be right to 1 % of the peak. Candidates of either shape within three errors of the best form the
+interval. A gamma pulse is chosen only if every Gaussian is rejected.
 
 Pairs of a pulse below one bin depend on its position within the bin. Where all echoes lie in a few
 bins, this is not averaged out: pulses at any one position compete, too.
 
-The pulse is determined if the hypothesis of no echo is rejected by five errors, and the interval
-lies within a factor of 1.3 of the estimate. Nothing is estimated from fewer than 16 bins or 32
-pixels, nor from more than 65,536 bins. The pairs of a pulse and of its mirror image are the same:
-that a tail is late is assumed.
+There is an echo if its absence is rejected by five errors. The width is determined if the interval
+lies within a factor of 1.3 of the estimate; otherwise, the estimate is still better than one bin.
+Of 320 captures of 1600 pixels, with Gaussian and gamma pulses of 0.3 to 30 bins, 1 to 1000 photons
+a pixel, SBRs of 0.02 to 100, and surfaces at one depth or spread out, 195 widths were determined,
+all within a factor of 1.3. Of 51 others an interval was found, which always included the truth; of
+74 no echo. Nothing is estimated from fewer than 16 bins or 32 pixels, nor from more than 65,536
+bins. The pairs of a pulse and of its mirror image are the same: that a tail is late is assumed.
 
 Pairs are counted by Fourier transforms, of as many evenly spread pixels as `_MOST_NUMBERS` allows.
 """
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+import math
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
@@ -71,6 +77,7 @@ _PEAK_ERRORS = 5.0  # standard errors
 
 Cube = NDArray[np.unsignedinteger]
 Shape = Literal["gaussian", "gamma"]
+_SHAPES: tuple[Shape, ...] = get_args(Shape)
 
 
 class PulseGuess(NamedTuple):
@@ -81,7 +88,12 @@ class PulseGuess(NamedTuple):
     """``Pulse.tau_s`` in bins: the standard deviation of a Gaussian."""
     low_bins: float
     high_bins: float
-    """Ends of its interval, of three standard errors; from 0 if all narrower ones are alike."""
+    """Ends of its interval, of three standard errors: 0 if all narrower ones are alike, infinite if
+    all wider ones are."""
+    is_determined: bool
+    """Whether the ends are close to the estimate."""
+    may_have_tail: bool
+    """Whether a gamma pulse fits; a Gaussian may, too."""
 
     @property
     def sigma_bins(self) -> float:
@@ -90,7 +102,9 @@ class PulseGuess(NamedTuple):
 
 
 def guessed_pulse(cube: Cube, bin_width_s: float) -> tuple[Pulse, str]:
-    """Return the estimated pulse, else a Gaussian of one bin, and how well it is known.
+    """Return the estimated pulse and how well it is known.
+
+    Without an echo, or if arbitrarily wide pulses fit, it is a Gaussian of one bin.
 
     Parameters
     ----------
@@ -104,17 +118,22 @@ def guessed_pulse(cube: Cube, bin_width_s: float) -> tuple[Pulse, str]:
     pulse : Pulse
         Its width has two digits.
     known : str
-        The interval of its width, or that it is not determined.
+        The interval of its width, and what is not determined.
     """
     guess = pulse_guess(cube)
-    if guess is None:
+    if guess is None or math.isinf(guess.high_bins):
         return Pulse.gaussian(bin_width_s), "one bin: width not determined"
-    tau_s, low_s, high_s = (float(f"{bins * bin_width_s:.1e}") for bins in guess[1:])
-    return Pulse(tau_s, shape=guess.shape), f"{time_text(low_s)} to {time_text(high_s)}"
+    tau_s, low_s, high_s = (float(f"{bins * bin_width_s:.1e}") for bins in guess[1:4])
+    known = f"{time_text(low_s)} to {time_text(high_s)}"
+    if not guess.is_determined:
+        known = f"width not determined: {known}"
+    elif guess.shape == "gaussian" and guess.may_have_tail:
+        known = f"{known}, a tail not excluded"
+    return Pulse(tau_s, shape=guess.shape), known
 
 
 def pulse_guess(cube: Cube) -> PulseGuess | None:
-    """Estimate the pulse and the interval of its width; None if the width is not determined.
+    """Estimate the pulse and the interval of its width; None if there is no echo.
 
     Parameters
     ----------
@@ -131,20 +150,27 @@ def pulse_guess(cube: Cube) -> PulseGuess | None:
     pairs = _echo_pairs(cube, _lag_edges(3 * n_bins // 4))
     if pairs.counted.sum() < 0.5:  # whole numbers, but for rounding
         return None
-    tau, peaks = _candidates("gaussian", n_bins, pairs)
-    gamma_tau, gamma_peaks = _candidates("gamma", n_bins, pairs)
-    against = _competition(pairs, np.concatenate([peaks, gamma_peaks])).against
-    shape: Shape = "gaussian"
-    if against[: tau.size].min() > _REJECTED:
-        shape, tau, peaks = "gamma", gamma_tau, gamma_peaks
-    found = _competition(pairs, peaks)
-    left = tau[found.against < _REJECTED]
-    best, low, high = float(tau[found.best]), float(left.min()), float(left.max())
-    is_narrow = best / low < _CLOSE and high / best < _CLOSE and high < tau.max()
-    if not is_narrow or found.against_none < _ECHO_REJECTED:
+    candidates = [_candidates(shape, n_bins, pairs) for shape in _SHAPES]
+    found = _competition(pairs, np.concatenate([peaks for _, peaks in candidates]))
+    if found.against_none < _ECHO_REJECTED:
         return None
-    low = low / (1 + _STEP) if low > tau.min() else 0.0
-    return PulseGuess(shape, best, low, high * (1 + _STEP))
+    sigma = np.concatenate([of_shape for of_shape, _ in candidates])
+    is_gamma = np.arange(sigma.size) >= candidates[0][0].size
+    left = found.against < _REJECTED
+    shape: Shape = "gamma" if is_gamma[left].all() else "gaussian"
+    best = sigma[np.where(is_gamma == (shape == "gamma"), found.gain, -np.inf).argmax()]
+    low, high = float(sigma[left].min()), float(sigma[left].max())
+    is_bounded = high < sigma.max()
+    is_close = best / low < _CLOSE and high / best < _CLOSE
+    unit = _GAMMA_SIGMA if shape == "gamma" else 1.0
+    return PulseGuess(
+        shape,
+        float(best) / unit,
+        low / (1 + _STEP) / unit if low > sigma.min() else 0.0,
+        high * (1 + _STEP) / unit if is_bounded else math.inf,
+        is_determined=bool(is_close and is_bounded),
+        may_have_tail=bool(is_gamma[left].any()),
+    )
 
 
 class _EchoPairs(NamedTuple):
@@ -311,16 +337,17 @@ def _in_classes(pairs: Floats, edges: NDArray[np.int64]) -> Floats:
 
 
 def _candidates(shape: Shape, n_bins: int, pairs: _EchoPairs) -> tuple[Floats, Floats]:
-    """Return the time constants of the candidates in bins, and their peaks as `_peaks` does."""
+    """Return standard deviations of the candidates in bins, and their peaks as `_peaks` does."""
     steps = np.arange(0.0, np.log(_WIDEST_SHARE * n_bins / _NARROWEST_BINS), _STEP)
     sigma = _NARROWEST_BINS * np.exp(steps)
     tau = sigma / (_GAMMA_SIGMA if shape == "gamma" else 1.0)
     peaks = _peaks(shape, tau, pairs.edges)
     if not 0 < pairs.occupied_bins < _FEW_BINS:
-        return tau, peaks
-    narrow = tau[sigma < 1.0]
-    at_phases = [_peaks_at(phase, shape, narrow, pairs.edges) for phase in _PHASES]
-    return np.append(tau, np.tile(narrow, _PHASES.size)), np.concatenate([peaks, *at_phases])
+        return sigma, peaks
+    narrow = sigma < 1.0
+    at_phases = [_peaks_at(phase, shape, tau[narrow], pairs.edges) for phase in _PHASES]
+    every = np.append(sigma, np.tile(sigma[narrow], _PHASES.size))
+    return every, np.concatenate([peaks, *at_phases])
 
 
 def _peaks(shape: Shape, tau: Floats, edges: NDArray[np.int64]) -> Floats:
@@ -372,10 +399,10 @@ def _peaks_at(phase: float, shape: Shape, tau: Floats, edges: NDArray[np.int64])
 class _Competition(NamedTuple):
     """Comparison of candidates."""
 
-    best: int
-    """Candidate of the smallest misfit."""
+    gain: Floats
+    """Twice the log likelihood ratio of each candidate to no echo, shape (candidate,)."""
     against: Floats
-    """Standard errors by which each candidate is worse, shape (candidate,)."""
+    """Standard errors by which each candidate is worse than the best, shape (candidate,)."""
     against_none: float
     """Standard errors by which the hypothesis of no echo is worse."""
 
@@ -400,12 +427,13 @@ def _competition(pairs: _EchoPairs, peaks: Floats) -> _Competition:
     scaled /= length[:, np.newaxis]
     amplitudes = (scale * pairs.excess) @ scaled.T  # (group, candidate)
     amplitude = amplitudes.sum(axis=0)
-    fitted = np.maximum(amplitude, pairs.pooled * length)
-    gain = (2 * amplitude - fitted) * fitted  # reduction of the misfit
+    least = pairs.pooled * length
+    # What the other groups predict of each, and twice the log likelihood ratio of its pairs.
+    predicted = np.maximum((amplitude - amplitudes) / (_GROUPS - 1), least / _GROUPS)
+    by_group = _GROUPS * predicted * (2 * amplitudes - predicted)
+    gain = by_group.sum(axis=0)
     best = int(np.argmax(gain))
-    by_group, doubt = (  # what they contribute to the gain, to first order
-        2 * fitted * contribution for contribution in (amplitudes, scaled @ (scale * pairs.doubt))
-    )
+    doubt = 2 * np.maximum(amplitude, least) * (scaled @ (scale * pairs.doubt))  # to first order
 
     def errors(difference: Floats, of_groups: Floats, of_doubt: Floats) -> Floats:
         variance = _GROUPS * of_groups.var(axis=0, ddof=1) + of_doubt**2
@@ -415,4 +443,4 @@ def _competition(pairs: _EchoPairs, peaks: Floats) -> _Competition:
 
     against = errors(gain[best] - gain, by_group[:, [best]] - by_group, doubt[best] - doubt)
     against_none = errors(gain[best], by_group[:, best], doubt[best])
-    return _Competition(best, against, float(against_none))
+    return _Competition(gain, against, float(against_none))
