@@ -625,6 +625,20 @@ WebSocket.prototype.send = function (part) {
 """
 
 
+NOTE_COLORS = """() => {
+  window.seen = [];
+  const look = () => {
+    const style = getComputedStyle(document.documentElement);
+    const names = ["--mui-palette-background-default", "--mui-palette-text-primary"];
+    const colors = names.map((name) => style.getPropertyValue(name)).join();
+    if (seen.at(-1) !== colors) seen.push(colors);
+    requestAnimationFrame(look);
+  };
+  look();
+}"""
+"""JavaScript that keeps the colours of paper and text of the page."""
+
+
 def change_theme(page: Page) -> None:
     """Toggle to dark mode and back; plots and cloud follow, at the cost of one event each."""
 
@@ -635,8 +649,10 @@ def change_theme(page: Page) -> None:
     eventually(lambda: all_drawn_in(LIGHT))
     page.evaluate("sent.length = 0")
     for palette in (DARK, LIGHT):
+        page.evaluate(NOTE_COLORS)
         page.get_by_role("button", name="Toggle theme").click()
         eventually(lambda palette=palette: all_drawn_in(palette))
+        assert len(page.evaluate("seen")) == 2  # no light text on light paper in between
         assert (pixels(page.screenshot()).mean() < 60) == (palette is DARK)
     sent = [event for part in page.evaluate("sent") for event in json.loads(part).get("events", ())]
     # The server paints the plots: the browser need not report the colour of each line.
