@@ -24,14 +24,22 @@ from numpy.typing import NDArray
 from core.acquisition import Acquisition, Floats, Flux, Pulse, pulses_sent
 from core.capture import Capture
 from core.checks import require
-from core.kernels.parallel import KERNEL_LOCK
-from core.kernels.simulate import SHAPE_CODES, add_echo_photons, draw_pulses, fire_once
+from core.kernels.parallel import KERNEL_LOCK, entering
+from core.kernels.simulate import (
+    SHAPE_CODES,
+    add_echo_photons,
+    draw_pulses,
+    fill_probability,
+    fire_once,
+)
 from core.scene import Scene, parts_of
 
 _Flux = TypeVar("_Flux", float, Floats)
 
 # With more pulses numpy's multinomial is faster: its time does not depend on their number.
 PULSES_DRAWN_ONE_BY_ONE = 8192
+
+_EXPONENTIAL = 16  # counts that other kernels process in the time of one
 
 
 def simulate(
@@ -199,11 +207,11 @@ def cumulative_trigger_probability(
         before[:] = steady
         for onset_bin, signal in echoes:
             add_echo(onset_bin + shift_bins, signal, pulse, acquisition.bin_width_s, before)
-        np.expm1(np.negative(before, out=before), out=before)
-        if group == 0:
-            np.negative(before, out=triggered)
-        else:
-            triggered -= before
+        to_probability(before)
+        if group > 0:
+            triggered += before
+        elif before is not triggered:
+            triggered[:] = before
     if shifts_bins.size > 1:
         triggered /= shifts_bins.size
     if faulty is not None:
@@ -244,7 +252,14 @@ def add_echo(
     samples = np.cumsum((0.0, *pulse.samples))
     share = samples / (samples[-1] or 1.0)
     bin_taus = bin_width_s / pulse.tau_s
-    add_echo_photons(onset_bin, signal, bin_taus, SHAPE_CODES[pulse.shape], share, before)
+    with entering(before.size * _EXPONENTIAL):
+        add_echo_photons(onset_bin, signal, bin_taus, SHAPE_CODES[pulse.shape], share, before)
+
+
+def to_probability(photons: Floats) -> None:
+    """Replace the photons expected before each bin edge (pixel, edge) by the probability of any."""
+    with entering(photons.size * _EXPONENTIAL):
+        fill_probability(photons)
 
 
 def _draw_multinomial(

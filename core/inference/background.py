@@ -22,6 +22,7 @@ surface, part of it is taken for background; the goodness of fit (`core.inferenc
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture
+from core.kernels.background import add_echo_free
 
 SIZE = 1e-3
 """Bound on the probability that a uniform background is taken for another."""
@@ -41,7 +43,6 @@ _RANGE = 3.0  # largest logarithm of the shape, on either side of 0
 _ERROR = 1e-5  # of the interpolation, relative
 _BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
 _NOISE = 3.0  # standard deviations of a sum of squares
-_LEAST_SHARE = 1e-6
 _FEWEST_COUNTS = 0.5
 _WIGGLES = 0.1  # of a slope, that are no second direction
 
@@ -83,71 +84,70 @@ def echo_window(capture: Capture) -> tuple[int, int]:
 
 
 class EchoFree(NamedTuple):
-    """Bins in which pixels see background alone, each of shape (pixel, bin)."""
+    """Sums over the pixels of what they see in each bin, without an echo; each of shape (bin,)."""
 
-    share: Floats
-    """Probability that no echo is near the bin."""
-    background: Floats
-    """Mean background per pulse of a bin, if there is none."""
+    counts: Floats
+    expected: Floats
+    """Counts expected of the background of each pixel, relative to its shape."""
+    armed: Floats
+    """Armed pulses; pixels if all photons are counted."""
 
 
 def echo_free(
-    mass: NDArray[np.float32], background: Floats, echo_window: tuple[int, int]
+    density: NDArray[np.float32],
+    prior: Floats,
+    background: Floats,
+    counts: NDArray[np.unsignedinteger],
+    n_pulses: int | None,
+    echo_window: tuple[int, int],
+    guess: Floats,
 ) -> EchoFree:
-    """Find the bins of pixels that hold no echo.
+    """Add up the bins of pixels, each with the probability that it holds no echo.
 
     Parameters
     ----------
-    mass : ndarray, shape (pixel, level, bin)
-        Probability of each signal level and of a delay in each bin. The first level is no echo.
+    density : ndarray, shape (pixel, level, bin)
+        Likelihood of each signal level and of a delay in each bin. The first level is no echo.
+    prior : ndarray, shape (level, bin)
+        Prior probability of each.
     background : ndarray, shape (pixel, level)
         Background per pulse over the gate for each level.
+    counts : ndarray, shape (pixel, bin)
+    n_pulses : int or None
+        None if all photons are counted.
     echo_window : (int, int)
         First bin and end, relative to that of a delay, that an echo may fill.
+    guess : ndarray, shape (bin,)
+        Shape of the background for which `density` was computed.
     """
-    n_bins = mass.shape[2]
-    bins, share = np.arange(n_bins), np.ones((len(mass), n_bins))
-    photons = share * np.vecdot(mass.sum(axis=2, dtype=float), background)[:, np.newaxis]
-    # Echoes of these delays fill the bin.
-    begin, end = (np.clip(bins + 1 - at, 0, n_bins) for at in reversed(echo_window))
-    upto = np.zeros((len(mass), n_bins + 1))
-    for level in range(1, mass.shape[1]):
-        np.cumsum(mass[:, level], axis=1, out=upto[:, 1:])
-        near = upto[:, end] - upto[:, begin]
-        share -= near
-        photons -= near * background[:, level : level + 1]
-    mean = np.divide(photons, share, out=np.zeros_like(share), where=share > _LEAST_SHARE)
-    return EchoFree(np.where(share > _LEAST_SHARE, share, 0.0), np.maximum(mean, 0.0) / n_bins)
+    sums = np.zeros((3, guess.size))
+    add_echo_free(
+        density,
+        prior,
+        np.array(background, order="C"),
+        counts.astype(np.uint32),  # compiled for one type of counts
+        n_pulses or 0,
+        echo_window,
+        guess,
+        sums,
+    )
+    return EchoFree(*sums)
 
 
-def mean_background(
-    counts: Floats, armed: Floats, free: EchoFree, is_first: bool, shape: Floats
-) -> float:
+def mean_background(free: EchoFree, is_first: bool, guess: Floats) -> float:
     """Estimate the mean background per pulse over the gate from bins without an echo.
 
-    Takes the parameters of `fitted_shape`. NaN if no bin is free of echoes.
+    Takes the shape for which `free` was found. NaN if no bin is free of echoes.
     """
-    exposed = float((free.share * armed * shape).sum())
+    exposed = float((free.armed * guess).sum())
     if exposed == 0:
         return math.nan
-    rate = max(float((free.share * counts).sum()), _FEWEST_COUNTS) / exposed
-    return shape.size * (-math.log1p(-min(rate, 0.5)) if is_first else rate)
+    rate = max(float(free.counts.sum()), _FEWEST_COUNTS) / exposed
+    return guess.size * (-math.log1p(-min(rate, 0.5)) if is_first else rate)
 
 
-def fitted_shape(
-    counts: Floats, armed: Floats, free: EchoFree, is_first: bool, guess: Floats
-) -> Floats | None:
+def fitted_shape(free: EchoFree) -> Floats | None:
     """Fit the background shape to the counts in bins without an echo.
-
-    Parameters
-    ----------
-    counts, armed : ndarray, shape (pixel, bin)
-        Counts, and pulses armed in each bin; 1 if all photons are counted.
-    free : EchoFree
-    is_first : bool
-        Whether only the first photon of a pulse is detected.
-    guess : ndarray, shape (bin,)
-        Shape for which `free` was found.
 
     Returns
     -------
@@ -155,14 +155,11 @@ def fitted_shape(
         None if the counts do not contradict a uniform background, or if the shape explains less of
         the contradiction than it leaves: echoes of another kind, not background.
     """
-    rate = free.background * guess
-    fires = -np.expm1(-rate) if is_first else rate
-    seen = (free.share * counts).sum(axis=0)
-    expected = (free.share * armed * fires).sum(axis=0) / guess
-    basis = _polynomials(guess.size)
+    seen, expected = free.counts, free.expected
+    basis = _polynomials(seen.size)
     # A weak prior of smooth logarithms, for gaps that echoes leave in the gate.
     prior = np.diag(np.arange(basis.shape[1], dtype=float))
-    log = np.zeros(guess.size)
+    log = np.zeros(seen.size)
     for _ in range(_FITTING_STEPS):
         mean = expected * np.exp(log)
         root = np.sqrt(mean)
@@ -183,6 +180,7 @@ def fitted_shape(
     return np.asarray(shape / shape.mean()) if is_smooth else None
 
 
+@lru_cache(maxsize=16)
 def _polynomials(n_bins: int) -> Floats:
     """Orthonormal Legendre polynomials of the time in the gate, shape (bin, degree)."""
     degree = min(_DEGREE, n_bins - 1)

@@ -79,8 +79,10 @@ def _simplified(found: FluxPrior, capture: Capture) -> FluxPrior:
     """Leave out of a detailed prior what the pulses of the capture do not resolve."""
     n_pulses = capture.gated_pulses
     if n_pulses is not None:
-        is_hidden = pile_up(capture.counts / n_pulses, n_pulses).is_hidden
-        found = found._replace(pile_up=not is_hidden)
+        # The more pulses fire, the clearer it is: of all but a few pixels, where most fire.
+        n_few = math.floor(FEW * capture.counts.size)
+        most = np.partition(capture.counts, -1 - n_few, axis=None)[-1 - n_few]
+        found = found._replace(pile_up=not pile_up(most / n_pulses, n_pulses).is_hidden)
     is_resolved = level_differences(found, capture).is_resolved
     return found.with_one_level() if found.share[1:] @ is_resolved <= FEW else found
 
@@ -114,25 +116,26 @@ def _background(
 ) -> _Background:
     """Estimate the background from pixels, given as flat indices.
 
-    `density` is that of `level_densities`, and is overwritten.
+    `density` is that of `level_densities`.
     """
     n_bins, n_pulses = capture.acquisition.n_bins, capture.gated_pulses
-    few = slice(None, None, math.ceil(pixels.size * n_bins / _AT_ONCE))
-    some, total = pixels[few], _totals(capture)[0].ravel()[pixels[few]]
-    background = known.model(total[np.newaxis], _least_background(capture)).background[:, 0].T
-    mass = density[few]
-    mass *= (known.share[:, np.newaxis] * known.depth).astype(np.float32)
-    mass /= mass.sum(axis=(1, 2), keepdims=True)
-    counts = capture.cube.reshape(-1, n_bins)[some].astype(float)
-    armed = np.ones_like(counts)
-    if n_pulses is not None:
-        armed = n_pulses - np.cumsum(counts, axis=1) + counts
-    free = echo_free(mass, background, echo_window(capture))
-    seen = counts, armed, free, n_pulses is not None, known.relative_background
-    shape = fitted_shape(*seen) if pixels.size >= _FEWEST_OF_SHAPE else None
+    total = _totals(capture)[0].ravel()[pixels]
+    flux = known.model(total[np.newaxis], _least_background(capture))
+    free = echo_free(
+        density,
+        known.share[:, np.newaxis] * known.depth,
+        flux.background[:, 0].T,
+        capture.cube.reshape(-1, n_bins)[pixels],
+        n_pulses,
+        echo_window(capture),
+        known.relative_background,
+    )
+    shape = fitted_shape(free) if pixels.size >= _FEWEST_OF_SHAPE else None
     if shape is not None and np.average(shape, weights=known.depth) > _MOST_AT_ECHOES:
         shape = None
-    return _Background(mean_background(*seen), shape)
+    return _Background(
+        mean_background(free, n_pulses is not None, known.relative_background), shape
+    )
 
 
 def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floats | None]:
@@ -260,6 +263,7 @@ def _least_background(capture: Capture) -> float:
     return 0.5 / (capture.gated_pulses or 1)
 
 
+@cached_per_capture
 def _totals(capture: Capture) -> tuple[Floats, float]:
     """Total rate of each pixel (row, col), and the mean variance due to chance.
 

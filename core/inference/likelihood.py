@@ -28,9 +28,10 @@ from core.capture import Capture
 from core.inference.background import nodes_of
 from core.inference.flux_model import FluxModel
 from core.kernels.blocks import LANES, lane_counts
-from core.kernels.confidence import fill_evidence, fill_peaks
+from core.kernels.confidence import fill_densities, fill_evidence, fill_peaks
 from core.kernels.parallel import entering
 from core.kernels.posterior import fill_blocks
+from core.kernels.rates import fill_rates
 
 NUMBERS_AT_ONCE = 2**19  # numbers that fit in the cache
 _SAMPLE_NUMBERS = 2**25  # likelihoods of the levels and delays of the sample: 128 MiB
@@ -87,10 +88,11 @@ def rate_and_n_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, F
     """
     if n_pulses is None:
         return histogram, np.ones_like(histogram)
-    armed = n_pulses - np.cumsum(histogram, axis=-1) + histogram
-    fired = np.divide(histogram, armed, out=np.zeros_like(histogram), where=armed > 0)
-    most = 1 - 0.5 / np.maximum(armed, 1.0)
-    return np.asarray(-np.log1p(-np.minimum(fired, most))), np.maximum(armed, 0.0)
+    counts = np.ascontiguousarray(histogram, float).reshape(-1, histogram.shape[-1])
+    counts.setflags(write=False)  # writability is part of a numba type: compile for one
+    rate, armed = np.empty((2, *counts.shape))
+    fill_rates(counts, float(n_pulses), rate, armed)
+    return rate.reshape(histogram.shape), armed.reshape(histogram.shape)
 
 
 def log_likelihood_ratio(
@@ -173,6 +175,8 @@ class LikelihoodInput(NamedTuple):
     """`FluxModel.depth`, shape (delay,)."""
     echo: NDArray[np.float32]
     """Share of the photons of an echo per bin, shape (step, tap)."""
+    echo_tail: NDArray[np.float32]
+    """Share of them in that bin and later ones, shape (step, tap + 1)."""
     first_tap: int
     """Bins from a delay to the first tap of its echo."""
     n_pulses: int
@@ -263,6 +267,7 @@ def _with_echo(
     # Delays are the centres of steps, so that steps fill the gate and every bin.
     delay = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
     echo, first = capture.pulse.taps(acquisition.n_bins, acquisition.bin_width_s, delay)
+    tail = np.cumsum(echo[:, ::-1], axis=1)[:, ::-1]
     log_share = np.log(np.maximum(flux.share, np.finfo(float).tiny))
     return LikelihoodInput(
         part.counts,
@@ -271,6 +276,7 @@ def _with_echo(
         log_share,
         np.repeat(flux.depth, steps_per_bin).astype(np.float32),
         echo.astype(np.float32),
+        np.pad(tail, ((0, 0), (0, 1))).astype(np.float32),
         first,
         capture.gated_pulses or 0,
         flux.relative_background,
@@ -306,16 +312,10 @@ def level_evidence(prepared: LikelihoodInput, depth: NDArray[np.float32] | None 
 def level_densities(prepared: LikelihoodInput) -> NDArray[np.float32]:
     """Likelihood of each level and delay relative to the pixel's maximum (pixel, level, delay)."""
     n_levels, n_blocks, lanes = prepared.signal.shape
-    n_copied = n_blocks if n_blocks > 1 else 0
-    densities = np.empty((n_copied, lanes, n_levels, prepared.depth.size), np.float32)
-    for some, log in _log_likelihoods(prepared):
-        np.subtract(log, log.max(axis=(1, 2), keepdims=True), out=log)
-        density = np.exp(log, out=log).transpose(0, 3, 1, 2)
-        if n_blocks == 1:
-            densities = density  # a view: a copy would double the memory
-        else:
-            densities[some] = density
-    return densities.reshape(-1, *densities.shape[2:])[: prepared.n_pixels]
+    density = np.empty((n_blocks, lanes, n_levels, prepared.depth.size), np.float32)
+    with entering(prepared.n_counts):
+        fill_densities(prepared, density)
+    return density.reshape(-1, *density.shape[2:])[: prepared.n_pixels]
 
 
 def delay_densities(

@@ -49,10 +49,10 @@ def refined(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
     last = acquisition.n_bins - 1
     at = np.clip(np.nan_to_num(delay_bin), 0, last).astype(np.intp)
     background = flux.typical_background / acquisition.n_bins * flux.relative_background[at]
-    delay = in_blocks(delay_bin)
+    counts, delay = capture.blocks.counts, in_blocks(delay_bin)
     with entering(capture.cube.size):
         refine_delays(
-            capture.blocks.counts,
+            counts,
             capture.gated_pulses or 0,
             in_blocks(flux.typical_signal),
             in_blocks(background),

@@ -6,10 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import NDArray
 
-from core.kernels.parallel import COMPILED
+from core.kernels.parallel import COMPILED, PARALLEL, entering
 
 LANES = 64
 """Pixels processed together: four vectors of sixteen float32."""
@@ -58,7 +58,8 @@ def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.uns
     filled, left = divmod(pixels.shape[0], lanes)
     counts = np.empty((filled + (left > 0), n_bins, lanes), cube.dtype)
     if lanes == LANES:
-        _lay_out(pixels, counts[:filled])
+        with entering(pixels.size):
+            _lay_out(pixels, counts[:filled])
     else:
         counts[:filled] = pixels[: filled * lanes].reshape(-1, lanes, n_bins).transpose(0, 2, 1)
     counts[filled:] = 0
@@ -66,10 +67,10 @@ def lane_counts(cube: NDArray[np.unsignedinteger], lanes: int) -> NDArray[np.uns
     return counts
 
 
-@njit(**COMPILED)
+@njit(**PARALLEL)
 def _lay_out(pixels, counts):  # type: ignore[no-untyped-def]
     """Transpose pixels (pixel, bin) into full blocks."""
-    for b in range(counts.shape[0]):
+    for b in prange(counts.shape[0]):
         # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
         for first in range(0, LANES, _PIXELS_AT_ONCE):
             for k in range(counts.shape[1]):
@@ -77,20 +78,28 @@ def _lay_out(pixels, counts):  # type: ignore[no-untyped-def]
                     counts[b, k, i] = pixels[b * LANES + i, k]
 
 
-@njit(**COMPILED)
-def lane_spread(counts, n_bins):  # type: ignore[no-untyped-def]
+def lane_spread(
+    counts: NDArray[np.unsignedinteger], n_bins: int
+) -> tuple[NDArray[np.unsignedinteger], NDArray[np.float64]]:
     """Largest count and standard deviation over the first `n_bins` of (block, bin, LANES) counts.
 
     Both of shape (block, LANES); 0 over no bins.
     """
-    largest = np.zeros((counts.shape[0], LANES), counts.dtype)
-    sigma = np.zeros((counts.shape[0], LANES))
-    total, squares = np.empty(LANES, np.int64), np.empty(LANES)
+    shape = len(counts), LANES
+    largest, sigma = np.zeros(shape, counts.dtype), np.zeros(shape)
+    if n_bins > 0:
+        with entering(counts.size):
+            _fill_spread(counts, n_bins, largest, sigma)
+    return largest, sigma
+
+
+@njit(**PARALLEL)
+def _fill_spread(counts, n_bins, largest, sigma):  # type: ignore[no-untyped-def]
+    """Fill the largest count and the standard deviation, see `lane_spread`."""
     grouped = n_bins - n_bins % _BINS_AT_ONCE
-    for b in range(counts.shape[0] if n_bins > 0 else 0):
+    for b in prange(counts.shape[0]):
         block, top = counts[b], largest[b]
-        total[:] = 0
-        squares[:] = 0.0
+        total, squares = np.zeros(LANES, np.int64), np.zeros(LANES)
         for k in range(0, grouped, _BINS_AT_ONCE):
             for i in range(LANES):
                 sums = total[i], squares[i], top[i]
@@ -104,7 +113,6 @@ def lane_spread(counts, n_bins):  # type: ignore[no-untyped-def]
         for i in range(LANES):
             mean = total[i] / n_bins
             sigma[b, i] = math.sqrt(max(squares[i] / n_bins - mean * mean, 0.0))
-    return largest, sigma
 
 
 @njit(**COMPILED, inline="always")

@@ -16,14 +16,24 @@ from core.kernels.elementary import exp32
 from core.kernels.parallel import COMPILED, PARALLEL
 from core.kernels.posterior import counts_of, fill_flat, fill_level
 
+_PIXELS_AT_ONCE = 8
+
 
 @njit(**COMPILED)
 def _fill_highest(ratio, highest):  # type: ignore[no-untyped-def]
-    """Fill `highest` (lane,) with the maximum over the rows of `ratio` (row, lane)."""
-    highest[:] = -np.inf
-    for d in range(len(ratio)):
+    """Fill `highest` (lane,) with the maximum over the rows of `ratio` (row, lane).
+
+    Two rows at a time, by way of a second one: without AVX-512, storing where a number is larger
+    takes several times as long as storing everywhere.
+    """
+    last, higher = len(ratio) - 1, np.empty_like(highest)
+    highest[:] = ratio[last]
+    for d in range(0, last, 2):
         for i in range(highest.size):
             here, most = ratio[d, i], highest[i]
+            higher[i] = here if here > most else most
+        for i in range(highest.size):
+            here, most = ratio[d + 1, i], higher[i]
             highest[i] = here if here > most else most
 
 
@@ -36,12 +46,12 @@ def fill_evidence(prepared, depth, evidence):  # type: ignore[no-untyped-def]
     n_steps, n_bins = depth.shape
     n_blocks, lanes, n_levels = evidence.shape
     for b in prange(n_blocks):
-        fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
+        fired, all_fired, armed, all_unfired = counts_of(b, prepared)
         ratio = lane_rows(depth.size, lanes).reshape(n_steps, n_bins, lanes)
         (highest, row), offset = np.empty((2, lanes), np.float32), np.empty(lanes)
         evidence[b, :, 0] = 0.0
         for level in range(1, n_levels):
-            fill_level(b, level, prepared, fired, unfired_echo, ratio)
+            fill_level(b, level, prepared, fired, armed, ratio)
             fill_flat(b, level, prepared, all_fired, all_unfired, offset)
             _fill_highest(ratio.reshape(-1, lanes), highest)
             total = np.zeros(lanes)
@@ -56,6 +66,38 @@ def fill_evidence(prepared, depth, evidence):  # type: ignore[no-untyped-def]
                 evidence[b, i, level] = offset[i] + highest[i] + math.log(mean)
 
 
+@njit(**PARALLEL)
+def fill_densities(prepared, density):  # type: ignore[no-untyped-def]
+    """Fill the likelihood of each level and delay relative to the pixel's largest.
+
+    `density` is of shape (block, lane, level, delay).
+    """
+    n_blocks, lanes, n_levels, n_delays = density.shape
+    n_steps = len(prepared.echo)
+    for b in prange(n_blocks):
+        fired, all_fired, armed, all_unfired = counts_of(b, prepared)
+        ratio = lane_rows(n_delays, lanes).reshape(n_steps, -1, lanes)
+        highest, offset, top = np.empty(lanes, np.float32), np.empty(lanes), np.zeros(lanes)
+        for level in range(1, n_levels):
+            fill_level(b, level, prepared, fired, armed, ratio)
+            fill_flat(b, level, prepared, all_fired, all_unfired, offset)
+            _fill_highest(ratio.reshape(-1, lanes), highest)
+            for i in range(lanes):
+                top[i] = max(top[i], highest[i] + offset[i])
+            # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
+            for first in range(0, lanes, _PIXELS_AT_ONCE):
+                for d in range(n_delays):
+                    for i in range(first, min(first + _PIXELS_AT_ONCE, lanes)):
+                        log = ratio[d % n_steps, d // n_steps, i] + offset[i]
+                        density[b, i, level, d] = log
+        for i in range(lanes):
+            density[b, i, 0] = math.exp(-top[i])
+            for level in range(1, n_levels):
+                row, most = density[b, i, level], np.float32(top[i])
+                for d in range(n_delays):
+                    row[d] = exp32(row[d] - most)
+
+
 @njit(**COMPILED)
 def _add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
     """Add ``exp(ratio + offset)`` (step, bin, lane) to `density`, in units of ``exp(top)``.
@@ -64,16 +106,16 @@ def _add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
     all terms so far.
     """
     n_delays, lanes = density.shape
-    highest, kept, added = np.empty((3, lanes), np.float32)
+    highest, kept, unit = np.empty((3, lanes), np.float32)
     _fill_highest(ratio.reshape(-1, lanes), highest)
     for i in range(lanes):
-        previous, here = top[i], highest[i] + offset[i]
-        top[i] = max(previous, here)
-        kept[i], added[i] = math.exp(previous - top[i]), math.exp(here - top[i])
+        previous = top[i]
+        top[i] = max(previous, highest[i] + offset[i])
+        kept[i], unit[i] = math.exp(previous - top[i]), top[i] - offset[i]
     for d in range(n_delays):
-        row = ratio[d % len(ratio), d // len(ratio)]
+        row, summed = ratio[d % len(ratio), d // len(ratio)], density[d]
         for i in range(lanes):
-            density[d, i] = kept[i] * density[d, i] + added[i] * exp32(row[i] - highest[i])
+            summed[i] = kept[i] * summed[i] + exp32(row[i] - unit[i])
 
 
 @njit(**COMPILED)
@@ -85,11 +127,11 @@ def _fill_density(b, prepared, ratio, offset, density, top):  # type: ignore[no-
     `offset` (level, lane), or that of the last level if there is room for one.
     """
     n_delays, lanes = density.shape
-    fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
+    fired, all_fired, armed, all_unfired = counts_of(b, prepared)
     density[:], top[:] = 0.0, -np.inf
     for level in range(1, len(prepared.signal)):
         at = (level - 1) % len(ratio)
-        fill_level(b, level, prepared, fired, unfired_echo, ratio[at])
+        fill_level(b, level, prepared, fired, armed, ratio[at])
         fill_flat(b, level, prepared, all_fired, all_unfired, offset[at])
         offset[at] += prepared.log_share[level]
         _add_level(ratio[at], offset[at], density, top)

@@ -28,17 +28,21 @@ _SMOOTHING /= _SMOOTHING.sum()
 def learn_shares(likelihood, share):  # type: ignore[no-untyped-def]
     """Estimate the shares of levels by expectation and maximisation (Laird 1978), in place."""
     n_pixels, n_levels = likelihood.shape
+    likely, mixture = likelihood.T.copy(), np.empty(n_pixels)
     for _ in range(_STEPS):
-        found = np.zeros(n_levels)
-        found[0] = _DARK_PIXELS
-        for pixel in range(n_pixels):
-            mixture = 0.0
-            for level in range(n_levels):
-                mixture += share[level] * likelihood[pixel, level]
-            for level in range(n_levels):
-                found[level] += share[level] * likelihood[pixel, level] / mixture
+        mixture[:] = 0.0
         for level in range(n_levels):
-            share[level] = found[level] / (n_pixels + _DARK_PIXELS)
+            part, of_level = share[level], likely[level]
+            for pixel in range(n_pixels):
+                mixture[pixel] += part * of_level[pixel]
+        for pixel in range(n_pixels):
+            mixture[pixel] = 1.0 / mixture[pixel]
+        for level in range(n_levels):
+            found, of_level = 0.0, likely[level]
+            for pixel in range(n_pixels):
+                found += of_level[pixel] * mixture[pixel]
+            dark = _DARK_PIXELS if level == 0 else 0.0
+            share[level] = (share[level] * found + dark) / (n_pixels + _DARK_PIXELS)
 
 
 @njit(**SUMMING)
@@ -150,19 +154,17 @@ def counts_of(b, prepared):  # type: ignore[no-untyped-def]
     """Return the parts of ``T(d)`` of a block that all levels share.
 
     Counts, shared out among the nodes of the background (node, bin, lane), and their sums (node,
-    lane), sums of unfired pulses ``A_k - n_k``, weighted with the shape of the background (lane,),
-    and ``Σ_k (A_k - n_k) p_k(d)`` (step, bin, lane).
+    lane), the armed pulses ``A_k`` at each edge of the bins (edge, lane), and sums of the unfired
+    pulses ``A_k - n_k``, weighted with the shape of the background (lane,).
     """
     n_bins, lanes = prepared.counts.shape[1:]
     n_nodes = len(prepared.node)
-    n_steps, n_taps = prepared.echo.shape
     # Aligned to cache lines: vectors that straddle them cost twice.
     fired = lane_rows(n_nodes * n_bins, lanes).reshape(n_nodes, n_bins, lanes)
-    unfired = lane_rows(n_bins, lanes).reshape(n_bins, lanes)
-    unfired_echo = lane_rows(n_steps * n_bins, lanes).reshape(n_steps, n_bins, lanes)
-    taps = lane_rows(n_taps, lanes).reshape(n_taps, lanes)
-    armed = np.full(lanes, float(prepared.n_pulses))
+    armed = lane_rows(n_bins + 1, lanes).reshape(n_bins + 1, lanes)
+    left = np.full(lanes, float(prepared.n_pulses))
     all_fired, all_unfired = np.zeros((n_nodes, lanes)), np.zeros(lanes)
+    armed[0] = prepared.n_pulses
     for k in range(n_bins):
         # Separate loops, since those of several types are not vectorised.
         for node in range(n_nodes):
@@ -172,24 +174,19 @@ def counts_of(b, prepared):  # type: ignore[no-untyped-def]
             for i in range(lanes):
                 all_fired[node, i] += weight * prepared.counts[b, k, i]
         for i in range(lanes):
-            armed[i] -= prepared.counts[b, k, i]
+            left[i] -= prepared.counts[b, k, i]
         for i in range(lanes):
-            unfired[k, i] = armed[i]
+            armed[k + 1, i] = left[i]
         for i in range(lanes):
-            all_unfired[i] += prepared.background_shape[k] * armed[i]
+            all_unfired[i] += prepared.background_shape[k] * left[i]
     if prepared.n_pulses == 0:
-        unfired[:], all_unfired[:] = 1.0, n_bins
-    unfired_echo[:] = 0.0
-    for step in range(n_steps):
-        for tap in range(n_taps):
-            taps[tap, :] = prepared.echo[step, tap]
-        _correlate(taps, unfired, prepared.first_tap, unfired_echo[step])
-    return fired, all_fired, all_unfired, unfired_echo
+        armed[:], all_unfired[:] = 1.0, n_bins
+    return fired, all_fired, armed, all_unfired
 
 
 @njit(**COMPILED)
 def _fill_gain(b, level, node, prepared, gain):  # type: ignore[no-untyped-def]
-    """Fill `gain` (step, tap, lane) with the logarithm that each count adds to ``T(d)``.
+    """Fill `gain` (step, tap, lane) with what each count adds to ``T(d)``; see `fill_level`.
 
     `node` is the background relative to its mean.
     """
@@ -210,22 +207,38 @@ def _fill_gain(b, level, node, prepared, gain):  # type: ignore[no-untyped-def]
         previous = signal
     for step in range(n_steps):
         for tap in range(n_taps):
+            missed = prepared.echo_tail[step, tap] if prepared.n_pulses > 0 else 0.0
             for i in range(lanes):
                 # (1 - exp(-b - s)) / (1 - exp(-b)), without cancellation.
                 gain[step, tap, i] = log1p32(gain[step, tap, i] * unit[i])
+            for i in range(lanes):
+                gain[step, tap, i] += np.float32(missed * prepared.signal[level, b, i])
 
 
 @njit(**COMPILED)
-def fill_level(b, level, prepared, fired, unfired_echo, ratio):  # type: ignore[no-untyped-def]
-    """Fill `ratio` (step, bin, lane) with ``T(d)`` of one level (`core.inference.likelihood`)."""
+def fill_level(b, level, prepared, fired, armed, ratio):  # type: ignore[no-untyped-def]
+    """Fill `ratio` (step, bin, lane) with ``T(d)`` of one level (`core.inference.likelihood`).
+
+    The pulses that are unfired after a bin are those armed when the echo begins, less the counts
+    in between. So each count of an echo's bin adds its logarithm and the signal of that bin and of
+    later ones, and ``S A`` is subtracted, as if all of the echo met the pulses armed at its
+    beginning: one sum over the taps instead of two. Taps outside the gate count for nothing.
+    """
     n_nodes, n_bins, lanes = fired.shape
     n_steps, n_taps = prepared.echo.shape
     gain = lane_rows(n_steps * n_taps, lanes).reshape(n_steps, n_taps, lanes)
+    signal = np.empty(lanes, np.float32)
+    signal[:] = prepared.signal[level, b]
     for step in range(n_steps):
-        for k in range(n_bins):
+        tail = prepared.echo_tail[step]
+        for d in range(n_bins):
+            first = d + prepared.first_tap
+            before = tail[0] - tail[min(max(-first, 0), n_taps)]
+            behind = tail[min(max(n_bins - first, 0), n_taps)]
+            here, row = armed[min(max(first, 0), n_bins)], ratio[step, d]
             for i in range(lanes):
-                signal = np.float32(prepared.signal[level, b, i])
-                ratio[step, k, i] = -signal * unfired_echo[step, k, i]
+                outside = before * armed[0, i] + behind * armed[n_bins, i]
+                row[i] = signal[i] * (outside - tail[0] * here[i])
     for node in range(n_nodes):
         _fill_gain(b, level, prepared.node[node], prepared, gain)
         for step in range(n_steps):
@@ -258,12 +271,12 @@ def fill_flat(b, level, prepared, fired, unfired, flat):  # type: ignore[no-unty
 def _fill_block(b, prepared, log):  # type: ignore[no-untyped-def]
     """Fill log likelihood ratios of each level and delay to no echo, (level, delay, lane)."""
     n_levels, n_delays, lanes = log.shape
-    fired, all_fired, all_unfired, unfired_echo = counts_of(b, prepared)
+    fired, all_fired, armed, all_unfired = counts_of(b, prepared)
     n_steps = len(prepared.echo)
     ratio, flat = lane_rows(n_delays, lanes).reshape(n_steps, -1, lanes), np.empty(lanes)
     log[0] = 0.0
     for level in range(1, n_levels):
-        fill_level(b, level, prepared, fired, unfired_echo, ratio)
+        fill_level(b, level, prepared, fired, armed, ratio)
         fill_flat(b, level, prepared, all_fired, all_unfired, flat)
         for d in range(n_delays):
             for i in range(lanes):

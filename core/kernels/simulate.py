@@ -13,6 +13,7 @@ from core.kernels.streams import pixel_key, uniform_at
 _GAMMA, _GAUSSIAN, _MEASURED = range(3)
 SHAPE_CODES = {"gamma": _GAMMA, "gaussian": _GAUSSIAN, "measured": _MEASURED}
 _SQRT_HALF = math.sqrt(0.5)
+_CELLS = 256  # of a guide table
 
 
 @njit(**COMPILED)
@@ -30,11 +31,11 @@ def _arrived(t, shape, share):  # type: ignore[no-untyped-def]
     return share[below] + (t - below) * (share[below + 1] - share[below])
 
 
-@njit(**COMPILED)
+@njit(**PARALLEL)
 def add_echo_photons(onset_bin, signal, bin_taus, shape, share, before):  # type: ignore[no-untyped-def]
     """Add the expected photons of each pixel's echo before each bin edge to `before`."""
     n_pixels, n_edges = before.shape
-    for pixel in range(n_pixels):
+    for pixel in prange(n_pixels):
         onset = onset_bin[pixel]
         if not math.isfinite(onset):
             continue
@@ -46,26 +47,37 @@ def add_echo_photons(onset_bin, signal, bin_taus, shape, share, before):  # type
             before[pixel, edge] += signal[pixel] * (arrived - early)
 
 
+@njit(**PARALLEL)
+def fill_probability(photons):  # type: ignore[no-untyped-def]
+    """Replace expected photons (pixel, edge) by the probability of any."""
+    n_pixels, n_edges = photons.shape
+    for pixel in prange(n_pixels):
+        for edge in range(n_edges):
+            photons[pixel, edge] = -math.expm1(-photons[pixel, edge])
+
+
 @njit(**COMPILED)
 def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
     """Add `n_pulses` first-photon draws to `counts`, whose last element counts "no trigger".
 
     ``fired_by[k]`` is the probability of a trigger by the end of bin k; its last element, above 1,
     ends every search. The guide table holds the bin of the lowest number in each of its cells of
-    ``[0, 1)``. `uniform` is a buffer for a batch of numbers, drawn in a loop that vectorises.
+    ``[0, 1)``, found by counting the ends of bins in each cell; its last element is beyond 1.
+    `uniform` is a buffer for a batch of numbers, drawn in a loop that vectorises.
     """
-    k = np.uint64(0)
-    for cell in range(guide.size):
-        while fired_by[k] <= cell / guide.size:
-            k += np.uint64(1)
-        guide[cell] = k
+    n_cells = guide.size - 1
+    guide[:] = 0
+    for end in range(fired_by.size - 1):
+        guide[np.int64(math.ceil(fired_by[end] * n_cells))] += np.uint32(1)
+    for cell in range(n_cells):
+        guide[cell + 1] += guide[cell]
     done = 0
     while done < n_pulses:
         batch = min(uniform.size, n_pulses - done)
         for i in range(batch):
             uniform[i] = uniform_at(key, done + i)
         for i in range(batch):
-            k = np.uint64(guide[np.uint64(uniform[i] * guide.size)])
+            k = np.uint64(guide[np.uint64(uniform[i] * n_cells)])
             # A step without a branch settles nearly every draw; a mispredicted branch costs five.
             k += np.uint64(fired_by[k] <= uniform[i])
             while fired_by[k] <= uniform[i]:
@@ -81,7 +93,7 @@ def draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-def
     for pixel in prange(n_pixels):
         fired_by = np.full(n_bins + 1, 2.0)
         fired_by[:n_bins] = triggered[pixel, 1:]
-        guide = np.empty(256, np.uint32)
+        guide = np.empty(_CELLS + 1, np.uint32)
         uniform = np.empty(64)
         counts = np.zeros(n_bins + 1, np.int64)
         _draw_pixel(fired_by, n_pulses, pixel_key(seed, pixel), guide, uniform, counts)

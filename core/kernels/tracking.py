@@ -137,9 +137,11 @@ def _track_block(b, blocks, lanes, weight, settings, row):  # type: ignore[no-un
             residual = large - small
             gain = weight_of_bin * row[_GAIN + i]
             enhanced = residual * gain if residual > row[_FLOOR + i] else zero
-            best = row[_BEST + i]
-            row[_AT + i] = bin_number if enhanced > best else row[_AT + i]
-            row[_BEST + i] = enhanced if enhanced > best else best
+            best, at = row[_BEST + i], row[_AT + i]
+            # Times one, so that all lanes are stored: without AVX-512, storing only those that
+            # change takes several times as long.
+            row[_AT + i] = r_small * (bin_number if enhanced > best else at)
+            row[_BEST + i] = r_small * (enhanced if enhanced > best else best)
     for i in range(LANES):
         found = row[_BEST + i] > zero
         lanes.position[b, i] = row[_AT + i] if found else np.nan

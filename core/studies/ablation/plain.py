@@ -8,7 +8,7 @@ import numpy as np
 
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.scene import PARTS, Scene, without
-from core.simulation import add_echo, cumulative_trigger_probability
+from core.simulation import add_echo, cumulative_trigger_probability, to_probability
 from core.studies.outputs import Table
 from core.studies.timing import time_ratio
 
@@ -24,8 +24,8 @@ def plain_triggered(scene: Scene, acquisition: Acquisition, flux: Flux, pulse: P
     before = np.empty((onset_bin.size, acquisition.n_bins + 1))
     before[:] = flux.background * np.linspace(0.0, 1.0, acquisition.n_bins + 1)
     add_echo(onset_bin, signal, pulse, acquisition.bin_width_s, before)
-    np.expm1(np.negative(before, out=before), out=before)
-    return np.negative(before, out=before)
+    to_probability(before)
+    return before
 
 
 def bare(scene: Scene) -> Scene:
