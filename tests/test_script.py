@@ -30,10 +30,10 @@ from tests.states import another, link_to, random_state
 
 PAGE_NAMES = [page.name for page in PAGES]
 
-NOT_CODE = {"cloud_color", "unit", "kept", "study", "reported", "held", "echo_free"}
+NOT_CODE = {"cloud_color", "unit", "kept", "study", "reported", "held", "echo_free", "learning"}
 """Parameters without an effect on arrays: colours, units on axes, the estimate kept as A, the
 sections of Trade-off and Paper, whose scripts name a command, what a slider leaves alone, and
-whether estimates are simulated without an echo."""
+whether estimates are simulated without an echo, and lessons."""
 
 RUN_EACH = """
 import os, runpy, sys
