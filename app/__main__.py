@@ -27,6 +27,7 @@ from tornado.ioloop import IOLoop, PeriodicCallback
 import core
 from app import THRESHOLD
 from app.model import text
+from app.model.lessons import Lesson, read_lessons
 from app.model.store import (
     Source,
     built_in_sources,
@@ -70,6 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
         if not chosen.captures and chosen.watch is None:
             truth_options_from(chosen, None)
         add_truth = partial(with_chosen_truth, chosen)
+        lessons = read_lessons(chosen.lessons)
         files = readable(chosen.captures, options, add_truth)
         watched = None if chosen.watch is None else WatchedFolder(chosen.watch, options, add_truth)
     except ValueError as error:
@@ -88,7 +90,8 @@ def main(arguments: list[str] | None = None) -> int:
         token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
         access = Access.of(chosen.address, port, chosen.origin, token)
         server = server_of(
-            lambda: page_for(sources, uploads, arrivals),  # Panel would draw a partial as an object
+            # Panel would draw a partial as an object.
+            lambda: page_for(sources, uploads, arrivals, lessons),
             access,
             chosen.address,
             port,
@@ -103,13 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
     # An exception raised at an arbitrary place can be lost: handle SIGTERM like Ctrl+C, for which
     # Panel stops the loop below.
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
-    print("Compiling kernels that are not cached ...", flush=True)
-    core.warm_up()
-    tune()
-    apply_patches()
-    garbage.freeze_all()
-    gc.set_threshold(*THRESHOLD)
-    gettempdir()  # is chosen by writing to it: on a full disk, Python would find no folder at all
+    prepare()
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
     if chosen.show:
@@ -122,6 +119,17 @@ def main(arguments: list[str] | None = None) -> int:
     server.stop()
     STUDIES.is_closed = True
     return 0
+
+
+def prepare() -> None:
+    """Prepare this process for serving."""
+    print("Compiling kernels that are not cached ...", flush=True)
+    core.warm_up()
+    tune()
+    apply_patches()
+    garbage.freeze_all()
+    gc.set_threshold(*THRESHOLD)
+    gettempdir()  # is chosen by writing to it: on a full disk, Python would find no folder at all
 
 
 def parser_of_arguments() -> argparse.ArgumentParser:
@@ -163,6 +171,14 @@ def parser_of_arguments() -> argparse.ArgumentParser:
         type=Path,
         metavar="FOLDER",
         help="open each capture that is written to this folder, beginning with the newest there",
+    )
+    parser.add_argument(
+        "--lessons",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="FOLDER",
+        help="add the lessons (*.md) of a folder to the page Learn; may be repeated",
     )
     add_truth_options(parser)
     add_read_options(parser)
@@ -224,14 +240,17 @@ async def look(watched: WatchedFolder, sources: dict[str, Source], arrivals: Arr
 
 
 def page_for(
-    sources: Mapping[str, Source], uploads: Uploads, arrivals: Arrivals | None = None
+    sources: Mapping[str, Source],
+    uploads: Uploads,
+    arrivals: Arrivals | None = None,
+    lessons: Mapping[str, Lesson] | None = None,
 ) -> Any:
     """Return the page of a new session, or a sentence if it cannot be built."""
     if pn.state.curdoc is not None:
         pn.state.curdoc.template_variables["scripts"] = scripts()
         pn.state.onload(garbage.freeze_all)
     try:
-        return build_page(sources, uploads, arrivals)
+        return build_page(sources, uploads, arrivals, lessons)
     except Exception:
         log.exception("could not build a page")
         return Sentence(text=text.NO_PAGE, warning=True)

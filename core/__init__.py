@@ -88,6 +88,7 @@ PUBLIC_MODULES = (
     "core.scripts",
     "core.studies",
     "core.studies.ablation",
+    "core.studies.lessons",
     "core.studies.paper",
     "core.studies.sensitivity",
     "core.studies.tradeoff",

@@ -11,7 +11,7 @@ import numpy as np
 import param
 
 from app.model.address import Link, defaults
-from app.model.state import CLOUDS, Comparison, State
+from app.model.state import CLOUDS, Comparison, Learning, State
 from app.model.store import Request, Source, built_in_sources
 from core import ESTIMATORS, Window
 from core.io import ReadOptions
@@ -24,11 +24,12 @@ OTHERWISE: dict[str, list[Any]] = {
     "window": [Window((0, 8), (3, 9)), Window((2, 30), (0, 40), step=3)],
     "absent": [frozenset({"jitter"}), frozenset({"pile_up", "signal_levels", "motion"})],
     "pixel": [(0, 0), (63, 5)],
-    "page": ["Inspect", "Compare", "Trade-off", "Paper"],
+    "page": ["Inspect", "Compare", "Trade-off", "Paper", "Learn"],
     "pins": [((1, 2),), ((1, 2), (3, 4), (0, 0), (9, 9))],
     "region": [((1, 2), (1, 9), (7, 5)), ((0.5, 1.25), (-3.0, 9.0), (7.0, 5.1))],
     "kept": ["source=car&method=coates", "tracking.l=0.006&light.sbr=2.0"],
     "unread": ["source=two.mat", "source=a%20b&reading.n_bins=40"],
+    "learning": [Learning("2-more-light", "0.3", "5.0"), Learning(answer="0.42")],
     "reading": [ReadOptions(**{name: value}) for name, value in EXAMPLES.items()],
 }
 """Other values of parameters whose kind does not tell which there are."""

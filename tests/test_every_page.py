@@ -10,6 +10,7 @@ from tests.browser import VIEWS, eventually, slider, stage
 from tests.test_browser import use_the_controls
 from tests.test_compare import compare_the_methods
 from tests.test_inspect_browser import inspect_the_building
+from tests.test_lessons import take_the_first_lesson
 from tests.test_paper_page import read_part_by_part
 from tests.test_tradeoff_page import open_a_configuration
 
@@ -88,6 +89,7 @@ JOURNEYS = {
     "Compare": compare_the_methods,
     "Trade-off": open_a_configuration,
     "Paper": read_part_by_part,
+    "Learn": take_the_first_lesson,
 }
 """Actions of a user on a page that has just been opened, by its name."""
 

@@ -31,11 +31,12 @@ from tests.states import another, link_to, random_state
 PAGE_NAMES = [page.name for page in PAGES]
 
 NOT_CODE = {
-    "cloud_color", "unit", "kept", "unread", "study", "reported", "held", "echo_free",
-}  # fmt: skip
+    *("cloud_color", "unit", "kept", "unread", "study", "reported", "held", "echo_free"),
+    "learning",
+}
 """Parameters without an effect on arrays: colours, units on axes, the estimate kept as A, a file
 that could not be read, the sections of Trade-off and Paper, whose scripts name a command, what a
-slider leaves alone, and whether estimates are simulated without an echo."""
+slider leaves alone, whether estimates are simulated without an echo, and lessons."""
 
 RUN_EACH = """
 import os, runpy, sys

@@ -35,7 +35,9 @@ def test_the_wheel_has_types_and_data_and_no_tests(wheel):
     names = ZipFile(wheel).namelist()
     assert {"core/py.typed", "app/py.typed", "assets/car.npz"} <= set(names)
     assert {"core/report/cloud.js", "core/report/page.css"} <= set(names)
-    assert not [name for name in names if "tests" in name or name.endswith((".png", ".md"))]
+    assert "app/lessons/1-first-photon.md" in names
+    own = [name for name in names if not name.startswith("app/lessons/")]
+    assert not [name for name in own if "tests" in name or name.endswith((".png", ".md"))]
 
 
 def test_the_installed_wheel_describes_the_sample_and_serves_the_app(wheel, tmp_path):

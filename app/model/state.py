@@ -246,6 +246,19 @@ class Comparison:
         require("kind", self.kind, self.kind in KINDS, " or ".join(map(repr, KINDS)))
 
 
+@dataclass(frozen=True)
+class Learning:
+    """What a learner has done in a lesson of the Learn page; empty texts stand for nothing yet."""
+
+    lesson: str = ""
+    """Key of the lesson; empty for the first one."""
+    prediction: str = ""
+    moved: str = ""
+    """Value of the lesson's control."""
+    answer: str = ""
+    """Answer to the lesson's check."""
+
+
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
 FIT = "Goodness of fit"
 """The map of the p-values of pixels."""
@@ -404,6 +417,8 @@ class State(param.Parameterized):
         default="", doc="Query of the file that was requested last and could not be read."
     )
     comparison = param.ClassSelector(class_=Comparison, default=Comparison())
+
+    learning = param.ClassSelector(class_=Learning, default=Learning())
 
     @property
     def box(self) -> Box:

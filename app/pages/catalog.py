@@ -12,6 +12,7 @@ FOLDERS = (
     "compare",
     "tradeoff",
     "paper",
+    "learn",
 )
 """Folders of `app.pages`, in the order of their buttons; each has a `page.py` with a `PAGE`."""
 

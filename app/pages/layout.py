@@ -16,6 +16,7 @@ from panel_material_ui.template.base import Meta
 
 from app.model import text
 from app.model.address import Link
+from app.model.lessons import Lesson
 from app.model.methods import doubts_hold
 from app.model.reading import options_in_use
 from app.model.restore import parameters_of
@@ -165,13 +166,16 @@ class Arrivals(Signal[Arrival]):
 
 
 def build_page(
-    sources: Mapping[str, Source], uploads: Uploads, arrivals: Arrivals | None = None
+    sources: Mapping[str, Source],
+    uploads: Uploads,
+    arrivals: Arrivals | None = None,
+    lessons: Mapping[str, Lesson] | None = None,
 ) -> pmui.Page:
     """Return a new page with a session of its own, restored from its address."""
     query = {
         name: texts[-1].decode(errors="replace") for name, texts in pn.state.session_args.items()
     }
-    return Layout(sources, Link(query), uploads, arrivals=arrivals).page
+    return Layout(sources, Link(query), uploads, arrivals=arrivals, lessons=lessons).page
 
 
 class Layout:
@@ -192,6 +196,8 @@ class Layout:
         The page's thread; by default that of the page being built.
     arrivals : Arrivals, optional
         Captures to follow.
+    lessons : mapping of str to Lesson, optional
+        Lessons of the page Learn; by default the built-in ones.
 
     Attributes
     ----------
@@ -210,13 +216,14 @@ class Layout:
         uploads: Uploads | None = None,
         tasks: PageTasks | None = None,
         arrivals: Arrivals | None = None,
+        lessons: Mapping[str, Lesson] | None = None,
     ) -> None:
         self._arrivals = arrivals
         link, self._uploads = link or Link({}), uploads or Uploads()
         known = dict(sources)
         for key in link.sources:
             known = self._with_uploads(known, key)
-        session = self.session = Session(known, link, tasks)
+        session = self.session = Session(known, link, tasks, lessons)
         state = session.state
         self._pages = {each.name: each for each in PAGES}
         if state.page not in self._pages:

@@ -10,6 +10,7 @@ from urllib.parse import parse_qsl, urlencode
 
 from app.model.address import Link, query_of
 from app.model.capture_defaults import defaults_of
+from app.model.lessons import Lesson, built_in_lessons
 from app.model.restore import described, parameters_of, parsed, places, restore
 from app.model.state import State
 from app.model.store import Answer, Refused, Request, Source
@@ -30,11 +31,14 @@ class Session:
         Settings from the link of the page.
     tasks : PageTasks, optional
         The page's thread; by default that of the page being built.
+    lessons : mapping of str to Lesson, optional
+        Lessons of the page Learn; by default the built-in ones.
 
     Attributes
     ----------
     state : State
         Everything that the user has chosen.
+    lessons : mapping of str to Lesson
     estimate : CurrentEstimate
         The estimate for that state.
     tasks : PageTasks
@@ -50,9 +54,11 @@ class Session:
         sources: Mapping[str, Source],
         link: Link | None = None,
         tasks: PageTasks | None = None,
+        lessons: Mapping[str, Lesson] | None = None,
     ) -> None:
         link = link or Link({})
         self.sources = dict(sources)
+        self.lessons = lessons or built_in_lessons()
         key, first = next(iter(self.sources.items()))
         # A session started with a file opens on Inspect.
         self._own = {"source": key, "page": "Explore" if first.is_scene else "Inspect"}

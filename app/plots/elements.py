@@ -310,10 +310,14 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "largest of noise alone, median": ("muted", [6, 3]),
     "largest of noise alone, 95 %": ("text", [6, 3]),
     "limit: probability of the right bin": ("text", [2, 4]),
+    "limit": ("text", [2, 4]),
     "theory, flux known": ("text", [2, 4]),
     "estimates, no echo": ("estimate", []),
     "even": ("muted", [6, 3]),
     "echoes found": ("truth", []),
+    "photons that arrive": ("large", []),
+    "expected": ("expected", [2, 2]),
+    "your prediction": ("estimate", [8, 4]),
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
     ESTIMATES_NAME: ("estimate", []),
@@ -364,7 +368,7 @@ def curves(item: items.Plot, colors: Palette) -> Any:
     legend = Legend(
         items=entries,
         orientation="vertical" if many else "horizontal",
-        ncols=3 if 4 < len(entries) <= 6 else "auto",
+        ncols=3 if 3 < len(entries) <= 6 else "auto",
         click_policy="hide",
         background_fill_alpha=0.0,
     )

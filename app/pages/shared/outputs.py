@@ -41,8 +41,10 @@ from core.typesetting import typeset
 
 Item = TypeVar("Item")
 
+# Panel takes the width of a figure by default, 600 px, for the least of all that holds it.
+FREE = ":host { min-width: 0 !important; }"
 GRID = """
-:host { display: grid !important; gap: 8px; width: 100%;
+:host { display: grid !important; gap: 8px; width: 100%; min-width: 0 !important;
   grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); }
 .scroll-button { display: none !important; }
 """
@@ -208,7 +210,12 @@ class Gallery:
         self._scale.pane.visible = False
         self._note = Sentence(text=NOT_COMPUTED, sizing_mode="stretch_width", margin=(4, 0))
         self.layout = pn.Column(
-            self._grid, self._scale.pane, self._note, sizing_mode="stretch_width", margin=0
+            self._grid,
+            self._scale.pane,
+            self._note,
+            stylesheets=[FREE],
+            sizing_mode="stretch_width",
+            margin=0,
         )
 
     def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
@@ -226,7 +233,7 @@ class Gallery:
 
         holder = pn.Column(
             pane,
-            stylesheets=[CONTAINER],
+            stylesheets=[CONTAINER, FREE],
             sizing_mode="stretch_width",
             height=PICTURE_HEIGHT,
             margin=0,

@@ -1,0 +1,24 @@
+"""Texts of the Learn page."""
+
+from __future__ import annotations
+
+LESSON_HELP = "Each lesson asks first, and shows what happens after your prediction."
+
+COMMIT_HELP = "Predict: the prediction stays drawn on the plot."
+SHAPES_HELP = "Shape of the histogram that you expect."
+AGAIN_HELP = "Start again: this lesson, with another prediction."
+CHECK_HELP = "Check: compares your answer with a computation."
+
+MOVE = "Now move this control; everything else stays."
+
+NO_SIDEBAR = "This page has its own controls; the other pages' controls are hidden."
+
+
+def answer_label(unit: str) -> str:
+    """Return the label of the field for a predicted number."""
+    return f"Your prediction ({unit})" if unit else "Your prediction"
+
+
+def no_lesson(key: str) -> str:
+    """Return the message about a lesson of a link that does not exist."""
+    return f"There is no lesson {key[:40]!r} here: the first one is shown."

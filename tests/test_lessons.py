@@ -1,0 +1,177 @@
+"""Lessons: their files, their checks, and the page that shows them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+from app.model.lessons import PREDICTED, SHAPES, lesson_of, read_lesson, read_lessons
+from app.model.state import Learning
+from app.model.store import built_in_sources
+from app.pages.learn.page import Learn
+from app.pages.session import Session
+from core.studies.outputs import Pictures, Plot
+from tests.browser import enter, eventually, slider
+from tests.states import link_to
+from tests.threads import HeldTasks
+
+LESSONS = read_lessons()
+FIRST = "1-first-photon"
+
+
+# -- files -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", LESSONS)
+def test_a_lesson_has_views_a_drawn_prediction_and_a_check_with_hints(key):
+    lesson = LESSONS[key]
+    predicted = "flat" if not lesson.prediction.axis else lesson.prediction.high
+    for name in lesson.before:
+        assert isinstance(lesson.seen(name, lesson.bench, None), Plot | Pictures)
+    plot = lesson.seen(lesson.prediction.view, lesson.bench, predicted)
+    assert PREDICTED in {*plot.curves, *plot.marks}
+    check = lesson.check
+    assert check.verdict(check.answer)[0]
+    for hint in check.hints:
+        wrong = replace(check, function=hint.function, arguments=hint.arguments).answer
+        assert check.verdict(wrong) == (False, hint.text)
+    assert lesson.introduction and lesson.explanation
+
+
+def test_expected_answers_of_the_built_in_lessons():
+    answers = {key: lesson.check.answer for key, lesson in LESSONS.items()}
+    assert answers[FIRST] == pytest.approx(np.exp(-1.735 / 2), abs=1e-4)
+    assert answers["2-more-light"] == pytest.approx(0.115, abs=0.002)
+    assert answers["4-two-scales"] > 3 * 0.2  # of a fifth of the gate
+
+
+TEXT = """+++
+title = "T"
+before = ["light"]
+after = ["first_photons"]
+[state]
+background = 2.0
+[control]
+name = "background"
+[prediction]
+question = "?"
+view = "first_photons"
+[check]
+question = "?"
+function = "share_armed"
+arguments = { bin = 50 }
+tolerance = 0.01
++++
+Before.
+---
+After.
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("+++\ntitle", "title", "front matter"),
+        ('title = "T"', "", "title is missing"),
+        ('["light"]', '["os.system"]', "view = 'os.system' is not accepted"),
+        ("background = 2.0", "background = -1.0", "background = -1.0 is not accepted"),
+        ("background = 2.0", "brightness = 2.0", "brightness"),
+        ('name = "background"', 'name = "colour"', "control.name = 'colour'"),
+        ('view = "first_photons"', 'view = "light"', "prediction.view = 'light'"),
+        ('"share_armed"', '"eval"', "check = 'eval' is not accepted"),
+        ("{ bin = 50 }", "{ place = 50 }", r"arguments = \['place'\]"),
+        ("tolerance = 0.01", "", "tolerance"),
+    ],
+)
+def test_a_lesson_that_is_not_valid_is_refused_by_file_and_entry(tmp_path, old, new, message):
+    assert lesson_of("t", TEXT).moved("3").background == 3.0
+    path = tmp_path / "mine.md"
+    path.write_text(TEXT.replace(old, new, 1))
+    with pytest.raises(ValueError, match=f"^mine.md: .*{message}"):
+        read_lesson(path)
+
+
+def test_a_folder_adds_lessons(tmp_path):
+    with pytest.raises(ValueError, match="--lessons"):
+        read_lessons([tmp_path])
+    (tmp_path / "mine.md").write_text(TEXT)
+    assert [*read_lessons([tmp_path])] == [*LESSONS, "mine"]
+
+
+# -- the page without a browser --------------------------------------------------------------------
+
+
+@pytest.fixture
+def session():
+    return Session(built_in_sources(), tasks=HeldTasks())
+
+
+def test_nothing_is_shown_before_the_prediction(session):
+    page = Learn(session)
+    page.show(True)
+    shown = page.shown
+    session.tasks.run_until(lambda: shown.views["before", "light"].item)
+    assert not shown.moving.visible  # it follows the prediction
+    assert not shown.views["after", "first_photons"].holder.visible
+    shown.prediction.value = "falling"
+    shown.commit.clicks += 1
+    assert session.state.learning == Learning(prediction="falling")
+    assert shown.moving.visible
+    session.tasks.run_until(lambda: shown.views["after", "first_photons"].item)
+    plot = shown.views["after", "first_photons"].item
+    first, last = SHAPES["falling"]
+    predicted = plot.curves[PREDICTED]
+    assert predicted[0] / predicted[-1] == pytest.approx(first / last)
+    shown.panel.controls["background"].value = 5.0
+    assert session.state.learning.moved == "5.0"
+    for answer, said in (("0.58", "before bin 50"), ("42 %", "Right")):
+        shown.answer.value = answer
+        assert session.state.learning.answer == answer
+        session.tasks.run_until(lambda said=said: said in shown.verdict.text)
+
+
+def test_a_link_opens_a_lesson_where_the_learner_was(session):
+    query = "page=Learn&learning.lesson=2-more-light&learning.prediction=0.3&learning.moved=10.0"
+    session = Session(built_in_sources(), link_to(query), HeldTasks())
+    assert session.refused == []
+    page = Learn(session)
+    page.show(True)
+    assert page.choice.value == page.shown.lesson.key == "2-more-light"
+    assert page.shown.prediction.value == "0.3"
+    assert page.shown.panel.controls["exposure"].value == 10.0
+    heard = []
+    session.failures.shown.subscribe(heard.append)
+    for learning, refused in (
+        (Learning("none such"), "no lesson 'none such'"),
+        (Learning("2-more-light", "many"), "'many' is not accepted: give a number"),
+        (Learning("2-more-light", "7"), "give a number from 0 to 1"),
+    ):
+        session.state.learning = learning
+        assert refused in heard[-1]
+        assert not page.shown.moving.visible
+
+
+# -- in a browser ----------------------------------------------------------------------------------
+
+
+def take_the_first_lesson(here: Page) -> None:
+    """Predict, move the control and answer, wrongly and then rightly, by keyboard."""
+    expect(here.get_by_text("Now move this control")).to_be_hidden()
+    here.get_by_role("button", name="falling", exact=True).press("Enter")
+    predict = here.get_by_role("button", name=re.compile("^Predict"))
+    predict.press("Enter")
+    expect(here.get_by_text("Now move this control")).to_be_visible()
+    expect(predict).to_be_disabled()
+    moved = slider(here, "Background (per pulse)").filter(visible=True)
+    moved.press("ArrowRight")
+    expect(here.get_by_text("The light has no slope")).to_be_visible()
+    for answer, said in (("0.58", "before bin 50"), ("0.42", "Right: 0.42.")):
+        enter(here, "Your answer", answer)
+        expect(here.get_by_role("status").filter(has_text=said)).to_be_visible()
+    eventually(lambda: "learning.answer=0.42" in here.evaluate("location.href"))
+    here.reload()
+    expect(here.get_by_role("status").filter(has_text="Right: 0.42.")).to_be_visible()
