@@ -141,16 +141,11 @@ def posteriors(capture: Capture, flux: FluxModel) -> Iterator[States]:
 
 def _windows(posterior: NDArray[np.float32], factor: int, n_bins: int) -> NDArray[np.float32]:
     """Probability within the tolerance of each bin (row, col, bin) of merged bins."""
-    each = posterior
-    if factor > 1:  # the same in all bins of a merged one
-        each = np.zeros((*posterior.shape[:2], n_bins), np.float32)
-        fine = np.repeat(posterior, factor, axis=2)
-        fine /= factor
-        each[:, :, : fine.shape[2]] = fine
-    window = np.empty_like(each)
-    with entering(each.size):
-        fill_windows(each.reshape(-1, n_bins), TOLERANCE_BINS, window.reshape(-1, n_bins))
-    return window
+    merged = posterior.reshape(-1, posterior.shape[2])
+    window = np.empty((len(merged), n_bins), np.float32)
+    with entering(window.size):
+        fill_windows(merged, factor, TOLERANCE_BINS, window)
+    return window.reshape(*posterior.shape[:2], n_bins)
 
 
 def peaks(posterior: NDArray[np.float32]) -> tuple[Floats, Floats]:

@@ -159,18 +159,20 @@ def fill_peaks(posterior, delay, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def fill_windows(posterior, half, window):  # type: ignore[no-untyped-def]
+def fill_windows(posterior, factor, half, window):  # type: ignore[no-untyped-def]
     """Fill `window` with the mass of `half` bins on either side of the beginning of each bin.
 
-    Both of shape (pixel, bin).
+    `posterior` (pixel, merged bin) is of `factor` bins each, which share it alike, and `window` is
+    of shape (pixel, bin).
     """
-    n_pixels, n_bins = posterior.shape
+    n_pixels, n_bins = window.shape
     for i in prange(n_pixels):
-        seen = np.zeros(n_bins + 2 * half, np.float32)
-        seen[half : half + n_bins] = posterior[i]
+        mass = np.zeros(n_bins + 2 * half, np.float32)
+        for d in range(posterior.shape[1] * factor):
+            mass[half + d] = posterior[i, d // factor] / np.float32(factor)
         here = window[i]
         here[:] = 0.0
         for j in range(2 * half):
-            met = seen[j : j + n_bins]
+            met = mass[j : j + n_bins]
             for d in range(n_bins):
                 here[d] += met[d]
