@@ -12,7 +12,7 @@ KERNELS := blocks fit more_estimators posterior reductions refinement simulate s
 # Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform tuning calibration fit results field large fuzz attack wheel clean
+.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform neighbours tuning calibration fit results field large fuzz attack wheel clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z0-9]*\):.* ## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -57,6 +57,9 @@ table2: $(VENV)/.app ## the paper's Table 2 beside ours
 uniform: $(VENV)/.app ## every method on random and smooth depths over the gate
 	$(BIN)/python -m core uniform
 
+neighbours: $(VENV)/.app ## what neighbouring pixels add, inside surfaces and at edges
+	$(BIN)/python -m core neighbours
+
 tuning: $(VENV)/.app ## the same search for the settings of every method
 	$(BIN)/python -m core tuning
 
@@ -69,6 +72,7 @@ fit: $(VENV)/.app ## are confidences right, or marked, where the model does not 
 results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core paper --repetitions 100 --results assets/results/paper.md
 	$(BIN)/python -m core uniform --results assets/results/uniform.md
+	$(BIN)/python -m core neighbours --results assets/results/neighbours.md
 	$(BIN)/python -m core tuning --results assets/results/tuning.md
 	$(BIN)/python -m core calibration --only confidence ranges --results assets/results/calibration.md
 	$(BIN)/python -m core calibration --only fluxes --captures 40 --results assets/results/fluxes.md

@@ -95,6 +95,7 @@ _RATES = {
     "shi": _Rates(40e-9),
     "chi": _Rates(60e-9, 1e-6, 170.0, 40e6),
     "unmixing": _Rates(200e-9, 5e-6, 300.0, 130e6, finds_delay=True),
+    "image_posterior": _Rates(80e-9, 20e-6, 500.0, 60e6, finds_delay=True),
     "likelihood": _Rates(0.0, 0.3e-6, 40.0, finds_delay=True),
     "oracle": _Rates(0.0, 0.3e-6, 60.0, finds_delay=True),
 }
@@ -132,7 +133,7 @@ def predicted(
     n_sampled = min(n_pixels, SAMPLE)
     entry_s = _ENTRY_S + _TAP_S * n_taps
     steps = 0
-    if rates.finds_delay and method != "unmixing":
+    if method in ("likelihood", "oracle"):
         steps = 2 if settings is None else settings.steps_per_bin
 
     n_bytes = _FIXED_BYTES + rates.fixed_bytes * min(1.0, n_counts / 1e6)

@@ -11,7 +11,7 @@ from typing import Any
 from core.cli.options import add_processes, show_progress, whole_from_to
 from core.cli.results import CheckFailed, add_results, publish
 from core.io.readers import read_capture
-from core.studies.methods import alarms, calibration, field, fit, tuning, uniform
+from core.studies.methods import alarms, calibration, field, fit, neighbours, tuning, uniform
 from core.studies.outputs import Table, as_markdown
 from core.studies.paper import figures as paper
 from core.studies.paper import page, recommend
@@ -38,6 +38,12 @@ def add(commands: Any) -> None:
 
     command = _added(commands, "uniform", "range random and smooth depths over the gate", _uniform)
     _add_count(command, "--seeds", 2, MAX_SEEDS, 24)
+    add_processes(command)
+
+    command = _added(
+        commands, "neighbours", "compare methods that use neighbouring pixels", _neighbours
+    )
+    _add_count(command, "--seeds", 2, MAX_SEEDS, 10)
     add_processes(command)
 
     command = _added(commands, "tuning", "search the settings of every method alike", _tuning)
@@ -128,6 +134,10 @@ def _table2(chosen: argparse.Namespace) -> None:
 
 def _uniform(chosen: argparse.Namespace) -> None:
     publish(uniform.tables(_trials(uniform.PLAN, chosen.seeds, chosen)), chosen)
+
+
+def _neighbours(chosen: argparse.Namespace) -> None:
+    publish(neighbours.tables(range(chosen.seeds), chosen.processes), chosen)
 
 
 def _tuning(chosen: argparse.Namespace) -> None:

@@ -13,6 +13,7 @@ from core.estimators import (
     cfar,
     chi,
     coates,
+    image_posterior,
     kde,
     likelihood,
     log_matched_filter,
@@ -48,6 +49,7 @@ ESTIMATORS: dict[str, Estimator] = {
     "cfar": cfar.ESTIMATOR,
     "unmixing": unmixing.ESTIMATOR,
     "likelihood": likelihood.ESTIMATOR,
+    "image_posterior": image_posterior.ESTIMATOR,
     "oracle": oracle.ESTIMATOR,
 }
 

@@ -111,7 +111,8 @@ class RangeImage:
     confidence : ndarray of float
         Posterior probability of a surface within 3 bins of the estimate, from the exact
         first-photon likelihood and the fluxes estimated from the capture
-        (`core.inference.posterior`). It is calibrated for every estimator: of pixels with
+        (`core.inference.posterior`); of the method "image_posterior", from its own, which includes
+        the neighbours. It is calibrated for every estimator: of pixels with
         confidence 0.9, nine in ten are right, unless the remark of `made_by` says that the model
         does not fit (`core.inference.fit`). 0 where `valid` is False.
     valid : ndarray of bool
@@ -254,6 +255,9 @@ class Estimator:
     refine : callable, optional
         ``(capture, flux_model, delay_bin, parameters) -> delay_bin``, each of shape (row, col): a
         finer search in the neighbourhood of a delay that is corrected for the lag.
+    confidence : callable, optional
+        ``(capture, flux_model, delay_bin, parameters) -> probability``, likewise: the confidence by
+        a posterior of the estimator's own instead of `core.inference.posterior`.
     """
 
     title: str
@@ -270,6 +274,7 @@ class Estimator:
     omits: Callable[[Capture], str] = lambda _: ""
     whole_image: bool = False
     refine: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
+    confidence: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
 
     light = renamed("flux_model")
     reach = renamed("window_size")
@@ -324,11 +329,15 @@ class Estimator:
     def ranged(self, capture: Capture, parameters: Any, calibration: Calibration) -> RangeImage:
         """Estimate the range of every pixel of a capture, or of a part of the calibrated one."""
         bins, score = self._delays(capture, parameters, calibration)
+        if self.confidence is None:
+            confidence = tolerance_probability(capture, bins)
+        else:
+            confidence = self.confidence(capture, self.flux_model(capture), bins, parameters)
         return RangeImage(
             range_m=capture.acquisition.bin_to_range_m(bins),
             bin=bins,
             score=score,
-            confidence=tolerance_probability(capture, bins),
+            confidence=confidence,
             valid=np.isfinite(bins),
         )
 

@@ -54,7 +54,12 @@ _TINY = 1e-30  # likelihood of a level relative to the likeliest, whose logarith
 @cached_per_capture
 def flux_model_of(capture: Capture) -> FluxModel:
     """Estimate signal levels, their shares, and the background of each pixel of a capture."""
-    return flux_prior_of(capture).model(_totals(capture)[0], _least_background(capture))
+    return flux_model_with(capture, flux_prior_of(capture))
+
+
+def flux_model_with(capture: Capture, flux_prior: FluxPrior) -> FluxModel:
+    """Return the flux model of a capture with flux parameters from elsewhere."""
+    return flux_prior.model(_totals(capture)[0], _least_background(capture))
 
 
 @cached_per_capture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -10,6 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
+
+
+class Agreement(NamedTuple):
+    """How neighbouring pixels of an image resemble each other (`core.estimators.image_model`)."""
+
+    gain: float
+    """Mean log likelihood ratio of two neighbours with a common surface to two without."""
+    alike: float
+    """Share of neighbouring pixels on one surface; 0 if neighbours tell nothing."""
+    scale_bins: float
+    """Scale of the Laplace density of their difference in delay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +43,8 @@ class FluxModel:
         Whether the pulses resolve that early photons hide later ones.
     background_shape : ndarray, shape (bin,), optional
         Background of each bin relative to its mean over the gate; None if it is uniform.
+    agreement : Agreement, optional
+        How neighbouring pixels resemble each other; None if not estimated.
     """
 
     signal: Floats
@@ -41,6 +54,7 @@ class FluxModel:
     image_contrast: float | None = None
     pile_up: bool = True
     background_shape: Floats | None = None
+    agreement: Agreement | None = None
 
     @cached_property
     def typical_signal(self) -> Floats:
@@ -69,14 +83,11 @@ class FluxModel:
     def of_pixels(self, pixels: NDArray[np.intp]) -> FluxModel:
         """Return the fluxes of some pixels, given as flat indices of shape (row, col)."""
         flat = (len(self.share), -1)
-        return FluxModel(
-            self.signal.reshape(flat)[:, pixels],
-            self.background.reshape(flat)[:, pixels],
-            self.share,
-            self.depth,
-            self.contrast,
-            self.pile_up,
-            self.background_shape,
+        return replace(
+            self,
+            signal=self.signal.reshape(flat)[:, pixels],
+            background=self.background.reshape(flat)[:, pixels],
+            image_contrast=self.contrast,
         )
 
 

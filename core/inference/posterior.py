@@ -27,7 +27,7 @@ from core.inference.likelihood import (
     pixels_of,
     prepared_groups,
 )
-from core.kernels.confidence import fill_masses
+from core.kernels.confidence import fill_masses, fill_states
 from core.kernels.parallel import entering
 
 TOLERANCE_BINS = 3
@@ -86,6 +86,36 @@ def _masses(
     return within.reshape(-1, n_windows)[:n_pixels], surface.ravel()[:n_pixels]
 
 
+class States(NamedTuple):
+    """Probability of each state of pixels, of shape (pixel, ...) or (row, col, ...)."""
+
+    surface: NDArray[np.float32]
+    """Of a surface in each bin, shape (..., bin)."""
+    nothing: NDArray[np.float32]
+    """Of none, shape (...)."""
+
+
+def states_of(prepared: LikelihoodInput, none: float, least: float) -> States:
+    """Return the probabilities of the states of pixels by themselves.
+
+    Parameters
+    ----------
+    prepared : LikelihoodInput
+        With one delay per bin.
+    none : float
+        Prior probability of nothing.
+    least : float
+        Lower bound of the probability of a bin.
+    """
+    _, n_blocks, lanes = prepared.signal.shape
+    surface = np.empty((n_blocks, lanes, prepared.depth.size), np.float32)
+    nothing = np.empty((n_blocks, lanes), np.float32)
+    with entering(prepared.n_counts):
+        fill_states(prepared, none, np.float32(least), surface, nothing)
+    pixels = slice(prepared.n_pixels)
+    return States(surface.reshape(-1, surface.shape[2])[pixels], nothing.ravel()[pixels])
+
+
 def has_posterior(capture: Capture) -> bool:
     """Return whether `posterior_of` has been computed."""
     return posterior_of.is_cached(capture)
@@ -121,6 +151,14 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
         some = slice(begin, begin + NUMBERS_AT_ONCE)
         found[some] = _interpolated(bins.ravel()[some], below[some], ends[some])
     return found.reshape(bins.shape)
+
+
+def probability_at(table: NDArray[np.float32], bins: Floats) -> Floats:
+    """Interpolate a `Posterior.tolerance_probability` at a delay (row, col) of each pixel."""
+    last = table.shape[2] - 1
+    below = _bin_below(bins.ravel(), last)
+    ends = np.take_along_axis(table.reshape(-1, last + 1), _both(below, last), axis=1)
+    return _interpolated(bins.ravel(), below, ends).reshape(bins.shape)
 
 
 def tolerance_probability_at(capture: Capture, row: int, col: int, bins: Floats) -> Floats:

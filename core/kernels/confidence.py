@@ -207,3 +207,30 @@ def fill_masses(prepared, half, first, mass, surface):  # type: ignore[no-untype
             share = np.float32(surface[b, i] / total[i])
             for j in range(mass.shape[2]):
                 mass[b, i, j] = share * window[first[b, i] + j, i]
+
+
+@njit(**PARALLEL)
+def fill_states(prepared, none, least, surface, nothing):  # type: ignore[no-untyped-def]
+    """Fill the probability of a surface at each delay, and of nothing, of pixels by themselves.
+
+    `none` is the prior of nothing, and no probability of a delay is below `least`. `surface` is of
+    shape (block, lane, delay) and `nothing` (block, lane).
+    """
+    n_blocks, lanes, n_delays = surface.shape
+    n_steps, n_bins = len(prepared.echo), prepared.counts.shape[1]
+    for b in prange(n_blocks):
+        density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+        ratio = lane_rows(n_delays, lanes).reshape(1, n_steps, n_bins, lanes)
+        top, total = np.empty(lanes), np.zeros(lanes)
+        _fill_density(b, prepared, ratio, np.empty((1, lanes)), density, top)
+        for d in range(n_delays):
+            for i in range(lanes):
+                total[i] += density[d, i]
+        for i in range(lanes):
+            unit = max(top[i], 0.0)  # so that neither overflows
+            seen, unseen = math.exp(top[i] - unit) / n_delays, none * math.exp(-unit)
+            every = seen * total[i] + unseen
+            nothing[b, i] = unseen / every
+            share = np.float32(seen / every)
+            for d in range(n_delays):
+                surface[b, i, d] = max(share * density[d, i], least)

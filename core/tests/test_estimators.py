@@ -35,7 +35,8 @@ every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 every_estimator = pytest.mark.parametrize("method", ESTIMATORS)
 # Methods that use single pixels; methods that are invariant to a factor on all counts.
 single_pixel = pytest.mark.parametrize(
-    "method", [name for name in ESTIMATORS if name not in ("kde", "chi", "unmixing")]
+    "method",
+    [name for name in ESTIMATORS if name not in ("kde", "chi", "unmixing", "image_posterior")],
 )
 scale_free = pytest.mark.parametrize(
     "case",

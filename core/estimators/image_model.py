@@ -1,0 +1,185 @@
+"""Flux and smoothness of an image: what its pixels share, as neighbours show it.
+
+At a low SBR single pixels hardly tell an echo from none, and the signal level estimated from them
+collapses. Neighbouring pixels that see one surface are as one pixel with more pulses. The levels
+are therefore estimated with 1 x 1 to 4 x 4 pixels added, and those are kept that make neighbours
+agree most. With the posteriors q of two pixels by themselves, the prior p and a Laplace density K
+of scale a, the pair is ::
+
+    c = Σ q(d) K(d - d') q'(d') / p(d')
+
+times as likely with one surface as with two. ``mean log (1 - ρ + ρ c)`` over pairs of neighbours is
+maximised over ρ and a; the same maximum of pairs at random, which see two surfaces, is subtracted.
+If nothing remains, neighbours tell nothing of each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import MOST_PULSES, Floats
+from core.capture import Capture, cached_per_capture
+from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_model_with
+from core.inference.flux_model import Agreement, FluxModel, FluxPrior
+from core.inference.likelihood import prepare, prepared_groups
+from core.inference.posterior import States, states_of
+from core.reductions import merge_bins, pool_pixels
+
+_SIDES = (1, 2, 3, 4)  # of the tiles whose pixels are added
+FEWEST_PIXELS = 64
+"""Pixels, or tiles, from which distributions are learned."""
+
+_MOST_COUNT = 2**32 // max(_SIDES) ** 2
+_PAIRS = 1024  # pixels whose right and lower neighbours are compared
+_SCALES_BINS = (0.3, 0.6, 1.2, 2.4)
+_SHARES = np.linspace(0.0, 0.95, 39)
+_SURE = 3.0  # standard errors
+_ECHO_BINS = 4  # merged bins of an echo; more tell nothing new
+_LEAST_SHARE, _LEAST_DEPTH = 1e-6, 1e-3  # of the pixels; relative to a uniform prior
+_LEAST_EVIDENCE = 1e-20  # so that no product of messages is subnormal
+_APART = Agreement(0.0, 0.0, 1.0)
+
+
+@cached_per_capture
+def image_model_of(capture: Capture) -> FluxModel:
+    """Estimate flux and smoothness of a capture from its pixels and their neighbours."""
+    found, best = flux_model_of(capture), _APART
+    merged, factor = merged_bins(capture)
+    for prior in _flux_priors(capture):
+        flux = flux_model_with(capture, prior)
+        here = _agreement(merged, merged_flux(flux, factor))
+        if here.gain > best.gain:
+            found, best = flux, here
+    return replace(found, agreement=best)
+
+
+def merged_bins(capture: Capture) -> tuple[Capture, int]:
+    """Merge bins that are much shorter than an echo; return the capture and the bins in one."""
+    factor = max(1, min(capture.echo_bins // _ECHO_BINS, capture.acquisition.n_bins))
+    return (capture, 1) if factor == 1 else (merge_bins(capture, factor), factor)
+
+
+def merged_flux(flux: FluxModel, factor: int) -> FluxModel:
+    """Return a flux model after merging bins; the rest at the end of the gate is left out."""
+    if factor == 1:
+        return flux
+    shape = flux.background_shape
+
+    def merged(values: Floats) -> Floats:
+        kept = values.size // factor * factor
+        found = values[:kept].reshape(-1, factor).mean(axis=1)
+        return np.asarray(found / found.mean())
+
+    return replace(
+        flux,
+        depth=merged(flux.depth),
+        background_shape=None if shape is None else merged(shape),
+    )
+
+
+def _flux_priors(capture: Capture) -> Iterator[FluxPrior]:
+    """Yield the flux prior of the pixels, and of tiles of pixels, per pixel."""
+    if capture.flux_prior is not None:
+        yield capture.flux_prior
+        return
+    own = detailed_flux_prior_of(capture)
+    yield own
+    n_pulses, is_first = capture.acquisition.n_pulses or 1, capture.gated_pulses is not None
+    for side in _SIDES[1:]:
+        tiles = math.prod(size // side for size in capture.shape)
+        fits = int(capture.cube.max()) < _MOST_COUNT and n_pulses * side**2 <= MOST_PULSES
+        if tiles < FEWEST_PIXELS or not fits:
+            return
+        pooled = detailed_flux_prior_of(pool_pixels(capture, side))
+        each = 1 if is_first else side**2  # counts of a pixel, or photons per pulse
+        yield pooled._replace(
+            levels=pooled.levels / each,
+            background=pooled.background / each,
+            own_weight=own.own_weight,
+        )
+
+
+def _agreement(capture: Capture, flux: FluxModel) -> Agreement:
+    """Find how much alike neighbours are under a flux model."""
+    rows, cols = capture.shape
+    if min(rows, cols) < 2 or rows * cols < FEWEST_PIXELS:
+        return _APART
+    at = np.random.default_rng(0).permutation((rows - 1) * (cols - 1))[:_PAIRS]
+    one = at // (cols - 1) * cols + at % (cols - 1)
+    pixels = np.concatenate([one, one + 1, one + cols])
+    cube = capture.cube.reshape(-1, capture.cube.shape[2])[pixels][np.newaxis]
+    prepared = prepare(capture, cube, flux.of_pixels(pixels[np.newaxis]), 1)
+    prior = Prior.of(flux)
+    found = states_of(prepared, prior.nothing, _LEAST_EVIDENCE)
+    q = found.surface.reshape(3, one.size, -1).astype(float)
+    dark = found.nothing.reshape(3, one.size).astype(float)
+    best, chance = _APART, 0.0
+    apart = np.roll(np.arange(one.size), one.size // 2)  # pixels are in random order
+    for scale in _SCALES_BINS:
+        smooth = _smoothed(q[0], laplace(scale)) / prior.surface
+
+        def alike(others: NDArray[np.intp], smooth: Floats = smooth) -> Floats:
+            ratio = [
+                np.vecdot(smooth, q[i, others]) + dark[0] * dark[i, others] / prior.nothing
+                for i in (1, 2)
+            ]
+            return np.asarray(np.log1p(_SHARES[:, np.newaxis] * (np.concatenate(ratio) - 1)))
+
+        gain = alike(np.arange(one.size))
+        chance = max(chance, float(alike(apart).mean(axis=1).max()))
+        k = int(gain.mean(axis=1).argmax())
+        mean, error = float(gain[k].mean()), float(gain[k].std()) / math.sqrt(gain.shape[1])
+        if mean > max(best.gain, _SURE * error):
+            best = Agreement(mean, float(_SHARES[k]), scale)
+    left = best.gain - chance
+    return best._replace(gain=left) if left > 0.5 * best.gain else _APART
+
+
+class Prior(NamedTuple):
+    """Prior of the states of a pixel."""
+
+    surface: Floats
+    """Of a surface in each bin, shape (bin,)."""
+    nothing: float
+
+    @classmethod
+    def of(cls, flux: FluxModel) -> Prior:
+        """Return the prior of a flux model; no state is impossible."""
+        nothing = min(max(float(flux.share[0]), _LEAST_SHARE), 1 - _LEAST_SHARE)
+        depth = np.maximum(flux.depth, _LEAST_DEPTH) / flux.depth.size
+        return cls((1 - nothing) * depth, nothing)
+
+
+def states_of_image(capture: Capture, flux: FluxModel) -> States:
+    """Return the probabilities of the states of each pixel by itself, of shape (row, col, ...)."""
+    (rows, cols), none = capture.shape, Prior.of(flux).nothing
+    surface = np.empty((rows * cols, capture.cube.shape[2]), np.float32)
+    nothing = np.empty(rows * cols, np.float32)
+    for pixels, prepared in prepared_groups(capture, flux, 1):
+        surface[pixels], nothing[pixels] = states_of(prepared, none, _LEAST_EVIDENCE)
+    return States(surface.reshape(rows, cols, -1), nothing.reshape(rows, cols))
+
+
+def laplace(scale_bins: float) -> Floats:
+    """Kernel of a Laplace density at whole bins, normalised, of odd size."""
+    half = min(max(1, math.ceil(7 * scale_bins)), 16)
+    kernel = np.exp(-np.abs(np.arange(-half, half + 1)) / scale_bins)
+    return np.asarray(kernel / kernel.sum())
+
+
+def _smoothed(values: Floats, kernel: Floats) -> Floats:
+    """Correlate (pixel, bin) with a symmetric kernel, with zeros beyond the gate."""
+    n_bins, half = values.shape[1], kernel.size // 2
+    sums = np.zeros_like(values)
+    for j, tap in enumerate(kernel):
+        shift = j - half
+        begin, end = max(0, -shift), min(n_bins, n_bins - shift)
+        if begin < end:
+            sums[:, begin:end] += tap * values[:, begin + shift : end + shift]
+    return sums

@@ -1,0 +1,211 @@
+"""Posterior of the image: the exact likelihood of each pixel, and what its neighbours say.
+
+Neighbouring pixels mostly see the same surface, so that at an SBR at which single pixels are
+ambiguous their common evidence is not. The delay of a pixel is a hidden variable; of two
+neighbours, the second lies with probability ρ on the plane of the first, and anywhere otherwise.
+
+**Evidence.** The likelihood ratio of each delay, averaged over the signal levels, which are
+estimated from pooled pixels (`core.estimators.image_model`).
+
+**Messages.** A posterior of each pixel given the others of its row, then of each given all rows by
+the same along the columns: sum-product messages (`core.kernels.messages`), in which each other
+pixel counts once.
+
+**Planes.** Where the surface is oblique or slopes, its pixels do not share a delay but a plane. A
+plane is fitted around each pixel, robust to other surfaces (`core.kernels.planes`), and the
+messages are repeated along it with a narrower kernel, starting again from the evidence, twice.
+
+If pairs of neighbours agree no more than pairs at random, each pixel is estimated by itself, by the
+likelihood with the depths of the image as their prior.
+
+Bins much shorter than an echo are merged first. Confidence is the mass of this posterior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.acquisition import Floats
+from core.capture import Capture, cached_per_capture
+from core.estimators.base import Estimator
+from core.estimators.image_model import (
+    FEWEST_PIXELS,
+    Prior,
+    image_model_of,
+    laplace,
+    merged_bins,
+    merged_flux,
+    states_of_image,
+)
+from core.estimators.likelihood import Depths, LikelihoodParameters, curve
+from core.estimators.likelihood import locate as locate_alone
+from core.inference.flux_model import FluxModel
+from core.inference.posterior import (
+    TOLERANCE_BINS,
+    States,
+    probability_at,
+    tolerance_probability,
+)
+from core.kernels.blocks import LANES
+from core.kernels.messages import fill_peaks, fill_posterior, fill_windows
+from core.kernels.parallel import entering
+from core.kernels.planes import fill_planes
+from core.parameters import Choice, Settings, parameter
+
+_ROUNDS = 3
+_LEAST_ODDS = 1e-12
+_ALONG_PLANES = 0.85, 0.15  # ρ and the scale of K in bins
+_HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
+
+Pixels = Literal["every pixel is answered", "a pixel may see nothing"]
+
+
+@dataclass(frozen=True)
+class ImageParameters(Settings):
+    """Settings of the image posterior."""
+
+    pixels: Pixels = parameter(
+        "every pixel is answered",
+        Choice("Pixels", ("every pixel is answered", "a pixel may see nothing")),
+        "Whether each pixel with a detection gets its likeliest range, or only those in which a "
+        "surface is likelier than nothing.",
+    )
+
+
+class Link(NamedTuple):
+    """Relation of two neighbours, for `core.kernels.messages`."""
+
+    kernel: NDArray[np.float32]
+    """K, shape (tap,)."""
+    share: np.float32
+    """ρ."""
+    per_prior: NDArray[np.float32]
+    """1 / p(d), shape (bin,)."""
+    per_nothing: np.float32
+    """1 / p(nothing)."""
+
+    @classmethod
+    def of(cls, alike: float, scale_bins: float, prior: Prior) -> Link:
+        """Return the relation for ρ, the scale of K and a prior."""
+        return cls(
+            laplace(scale_bins).astype(np.float32),
+            np.float32(alike),
+            (1 / prior.surface).astype(np.float32),
+            np.float32(1 / prior.nothing),
+        )
+
+
+class ImagePosterior(NamedTuple):
+    """Posterior of each pixel, given the whole image."""
+
+    delay: Floats
+    """Likeliest delay in bins, shape (row, col)."""
+    tolerance_probability: NDArray[np.float32]
+    """As in `core.inference.posterior.Posterior`."""
+    surface: Floats
+    """Likewise."""
+
+
+@cached_per_capture
+def image_posterior_of(capture: Capture, flux: FluxModel) -> ImagePosterior:
+    """Compute the posterior of an image with the flux model of `image_model_of`."""
+    merged, factor = merged_bins(capture)
+    *_, posterior = posteriors(merged, merged_flux(flux, factor))
+    delay, _ = peaks(posterior.surface)
+    surface = 1.0 - posterior.nothing.astype(float)
+    window = _windows(posterior.surface, factor, capture.acquisition.n_bins)
+    return ImagePosterior(delay * factor, window, surface)
+
+
+def posteriors(capture: Capture, flux: FluxModel) -> Iterator[States]:
+    """Yield the posterior of each round, in the memory of the one before."""
+    alone, prior, agreement = states_of_image(capture, flux), Prior.of(flux), flux.agreement
+    assert agreement is not None
+    by_rows, by_both = (States(*map(np.empty_like, alone)) for _ in range(2))
+    links = Link.of(agreement.alike, agreement.scale_bins, prior), Link.of(*_ALONG_PLANES, prior)
+    per_row, per_col = np.zeros((2, *capture.shape), np.float32)
+    for k in range(_ROUNDS):
+        link = links[min(k, 1)]
+        with entering(alone.surface.size):
+            fill_posterior(*alone, per_col, True, link, *by_rows)
+            fill_posterior(*by_rows, per_row, False, link, *by_both)
+        yield by_both
+        if k < _ROUNDS - 1:
+            _, per_row, per_col = np.ascontiguousarray(planes(*peaks(by_both.surface)))
+
+
+def _windows(posterior: NDArray[np.float32], factor: int, n_bins: int) -> NDArray[np.float32]:
+    """Probability within the tolerance of each bin (row, col, bin) of merged bins."""
+    merged = posterior.reshape(-1, posterior.shape[2])
+    window = np.empty((len(merged), n_bins), np.float32)
+    with entering(window.size):
+        fill_windows(merged, factor, TOLERANCE_BINS, window)
+    return window.reshape(*posterior.shape[:2], n_bins)
+
+
+def peaks(posterior: NDArray[np.float32]) -> tuple[Floats, Floats]:
+    """Likeliest delay of each pixel in bins and the probability of the bins around it."""
+    delay, weight = np.empty((2, *posterior.shape[:2]))
+    with entering(posterior.size):
+        fill_peaks(posterior.reshape(-1, posterior.shape[2]), delay.ravel(), weight.ravel())
+    return delay, weight
+
+
+def planes(delay: Floats, weight: Floats) -> NDArray[np.float32]:
+    """Fit a plane around each pixel: delay, change per row and change per column (3, row, col)."""
+    (rows, cols), margin = delay.shape, (_HALF, _HALF)
+    beyond = -cols % LANES
+    wide = [
+        np.pad(each.astype(np.float32), (margin, (_HALF, _HALF + beyond)))
+        for each in (delay, weight)
+    ]
+    plane = np.empty((3, rows, cols + beyond), np.float32)
+    with entering(delay.size * (2 * _HALF + 1) ** 2):
+        fill_planes(*wide, _HALF, plane)
+    return plane[:, :, :cols]
+
+
+def _locate(
+    capture: Capture, flux: FluxModel, parameters: ImageParameters
+) -> tuple[Floats, Floats]:
+    """Return the likeliest delay and the log odds of a surface."""
+    if not _has_neighbours(flux):
+        depths: Depths = "learned" if capture.counts.size >= FEWEST_PIXELS else "alike"
+        return locate_alone(capture, flux, LikelihoodParameters(depths=depths))
+    found = image_posterior_of(capture, flux)
+    surface = np.clip(found.surface, _LEAST_ODDS, 1 - _LEAST_ODDS)
+    delay = found.delay
+    if parameters.pixels == "a pixel may see nothing":
+        delay = np.where(surface >= 0.5, delay, np.nan)
+    return delay, np.log(surface / (1 - surface))
+
+
+def _confidence(
+    capture: Capture, flux: FluxModel, delay_bin: Floats, parameters: ImageParameters
+) -> Floats:
+    if not _has_neighbours(flux):
+        return tolerance_probability(capture, delay_bin)
+    found = image_posterior_of(capture, flux)
+    return probability_at(found.tolerance_probability, delay_bin)
+
+
+def _has_neighbours(flux: FluxModel) -> bool:
+    return flux.agreement is not None and flux.agreement.alike > 0
+
+
+ESTIMATOR = Estimator(
+    "Image posterior",
+    ImageParameters,
+    curve,
+    _locate,
+    finds_delay=True,
+    flux_model=image_model_of,
+    undoes_pile_up=True,
+    whole_image=True,
+    confidence=_confidence,
+)

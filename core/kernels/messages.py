@@ -1,0 +1,178 @@
+"""Kernels of messages between neighbouring pixels, along the rows or the columns of an image.
+
+The state of a pixel is the bin of its surface, or "nothing". Of two neighbours, the second is with
+probability ρ on the plane of the first, and otherwise independent of it, distributed as the prior
+p. The message of a pixel with weights h(d), which sum to 1, is therefore ::
+
+    m(d') = 1 - ρ + ρ / p(d') Σ_d K(d' - d - g) h(d)
+
+with the slope g of the plane and a narrow kernel K; after "nothing" follows "nothing". Messages are
+relative to the prior: a message of 1 leaves a pixel as it is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from core.kernels.parallel import COMPILED, PARALLEL, SUMMING
+
+MOST_TAPS = 33
+"""Taps of the kernel K, at most."""
+
+STEEPEST = 24.0
+"""Largest slope in bins per pixel; steeper planes are taken for such."""
+
+_MARGIN = int(STEEPEST) + MOST_TAPS  # bins on either side of the gate that a message may read
+
+
+@njit(**SUMMING)
+def _weigh(evidence, message, weights):  # type: ignore[no-untyped-def]
+    """Fill `weights` (bin,) with a pixel's evidence times the message to it; return the sum."""
+    total = np.float32(0.0)
+    for d in range(weights.size):
+        weights[d] = evidence[d] * message[d]
+        total += weights[d]
+    return total
+
+
+@njit(**COMPILED)
+def _pass_on(weights, nothing, total, slope, link, taps, sums, message):  # type: ignore[no-untyped-def]
+    """Fill `message` (bin,) with ``m(d')``; return the message about nothing.
+
+    `weights` (margin + bin + margin,), 0 in the margins, and `nothing` sum to `total`. `taps` and
+    `sums` are scratch memory.
+    """
+    n_bins, n_taps = message.size, link.kernel.size
+    bounded = min(max(slope, -STEEPEST), STEEPEST)
+    whole = math.floor(bounded)
+    part = np.float32(bounded - whole)
+    # A kernel at a fraction of a bin is interpolated.
+    taps[0], taps[n_taps] = (1 - part) * link.kernel[0], part * link.kernel[n_taps - 1]
+    for j in range(1, n_taps):
+        taps[j] = (1 - part) * link.kernel[j] + part * link.kernel[j - 1]
+    sums[:] = 0.0
+    for j in range(n_taps + 1):
+        first = _MARGIN - whole + n_taps // 2 - j
+        met, tap = weights[first : first + n_bins], taps[j]
+        for d in range(n_bins):
+            sums[d] += tap * met[d]
+    leak, gain = np.float32(1.0) - link.share, link.share / total
+    for d in range(n_bins):
+        message[d] = leak + gain * link.per_prior[d] * sums[d]
+    return leak + gain * link.per_nothing * nothing
+
+
+@njit(**SUMMING)
+def _multiply(evidence, message, posterior):  # type: ignore[no-untyped-def]
+    """Multiply `posterior`, the message from the other side, by evidence and message.
+
+    All of shape (bin,). Returns the sum.
+    """
+    total = np.float32(0.0)
+    for d in range(posterior.size):
+        posterior[d] *= evidence[d] * message[d]
+        total += posterior[d]
+    return total
+
+
+@njit(**PARALLEL)
+def fill_posterior(evidence, nothing, slope, along_rows, link, posterior, posterior_nothing):  # type: ignore[no-untyped-def]
+    """Fill the posteriors of the pixels of each row (or column), given the other pixels of it.
+
+    Exact, by messages forward and backward.
+
+    Parameters
+    ----------
+    evidence : ndarray, shape (row, col, bin)
+        Evidence of each pixel, prior included.
+    nothing : ndarray, shape (row, col)
+        Evidence of nothing.
+    slope : ndarray, shape (row, col)
+        Bins per pixel in the direction of the messages.
+    along_rows : bool
+    link : core.estimators.image_posterior.Link
+    posterior : ndarray, shape (row, col, bin)
+    posterior_nothing : ndarray, shape (row, col)
+        Together 1 in each pixel.
+    """
+    rows, cols, n_bins = evidence.shape
+    n_lines, length = (rows, cols) if along_rows else (cols, rows)
+    line_step, step = (cols, 1) if along_rows else (1, cols)
+    seen, found = evidence.reshape(-1, n_bins), posterior.reshape(-1, n_bins)
+    dark, found_dark, slopes = nothing.reshape(-1), posterior_nothing.reshape(-1), slope.reshape(-1)
+    for line in prange(n_lines):
+        weights = np.zeros(n_bins + 2 * _MARGIN, np.float32)
+        inner = weights[_MARGIN : _MARGIN + n_bins]
+        message, sums = np.ones(n_bins, np.float32), np.empty(n_bins, np.float32)
+        taps = np.empty(link.kernel.size + 1, np.float32)
+        on_nothing = np.float32(1.0)
+        for i in range(length):
+            at = line * line_step + i * step
+            found[at] = message
+            found_dark[at] = on_nothing
+            h = dark[at] * on_nothing
+            total = _weigh(seen[at], message, inner) + h
+            on_nothing = _pass_on(weights, h, total, slopes[at], link, taps, sums, message)
+        message[:] = 1.0
+        on_nothing = np.float32(1.0)
+        for i in range(length - 1, -1, -1):
+            at = line * line_step + i * step
+            h = dark[at] * on_nothing
+            found_dark[at] *= h
+            per_total = 1 / (_multiply(seen[at], message, found[at]) + found_dark[at])
+            found_dark[at] *= per_total
+            here = found[at]
+            for d in range(n_bins):
+                here[d] *= per_total
+            total = _weigh(seen[at], message, inner) + h
+            on_nothing = _pass_on(weights, h, total, -slopes[at], link, taps, sums, message)
+
+
+@njit(**PARALLEL)
+def fill_peaks(posterior, delay, weight):  # type: ignore[no-untyped-def]
+    """Fill the likeliest `delay` of each pixel in bins, refined by a parabola, and its `weight`.
+
+    The weight is the probability of a bin or two around it. `posterior` is of shape (pixel, bin),
+    `delay` and `weight` (pixel,).
+    """
+    n_pixels, n_bins = posterior.shape
+    for i in prange(n_pixels):
+        here = posterior[i]
+        best = 0
+        for d in range(1, n_bins):
+            best = d if here[d] > here[best] else best
+        shift, mass = 0.0, here[best]
+        if 0 < best < n_bins - 1:
+            mass += here[best - 1] + here[best + 1]
+            left, middle, right = (
+                math.log(max(here[best - 1], 1e-30)),
+                math.log(max(here[best], 1e-30)),
+                math.log(max(here[best + 1], 1e-30)),
+            )
+            curvature = min(left - 2 * middle + right, -1e-9)
+            shift = min(max(0.5 * (left - right) / curvature, -0.5), 0.5)
+        delay[i] = best + 0.5 + shift
+        weight[i] = mass
+
+
+@njit(**PARALLEL)
+def fill_windows(posterior, factor, half, window):  # type: ignore[no-untyped-def]
+    """Fill `window` with the mass of `half` bins on either side of the beginning of each bin.
+
+    `posterior` (pixel, merged bin) is of `factor` bins each, which share it alike, and `window` is
+    of shape (pixel, bin).
+    """
+    n_pixels, n_bins = window.shape
+    for i in prange(n_pixels):
+        mass = np.zeros(n_bins + 2 * half, np.float32)
+        for d in range(posterior.shape[1] * factor):
+            mass[half + d] = posterior[i, d // factor] / np.float32(factor)
+        here = window[i]
+        here[:] = 0.0
+        for j in range(2 * half):
+            met = mass[j : j + n_bins]
+            for d in range(n_bins):
+                here[d] += met[d]

@@ -1,0 +1,95 @@
+"""Tests of the image posterior: messages, planes, and what neighbours add to an estimate."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from core.estimators import estimate
+from core.estimators.image_model import laplace
+from core.estimators.image_posterior import Link, planes
+from core.kernels.messages import fill_posterior
+from core.metrics import restoration_degree
+from core.studies.trials import Condition
+from core.tests.twins import posterior_of_chain
+
+ALIKE, SCALE = 0.7, 0.4
+
+
+def link(n_bins: int, nothing: float) -> Link:
+    prior = np.full(n_bins, (1 - nothing) / n_bins)
+    return Link(
+        laplace(SCALE).astype(np.float32),
+        np.float32(ALIKE),
+        (1 / prior).astype(np.float32),
+        np.float32(1 / nothing),
+    )
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.75, -1.5])
+@pytest.mark.parametrize("along_rows", [True, False])
+def test_messages_give_the_exact_posterior_of_a_row(slope: float, along_rows: bool) -> None:
+    rng, n_bins, nothing = np.random.default_rng(0), 6, 0.2
+    weights = rng.exponential(size=(4, n_bins + 1)).astype(np.float32)
+    weights[0, 2] = 1e-18  # nearly excluded
+    shape = (1, 4) if along_rows else (4, 1)
+    surface = weights[:, :n_bins].reshape(*shape, n_bins).copy()
+    dark = weights[:, n_bins].reshape(shape).copy()
+    found, found_dark = np.empty_like(surface), np.empty_like(dark)
+    slopes, of = np.full(shape, slope, np.float32), link(n_bins, nothing)
+    fill_posterior(surface, dark, slopes, along_rows, of, found, found_dark)
+    expected = posterior_of_chain(weights.astype(float), ALIKE, SCALE, slope, nothing)
+    both = np.concatenate([found.reshape(4, n_bins), found_dark.reshape(4, 1)], axis=1)
+    np.testing.assert_allclose(both, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_planes_are_those_of_the_surface_in_spite_of_others() -> None:
+    row, col = np.mgrid[:40, :30]
+    delay = 20 + 1.5 * row - 0.25 * col
+    rng = np.random.default_rng(0)
+    outlier = rng.uniform(size=delay.shape) < 0.3
+    seen = np.where(outlier, rng.uniform(0, 100, delay.shape), delay)
+    plane = planes(seen, np.where(outlier, 0.3, 1.0))
+    right = ~outlier & (np.abs(plane[1] - 1.5) < 0.1) & (np.abs(plane[2] + 0.25) < 0.1)
+    assert right.sum() > 0.97 * (~outlier).sum()
+
+
+def degree(condition: Condition, method: str, seed: int = 900) -> float:
+    capture = condition.capture(seed)
+    return restoration_degree(
+        estimate(capture, method).range_m, capture.truth_range_m, capture.acquisition.bin_length_m
+    )
+
+
+def test_neighbours_range_what_single_pixels_cannot() -> None:
+    condition = Condition("piecewise", 0.02)
+    assert degree(condition, "likelihood") < 0.35
+    assert degree(condition, "image_posterior") > 0.85
+
+
+def test_pixels_with_depths_of_their_own_are_estimated_by_themselves() -> None:
+    capture = Condition("uniform", 0.03).capture(900)
+    alone = estimate(capture, "likelihood", depths="learned")
+    found = estimate(capture, "image_posterior")
+    np.testing.assert_array_equal(found.bin, alone.bin)
+    np.testing.assert_array_equal(found.confidence, alone.confidence)
+
+
+def test_confidence_is_the_share_of_right_estimates() -> None:
+    capture = Condition("piecewise", 0.03).capture(901)
+    image = estimate(capture, "image_posterior")
+    bin_m = capture.acquisition.bin_length_m
+    right = np.abs(image.range_m - capture.truth_range_m) <= 3 * bin_m
+    assert abs(image.confidence.mean() - right.mean()) < 0.03
+
+
+@pytest.mark.usefixtures("threads")
+def test_messages_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("core.kernels.parallel.SERIAL_BELOW", 0)
+    found = []
+    for n_threads in (1, numba.config.NUMBA_NUM_THREADS):
+        numba.set_num_threads(n_threads)
+        found.append(estimate(Condition("car", 0.03).capture(900), "image_posterior"))
+    np.testing.assert_array_equal(found[0].bin, found[1].bin)
+    np.testing.assert_array_equal(found[0].confidence, found[1].confidence)
