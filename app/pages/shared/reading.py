@@ -20,6 +20,9 @@ from core.io import ReadOptions, reading_options
 RECORD_MS = 1500
 """Time between the records of a sequence that is played."""
 
+# Those of panel-material-ui 0.16 are dark in the dark mode, too.
+PLAYER_BUTTONS = {"& .MuiIconButton-root:not(.MuiIconButton-colorPrimary)": {"color": "inherit"}}
+
 QUESTION = "Several arrays of {file} could be the capture. Which one?"
 
 ALL_RECORDS_HELP = "Add up all records of the file."
@@ -75,6 +78,7 @@ class ReadingForm:
             loop_policy="loop",
             interval=RECORD_MS,
             size="small",
+            sx=PLAYER_BUTTONS,
             sizing_mode="stretch_width",
             margin=(4, 8),
         )
