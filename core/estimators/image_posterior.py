@@ -9,7 +9,7 @@ estimated from pooled pixels (`core.estimators.image_model`).
 
 **Messages.** A posterior of each pixel given the others of its row, then of each given all rows by
 the same along the columns: sum-product messages (`core.kernels.messages`), in which each other
-pixel counts once.
+pixel counts once. The same with columns first; the posterior is the mean of both.
 
 **Planes.** Where the surface is oblique or slopes, its pixels do not share a delay but a plane. A
 plane is fitted around each pixel, robust to other surfaces (`core.kernels.planes`), and the
@@ -24,7 +24,7 @@ Bins much shorter than an echo are merged first. Confidence is the mass of this 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -59,7 +59,8 @@ from core.parameters import Choice, Settings, parameter
 
 _ROUNDS = 3
 _LEAST_ODDS = 1e-12
-_ALONG_PLANES = 0.85, 0.15  # ρ and the scale of K in bins
+_DARK_IF_ANSWERED = 0.01  # share of pixels without an echo, if every pixel is answered
+_ALONG_PLANES = 0.8, 0.15  # ρ and the scale of K in bins
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
 
 Pixels = Literal["every pixel is answered", "a pixel may see nothing"]
@@ -72,8 +73,9 @@ class ImageParameters(Settings):
     pixels: Pixels = parameter(
         "every pixel is answered",
         Choice("Pixels", ("every pixel is answered", "a pixel may see nothing")),
-        "Whether each pixel with a detection gets its likeliest range, or only those in which a "
-        "surface is likelier than nothing.",
+        "Every pixel is answered: each one with a detection gets its likeliest range, as if nearly "
+        "all had a surface. A pixel may see nothing: only those get one in which a surface is "
+        "likelier than nothing. Confidence never assumes a surface.",
     )
 
 
@@ -122,21 +124,35 @@ def image_posterior_of(capture: Capture, flux: FluxModel) -> ImagePosterior:
     return ImagePosterior(delay * factor, window, surface)
 
 
+@cached_per_capture
+def answers_of(capture: Capture, flux: FluxModel) -> Floats:
+    """Find the likeliest delay of each pixel in bins if nearly all have a surface, (row, col)."""
+    merged, factor = merged_bins(capture)
+    dark = _DARK_IF_ANSWERED
+    share = np.append(dark, (1 - dark) * flux.share[1:] / (flux.share[1:].sum() or 1.0))
+    *_, posterior = posteriors(merged, merged_flux(replace(flux, share=share), factor))
+    return peaks(posterior.surface)[0] * factor
+
+
 def posteriors(capture: Capture, flux: FluxModel) -> Iterator[States]:
     """Yield the posterior of each round, in the memory of the one before."""
     alone, prior, agreement = states_of_image(capture, flux), Prior.of(flux), flux.agreement
     assert agreement is not None
-    by_rows, by_both = (States(*map(np.empty_like, alone)) for _ in range(2))
+    half, both, other = (States(*map(np.empty_like, alone)) for _ in range(3))
     links = Link.of(agreement.alike, agreement.scale_bins, prior), Link.of(*_ALONG_PLANES, prior)
     per_row, per_col = np.zeros((2, *capture.shape), np.float32)
     for k in range(_ROUNDS):
         link = links[min(k, 1)]
         with entering(alone.surface.size):
-            fill_posterior(*alone, per_col, True, link, *by_rows)
-            fill_posterior(*by_rows, per_row, False, link, *by_both)
-        yield by_both
+            fill_posterior(*alone, per_col, True, link, *half)
+            fill_posterior(*half, per_row, False, link, *both)
+            fill_posterior(*alone, per_row, False, link, *half)
+            fill_posterior(*half, per_col, True, link, *other)
+        for one, another in zip(both, other, strict=True):
+            np.multiply(np.add(one, another, out=one), np.float32(0.5), out=one)
+        yield both
         if k < _ROUNDS - 1:
-            _, per_row, per_col = np.ascontiguousarray(planes(*peaks(by_both.surface)))
+            _, per_row, per_col = np.ascontiguousarray(planes(*peaks(both.surface)))
 
 
 def _windows(posterior: NDArray[np.float32], factor: int, n_bins: int) -> NDArray[np.float32]:
@@ -179,9 +195,10 @@ def _locate(
         return locate_alone(capture, flux, LikelihoodParameters(depths=depths))
     found = image_posterior_of(capture, flux)
     surface = np.clip(found.surface, _LEAST_ODDS, 1 - _LEAST_ODDS)
-    delay = found.delay
     if parameters.pixels == "a pixel may see nothing":
-        delay = np.where(surface >= 0.5, delay, np.nan)
+        delay = np.where(surface >= 0.5, found.delay, np.nan)
+    else:
+        delay = answers_of(capture, flux)
     return delay, np.log(surface / (1 - surface))
 
 
