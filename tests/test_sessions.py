@@ -204,7 +204,7 @@ def open_pages(site, count):
             links.append(link)
         return len(links) == count
 
-    eventually(all_entered)
+    eventually(all_entered, limit_s=300.0)  # a busy machine builds one page after the other
     return links
 
 
