@@ -44,7 +44,7 @@ from tests.browser import (
     upload,
     warning,
 )
-from tests.test_inspect_browser import Subject, expect_all, ranged
+from tests.test_inspect_browser import Subject, expect_pixel, is_mapped, ranged
 
 pytestmark = pytest.mark.browser
 
@@ -746,7 +746,9 @@ def test_a_real_capture_is_ranged_inspected_and_its_reading_can_be_changed(page,
     capture = core.read_capture(path)
     for name in ("Row", "Column"):  # the middle; written late, it would replace an entry
         expect(field(new, name)).to_have_value(re.compile(r"^1\d\d$"))
-    expect_all(new, Subject(capture, ranged(capture), path.stem, (100, 190)))
+    subject = Subject(capture, ranged(capture), path.stem, (100, 190))
+    expect_pixel(new, subject)
+    eventually(lambda: is_mapped(new, subject.visible_m))
     go(new, "Explore")
     new.get_by_role("button", name="Reading options").click()
     bin_width = new.get_by_role("textbox", name="Bin width")  # its help is part of the name

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import app
 import core
-from core.tests.test_imports import imported_names, room_of, sources
+from core.tests.test_imports import imported_names, imports_of_higher_rooms, sources
 
 PACKAGE = Path(app.__file__).parent
 
@@ -38,15 +38,4 @@ def test_the_app_uses_public_names_of_core_only() -> None:
 
 
 def test_each_room_imports_from_lower_rooms_only() -> None:
-    row_of = {room: row for row, rooms in enumerate(ROOMS) for room in rooms}
-    wrong = []
-    for path in sources(PACKAGE):
-        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        if room in ("__init__", "__main__"):
-            continue
-        for module, name in imported_names(path):
-            if module.partition(".")[0] == "app":
-                other = room_of(module, name)
-                if other != room and row_of[other] >= row_of[room]:
-                    wrong.append(f"{path.relative_to(PACKAGE)} imports {module}.{name}")
-    assert wrong == []
+    assert imports_of_higher_rooms(PACKAGE, ROOMS) == []
