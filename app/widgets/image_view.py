@@ -96,6 +96,8 @@ class ImageView:
         """Share zoom with the first of several images, and their colour scale."""
         self._bar.visible = False
         self.figure.xaxis.axis_label = self.figure.yaxis.axis_label = None
+        for axis in self.figure.axis:
+            axis.ticker.desired_num_ticks = 4  # two images side by side fit on a phone
         self._reserve(JOINED_BORDER_PX)
         if first is self:
             return
