@@ -40,6 +40,7 @@ from app.widgets.figures import Plot
 from app.widgets.image_view import ImageView
 from app.widgets.signal_plots import SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
+from core.inference import fit_of
 from core.io import OUTSIDE_COLOR, ColorScale, ReadOptions, reading_options
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
@@ -231,6 +232,15 @@ def test_what_an_image_hides_is_said(car):
     assert "Lower" in looks.legend(car, "Estimate", Viewing(1.0), nothing, look)
     values, look = looks.image_of(car, "Counts", Viewing(0.9))
     assert looks.legend(car, "Counts", Viewing(), values, look) == ""
+
+
+def test_a_misfit_is_stated_once_it_is_known():
+    worn, kind = compute(ask("worn"), None), "Estimate"
+    drawn = looks.image_of(worn, kind, Viewing())
+    assert "relied" not in looks.legend(worn, kind, Viewing(), *drawn)
+    misfit = fit_of(worn.capture).remark
+    assert "relied" in misfit
+    assert f"{misfit.capitalize()}." in looks.legend(worn, kind, Viewing(), *drawn)
 
 
 def test_image_and_cloud_take_the_chosen_limits_and_colours(car):

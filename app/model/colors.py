@@ -16,7 +16,7 @@ from app.theme import COUNT_COLORS, ERROR_COLORS
 from core import inspection
 from core.cost import predicted_fit_time
 from core.geometry import WHOLE, Box, pixel_angle_of
-from core.inference import fit_of, fit_p_values, share_below
+from core.inference import fit_of, fit_p_values, has_fit, share_below
 from core.io import ColorScale, p_value_scale, range_scale
 
 Array = NDArray[Any]
@@ -70,8 +70,9 @@ def unseen(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
 def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
     """Return why pixels of an image (row, col) of a kind of `map_of` are blank, or grey.
 
-    Where the model does not describe the capture, also that confidences are not to be relied on. Of
-    p-values, how many are small, and whether the model fits the capture.
+    Where the model is known not to describe the capture (`core.inference.has_fit`), also that
+    confidences are not to be relied on. Of p-values, how many are small, and whether the model fits
+    the capture.
 
     Parameters
     ----------
@@ -89,8 +90,9 @@ def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
         sentences.append("Lower “Show from confidence”.")
     if found.n_outside:
         sentences.append(f"Grey: {found.n_outside:,} beyond the colour scale.")
-    if kind in ("Estimate", "Error", "Confidence") and (misfit := fit_of(answer.capture).remark):
-        sentences.append(f"{misfit.capitalize()}.")
+    if kind in ("Estimate", "Error", "Confidence") and has_fit(answer.capture):
+        misfit = fit_of(answer.capture).remark
+        sentences += [f"{misfit.capitalize()}."] if misfit else []
     if kind == FIT:
         sentences += [share_below(values), fit_of(answer.capture).verdict]
     return " ".join(sentences)

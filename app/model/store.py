@@ -41,7 +41,7 @@ from core import (
 )
 from core.cost import Cost, predicted
 from core.geometry import guessed_field_of_view_deg
-from core.inference import fit_of, has_posterior, pixel_range_intervals, posterior_of
+from core.inference import has_posterior, pixel_range_intervals, posterior_of
 from core.inspection import PixelReport
 from core.io import ReadOptions, files_of
 from core.metrics import Interval
@@ -383,7 +383,6 @@ def _estimate(capture: Capture, request: Request, previous: Answer | None) -> tu
             started = perf_counter()
             posterior_of(capture)  # every confidence is computed from it, whatever the method
             flux_s = perf_counter() - started
-        fit_of(capture)  # the legend states it: compute it here rather than while painting
         return run(capture, method, settings), flux_s
 
 

@@ -86,6 +86,10 @@ class Provenance:
         """Return the fields, with `remark` as text, for another process."""
         return vars(self) | {"remark": self.remark}
 
+    def after(self, **removal: Any) -> Provenance:
+        """Return it with a reason why estimates were removed; a deferred remark stays so."""
+        return replace(self, remark=vars(self)["remark"], **removal)
+
     @property
     def facts(self) -> dict[str, str | float]:
         """Facts for a file: all settings as JSON; what was not given is left out."""
@@ -193,7 +197,7 @@ class RangeImage:
         """Return the image without the estimates of other pixels, and the reason in `made_by`."""
         kept = self.valid & pixels
         range_m, bins = (np.where(kept, each, np.nan) for each in (self.range_m, self.bin))
-        made_by = self.made_by and replace(self.made_by, **why)
+        made_by = self.made_by and self.made_by.after(**why)
         return replace(self, range_m=range_m, bin=bins, valid=kept, made_by=made_by)
 
 

@@ -7,6 +7,7 @@ from core.inference.fit import (
     fit_of,
     fit_p_values,
     fit_p_values_of,
+    has_fit,
     share_below,
 )
 from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_prior_of
@@ -46,6 +47,7 @@ __all__ = [
     "fit_p_values_of",
     "flux_model_of",
     "flux_prior_of",
+    "has_fit",
     "has_posterior",
     "least_loss",
     "log_likelihood_ratio",

@@ -129,6 +129,11 @@ def fit_of(capture: Capture) -> Fit:
     return fit_in(capture, np.sort(drawn[: _most_at_once(capture)]))
 
 
+def has_fit(capture: Capture) -> bool:
+    """Return whether `fit_of` has been computed."""
+    return fit_of.is_cached(capture)
+
+
 def fit_in(capture: Capture, pixels: NDArray[np.intp]) -> Fit:
     """Test the model on pixels given as flat indices (pixel,), at least one.
 

@@ -83,12 +83,12 @@ def test_the_command_measures_and_fails_where_a_speed_up_is_lost(
 ) -> None:
     monkeypatch.setattr(speed, "first_image", lambda cache: np.full(len(start.STAGES), 0.1))
     monkeypatch.setattr(speed, "MIN_SPEEDUP", {PUBLIC: 1e9})
-    small = speed.Extent(ROUNDS, ROUNDS, 16, 40, ((8, 40), (16, 20)))
+    small = speed.Extent(ROUNDS, ROUNDS, 16, 40, ((8, 40), (16, 20)), ((8, 40),))
     monkeypatch.setattr(speed, "Extent", lambda rounds: small)
     assert main(["speed", "--rounds", "6", "--folder", str(tmp_path)]) == 1
     printed = capsys.readouterr()
-    assert f"{PUBLIC}: " in printed.err and "4 of 4 pieces" in printed.err
-    tables = ("targets", "variants", "sizes", "start", "machine")
+    assert f"{PUBLIC}: " in printed.err and "5 of 5 pieces" in printed.err
+    tables = ("targets", "variants", "sizes", "fresh", "start", "machine")
     assert all((tmp_path / f"{key}.csv").exists() for key in tables)
     assert "| 16 x 16 x 20 |" in printed.out
     assert "nan" not in printed.out

@@ -55,6 +55,7 @@ from app.widgets.method_picture import Picture, ScaleBar
 from app.widgets.method_plots import CurvePlot, ReliabilityPlot, Style
 from core import ESTIMATORS, Capture
 from core.estimators import FALSE_ALARM
+from core.inference import has_fit
 
 log = logging.getLogger(__name__)
 
@@ -364,6 +365,7 @@ class Compare(Section):
         session = self.session
         self._capture = session.answer.capture
         self.results, self.reference, self._is_stopped = {}, None, False
+        self.remarks.text = ""
         self._keys.shape = list(self._capture.shape)
         has_truth = self._capture.truth_range_m is not None
         kinds = [kind for kind in KINDS if has_truth or kind != "Error"]
@@ -555,7 +557,8 @@ class Compare(Section):
         }
         self._reliability.update(lines, styles)
         n_working = sum(not isinstance(each, str) for each in found.values())
-        self.remarks.text = text.remarks(capture, n_working, len(self.pictured))
+        if has_fit(capture):
+            self.remarks.text = text.remarks(capture, n_working, len(self.pictured))
 
     def _mark_pixel(self) -> None:
         row, col = self.session.state.pixel

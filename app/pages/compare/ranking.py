@@ -13,6 +13,7 @@ from app.model.budget import ranging
 from app.model.state import Comparison
 from app.model.store import Answer, Request, is_wrong
 from core import ESTIMATORS, Capture, RangeImage, estimate, limits, metrics, run
+from core.inference import fit_of
 from core.inspection import CONFIDENT
 
 Array = NDArray[Any]
@@ -85,6 +86,7 @@ def run_task(task: Task, explored: Answer) -> Result:
         with ranging(capture, task.method, task.settings, task.false_alarm):
             ran = run(capture, task.method, task.settings, task.false_alarm)
         answer = replace(explored, run=ran)
+    fit_of(capture)  # stated by the remarks
     return Result(answer, accuracy_of(answer))
 
 

@@ -56,6 +56,7 @@ from app.widgets.controls import (
 from app.widgets.figures import pane_of
 from app.widgets.image_view import CONTAINER, ImageView
 from app.widgets.signal_plots import BESIDE_PX, LEFT_PX, SignalPlots
+from core.inference import fit_of, has_fit
 from core.studies import outputs
 
 # Where the numbers of the pixel need more rows, the plots keep their height.
@@ -73,6 +74,10 @@ ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; g
 
 PICTURES_DELAY_MS = 60
 """Image and cloud are drawn this long after the pixel's plots, which the eye follows."""
+
+FIT_DELAY_MS = 250
+"""The model is tested this long after image and cloud are drawn, if the estimate is still shown: it
+takes longer than the estimate, and sliders come first."""
 
 MAX_PICTURES_DELAY_S = 1.0
 """Image and cloud wait at most this long for other pages."""
@@ -327,9 +332,8 @@ class Explore(Section):
             return
         answer, state = self.session.answer, self.session.state
         with self.session.tasks.hold():
-            values, look = image_of(answer, state.image, state.viewing)
-            self.image.update(values, look)
-            self.legend.text = legend(answer, state.image, state.viewing, values, look)
+            self.image.update(*image_of(answer, state.image, state.viewing))
+            self._draw_legend()
             box, is_guessed = state.box, answer.is_width_guessed(state.viewing)
             cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing, box)
             # Another box is framed by the camera, like another scene.
@@ -338,6 +342,19 @@ class Explore(Section):
             self.cloud.caption = text.cloud_caption(
                 answer, cloud.n_points, n_wrong, box, is_guessed
             )
+        if not has_fit(answer.capture):
+            self.session.tasks.call_later(FIT_DELAY_MS, partial(self._test_model, answer))
+
+    def _draw_legend(self) -> None:
+        """State what the image hides, and that the model does not fit once that is known."""
+        answer, state = self.session.answer, self.session.state
+        values, look = image_of(answer, state.image, state.viewing)
+        self.legend.text = legend(answer, state.image, state.viewing, values, look)
+
+    def _test_model(self, answer: Answer) -> None:
+        """Test the model on the capture of an estimate, if it is still shown."""
+        if self.is_on_screen and answer is self.session.answer:
+            self.submit(partial(fit_of, answer.capture), lambda _: self._draw_legend())
 
 
 PAGE = Page("Explore", Explore, "shows one method in detail", text.EXPLANATION, sidebar_last=True)

@@ -43,6 +43,7 @@ from app.widgets.controls import (
 )
 from app.widgets.image_view import CONTAINER
 from core.checks import require
+from core.inference import fit_of
 from core.inspection import FaultyPixel, faulty_pixels
 from core.io import ColorScale, RangeColors
 
@@ -366,6 +367,7 @@ class Inspect(Section):
             self._viewing.show(viewing)
 
             def work() -> tuple[tuple[Any, ColorScale], list[FaultyPixel]]:
+                fit_of(answer.capture)  # stated by the legend
                 return map_of(answer, kind, viewing), faulty_pixels(answer.capture)
 
             def draw(found: tuple[tuple[Any, ColorScale], list[FaultyPixel]]) -> None:

@@ -10,14 +10,18 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from time import perf_counter
 
 import numba
 import numpy as np
 
 from core.acquisition import Acquisition, Floats, Flux
+from core.capture import Capture
 from core.checks import require
 from core.estimators import ESTIMATORS, estimate
+from core.inference import flux_model_of, tolerance_probability
 from core.kernels.blocks import to_blocks
 from core.kernels.parallel import SERIAL_BELOW
 from core.metrics import Interval
@@ -73,6 +77,8 @@ class Extent:
         (64, 4096),
     )
     """Side and bins of the captures over which the cost per count is compared."""
+    fresh: tuple[tuple[int, int], ...] = ((64, 100), (256, 200))
+    """Likewise, of the new captures whose estimate is timed stage by stage."""
 
     def __post_init__(self) -> None:
         for name in ("rounds", "starts"):
@@ -84,19 +90,22 @@ def study(
     extent: Extent, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> tuple[list[Table], list[str]]:
     """Measure everything; return the tables and a sentence for each speed-up that was lost."""
-    progress(0, 4)
+    progress(0, 5)
     root_ns = square_root_ns(extent.rounds)
-    progress(1, 4)
+    progress(1, 5)
     seconds = variants(extent)
-    progress(2, 4)
+    progress(2, 5)
     sizes = sizes_table(extent, root_ns)
-    progress(3, 4)
+    progress(3, 5)
+    fresh = fresh_table(extent)
+    progress(4, 5)
     compiled, starts = _starts(extent.starts)
-    progress(4, 4)
+    progress(5, 5)
     return [
         targets_table(seconds, starts),
         variants_table(seconds, extent.side**2 * extent.bins, root_ns),
         sizes,
+        fresh,
         start_table(starts, compiled),
         machine(),
     ], regressions(seconds)
@@ -210,6 +219,45 @@ def sizes_table(extent: Extent, root_ns: Interval) -> Table:
         f"Up to {SERIAL_BELOW / 1e6:.0f} million counts are ranged on one thread. {_ROOFLINE}",
         _FORMATS,
     )
+
+
+FRESH_STAGES = ("capture", "block layout", "fluxes", "positions", "confidence", "total")
+"""Of `core.estimate` with tracking, in this order; positions with lag and refinement."""
+
+
+def fresh_table(extent: Extent) -> Table:
+    """Show where the estimate of a new capture takes its time."""
+    columns = {}
+    for side, bins in extent.fresh:
+        capture = simulate(scenes["uniform"](size=side), _gate(bins), FLUX, seed=1)
+        taken = np.array([stage_seconds(capture) for _ in range(extent.rounds + 1)])[1:]
+        taken = np.column_stack([taken, taken.sum(axis=1)])
+        columns[f"{side} x {side} x {bins}, ms [95 %]"] = map(median_interval, 1e3 * taken.T)
+    return Table(
+        "fresh",
+        "core.estimate of a new capture, stage by stage",
+        ("stage", *columns),
+        tuple(zip(FRESH_STAGES, *columns.values(), strict=True)),
+        "Fluxes take as long for any number of pixels; the other stages grow with the counts, "
+        "confidence also with the levels and bins of an echo.",
+        dict.fromkeys(columns, ".3g"),
+    )
+
+
+def stage_seconds(capture: Capture) -> list[float]:
+    """Return the seconds of each of `FRESH_STAGES`, but for their total."""
+    marks = [perf_counter()]
+    new = replace(capture)
+    marks.append(perf_counter())
+    new.blocks  # noqa: B018 - cached
+    marks.append(perf_counter())
+    flux_model_of(new)
+    marks.append(perf_counter())
+    bins, _ = ESTIMATORS["tracking"].delays(new, TrackingParameters())
+    marks.append(perf_counter())
+    tolerance_probability(new, bins)
+    marks.append(perf_counter())
+    return [after - before for before, after in pairwise(marks)]
 
 
 _ROOFLINE = "Roofline: time of the two float32 square roots of each count on one thread."
