@@ -93,3 +93,15 @@ def test_messages_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> N
         found.append(estimate(Condition("car", 0.03).capture(900), "image_posterior"))
     np.testing.assert_array_equal(found[0].bin, found[1].bin)
     np.testing.assert_array_equal(found[0].confidence, found[1].confidence)
+
+
+def test_the_sky_is_left_empty_if_a_pixel_may_see_nothing() -> None:
+    capture = Condition("car", 0.03).capture(902)
+    is_sky = np.isnan(np.asarray(capture.truth_range_m))
+    every, some = (
+        estimate(capture, "image_posterior", pixels=each).valid
+        for each in ("every pixel is answered", "a pixel may see nothing")
+    )
+    assert every.all()
+    assert some[is_sky].mean() < 0.08  # next to the car its neighbours say otherwise
+    assert some[~is_sky].mean() > 0.85
