@@ -746,7 +746,7 @@ def test_a_real_capture_is_ranged_inspected_and_its_reading_can_be_changed(page,
     capture = core.read_capture(path)
     for name in ("Row", "Column"):  # the middle; written late, it would replace an entry
         expect(field(new, name)).to_have_value(re.compile(r"^1\d\d$"))
-    subject = Subject(capture, ranged(capture), path.stem, (100, 190))
+    subject = Subject(capture, ranged(capture), (100, 190))
     expect_pixel(new, subject)
     eventually(lambda: is_mapped(new, subject.visible_m))
     go(new, "Explore")

@@ -36,8 +36,6 @@ class Subject:
 
     capture: Capture
     image: RangeImage
-    name: str
-    """The capture's name in files' names."""
     pixel: tuple[int, int]
     """A pixel with a surface, which continues to its right."""
 
@@ -57,7 +55,7 @@ def simulated_building() -> Subject:
     scene, illumination = core.scenes["building"](), Illumination()
     acquisition = illumination.acquisition(scene.acquisition)
     capture = core.simulate(scene, acquisition, illumination.flux, seed=illumination.seed)
-    return Subject(capture, ranged(capture), "building", (30, 20))
+    return Subject(capture, ranged(capture), (30, 20))
 
 
 LINK = "?source=building&page=Inspect&pixel=[30,20]"
