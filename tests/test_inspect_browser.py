@@ -251,9 +251,9 @@ def expect_maps(page: Page, subject: Subject) -> None:
 def expect_report(page: Page, capture: Capture) -> None:
     """Expect the capture's flux, how it was found, and the sum of all histograms."""
     report = inspection.capture_report(capture)
-    for name, found in zip(
-        ("PPP, all pixels", "Background", "SBR, all pixels"), report.flux, strict=True
-    ):
+    signal = "Photons per pixel" if capture.acquisition.n_pulses is None else "PPP"
+    names = f"{signal}, all pixels", "Background", "SBR, all pixels"
+    for name, found in zip(names, report.flux, strict=True):
         expect(fact(page, name)).to_have_text(text.interval(found))
     method = f"Signal, background and SBR: {report.flux_method}"
     expect(page.get_by_text(method)).to_be_visible()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -47,7 +47,7 @@ class View:
         What is shown.
     """
 
-    def __init__(self, session: Session, about: Any) -> None:
+    def __init__(self, session: Session, about: Callable[[], Subject]) -> None:
         self._session, self._about = session, about
         self.item: outputs.Plot | outputs.Pictures | None = None
         self._colors: Palette | None = None
@@ -91,7 +91,7 @@ class LessonView:
     about : callable
         Returns what the files of its views are about.
     change : callable
-        Called with the parts of `Learning` that the learner changes.
+        Called with the parts of `Learning` that the learner changes, by name.
 
     Attributes
     ----------
@@ -106,7 +106,13 @@ class LessonView:
     verdict : Sentence
     """
 
-    def __init__(self, session: Session, lesson: Lesson, about: Any, change: Any) -> None:
+    def __init__(
+        self,
+        session: Session,
+        lesson: Lesson,
+        about: Callable[[], Subject],
+        change: Callable[..., None],
+    ) -> None:
         self.lesson, self._change = lesson, change
         self.views = {
             (part, name): View(session, about)
@@ -128,7 +134,7 @@ class LessonView:
             )
         self.commit = button("Predict", text.COMMIT_HELP, self._commit)
         self.commit.variant = "contained"
-        self.again = button("Start again", text.AGAIN_HELP, lambda: change(None))
+        self.again = button("Start again", text.AGAIN_HELP, self._start_again)
         self.panel = SettingsPanel(lesson.bench, self._moved)
         control = self.panel.controls[lesson.control]
         if lesson.ends is not None:
@@ -173,6 +179,9 @@ class LessonView:
             sizing_mode="stretch_width",
             margin=0,
         )
+
+    def _start_again(self) -> None:
+        self._change(prediction="", moved="", answer="")
 
     def _commit(self) -> None:
         self._change(prediction=self.prediction.value)
@@ -262,10 +271,9 @@ class Learn(Section):
         if key != self.shown.lesson.key:
             self.session.state.learning = Learning(lesson=key)
 
-    def _change(self, *again: None, **parts: str) -> None:
+    def _change(self, **parts: str) -> None:
         state = self.session.state
-        begun = Learning(lesson=self.shown.lesson.key)
-        state.learning = begun if again else replace(state.learning, **parts)
+        state.learning = replace(state.learning, **parts)
 
     def _possible(self, learning: Learning) -> Learning:
         """Return what can be shown of a state, which may come from a link; report the rest."""
