@@ -95,7 +95,8 @@ def add_false_alarm(command: Any) -> None:
         type=float,
         help="accepted share of echo-free pixels with an estimate, "
         f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one; without "
-        "effect on the method unmixing, which has --false-acceptance instead",
+        "effect on the methods unmixing and image_posterior, which have --false-acceptance and "
+        "--pixels instead",
     )
 
 

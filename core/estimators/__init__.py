@@ -73,8 +73,8 @@ def estimate(
         Settings of the method, of type ``ESTIMATORS[method].parameters``.
     false_alarm : float, optional
         Give a range only where the score exceeds the threshold that this share of echo-free pixels
-        exceeds. If None, every pixel with a detection gets one. The method "unmixing" has a
-        threshold of its own, ``false_acceptance``, and ignores this one.
+        exceeds. If None, every pixel with a detection gets one. The methods "unmixing" and
+        "image_posterior" ignore it; see their settings ``false_acceptance`` and ``pixels``.
     **parameters
         Settings as single fields, instead of `settings`.
 

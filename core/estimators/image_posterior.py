@@ -222,6 +222,7 @@ ESTIMATOR = Estimator(
     _locate,
     finds_delay=True,
     flux_model=image_model_of,
+    own_threshold="beside a surface, its neighbours raise it; let a pixel see nothing instead",
     undoes_pile_up=True,
     whole_image=True,
     confidence=_confidence,
