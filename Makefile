@@ -26,7 +26,7 @@ test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -n auto $(KERNELS:%=core/tests/test_%.py) --cov --cov-report=
-	$(BIN)/python -m pytest -n 3 --dist loadfile core/tests --cov --cov-append --cov-fail-under=95
+	$(BIN)/python -m pytest -n 3 --dist worksteal core/tests --cov --cov-append --cov-fail-under=95
 	$(BIN)/python -m pytest -n 3 --dist loadfile tests -m "not browser"
 	$(BIN)/python -m pytest -n auto --dist loadgroup tests -m browser
 
