@@ -40,9 +40,9 @@ from core.trigger import rate_per_bin, trigger_probability
 _AT_ONCE = 2**19  # numbers that fit in the cache
 LEVELS = 12  # of signal, without "no echo"
 SAMPLE = 512  # pixels from which the levels of signal are estimated
-DEPTH_SAMPLE = 1024  # pixels from which their shares and the distribution of delays are estimated
+DEPTH_SAMPLE = 1024
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
-_LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
+_LEAST_GAIN = 2.0
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
@@ -153,12 +153,10 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     """
     total, chance = _totals(capture)
     flat = capture.cube.reshape(total.size, -1)
-    # At random, since a regular step could miss columns.
-    drawn = np.random.default_rng(0).permutation(total.size)[:DEPTH_SAMPLE]
-    pixels, least = np.sort(drawn[:SAMPLE])[np.newaxis], _least_background(capture)
+    pixels, least = _sampled(total.size, SAMPLE)[np.newaxis], _least_background(capture)
     levels = _levels(flat[pixels[0]], capture, shape)
-    # Initially each level is the signal of all pixels.
-    guess = FluxPrior(
+    # Initially each level is the signal of all pixels; a few pixels show how many have it.
+    found = FluxPrior(
         levels,
         share=np.full(levels.size, 1 / levels.size),
         depth=np.ones(flat.shape[1]),
@@ -166,22 +164,21 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
         own_weight=_own_weight(total, chance),
         background_shape=shape,
     )
-    flux = guess.model(total.ravel()[pixels], least)
-    share = _shares(level_evidence(prepare(capture, flat[pixels], flux, 1)))
-    mean = np.asarray(share @ levels)
-    variance = float(share @ (levels - mean) ** 2)
-    kept = _kept(share)
-    levels, share = _halved(levels[kept], share[kept] / share[kept].sum())
-    found = guess._replace(
-        levels=levels,
-        share=share,
-        background=total.mean() - mean,
-        own_weight=_own_weight(total, chance + variance),
-    )
+    for some in (_sampled(total.size, SAMPLE // 4)[np.newaxis], pixels):
+        flux = found.model(total.ravel()[some], least)
+        share = _shares(level_evidence(prepare(capture, flat[some], flux, 1)))
+        mean = np.asarray(share @ levels)
+        variance = float(share @ (levels - mean) ** 2)
+        found = found._replace(
+            background=total.ravel()[some].mean() - mean,
+            own_weight=_own_weight(total, chance + variance),
+        )
+    levels, share, pair = _halved(levels, share, _kept(share))
+    found = found._replace(levels=levels, share=share, background=total.mean() - mean)
     # Delays need a table of all levels of the sample: fewer pixels in a long gate.
     each = found.share.size * flat.shape[1]
     most = sampled_numbers(found.share.size, flat.shape[1]) // each
-    pixels = np.sort(drawn[:most])[np.newaxis]
+    pixels = _sampled(total.size, min(most, DEPTH_SAMPLE))[np.newaxis]
     flux = found.model(total.ravel()[pixels], least)
     density = level_densities(prepare(capture, flat[pixels], flux, 1))
     share, depth = shares_and_depths(density, found.share)
@@ -189,7 +186,9 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     evidence = np.log(np.maximum(density @ depth.astype(np.float32), _TINY))
     found = found._replace(share=share, depth=depth)
     free = _background(capture, found, pixels[0], density)
-    levels, share = _joined(found.levels, _shares(evidence))
+    share = _shares(evidence)
+    learn_shares(_likelihood(evidence), share)  # of the levels that are left
+    levels, share = _joined(found.levels, share, pair)
     kept = _kept(share)
     levels, share = levels[kept], share[kept] / share[kept].sum()
     background = float(total.mean() - share @ levels)
@@ -199,6 +198,16 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
         levels = levels * ((total.mean() - background) / (share @ levels))
     found = found._replace(levels=levels, share=share, background=np.asarray(background))
     return found._replace(contrast=found.model(total, least).contrast), free.shape
+
+
+def _sampled(n_pixels: int, most: int) -> NDArray[np.intp]:
+    """Sample at most as many pixels, one at random of each of equal parts of the image.
+
+    Their share of every surface is closer to that in the image than if all were drawn at random. A
+    regular step could miss columns.
+    """
+    first = np.arange(min(most, n_pixels) + 1) * n_pixels // min(most, n_pixels)
+    return np.random.default_rng(0).integers(first[:-1], first[1:])
 
 
 def total_rates(capture: Capture) -> Floats:
@@ -340,22 +349,31 @@ def _strongest(
     return max(float(np.quantile(excess, 0.999)), 1.0 / (capture.gated_pulses or 1))
 
 
-def _halved(levels: Floats, share: Floats) -> tuple[Floats, Floats]:
+def _halved(
+    levels: Floats, share: Floats, kept: NDArray[np.bool_]
+) -> tuple[Floats, Floats, NDArray[np.intp]]:
     """Replace each level, except no echo, by two, which together form a grid of half the spacing.
 
     The mean of a coarse grid of levels is biased: the signal of an image lies between two of them.
+    Next to the kept levels, one more is added on either side. Also returns the coarse level of
+    each.
     """
     quarter = LEVEL_SPAN ** (0.25 / (LEVELS - 1))
-    pairs = levels[1:, np.newaxis] * [1 / quarter, quarter]
-    return np.append(0.0, pairs), np.append(share[0], np.repeat(share[1:] / 2, 2))
+    pairs = (levels[1:, np.newaxis] * [1 / quarter, quarter]).ravel()
+    near = np.pad(np.repeat(kept[1:], 2), 1)
+    some = np.flatnonzero(near[:-2] | near[1:-1] | near[2:])
+    halves = np.maximum(np.repeat(share[1:] / 2, 2)[some], _RARE)
+    shares = np.append(share[0], halves)
+    return np.append(0.0, pairs[some]), shares / shares.sum(), some // 2
 
 
-def _joined(levels: Floats, share: Floats) -> tuple[Floats, Floats]:
+def _joined(levels: Floats, share: Floats, pair: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Join pairs of levels from `_halved` in their means."""
-    shares = share[1:].reshape(-1, 2)
-    weights = np.maximum(shares, np.finfo(float).tiny)
-    pairs = levels[1:].reshape(-1, 2)
-    return np.append(0.0, np.average(pairs, 1, weights)), np.append(share[0], shares.sum(axis=1))
+    weight = np.maximum(share[1:], np.finfo(float).tiny)
+    total = np.bincount(pair, weight)
+    some = total > 0
+    means = np.bincount(pair, weight * levels[1:])[some] / total[some]
+    return np.append(0.0, means), np.append(share[0], total[some])
 
 
 def _kept(share: Floats) -> NDArray[np.bool_]:
@@ -370,6 +388,11 @@ def _kept(share: Floats) -> NDArray[np.bool_]:
     return kept
 
 
+def _likelihood(evidence: Floats) -> Floats:
+    """Likelihood of each level relative to the likeliest of the pixel (pixel, level)."""
+    return np.asarray(np.exp(evidence - evidence.max(axis=1, keepdims=True)))
+
+
 def _shares(evidence: Floats) -> Floats:
     """Estimate the shares of levels from the evidence (pixel, level), in logarithms.
 
@@ -378,7 +401,7 @@ def _shares(evidence: Floats) -> Floats:
     decreases little.
     """
     n_levels = evidence.shape[1]
-    likelihood = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+    likelihood = _likelihood(evidence)
     share = np.full(n_levels, 1 / n_levels)
     learn_shares(likelihood, share)
     least = np.log(likelihood @ share).sum() - _LEAST_GAIN

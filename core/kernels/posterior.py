@@ -12,13 +12,14 @@ from core.kernels.elementary import log1p32
 from core.kernels.parallel import COMPILED, PARALLEL, SUMMING
 
 _STEPS = 100  # of expectation and maximisation
-_DEPTH_STEPS = 30
+_DEPTH_STEPS = 60
 _DARK_PIXELS = 0.1  # additional pixels without an echo, so that their share is never 0
 _UNIFORM_SHARE = 0.1  # initial share of the surfaces with a delay that is uniform over the gate
 
-_SMOOTHING_BINS = 2.0
-_SMOOTHING = np.exp(-0.5 * (np.arange(-8, 9) / _SMOOTHING_BINS) ** 2)  # to four sigmas
+_SMOOTHING_BINS = 1.0
+_SMOOTHING = np.exp(-0.5 * (np.arange(-4, 5) / _SMOOTHING_BINS) ** 2)  # to four sigmas
 _SMOOTHING /= _SMOOTHING.sum()
+_CELL_BINS = 1 / (_SMOOTHING**2).sum()  # bins that are smoothed into one
 
 
 # All EM steps run in one kernel: between numpy calls other threads would take the GIL.
@@ -47,46 +48,63 @@ def learn_shares(likelihood, share):  # type: ignore[no-untyped-def]
 
 @njit(**SUMMING)
 def learn_shares_and_depths(density, share, depth):  # type: ignore[no-untyped-def]
-    """Estimate the shares of levels and the probabilities of delays likewise, in place.
+    """Estimate the share of no echo and the probabilities of delays likewise, in place.
 
-    Some delays are uniform over the gate, the others distributed smoothly. The share of the uniform
-    ones is estimated, too; one additional surface counts as uniform, so that it is never 0.
+    The shares of the other levels keep their ratios. Some delays are uniform over the gate, the
+    others distributed smoothly. The share of the uniform ones is estimated, too; one additional
+    surface counts as uniform, so that it is never 0.
     """
     n_pixels, n_levels, n_bins = density.shape
-    mass, some = np.empty(n_levels), depth.copy()
-    uniform = _UNIFORM_SHARE
+    none, echo = np.empty(n_pixels), np.zeros((n_pixels, n_bins), np.float32)
+    for pixel in range(n_pixels):
+        none[pixel] = density[pixel, 0, 0]
+        for level in range(1, n_levels):
+            weight = np.float32(share[level] / (1 - share[0]))
+            for k in range(n_bins):
+                echo[pixel, k] += weight * density[pixel, level, k]
+    some, uniform, before = depth.copy(), _UNIFORM_SHARE, share[0]
+    dark = before
     for _ in range(_DEPTH_STEPS):
         likely = depth.astype(np.float32)
-        found, reweighted = np.zeros(n_levels), np.zeros(n_bins, np.float32)
-        found[0] = _DARK_PIXELS
+        found, reweighted = _DARK_PIXELS, np.zeros(n_bins, np.float32)
         for pixel in range(n_pixels):
-            mass[0] = share[0] * density[pixel, 0, 0]
-            for level in range(1, n_levels):
-                total_density = np.float32(0.0)
-                for k in range(n_bins):
-                    total_density += density[pixel, level, k] * likely[k]
-                mass[level] = share[level] * total_density
-            total = mass.sum()
-            for level in range(n_levels):
-                found[level] += mass[level] / total
-            for level in range(1, n_levels):
-                weight = np.float32(share[level] / total)
-                for k in range(n_bins):
-                    reweighted[k] += weight * density[pixel, level, k]
-        for level in range(n_levels):
-            share[level] = max(found[level] / (n_pixels + _DARK_PIXELS), 1e-12)  # never 0
+            seen = np.float32(0.0)
+            for k in range(n_bins):
+                seen += echo[pixel, k] * likely[k]
+            total = dark * none[pixel] + (1 - dark) * seen
+            found += dark * none[pixel] / total
+            weight = np.float32((1 - dark) / total)
+            for k in range(n_bins):
+                reweighted[k] += weight * echo[pixel, k]
+        dark = min(max(found / (n_pixels + _DARK_PIXELS), 1e-12), 1 - 1e-12)  # never 0 or 1
         surfaces, anywhere = 0.0, 0.0
         for k in range(n_bins):
             surfaces += depth[k] * reweighted[k]
             anywhere += uniform / n_bins * reweighted[k]
-        smooth = smoothed(some * reweighted)
-        whole = smooth.sum()
-        if whole == 0:  # certainly no pixel has an echo
-            break
-        uniform = (anywhere + 1) / (surfaces + 1)
+        smooth = smoothed((1 - uniform) * some * reweighted)
         for k in range(n_bins):
-            some[k] = smooth[k] / whole
+            smooth[k] *= _credit(smooth[k] * _CELL_BINS)
+        whole = smooth.sum()  # 0 if the pixels require no delay but uniform ones
+        uniform = (anywhere + 1) / (surfaces + 1) if whole > 0 else 1.0
+        for k in range(n_bins):
+            some[k] = smooth[k] / whole if whole > 0 else 0.0
             depth[k] = (1 - uniform) * some[k] + uniform / n_bins
+    for level in range(1, n_levels):
+        share[level] *= (1 - dark) / (1 - before)
+    share[0] = dark
+
+
+@njit(**COMPILED)
+def _credit(pixels):  # type: ignore[no-untyped-def]
+    """Return the factor on the share of delays that a number of pixels seem to have.
+
+    ``exp(ψ(n)) / n``, about ``1 - 1 / 2n``: a share is estimated by its expected logarithm under a
+    sparse Dirichlet prior, which empties what the pixels do not require (Rousseau & Mengersen
+    2011). The largest likelihood would find surfaces in the noise of pixels without an echo.
+    """
+    if pixels < 0.01:
+        return 0.0
+    return (1 + 0.5 / pixels) * math.exp(-1 / pixels)
 
 
 @njit(**COMPILED)

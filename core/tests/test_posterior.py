@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 import pytest
-from scipy import ndimage, stats
+from scipy import ndimage, special, stats
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture
@@ -501,18 +501,26 @@ def any_densities(n_levels: int, n_bins: int) -> np.ndarray:
 @pytest.mark.parametrize("n_bins", [1, 7, 40])
 def test_shares_and_depths_are_the_equations(n_levels: int, n_bins: int) -> None:
     density, initial = any_densities(n_levels, n_bins), np.full(n_levels, 1 / n_levels)
-    share, uniform, learned = initial, 0.1, np.full(n_bins, 1 / n_bins)
-    depth = learned
-    for _ in range(30):
+    ratios, uniform, learned = initial[1:] / initial[1:].sum(), 0.1, np.full(n_bins, 1 / n_bins)
+    share, depth = initial, learned
+    cell = 1 / (ndimage.gaussian_filter1d(np.eye(17)[8], 1.0) ** 2).sum()
+    for _ in range(60):
         joint = density * share[:, np.newaxis] * depth
         joint /= joint.sum(axis=(1, 2), keepdims=True)
-        share = (0.1 * np.eye(n_levels)[0] + joint.sum(axis=(0, 2))) / (len(density) + 0.1)
-        share = np.maximum(share, 1e-12)
+        none = (0.1 + joint[:, 0].sum()) / (len(density) + 0.1)
+        none = np.clip(none, 1e-12, 1 - 1e-12)
+        share = np.append(none, (1 - none) * ratios)
         echoes = joint[:, 1:].sum(axis=(0, 1))
         anywhere = (echoes * uniform / n_bins / depth).sum()
-        learned = ndimage.gaussian_filter1d(echoes * learned / depth, 2.0, mode="nearest")
-        learned /= learned.sum()
-        uniform = (anywhere + 1) / (echoes.sum() + 1)
+        some = echoes * (1 - uniform) * learned / depth
+        pixels = cell * ndimage.gaussian_filter1d(some, 1.0, mode="nearest")
+        # About the exponential of the digamma function.
+        kept = np.maximum(pixels, 0.01)
+        learned = np.where(pixels > 0.01, (pixels + 0.5) * np.exp(-1 / kept), 0.0)
+        np.testing.assert_allclose(learned, np.exp(special.digamma(kept)), 0.13, 1e-9)
+        found_some = learned.sum() > 0
+        learned /= learned.sum() or 1.0
+        uniform = (anywhere + 1) / (echoes.sum() + 1) if found_some else 1.0
         depth = (1 - uniform) * learned + uniform / n_bins
     found = shares_and_depths(density, initial)
     np.testing.assert_allclose(found[0], share, rtol=1e-4)
@@ -524,7 +532,7 @@ def test_no_echo_at_all_leaves_depths_alike() -> None:
     density = any_densities(3, 9)
     density[:, 1:] = 0.0
     share, depth = shares_and_depths(density, np.full(3, 1 / 3))
-    np.testing.assert_allclose(share, [1, 1e-12, 1e-12])
+    np.testing.assert_allclose(share, [1, 5e-13, 5e-13], rtol=1e-4)
     np.testing.assert_array_equal(depth, np.ones(9))
 
 

@@ -30,7 +30,7 @@ METHODS = ("likelihood", "tracking", "coates", "peak")
 _FEW_PULSES = 100
 CONDITIONS = tuple(
     condition
-    for scene in ("uniform", "car", "building", "staircase")
+    for scene in ("uniform", "car", "building", "staircase", "piecewise")
     for condition in (
         *(Condition(scene, sbr) for sbr in TABLE_2),
         Condition(scene, 0.1, signal=0.3, n_pulses=_FEW_PULSES),
