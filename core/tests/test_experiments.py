@@ -178,13 +178,17 @@ def test_uniform_depths_reach_the_expected_degree() -> None:
 
 
 def test_no_method_beats_the_oracle_on_uniform_depths() -> None:
-    """Among pixels that only one of the two finds, no method finds more (McNemar 1947)."""
+    """Among pixels that only one of the two finds, no method finds more (McNemar 1947).
+
+    The image posterior does: it learns which depths the image has, a narrower prior than the gate.
+    """
+    compared = [method for method in paper.COMPARED if method.name != "image_posterior"]
     for condition in uniform.CONDITIONS:
         capture = condition.capture(1)
         truth_bin = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
         bins = {
             method.name: estimate(capture, method.estimator, method.settings).bin
-            for method in paper.COMPARED
+            for method in compared
         }
         found = {name: np.abs(each - truth_bin) <= 3 for name, each in bins.items()}
         for name, right in found.items():
