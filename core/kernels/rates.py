@@ -24,7 +24,7 @@ def fill_rates(counts, n_pulses, rate, armed):  # type: ignore[no-untyped-def]
             its_armed[k] = left
             left -= count[k]
         for k in range(n_bins):
-            z = count[k] / (2.0 * its_armed[k] - count[k])
+            z = count[k] / max(2.0 * its_armed[k] - count[k], 1.0)
             q = z * z
             p = (((q / 15.0 + 1.0 / 13.0) * q + 1.0 / 11.0) * q + 1.0 / 9.0) * q + 1.0 / 7.0
             its_rate[k] = 2.0 * z * (((p * q + 1.0 / 5.0) * q + 1.0 / 3.0) * q + 1.0)
