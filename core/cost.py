@@ -86,6 +86,7 @@ class _Rates:
     pixel_bytes: float = 0.0
     fixed_bytes: float = 0.0
     count_bytes: float = 0.0
+    sampled_bytes: float = 0.0
     finds_delay: bool = False
 
 
@@ -96,7 +97,7 @@ _RATES = {
     "shi": _Rates(40e-9),
     "chi": _Rates(60e-9, 1e-6, 170.0, 40e6),
     "unmixing": _Rates(200e-9, 5e-6, 300.0, 130e6, finds_delay=True),
-    "image_posterior": _Rates(300e-9, 20e-6, 500.0, 60e6, 24.0, finds_delay=True),
+    "image_posterior": _Rates(300e-9, 20e-6, 500.0, 60e6, 24.0, 70.0, finds_delay=True),
     "likelihood": _Rates(0.0, 0.3e-6, 40.0, finds_delay=True),
     "oracle": _Rates(0.0, 0.3e-6, 60.0, finds_delay=True),
 }
@@ -139,6 +140,7 @@ def predicted(
 
     n_bytes = _FIXED_BYTES + rates.fixed_bytes * min(1.0, n_counts / 1e6)
     n_bytes += (_PIXEL_BYTES + rates.pixel_bytes) * n_pixels + rates.count_bytes * n_counts
+    n_bytes += rates.sampled_bytes * min(n_pixels, DEPTH_SAMPLE) * n_bins
     seconds = _FIXED_S + (_PIXEL_S + rates.pixel_s) * n_pixels + rates.count_s * n_counts
     lanes = lanes_of(levels, n_bins)
     if not posterior_is_cached:

@@ -10,7 +10,7 @@ from core.estimators import ESTIMATORS, estimate
 from core.inference import fit_of
 from core.inspection import pixel_report
 from core.kernels.parallel import SERIAL_BELOW
-from core.scene import Scene
+from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.tracking import PRESETS, track, tracking_signals
 
@@ -25,6 +25,9 @@ def warm_up() -> None:
     small = simulate(scene, acquisition, Flux())
     pixels = SERIAL_BELOW // acquisition.n_bins + 1
     large = Capture(np.zeros((pixels, 1, acquisition.n_bins), np.uint16), acquisition)
+    # The image posterior uses neighbours only where they agree.
+    wall = scenes["wall"](16)
+    estimate(simulate(wall, wall.acquisition, Flux(sbr=1.0)), "image_posterior")
     images = {method: estimate(small, method) for method in ESTIMATORS}
     fit_of(small)
     pixel_report(small, images["tracking"], 0, 0)  # `scipy.signal` takes a second to import

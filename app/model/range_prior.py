@@ -10,7 +10,6 @@ import numpy as np
 from app.model.state import ReductionSettings
 from app.model.store import Answer, reduced
 from core import ESTIMATORS, Capture, Scene, simulate
-from core.inference import flux_model_of
 from core.studies import outputs, range_prior
 
 SIDE, ECHO_SIDE = 64, 32
@@ -19,8 +18,7 @@ SIDE, ECHO_SIDE = 64, 32
 
 def has_range_prior(answer: Answer) -> bool:
     """Return whether there is one: the flux is known, and the estimator is not told it."""
-    is_told = ESTIMATORS[answer.method].flux_model is not flux_model_of
-    return answer.request.source.is_scene and not is_told
+    return answer.request.source.is_scene and not ESTIMATORS[answer.method].knows_flux
 
 
 def range_prior_of(answer: Answer) -> outputs.Plot:

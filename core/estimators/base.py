@@ -244,6 +244,8 @@ class Estimator:
         Whether positions are delays of the surface, without a lag to calibrate.
     flux_model : callable
         ``capture -> FluxModel`` for the estimator; raises ``ValueError`` if it is unknown.
+    knows_flux : bool
+        Whether `flux_model` is the true one, which no instrument knows.
     reconstructed : str
         If the original was not available: the source of the reconstruction.
     own_threshold : str
@@ -272,6 +274,7 @@ class Estimator:
     first_bin: Callable[[Any], int] = lambda _: 0
     finds_delay: bool = False
     flux_model: Callable[[Capture], FluxModel] = flux_model_of
+    knows_flux: bool = False
     reconstructed: str = ""
     own_threshold: str = ""
     undoes_pile_up: bool = False

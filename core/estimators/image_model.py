@@ -1,16 +1,16 @@
 """Flux and smoothness of an image: what its pixels share, as neighbours show it.
 
-At a low SBR single pixels hardly tell an echo from none, and the signal level estimated from them
-collapses. Neighbouring pixels that see one surface are as one pixel with more pulses. The levels
-are therefore estimated with 1 x 1 to 4 x 4 pixels added, and those are kept that make neighbours
-agree most. With the posteriors q of two pixels by themselves, the prior p and a Laplace density K
-of scale a, the pair is ::
+At a low SBR single pixels cannot distinguish an echo from background, and the signal level
+estimated from them collapses. Neighbouring pixels that see one surface are as one pixel with more
+pulses. The levels are therefore estimated with 1 x 1 to 4 x 4 pixels added, and those are kept that
+make neighbours agree most. With the posteriors q of two pixels by themselves, the prior p and a
+Laplace density K of scale a, the pair is ::
 
     c = Σ q(d) K(d - d') q'(d') / p(d')
 
 times as likely with one surface as with two. ``mean log (1 - ρ + ρ c)`` over pairs of neighbours is
 maximised over ρ and a; the same maximum of pairs at random, which see two surfaces, is subtracted.
-If nothing remains, neighbours tell nothing of each other.
+If nothing remains, neighbours carry no information about each other.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ _PAIRS = 1024  # pixels whose right and lower neighbours are compared
 _SCALES_BINS = (0.3, 0.6, 1.2, 2.4)
 _SHARES = np.linspace(0.0, 0.95, 39)
 _SURE = 3.0  # standard errors
-_ECHO_BINS = 4  # merged bins of an echo; more tell nothing new
-_LEAST_SHARE, _LEAST_DEPTH = 1e-6, 1e-3  # of the pixels; relative to a uniform prior
+_ECHO_BINS = 4  # merged bins of an echo; more add no information
+_LEAST_SHARE = 1e-6  # of the pixels
+_LEAST_DEPTH = 0.3  # relative to a uniform prior; fewer pixels teach depths than are estimated
 _LEAST_EVIDENCE = 1e-20  # so that no product of messages is subnormal
 _APART = Agreement(0.0, 0.0, 1.0)
 
@@ -66,18 +67,19 @@ def merged_bins(capture: Capture) -> tuple[Capture, int]:
 
 
 def merged_flux(flux: FluxModel, factor: int) -> FluxModel:
-    """Return a flux model after merging bins; the rest at the end of the gate is left out."""
+    """Return a flux model after merging bins; bins left over at the end of the gate are dropped."""
     if factor == 1:
         return flux
-    shape = flux.background_shape
+    kept = flux.depth.size // factor * factor
+    shape, relative = flux.background_shape, flux.relative_background
 
     def merged(values: Floats) -> Floats:
-        kept = values.size // factor * factor
         found = values[:kept].reshape(-1, factor).mean(axis=1)
         return np.asarray(found / found.mean())
 
     return replace(
         flux,
+        background=flux.background * (relative[:kept].sum() / relative.sum()),
         depth=merged(flux.depth),
         background_shape=None if shape is None else merged(shape),
     )
@@ -106,7 +108,7 @@ def _flux_priors(capture: Capture) -> Iterator[FluxPrior]:
 
 
 def _agreement(capture: Capture, flux: FluxModel) -> Agreement:
-    """Find how much alike neighbours are under a flux model."""
+    """Find how similar neighbours are under a flux model."""
     rows, cols = capture.shape
     if min(rows, cols) < 2 or rows * cols < FEWEST_PIXELS:
         return _APART
@@ -150,7 +152,11 @@ class Prior(NamedTuple):
 
     @classmethod
     def of(cls, flux: FluxModel) -> Prior:
-        """Return the prior of a flux model; no state is impossible."""
+        """Return the prior of a flux model; no state is impossible.
+
+        It is not normalised again: at a low SBR the share of pixels without an echo is estimated
+        too large, and what is added to the depths makes up for that.
+        """
         nothing = min(max(float(flux.share[0]), _LEAST_SHARE), 1 - _LEAST_SHARE)
         depth = np.maximum(flux.depth, _LEAST_DEPTH) / flux.depth.size
         return cls((1 - nothing) * depth, nothing)

@@ -52,18 +52,18 @@ from core.inference.posterior import (
     tolerance_probability,
 )
 from core.kernels.blocks import LANES
-from core.kernels.messages import fill_peaks, fill_posterior, fill_windows
+from core.kernels.messages import fill_modes, fill_posterior, fill_window_masses
 from core.kernels.parallel import entering
 from core.kernels.planes import fill_planes
 from core.parameters import Choice, Settings, parameter
 
 _ROUNDS = 3
 _LEAST_ODDS = 1e-12
-_DARK_IF_ANSWERED = 0.01  # share of pixels without an echo, if every pixel is answered
+_EMPTY_SHARE = 0.01  # of pixels without an echo, if every pixel is estimated
 _ALONG_PLANES = 0.8, 0.15  # ρ and the scale of K in bins
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
 
-Pixels = Literal["every pixel is answered", "a pixel may see nothing"]
+Pixels = Literal["estimate every pixel", "allow empty pixels"]
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ class ImageParameters(Settings):
     """Settings of the image posterior."""
 
     pixels: Pixels = parameter(
-        "every pixel is answered",
-        Choice("Pixels", ("every pixel is answered", "a pixel may see nothing")),
-        "Every pixel is answered: each one with a detection gets its likeliest range, as if nearly "
-        "all had a surface. A pixel may see nothing: only those get one in which a surface is "
-        "likelier than nothing. Confidence never assumes a surface.",
+        "estimate every pixel",
+        Choice("Pixels", ("estimate every pixel", "allow empty pixels")),
+        "Estimate every pixel: each with a detection gets its likeliest range, as if nearly all "
+        "had a surface. Allow empty pixels: only those get a range in which a surface is likelier "
+        "than none. Confidence never assumes a surface.",
     )
 
 
@@ -125,10 +125,10 @@ def image_posterior_of(capture: Capture, flux: FluxModel) -> ImagePosterior:
 
 
 @cached_per_capture
-def answers_of(capture: Capture, flux: FluxModel) -> Floats:
+def likeliest_delays(capture: Capture, flux: FluxModel) -> Floats:
     """Find the likeliest delay of each pixel in bins if nearly all have a surface, (row, col)."""
     merged, factor = merged_bins(capture)
-    dark = _DARK_IF_ANSWERED
+    dark = _EMPTY_SHARE
     share = np.append(dark, (1 - dark) * flux.share[1:] / (flux.share[1:].sum() or 1.0))
     *_, posterior = posteriors(merged, merged_flux(replace(flux, share=share), factor))
     return peaks(posterior.surface)[0] * factor
@@ -160,7 +160,7 @@ def _windows(posterior: NDArray[np.float32], factor: int, n_bins: int) -> NDArra
     merged = posterior.reshape(-1, posterior.shape[2])
     window = np.empty((len(merged), n_bins), np.float32)
     with entering(window.size):
-        fill_windows(merged, factor, TOLERANCE_BINS, window)
+        fill_window_masses(merged, factor, TOLERANCE_BINS, window)
     return window.reshape(*posterior.shape[:2], n_bins)
 
 
@@ -168,7 +168,7 @@ def peaks(posterior: NDArray[np.float32]) -> tuple[Floats, Floats]:
     """Likeliest delay of each pixel in bins and the probability of the bins around it."""
     delay, weight = np.empty((2, *posterior.shape[:2]))
     with entering(posterior.size):
-        fill_peaks(posterior.reshape(-1, posterior.shape[2]), delay.ravel(), weight.ravel())
+        fill_modes(posterior.reshape(-1, posterior.shape[2]), delay.ravel(), weight.ravel())
     return delay, weight
 
 
@@ -190,28 +190,34 @@ def _locate(
     capture: Capture, flux: FluxModel, parameters: ImageParameters
 ) -> tuple[Floats, Floats]:
     """Return the likeliest delay and the log odds of a surface."""
-    if not _has_neighbours(flux):
+    if not _neighbours_agree(flux):
         depths: Depths = "learned" if capture.counts.size >= FEWEST_PIXELS else "alike"
         return locate_alone(capture, flux, LikelihoodParameters(depths=depths))
     found = image_posterior_of(capture, flux)
     surface = np.clip(found.surface, _LEAST_ODDS, 1 - _LEAST_ODDS)
-    if parameters.pixels == "a pixel may see nothing":
+    if parameters.pixels == "allow empty pixels":
         delay = np.where(surface >= 0.5, found.delay, np.nan)
     else:
-        delay = answers_of(capture, flux)
+        delay = likeliest_delays(capture, flux)
     return delay, np.log(surface / (1 - surface))
 
 
 def _confidence(
     capture: Capture, flux: FluxModel, delay_bin: Floats, parameters: ImageParameters
 ) -> Floats:
-    if not _has_neighbours(flux):
+    if not _neighbours_agree(flux):
         return tolerance_probability(capture, delay_bin)
     found = image_posterior_of(capture, flux)
     return probability_at(found.tolerance_probability, delay_bin)
 
 
-def _has_neighbours(flux: FluxModel) -> bool:
+def _omits(capture: Capture) -> str:
+    if _neighbours_agree(image_model_of(capture)):
+        return ""
+    return "neighbours agree no more than pixels at random: each pixel is estimated by itself"
+
+
+def _neighbours_agree(flux: FluxModel) -> bool:
     return flux.agreement is not None and flux.agreement.alike > 0
 
 
@@ -222,6 +228,7 @@ ESTIMATOR = Estimator(
     _locate,
     finds_delay=True,
     flux_model=image_model_of,
+    omits=_omits,
     own_threshold="beside a surface, its neighbours raise it; let a pixel see nothing instead",
     undoes_pile_up=True,
     whole_image=True,

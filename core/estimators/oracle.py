@@ -48,5 +48,6 @@ ESTIMATOR = Estimator(
     locate,
     finds_delay=True,
     flux_model=true_flux_model,
+    knows_flux=True,
     undoes_pile_up=True,
 )

@@ -40,9 +40,9 @@ from core.trigger import rate_per_bin, trigger_probability
 _AT_ONCE = 2**19  # numbers that fit in the cache
 LEVELS = 12  # of signal, without "no echo"
 SAMPLE = 512  # pixels from which the levels of signal are estimated
-DEPTH_SAMPLE = 1024
+DEPTH_SAMPLE = 1024  # pixels from which the distribution of delays is estimated
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
-_LEAST_GAIN = 2.0
+_LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
@@ -416,11 +416,12 @@ def _shares(evidence: Floats) -> Floats:
 
 
 def shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Floats, Floats]:
-    """Estimate shares of levels, and of delays in each bin, from densities (pixel, level, bin).
+    """Estimate the share of no echo, and those of delays in each bin, from densities.
 
-    The first level, no echo, has the same density at all delays. There are too few pixels for an
-    independent share of each bin: delays start uniform, take few steps, are smoothed in each, and
-    keep a uniform part, as large as the pixels require.
+    Densities have shape (pixel, level, bin). The first level, no echo, has the same density at all
+    delays; the other levels keep their ratios. There are too few pixels for an independent share of
+    each bin: delays have a sparse prior, are smoothed over a bin in each step, and keep a uniform
+    part, as large as the pixels require.
     """
     n_bins = density.shape[2]
     share, depth = share.copy(), np.full(n_bins, 1 / n_bins)

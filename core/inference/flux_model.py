@@ -18,7 +18,7 @@ class Agreement(NamedTuple):
     gain: float
     """Mean log likelihood ratio of two neighbours with a common surface to two without."""
     alike: float
-    """Share of neighbouring pixels on one surface; 0 if neighbours tell nothing."""
+    """Share of neighbouring pixels on one surface; 0 if neighbours carry no information."""
     scale_bins: float
     """Scale of the Laplace density of their difference in delay."""
 

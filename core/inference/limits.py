@@ -139,11 +139,12 @@ ASSUMES = "the likeliest delay of a single pixel with known fluxes, if depths ar
 """What `right_bin_probability` is the probability of; other methods may exceed it."""
 
 
-def approximation_error(probability: float, n_pulses: int) -> float:
-    """Return the largest error found of a `right_bin_probability`, in simulations of its docs."""
+def approximation_error(probability: ArrayLike, n_pulses: int) -> float:
+    """Return the largest error found of a mean `right_bin_probability`, in its simulations."""
     if n_pulses < _MANY_PULSES:
         return _ERROR_FEW_PULSES
-    return 0.005 if probability > 0.9 and n_pulses >= 1000 else 0.015
+    is_small = (np.asarray(probability) > 0.9) & (n_pulses >= 1000)
+    return float(np.where(is_small, 0.005, 0.015).mean(where=np.isfinite(probability)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -164,7 +164,7 @@ def pixel_report(
     curve = ESTIMATORS[method].curves(capture, row, col, settings)
     lag = lag_bins(capture, method, settings)
     interval_68_m, interval_95_m = pixel_range_intervals(capture, image, row, col, (0.68, 0.95))
-    candidates, confidence = _candidates(capture, image, row, col, curve, lag)
+    candidates, confidence = _candidates(capture, image, row, col, curve, method, lag)
     answer_bin = float(image.bin[row, col])
     likely = [each.bin for each in candidates if each.probability >= LIKELY]
     surfaces_bin = tuple(sorted(likely, key=lambda at: at != answer_bin))
@@ -234,7 +234,13 @@ def lag_bins(capture: Capture, method: str, settings: Any) -> float:
 
 
 def _candidates(
-    capture: Capture, image: RangeImage, row: int, col: int, curve: Floats, lag_bins: float
+    capture: Capture,
+    image: RangeImage,
+    row: int,
+    col: int,
+    curve: Floats,
+    method: str,
+    lag_bins: float,
 ) -> tuple[tuple[RangeCandidate, ...], float]:
     """Return the candidates and the probability of the estimate, whether it is one of them."""
     estimate_bin, confidence = float(image.bin[row, col]), float(image.confidence[row, col])
@@ -251,8 +257,11 @@ def _candidates(
     kept = _apart(bins, width_bins)
     bins, score = bins[kept], curve[peaks[kept]]
     probability = surface_probabilities(capture, row, col, bins)
-    if estimate_bin in bins:
-        confidence = float(probability[bins == estimate_bin][0])
+    is_estimate = bins == estimate_bin
+    if ESTIMATORS[method].confidence is not None:  # which knows more than the pixel
+        probability[is_estimate] = confidence
+    elif is_estimate.any():
+        confidence = float(probability[is_estimate][0])
     range_m = capture.acquisition.bin_to_range_m(bins)
     interval_m = delay_range_interval(capture, row, col, bins)
     columns = (bins, range_m, *interval_m, score, score / score[0], probability)

@@ -132,7 +132,7 @@ def fill_posterior(evidence, nothing, slope, along_rows, link, posterior, poster
 
 
 @njit(**PARALLEL)
-def fill_peaks(posterior, delay, weight):  # type: ignore[no-untyped-def]
+def fill_modes(posterior, delay, weight):  # type: ignore[no-untyped-def]
     """Fill the likeliest `delay` of each pixel in bins, refined by a parabola, and its `weight`.
 
     The weight is the probability of a bin or two around it. `posterior` is of shape (pixel, bin),
@@ -159,7 +159,7 @@ def fill_peaks(posterior, delay, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def fill_windows(posterior, factor, half, window):  # type: ignore[no-untyped-def]
+def fill_window_masses(posterior, factor, half, window):  # type: ignore[no-untyped-def]
     """Fill `window` with the mass of `half` bins on either side of the beginning of each bin.
 
     `posterior` (pixel, merged bin) is of `factor` bins each, which share it alike, and `window` is

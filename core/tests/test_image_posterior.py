@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from core.estimators import estimate
-from core.estimators.image_model import laplace
+from core.estimators.image_model import Prior, image_model_of, merged_flux
 from core.estimators.image_posterior import Link, planes
 from core.kernels.messages import fill_posterior
 from core.metrics import restoration_degree
@@ -18,13 +18,7 @@ ALIKE, SCALE = 0.7, 0.4
 
 
 def link(n_bins: int, nothing: float) -> Link:
-    prior = np.full(n_bins, (1 - nothing) / n_bins)
-    return Link(
-        laplace(SCALE).astype(np.float32),
-        np.float32(ALIKE),
-        (1 / prior).astype(np.float32),
-        np.float32(1 / nothing),
-    )
+    return Link.of(ALIKE, SCALE, Prior(np.full(n_bins, (1 - nothing) / n_bins), nothing))
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.75, -1.5])
@@ -74,6 +68,14 @@ def test_pixels_with_depths_of_their_own_are_estimated_by_themselves() -> None:
     found = estimate(capture, "image_posterior")
     np.testing.assert_array_equal(found.bin, alone.bin)
     np.testing.assert_array_equal(found.confidence, alone.confidence)
+    assert "each pixel is estimated by itself" in found.made_by.remark
+
+
+def test_merged_bins_keep_the_background_per_bin() -> None:
+    capture = Condition("car", 0.06).capture(900)
+    flux = image_model_of(capture)
+    merged = merged_flux(flux, 30)  # 10 of 100 bins are left over
+    np.testing.assert_allclose(merged.background / (3 * 30), flux.background / 100)
 
 
 def test_confidence_is_the_share_of_right_estimates() -> None:
@@ -95,12 +97,12 @@ def test_messages_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_array_equal(found[0].confidence, found[1].confidence)
 
 
-def test_the_sky_is_left_empty_if_a_pixel_may_see_nothing() -> None:
+def test_the_sky_is_left_empty_if_pixels_may_be() -> None:
     capture = Condition("car", 0.03).capture(902)
     is_sky = np.isnan(np.asarray(capture.truth_range_m))
     every, some = (
         estimate(capture, "image_posterior", pixels=each).valid
-        for each in ("every pixel is answered", "a pixel may see nothing")
+        for each in ("estimate every pixel", "allow empty pixels")
     )
     assert every.all()
     assert some[is_sky].mean() < 0.08  # next to the car its neighbours say otherwise

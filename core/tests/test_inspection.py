@@ -124,8 +124,9 @@ def test_the_best_candidate_is_the_estimate(method: str) -> None:
         ("tracking", TrackingParameters(refine="none")),
         ("likelihood", None),
         ("unmixing", None),
+        ("image_posterior", None),
     ],
-    ids=["tracking", "tracking in whole bins", "likelihood", "unmixing"],
+    ids=["tracking", "tracking in whole bins", "likelihood", "unmixing", "image_posterior"],
 )
 def test_the_candidate_at_the_estimate_is_the_estimate(method: str, settings: Any) -> None:
     capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)

@@ -80,6 +80,8 @@ scene = core.scenes["uniform"](8)
 capture = core.simulate(scene, scene.acquisition, core.Flux())
 for method in core.ESTIMATORS:
     core.run(capture, method)
+flat = core.simulate(core.scenes["wall"](16), scene.acquisition, core.Flux(sbr=1.0))
+core.run(flat, "image_posterior")
 for settings in core.PRESETS.values():
     core.tracking_signals(capture.cube, settings)
     image = core.estimate(capture, "tracking", settings)

@@ -158,7 +158,8 @@ def pulse_guess(cube: Cube) -> PulseGuess | None:
     is_gamma = np.arange(sigma.size) >= candidates[0][0].size
     left = found.against < _REJECTED
     shape: Shape = "gamma" if is_gamma[left].all() else "gaussian"
-    best = sigma[np.where(is_gamma == (shape == "gamma"), found.gain, -np.inf).argmax()]
+    is_shape = left & (is_gamma == (shape == "gamma"))
+    best = sigma[np.where(is_shape, found.gain, -np.inf).argmax()]
     low, high = float(sigma[left].min()), float(sigma[left].max())
     is_bounded = high < sigma.max()
     is_close = best / low < _CLOSE and high / best < _CLOSE

@@ -101,7 +101,9 @@ def _table(
     parts = ("all",) if scene == "uniform" else ("all", "inside", "at edges")
 
     def cell(condition: Condition, name: str, part: int) -> Interval:
-        return mean_interval(np.array([found[condition, seed][name][part] for seed in seeds]))
+        of_seeds = np.array([found[condition, seed][name][part] for seed in seeds])
+        mean = mean_interval(of_seeds)
+        return Interval(mean.value, max(mean.low, 0.0), min(mean.high, 1.0))
 
     return Table(
         f"neighbours_{scene}",

@@ -362,7 +362,9 @@ def limits(seed: int = 0) -> Table:
             "scene": lambda row: row[0].scene,
             "SBR": lambda row: row[0].sbr,
             "probability of the right bin": right,
-            "approximated to": lambda row: approximation_error(right(row), N_PULSES),
+            "approximated to": lambda row: approximation_error(
+                row[1].right_bin_probability, N_PULSES
+            ),
             "Cramér-Rao bound m": lambda row: float(np.nanmean(row[1].cramer_rao_m)),
         },
         f"The probability is that of {ASSUMES}. It does not bound other methods: deciding by the "

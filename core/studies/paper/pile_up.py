@@ -19,7 +19,7 @@ ONSETS = np.arange(20, 100)
 """Bins of the target; the bins before them hold noise alone."""
 
 LEAST_P = 0.05
-"""p-value from which on a curve is said to fit."""
+"""p-value at or above which a curve is said to fit."""
 
 _N_NOISE = 19  # bins at the front of the gate whose mean is Figure 5b
 

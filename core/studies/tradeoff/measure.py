@@ -119,7 +119,7 @@ class Candidate:
     @property
     def knows_flux(self) -> bool:
         """Whether it is given the true flux, which no instrument knows, as the oracle is."""
-        return self.estimator.flux_model is not flux_model_of
+        return self.estimator.knows_flux
 
     @property
     def is_bound(self) -> bool:
@@ -131,10 +131,10 @@ class Candidate:
     ) -> Floats:
         """Return ranges at full resolution `shape` from the reduced capture.
 
-        A given flux model is not estimated again; the oracle keeps the true one.
+        A given flux model is not estimated again, except by methods with one of their own.
         """
         estimator = self.estimator
-        if flux is not None and not self.knows_flux:
+        if flux is not None and estimator.flux_model is flux_model_of:
             estimator = replace(estimator, flux_model=lambda _: flux)
         with kernel_threads(self.threads):
             bins, _ = estimator.delays(reduced, self.settings)
