@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from html import escape, unescape
 
 import numpy as np
+import panel_material_ui as pmui
 import pytest
 from playwright.sync_api import Page, expect
 
@@ -132,6 +134,20 @@ def test_nothing_is_shown_before_the_prediction(session):
         shown.answer.value = answer
         assert session.state.learning.answer == answer
         session.tasks.run_until(lambda said=said: said in shown.verdict.text)
+
+
+def test_html_in_a_lesson_is_shown_as_text():
+    html = "<script>alert(1)</script>"
+    text = TEXT.replace('"T"', f'"{html}"').replace('"?"', f'"{html}"')
+    text = text.replace("Before.", html).replace("After.", f"**a** {html}")
+    lessons = {"t": lesson_of("t", text)}
+    page = Learn(Session(built_in_sources(), tasks=HeldTasks(), lessons=lessons))
+    shown = [
+        unescape(each.get_root().data.object) for each in page.shown.layout.select(pmui.Typography)
+    ]
+    assert sum(escape(html) in each for each in shown) == 4
+    assert any("<strong>a</strong>" in each for each in shown)
+    assert not any("<script" in each for each in shown)
 
 
 def test_a_link_opens_a_lesson_where_the_learner_was(session):

@@ -331,7 +331,10 @@ class Learn(Section):
 
 
 def _markdown(source: str) -> pmui.Typography:
-    return pmui.Typography(source, sizing_mode="stretch_width", margin=(2, 8))
+    """Return formatted text; HTML in a lesson's file is shown as text, so that none can run."""
+    return pmui.Typography(
+        source, renderer_options={"html": False}, sizing_mode="stretch_width", margin=(2, 8)
+    )
 
 
 def _field(label: str) -> pmui.TextInput:
