@@ -284,7 +284,7 @@ class Learn(Section):
         for name, parse in (
             ("prediction", lesson.prediction.parsed),
             ("moved", lesson.moved),
-            ("answer", lambda given: given and number_of(given)),
+            ("answer", lambda given: given and number_of(given, "answer")),
         ):
             try:
                 parse(getattr(learning, name))
@@ -315,7 +315,7 @@ class Learn(Section):
 
         self.submit(work, partial(self._draw, shown, wanted))
         if learning.answer:
-            verdict = partial(lesson.check.verdict, number_of(learning.answer))
+            verdict = partial(lesson.check.verdict, number_of(learning.answer, "answer"))
             self._checks.submit(verdict, partial(self._judge, shown), self.report_error)
 
     def _draw(
