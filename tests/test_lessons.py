@@ -179,10 +179,45 @@ def test_nothing_is_shown_before_the_prediction(session):
     assert predicted[0] / predicted[-1] == pytest.approx(first / last)
     shown.panel.controls["background"].value = 5.0
     assert session.state.learning.moved == "5.0"
+    moved, constant = shown.views["after", "first_photons"], shown.views["before", "light"]
+    assert moved.about().settings == (LESSONS[FIRST].bench,)  # the one still on screen
+    session.tasks.run_until(lambda: moved.item is not plot)
+    plot, light = moved.item, constant.item
     for answer, said in (("0.58", "before bin 50"), ("42 %", "Right")):
         shown.answer.value = answer
         assert session.state.learning.answer == answer
         session.tasks.run_until(lambda said=said: said in shown.verdict.text)
+    assert moved.about().settings == (replace(LESSONS[FIRST].bench, background=5.0),)
+    assert constant.about().settings == (LESSONS[FIRST].bench,)
+    assert (moved.item, constant.item) == (plot, light)  # an answer changes no view
+
+
+def test_a_failed_check_is_shown_until_a_check_works(session, monkeypatch):
+    session.state.learning = Learning(FIRST, "flat", "1.0", "0.42")
+    heard = []
+    session.failures.shown.subscribe(heard.append)
+    page = Learn(session)
+    with monkeypatch.context() as broken:
+        broken.setitem(CHECKS, "share_armed", lambda *_, **__: 1 / 0)
+        page.show(True)
+        session.tasks.run_until(lambda: heard)
+    after = page.shown.views["after", "still_armed"]
+    session.tasks.run_until(lambda: after.item)
+    assert "ZeroDivisionError" in heard[-1]
+    page.shown.answer.value = "0.43"
+    session.tasks.run_until(lambda: "Right" in page.shown.verdict.text)
+    assert heard[-1] == ""
+
+
+def test_a_page_that_is_left_while_it_computes_is_drawn_on_return(session):
+    page = Learn(session)
+    page.show(True)
+    page.show(False)
+    session.tasks.run_one()
+    light = page.shown.views["before", "light"]
+    assert light.item is None
+    page.show(True)
+    session.tasks.run_until(lambda: light.item)
 
 
 def test_html_in_a_lesson_is_shown_as_text():
@@ -214,10 +249,16 @@ def test_a_link_opens_a_lesson_where_the_learner_was(session):
         (Learning("none such"), "no lesson 'none such'"),
         (Learning("2-more-light", "many"), "'many' is not accepted: give a number"),
         (Learning("2-more-light", "7"), "give a number from 0 to 1"),
+        (Learning("2-more-light", moved="-1"), "exposure = -1.0 is not accepted"),
     ):
         session.state.learning = learning
         assert refused in heard[-1]
         assert not page.shown.moving.visible
+        count = len(heard)
+        page.shown.prediction.value = "flat" if page.shown.lesson.key == FIRST else "0.2"
+        page.shown.commit.clicks += 1
+        assert page.shown.moving.visible
+        assert refused not in "".join(heard[count:])
 
 
 # -- in a browser ----------------------------------------------------------------------------------
