@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
+from html import escape, unescape
 
 import numpy as np
+import panel_material_ui as pmui
 import pytest
 from playwright.sync_api import Page, expect
 
-from app.model.lessons import PREDICTED, SHAPES, lesson_of, read_lesson, read_lessons
+from app.model.lessons import PREDICTED, SHAPES, lesson_of, number_of, read_lesson, read_lessons
 from app.model.state import Learning
 from app.model.store import built_in_sources
 from app.pages.learn.page import Learn
 from app.pages.session import Session
+from core.studies.lessons import CHECKS, NEED_SIGNAL, VIEWS, Bench, require_signal
 from core.studies.outputs import Pictures, Plot
 from tests.browser import enter, eventually, slider
 from tests.states import link_to
@@ -79,12 +83,24 @@ After.
         ('title = "T"', "", "title is missing"),
         ('["light"]', '["os.system"]', "view = 'os.system' is not accepted"),
         ("background = 2.0", "background = -1.0", "background = -1.0 is not accepted"),
-        ("background = 2.0", "brightness = 2.0", "brightness"),
+        ("background = 2.0", "brightness = 2.0", "state = 'brightness' .* give 'signal' or 'back"),
+        ('"T"', '"T"\nauthor = "A"', "front matter = 'author' is not accepted: give 'title' or"),
         ('name = "background"', 'name = "colour"', "control.name = 'colour'"),
         ('view = "first_photons"', 'view = "light"', "prediction.view = 'light'"),
         ('"share_armed"', '"eval"', "check = 'eval' is not accepted"),
-        ("{ bin = 50 }", "{ place = 50 }", r"arguments = \['place'\]"),
-        ("tolerance = 0.01", "", "tolerance"),
+        ('view = "first_photons"', 'view = "first_photons"\nlow = "0"', "prediction: low = '0'"),
+        ('"first_photons"', '"car_image"', r"view = 'first_photons' .* a plot of after, \[\]"),
+        ("{ bin = 50 }", "{ place = 50 }", "arguments = 'place' is not accepted: give 'bin'"),
+        ("{ bin = 50 }", "{ bin = true }", "bin = True is not accepted: give a finite number"),
+        ("tolerance = 0.01", "", "check: tolerance is missing$"),
+        ("tolerance = 0.01", "tolerance = 0", "tolerance = 0 .* a number above 0"),
+        ('name = "background"', 'name = "background"\nfrom = 1.0', "control: to is missing"),
+        ('name = "background"', 'name = "background"\nfrom = 3\nto = 2', r"\(3, 2\) .* increasing"),
+        ('name = "background"', 'name = "background"\nfrom = 1\nto = 99', "from 0.05 to 20"),
+        ('name = "background"', 'name = "preset"\nfrom = 1\nto = 2', "'preset' is not a number"),
+        ("[check]", "hints = [1]\n[check]", "entry of prediction = 'hints'"),
+        ("tolerance = 0.01", "tolerance = 0.01\nhints = [1]", "hints = 1 .* give a table"),
+        ("background = 2.0", "signal = 0\nbackground = 2.0\n[x]", "entry of front matter = 'x'"),
     ],
 )
 def test_a_lesson_that_is_not_valid_is_refused_by_file_and_entry(tmp_path, old, new, message):
@@ -98,8 +114,43 @@ def test_a_lesson_that_is_not_valid_is_refused_by_file_and_entry(tmp_path, old, 
 def test_a_folder_adds_lessons(tmp_path):
     with pytest.raises(ValueError, match="--lessons"):
         read_lessons([tmp_path])
-    (tmp_path / "mine.md").write_text(TEXT)
+    (tmp_path / "mine.md").write_text(TEXT, "utf-8-sig")  # as Notepad does
     assert [*read_lessons([tmp_path])] == [*LESSONS, "mine"]
+    (tmp_path / "other.md").write_text(TEXT)
+    with pytest.raises(ValueError, match=r"^other\.md: title = 'T' is not accepted"):
+        read_lessons([tmp_path])
+    (tmp_path / "other.md").rename(tmp_path / f"{FIRST}.md")
+    with pytest.raises(ValueError, match=f"file name = .*{FIRST}.md' is not accepted"):
+        read_lessons([tmp_path])
+
+
+@pytest.mark.parametrize("name", [*VIEWS, "best_attenuation"])
+def test_what_needs_a_signal_is_refused_without_one(name):
+    bench = Bench(signal=0.0)
+    compute = VIEWS.get(name) or CHECKS[name]
+    if name not in NEED_SIGNAL:
+        require_signal(name, bench)
+        compute(bench)
+        return
+    for refused in (compute, partial(require_signal, name)):
+        with pytest.raises(ValueError, match=r"signal = 0\.0 is not accepted: give a number above"):
+            refused(bench)
+
+
+def test_without_a_signal_there_is_no_echo():
+    plot = VIEWS["estimates_without_echo"](Bench(signal=0.0))
+    assert np.nanmax(plot.curves["echoes found"]) < 0.3  # by chance only
+    text = TEXT.replace('"background"', '"signal"').replace(
+        '["first_photons"]', '["first_photons", "both_scales"]'
+    )
+    with pytest.raises(ValueError, match="above 0, which 'both_scales' needs"):
+        lesson_of("t", text).moved("0")
+
+
+def test_typed_numbers():
+    assert number_of(" 42 % ", "answer") == number_of("0,42", "answer") == 0.42
+    with pytest.raises(ValueError, match="exposure = 'many' is not accepted: give a number"):
+        LESSONS["2-more-light"].moved("many")
 
 
 # -- the page without a browser --------------------------------------------------------------------
@@ -128,10 +179,59 @@ def test_nothing_is_shown_before_the_prediction(session):
     assert predicted[0] / predicted[-1] == pytest.approx(first / last)
     shown.panel.controls["background"].value = 5.0
     assert session.state.learning.moved == "5.0"
+    moved, constant = shown.views["after", "first_photons"], shown.views["before", "light"]
+    assert moved.about().settings == (LESSONS[FIRST].bench,)  # the one still on screen
+    session.tasks.run_until(lambda: moved.item is not plot)
+    plot, light = moved.item, constant.item
     for answer, said in (("0.58", "before bin 50"), ("42 %", "Right")):
         shown.answer.value = answer
         assert session.state.learning.answer == answer
         session.tasks.run_until(lambda said=said: said in shown.verdict.text)
+    assert moved.about().settings == (replace(LESSONS[FIRST].bench, background=5.0),)
+    assert constant.about().settings == (LESSONS[FIRST].bench,)
+    assert (moved.item, constant.item) == (plot, light)  # an answer changes no view
+
+
+def test_a_failed_check_is_shown_until_a_check_works(session, monkeypatch):
+    session.state.learning = Learning(FIRST, "flat", "1.0", "0.42")
+    heard = []
+    session.failures.shown.subscribe(heard.append)
+    page = Learn(session)
+    with monkeypatch.context() as broken:
+        broken.setitem(CHECKS, "share_armed", lambda *_, **__: 1 / 0)
+        page.show(True)
+        session.tasks.run_until(lambda: heard)
+    after = page.shown.views["after", "still_armed"]
+    session.tasks.run_until(lambda: after.item)
+    assert "ZeroDivisionError" in heard[-1]
+    page.shown.answer.value = "0.43"
+    session.tasks.run_until(lambda: "Right" in page.shown.verdict.text)
+    assert heard[-1] == ""
+
+
+def test_a_page_that_is_left_while_it_computes_is_drawn_on_return(session):
+    page = Learn(session)
+    page.show(True)
+    page.show(False)
+    session.tasks.run_one()
+    light = page.shown.views["before", "light"]
+    assert light.item is None
+    page.show(True)
+    session.tasks.run_until(lambda: light.item)
+
+
+def test_html_in_a_lesson_is_shown_as_text():
+    html = "<script>alert(1)</script>"
+    text = TEXT.replace('"T"', f'"{html}"').replace('"?"', f'"{html}"')
+    text = text.replace("Before.", html).replace("After.", f"**a** {html}")
+    lessons = {"t": lesson_of("t", text)}
+    page = Learn(Session(built_in_sources(), tasks=HeldTasks(), lessons=lessons))
+    shown = [
+        unescape(each.get_root().data.object) for each in page.shown.layout.select(pmui.Typography)
+    ]
+    assert sum(escape(html) in each for each in shown) == 4
+    assert any("<strong>a</strong>" in each for each in shown)
+    assert not any("<script" in each for each in shown)
 
 
 def test_a_link_opens_a_lesson_where_the_learner_was(session):
@@ -149,10 +249,16 @@ def test_a_link_opens_a_lesson_where_the_learner_was(session):
         (Learning("none such"), "no lesson 'none such'"),
         (Learning("2-more-light", "many"), "'many' is not accepted: give a number"),
         (Learning("2-more-light", "7"), "give a number from 0 to 1"),
+        (Learning("2-more-light", moved="-1"), "exposure = -1.0 is not accepted"),
     ):
         session.state.learning = learning
         assert refused in heard[-1]
         assert not page.shown.moving.visible
+        count = len(heard)
+        page.shown.prediction.value = "flat" if page.shown.lesson.key == FIRST else "0.2"
+        page.shown.commit.clicks += 1
+        assert page.shown.moving.visible
+        assert refused not in "".join(heard[count:])
 
 
 # -- in a browser ----------------------------------------------------------------------------------

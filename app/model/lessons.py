@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib import resources
@@ -20,11 +20,14 @@ import numpy as np
 from core.checks import require
 from core.parameters import Choice, spec_of
 from core.studies import outputs
-from core.studies.lessons import CHECKS, VIEWS, Bench, arguments_of
+from core.studies.lessons import CHECKS, PLOTS, VIEWS, Bench, arguments_of, require_signal
 
 FENCE, RULE = "+++", "\n---\n"
 BUILT_IN = Path(str(resources.files("app"))) / "lessons"
 PREDICTED = "your prediction"
+
+SPECS = {each.name: spec_of(each) for each in fields(Bench)}
+"""What the state of a lesson and its control can name."""
 
 SHAPES = {"flat": (1.0, 1.0), "rising": (0.2, 1.8), "falling": (1.8, 0.2)}
 """Predicted curves: their first and last value, over the mean of what is predicted."""
@@ -56,7 +59,7 @@ class Prediction:
         if not self.axis:
             require("prediction", text, text in SHAPES, " or ".join(SHAPES))
             return text
-        value = number_of(text)
+        value = number_of(text, "prediction")
         possible = self.low <= value <= self.high
         require("prediction", text, possible, f"a number from {self.low:g} to {self.high:g}")
         return value
@@ -144,36 +147,39 @@ class Lesson:
         """
         if not text:
             return self.bench
-        (field,) = (each for each in fields(self.bench) if each.name == self.control)
-        spec = spec_of(field)
-        value: Any = text if isinstance(spec, Choice) else number_of(text)
+        spec = SPECS[self.control]
+        value: Any = text if isinstance(spec, Choice) else number_of(text, self.control)
         if getattr(spec, "whole", False):
             value = round(value)
-        return replace(self.bench, **{self.control: value})
+        bench = replace(self.bench, **{self.control: value})
+        for name in self.after:
+            require_signal(name, bench)
+        return bench
 
-    def seen(self, name: str, bench: Bench, committed: str | float | None) -> Any:
+    def seen(
+        self, name: str, bench: Bench, committed: str | float | None
+    ) -> outputs.Plot | outputs.Pictures:
         """Return a view, with the prediction if it belongs there."""
-        view = VIEWS[name](bench)
         if committed is not None and name == self.prediction.view:
-            assert isinstance(view, outputs.Plot)
-            return self.prediction.drawn(view, committed)
-        return view
+            return self.prediction.drawn(PLOTS[name](bench), committed)
+        return VIEWS[name](bench)
 
 
-def number_of(text: str) -> float:
-    """Return a number that a learner typed, with a decimal point or comma.
+def number_of(text: str, name: str) -> float:
+    """Return a number that a learner typed as `name`, with a decimal point or comma.
 
     Raises
     ------
     ValueError
         If it is not a finite number.
     """
+    typed = text.strip()
     try:
-        value = float(text.replace(",", ".").removesuffix("%"))
+        value = float(typed.replace(",", ".").removesuffix("%"))
     except ValueError:
         value = math.nan
-    require("answer", text[:40], math.isfinite(value), "a number")
-    return value / 100 if text.strip().endswith("%") else value
+    require(name, text[:40], math.isfinite(value), "a number")
+    return value / 100 if typed.endswith("%") else value
 
 
 # -- Files -----------------------------------------------------------------------------------------
@@ -185,13 +191,20 @@ def read_lessons(folders: Sequence[Path] = ()) -> dict[str, Lesson]:
     Raises
     ------
     ValueError
-        If a folder does not exist or has no lessons, or a lesson is not valid.
+        If a folder does not exist or has no lessons, a lesson is not valid, or two have the same
+        file name or title.
     """
     found: dict[str, Lesson] = {}
     for folder in (BUILT_IN, *folders):
         files = sorted(folder.glob("*.md"))
         require("--lessons", str(folder), bool(files), "a folder with lessons (*.md)")
-        found |= {each.stem: read_lesson(each) for each in files}
+        for each in files:
+            lesson = read_lesson(each)
+            titles = [other.title for other in found.values()]
+            unique = "one that no other lesson has"
+            require("--lessons: file name", str(each), lesson.key not in found, unique)
+            require(f"{each.name}: title", lesson.title, lesson.title not in titles, unique)
+            found[lesson.key] = lesson
     return found
 
 
@@ -210,35 +223,36 @@ def read_lesson(path: Path) -> Lesson:
         If it is not valid: the message names the file and the entry.
     """
     try:
-        return lesson_of(path.stem, path.read_text("utf-8"))
-    except (ValueError, TypeError, KeyError, OSError) as error:
-        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path.name}: {reason}") from error
+        return lesson_of(path.stem, path.read_text("utf-8-sig"))  # editors may write a BOM
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path.name}: {error}") from error
+
+
+_ENTRIES = ("title", "before", "after", "state", "control", "prediction", "check")
+_CHECK_ENTRIES = ("question", "function", "arguments", "tolerance", "state", "hints")
 
 
 def lesson_of(key: str, text: str) -> Lesson:
     """Return the lesson that a text holds; raises as `read_lesson`, without the file's name."""
     start, front, body = _split(text)
     require("beginning", start[:20], not start.strip(), f"a line of {FENCE}")
-    given = _Table("front matter", tomllib.loads(front))
-    bench = Bench(**given.table("state").values)
-    moved = given.table("control")
+    given = _Table("front matter", tomllib.loads(front), _ENTRIES)
+    bench = Bench(**given.table("state", SPECS).values)
+    moved = given.table("control", ("name", "from", "to"))
     control = moved.text("name")
-    known = [each.name for each in fields(bench)]
-    require("control.name", control, control in known, " or ".join(map(repr, known)))
-    views = {name: _views(given.texts(name)) for name in ("before", "after")}
+    require("control.name", control, control in SPECS, " or ".join(map(repr, SPECS)))
+    before, after = (_views(given.texts(name), bench) for name in ("before", "after"))
     introduction, _, explanation = body.partition(RULE)
-    ends = moved.values.get("from"), moved.values.get("to")
     return Lesson(
         key,
         given.text("title"),
         bench,
         control,
-        None if None in ends else (float(ends[0]), float(ends[1])),  # type: ignore[arg-type]
-        views["before"],
-        views["after"],
-        _prediction(given.table("prediction"), views["after"]),
-        _check(given.table("check"), bench),
+        _ends(moved, control),
+        before,
+        after,
+        _prediction(given.table("prediction", [each.name for each in fields(Prediction)]), after),
+        _check(given.table("check", _CHECK_ENTRIES), bench),
         introduction.strip(),
         explanation.strip(),
     )
@@ -250,44 +264,65 @@ def _split(text: str) -> tuple[str, str, str]:
     return parts[0], parts[1], parts[2]
 
 
-def _views(names: Sequence[str]) -> tuple[str, ...]:
+def _views(names: Sequence[str], bench: Bench) -> tuple[str, ...]:
     for name in names:
         require("view", name, name in VIEWS, " or ".join(map(repr, VIEWS)))
+        require_signal(name, bench)
     return tuple(names)
 
 
+def _ends(given: _Table, control: str) -> tuple[float, float] | None:
+    if not {"from", "to"} & given.values.keys():
+        return None
+    spec = SPECS[control]
+    if isinstance(spec, Choice):
+        raise ValueError(f"control: leave out from and to, since {control!r} is not a number.")
+    low, high = given.number("from"), given.number("to")
+    accepted = spec.low <= low < high <= spec.high and spec.takes(low) and spec.takes(high)
+    noun = "integers" if spec.whole else "numbers"
+    what = f"increasing {noun} from {spec.low:g} to {spec.high:g}"
+    require("control: from, to", (low, high), accepted, what)
+    return low, high
+
+
 def _prediction(given: _Table, after: Sequence[str]) -> Prediction:
-    found = Prediction(**given.values)
-    require("prediction.view", found.view, found.view in after, f"one of after, {list(after)}")
+    found = Prediction(
+        given.text("question"),
+        given.text("view"),
+        given.text("axis", ""),
+        given.number("low", 0.0),
+        given.number("high", 1.0),
+        given.text("unit", ""),
+    )
+    plots = [name for name in after if name in PLOTS]
+    require("prediction.view", found.view, found.view in plots, f"a plot of after, {plots}")
     require("prediction.axis", found.axis, found.axis in ("", "x", "y"), "'x', 'y' or nothing")
+    ends = found.low, found.high
+    require("prediction: low, high", ends, found.low < found.high, "increasing numbers")
     return found
 
 
 def _check(given: _Table, bench: Bench) -> Check:
-    at = replace(bench, **given.table("state", {}).values)
+    at = replace(bench, **given.table("state", SPECS, {}).values)
+    tolerance = given.number("tolerance")
+    require("check.tolerance", tolerance, tolerance > 0, "a number above 0")
     hints = [
-        Hint(each.text("function"), _arguments(each), each.text("text"))
-        for each in given.tables("hints")
+        Hint(*_function(each, at), each.text("text"))
+        for each in given.tables("hints", ("function", "arguments", "text"))
     ]
-    return Check(
-        given.text("question"),
-        given.text("function"),
-        _arguments(given),
-        float(given.values["tolerance"]),
-        at,
-        tuple(hints),
-    )
+    return Check(given.text("question"), *_function(given, at), tolerance, at, tuple(hints))
 
 
-def _arguments(given: _Table) -> Mapping[str, float]:
-    """Return the arguments of a named function, which must be all of its own."""
-    expected = arguments_of(given.text("function"))
-    values = given.table("arguments", {}).values
-    require("arguments", list(values), set(values) == set(expected), f"{expected}")
-    return {name: float(value) for name, value in values.items()}
+def _function(given: _Table, bench: Bench) -> tuple[str, Mapping[str, float]]:
+    """Return the name of a check and its arguments, which must be all of its own."""
+    name = given.text("function")
+    expected = arguments_of(name)
+    require_signal(name, bench)
+    arguments = given.table("arguments", expected, {})
+    return name, {each: arguments.number(each) for each in expected}
 
 
-_KINDS: dict[type, str] = {str: "text", dict: "a table", list: "a list"}
+_KINDS: dict[type, str] = {str: "text", dict: "a table", list: "a list", float: "a finite number"}
 
 
 @dataclass(frozen=True)
@@ -296,22 +331,40 @@ class _Table:
 
     name: str
     values: dict[str, Any]
+    known: Collection[str]
+    """Names that its entries may have."""
+
+    def __post_init__(self) -> None:
+        require(self.name, self.values, isinstance(self.values, dict), _KINDS[dict])
+        what = " or ".join(map(repr, self.known)) or "none"
+        for name in self.values:
+            require(f"entry of {self.name}", name, name in self.known, what)
 
     def _get(self, name: str, kind: type, default: Any = None) -> Any:
         value = self.values.get(name, default)
         if value is None:
             raise ValueError(f"{self.name}: {name} is missing")
-        require(f"{self.name}: {name}", value, isinstance(value, kind), _KINDS[kind])
+        if kind is float:
+            accepted = type(value) in (int, float) and math.isfinite(value)
+        else:
+            accepted = isinstance(value, kind)
+        require(f"{self.name}: {name}", value, accepted, _KINDS[kind])
         return value
 
-    def text(self, name: str) -> str:
-        return str(self._get(name, str))
+    def text(self, name: str, default: str | None = None) -> str:
+        return str(self._get(name, str, default))
+
+    def number(self, name: str, default: float | None = None) -> float:
+        value: float = self._get(name, float, default)
+        return value
 
     def texts(self, name: str) -> list[str]:
         return list(map(str, self._get(name, list)))
 
-    def table(self, name: str, default: dict[str, Any] | None = None) -> _Table:
-        return _Table(name, self._get(name, dict, default))
+    def table(
+        self, name: str, known: Collection[str], default: dict[str, Any] | None = None
+    ) -> _Table:
+        return _Table(name, self._get(name, dict, default), known)
 
-    def tables(self, name: str) -> list[_Table]:
-        return [_Table(name, each) for each in self._get(name, list, [])]
+    def tables(self, name: str, known: Collection[str]) -> list[_Table]:
+        return [_Table(name, each, known) for each in self._get(name, list, [])]

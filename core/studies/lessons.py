@@ -30,9 +30,12 @@ from core.trigger import rate_per_bin, trigger_probability
 
 __all__ = [
     "CHECKS",
+    "NEED_SIGNAL",
+    "PLOTS",
     "VIEWS",
     "Bench",
     "arguments_of",
+    "require_signal",
 ]
 
 PULSE = Pulse()
@@ -62,7 +65,7 @@ class Bench(Settings):
         "Factor on signal and background: below 1 a filter, above 1 a longer exposure.",
     )
     onset_bin: int = parameter(
-        50, Number("Echo's bin", 0, 99, whole=True, least=0, most=99), "Where the echo begins."
+        50, Number("Bin of the echo", 0, 99, whole=True, least=0, most=99), "Where the echo begins."
     )
     n_pulses: int = parameter(
         1000,
@@ -82,19 +85,20 @@ class Bench(Settings):
 
     @property
     def flux(self) -> Flux:
-        """Signal and background with this exposure."""
-        signal = self.exposure * self.signal
-        return Flux(signal, self.signal / self.background) if signal else _no_signal(self)
+        """Signal and background with this exposure.
+
+        Raises
+        ------
+        ValueError
+            Without a signal: an SBR of 0 does not define the background.
+        """
+        require("signal", self.signal, self.signal > 0, "a number above 0")
+        return Flux(self.exposure * self.signal, self.signal / self.background)
 
     @property
     def tracking(self) -> TrackingParameters:
         """Settings of the preset."""
         return PRESETS[self.preset]
-
-
-def _no_signal(bench: Bench) -> Flux:
-    """Return the background as a flux for scenes without a surface, which return no signal."""
-    return Flux(bench.exposure * bench.background, 1.0)
 
 
 def _rate(bench: Bench) -> Floats:
@@ -105,8 +109,13 @@ def _rate(bench: Bench) -> Floats:
 
 
 def _captured(bench: Bench, range_m: float, side: int = 1) -> Capture:
+    """Simulate a flat target; NaN stands for none. Without a signal there is none, either."""
+    if bench.signal:
+        flux = bench.flux
+    else:  # the background is all that a scene without a surface returns
+        range_m, flux = math.nan, Flux(bench.exposure * bench.background, 1.0)
     scene = Scene(np.full((side, side), range_m))
-    return simulate(scene, bench.acquisition, bench.flux, PULSE)
+    return simulate(scene, bench.acquisition, flux, PULSE)
 
 
 def _centres(bench: Bench) -> Floats:
@@ -131,8 +140,7 @@ def light(bench: Bench) -> Plot:
 
 def first_photons(bench: Bench) -> Plot:
     """Plot the first photons of all pulses, which are all that is recorded."""
-    range_m = float(bench.acquisition.bin_to_range_m(bench.onset_bin))
-    capture = _captured(bench, range_m if bench.signal else math.nan)
+    capture = _captured(bench, float(bench.acquisition.bin_to_range_m(bench.onset_bin)))
     rate = _rate(bench)
     return Plot(
         "first_photons",
@@ -210,13 +218,13 @@ def _accuracy(bench: Bench) -> dict[str, Floats]:
     shares: dict[str, list[float]] = {"tracking": [], "likelihood": [], LIMIT: []}
     for exposure in EXPOSURES:
         at = replace(bench, exposure=exposure)
+        flux = at.flux
         capture = _captured(at, range_m, _SIDE)
         for method in ("tracking", "likelihood"):
             settings = bench.tracking if method == "tracking" else None
             settings = settings or ESTIMATORS[method].parameters()
             error = np.abs(ESTIMATORS[method].delays(capture, settings)[0] - onset)
             shares[method].append(float((error <= 3).mean()))
-        flux = at.flux
         limit = right_bin_probability(onset, flux.signal, flux.background, PULSE, gate)
         shares[LIMIT].append(float(limit))
     return {name: np.array(values) for name, values in shares.items()}
@@ -245,19 +253,21 @@ def estimates_without_echo(bench: Bench) -> Plot:
     return range_prior.range_prior(simulated, "tracking", bench.tracking)
 
 
-VIEWS: Mapping[str, Callable[[Bench], Plot | Pictures]] = {
+PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
     each.__name__: each
     for each in (
         light,
         first_photons,
         still_armed,
-        car_image,
         accuracy_by_exposure,
         both_scales,
         both_scales_without_echo,
         estimates_without_echo,
     )
 }
+"""Views on which a prediction can be drawn."""
+
+VIEWS: Mapping[str, Callable[[Bench], Plot | Pictures]] = {**PLOTS, "car_image": car_image}
 """Views that a lesson can name."""
 
 
@@ -328,3 +338,22 @@ def arguments_of(name: str) -> list[str]:
     """
     require("check", name, name in CHECKS, " or ".join(map(repr, CHECKS)))
     return list(inspect.signature(CHECKS[name]).parameters)[1:]
+
+
+NEED_SIGNAL = frozenset(
+    each.__name__
+    for each in (
+        accuracy_by_exposure,
+        best_attenuation,
+        both_scales,
+        both_scales_without_echo,  # names the SBR
+        car_image,
+    )
+)
+"""Views and checks that raise ``ValueError`` without a signal."""
+
+
+def require_signal(name: str, bench: Bench) -> None:
+    """Raise ``ValueError`` if a view or check needs a signal and the bench has none."""
+    accepted = bench.signal > 0 or name not in NEED_SIGNAL
+    require("signal", bench.signal, accepted, f"a number above 0, which {name!r} needs")

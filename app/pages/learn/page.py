@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import panel as pn
 import panel_material_ui as pmui
@@ -23,6 +23,9 @@ from app.theme import Palette, palette
 from app.widgets.cards import button, select
 from app.widgets.controls import Sentence, SettingsPanel
 from core.studies import outputs
+from core.studies.lessons import Bench
+
+Result = TypeVar("Result")
 
 PAGE_STYLE = """
 :host { display: flex !important; flex-direction: column; gap: 6px; max-width: 1100px;
@@ -40,15 +43,23 @@ ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; g
 class View:
     """One view of a lesson: curves or pictures, whichever it turns out to be.
 
+    Parameters
+    ----------
+    session : Session
+    lesson : Lesson
+
     Attributes
     ----------
     holder : pn.Column
     item : outputs.Plot or outputs.Pictures or None
         What is shown.
+    bench : Bench
+        The state from which it was computed.
     """
 
-    def __init__(self, session: Session, about: Callable[[], Subject]) -> None:
-        self._session, self._about = session, about
+    def __init__(self, session: Session, lesson: Lesson) -> None:
+        self._session, self._lesson = session, lesson.key
+        self.bench = lesson.bench
         self.item: outputs.Plot | outputs.Pictures | None = None
         self._colors: Palette | None = None
         self._shown: CurveCard | Gallery | None = None
@@ -60,13 +71,17 @@ class View:
             margin=0,
         )
 
-    def show(self, item: outputs.Plot | outputs.Pictures) -> None:
-        """Show the view."""
-        self.item = item
+    def about(self) -> Subject:
+        """Return what the files of the view are about."""
+        return Subject("lesson", self._lesson, (self.bench,))
+
+    def show(self, item: outputs.Plot | outputs.Pictures, bench: Bench) -> None:
+        """Show the view of a state."""
+        self.item, self.bench = item, bench
         if self._shown is None:
             is_plot = isinstance(item, outputs.Plot)
             self._shown = shown = CurveCard() if is_plot else Gallery()
-            shown.offer(self._session, self._about)
+            shown.offer(self._session, self.about)
             if self._colors is not None:
                 shown.paint(self._colors)
             if not is_plot:
@@ -88,8 +103,6 @@ class LessonView:
     ----------
     session : Session
     lesson : Lesson
-    about : callable
-        Returns what the files of its views are about.
     change : callable
         Called with the parts of `Learning` that the learner changes, by name.
 
@@ -110,12 +123,11 @@ class LessonView:
         self,
         session: Session,
         lesson: Lesson,
-        about: Callable[[], Subject],
         change: Callable[..., None],
     ) -> None:
         self.lesson, self._change = lesson, change
         self.views = {
-            (part, name): View(session, about)
+            (part, name): View(session, lesson)
             for part in ("before", "after")
             for name in getattr(lesson, part)
         }
@@ -227,7 +239,8 @@ class Learn(Section):
         self.choice.max_width = 480
         self.choice.param.watch(lambda event: self._choose(event.new), "value")
         self._stage = pn.Column(sizing_mode="stretch_width", margin=0)
-        self._checks = session.tasks.latest()
+        self._channels = {part: session.tasks.latest() for part in ("before", "after", "check")}
+        self._requested: dict[str, Any] = {}  # what each channel last computed from
         self.shown = self._made(next(iter(self.lessons)))
 
     def layout(self) -> tuple[Any, Any]:
@@ -241,10 +254,6 @@ class Learn(Section):
         )
         return main, Sentence(text=text.NO_SIDEBAR, margin=8)
 
-    def about(self) -> Subject:
-        """Return what the files of a lesson are about."""
-        return Subject("lesson", self.shown.lesson.key, (self.shown.lesson.bench,))
-
     def paint(self, dark: bool) -> None:
         """Change between light and dark mode."""
         super().paint(dark)
@@ -254,12 +263,17 @@ class Learn(Section):
     def refresh(self) -> None:
         """Show how far the learner is."""
         if not self.is_on_screen:
+            self._requested = {}  # results that arrive now are not drawn
             return
-        learning = self._possible(self.session.state.learning)
+        state = self.session.state
+        learning = self._possible(state.learning)
+        if learning != state.learning:
+            state.learning = learning  # which refreshes; a bad value would be reported each time
+            return
         key = learning.lesson or next(iter(self.lessons))
         with self.session.tasks.hold():
             if key != self.shown.lesson.key or not self._stage.objects:
-                self.shown = self._made(key)
+                self.shown, self._requested = self._made(key), {}
                 self.choice.value = key
                 self._stage[:] = [self.shown.layout]
             self.shown.follow(learning)
@@ -284,7 +298,7 @@ class Learn(Section):
         for name, parse in (
             ("prediction", lesson.prediction.parsed),
             ("moved", lesson.moved),
-            ("answer", lambda given: given and number_of(given)),
+            ("answer", lambda given: given and number_of(given, "answer")),
         ):
             try:
                 parse(getattr(learning, name))
@@ -296,42 +310,75 @@ class Learn(Section):
     # Drawing
 
     def _made(self, key: str) -> LessonView:
-        made = LessonView(self.session, self.lessons[key], self.about, self._change)
+        made = LessonView(self.session, self.lessons[key], self._change)
         for view in made.views.values():
             view.paint(palette(self.is_dark))
         return made
 
     def _request(self, learning: Learning) -> None:
-        """Compute the views, and compare the answer with a computation."""
+        """Compute the views and the verdict on the answer, where what they depend on changed."""
         shown, lesson = self.shown, self.shown.lesson
         committed = lesson.prediction.parsed(learning.prediction)
         bench = lesson.moved(learning.moved)
         shown.panel.show(bench)
-        wanted = [key for key in shown.views if key[0] == "before" or committed is not None]
-
-        def work() -> list[Any]:
-            at = {"before": (lesson.bench, None), "after": (bench, committed)}
-            return [lesson.seen(name, *at[part]) for part, name in wanted]
-
-        self.submit(work, partial(self._draw, shown, wanted))
+        wanted: dict[str, Any] = {"before": (lesson.bench, None)}
+        if committed is not None:
+            wanted["after"] = bench, committed
         if learning.answer:
-            verdict = partial(lesson.check.verdict, number_of(learning.answer))
-            self._checks.submit(verdict, partial(self._judge, shown), self.report_error)
+            wanted["check"] = number_of(learning.answer, "answer")
+        before, self._requested = self._requested, wanted
+        for part, given in wanted.items():
+            if before.get(part) == given:
+                continue
+            if part == "check":
+                judge = partial(self._judge, shown, given)
+                self._submit(part, partial(lesson.check.verdict, given), judge)
+            else:
+                draw = partial(self._draw, shown, part, given[0])
+                self._submit(part, partial(_seen, lesson, part, *given), draw)
+
+    def _submit(
+        self, part: str, work: Callable[[], Result], draw: Callable[[Result], None]
+    ) -> None:
+        """Run `work` in the background and draw its result if the page is still on screen."""
+        failures, failed = self.session.failures, (self, part)
+
+        def arrived(result: Result) -> None:
+            failures.resolve(failed)
+            if self.is_on_screen:
+                with self.session.tasks.hold():
+                    draw(result)
+
+        self._channels[part].submit(work, arrived, partial(failures.report, part=failed))
 
     def _draw(
-        self, shown: LessonView, keys: Sequence[tuple[str, str]], items: Sequence[Any]
+        self,
+        shown: LessonView,
+        part: str,
+        bench: Bench,
+        items: Mapping[str, outputs.Plot | outputs.Pictures],
     ) -> None:
         if shown is self.shown:
-            for key, item in zip(keys, items, strict=True):
-                shown.views[key].show(item)
+            for name, item in items.items():
+                shown.views[part, name].show(item, bench)
 
-    def _judge(self, shown: LessonView, verdict: tuple[bool, str]) -> None:
-        if shown is self.shown:
+    def _judge(self, shown: LessonView, answer: float, verdict: tuple[bool, str]) -> None:
+        if shown is self.shown and self._requested.get("check") == answer:
             shown.verdict.text = verdict[1]
 
 
+def _seen(
+    lesson: Lesson, part: str, bench: Bench, committed: str | float | None
+) -> dict[str, outputs.Plot | outputs.Pictures]:
+    """Return the views before or after the prediction, by name."""
+    return {name: lesson.seen(name, bench, committed) for name in getattr(lesson, part)}
+
+
 def _markdown(source: str) -> pmui.Typography:
-    return pmui.Typography(source, sizing_mode="stretch_width", margin=(2, 8))
+    """Return formatted text; HTML in a lesson's file is shown as text, so that none can run."""
+    return pmui.Typography(
+        source, renderer_options={"html": False}, sizing_mode="stretch_width", margin=(2, 8)
+    )
 
 
 def _field(label: str) -> pmui.TextInput:
