@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from app.model.budget import spending
 from app.model.state import ReductionSettings
 from app.model.store import Answer, reduced
 from core import ESTIMATORS, Capture, Scene, simulate
+from core.cost import cost_of
 from core.inference import flux_model_of
 from core.studies import outputs, range_prior
 
@@ -18,9 +20,9 @@ SIDE, ECHO_SIDE = 64, 32
 
 
 def has_range_prior(answer: Answer) -> bool:
-    """Return whether there is one: the flux is known, and the estimator is not told it."""
-    is_told = ESTIMATORS[answer.method].flux_model is not flux_model_of
-    return answer.request.source.is_scene and not is_told
+    """Return whether there is one: the flux is known, and the estimator does not use it."""
+    is_used = ESTIMATORS[answer.method].flux_model is not flux_model_of
+    return answer.request.source.is_scene and not is_used
 
 
 def range_prior_of(answer: Answer) -> outputs.Plot:
@@ -33,10 +35,15 @@ def range_prior_of(answer: Answer) -> outputs.Plot:
         scene = Scene(np.full((side, side), range_m))
         return reduced(simulate(scene, acquisition, light.flux, seed=light.seed), request)
 
-    plot = range_prior.range_prior(simulated, answer.method, answer.settings)
+    empty = simulated(math.nan)
+    cost = cost_of(empty, answer.method, answer.settings)
+    n_images = 1 + range_prior.GROUPS * (ECHO_SIDE / SIDE) ** 2
+    cost = replace(cost, seconds=n_images * cost.seconds)
+    with spending(empty.cube.shape, "estimates without an echo", cost):
+        plot = range_prior.range_prior(simulated, answer.method, answer.settings)
     about = (
-        "Simulated with the fluxes and settings on show, pixels of one surface over a uniform "
-        f"background: {SIDE**2:,} without an echo, {ECHO_SIDE**2:,} for each position of one."
+        "Simulated with the fluxes and settings shown, pixels of one surface over a uniform "
+        "background."
     )
     return replace(plot, note=f"{plot.note} {about}")
 
@@ -44,7 +51,8 @@ def range_prior_of(answer: Answer) -> outputs.Plot:
 def slow_start(answer: Answer) -> str:
     """Return how far the small scale begins below the background; empty where it does not."""
     request = answer.request
-    if answer.method != "tracking" or request.less != ReductionSettings():
+    is_whole = request.less == ReductionSettings()
+    if answer.method != "tracking" or not request.source.is_scene or not is_whole:
         return ""
     return range_prior.slow_start(
         answer.settings, answer.whole.acquisition, request.light.flux, answer.whole.pulse
