@@ -145,6 +145,7 @@ def test_the_capture_sets_what_the_link_leaves_open():
         ("source=sample&reading.variable=none", "'none'", "source=sample"),
         ("source=sample&image=Truth", "", "light.seed=3&source=sample"),
         ("tracking.weight=heavy", "'heavy'", "light.seed=3"),
+        ("unread=source%3Dcar%26less.merge%3D101", "", "light.seed=3"),
     ],
 )
 def test_a_session_names_what_it_could_not_restore_and_keeps_the_rest(query, named, kept):

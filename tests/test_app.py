@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict, fields, replace
+from threading import Event
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ from app.widgets.figures import Plot
 from app.widgets.image_view import ImageView
 from app.widgets.signal_plots import SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
-from core.inference import fit_of
+from core.inference import fit_of, has_fit
 from core.io import OUTSIDE_COLOR, ColorScale, ReadOptions, reading_options
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
@@ -955,7 +956,44 @@ def test_estimates_without_an_echo_are_shown_in_place_of_the_stages(layout, expl
         np.testing.assert_allclose(drawn[name], values, rtol=1e-6)
     state.param.update(method="oracle")
     layout.next_answer()
-    assert not explore.prior.card.visible  # it is told that there is no echo
+    assert not explore.prior.card.visible  # the oracle knows that there is no echo
+
+
+def test_estimates_without_an_echo_are_those_of_the_estimate_on_screen(
+    layout, explore, monkeypatch
+):
+    state, may_end = layout.session.state, Event()
+
+    def computed(answer):
+        assert may_end.wait(60)
+        return range_prior_of(answer)
+
+    def is_drawn():
+        return explore.prior.figure and any(each.visible for each in explore.prior.figure.renderers)
+
+    monkeypatch.setattr("app.pages.explore.page.range_prior_of", computed)
+    with monkeypatch.context() as patched:  # the model is tested at once
+        patched.setattr(layout.tasks, "call_later", lambda _, act: act())
+        state.echo_free = True
+        state.light = replace(state.light, seed=1)  # another estimate, before the first are known
+        layout.next_answer()
+    may_end.set()
+    layout.tasks.run_until(is_drawn)
+    layout.tasks.run_until(lambda: has_fit(layout.session.answer.capture))
+    layout.settle()
+    may_end.clear()
+    state.light = replace(state.light, seed=2)
+    layout.next_answer()
+    layout.settle()
+    assert not is_drawn()
+    explore.show(False)
+    may_end.set()
+    layout.tasks.run_one()  # the result arrives off screen
+    explore.show(True)
+    layout.tasks.run_until(is_drawn)
+    drawn = {each.name: each.data_source.data["y"] for each in explore.prior.figure.renderers}
+    for name, values in range_prior_of(layout.session.answer).curves.items():
+        np.testing.assert_allclose(drawn[name], values, rtol=1e-6)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -99,6 +99,8 @@ def test_scores_are_scaled_from_their_median_to_their_maximum(car):
 def test_the_limit_is_known_where_truth_and_flux_are(car):
     reference = ranking.reference_of(car.capture)
     assert reference.limit is not None and reference.likelihood is None
+    (limit,) = text.rows(car.capture, {}, {}, reference, {})
+    assert "± 0.5 percentage points" in [below for _, _, below in limit["cells"]]
     rows = rows_of(car, ("peak", "oracle"), reference)
     n_cells = len(text.columns(car.capture)) - 1
     assert [len(row["cells"]) for row in rows] == [n_cells] * 3
@@ -344,8 +346,8 @@ def test_the_legend_counts_what_pictures_do_not_show(stage):
     )
     stage.page.show(True)
     stage.settle()
-    stage.page.kind.value = CLOUDS  # of all estimates
-    assert stage.page.legend.text == ""
+    stage.page.kind.value = CLOUDS  # blank pixels have no points
+    assert re.fullmatch(r"Hidden below confidence 0.9: [^.]+\.", stage.page.legend.text)
 
 
 def test_without_a_method_the_page_asks_for_one(stage):

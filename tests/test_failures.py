@@ -282,6 +282,13 @@ def test_a_failure_is_shown_until_its_own_part_works_again():
     assert shown[2:] == [of_pins, of_map, of_pins]
     failures.resolve(pins)
     assert shown[-1] == ""
+    failures.show("Not saved.")
+    failures.remark("")
+    failures.report(MemoryError(), part=map_)
+    failures.resolve(map_)
+    assert shown[-1] == "Not saved."
+    failures.clear()
+    assert shown[-1] == ""
 
 
 def test_another_pixel_does_not_hide_that_a_map_failed(monkeypatch, session, shown):
@@ -427,6 +434,12 @@ def test_the_form_is_open_for_a_file_that_a_link_names_and_that_is_refused(tmp_p
     control(layout, "Read again").clicks += 1
     layout.tasks.run_until(lambda: layout.session.state.source == "frames")
     assert layout.next_answer().request.reading == ReadOptions(no_trigger=65535, bin_width_s=64e-12)
+    # The page stays where only other reading options of the file on screen are refused.
+    link = {"source": "frames", "reading.no_trigger": "65535", "reading.bin_width_s": "64 ps"}
+    link |= {"page": "Explore", "unread": "source=frames"}
+    again = HeldLayout(sources, Link(link))
+    assert f"“{label}” is empty" in again.alert.text
+    assert again.session.state.page == "Explore"
 
 
 def test_a_link_to_an_unreadable_file_shows_no_folder(monkeypatch):

@@ -37,6 +37,7 @@ from app.plots.gate_cut import Cut
 from app.theme import DARK
 from app.units import ShownGate, scale
 from core import Acquisition, TrackingParameters, coates_rate, inspection, tracking_signals
+from core.inference import has_fit
 from core.tests.captures import real_capture_path
 from tests.states import link_to
 from tests.test_downloads import columns_of, written
@@ -535,6 +536,7 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, mon
     again.session.tasks.run_until(lambda: again.pair)
     np.testing.assert_array_equal(again.pair.a.run.image.range_m, image_a.range_m)
     np.testing.assert_array_equal(again.pair.difference_m, difference_m)
+    assert has_fit(again.pair.a.capture) and has_fit(again.pair.b.capture)  # for the legends
     same = script_of(again.session.answer, again.session.state, again.session.kept_answer)
     assert same == script
     kept = building.state.kept

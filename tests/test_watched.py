@@ -98,12 +98,12 @@ def test_an_open_page_follows_with_its_settings_unless_it_should_not(tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"no archive")
     arrivals.emit(folder.look() or folder.look())
     layout.settle()
-    told = layout.alert.text
-    assert "watched folder. bad.npz" in told and str(tmp_path) not in told
+    sentence = layout.alert.text
+    assert "watched folder. bad.npz" in sentence and str(tmp_path) not in sentence
     assert session.answer.request.source is second
-    assert HeldLayout(served | built_in_sources(), arrivals=arrivals).alert.text == told
+    assert HeldLayout(served | built_in_sources(), arrivals=arrivals).alert.text == sentence
     session.choose_pixel(0, 0)  # the page goes on, and so does the sentence
-    assert layout.alert.text == told
+    assert layout.alert.text == sentence
     control(layout, "Follow new captures").value = False
     shown = state.source
     for number in range(2, MOST_CAPTURES + 3):

@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from app.model.budget import spending
 from app.model.state import ReductionSettings
 from app.model.store import Answer, reduced
 from core import ESTIMATORS, Capture, Scene, simulate
+from core.cost import cost_of
 from core.studies import outputs, range_prior
 
 SIDE, ECHO_SIDE = 64, 32
@@ -17,7 +19,7 @@ SIDE, ECHO_SIDE = 64, 32
 
 
 def has_range_prior(answer: Answer) -> bool:
-    """Return whether there is one: the flux is known, and the estimator is not told it."""
+    """Return whether there is one: the flux is known, and the estimator does not use it."""
     return answer.request.source.is_scene and not ESTIMATORS[answer.method].knows_flux
 
 
@@ -31,10 +33,15 @@ def range_prior_of(answer: Answer) -> outputs.Plot:
         scene = Scene(np.full((side, side), range_m))
         return reduced(simulate(scene, acquisition, light.flux, seed=light.seed), request)
 
-    plot = range_prior.range_prior(simulated, answer.method, answer.settings)
+    empty = simulated(math.nan)
+    cost = cost_of(empty, answer.method, answer.settings)
+    n_images = 1 + range_prior.GROUPS * (ECHO_SIDE / SIDE) ** 2
+    cost = replace(cost, seconds=n_images * cost.seconds)
+    with spending(empty.cube.shape, "estimates without an echo", cost):
+        plot = range_prior.range_prior(simulated, answer.method, answer.settings)
     about = (
-        "Simulated with the fluxes and settings on show, pixels of one surface over a uniform "
-        f"background: {SIDE**2:,} without an echo, {ECHO_SIDE**2:,} for each position of one."
+        "Simulated with the fluxes and settings shown, pixels of one surface over a uniform "
+        "background."
     )
     return replace(plot, note=f"{plot.note} {about}")
 
@@ -42,7 +49,8 @@ def range_prior_of(answer: Answer) -> outputs.Plot:
 def slow_start(answer: Answer) -> str:
     """Return how far the small scale begins below the background; empty where it does not."""
     request = answer.request
-    if answer.method != "tracking" or request.less != ReductionSettings():
+    is_whole = request.less == ReductionSettings()
+    if answer.method != "tracking" or not request.source.is_scene or not is_whole:
         return ""
     return range_prior.slow_start(
         answer.settings, answer.whole.acquisition, request.light.flux, answer.whole.pulse

@@ -58,6 +58,8 @@ def _still_refused(
     except ValueError as error:
         link.refused.append(str(error))
         return None
+    if request.source.is_scene:
+        return None
     try:
         compute(request, None)
     except Exception as error:  # the page reports any failure

@@ -302,7 +302,9 @@ class Layout:
         )
         self._make_parts(unit)
         refused = session.estimate.refused
-        self._uploaded = "" if refused is None else session.key(refused.request.source)
+        self._uploaded = ""
+        if refused is not None and refused.request.source is not session.answer.request.source:
+            self._uploaded = session.key(refused.request.source)
         self._link = AddressBar()
         session_id = session.page.session_context.id if session.tasks.is_served else ""
         self._connection = Connection(session_id)

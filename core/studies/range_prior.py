@@ -40,11 +40,11 @@ def range_prior(simulated: Simulated, method: str, settings: Any) -> Plot:
     edges = np.array([0.0, *(places[1:] - group / 2), float(n_bins)])
     bins = _estimates(empty, method, settings)
     share = np.histogram(bins, edges)[0] / bins.size
-    found = np.full(places.size, np.nan)
+    found, n_echoes = np.full(places.size, np.nan), 0
     for n, place in enumerate(places[places < n_bins]):
         capture = simulated(float(acquisition.bin_to_range_m(place)))
         error = np.abs(_estimates(capture, method, settings) - place)
-        found[n] = (error <= TOLERANCE_BINS).mean()
+        found[n], n_echoes = (error <= TOLERANCE_BINS).mean(), error.size
     return Plot(
         "range_prior",
         f"Estimates without an echo; echoes found within {TOLERANCE_BINS} bins",
@@ -56,7 +56,7 @@ def range_prior(simulated: Simulated, method: str, settings: Any) -> Plot:
             "even": np.diff(edges) / n_bins,
             "echoes found": found,
         },
-        note=_note(bins, places, found, n_bins),
+        note=_note(bins, places, found, n_echoes, n_bins),
     )
 
 
@@ -73,14 +73,14 @@ def densest(bins: Floats, n_bins: int) -> tuple[int, int, float]:
     return first, first + width, float(in_window[first] / bins.size)
 
 
-def _note(bins: Floats, places: Floats, found: Floats, n_bins: int) -> str:
+def _note(bins: Floats, places: Floats, found: Floats, n_echoes: int, n_bins: int) -> str:
     first, end, share = densest(bins, n_bins)
     middle, late = (int(np.abs(places - part * n_bins).argmin()) for part in (0.5, 0.8))
     return (
-        f"Without an echo, {share:.1%} of the estimates lie in bins {first} to {end} "
+        f"Without an echo, {share:.1%} of {bins.size:,} estimates lie in bins {first} to {end} "
         f"({(end - first) / n_bins:.0%} if even): there, echoes are found by luck, "
-        f"too. Of echoes at bin {places[middle]:g}, {found[middle]:.1%} are found, of those at bin "
-        f"{places[late]:g}, {found[late]:.1%}."
+        f"too. Of {n_echoes:,} echoes at bin {places[middle]:g}, {found[middle]:.1%} are found, of "
+        f"those at bin {places[late]:g}, {found[late]:.1%}."
     )
 
 

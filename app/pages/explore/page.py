@@ -14,7 +14,7 @@ from app.model.exports import cloud_files, facts_file
 from app.model.range_prior import has_range_prior, range_prior_of, slow_start
 from app.model.state import Viewing
 from app.model.store import Answer, inspect
-from app.model.text import COMPUTING
+from app.model.text import COMPUTING, NOT_COMPUTED
 from app.pages.explore import text
 from app.pages.navigation import Page
 from app.pages.session import Session
@@ -136,6 +136,8 @@ class Explore(Section):
         self.prior = CurveCard(self.signals.histogram.figure.x_range, COMPUTING)
         self.prior.offer(session, self.about)
         self._prior_axes: GateAxes | None = None
+        self._has_prior = False
+        self._priors, self._fits = session.tasks.latest(), session.tasks.latest()
         self._painted.append(self.prior)
         self.remark = Sentence(margin=0)
         switch = pmui.Switch.from_param(
@@ -161,7 +163,7 @@ class Explore(Section):
         self.cloud.param.watch(lambda event: session.pick(event.new), "selected")
         draw_pixel = session.tasks.soon(self._draw_pixel)
         state.param.watch(draw_pixel, ["pixel", "pins", "difference", "unit", "echo_free"])
-        state.param.watch(lambda *_: self._request_prior(), ["echo_free", "unit"])
+        state.param.watch(lambda *_: self._request_prior(), "echo_free")
         draw_pictures = partial(session.tasks.queue, self._draw_pictures)
         state.param.watch(
             lambda *_: draw_pictures(), ["image", "cloud_color", "viewing", "crop", "region"]
@@ -233,13 +235,17 @@ class Explore(Section):
             self._is_outdated = False
             self._draw_pixel()
             self._draw_pictures()
-            self._request_prior()
+        elif is_on_screen:  # what arrived meanwhile was dropped
+            self._draw_legend()
+            self._request_fit()
+        self._request_prior()
         self._large.show(is_on_screen)
         self.crop.show(is_on_screen)
         self.measure.show(is_on_screen)
 
     def follow(self, answer: Answer) -> None:
         """Show another estimate of the session."""
+        self._has_prior = False
         self._show_sidebar()
         self._draw_pixel()
         self._request_prior()
@@ -262,8 +268,10 @@ class Explore(Section):
     # Drawing; changes off screen are drawn when the page comes back
 
     def _show_sidebar(self) -> None:
+        answer = self.session.answer
         self._viewing.show(self.session.state.viewing)
-        show_own_width(self._viewing, self.session.answer)
+        show_own_width(self._viewing, answer)
+        self.remark.text = slow_start(answer)
 
     def _draw_pixel(self) -> None:
         """Draw the pixel's plots and numbers, and the frames that mark it."""
@@ -279,8 +287,9 @@ class Explore(Section):
             self.signals.cut.update(Cut.of(answer, state.less))
             self.signals.update(pixel, answer.gate, state.difference, state.unit)
             self.zoom.follow(answer.capture, pixel.answer_bin)
+            if self._prior_axes is not None:
+                self._prior_axes.follow(state.unit, answer.gate)
             self._show_cards(is_tracking=pixel.signals is not None)
-            self.remark.text = slow_start(answer) if self._prior_row.visible else ""
             self.image.mark(row, col)
             self.image_keys.shape = list(answer.capture.shape)
             self.image_keys.pixel = [row, col]
@@ -304,11 +313,18 @@ class Explore(Section):
         return self.session.state.echo_free and has_range_prior(self.session.answer)
 
     def _request_prior(self) -> None:
-        """Compute where estimates lie without an echo, if that is on show."""
-        if self.is_on_screen and self._shows_prior:
-            self.submit(partial(range_prior_of, self.session.answer), self._draw_prior)
+        """Compute where estimates lie without an echo, if that is wanted and not drawn yet."""
+        if self.is_on_screen and self._shows_prior and not self._has_prior:
+            self.prior.clear(COMPUTING)
+            work = partial(range_prior_of, self.session.answer)
+            self.submit(work, self._draw_prior, self._refuse_prior, self._priors)
+
+    def _refuse_prior(self, error: Exception) -> None:
+        self.prior.clear(NOT_COMPUTED)
+        self.session.failures.report(error, part=self._priors)
 
     def _draw_prior(self, plot: outputs.Plot) -> None:
+        self._has_prior = True
         self.prior.show(plot)
         if self._prior_axes is None:
             figure = self.prior.figure
@@ -332,8 +348,9 @@ class Explore(Section):
             return
         answer, state = self.session.answer, self.session.state
         with self.session.tasks.hold():
-            self.image.update(*image_of(answer, state.image, state.viewing))
-            self._draw_legend()
+            values, look = image_of(answer, state.image, state.viewing)
+            self.image.update(values, look)
+            self.legend.text = legend(answer, state.image, state.viewing, values, look)
             box, is_guessed = state.box, answer.is_width_guessed(state.viewing)
             cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing, box)
             # Another box is framed by the camera, like another scene.
@@ -342,8 +359,7 @@ class Explore(Section):
             self.cloud.caption = text.cloud_caption(
                 answer, cloud.n_points, n_wrong, box, is_guessed
             )
-        if not has_fit(answer.capture):
-            self.session.tasks.call_later(FIT_DELAY_MS, partial(self._test_model, answer))
+        self._request_fit()
 
     def _draw_legend(self) -> None:
         """State what the image hides, and that the model does not fit once that is known."""
@@ -351,10 +367,17 @@ class Explore(Section):
         values, look = image_of(answer, state.image, state.viewing)
         self.legend.text = legend(answer, state.image, state.viewing, values, look)
 
+    def _request_fit(self) -> None:
+        """Test the model later, unless that was done."""
+        answer = self.session.answer
+        if not has_fit(answer.capture):
+            self.session.tasks.call_later(FIT_DELAY_MS, partial(self._test_model, answer))
+
     def _test_model(self, answer: Answer) -> None:
         """Test the model on the capture of an estimate, if it is still shown."""
         if self.is_on_screen and answer is self.session.answer:
-            self.submit(partial(fit_of, answer.capture), lambda _: self._draw_legend())
+            work = partial(fit_of, answer.capture)
+            self.submit(work, lambda _: self._draw_legend(), own=self._fits)
 
 
 PAGE = Page("Explore", Explore, "shows one method in detail", text.EXPLANATION, sidebar_last=True)

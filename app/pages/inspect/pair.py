@@ -23,6 +23,7 @@ from app.theme import ERROR_COLORS
 from app.widgets.cards import BREAK_PX, button
 from app.widgets.controls import Facts, Sentence
 from app.widgets.method_picture import Picture, ScaleBar
+from core.inference import fit_of
 from core.io import ColorScale, Product
 
 HEIGHT_PX = 240
@@ -181,8 +182,14 @@ class PairSection(Section):
 
 
 def compared(known: Answer | None, request: Request, b: Answer, viewing: Viewing) -> Pair:
-    """Compare the estimate for a request, if `known` is None, with another one."""
-    return pair_of(known or compute(request, None), b, viewing.least_confidence)
+    """Compare the estimate for a request, if `known` is None, with another one.
+
+    The model is tested on both captures: legends state where it does not fit.
+    """
+    a = known or compute(request, None)
+    for each in (a, b):
+        fit_of(each.capture)
+    return pair_of(a, b, viewing.least_confidence)
 
 
 def difference_scale(pair: Pair) -> ColorScale:

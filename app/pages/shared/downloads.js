@@ -111,7 +111,7 @@ function keepWidths(root) {
 }
 
 // Plots drawn with this number of pixels for each of the page's, which Bokeh takes from the window.
-// The signs of a legend are copied from the screen: they are painted before and afterwards, too.
+// The glyphs of a legend are copied from the screen: they are painted before and afterwards, too.
 function exported(plots, suffix, ratio) {
   const own = Object.getOwnPropertyDescriptor(window, "devicePixelRatio");
   const parts = plots.flatMap((plot) => [...plot.renderer_views.values()]);

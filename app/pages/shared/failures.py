@@ -23,7 +23,7 @@ class FailureLog:
     def __init__(self) -> None:
         self.shown: Signal[str] = Signal()
         self._sentences: dict[object, str] = {}
-        self._otherwise = self._remark = ""
+        self._shown = self._otherwise = self._remark = ""
 
     def report(
         self,
@@ -43,20 +43,22 @@ class FailureLog:
             self._show_latest()
 
     def clear(self, otherwise: str = "") -> None:
-        """Remove all failures; show another sentence as long as there are none."""
+        """Remove all sentences but the remark; show another one as long as there are none."""
         self._sentences.clear()
-        self._otherwise = otherwise
+        self._shown, self._otherwise = "", otherwise
         self._show_latest()
 
     def remark(self, sentence: str) -> None:
         """Show a sentence whenever there is no other one, until the next remark."""
-        self._remark = sentence
-        self._show_latest()
+        if sentence != self._remark:
+            self._remark = sentence
+            self._show_latest()
 
     def show(self, sentence: str) -> None:
-        """Show a sentence that belongs to no part, until the next one."""
+        """Show a sentence that belongs to no part, until the next one or `clear`."""
+        self._shown = sentence
         self.shown.emit(sentence)
 
     def _show_latest(self) -> None:
-        otherwise = self._otherwise or self._remark
+        otherwise = self._shown or self._otherwise or self._remark
         self.shown.emit(next(reversed(self._sentences.values()), otherwise))

@@ -72,6 +72,7 @@ class CurveCard:
         self._note = Sentence(text=waiting, sizing_mode="stretch_width", margin=(2, 10, 6, 10))
         self._plot: Layers | None = None
         self._item: items.Plot | None = None
+        self._is_cleared = False
         self._colors = LIGHT
         self.card = card(self._note)
 
@@ -84,7 +85,8 @@ class CurveCard:
         """Add a download button, shown with the first curves."""
 
         def show() -> Shown:
-            item, plot = _required(self._item), _required(self._plot)
+            item = _required(None if self._is_cleared else self._item)
+            plot = _required(self._plot)
             return Shown(subject(), item.key, {"csv": plot.csv()})
 
         downloadable(self.card, session, "curves", show, PLOT)[-1].visible = self._plot is not None
@@ -93,7 +95,7 @@ class CurveCard:
         """Show curves in place of the last ones."""
         if self._plot is None or self._item is None or _names(item) != _names(self._item):
             self._plot = self._built(item)
-        self._item = item
+        self._item, self._is_cleared = item, False
         self._plot.keep(item.x_label, curves_of(item))
         figure = self._plot.figure
         low, high = (
@@ -104,13 +106,22 @@ class CurveCard:
             figure.y_range.update(start=-low, end=high, reset_start=-low, reset_end=high)
         for name, values in item.curves.items():
             self._plot.write(name, **{"x": item.x, "top" if name == plots.BARS else "y": values})
+            self._plot.show(name, True)
         for name, (below, above) in item.bands.items():
             self._plot.write(f"{name} band", x=item.x, y1=below, y2=above)
+            self._plot.show(f"{name} band", True)
         for name, place in item.marks.items():
             x, y = plots.marker_line(place, high, -low)
             self._plot.write(name, x=x, y=y)
             self._plot.show(name, math.isfinite(place))
         figure.title.text, self._note.text = item.title, item.note
+
+    def clear(self, why: str) -> None:
+        """Hide the curves, which are outdated, and state why below the empty axes."""
+        self._is_cleared, self._note.text = True, why
+        if self._plot is not None:
+            for name in self._plot.layers:
+                self._plot.show(name, False)
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Generic, Protocol, TypeVar
 
 import panel as pn
@@ -26,7 +26,7 @@ from app.pages.shared.downloads import (
     shown_with,
 )
 from app.pages.shared.studies import Study, aside
-from app.tasks.scheduler import Step
+from app.tasks.scheduler import Latest, Step
 from app.theme import Palette, palette
 from app.widgets.controls import Facts, SettingsPanel, Table
 from app.widgets.figures import Layers
@@ -126,17 +126,24 @@ class Section(ABC):
         work: Callable[[], Result],
         draw: Callable[[Result], None],
         failed: Callable[[Exception], None] | None = None,
+        own: Latest | None = None,
     ) -> None:
-        """Run `work` in the background and draw its result, unless it is outdated by then."""
+        """Run `work` in the background and draw its result, unless it is outdated by then.
+
+        Work that other work of the section must neither replace nor report as successful needs a
+        channel of its `own`, which is also the part of its failures.
+        """
         session, answer = self.session, self.session.answer
+        part = own or self
 
         def arrived(result: Result) -> None:
-            session.failures.resolve(self)
+            session.failures.resolve(part)
             if self.is_on_screen and answer is session.answer:
                 with session.tasks.hold():
                     draw(result)
 
-        self._jobs.submit(work, arrived, failed or self.report_error)
+        report = partial(session.failures.report, part=part)
+        (own or self._jobs).submit(work, arrived, failed or report)
 
     def report_error(self, error: Exception) -> None:
         """Show an error until this section works again."""

@@ -153,7 +153,7 @@ def _recommended(goal: str, found: Recommendation | None, keeps: str) -> str:
 ACQUISITION = """
 Number of pulses, flux and length of the gate that reach a restoration degree: from theory, for
 the likeliest delay with known fluxes; and from simulation, for the likelihood with known and with
-estimated fluxes. Below each plot: how far the theory is exact, and what it assumes.
+estimated fluxes. Below each plot: the error of the theory, and what it assumes.
 """
 NOT_SIMULATED = (
     "25 acquisitions of this scene are simulated, which takes up to half a minute. The sidebar "
