@@ -21,7 +21,7 @@ from core.studies.lessons import CHECKS, NEED_SIGNAL, VIEWS, Bench, require_sign
 from core.studies.outputs import Pictures, Plot
 from tests.browser import enter, eventually, slider
 from tests.states import link_to
-from tests.threads import HeldTasks
+from tests.threads import HeldLayout, HeldTasks
 
 LESSONS = read_lessons()
 FIRST = "1-first-photon"
@@ -259,6 +259,13 @@ def test_a_link_opens_a_lesson_where_the_learner_was(session):
         page.shown.commit.clicks += 1
         assert page.shown.moving.visible
         assert refused not in "".join(heard[count:])
+
+
+def test_an_unknown_lesson_of_a_link_is_reported_with_the_first_one():
+    layout = HeldLayout(built_in_sources(), link_to("page=Learn&learning.lesson=none"))
+    assert "no lesson 'none' here" in layout.alert.text
+    assert layout.contents["Learn"].shown.lesson.key == FIRST
+    assert layout.session.state.learning == Learning()
 
 
 # -- in a browser ----------------------------------------------------------------------------------

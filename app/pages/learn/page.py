@@ -292,7 +292,7 @@ class Learn(Section):
     def _possible(self, learning: Learning) -> Learning:
         """Return what can be shown of a state, which may come from a link; report the rest."""
         if learning.lesson and learning.lesson not in self.lessons:
-            self.session.failures.show(text.no_lesson(learning.lesson))
+            self._refuse(text.no_lesson(learning.lesson))
             return Learning()
         lesson = self.lessons[learning.lesson or next(iter(self.lessons))]
         for name, parse in (
@@ -303,9 +303,14 @@ class Learn(Section):
             try:
                 parse(getattr(learning, name))
             except ValueError as error:
-                self.session.failures.show(str(error))
+                self._refuse(str(error))
                 learning = replace(learning, **{name: ""})
         return learning
+
+    def _refuse(self, sentence: str) -> None:
+        """Show what is wrong with a state, also while the app is built around this page."""
+        self.session.refused.append(sentence)  # shown when it is built
+        self.session.failures.show(sentence)
 
     # Drawing
 
