@@ -49,7 +49,7 @@ STACK = """
 
 _SBR = Number("SBR", 0.02, 0.2, log=True, least=0.0, open_below=True)
 _SBR_HELP = "Signal divided by background flux. The paper has 0.03 to 0.08."
-_ECHO = Number("Echo's bin", 20, 99, whole=True, least=0, most=99)
+_ECHO = Number("Bin of the echo", 20, 99, whole=True, least=0, most=99)
 
 
 @dataclass(frozen=True)
