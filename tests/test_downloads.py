@@ -459,7 +459,8 @@ def test_a_methods_picture_is_saved_as_its_estimate(layout, kind):
     for method, task in compare.tasks.items():
         assert f"method: {method}; settings: {task.settings}, false alarms 1" in described
     layout.pages.choice.value = "Explore"
-    image = compare.answers["peak"].run.image
+    shown = layout.session.state.comparison.viewing.least_confidence
+    image = compare.answers["peak"].run.image.confident(shown)
     assert (found.heading, found.subject.estimator) == ("Peak of the histogram", "peak")
     if kind == "3D clouds":
         points = laspy.read(io.BytesIO(written(found.files["las"])))

@@ -16,7 +16,7 @@ from app.model.store import Answer
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
 from core.geometry import WHOLE, Box
 from core.io import RangeColors
-from core.scripts import assign, call, changed_fields, literal
+from core.scripts import assign, changed_fields, literal
 
 IMAGES = {
     "Estimate": "shown.range_m",
@@ -147,7 +147,7 @@ def _single_estimate(answer: Answer, state: State) -> Lines:
     elif state.difference:
         yield "difference = core.first_difference(capture.cube[row, col])"
     yield "\n# Save image, point cloud and pixel."
-    yield _saved('"range.png"', **_colors(state.viewing))
+    yield from _saved_picture('"range.png"', state.viewing)
     yield from _saved_cloud('"cloud.ply"', state.box)
     pixel = ("capture", "row", "col", "settings", '"pixel.csv"')
     chosen = {} if answer.method == "tracking" else {"method": method}
@@ -170,7 +170,7 @@ def _pair(a: Answer, b: Answer, state: State) -> Lines:
     yield "# A is the estimate that was kept."
     yield from capture_a
     yield from _estimate(a, state)
-    yield _saved('"range_a.png"', **_colors(state.viewing))
+    yield from _saved_picture('"range_a.png"', state.viewing)
     yield "shown_a = shown"
     yield "\n# B is the estimate on screen."
     if capture_b != capture_a:
@@ -239,11 +239,13 @@ def _angle(answer: Answer, viewing: Viewing) -> Lines:
     yield assign("angle_rad", "core.geometry.pixel_angle_of", *arguments)
 
 
-def _colors(viewing: Viewing) -> dict[str, str]:
-    """Return the argument for the colours of a picture, unless they are the default."""
+def _saved_picture(path: str, viewing: Viewing) -> Lines:
+    """Save a picture in the colours on screen, unless they are the default."""
     chosen = RangeColors(**{each.name: getattr(viewing, each.name) for each in fields(RangeColors)})
     changed = changed_fields(chosen)
-    return {"colors": call("core.io.RangeColors", **changed)} if changed else {}
+    if changed:
+        yield assign("colors", "core.io.RangeColors", **changed)
+    yield _saved(path, **({"colors": "colors"} if changed else {}))
 
 
 def _saved(path: str, image: str = "shown", **options: str) -> str:
@@ -291,7 +293,7 @@ def _comparison(answer: Answer, state: State) -> Lines:
         *(
             _saved_cloud('f"{method}.ply"')
             if has_clouds
-            else [_saved('f"{method}.png"', **_colors(chosen.viewing))]
+            else _saved_picture('f"{method}.png"', chosen.viewing)
         ),
     ]
     yield indent("\n".join(of_each), "    ")

@@ -303,11 +303,16 @@ def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats
     Bins without armed pulses have no rate; theirs is taken as the median of the others, weighted
     with their armed pulses. That is the background if it fired the pulses, and nearly 0 if an echo
     did. Without this, flux that fires every pulse early in the gate would be mistaken for an echo.
+
+    Where all fire in the first bin, its rate has only a lower bound, which is higher for all such
+    pixels together than for one.
     """
     median = np.empty(len(pixels))
     for some in _some_rows(pixels):
         rate, armed = rate_and_n_armed(pixels[some].astype(float), n_pulses)
         median[some] = weighted_median(rate.T, armed.T)
+    at_once = pixels[:, 0] >= n_pulses
+    median[at_once] = math.log(2 * n_pulses * max(int(at_once.sum()), 1))
     return np.asarray(median * pixels.shape[1])
 
 
