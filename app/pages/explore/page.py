@@ -70,7 +70,11 @@ BOARD = (
 """
 )
 COLUMN = column(8, BREAK_PX)
-ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 0 12px; }"
+# As high as the switch, which has no height until it is drawn: the plots keep theirs.
+ROW = (
+    ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 0 12px; "
+    "min-height: 24px; }"
+)
 
 PICTURES_DELAY_MS = 60
 """Image and cloud are drawn this long after the pixel's plots, which the eye follows."""
