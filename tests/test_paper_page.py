@@ -317,7 +317,7 @@ def move_the_slider_of_figure_4(here: Page) -> None:
         expect(each).to_be_visible()
     assert "Both scales, echo at bin 50, SBR 0.08" in titles(here)
     before = pixel.screenshot(), curve.screenshot()
-    slider(here, "Echo's bin").focus()
+    slider(here, "Bin of the echo").focus()
     for _ in range(20):
         here.keyboard.press("ArrowRight")
     eventually(lambda: "Both scales, echo at bin 70, SBR 0.08" in titles(here))
