@@ -204,7 +204,7 @@ class Scale:
 
     def length(self, bins: float) -> str:
         """Format a distance, given in bins, with the unit."""
-        return f"{abs(self.step) * bins:.{max(0, self.decimals - 1)}f} {self.name}"
+        return f"{self.step * bins:.{max(0, self.decimals - 1)}f} {self.name}"
 
     def number(self, position_bin: float) -> Quantity:
         """Format a position without its unit; a dash for NaN."""

@@ -231,8 +231,8 @@ _PLANES: tuple[tuple[float, ...], ...] = (
 def piecewise(size: int = 64) -> Scene:
     """Planes before a wall, over a ground that recedes by 2.5 bins from row to row.
 
-    Neighbouring pixels agree, except at the edges of the planes, to which one in five pixels is
-    next: a test of methods that use neighbours. The depths cover bins 23 to 83 of the gate's 100.
+    Neighbouring pixels agree except at edges, which one pixel in five adjoins: a test of methods
+    that use neighbours. The depths cover bins 23 to 83 of the gate's 100.
 
     Parameters
     ----------
@@ -425,13 +425,13 @@ _CORD_EVERY, _NET_SHARE = 8, 0.4
 
 
 def field_capture(size: int = 64) -> Scene:
-    """A generated field capture: a net before a wall, sky, hot pixels, an uneven background.
+    """Simulated field scene: a net before a wall, sky, hot pixels, uneven background.
 
-    It has what captures outdoors have, and a known truth. Above the skyline no pixel has a target;
-    below the wall is ground. Every eighth row and column of the net is a cord that fills the pixel;
-    elsewhere its threads fill 40 % of it, and two echoes return. Dark panels hang on the wall. The
-    sky is the brightest background, the left half of the rest lies in shadow. One pixel in a
-    hundred is hot, with 10⁷ to 10⁹ dark counts per second, and one in two hundred is dead.
+    It has typical features of outdoor captures and a known truth. Above the skyline no pixel has a
+    target; below the wall is ground. Every eighth row and column of the net is a cord that fills
+    the pixel; elsewhere its threads fill 40 % of it, and two echoes return. Dark panels hang on the
+    wall. The sky is the brightest background, the left half of the rest lies in shadow. One pixel
+    in a hundred is hot, with 10⁷ to 10⁹ dark counts per second, and one in two hundred is dead.
 
     The gate is 100 to 300 ns (15 to 45 m) in 1 ns bins.
 
@@ -452,7 +452,8 @@ def field_capture(size: int = 64) -> Scene:
     down = (row - _FOOT) / (1 - _FOOT)
     behind_m = np.where(is_ground, _WALL_M + (_GROUND_M - _WALL_M) * down, _WALL_M)
     is_net = _is_between(row, *_NET_ROWS) & _is_between(col, *_NET_COLS)
-    is_cord = is_net & np.logical_or.outer(*2 * [np.arange(size) % _CORD_EVERY == 0])
+    has_cord = np.arange(size) % _CORD_EVERY == 0
+    is_cord = is_net & np.logical_or.outer(has_cord, has_cord)
     is_panel = _is_between(row, 0.4, 0.6) & _is_between(col, 0.7, 0.9)
     drawn = np.random.default_rng(0).uniform(size=behind_m.shape)
     hot_hz = np.where(drawn < 0.01, 10 ** (7 + 2 * np.minimum(drawn / 0.01, 1.0)), 0.0)

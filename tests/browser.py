@@ -201,7 +201,7 @@ def choose(page: Page, name: str, option: str) -> None:
 
 
 def unfold(page: Page, title: str) -> None:
-    """Unfold a part of the sidebar by key."""
+    """Unfold a section of the sidebar by keyboard."""
     head = page.get_by_role("button", name=title, exact=True).filter(visible=True)
     head.press("Enter")
     expect(head).to_have_attribute("aria-expanded", "true")

@@ -7,6 +7,7 @@ from dataclasses import asdict, fields, replace
 from threading import Event
 
 import numpy as np
+import panel_material_ui as pmui
 import pytest
 from bokeh.document import Document
 
@@ -934,10 +935,16 @@ def test_a_link_unfolds_the_rarely_used_settings_that_it_changes():
 
 
 def test_each_page_has_its_own_help_at_the_top_of_the_sidebar(layout):
-    layout.session.state.page = "Compare"
-    helps = [each for each in layout.page.sidebar if getattr(each, "title", "") == HELP]
-    assert layout.page.sidebar[: len(helps)] == helps
-    assert [each.visible for each in helps] == [False, False, True]
+    help = layout.page.sidebar[0]
+    assert help.title == HELP
+    help.collapsed = False
+    found = {}
+    for page in PAGES:
+        layout.session.state.page = page.name
+        if help.visible:
+            (found[page.name],) = (each.object for each in help.select(pmui.Typography))
+    assert found == {page.name: page.explanation for page in PAGES if page.explanation}
+    assert {"Explore", "Compare"} <= found.keys()
 
 
 def test_estimates_without_an_echo_are_shown_in_place_of_the_stages(layout, explore):

@@ -626,8 +626,9 @@ WebSocket.prototype.send = function (part) {
 
 
 NOTE_COLORS = """() => {
-  window.seen = [];
+  const seen = (window.seen = []);
   const look = () => {
+    if (window.seen !== seen) return;
     const style = getComputedStyle(document.documentElement);
     const names = ["--mui-palette-background-default", "--mui-palette-text-primary"];
     const colors = names.map((name) => style.getPropertyValue(name)).join();
@@ -636,7 +637,7 @@ NOTE_COLORS = """() => {
   };
   look();
 }"""
-"""JavaScript that keeps the colours of paper and text of the page."""
+"""JavaScript that records background and text colours of the page when they change."""
 
 
 def change_theme(page: Page) -> None:
@@ -653,6 +654,7 @@ def change_theme(page: Page) -> None:
         page.get_by_role("button", name="Toggle theme").click()
         eventually(lambda palette=palette: all_drawn_in(palette))
         assert len(page.evaluate("seen")) == 2  # no light text on light paper in between
+        page.evaluate("seen = null")
         assert (pixels(page.screenshot()).mean() < 60) == (palette is DARK)
     sent = [event for part in page.evaluate("sent") for event in json.loads(part).get("events", ())]
     # The server paints the plots: the browser need not report the colour of each line.

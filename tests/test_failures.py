@@ -85,7 +85,7 @@ FAILING = {
 
 def test_what_fails_on_the_server_is_reported_and_the_next_move_works():
     async def session(address):
-        # With a seed, the part that holds its slider is unfolded.
+        # A seed in the link unfolds the section with its slider.
         wire, _ = await opened_wire(f"{address}?light.seed=50", seed=0)
         alert = wire.find("Sentence", warning=True), "text"
         said = {}

@@ -245,15 +245,14 @@ def expect_maps(page: Page, subject: Subject) -> None:
         eventually(lambda values=values: is_mapped(page, values))
     _, content = download(page, "map", "csv")
     _, _, range_m, *_ = columns_of(content).values()
-    half_step_m = capture.acquisition.bin_length_m / 20  # of a range in a CSV, at most
+    half_step_m = capture.acquisition.bin_length_m / 20  # largest rounding of a range in CSV
     np.testing.assert_allclose(range_m, expected["Estimate"].ravel(), atol=half_step_m)
 
 
 def expect_report(page: Page, capture: Capture) -> None:
     """Expect the capture's flux, how it was found, and the sum of all histograms."""
     report = inspection.capture_report(capture)
-    signal = "Photons per pixel" if capture.acquisition.n_pulses is None else "PPP"
-    names = f"{signal}, all pixels", "Background", "SBR, all pixels"
+    names = "PPP, all pixels", "Background", "SBR, all pixels"
     for name, found in zip(names, report.flux, strict=True):
         expect(fact(page, name)).to_have_text(text.interval(found))
     method = f"Signal, background and SBR: {report.flux_method}"

@@ -634,6 +634,10 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
     stated = text.capture_facts(building.answer, replace(report, stated=(check,)))
     (shown,) = (value for name, value, _ in stated if name == "SBR, stated")
     assert shown.value == check.stated and shown.note == "estimate −50.0 %"
+    unknown = replace(before, acquisition=replace(before.acquisition, n_pulses=None))
+    run = replace(building.answer.run, capture=unknown)
+    named = text.capture_facts(replace(building.answer, run=run), report)
+    assert "Photons per pixel, all pixels" in [name for name, *_ in named]
     assert report.flux_method in capture.flux.text
     assert report.flux_remark in capture.flux.text
     assert report.suggestion.why_gate in capture.advice[0].text

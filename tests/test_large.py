@@ -244,7 +244,7 @@ def saved_window(app):
     session = app.session
     values, _ = image_of(session.answer, "Estimate", session.state.viewing)
     at = [session.answer.grid.pixel(*each) for each in zip(rows, cols, strict=True)]
-    step_m = session.answer.capture.acquisition.bin_length_m / 10  # at most, of a range in a CSV
+    step_m = session.answer.capture.acquisition.bin_length_m / 10  # largest step of a range in CSV
     np.testing.assert_allclose(shown, [values[each] for each in at], atol=step_m / 2)
     return (rows.min(), rows.max()), (cols.min(), cols.max()), rows.size
 

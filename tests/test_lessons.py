@@ -183,10 +183,10 @@ def test_nothing_is_shown_before_the_prediction(session):
     assert moved.about().settings == (LESSONS[FIRST].bench,)  # the one still on screen
     session.tasks.run_until(lambda: moved.item is not plot)
     plot, light = moved.item, constant.item
-    for answer, said in (("0.58", "before bin 50"), ("42 %", "Right")):
+    for answer, feedback in (("0.58", "before bin 50"), ("42 %", "Right")):
         shown.answer.value = answer
         assert session.state.learning.answer == answer
-        session.tasks.run_until(lambda said=said: said in shown.verdict.text)
+        session.tasks.run_until(lambda feedback=feedback: feedback in shown.verdict.text)
     assert moved.about().settings == (replace(LESSONS[FIRST].bench, background=5.0),)
     assert constant.about().settings == (LESSONS[FIRST].bench,)
     assert (moved.item, constant.item) == (plot, light)  # an answer changes no view
@@ -234,7 +234,7 @@ def test_html_in_a_lesson_is_shown_as_text():
     assert not any("<script" in each for each in shown)
 
 
-def test_a_link_opens_a_lesson_where_the_learner_was(session):
+def test_a_link_opens_a_lesson_where_the_learner_was():
     query = "page=Learn&learning.lesson=2-more-light&learning.prediction=0.3&learning.moved=10.0"
     session = Session(built_in_sources(), link_to(query), HeldTasks())
     assert session.refused == []
@@ -282,9 +282,9 @@ def take_the_first_lesson(here: Page) -> None:
     moved = slider(here, "Background (per pulse)").filter(visible=True)
     moved.press("ArrowRight")
     expect(here.get_by_text("The light has no slope")).to_be_visible()
-    for answer, said in (("0.58", "before bin 50"), ("0.42", "Right: 0.42.")):
+    for answer, feedback in (("0.58", "before bin 50"), ("0.42", "Right: 0.42.")):
         enter(here, "Your answer", answer)
-        expect(here.get_by_role("status").filter(has_text=said)).to_be_visible()
+        expect(here.get_by_role("status").filter(has_text=feedback)).to_be_visible()
     eventually(lambda: "learning.answer=0.42" in here.evaluate("location.href"))
     here.reload()
     expect(here.get_by_role("status").filter(has_text="Right: 0.42.")).to_be_visible()

@@ -102,7 +102,7 @@ def test_an_open_page_follows_with_its_settings_unless_it_should_not(tmp_path):
     assert "watched folder. bad.npz" in sentence and str(tmp_path) not in sentence
     assert session.answer.request.source is second
     assert HeldLayout(served | built_in_sources(), arrivals=arrivals).alert.text == sentence
-    session.choose_pixel(0, 0)  # the page goes on, and so does the sentence
+    session.choose_pixel(0, 0)  # other actions keep the message
     assert layout.alert.text == sentence
     control(layout, "Follow new captures").value = False
     shown = state.source

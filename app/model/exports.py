@@ -279,7 +279,7 @@ def _in_view(axis_range: Any, place: Array, half: float) -> NDArray[np.bool_]:
 
 
 def _product(answer: Answer, least_confidence: float, box: Box = WHOLE, **more: Any) -> Product:
-    """Return the pixels on show of an estimate, for `core.io.writers`."""
+    """Return the visible pixels of an estimate, for `core.io.writers`."""
     more.setdefault("pixel_angle_rad", answer.capture.acquisition.pixel_angle_rad)
     image = answer.run.image.confident(least_confidence)
     return Product(answer.capture, image if box == WHOLE else image.cropped(box), **more)
@@ -405,7 +405,7 @@ def facts_file(facts: Sequence[Fact]) -> Write:
 
 
 def _value(text: str) -> Any:
-    """Return the number of a text that keeps one, as exact as it is; a dash is an empty cell."""
+    """Return the number of a text that keeps one, as exact as shown; a dash is an empty cell."""
     return text.rounded(text.value) if isinstance(text, Quantity) else "" if text == "–" else text
 
 

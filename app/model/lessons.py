@@ -1,7 +1,7 @@
 """Lessons: Markdown files with front matter (TOML between lines of +++), read and checked.
 
-A file names views and checks of `core.studies.lessons`; nothing in it is evaluated. Below its front
-matter stands what is read before the prediction, and, below a line of three dashes, after it.
+A file names views and checks of `core.studies.lessons`; nothing in it is evaluated. The text below
+the front matter introduces the lesson; the text below a line of three dashes explains the result.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BUILT_IN = Path(str(resources.files("app"))) / "lessons"
 PREDICTED = "your prediction"
 
 SPECS = {each.name: spec_of(each) for each in fields(Bench)}
-"""What the state of a lesson and its control can name."""
+"""Specification of each field that a lesson can set or control."""
 
 SHAPES = {"flat": (1.0, 1.0), "rising": (0.2, 1.8), "falling": (1.8, 0.2)}
 """Predicted curves: their first and last value, over the mean of what is predicted."""
@@ -35,7 +35,7 @@ SHAPES = {"flat": (1.0, 1.0), "rising": (0.2, 1.8), "falling": (1.8, 0.2)}
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the learner commits to before anything is shown: a shape, or a number on an axis."""
+    """Prediction made before the result is shown: a shape, or a number on an axis."""
 
     question: str
     view: str
@@ -79,7 +79,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Hint:
-    """A typical wrong answer, computed, and what to say about it."""
+    """Typical wrong answer, computed, and the remark on it."""
 
     function: str
     arguments: Mapping[str, float]
@@ -314,7 +314,7 @@ def _check(given: _Table, bench: Bench) -> Check:
 
 
 def _function(given: _Table, bench: Bench) -> tuple[str, Mapping[str, float]]:
-    """Return the name of a check and its arguments, which must be all of its own."""
+    """Return the name of a check and its arguments, all of which are required."""
     name = given.text("function")
     expected = arguments_of(name)
     require_signal(name, bench)

@@ -1,9 +1,10 @@
-"""Where the estimator of an answer has its estimates without an echo, by simulation."""
+"""Range prior of an estimator, by simulation: where its estimates lie without an echo."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -19,7 +20,7 @@ SIDE, ECHO_SIDE = 64, 32
 
 
 def has_range_prior(answer: Answer) -> bool:
-    """Return whether there is one: the flux is known, and the estimator does not use it."""
+    """Return whether it can be simulated: the flux must be known, but not to the estimator."""
     return answer.request.source.is_scene and not ESTIMATORS[answer.method].knows_flux
 
 
@@ -28,6 +29,7 @@ def range_prior_of(answer: Answer) -> outputs.Plot:
     request, light = answer.request, answer.request.light
     acquisition = answer.whole.acquisition
 
+    @lru_cache(maxsize=1)  # the study begins with the image whose cost is predicted
     def simulated(range_m: float) -> Capture:
         side = SIDE if math.isnan(range_m) else ECHO_SIDE
         scene = Scene(np.full((side, side), range_m))

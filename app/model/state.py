@@ -32,8 +32,8 @@ class Illumination:
     ppp: float = parameter(
         0.1041,
         Number("Signal", 0.001, 10.0, log=True, least=0.0, unit="per pulse"),
-        "Signal flux (PPP, photons per pulse), detected if the detector were always armed. Others "
-        "call photons per pixel PPP: those of all pulses together.",
+        "Signal flux (PPP, photons per pulse), detected if the detector were always armed. "
+        "Elsewhere PPP often means photons per pixel, summed over all pulses.",
     )
     n_pulses: int = parameter(
         1000,
@@ -248,7 +248,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Learning:
-    """What a learner has done in a lesson of the Learn page; empty texts stand for nothing yet."""
+    """Progress of a learner in a lesson of the Learn page; empty strings mean not yet."""
 
     lesson: str = ""
     """Key of the lesson; empty for the first one."""

@@ -314,11 +314,8 @@ class Layout:
         self._light_part = part("Simulation", self._panels["light"].layout, is_shown=False)
         if self.session.answer.request.reading != ReadOptions():
             self._reading.part.collapsed = False
-        self._helps = {
-            each.name: part(HELP, pmui.Typography(each.explanation, margin=8), is_open=False)
-            for each in PAGES
-            if each.explanation
-        }
+        self._explanation = pmui.Typography(margin=8)
+        self._help = part(HELP, self._explanation, is_open=False)
         tracking = self._panels["tracking"]
         rare = [name for name in tracking.controls if name not in COMMON]
         chosen = self.session.state.tracking
@@ -361,7 +358,7 @@ class Layout:
         session, asides = self.session, self.pages.asides
         share = Share(lambda: script_of(session.answer, session.state, session.kept_answer))
         return [
-            *self._helps.values(),
+            self._help,
             self._source,
             self._file,
             *([] if self._arrivals is None else [self._follow]),
@@ -410,8 +407,7 @@ class Layout:
         """Show the controls that affect the open page."""
         page = self._pages[self.pages.choice.value]
         shows_other = Shared.METHOD in page.shared and self.session.answer.method != "tracking"
-        for name, explanation in self._helps.items():
-            explanation.visible = name == page.name
+        self._explanation.object, self._help.visible = page.explanation, bool(page.explanation)
         for each, content in self._shared.items():
             is_other = each is Shared.TRACKING and shows_other
             content.visible = each in page.shared and not is_other

@@ -75,7 +75,7 @@ class Page:
     help: str
     """Purpose of the page: the rest of a sentence that begins with its name."""
     explanation: str = ""
-    """How to read the page, as Markdown; empty where the page itself says it."""
+    """How to read the page, as Markdown; empty if the page needs none."""
     shared: frozenset[Shared] = frozenset(Shared)
     """Shared parts of the sidebar that affect this page."""
     is_standalone: bool = False

@@ -60,11 +60,11 @@ ESTIMATES_NAME = "estimate, own lag removed"
 
 
 MOST_LAG = 0.1
-"""Share of the gate above which a distance from estimate to maximum is no lag."""
+"""Share of the gate above which a distance from estimate to maximum is not a lag."""
 
 
 def score_title(what: str, pixel: Pixel, along: Scale) -> str:
-    """Return the title of a plot of a pixel's score: what its maximum has to do with the estimate.
+    """Return the title of a plot of a pixel's score: how its maximum relates to the estimate.
 
     The estimate of a method is this maximum minus the method's lag, unless the estimate was then
     replaced by another, as some methods do.

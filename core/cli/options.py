@@ -159,7 +159,7 @@ def _corners(text: str) -> tuple[tuple[float, float], ...]:
 
 def add_colors(command: Any) -> None:
     """Add the options for the colours of pictures."""
-    group = command.add_argument_group("colours of ranges in pictures; those of the app")
+    group = command.add_argument_group("colours of ranges in pictures, as in the app")
     for each in fields(RangeColors):
         spec, help = spec_of(each), f"{each.metadata['help']}".replace("%", "%%")
         name = each.name.removesuffix("_m").replace("_", "-")

@@ -87,7 +87,7 @@ class Provenance:
         return vars(self) | {"remark": self.remark}
 
     def after(self, **removal: Any) -> Provenance:
-        """Return it with a reason why estimates were removed; a deferred remark stays so."""
+        """Return a copy with the reason why estimates were removed; a deferred remark stays so."""
         return replace(self, remark=vars(self)["remark"], **removal)
 
     @property

@@ -1,7 +1,7 @@
-"""Flux and smoothness of an image: what its pixels share, as neighbours show it.
+"""Flux and smoothness of an image, estimated from neighbouring pixels.
 
 At a low SBR single pixels cannot distinguish an echo from background, and the signal level
-estimated from them collapses. Neighbouring pixels that see one surface are as one pixel with more
+estimated from them collapses. Neighbouring pixels that see one surface act like one pixel with more
 pulses. The levels are therefore estimated with 1 x 1 to 4 x 4 pixels added, and those are kept that
 make neighbours agree most. With the posteriors q of two pixels by themselves, the prior p and a
 Laplace density K of scale a, the pair is ::
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from core.acquisition import MOST_PULSES, Floats
 from core.capture import Capture, cached_per_capture
 from core.inference.flux import detailed_flux_prior_of, flux_model_of, flux_model_with
-from core.inference.flux_model import Agreement, FluxModel, FluxPrior
+from core.inference.flux_model import UNRELATED, Agreement, FluxModel, FluxPrior
 from core.inference.likelihood import prepare, prepared_groups
 from core.inference.posterior import States, states_of
 from core.reductions import merge_bins, pool_pixels
@@ -44,13 +44,12 @@ _ECHO_BINS = 4  # merged bins of an echo; more add no information
 _LEAST_SHARE = 1e-6  # of the pixels
 _LEAST_DEPTH = 0.3  # relative to a uniform prior; fewer pixels teach depths than are estimated
 _LEAST_EVIDENCE = 1e-20  # so that no product of messages is subnormal
-_APART = Agreement(0.0, 0.0, 1.0)
 
 
 @cached_per_capture
 def image_model_of(capture: Capture) -> FluxModel:
     """Estimate flux and smoothness of a capture from its pixels and their neighbours."""
-    found, best = flux_model_of(capture), _APART
+    found, best = flux_model_of(capture), UNRELATED
     merged, factor = merged_bins(capture)
     for prior in _flux_priors(capture):
         flux = flux_model_with(capture, prior)
@@ -111,7 +110,7 @@ def _agreement(capture: Capture, flux: FluxModel) -> Agreement:
     """Find how similar neighbours are under a flux model."""
     rows, cols = capture.shape
     if min(rows, cols) < 2 or rows * cols < FEWEST_PIXELS:
-        return _APART
+        return UNRELATED
     at = np.random.default_rng(0).permutation((rows - 1) * (cols - 1))[:_PAIRS]
     one = at // (cols - 1) * cols + at % (cols - 1)
     pixels = np.concatenate([one, one + 1, one + cols])
@@ -121,7 +120,7 @@ def _agreement(capture: Capture, flux: FluxModel) -> Agreement:
     found = states_of(prepared, prior.nothing, _LEAST_EVIDENCE)
     q = found.surface.reshape(3, one.size, -1).astype(float)
     dark = found.nothing.reshape(3, one.size).astype(float)
-    best, chance = _APART, 0.0
+    best, chance = UNRELATED, 0.0
     apart = np.roll(np.arange(one.size), one.size // 2)  # pixels are in random order
     for scale in _SCALES_BINS:
         smooth = _smoothed(q[0], laplace(scale)) / prior.surface
@@ -140,15 +139,16 @@ def _agreement(capture: Capture, flux: FluxModel) -> Agreement:
         if mean > max(best.gain, _SURE * error):
             best = Agreement(mean, float(_SHARES[k]), scale)
     left = best.gain - chance
-    return best._replace(gain=left) if left > 0.5 * best.gain else _APART
+    return best._replace(gain=left) if left > 0.5 * best.gain else UNRELATED
 
 
 class Prior(NamedTuple):
     """Prior of the states of a pixel."""
 
     surface: Floats
-    """Of a surface in each bin, shape (bin,)."""
+    """Probability of a surface in each bin, shape (bin,)."""
     nothing: float
+    """Probability of no surface."""
 
     @classmethod
     def of(cls, flux: FluxModel) -> Prior:

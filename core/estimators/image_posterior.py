@@ -1,4 +1,4 @@
-"""Posterior of the image: the exact likelihood of each pixel, and what its neighbours say.
+"""Posterior of the image: exact likelihood of each pixel, combined with its neighbours.
 
 Neighbouring pixels mostly see the same surface, so that at an SBR at which single pixels are
 ambiguous their common evidence is not. The delay of a pixel is a hidden variable; of two
@@ -23,7 +23,6 @@ Bins much shorter than an echo are merged first. Confidence is the mass of this 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -110,14 +109,14 @@ class ImagePosterior(NamedTuple):
     tolerance_probability: NDArray[np.float32]
     """As in `core.inference.posterior.Posterior`."""
     surface: Floats
-    """Likewise."""
+    """Probability of a surface anywhere in the gate, shape (row, col)."""
 
 
 @cached_per_capture
 def image_posterior_of(capture: Capture, flux: FluxModel) -> ImagePosterior:
     """Compute the posterior of an image with the flux model of `image_model_of`."""
     merged, factor = merged_bins(capture)
-    *_, posterior = posteriors(merged, merged_flux(flux, factor))
+    posterior = _posterior(merged, merged_flux(flux, factor))
     delay, _ = peaks(posterior.surface)
     surface = 1.0 - posterior.nothing.astype(float)
     window = _windows(posterior.surface, factor, capture.acquisition.n_bins)
@@ -130,14 +129,13 @@ def likeliest_delays(capture: Capture, flux: FluxModel) -> Floats:
     merged, factor = merged_bins(capture)
     dark = _EMPTY_SHARE
     share = np.append(dark, (1 - dark) * flux.share[1:] / (flux.share[1:].sum() or 1.0))
-    *_, posterior = posteriors(merged, merged_flux(replace(flux, share=share), factor))
+    posterior = _posterior(merged, merged_flux(replace(flux, share=share), factor))
     return peaks(posterior.surface)[0] * factor
 
 
-def posteriors(capture: Capture, flux: FluxModel) -> Iterator[States]:
-    """Yield the posterior of each round, in the memory of the one before."""
+def _posterior(capture: Capture, flux: FluxModel) -> States:
+    """Compute the posterior of each pixel, given the whole image."""
     alone, prior, agreement = states_of_image(capture, flux), Prior.of(flux), flux.agreement
-    assert agreement is not None
     half, both, other = (States(*map(np.empty_like, alone)) for _ in range(3))
     links = Link.of(agreement.alike, agreement.scale_bins, prior), Link.of(*_ALONG_PLANES, prior)
     per_row, per_col = np.zeros((2, *capture.shape), np.float32)
@@ -150,9 +148,9 @@ def posteriors(capture: Capture, flux: FluxModel) -> Iterator[States]:
             fill_posterior(*half, per_col, True, link, *other)
         for one, another in zip(both, other, strict=True):
             np.multiply(np.add(one, another, out=one), np.float32(0.5), out=one)
-        yield both
         if k < _ROUNDS - 1:
             _, per_row, per_col = np.ascontiguousarray(planes(*peaks(both.surface)))
+    return both
 
 
 def _windows(posterior: NDArray[np.float32], factor: int, n_bins: int) -> NDArray[np.float32]:
@@ -218,7 +216,7 @@ def _omits(capture: Capture) -> str:
 
 
 def _neighbours_agree(flux: FluxModel) -> bool:
-    return flux.agreement is not None and flux.agreement.alike > 0
+    return flux.agreement.alike > 0
 
 
 ESTIMATOR = Estimator(
@@ -229,7 +227,7 @@ ESTIMATOR = Estimator(
     finds_delay=True,
     flux_model=image_model_of,
     omits=_omits,
-    own_threshold="beside a surface, its neighbours raise it; let a pixel see nothing instead",
+    own_threshold="neighbours raise it next to a surface; choose 'allow empty pixels' instead",
     undoes_pile_up=True,
     whole_image=True,
     confidence=_confidence,

@@ -23,6 +23,10 @@ class Agreement(NamedTuple):
     """Scale of the Laplace density of their difference in delay."""
 
 
+UNRELATED = Agreement(0.0, 0.0, 1.0)
+"""Agreement of an image whose neighbouring pixels carry no information about each other."""
+
+
 @dataclass(frozen=True, eq=False)
 class FluxModel:
     """Possible fluxes of each pixel: signal levels, and how often each occurs.
@@ -43,8 +47,8 @@ class FluxModel:
         Whether the pulses resolve that early photons hide later ones.
     background_shape : ndarray, shape (bin,), optional
         Background of each bin relative to its mean over the gate; None if it is uniform.
-    agreement : Agreement, optional
-        How neighbouring pixels resemble each other; None if not estimated.
+    agreement : Agreement
+        How neighbouring pixels resemble each other; by default not at all.
     """
 
     signal: Floats
@@ -54,7 +58,7 @@ class FluxModel:
     image_contrast: float | None = None
     pile_up: bool = True
     background_shape: Floats | None = None
-    agreement: Agreement | None = None
+    agreement: Agreement = UNRELATED
 
     @cached_property
     def typical_signal(self) -> Floats:

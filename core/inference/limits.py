@@ -136,11 +136,17 @@ def right_bin_probability(
 
 
 ASSUMES = "the likeliest delay of a single pixel with known fluxes, if depths are uniform"
-"""What `right_bin_probability` is the probability of; other methods may exceed it."""
+"""Estimate whose probability of success `right_bin_probability` is; other methods may exceed it."""
+
+ACCURACY = (
+    "approximated to 0.015; to 0.005 above 0.9 with 1000 pulses or more; up to 0.1 too high with "
+    "fewer than 300 pulses, 0.2 if the echo alone fires most pulses"
+)
+"""Errors of a mean `right_bin_probability`, as found by simulation."""
 
 
 def approximation_error(probability: ArrayLike, n_pulses: int) -> float:
-    """Return the largest error found of a mean `right_bin_probability`, in its simulations."""
+    """Return the largest simulated error of a mean `right_bin_probability`, for a small signal."""
     if n_pulses < _MANY_PULSES:
         return _ERROR_FEW_PULSES
     is_small = (np.asarray(probability) > 0.9) & (n_pulses >= 1000)

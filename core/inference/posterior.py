@@ -90,9 +90,9 @@ class States(NamedTuple):
     """Probability of each state of pixels, of shape (pixel, ...) or (row, col, ...)."""
 
     surface: NDArray[np.float32]
-    """Of a surface in each bin, shape (..., bin)."""
+    """Probability of a surface in each bin, shape (..., bin)."""
     nothing: NDArray[np.float32]
-    """Of none, shape (...)."""
+    """Probability of no surface, shape (...)."""
 
 
 def states_of(prepared: LikelihoodInput, none: float, least: float) -> States:
@@ -137,28 +137,22 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
     bins : ndarray, shape (row, col)
         Delays in fractional bins, from 0 to n_bins; NaN gives 0.
     """
-    last = capture.cube.shape[2] - 1
-    below, found = _bin_below(bins.ravel(), last), np.empty(bins.size)
     if has_posterior(capture) or capture in _estimated:
-        table = posterior_of(capture).tolerance_probability
-        # Flat indices: `numpy.take_along_axis` takes longer than everything else.
-        first = np.arange(bins.size)[:, np.newaxis] * (last + 1)
-        ends = table.take(first + _both(below, last))
-    else:
-        ends, _ = _masses(capture, below, min(2, last + 1))
-        _estimated.add(capture)
-    for begin in range(0, bins.size, NUMBERS_AT_ONCE):
-        some = slice(begin, begin + NUMBERS_AT_ONCE)
-        found[some] = _interpolated(bins.ravel()[some], below[some], ends[some])
-    return found.reshape(bins.shape)
+        return probability_at(posterior_of(capture).tolerance_probability, bins)
+    last = capture.cube.shape[2] - 1
+    below = _bin_below(bins.ravel(), last)
+    ends, _ = _masses(capture, below, min(2, last + 1))
+    _estimated.add(capture)
+    return _between(bins, below, ends)
 
 
 def probability_at(table: NDArray[np.float32], bins: Floats) -> Floats:
     """Interpolate a `Posterior.tolerance_probability` at a delay (row, col) of each pixel."""
     last = table.shape[2] - 1
     below = _bin_below(bins.ravel(), last)
-    ends = np.take_along_axis(table.reshape(-1, last + 1), _both(below, last), axis=1)
-    return _interpolated(bins.ravel(), below, ends).reshape(bins.shape)
+    # Flat indices: `numpy.take_along_axis` takes longer than everything else.
+    first = np.arange(bins.size)[:, np.newaxis] * (last + 1)
+    return _between(bins, below, table.take(first + _both(below, last)))
 
 
 def tolerance_probability_at(capture: Capture, row: int, col: int, bins: Floats) -> Floats:
@@ -166,6 +160,15 @@ def tolerance_probability_at(capture: Capture, row: int, col: int, bins: Floats)
     table = posterior_of(capture).tolerance_probability[row, col]
     below = _bin_below(bins, table.size - 1)
     return _interpolated(bins, below, table[_both(below, table.size - 1)])
+
+
+def _between(bins: Floats, below: NDArray[np.intp], ends: NDArray[np.float32]) -> Floats:
+    """Interpolate at delays (row, col) between `ends` (pixel, 2), a part at a time."""
+    found = np.empty(bins.size)
+    for begin in range(0, bins.size, NUMBERS_AT_ONCE):
+        some = slice(begin, begin + NUMBERS_AT_ONCE)
+        found[some] = _interpolated(bins.ravel()[some], below[some], ends[some])
+    return found.reshape(bins.shape)
 
 
 def _bin_below(delay_bin: Floats, last: int) -> NDArray[np.intp]:

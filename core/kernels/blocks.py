@@ -14,7 +14,7 @@ from core.kernels.parallel import COMPILED, PARALLEL, entering
 LANES = 64
 """Pixels processed together: four vectors of sixteen float32."""
 
-_PIXELS_AT_ONCE = 8
+PIXELS_AT_ONCE = 8
 _BINS_AT_ONCE = 4  # per read and write of the sums, which cost more than the additions
 
 
@@ -72,9 +72,9 @@ def _lay_out(pixels, counts):  # type: ignore[no-untyped-def]
     """Transpose pixels (pixel, bin) into full blocks."""
     for b in prange(counts.shape[0]):
         # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
-        for first in range(0, LANES, _PIXELS_AT_ONCE):
+        for first in range(0, LANES, PIXELS_AT_ONCE):
             for k in range(counts.shape[1]):
-                for i in range(first, first + _PIXELS_AT_ONCE):
+                for i in range(first, first + PIXELS_AT_ONCE):
                     counts[b, k, i] = pixels[b * LANES + i, k]
 
 

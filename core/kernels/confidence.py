@@ -11,12 +11,10 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from core.kernels.blocks import lane_rows
+from core.kernels.blocks import PIXELS_AT_ONCE, lane_rows
 from core.kernels.elementary import exp32
 from core.kernels.parallel import COMPILED, PARALLEL
 from core.kernels.posterior import counts_of, fill_flat, fill_level
-
-_PIXELS_AT_ONCE = 8
 
 
 @njit(**COMPILED)
@@ -85,9 +83,9 @@ def fill_densities(prepared, density):  # type: ignore[no-untyped-def]
             for i in range(lanes):
                 top[i] = max(top[i], highest[i] + offset[i])
             # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
-            for first in range(0, lanes, _PIXELS_AT_ONCE):
+            for first in range(0, lanes, PIXELS_AT_ONCE):
                 for d in range(n_delays):
-                    for i in range(first, min(first + _PIXELS_AT_ONCE, lanes)):
+                    for i in range(first, min(first + PIXELS_AT_ONCE, lanes)):
                         log = ratio[d % n_steps, d // n_steps, i] + offset[i]
                         density[b, i, level, d] = log
         for i in range(lanes):

@@ -1,8 +1,8 @@
 """Kernels of messages between neighbouring pixels, along the rows or the columns of an image.
 
-The state of a pixel is the bin of its surface, or "nothing". Of two neighbours, the second is with
-probability ρ on the plane of the first, and otherwise independent of it, distributed as the prior
-p. The message of a pixel with weights h(d), which sum to 1, is therefore ::
+The state of a pixel is the bin of its surface, or "nothing". With probability ρ the second of two
+neighbours lies on the plane of the first; otherwise it is independent, with the prior p. The
+message of a pixel with weights h(d), which sum to 1, is therefore ::
 
     m(d') = 1 - ρ + ρ / p(d') Σ_d K(d' - d - g) h(d)
 
@@ -23,7 +23,7 @@ MOST_TAPS = 33
 """Taps of the kernel K, at most."""
 
 STEEPEST = 24.0
-"""Largest slope in bins per pixel; steeper planes are taken for such."""
+"""Largest slope in bins per pixel; steeper slopes are clipped."""
 
 _MARGIN = int(STEEPEST) + MOST_TAPS  # bins on either side of the gate that a message may read
 

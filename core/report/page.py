@@ -215,11 +215,10 @@ def _maps(
     beyond = scale.n_outside(range_m)
     grey = f" Grey: {beyond:,} beyond the colours." if beyond else ""
     least, most = int(counts.min()), int(counts.max())
-    drawn_pixels = np.arange(counts.size).reshape(counts.shape)[::step, ::step]
+    is_drawn = np.zeros(counts.shape, bool)
+    is_drawn[::step, ::step] = True
     p_values = np.full(counts.shape, np.nan)
-    p_values[::step, ::step] = fit_p_values_of(capture, drawn_pixels.ravel()).reshape(
-        drawn_pixels.shape
-    )
+    p_values[is_drawn] = fit_p_values_of(capture, np.flatnonzero(is_drawn))
     colors = colors_of("inferno")
     yield _heading_2("Maps")
     if step > 1:
@@ -248,7 +247,7 @@ def _maps(
             "Goodness of fit",
             p_values,
             p_value_scale(),
-            f"{share_below(p_values[::step, ::step])} {fit_of(capture).verdict}",
+            f"{share_below(p_values[is_drawn])} {fit_of(capture).verdict}",
         ),
     )
     drawn = [

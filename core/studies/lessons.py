@@ -17,6 +17,7 @@ from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.checks import require
 from core.estimators import ESTIMATORS, estimate
+from core.inference import TOLERANCE_BINS
 from core.inference.limits import best_exposure, right_bin_probability
 from core.metrics import restoration_degree
 from core.parameters import Choice, Number, Settings, parameter
@@ -109,7 +110,7 @@ def _rate(bench: Bench) -> Floats:
 
 
 def _captured(bench: Bench, range_m: float, side: int = 1) -> Capture:
-    """Simulate a flat target; NaN stands for none. Without a signal there is none, either."""
+    """Simulate a flat target at a range, or none if it is NaN or the signal is 0."""
     if bench.signal:
         flux = bench.flux
     else:  # the background is all that a scene without a surface returns
@@ -215,22 +216,18 @@ def _accuracy(bench: Bench) -> dict[str, Floats]:
     """Return the share of pixels that each method finds, and its limit, at each exposure."""
     gate, onset = bench.acquisition, bench.onset_bin
     range_m = float(gate.bin_to_range_m(onset))
-    shares: dict[str, list[float]] = {"tracking": [], "likelihood": [], LIMIT: []}
+    settings = {"tracking": bench.tracking, "likelihood": ESTIMATORS["likelihood"].parameters()}
+    shares: dict[str, list[float]] = {name: [] for name in (*settings, "limit")}
     for exposure in EXPOSURES:
         at = replace(bench, exposure=exposure)
         flux = at.flux
         capture = _captured(at, range_m, _SIDE)
-        for method in ("tracking", "likelihood"):
-            settings = bench.tracking if method == "tracking" else None
-            settings = settings or ESTIMATORS[method].parameters()
-            error = np.abs(ESTIMATORS[method].delays(capture, settings)[0] - onset)
-            shares[method].append(float((error <= 3).mean()))
+        for method, each in settings.items():
+            error = np.abs(ESTIMATORS[method].delays(capture, each)[0] - onset)
+            shares[method].append(float((error <= TOLERANCE_BINS).mean()))
         limit = right_bin_probability(onset, flux.signal, flux.background, PULSE, gate)
-        shares[LIMIT].append(float(limit))
+        shares["limit"].append(float(limit))
     return {name: np.array(values) for name, values in shares.items()}
-
-
-LIMIT = "limit"
 
 
 def both_scales(bench: Bench) -> Plot:

@@ -11,14 +11,13 @@ import numpy as np
 from core.acquisition import Acquisition, Floats, Flux, Pulse, pulses_sent
 from core.capture import Capture
 from core.estimators import ESTIMATORS
+from core.inference import TOLERANCE_BINS
 from core.studies.outputs import Plot
 from core.tracking import TrackingParameters, tracking_signals
 from core.trigger import rate_per_bin, trigger_probability
 
 GROUPS = 20
 """Groups of bins, and positions of the echo, along the gate."""
-
-TOLERANCE_BINS = 3
 
 Simulated = Callable[[float], Capture]
 """Returns a capture whose pixels all see a surface at a range in metres, or none at NaN."""

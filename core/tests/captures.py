@@ -14,6 +14,6 @@ def real_capture_path(name: str) -> Path:
     """Path of a published capture; without it a test is skipped, but fails in CI."""
     path = CAPTURES / name
     if not path.exists():
-        reason = f"{path} is absent: see CONTRIBUTING.md on real captures"
-        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+        reason = f"{path} is absent: put the published captures there (CONTRIBUTING.md)"
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
     return path

@@ -218,6 +218,7 @@ def test_estimates_do_not_depend_on_threads(
     capture = simulated(size=14)
     serial = estimate(capture, *case)
     monkeypatch.setattr(tracking, "SERIAL_BELOW", 0)
+    monkeypatch.setattr("core.kernels.parallel.SERIAL_BELOW", 0)
     numba.set_num_threads(n_threads)
     assert_same(estimate(capture, *case), serial)
 

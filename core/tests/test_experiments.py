@@ -278,13 +278,13 @@ def test_pile_up_lowers_the_peak_of_an_echo_exponentially() -> None:
     assert (np.abs(curves["reciprocal of the cubic weight"] - expected) > 3 * sd)[:40].any()
 
 
-def test_the_fits_of_figure_6_are_judged() -> None:
+def test_figure_6_states_the_goodness_of_fit() -> None:
     note = pile_up.figure_6(Flux(0.5, 0.1)).note
     for name, verdict in (("expected (Eq. 1)", "fits"), ("cubic weight", "does not fit")):
         assert re.search(rf"{re.escape(name)} [\d.e+]+ \({verdict}\)", note)
 
 
-def test_a_method_s_hidden_prior_is_where_its_estimates_lie_without_an_echo() -> None:
+def test_the_range_prior_is_the_distribution_of_estimates_without_an_echo() -> None:
     def simulated(range_m: float) -> Capture:
         return simulate(Scene(np.full((24, 24), range_m)), paper.GATE, Flux(sbr=0.06))
 
@@ -293,7 +293,7 @@ def test_a_method_s_hidden_prior_is_where_its_estimates_lie_without_an_echo() ->
     share, even, found = plot.curves.values()
     assert share[plot.x < slow.t_n - 5].sum() == 0
     assert share[(plot.x >= 35) & (plot.x <= 55)].sum() > 0.8  # of .2 without a preference
-    assert share.sum() == pytest.approx(even.sum()) == pytest.approx(1)
+    assert (share.sum(), even.sum()) == pytest.approx((1, 1))
     place = {at: float(rd) for at, rd in zip(plot.x, found, strict=True)}
     assert place[50] > 0.97
     assert place[80] < 0.6
@@ -302,8 +302,9 @@ def test_a_method_s_hidden_prior_is_where_its_estimates_lie_without_an_echo() ->
     assert first <= 41 and end > 60
 
     uneven = range_prior.slow_start(slow, paper.GATE, Flux(sbr=0.06))
-    gap = float((re.search(r"begins (\d+) counts below", uneven) or [0, "0"])[1])
-    assert gap == pytest.approx(1000 * 0.1041 / 0.06 / 100, abs=1)
+    stated = re.search(r"begins (\d+) counts below", uneven)
+    assert stated is not None
+    assert float(stated[1]) == pytest.approx(1000 * 0.1041 / 0.06 / 100, abs=1)
     assert range_prior.slow_start(PRESETS["recommended"], paper.GATE, Flux(sbr=0.06)) == ""
 
 

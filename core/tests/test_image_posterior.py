@@ -10,7 +10,7 @@ from core.estimators import estimate
 from core.estimators.image_model import Prior, image_model_of, merged_flux
 from core.estimators.image_posterior import Link, planes
 from core.kernels.messages import fill_posterior
-from core.metrics import restoration_degree
+from core.metrics import calibration_error, reliability, restoration_degree
 from core.studies.trials import Condition
 from core.tests.twins import posterior_of_chain
 
@@ -38,7 +38,7 @@ def test_messages_give_the_exact_posterior_of_a_row(slope: float, along_rows: bo
     np.testing.assert_allclose(both, expected, rtol=1e-4, atol=1e-6)
 
 
-def test_planes_are_those_of_the_surface_in_spite_of_others() -> None:
+def test_planes_are_fitted_despite_outliers() -> None:
     row, col = np.mgrid[:40, :30]
     delay = 20 + 1.5 * row - 0.25 * col
     rng = np.random.default_rng(0)
@@ -56,13 +56,13 @@ def degree(condition: Condition, method: str, seed: int = 900) -> float:
     )
 
 
-def test_neighbours_range_what_single_pixels_cannot() -> None:
+def test_neighbours_raise_the_restoration_degree() -> None:
     condition = Condition("piecewise", 0.02)
     assert degree(condition, "likelihood") < 0.35
     assert degree(condition, "image_posterior") > 0.85
 
 
-def test_pixels_with_depths_of_their_own_are_estimated_by_themselves() -> None:
+def test_unrelated_pixels_are_estimated_independently() -> None:
     capture = Condition("uniform", 0.03).capture(900)
     alone = estimate(capture, "likelihood", depths="learned")
     found = estimate(capture, "image_posterior")
@@ -83,7 +83,8 @@ def test_confidence_is_the_share_of_right_estimates() -> None:
     image = estimate(capture, "image_posterior")
     bin_m = capture.acquisition.bin_length_m
     right = np.abs(image.range_m - capture.truth_range_m) <= 3 * bin_m
-    assert abs(image.confidence.mean() - right.mean()) < 0.03
+    calibration = reliability(image.confidence.ravel(), right.ravel())
+    assert calibration_error(calibration) < 0.03
 
 
 @pytest.mark.usefixtures("threads")
@@ -97,7 +98,7 @@ def test_messages_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_array_equal(found[0].confidence, found[1].confidence)
 
 
-def test_the_sky_is_left_empty_if_pixels_may_be() -> None:
+def test_the_sky_is_empty_if_empty_pixels_are_allowed() -> None:
     capture = Condition("car", 0.03).capture(902)
     is_sky = np.isnan(np.asarray(capture.truth_range_m))
     every, some = (
@@ -105,5 +106,5 @@ def test_the_sky_is_left_empty_if_pixels_may_be() -> None:
         for each in ("estimate every pixel", "allow empty pixels")
     )
     assert every.all()
-    assert some[is_sky].mean() < 0.08  # next to the car its neighbours say otherwise
+    assert some[is_sky].mean() < 0.08  # next to the car, neighbours favour a surface
     assert some[~is_sky].mean() > 0.85

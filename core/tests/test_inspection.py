@@ -222,8 +222,8 @@ def test_a_candidate_has_the_probability_of_a_surface_there(
 
 
 @pytest.mark.parametrize("n_pulses", [300, None])
-def test_the_echo_of_another_surface_is_no_background(n_pulses: int | None) -> None:
-    """The first four pixels see a net before the wall, the others the wall alone."""
+def test_the_echo_of_another_surface_is_not_counted_as_background(n_pulses: int | None) -> None:
+    """Rows 0 to 3 see a net before the wall, the others the wall alone."""
     capture, walls, _ = net_before_wall(n_pulses, 1.5)
     image, unit = estimate(capture, "likelihood"), 1 / (n_pulses or 1)
     hits, trials = np.zeros(2, int), 0

@@ -123,7 +123,8 @@ def test_right_place_where_it_is_likely(sbr: float, published: float | None) -> 
     share = share_right(2000, 0.1041, background, GATE)
     found = float(right_bin_probability(53.6, 0.1041, background, Pulse(), GATE))
     assert found > 0.9
-    error = approximation_error(found, 1000)
+    error = 0.005
+    assert approximation_error(found, 1000) == error
     assert_share(share, 2000, found - error, found + error)
     if published is not None:
         assert_share(share, 2000, published - 0.005, published + 0.005)

@@ -97,10 +97,10 @@ FAINT = [("first", 5.0, 0.03), ("first", 5.0, 0.06)]
 @pytest.mark.compiled
 @pytest.mark.parametrize("regime", [Regime(*each) for each in REGIMES + FAINT], ids=str)
 def test_tracking_is_as_precise_as_the_likelihood(regime: Regime) -> None:
-    """Bias is measured where refined delay and likelihood are right, whatever the whole bins are.
+    """The bias is measured where the refined delay and the likelihood are within tolerance.
 
-    The whole bins of tracking are biased by up to half a bin and correlated with the refined delay,
-    so that where they, too, are within the tolerance, the refined delay is biased.
+    The whole bins of tracking are biased by up to half a bin and correlated with the refined delay:
+    selecting pixels by them, too, would bias the refined delay.
     """
     is_faint = (regime.detection, regime.sigma_bins, regime.sbr) in FAINT
     captures = [regime.capture(seed) for seed in range(4 if is_faint else 1)]

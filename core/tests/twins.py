@@ -24,7 +24,7 @@ def posterior_of_chain(
     Parameters
     ----------
     evidence : ndarray, shape (pixel, bin + 1)
-        Evidence of each bin and, last, of nothing.
+        Evidence of a surface in each bin; the last column is that of no surface.
     alike, scale_bins, slope, nothing : float
         ρ, scale of K, g and prior of nothing of `core.kernels.messages`; the prior of the bins is
         uniform.

@@ -252,7 +252,7 @@ def figures(_: Path) -> Answers:
     answer_m, truth_m = ran.image.range_m, ran.capture.truth_range_m
     yield "run", {"image": ran.image, "figures": ran.figures}
     right = np.abs(of.errors_m(answer_m, np.nan_to_num(truth_m))) < 0.5
-    told = of.reliability(ran.image.confidence.ravel(), right.ravel())
+    reliability = of.reliability(ran.image.confidence.ravel(), right.ravel())
     again_m = [
         core.estimate(drawn(some_of("car"), 1.0, 1.0, seed=s), "peak").range_m for s in (1, 2)
     ]
@@ -262,8 +262,8 @@ def figures(_: Path) -> Answers:
             "errors_m": of.errors_m(answer_m, truth_m),
             "precision": of.precision_recall(ran.image.valid, truth_m),
             "wilson": of.wilson(7, 30),
-            "told": told,
-            "calibration_error": of.calibration_error(told),
+            "reliability": reliability,
+            "calibration_error": of.calibration_error(reliability),
             "rd_variance": of.rd_variance([0.3, 0.7, 0.45]),
             "variance_m2": of.estimator_variance_m2(again_m, some_of("car").range_m),
         },

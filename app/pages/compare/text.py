@@ -149,7 +149,7 @@ def rows(
         *rows,
         {
             "name": "Single-pixel limit",
-            "note": f"Of {limits.ASSUMES}; others may exceed it",
+            "note": f"For {limits.ASSUMES}; others may exceed it",
             "last": True,
             **_limit_row(capture, reference),
         },

@@ -105,7 +105,7 @@ def predict(found: Inspected) -> Prediction:
 
 
 def profile_of(answer: Answer, pins: Sequence[tuple[int, int]], viewing: Viewing) -> LineProfile:
-    """Return the ranges on show along the line that joins pixels."""
+    """Return the visible ranges along the line that joins pixels."""
     angle_rad = pixel_angle_of(answer.field_of_view_deg(viewing), answer.capture.shape[1])
     image = answer.run.image.confident(viewing.least_confidence)
     return inspection.line_profile(answer.capture, image, pins, angle_rad)

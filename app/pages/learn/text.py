@@ -6,7 +6,7 @@ LESSON_HELP = "Each lesson asks first, and shows what happens after your predict
 
 COMMIT_HELP = "Predict: the prediction stays drawn on the plot."
 SHAPES_HELP = "Shape of the histogram that you expect."
-AGAIN_HELP = "Start again: this lesson, with another prediction."
+AGAIN_HELP = "Start again: clear the prediction and the answer of this lesson."
 CHECK_HELP = "Check: compares your answer with a computation."
 
 MOVE = "Now move this control; everything else stays."

@@ -41,7 +41,7 @@ from core.typesetting import typeset
 
 Item = TypeVar("Item")
 
-# Panel takes the width of a figure by default, 600 px, for the least of all that holds it.
+# Panel uses a figure's default width, 600 px, as the minimum width of its containers.
 FREE = ":host { min-width: 0 !important; }"
 GRID = """
 :host { display: grid !important; gap: 8px; width: 100%; min-width: 0 !important;

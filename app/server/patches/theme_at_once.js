@@ -2,7 +2,7 @@
 //
 // A page of panel-material-ui takes the colours of the other mode only after it has been drawn in
 // that mode, and until then shows light text on light paper. Upstream: none found. Gain: avoids an
-// unreadable page for the time of a drawing (0.2 s, 5 s on a busy machine).
+// unreadable page while it draws (0.2 s, 5 s on a busy machine).
 {
   const view = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype.default_view.prototype;
   const { connect_signals: connect } = view;

@@ -33,9 +33,10 @@ There is an echo if its absence is rejected by five errors. The width is determi
 lies within a factor of 1.3 of the estimate; otherwise, the estimate is still better than one bin.
 Of 320 captures of 1600 pixels, with Gaussian and gamma pulses of 0.3 to 30 bins, 1 to 1000 photons
 a pixel, SBRs of 0.02 to 100, and surfaces at one depth or spread out, 195 widths were determined,
-all within a factor of 1.3. Of 51 others an interval was found, which always included the truth; of
-74 no echo. Nothing is estimated from fewer than 16 bins or 32 pixels, nor from more than 65,536
-bins. The pairs of a pulse and of its mirror image are the same: that a tail is late is assumed.
+all within a factor of 1.3. For 51 others an interval was found, which always included the truth; in
+74 no echo was found. Nothing is estimated from fewer than 16 bins or 32 pixels, nor from more than
+65,536 bins. The pairs of a pulse and of its mirror image are the same: that a tail is late is
+assumed.
 
 Pairs are counted by Fourier transforms, of as many evenly spread pixels as `_MOST_NUMBERS` allows.
 """

@@ -1,4 +1,4 @@
-"""What neighbouring pixels add: restoration degrees within 1 bin, inside surfaces and at edges."""
+"""Gain from neighbouring pixels: restoration degrees within 1 bin, in surfaces and at edges."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def shares(piece: tuple[Condition, int]) -> Shares:
     for name, method in METHODS.items():
         right = np.abs(method(capture) - truth_bin) <= _TOLERANCE_BINS + 1e-6
         parts = (right[target], right[target & ~edge], right[target & edge])
-        all_, inside, outside = (float(part.mean()) if part.size else np.nan for part in parts)
-        found[name] = all_, inside, outside
+        every, inside, at_edge = (float(part.mean()) if part.size else np.nan for part in parts)
+        found[name] = every, inside, at_edge
     return found
 
 

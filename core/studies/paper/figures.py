@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS
-from core.inference.limits import ASSUMES, Limit, approximation_error, limit
+from core.inference.limits import ACCURACY, ASSUMES, Limit, approximation_error, limit
 from core.inspection.echoes import CONFIDENT
 from core.inspection.maps import likeliest
 from core.metrics import Interval
@@ -454,8 +454,8 @@ def by_place(
         np.asarray(onset, dtype=float),
         {**found, "limit: probability of the right bin": np.array(bounds)},
         note="The paper's targets lie in bins 45 to 70. Tracking excludes bins before T_n. "
-        f"Limit: {ASSUMES}, approximated to 0.005 above 0.9 and to 0.015 below. Sampling error of "
-        f"a share of {size**2:,} pixels: at most ± {chance:.2g} (95 %).",
+        f"Limit: {ASSUMES}, {ACCURACY}. "
+        f"Sampling error of a share of {size**2:,} pixels: at most ± {chance:.2g} (95 %).",
     )
 
 

@@ -19,7 +19,7 @@ ONSETS = np.arange(20, 100)
 """Bins of the target; the bins before them hold noise alone."""
 
 LEAST_P = 0.05
-"""p-value at or above which a curve is said to fit."""
+"""p-value at or above which a curve is reported to fit."""
 
 _N_NOISE = 19  # bins at the front of the gate whose mean is Figure 5b
 
@@ -47,7 +47,7 @@ def figure_6(flux: Flux, seed: int = 0) -> Plot:
     """Plot the trigger frequency at the target's peak against its bin, and fits of this curve.
 
     The paper fits an exponential, concludes that the weight should grow exponentially, and prints
-    the cubic weight of Eq. 13, whose reciprocal is fitted here beside it. By Eq. 1 the peak falls
+    the cubic weight of Eq. 13, whose reciprocal is also fitted here. By Eq. 1 the peak falls
     with the probability that a pulse is still armed, which is exponential in the target's bin.
     """
     frequency, expected = _frequencies(flux, seed)

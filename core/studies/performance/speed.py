@@ -78,7 +78,7 @@ class Extent:
     )
     """Side and bins of the captures over which the cost per count is compared."""
     fresh: tuple[tuple[int, int], ...] = ((64, 100), (256, 200))
-    """Likewise, of the new captures whose estimate is timed stage by stage."""
+    """Side and bins of the new captures whose estimate is timed stage by stage."""
 
     def __post_init__(self) -> None:
         for name in ("rounds", "starts"):
@@ -222,7 +222,7 @@ def sizes_table(extent: Extent, root_ns: Interval) -> Table:
 
 
 FRESH_STAGES = ("capture", "block layout", "fluxes", "positions", "confidence", "total")
-"""Of `core.estimate` with tracking, in this order; positions with lag and refinement."""
+"""Stages of `core.estimate` with tracking, in order; positions include lag and refinement."""
 
 
 def fresh_table(extent: Extent) -> Table:
@@ -238,8 +238,8 @@ def fresh_table(extent: Extent) -> Table:
         "core.estimate of a new capture, stage by stage",
         ("stage", *columns),
         tuple(zip(FRESH_STAGES, *columns.values(), strict=True)),
-        "Fluxes take as long for any number of pixels; the other stages grow with the counts, "
-        "confidence also with the levels and bins of an echo.",
+        "The time of fluxes does not depend on the number of pixels; the other stages grow "
+        "with the counts, confidence also with the levels and bins of an echo.",
         dict.fromkeys(columns, ".3g"),
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from core.acquisition import Floats
 from core.checks import require
-from core.inference.limits import ASSUMES
+from core.inference.limits import ACCURACY, ASSUMES
 from core.metrics import Interval
 from core.studies.outputs import Item, Plot, Scatter, Table, as_text, table
 from core.studies.statistics import mean_interval, median_interval
@@ -360,10 +360,7 @@ def acquisition_items(sweeps: Sequence[AcquisitionSweeps]) -> Iterator[Item]:
 acquired, acquiring_items = acquisition_sweeps, acquisition_items
 
 
-_THEORY = (
-    f"Theory: {ASSUMES}, approximated to 0.015, or to 0.005 above 0.9; with fewer than 300 pulses "
-    "up to 0.1 too high. Other methods may exceed it."
-)
+_THEORY = f"Theory: {ASSUMES}, {ACCURACY}. Other methods may exceed it."
 
 
 def _sweep_plot(
