@@ -131,8 +131,8 @@ class TrackingParameters(Settings):
     refine: Refine = parameter(
         "likelihood",
         Choice("Refine", ("none", "likelihood")),
-        "Range below a bin: the largest likelihood within one pulse of the bin found, or none: "
-        "that bin itself, as in the paper, in about half the time.",
+        "Range below a bin: the largest likelihood within one pulse of the bin found, or beyond as "
+        "far as it increases; or none: that bin itself, as in the paper, in about half the time.",
     )
 
     def joint_doubts(self) -> list[str]:

@@ -20,7 +20,8 @@ def refined(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
 
     The likelihood ``T(d)`` of `core.inference.likelihood` with the typical fluxes of each pixel is
     computed at four delays in each bin, those less than `same_echo_bins` away; a parabola refines
-    between them.
+    between them. From an end of this window the search goes on as long as the likelihood
+    increases, since an estimator may find only the flank of an echo.
 
     Parameters
     ----------

@@ -67,6 +67,9 @@ def _highest(score, begin, end):  # type: ignore[no-untyped-def]
 def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, reach, delay):  # type: ignore[no-untyped-def]
     """Move each delay (block, lane) to the maximum of ``T(d)`` less than `reach` bins from it.
 
+    A maximum at the end of that window is on the slope of one outside: the window moves there, as
+    long as ``T(d)`` increases.
+
     `blocks` holds counts (block, bin, lane); `signal` and `background`, per bin, have the shape
     (block, lane); `n_pulses` is 0 if unknown; `echo` has `steps` samples a bin, see the module,
     and begins `first_tap` bins from a delay. NaN remains.
@@ -83,10 +86,15 @@ def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, 
             if signal[b, i] != last_signal or background[b, i] != last_background:
                 last_signal, last_background = signal[b, i], background[b, i]
                 _fill_gain(last_signal, last_background, n_pulses > 0, echo, gain)
-            first = min(int(delay[b, i]), n_bins - 1) - reach
-            _fill_window(blocks[b, :, i], n_pulses, first + first_tap, fired, unfired)
-            _fill_score(last_signal, echo, gain, steps, fired, unfired, score)
-            at = (delay[b, i] - first) * steps - 0.5
-            begin = max(math.floor(at - reach * steps) + 1, -first * steps)
-            end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
-            delay[b, i] = first + (_highest(score, begin, end) + 0.5) / steps
+            highest, is_highest = -math.inf, False
+            while not is_highest:
+                first = min(int(delay[b, i]), n_bins - 1) - reach
+                _fill_window(blocks[b, :, i], n_pulses, first + first_tap, fired, unfired)
+                _fill_score(last_signal, echo, gain, steps, fired, unfired, score)
+                at = (delay[b, i] - first) * steps - 0.5
+                begin = max(math.floor(at - reach * steps) + 1, -first * steps)
+                end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
+                found = _highest(score, begin, end)
+                is_highest = begin < found < end - 1 or score[int(found)] <= highest
+                highest = score[int(found)]
+                delay[b, i] = first + (found + 0.5) / steps
