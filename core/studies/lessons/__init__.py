@@ -41,6 +41,8 @@ PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
         pile_up.first_photons,
         pile_up.still_armed,
         pile_up.accuracy_by_exposure,
+        pile_up.corrected,
+        pile_up.noise_along_gate,
         tracking.both_scales,
         tracking.both_scales_without_echo,
         tracking.estimates_without_echo,
@@ -63,6 +65,9 @@ CHECKS: Mapping[str, Callable[..., float]] = {
         pile_up.share_fired,
         pile_up.best_attenuation,
         pile_up.sbr,
+        pile_up.noise_ratio,
+        pile_up.noise_ratio_of_counts,
+        pile_up.armed_ratio,
         tracking.share_without_echo,
     )
 }
@@ -92,6 +97,11 @@ NEED_SIGNAL = frozenset({*VIEWS, *CHECKS}) - {
         pile_up.share_armed,
         pile_up.share_fired,
         pile_up.sbr,
+        pile_up.corrected,
+        pile_up.noise_along_gate,
+        pile_up.noise_ratio,
+        pile_up.noise_ratio_of_counts,
+        pile_up.armed_ratio,
         tracking.estimates_without_echo,
         tracking.share_without_echo,
     )

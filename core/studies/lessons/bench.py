@@ -19,6 +19,8 @@ from core.trigger import rate_per_bin
 
 PULSE = Pulse()
 
+SWITCH = ("off", "on")
+
 SIDE = 24
 """Rows and columns of flat targets."""
 
@@ -54,6 +56,11 @@ class Bench(Settings):
         "recommended",
         Choice("Preset", tuple(PRESETS)),
         "Settings of the tracking differentiator: recommended, or the paper's literal equations.",
+    )
+    correction: str = parameter(
+        "off",
+        Choice("Coates correction", SWITCH),
+        "Divide each bin by the pulses that are still armed there, which undoes pile-up.",
     )
 
     @property

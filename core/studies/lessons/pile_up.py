@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import lru_cache
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from core.acquisition import Floats
 from core.estimators import ESTIMATORS, estimate
+from core.inference.likelihood import rate_and_n_armed
 from core.inference.limits import best_exposure, right_bin_probability
 from core.metrics import restoration_degree
 from core.studies.lessons.bench import PULSE, SIDE, Bench, captured, centres, flat_target, rate_of
@@ -125,6 +127,54 @@ def _accuracy(bench: Bench) -> dict[str, Floats]:
     return {name: np.array(values) for name, values in shares.items()}
 
 
+def corrected(bench: Bench) -> Plot:
+    """Plot the histogram of a pixel without an echo, or its rate with pile-up undone."""
+    counts = flat_target(bench, math.nan).cube[0, 0].astype(float)
+    is_on = bench.correction == "on"
+    armed = share_armed(bench, bench.acquisition.n_bins)
+    return Plot(
+        "corrected",
+        "Photons per armed pulse, pile-up undone" if is_on else "First photons per pulse",
+        "Bin (1 ns)",
+        "Photons per pulse and bin",
+        centres(bench),
+        {"histogram": _measured(counts, bench), "photons that arrive": rate_of(bench)},
+        note=f"One pixel, {bench.n_pulses:,} pulses, no echo. At the end of the gate, {armed:.0%} "
+        "of the pulses are still armed.",
+    )
+
+
+def noise_along_gate(bench: Bench) -> Plot:
+    """Plot the standard deviation of the rate in each bin, with and without the correction."""
+    on, off = (_noise(replace(bench, correction=each)) for each in ("on", "off"))
+    return Plot(
+        "noise_along_gate",
+        f"Noise of a bin, standard deviation over {_NOISY_PIXELS**2:,} pixels",
+        "Bin (1 ns)",
+        "Photons per pulse and bin",
+        centres(bench),
+        {"correction on": on, "correction off": off},
+        note="The pixels are alike: what differs between them is chance.",
+    )
+
+
+_NOISY_PIXELS = 64  # rows and columns
+
+
+def _measured(counts: Floats, bench: Bench) -> Floats:
+    """Return photons per pulse from counts (..., bin), with or without the correction."""
+    if bench.correction == "on":
+        return rate_and_n_armed(counts, bench.n_pulses)[0]
+    return counts / bench.n_pulses
+
+
+@lru_cache(maxsize=16)
+def _noise(bench: Bench) -> Floats:
+    """Return the standard deviation of `_measured` over pixels, in each bin."""
+    counts = flat_target(bench, math.nan, _NOISY_PIXELS).cube.astype(float)
+    return np.asarray(_measured(counts, bench).std(axis=(0, 1)))
+
+
 def share_armed(bench: Bench, bin: float) -> float:
     """Share of pulses that are still armed at the beginning of a bin."""
     return float(np.exp(-rate_of(bench)[: round(bin)].sum()))
@@ -146,3 +196,20 @@ def best_attenuation(bench: Bench) -> float:
 def sbr(bench: Bench) -> float:
     """Signal over background."""
     return bench.signal / bench.background
+
+
+def noise_ratio(bench: Bench, bin: float, over: float) -> float:
+    """Noise of the corrected rate in one bin, over that in another."""
+    noise = _noise(replace(bench, correction="on"))
+    return float(noise[round(bin)] / noise[round(over)])
+
+
+def noise_ratio_of_counts(bench: Bench, bin: float, over: float) -> float:
+    """Noise of the counts in one bin, over that in another."""
+    noise = _noise(replace(bench, correction="off"))
+    return float(noise[round(bin)] / noise[round(over)])
+
+
+def armed_ratio(bench: Bench, bin: float, over: float) -> float:
+    """Pulses that are armed in one bin, over those in another."""
+    return share_armed(bench, bin) / share_armed(bench, over)
