@@ -46,6 +46,9 @@ PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
         tracking.both_scales,
         tracking.both_scales_without_echo,
         tracking.estimates_without_echo,
+        tracking.weight_along_gate,
+        tracking.pixels_moved,
+        tracking.found_by_t_n,
     )
 }
 """Views on which a prediction can be drawn."""
@@ -69,6 +72,8 @@ CHECKS: Mapping[str, Callable[..., float]] = {
         pile_up.noise_ratio_of_counts,
         pile_up.armed_ratio,
         tracking.share_without_echo,
+        tracking.share_moved,
+        tracking.share_moved_by_cubic,
     )
 }
 """Functions that compute the answer to a question of a lesson, or a typical wrong one."""
@@ -104,6 +109,7 @@ NEED_SIGNAL = frozenset({*VIEWS, *CHECKS}) - {
         pile_up.armed_ratio,
         tracking.estimates_without_echo,
         tracking.share_without_echo,
+        tracking.weight_along_gate,
     )
 }
 """Views and checks that raise ``ValueError`` without a signal."""

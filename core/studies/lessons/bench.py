@@ -62,6 +62,11 @@ class Bench(Settings):
         Choice("Coates correction", SWITCH),
         "Divide each bin by the pulses that are still armed there, which undoes pile-up.",
     )
+    alpha: float = parameter(
+        0.15,
+        Number("α", 0.1, 30.0, log=True, least=0.0, most=1e6),
+        "Strength of the weight with which the tracking differentiator raises late bins.",
+    )
 
     @property
     def acquisition(self) -> Acquisition:
