@@ -9,7 +9,7 @@ import inspect
 from collections.abc import Callable, Mapping
 
 from core.checks import require
-from core.studies.lessons import pile_up, tracking
+from core.studies.lessons import accuracy, pile_up, tracking
 from core.studies.lessons.bench import Bench
 from core.studies.outputs import Pictures, Plot
 
@@ -49,6 +49,10 @@ PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
         tracking.weight_along_gate,
         tracking.pixels_moved,
         tracking.found_by_t_n,
+        accuracy.accuracy_by_pulses,
+        accuracy.found_along_gate,
+        accuracy.reliability_diagram,
+        accuracy.kept_by_confidence,
     )
 }
 """Views on which a prediction can be drawn."""
@@ -74,6 +78,10 @@ CHECKS: Mapping[str, Callable[..., float]] = {
         tracking.share_without_echo,
         tracking.share_moved,
         tracking.share_moved_by_cubic,
+        accuracy.pulses_ratio,
+        accuracy.place_of_half,
+        accuracy.share_kept,
+        accuracy.share_right,
     )
 }
 """Functions that compute the answer to a question of a lesson, or a typical wrong one."""

@@ -67,6 +67,11 @@ class Bench(Settings):
         Number("α", 0.1, 30.0, log=True, least=0.0, most=1e6),
         "Strength of the weight with which the tracking differentiator raises late bins.",
     )
+    least_confidence: float = parameter(
+        0.0,
+        Number("Least confidence", 0.0, 1.0, least=0.0, most=1.0),
+        "Estimates of less confidence are removed.",
+    )
 
     @property
     def acquisition(self) -> Acquisition:
