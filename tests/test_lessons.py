@@ -48,8 +48,10 @@ def test_a_lesson_has_views_a_drawn_prediction_and_a_check_with_hints(key):
 
 def test_expected_answers_of_the_built_in_lessons():
     answers = {key: lesson.check.answer for key, lesson in LESSONS.items()}
+    assert [*answers] == sorted(answers, key=lambda key: int(key.partition("-")[0]))
     assert answers[FIRST] == pytest.approx(np.exp(-1.735 / 2), abs=1e-4)
     assert answers["2-more-light"] == pytest.approx(0.115, abs=0.002)
+    assert answers["3-coates"] == pytest.approx(np.exp(1.735 * 0.8 / 2), rel=0.05)
     assert answers["4-two-scales"] > 3 * 0.2  # of a fifth of the gate
 
 

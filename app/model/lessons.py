@@ -7,6 +7,7 @@ the front matter introduces the lesson; the text below a line of three dashes ex
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -186,7 +187,9 @@ def number_of(text: str, name: str) -> float:
 
 
 def read_lessons(folders: Sequence[Path] = ()) -> dict[str, Lesson]:
-    """Return the built-in lessons and those of folders by key, in the order of their file names.
+    """Return the built-in lessons and those of folders by key.
+
+    They are in the order of the numbers with which the names of their files begin.
 
     Raises
     ------
@@ -196,7 +199,7 @@ def read_lessons(folders: Sequence[Path] = ()) -> dict[str, Lesson]:
     """
     found: dict[str, Lesson] = {}
     for folder in (BUILT_IN, *folders):
-        files = sorted(folder.glob("*.md"))
+        files = sorted(folder.glob("*.md"), key=_place)
         require("--lessons", str(folder), bool(files), "a folder with lessons (*.md)")
         for each in files:
             lesson = read_lesson(each)
@@ -206,6 +209,12 @@ def read_lessons(folders: Sequence[Path] = ()) -> dict[str, Lesson]:
             require(f"{each.name}: title", lesson.title, lesson.title not in titles, unique)
             found[lesson.key] = lesson
     return found
+
+
+def _place(path: Path) -> tuple[float, str]:
+    """Return what sorts files by their number, those without one last, and then by name."""
+    number = re.match(r"\d+", path.name)
+    return (int(number.group()) if number else math.inf), path.name
 
 
 @cache
