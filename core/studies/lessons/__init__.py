@@ -9,7 +9,7 @@ import inspect
 from collections.abc import Callable, Mapping
 
 from core.checks import require
-from core.studies.lessons import accuracy, pile_up, tracking
+from core.studies.lessons import accuracy, images, pile_up, tracking
 from core.studies.lessons.bench import Bench
 from core.studies.outputs import Pictures, Plot
 
@@ -53,13 +53,19 @@ PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
         accuracy.found_along_gate,
         accuracy.reliability_diagram,
         accuracy.kept_by_confidence,
+        images.outdoor_pixel,
+        images.surface_probability,
+        images.found_by_distance,
     )
 }
 """Views on which a prediction can be drawn."""
 
 VIEWS: Mapping[str, Callable[[Bench], Plot | Pictures]] = {
     **PLOTS,
-    "car_image": pile_up.car_image,
+    **{
+        each.__name__: each
+        for each in (pile_up.car_image, images.agreement, images.neighbours_image)
+    },
 }
 """Views that a lesson can name."""
 
@@ -82,6 +88,11 @@ CHECKS: Mapping[str, Callable[..., float]] = {
         accuracy.place_of_half,
         accuracy.share_kept,
         accuracy.share_right,
+        images.share_agreed,
+        images.share_wrong_of_agreed,
+        images.share_at_edges,
+        images.share_inside,
+        images.share_at_edges_alone,
     )
 }
 """Functions that compute the answer to a question of a lesson, or a typical wrong one."""

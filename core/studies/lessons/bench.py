@@ -21,6 +21,9 @@ PULSE = Pulse()
 
 SWITCH = ("off", "on")
 
+PIXELS = ("A", "B", "C", "D")
+"""Names of some pixels of the field capture."""
+
 SIDE = 24
 """Rows and columns of flat targets."""
 
@@ -71,6 +74,16 @@ class Bench(Settings):
         0.0,
         Number("Least confidence", 0.0, 1.0, least=0.0, most=1.0),
         "Estimates of less confidence are removed.",
+    )
+    pixel: str = parameter(
+        "A",
+        Choice("Pixel", PIXELS),
+        "Pixel of the capture that the plots show.",
+    )
+    neighbours: str = parameter(
+        "off",
+        Choice("Neighbours", SWITCH),
+        "Estimate each pixel by itself, or all of them together.",
     )
 
     @property

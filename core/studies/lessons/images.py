@@ -1,0 +1,211 @@
+"""Whole images: a capture outdoors (lesson 9), and what neighbours add (lesson 10)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_cdt
+
+from core.acquisition import Floats
+from core.capture import Capture, cached_per_capture
+from core.estimators import RangeImage, estimate
+from core.inference.posterior import posterior_of
+from core.inspection import pixel_report
+from core.metrics import Interval
+from core.scene import scenes
+from core.studies.lessons.bench import PIXELS, Bench, captured
+from core.studies.methods.neighbours import at_edges
+from core.studies.outputs import Pictures, Plot
+
+# -- A capture outdoors ----------------------------------------------------------------------------
+
+PLACES = dict(zip(PIXELS, ((3, 24), (22, 44), (48, 36), (34, 20)), strict=True))
+"""Row and column of the named pixels: sky, wall, a hot pixel, a net before the wall."""
+
+AGREEING = ("likelihood", "coates")
+"""Methods whose estimates are compared."""
+
+
+def outdoor_pixel(bench: Bench) -> Plot:
+    """Plot the histogram of a pixel of the field capture, with the estimates of two methods."""
+    capture, (row, col) = captured("field", bench), PLACES[bench.pixel]
+    bins = {name: float(_estimate(capture, name).bin[row, col]) for name in AGREEING}
+    return Plot(
+        "outdoor_pixel",
+        f"Pixel {bench.pixel} of a generated field capture",
+        "Bin (1 ns)",
+        "Counts",
+        np.arange(capture.acquisition.n_bins, dtype=float) + 0.5,
+        {"histogram": capture.cube[row, col].astype(float)},
+        bins,
+        f"Row {row}, column {col}. {_description(capture, row, col)}",
+    )
+
+
+def _description(capture: Capture, row: int, col: int) -> str:
+    report = pixel_report(capture, _estimate(capture, "likelihood"), row, col, "likelihood")
+    surfaces = " and ".join(f"{each:.0f}" for each in report.surfaces_bin) or "none"
+    return f"{report.verdict.why} SBR {_text(report.flux.sbr)} (95 %). Surfaces: {surfaces}."
+
+
+def _text(found: Interval) -> str:
+    return f"{found.value:.2g}, {found.low:.2g} to {found.high:.2g}"
+
+
+def surface_probability(bench: Bench) -> Plot:
+    """Plot the probability of a surface near each bin of a pixel of the field capture."""
+    capture, (row, col) = captured("field", bench), PLACES[bench.pixel]
+    posterior = posterior_of(capture)
+    near = posterior.tolerance_probability[row, col].astype(float)
+    return Plot(
+        "surface_probability",
+        f"Is there a surface? Pixel {bench.pixel}",
+        "Bin (1 ns)",
+        "Probability",
+        np.arange(near.size, dtype=float),
+        {"surface within 3 bins": near},
+        note=f"Of a surface anywhere in the gate: {posterior.surface[row, col]:.3f}.",
+    )
+
+
+def agreement(bench: Bench) -> Pictures:
+    """Show where two methods agree on the field capture, and where they agree and are wrong."""
+    capture = captured("field", bench)
+    range_m, agreed, right = _agreement(capture)
+    return Pictures(
+        "agreement",
+        "Pixels of a generated field capture in which two methods agree",
+        "Range (m)",
+        {
+            "likelihood": range_m,
+            "both agree": np.where(agreed, range_m, np.nan),
+            "both agree, wrongly": np.where(agreed & ~right, range_m, np.nan),
+        },
+        float(capture.acquisition.bin_to_range_m(0)),
+        float(capture.acquisition.bin_to_range_m(capture.acquisition.n_bins)),
+        f"The likelihood and Coates agree within 3 bins in {agreed.sum():,} of {agreed.size:,} "
+        f"pixels; in {(agreed & ~right).sum():,} of these there is no surface at that range.",
+    )
+
+
+@cached_per_capture
+def _agreement(capture: Capture) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return ranges, whether both methods agree within 3 bins, and whether a surface is there."""
+    one, other = (_estimate(capture, name) for name in AGREEING)
+    agreed = np.abs(one.bin - other.bin) <= 3
+    right = np.zeros(agreed.shape, bool)
+    scene = scenes["field"]()
+    assert scene.second_surface is not None
+    for truth_m in (scene.range_m, scene.second_surface.range_m):
+        right |= np.abs(one.bin - capture.acquisition.range_m_to_bin(truth_m)) <= 3
+    return one.range_m, agreed, right
+
+
+def share_agreed(bench: Bench) -> float:
+    """Share of the pixels of the field capture in which two methods agree."""
+    return float(_agreement(captured("field", bench))[1].mean())
+
+
+def share_wrong_of_agreed(bench: Bench) -> float:
+    """Share of the pixels without a surface where two methods agree on one, of all they do."""
+    _, agreed, right = _agreement(captured("field", bench))
+    return float((agreed & ~right).sum() / agreed.sum())
+
+
+@cached_per_capture
+def _estimate(capture: Capture, method: str) -> RangeImage:
+    return estimate(capture, method)
+
+
+# -- Neighbours ------------------------------------------------------------------------------------
+
+METHODS = {"off": "likelihood", "on": "image_posterior"}
+"""Method by the value of the control."""
+
+TITLES = {"off": "each pixel alone", "on": "with neighbours"}
+
+DISTANCES = np.arange(6.0)
+"""Distances to the nearest edge in pixels; the last one stands for itself and all beyond."""
+
+
+class _Found(NamedTuple):
+    """Estimates of a method on planes before a wall, each of shape (row, col)."""
+
+    range_m: Floats
+    right: NDArray[np.bool_]
+    """Whether each is within 1 bin of the truth."""
+    distance: NDArray[np.int32]
+    """Pixels to the nearest one that is next to an edge, 0 for itself."""
+
+
+@cached_per_capture
+def _found(capture: Capture, method: str) -> _Found:
+    image, truth_m = estimate(capture, method), np.asarray(capture.truth_range_m)
+    right = np.abs(image.bin - capture.acquisition.range_m_to_bin(truth_m)) <= 1
+    distance = distance_transform_cdt(~at_edges(capture), "chessboard")
+    return _Found(image.range_m, right, distance)
+
+
+def neighbours_image(bench: Bench) -> Pictures:
+    """Show planes before a wall, their estimate, and the true ranges of missed pixels."""
+    capture = captured("piecewise", bench)
+    truth_m = np.asarray(capture.truth_range_m)
+    found = _found(capture, METHODS[bench.neighbours])
+    return Pictures(
+        "neighbours_image",
+        f"Planes before a wall, {TITLES[bench.neighbours]}",
+        "Range (m)",
+        {
+            "truth": truth_m,
+            TITLES[bench.neighbours]: found.range_m,
+            "pixels missed, their truth": np.where(found.right, np.nan, truth_m),
+        },
+        float(truth_m.min()) - 0.5,
+        float(truth_m.max()) + 0.5,
+        f"SBR {bench.flux.sbr:.2g}. {found.right.mean():.1%} of the pixels are within 1 bin; the "
+        "last picture shows the others.",
+    )
+
+
+def found_by_distance(bench: Bench) -> Plot:
+    """Plot the share of pixels found against their distance from the nearest edge."""
+    capture = captured("piecewise", bench)
+    curves = {}
+    for switch, title in TITLES.items():
+        found = _found(capture, METHODS[switch])
+        distance = np.minimum(found.distance, DISTANCES[-1])
+        curves[title] = np.array([found.right[distance == each].mean() for each in DISTANCES])
+    counts = np.bincount(np.minimum(distance, DISTANCES[-1]).astype(int).ravel())
+    return Plot(
+        "found_by_distance",
+        "Pixels found within 1 bin, against their distance from an edge",
+        "Distance from the nearest edge (pixels)",
+        "Share of pixels",
+        DISTANCES,
+        curves,
+        note="An edge is a step of more than 3 bins; the pixels on both of its sides have the "
+        f"distance 0, the last point is {DISTANCES[-1]:g} or more. Pixels at each distance: "
+        f"{', '.join(f'{each:,}' for each in counts)}.",
+    )
+
+
+def _share(bench: Bench, switch: str, is_edge: bool) -> float:
+    found = _found(captured("piecewise", bench), METHODS[switch])
+    return float(found.right[(found.distance == 0) == is_edge].mean())
+
+
+def share_at_edges(bench: Bench) -> float:
+    """Share of pixels at edges that are found with neighbours."""
+    return _share(bench, "on", is_edge=True)
+
+
+def share_inside(bench: Bench) -> float:
+    """Share of pixels inside surfaces that are found with neighbours."""
+    return _share(bench, "on", is_edge=False)
+
+
+def share_at_edges_alone(bench: Bench) -> float:
+    """Share of pixels at edges that are found without neighbours."""
+    return _share(bench, "off", is_edge=True)
