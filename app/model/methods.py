@@ -40,14 +40,6 @@ def default_settings() -> Mapping[str, Any]:
     return {name: ESTIMATORS[name].parameters() for name in OTHERS}
 
 
-def suitable_method(capture: Capture) -> str:
-    """Return the estimator to begin with: the paper's, unless all photons were counted.
-
-    Then the likelihood finds more surfaces, and ranges them below a bin.
-    """
-    return "likelihood" if capture.detection == "all" else "tracking"
-
-
 def doubts_hold(capture: Capture) -> bool:
     """Return whether doubtful settings are those of this kind of data.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from app.model.budget import fits, fitting, ranging, require_fitting
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
-from app.model.methods import default_settings, suitable_method
+from app.model.methods import default_settings
 from app.model.state import AUTOMATIC, Illumination, ReductionSettings, Viewing
 from app.units import ShownGate
 from core import (
@@ -40,6 +40,7 @@ from core import (
     without_correction,
 )
 from core.cost import Cost, predicted
+from core.estimators import suitable_method
 from core.geometry import guessed_field_of_view_deg
 from core.inference import has_posterior, pixel_range_intervals, posterior_of
 from core.inspection import PixelReport

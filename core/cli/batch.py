@@ -19,9 +19,11 @@ from core.capture import Capture, CaptureInfo
 from core.checks import printable, require, shown
 from core.cli.options import (
     add_colors,
+    add_crop,
     add_filters,
     add_settings,
     colors_given,
+    crop_given,
     reading,
     settings_given,
     show,
@@ -29,8 +31,15 @@ from core.cli.options import (
     whole_from_to,
 )
 from core.cli.results import Incomplete
-from core.cli.saving import refused_outputs, save_each, save_ranges
+from core.cli.saving import (
+    add_further_values,
+    refuse_further_values,
+    refused_outputs,
+    save_each,
+    save_ranges,
+)
 from core.estimators import ESTIMATORS, Provenance, RangeImage
+from core.geometry import WHOLE, Box
 from core.inspection import estimate_mean_flux
 from core.io.names import changed_settings, distinct_names, file_name, named
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
@@ -62,6 +71,11 @@ class Job:
     """Estimates below it are not written."""
     colors: RangeColors | None = None
     """Colours of pictures."""
+    box: Box = WHOLE
+    """Part of the scene that clouds hold."""
+    intervals: bool = False
+    fit: bool = False
+    """Whether intervals of ranges and p-values of the fit are written, too."""
     outputs: tuple[Path, ...] = ()
     overwrite: bool = False
 
@@ -136,7 +150,9 @@ def add(commands: Any) -> None:
         )
         method.add_argument("--json", action="store_true", help="one JSON object, by file")
         add_filters(method)
+        add_crop(method)
         add_colors(method)
+        add_further_values(method)
         add_settings(method, estimator.parameters)
         add_read_options(method)
         method.set_defaults(work=_batch)
@@ -179,7 +195,7 @@ def _jobs(chosen: argparse.Namespace) -> list[Job]:
         if (value := getattr(chosen, name)) is not None:
             named_settings.append(named(name.replace("_", "-"), value))
     formats = dict.fromkeys((chosen.format or ["npz"]) if chosen.out else ())
-    colors = colors_given(chosen)
+    colors, box = colors_given(chosen), crop_given(chosen)
     jobs = []
     for path, name in zip(paths, distinct_names(paths), strict=True):
         outputs = tuple(
@@ -201,6 +217,9 @@ def _jobs(chosen: argparse.Namespace) -> list[Job]:
             chosen.false_alarm,
             chosen.least_confidence,
             colors,
+            box,
+            chosen.intervals,
+            chosen.fit,
             outputs,
             chosen.overwrite,
         )
@@ -249,7 +268,16 @@ def range_one(job: Job) -> Row:
     try:
         refused = refused_outputs(job.outputs, (*WRITERS, *FOLDER_WRITERS), job.overwrite)
         described, image, sbr = _estimate(job)
-        save = save_ranges(described, image, job.least_confidence, job.overwrite, job.colors)
+        save = save_ranges(
+            described,
+            image,
+            job.least_confidence,
+            job.overwrite,
+            job.colors,
+            job.intervals,
+            job.fit,
+            job.box,
+        )
         written, refused = save_each(job.outputs, refused, save)
     except Exception as error:  # of whatever kind: the other files are ranged
         text = _one_line(error)
@@ -287,6 +315,7 @@ def _estimate(job: Job) -> tuple[CaptureInfo, RangeImage, float]:
         return capture, found.image, estimate_mean_flux(capture).sbr.value
     from core.out_of_core import tiles  # noqa: PLC0415 - loads Dask
 
+    refuse_further_values(job.intervals, job.fit)
     counts = open_capture(job.path, **job.options)
     parts = tiles.estimate_large(counts, job.method, job.settings, false_alarm=job.false_alarm)
     return *tiles.as_image(parts.compute()), np.nan

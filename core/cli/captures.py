@@ -37,12 +37,14 @@ from core.cli.options import (
 )
 from core.cli.saving import (
     Refused,
+    add_further_values,
+    refuse_further_values,
     refused_outputs,
     require_all,
     save_each,
     save_ranges,
 )
-from core.estimators import ESTIMATORS, RangeImage, estimate
+from core.estimators import ESTIMATORS, RangeImage, estimate, suitable_method
 from core.inspection import (
     CaptureReport,
     PixelReport,
@@ -99,7 +101,11 @@ def _add_info(commands: Any) -> None:
         "info", help="show what a capture file contains and what is assumed about it"
     )
     command.add_argument("capture", type=Path, help=f"a file: {', '.join(SUFFIXES)}")
-    add_pixel(command, "report on one pixel, ranged by tracking with default settings")
+    add_pixel(
+        command,
+        "report on one pixel, ranged by tracking, or by the likelihood where the capture holds all "
+        "photons, with default settings",
+    )
     _add_json(command)
     add_read_options(command)
     command.set_defaults(work=_info)
@@ -211,9 +217,11 @@ def _reported_facts(capture: Capture) -> dict[str, Any]:
 
 
 def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
-    report = pixel_report(capture, estimate(capture, "tracking"), row, col)
+    method = suitable_method(capture)
+    report = pixel_report(capture, estimate(capture, method), row, col, method)
     facts: dict[str, Any] = {
         "source": capture.source,
+        "method": method,
         "row": report.row,
         "col": report.col,
         "photons": int(report.counts.sum()),
@@ -274,18 +282,7 @@ def _add_estimate(commands: Any) -> None:
         add_crop(method)
         add_colors(method)
         _add_out(method, "the range image", (*WRITERS, *FOLDER_WRITERS), more=_CLOUD_HELP)
-        method.add_argument(
-            "--intervals",
-            action="store_true",
-            help="write the 68 %% and 95 %% intervals of each range, too: in NPZ, netCDF, HDF5, "
-            "Zarr, CSV and TIFF; in point clouds half the width of the former, range_sd_m",
-        )
-        method.add_argument(
-            "--fit",
-            action="store_true",
-            help="write the p-value of the goodness of fit of each pixel, too: in NPZ, netCDF, "
-            "HDF5, Zarr and CSV",
-        )
+        add_further_values(method)
         method.add_argument(
             "--scheduler", help="address of a Dask cluster to use, such as tcp://host:8786"
         )
@@ -301,10 +298,8 @@ def _estimate(chosen: argparse.Namespace) -> None:
     settings = settings_given(chosen, ESTIMATORS[chosen.method].parameters)
     colors, box = colors_given(chosen), crop_given(chosen)
     in_tiles = chosen.scheduler or _exceeds_memory(chosen)
-    accepted = "False for a capture that is ranged in tiles"
-    for name in ("intervals", "fit"):
-        given = getattr(chosen, name)
-        require(name, given, not (given and in_tiles), accepted)
+    if in_tiles:
+        refuse_further_values(chosen.intervals, chosen.fit)
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
     save = save_ranges(
         described,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,28 @@ from core.io.writers.whole import writing
 
 Refused = Mapping[Path, Exception]
 """Files that cannot be written, and why."""
+
+
+def add_further_values(command: argparse.ArgumentParser) -> None:
+    """Add the options for what `save_ranges` writes beside the ranges."""
+    command.add_argument(
+        "--intervals",
+        action="store_true",
+        help="write the 68 %% and 95 %% intervals of each range, too: in NPZ, netCDF, HDF5, Zarr, "
+        "CSV and TIFF; in point clouds half the width of the former, range_sd_m",
+    )
+    command.add_argument(
+        "--fit",
+        action="store_true",
+        help="write the p-value of the goodness of fit of each pixel, too: in NPZ, netCDF, HDF5, "
+        "Zarr and CSV",
+    )
+
+
+def refuse_further_values(intervals: bool, fit: bool) -> None:
+    """Raise ``ValueError`` if one of these options was given: they need the capture in memory."""
+    for name, given in (("intervals", intervals), ("fit", fit)):
+        require(name, given, not given, "False for a capture that is ranged in tiles")
 
 
 def save_ranges(

@@ -35,6 +35,7 @@ __all__ = [
     "estimate",
     "require_capture",
     "settings_of",
+    "suitable_method",
 ]
 
 ESTIMATORS: dict[str, Estimator] = {
@@ -97,6 +98,14 @@ def estimate(
         method, settings, false_alarm, partial(estimator.remark, capture, false_alarm)
     )
     return replace(estimator(capture, settings, false_alarm), made_by=made_by)
+
+
+def suitable_method(capture: Capture) -> str:
+    """Return the estimator to begin with: the paper's, unless all photons were counted.
+
+    Then the likelihood finds more surfaces, and ranges them below a bin.
+    """
+    return "likelihood" if capture.detection == "all" else "tracking"
 
 
 def require_capture(capture: object) -> None:

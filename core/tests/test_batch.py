@@ -19,6 +19,7 @@ from core.cli import main
 from core.cli.batch import Job, ranged
 from core.estimators import estimate
 from core.estimators.base import NoParameters
+from core.geometry import Box
 from core.inspection import estimate_mean_flux
 from core.io import MOST_LETTERS, distinct_names, file_name
 from core.io.writers import save_capture
@@ -121,14 +122,21 @@ def test_files_are_ranged_in_parallel(
 
 def test_files_are_replaced_on_request_only(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     filters = ("--least-confidence", "0.95", "--false-alarm", "0.1")
-    given = ("runs/day/a.npz", "runs/day/a.npz", "--out", "found", *filters)
+    more = ("--format", "npz", "--format", "ply", "--intervals", "--fit", "--crop", "45", "-")
+    given = ("runs/day/a.npz", "runs/day/a.npz", "--out", "found", *filters, *more)
     assert batch(capsys, *given)[0] == 0
-    name = "a_tracking_false-alarm0.1_least-confidence0.95_range-image.npz"
-    assert files_in(Path("found")) == [name, "summary.csv"]
-    image = estimate(stairs(0), "tracking", false_alarm=0.1)
+    stem = "a_tracking_false-alarm0.1_least-confidence0.95"
+    name, cloud = f"{stem}_range-image.npz", f"{stem}_cloud.ply"
+    assert files_in(Path("found")) == [cloud, name, "summary.csv"]
+    image = estimate(stairs(0), "tracking", false_alarm=0.1).confident(0.95)
     with np.load(f"found/{name}") as archive:
-        np.testing.assert_array_equal(archive["range_m"], image.confident(0.95).range_m)
+        np.testing.assert_array_equal(archive["range_m"], image.range_m)
         assert archive["least_confidence"] == 0.95
+        assert (archive["range_low_m"] <= image.range_m)[image.valid].all()
+        assert archive["fit_p_value"].shape == image.range_m.shape
+    inside = image.cropped(Box(from_m=45.0)).valid
+    assert 0 < inside.sum() < image.valid.sum()
+    assert f"element vertex {inside.sum()}\n".encode() in Path("found", cloud).read_bytes()
     code, _, err = batch(capsys, *given)
     assert code == 2 and "found/summary.csv exists: give another name, or --overwrite" in err
     code, _, err = batch(capsys, *given, "--summary", "other.csv")

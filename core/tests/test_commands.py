@@ -120,6 +120,7 @@ def test_info_reports_on_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert found["hot_pixels"] == found["dead_pixels"] == 0
     assert found["suggested_gate_first_bin"] < found["suggested_gate_end_bin"] <= 100
     pixel = facts(capsys, "info", path, "--pixel", 2, 3)
+    assert pixel["method"] == "tracking"
     assert pixel["photons"] == capture.counts[2, 3]
     assert pixel["candidate_1_range_m"] == pixel["range_m"]
     assert pixel["candidate_1_probability"] == pixel["confidence"]
@@ -131,6 +132,8 @@ def test_info_reports_on_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert pixel["reported_range_difference_m"] == pytest.approx(difference_m)
     code, _, err = ran(capsys, "info", path, "--pixel", 8, 0)
     assert code == 2 and "row, col = (8, 0)" in err
+    save_capture(replace(capture, detection="all"), path, overwrite=True)
+    assert facts(capsys, "info", path, "--pixel", 2, 3)["method"] == "likelihood"
 
 
 @pytest.mark.parametrize("suffix", CAPTURE_SUFFIXES)
