@@ -73,6 +73,7 @@ results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core paper --repetitions 100 --results assets/results/paper.md
 	$(BIN)/python -m core uniform --results assets/results/uniform.md
 	$(BIN)/python -m core neighbours --results assets/results/neighbours.md
+	$(BIN)/python -m core budget --results assets/results/budget.md
 	$(BIN)/python -m core tuning --results assets/results/tuning.md
 	$(BIN)/python -m core calibration --only confidence ranges --results assets/results/calibration.md
 	$(BIN)/python -m core calibration --only fluxes --captures 40 --results assets/results/fluxes.md

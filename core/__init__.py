@@ -56,6 +56,7 @@ from core.io import (
     save_pixel,
 )
 from core.out_of_core import Window, as_image, estimate_large, read_window, sampled_flux_prior
+from core.photon_budget import PhotonBudget
 from core.pipeline import Run, run
 from core.report import save_report
 from core.scene import PARTS, Scene, parts_of, scenes, without
@@ -83,11 +84,13 @@ PUBLIC_MODULES = (
     "core.metrics",
     "core.out_of_core",
     "core.parameters",
+    "core.photon_budget",
     "core.reductions",
     "core.report",
     "core.scripts",
     "core.studies",
     "core.studies.ablation",
+    "core.studies.budget",
     "core.studies.lessons",
     "core.studies.paper",
     "core.studies.sensitivity",
@@ -109,6 +112,7 @@ __all__ = [
     "CaptureError",
     "Estimator",
     "Flux",
+    "PhotonBudget",
     "Pulse",
     "RangeImage",
     "RangeInterval",

@@ -69,6 +69,32 @@ OVERLAP_M = 1.0
 
 
 @dataclass(frozen=True)
+class Falloff:
+    """Fall of the signal with range: an aperture collects ``1 / R²`` of a Lambertian echo.
+
+    Parameters
+    ----------
+    reference_m : float
+        Range in metres to which the signal of `core.Flux` refers.
+
+    Raises
+    ------
+    ValueError
+        If it is not positive.
+    """
+
+    reference_m: float
+
+    def __post_init__(self) -> None:
+        range_m = self.reference_m
+        require("reference_m", range_m, 0 < range_m < np.inf, "metres, positive")
+
+    def transmission(self, range_m: Floats) -> Floats:
+        """Signal from each range relative to that from the reference, shape of `range_m`."""
+        return np.asarray((self.reference_m / np.maximum(range_m, OVERLAP_M)) ** 2)
+
+
+@dataclass(frozen=True)
 class Backscatter:
     """Fog: droplets that scatter light back from every range and attenuate echoes behind them.
 

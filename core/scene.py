@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats
 from core.checks import require
-from core.effects import Backscatter, FaultyPixels, Jitter, Motion, SecondSurface
+from core.effects import Backscatter, Falloff, FaultyPixels, Jitter, Motion, SecondSurface
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Scene:
         Acquisition that suits this scene; `simulate` takes its own.
     ambient : ndarray, shape (row, col), optional
         Factor on the background, finite and non-negative; None means 1 everywhere.
-    second_surface, backscatter, faulty_pixels, motion, jitter : optional
+    second_surface, backscatter, faulty_pixels, motion, jitter, falloff : optional
         Parts of `core.effects`; None for an absent one.
 
     Raises
@@ -47,6 +47,7 @@ class Scene:
     faulty_pixels: FaultyPixels | None = None
     motion: Motion | None = None
     jitter: Jitter | None = None
+    falloff: Falloff | None = None
 
     def __post_init__(self) -> None:
         shape = np.shape(self.range_m)
@@ -67,6 +68,7 @@ class Scene:
 PARTS = {
     "reflectivity": "reflectivity",
     "ambient": "uneven background",
+    "falloff": "fall of the signal with range",
     "second_surface": "second surface",
     "backscatter": "backscatter of fog",
     "faulty_pixels": "hot and dead pixels",

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from math import prod
 from numbers import Integral
 from typing import TypeVar
 
@@ -89,13 +90,13 @@ def simulate(
             draw_pulses(triggered, n_pulses, np.uint64(seed), cube)
     else:
         _draw_multinomial(triggered, n_pulses, seed, cube)
-    is_plain = set(parts_of(scene)) <= {"reflectivity"}
+    is_plain = set(parts_of(scene)) <= {"reflectivity", "falloff"}
     return Capture(
         cube.reshape(*shape, acquisition.n_bins),
         acquisition,
         pulse,
         truth_range_m=np.array(scene.range_m, float),
-        signal=_signal(scene, flux) if is_plain else None,
+        signal=next(echoes(scene, flux))[1] if is_plain else None,
         background=flux.background if is_plain else None,
         source=f"simulated, seed {seed}, SBR {flux.sbr:g}, PPP {flux.signal:g}",
     )
@@ -161,12 +162,6 @@ def _require_seed(seed: int) -> None:
     require("seed", seed, whole and 0 <= seed < 2**63, "an integer from 0 to 2**63 - 1")
 
 
-def _signal(scene: Scene, flux: Flux) -> Floats:
-    """Signal photons per pulse of each pixel, shape (row, col); 0 where there is no target."""
-    reflectivity = 1.0 if scene.reflectivity is None else scene.reflectivity
-    return np.where(np.isfinite(scene.range_m), flux.signal * reflectivity, 0.0)
-
-
 def cumulative_trigger_probability(
     scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse
 ) -> Floats:
@@ -194,9 +189,9 @@ def cumulative_trigger_probability(
     shifts_bins = np.zeros(1)
     if scene.motion is not None:
         shifts_bins = scene.motion.shifts_bins(pulse, acquisition, pulses_sent(acquisition))
-    echoes = [
+    onsets = [
         (np.ravel(acquisition.range_m_to_bin(range_m)), np.ravel(signal))
-        for range_m, signal in _echoes(scene, flux)
+        for range_m, signal in echoes(scene, flux)
     ]
     faulty = scene.faulty_pixels
     if faulty is not None:
@@ -205,7 +200,7 @@ def cumulative_trigger_probability(
     before = triggered if shifts_bins.size == 1 else np.empty_like(triggered)
     for group, shift_bins in enumerate(shifts_bins):
         before[:] = steady
-        for onset_bin, signal in echoes:
+        for onset_bin, signal in onsets:
             add_echo(onset_bin + shift_bins, signal, pulse, acquisition.bin_width_s, before)
         to_probability(before)
         if group > 0:
@@ -221,16 +216,21 @@ def cumulative_trigger_probability(
     return triggered
 
 
-def _echoes(scene: Scene, flux: Flux) -> Iterator[tuple[Floats, Floats]]:
-    """Range and signal photons per pulse of each surface, both of shape (row, col)."""
-    signal, second, fog = _signal(scene, flux), scene.second_surface, scene.backscatter
-    surfaces = [(scene.range_m, signal)]
+def echoes(scene: Scene, flux: Flux) -> Iterator[tuple[Floats, Floats]]:
+    """Range and signal photons per pulse of each surface, both of shape (row, col).
+
+    The signal is 0 where there is no target.
+    """
+    reflectivity = 1.0 if scene.reflectivity is None else scene.reflectivity
+    signal = np.where(np.isfinite(scene.range_m), flux.signal * reflectivity, 0.0)
+    surfaces, second = [(scene.range_m, signal)], scene.second_surface
     if second is not None:
         share = second.effective_share
         surfaces = [(scene.range_m, (1 - share) * signal), (second.range_m, share * signal)]
+    weakening = [part for part in (scene.falloff, scene.backscatter) if part is not None]
     for range_m, photons in surfaces:
-        dimmed = photons if fog is None else photons * np.nan_to_num(fog.transmission(range_m))
-        yield range_m, dimmed
+        shares = (np.nan_to_num(part.transmission(range_m)) for part in weakening)
+        yield range_m, prod(shares, start=photons)
 
 
 def add_echo(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["interval_text", "three_digits", "typeset", "value_and_bounds"]
+__all__ = ["interval_text", "scientific", "three_digits", "typeset", "value_and_bounds"]
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -26,6 +26,21 @@ def typeset(text: str) -> str:
     elif power:
         digits = f"{digits}×10{str(int(power)).translate(_RAISED)}"
     return digits.replace("-", "−")
+
+
+def scientific(value: float) -> str:
+    """Format a number with three digits, and a power of ten far from 1.
+
+    Examples
+    --------
+    >>> scientific(1.7346), scientific(4096.0), scientific(1.823e12)
+    ('1.73', '4,096', '1.82×10¹²')
+    """
+    if 1e3 <= abs(value) < 1e6:
+        return typeset(f"{value:,.0f}")
+    digits, _, power = f"{value:.3g}".partition("e")
+    raised = f"×10{str(int(power)).translate(_RAISED)}" if power else ""
+    return typeset(digits) + raised
 
 
 def value_and_bounds(value: float, low: float, high: float) -> tuple[str, str]:

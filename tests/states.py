@@ -13,7 +13,7 @@ import param
 from app.model.address import Link, defaults
 from app.model.state import CLOUDS, Comparison, Learning, State
 from app.model.store import Request, Source, built_in_sources
-from core import ESTIMATORS, Window
+from core import ESTIMATORS, PhotonBudget, Window
 from core.io import ReadOptions
 from core.parameters import Choice
 from core.tests.read_options import EXAMPLES
@@ -27,6 +27,10 @@ OTHERWISE: dict[str, list[Any]] = {
     "page": ["Inspect", "Compare", "Trade-off", "Paper", "Learn"],
     "pins": [((1, 2),), ((1, 2), (3, 4), (0, 0), (9, 9))],
     "region": [((1, 2), (1, 9), (7, 5)), ((0.5, 1.25), (-3.0, 9.0), (7.0, 5.1))],
+    "budget": [
+        PhotonBudget(),
+        PhotonBudget(0.5, 20.0, 1.0, 2e4, 0.5, 0.3, 0.8, 1550.0, 10.0, 2.0, 60.0, 0.2),
+    ],
     "kept": ["source=car&method=coates", "tracking.l=0.006&light.sbr=2.0"],
     "unread": ["source=two.mat", "source=a%20b&reading.n_bins=40"],
     "learning": [Learning("2-more-light", "0.3", "5.0"), Learning(answer="0.42")],

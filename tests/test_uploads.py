@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from app.model.script import script_of
-from app.model.state import Illumination
-from app.model.store import built_in_sources
+from app.model.store import Request, built_in_sources
 from app.model.uploads import Bounds, Uploads, safe_name
 from app.pages.shared.reading import QUESTION
 from core import Acquisition, Capture, save_capture
@@ -48,7 +47,7 @@ def saved(path: Path, source: str = "made") -> Path:
 
 
 def load(source, reading: ReadOptions | None = None) -> Capture:
-    return source.load(Illumination(), reading or ReadOptions(), ())
+    return source.load(Request(source, reading=reading or ReadOptions()))
 
 
 def test_a_file_is_deleted_with_its_last_user_and_loaded_once_for_all(folder, content):

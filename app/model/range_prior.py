@@ -26,7 +26,7 @@ def has_range_prior(answer: Answer) -> bool:
 
 def range_prior_of(answer: Answer) -> outputs.Plot:
     """Plot the range prior of an answer's estimator, with its settings and its reduction."""
-    request, light = answer.request, answer.request.light
+    request, light = answer.request, answer.request.illumination
     acquisition = answer.whole.acquisition
 
     @lru_cache(maxsize=1)  # the study begins with the image whose cost is predicted
@@ -55,5 +55,5 @@ def slow_start(answer: Answer) -> str:
     if answer.method != "tracking" or not request.source.is_scene or not is_whole:
         return ""
     return range_prior.slow_start(
-        answer.settings, answer.whole.acquisition, request.light.flux, answer.whole.pulse
+        answer.settings, answer.whole.acquisition, request.illumination.flux, answer.whole.pulse
     )

@@ -100,6 +100,11 @@ def _simulation(answer: Answer) -> Lines:
     yield "# Simulate a capture of the scene."
     arguments = {name: literal(value) for name, value in source.arguments.items()}
     yield assign("scene", f"core.scenes[{literal(source.name)}]", **arguments)
+    flux = literal(light.flux)
+    if request.budget is not None:
+        flux = "flux"
+        yield assign("budget", "core.PhotonBudget", **changed_fields(request.budget))
+        yield "scene, flux = budget.apply(scene)"
     for part in PARTS:
         if part in request.absent:
             yield assign("scene", "core.without", "scene", literal(part))
@@ -109,7 +114,7 @@ def _simulation(answer: Answer) -> Lines:
         yield assign("acquisition", "replace", acquisition, n_pulses=pulses)
         acquisition = "acquisition"
     seed = {"seed": literal(light.seed)} if light.seed else {}
-    yield assign("capture", "core.simulate", "scene", acquisition, literal(light.flux), **seed)
+    yield assign("capture", "core.simulate", "scene", acquisition, flux, **seed)
 
 
 def _file(answer: Answer) -> Lines:

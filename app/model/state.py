@@ -10,7 +10,7 @@ from typing import Any
 import param
 
 from app.model.methods import FIRST_METHODS, OTHERS, default_settings
-from core import ESTIMATORS, Acquisition, Flux, TrackingParameters, Window
+from core import ESTIMATORS, Acquisition, Flux, PhotonBudget, TrackingParameters, Window
 from core.checks import require
 from core.estimators import FALSE_ALARM
 from core.geometry import Box
@@ -358,6 +358,11 @@ class State(param.Parameterized):
 
     source = param.String(default="car", doc="Key of a scene or capture.")
     light = param.ClassSelector(class_=Illumination, default=Illumination())
+    budget = param.ClassSelector(
+        class_=PhotonBudget,
+        default=None,
+        doc="Laser, optics and sunlight that give the flux of a scene; None for that of `light`.",
+    )
     held = param.Selector(
         default=HELD[0], objects=list(HELD), doc="What stays when the signal moves."
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from hashlib import sha256
 from importlib import resources
 from pathlib import Path
@@ -23,6 +23,7 @@ from core import (
     ESTIMATORS,
     PARTS,
     Capture,
+    PhotonBudget,
     Run,
     Scene,
     Signals,
@@ -57,8 +58,8 @@ class Source:
     """A built-in scene to simulate, or a file to read."""
 
     title: str
-    load: Callable[[Illumination, ReadOptions, Collection[str]], Capture]
-    """Makes the capture, without the parts of the scene that are named."""
+    load: Callable[[Request], Capture]
+    """Simulates the scene, or reads the file, as a request says."""
     scene: Callable[[], Scene] | None = None
     """None for a file."""
     large: Callable[[ReadOptions], LargeFile | None] = lambda _reading: None
@@ -86,7 +87,7 @@ class Source:
         ValueError
             If it cannot be read or is too large.
         """
-        return self.load(Illumination(), NO_OPTIONS, ())
+        return self.load(Request(self))
 
     @property
     def without_truth(self) -> Source:
@@ -117,12 +118,13 @@ def bare(scene: Scene, absent: Collection[str]) -> Scene:
 def scene_source(title: str, name: str, **arguments: Any) -> Source:
     """Return a source of captures of a scene of `core.scenes`."""
     build = cache(partial(scenes[name], **arguments))
+    return Source(title, simulated, build, name=name, arguments=arguments)
 
-    def load(light: Illumination, _reading: ReadOptions, absent: Collection[str]) -> Capture:
-        scene = bare(build(), absent)
-        return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
-    return Source(title, load, build, name=name, arguments=arguments)
+def simulated(request: Request) -> Capture:
+    """Return a capture of the scene of a request."""
+    scene, light = request.scene, request.illumination
+    return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
 
 
 def file_source(
@@ -139,9 +141,9 @@ def file_source(
         require_small(path, capture.cube.nbytes)
         return capture
 
-    def load(_light: Illumination, reading: ReadOptions, _absent: Collection[str]) -> Capture:
-        large = opened(reading)
-        return get(reading) if large is None else large.preview.capture
+    def load(request: Request) -> Capture:
+        large = opened(request.reading)
+        return get(request.reading) if large is None else large.preview.capture
 
     @lru_cache(maxsize=1)
     def opened(reading: ReadOptions) -> LargeFile | None:
@@ -207,6 +209,32 @@ class Request:
     """Parts of the scene and corrections of the estimators that are switched off."""
     window: Window | None = None
     """Part of a capture larger than memory; None for its preview."""
+    budget: PhotonBudget | None = None
+    """Laser, optics and sunlight that give the flux of a scene; None for that of `light`."""
+
+    @property
+    def whole_scene(self) -> Scene:
+        """The scene with all parts; with a photon budget, its signal falls with range."""
+        return self._lit[0]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene without the parts that are switched off."""
+        return bare(self.whole_scene, self.absent)
+
+    @property
+    def illumination(self) -> Illumination:
+        """The illumination of a scene, with the flux of the photon budget if there is one."""
+        return self._lit[1] if self.source.is_scene else self.light
+
+    @cached_property
+    def _lit(self) -> tuple[Scene, Illumination]:
+        assert self.source.scene is not None
+        scene = self.source.scene()
+        if self.budget is None:
+            return scene, self.light
+        scene, flux = self.budget.apply(scene)
+        return scene, replace(self.light, ppp=flux.signal, sbr=flux.sbr)
 
     def method_for(self, capture: Capture) -> str:
         """Return the key of the estimator for a capture."""
@@ -328,7 +356,7 @@ def compute(request: Request, previous: Answer | None) -> Answer:
     if cutout is not None:
         whole = cutout.capture
     elif previous is None or is_new:
-        whole = request.source.load(request.light, request.reading, request.absent)
+        whole = request.source.load(request)
     else:
         whole = previous.whole
     requested = request.less
@@ -430,7 +458,7 @@ def reduced(whole: Capture, request: Request) -> Capture:
 
 def same_subject(one: Request, other: Request) -> bool:
     """Whether two requests are for the same scene and illumination, or the same file."""
-    return _agree(one, other, "source", "light", "reading", "window")
+    return _agree(one, other, "source", "light", "budget", "reading", "window")
 
 
 def same_capture(one: Request, other: Request) -> bool:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from app.model.state import Illumination
-from app.model.store import AddedTruth, Answer, Source
+from app.model.store import AddedTruth, Answer, Request, Source
 from app.model.uploads import cached_while_used
 from core import Capture, read_truth
 from core.checks import require
-from core.io import PossibleTruth, ReadOptions, possible_truths, truth_options_from
+from core.io import PossibleTruth, possible_truths, truth_options_from
 
 _BETWEEN = "|"
 
@@ -53,8 +51,8 @@ def with_truth(source: Source, truth: Truth, path: Path) -> Source:
     source = source.without_truth
     name = (path == source.path and truth.variable) or path.name
 
-    def load(light: Illumination, reading: ReadOptions, absent: Collection[str]) -> Capture:
-        return read_truth(path, source.load(light, reading, absent), **truth.options)
+    def load(request: Request) -> Capture:
+        return read_truth(path, source.load(request), **truth.options)
 
     return replace(
         source,

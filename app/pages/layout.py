@@ -31,6 +31,7 @@ from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
 from app.pages.shared.illumination import IlluminationPanel
 from app.pages.shared.method import MethodChoice
+from app.pages.shared.photon_budget import PhotonBudgetForm
 from app.pages.shared.reading import QUESTION, ReadingForm
 from app.pages.shared.truth import TruthForm, TruthOffer
 from app.tasks.page import PageTasks
@@ -284,7 +285,8 @@ class Layout:
             name: SettingsPanel(type(getattr(state, name))(), partial(setattr, state, name))
             for name in ("tracking", "less")
         }
-        self._panels["light"] = IlluminationPanel(state)
+        self._panels["light"] = IlluminationPanel(state, lambda: session.request.illumination)
+        self._budget = PhotonBudgetForm(session)
         self._preset = select(
             "Preset",
             [*PRESETS, CUSTOM],
@@ -368,6 +370,7 @@ class Layout:
             self._shared[Shared.UNIT],
             *(aside for name, aside in asides.items() if not self._pages[name].sidebar_last),
             self._light_part,
+            self._budget.part,
             self._reading.part,
             self._truth.part,
             self._shared[Shared.METHOD],
@@ -390,7 +393,7 @@ class Layout:
         self._source.param.watch(lambda event: self._go_to(event.new), "value")
         self._preset.param.watch(lambda event: self._preset_changed(event.new), "value")
         state.param.watch(
-            lambda *_: self._show_settings("light", "tracking"), ["light", "tracking"]
+            lambda *_: self._show_settings("light", "tracking"), ["light", "budget", "tracking"]
         )
         self.pages.choice.link(state, value="page", bidirectional=True)
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
@@ -429,6 +432,7 @@ class Layout:
         self._truth_offer.show(answer)
         self._provenance.text = text.provenance(answer)[:2000]
         self._method.show(answer)
+        self._budget.refresh()
         self._panels["tracking"].mark_doubts(doubts_hold(answer.capture))
         self._fit_sidebar()
         self._show_settings()
@@ -461,7 +465,9 @@ class Layout:
         """Show settings that were changed by a page, a preset or an estimate; all by default."""
         state = self.session.state
         for name in names or self._panels:
-            self._panels[name].show(getattr(state, name))
+            is_light = name == "light"
+            chosen = self.session.request.illumination if is_light else getattr(state, name)
+            self._panels[name].show(chosen)
         self._preset.value = _preset_of(state.tracking)
 
     # Actions of the user
@@ -477,6 +483,7 @@ class Layout:
                 ReductionSettings(),
                 state.method,
                 state.settings,
+                budget=state.budget,
             )
             state.param.update(parameters_of(request, session.sources))
 

@@ -84,6 +84,11 @@ class Session:
         return self.estimate.answer
 
     @property
+    def request(self) -> Request:
+        """The request that the state describes."""
+        return self.estimate.request
+
+    @property
     def page(self) -> Any:
         """The document that the browser shows; None without a browser."""
         return self.tasks.document

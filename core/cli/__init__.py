@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import core
-from core.cli import ablation, batch, captures, report, studies, tradeoff
+from core.cli import ablation, batch, budget, captures, report, studies, tradeoff
 from core.cli.results import CheckFailed, Incomplete
 from core.io import TRUTH_OPTIONS, with_flags
 
@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"firstphoton {core.__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
-    for room in (captures, report, batch, studies, tradeoff, ablation):
+    for room in (captures, budget, report, batch, studies, tradeoff, ablation):
         room.add(commands)
     chosen = parser.parse_args(arguments)
     chosen.arguments = sys.argv[1:] if arguments is None else arguments

@@ -24,6 +24,7 @@ from core.cli.results import CheckFailed, add_results, publish
 from core.estimators import ESTIMATORS
 from core.io.readers import read_capture
 from core.io.readers.options import add_read_options
+from core.photon_budget import with_falloff
 from core.scene import scenes
 from core.studies.ablation import plain, power
 from core.studies.ablation.criterion import Requirement
@@ -50,6 +51,12 @@ def add(commands: Any) -> None:
         "size of each part",
     )
     add_flux(command)
+    command.add_argument(
+        "--falloff",
+        action="store_true",
+        default=None,
+        help="judge the fall of a scene's signal with range (1/R²), too, around its median range",
+    )
     command.add_argument("--method", choices=ESTIMATORS, default="likelihood", help="(likelihood)")
     command.add_argument(
         "--seeds", type=whole_from_to(2, 1000), help=f"simulated captures of a scene ({_SEEDS})"
@@ -77,7 +84,7 @@ def _requires(chosen: argparse.Namespace) -> None:
 
 
 def _measure_power(chosen: argparse.Namespace) -> None:
-    given = (*FLUX_OPTIONS, "seeds", "json")
+    given = (*FLUX_OPTIONS, "falloff", "seeds", "json")
     require_none({**vars(chosen), "json": chosen.json or None}, given, "power has its own captures")
     found = list(power.outcomes(power.CASES, chosen.power, chosen.processes, show_progress))
     print(file=sys.stderr)
@@ -94,6 +101,8 @@ def _judge_scene(chosen: argparse.Namespace) -> _Judged:
     n_pulses = options.pop("n_pulses")
     require_none(options, sorted(options), "a scene is not read from a file")
     scene, flux, pulse = scenes[chosen.scene](), flux_of(chosen), Pulse()
+    if chosen.falloff:
+        scene = with_falloff(scene)
     acquisition = replace(scene.acquisition, n_pulses=n_pulses or scene.acquisition.n_pulses)
     first, count = chosen.seed or 0, chosen.seeds or _SEEDS
     rows = requirements(
@@ -114,6 +123,7 @@ def _judge_scene(chosen: argparse.Namespace) -> _Judged:
 
 def _judge_capture(chosen: argparse.Namespace) -> _Judged:
     require_none(vars(chosen), (*FLUX_OPTIONS, "seeds"), "a capture has its own flux")
+    require_none(vars(chosen), ("falloff",), "a capture has its own signal")
     capture = read_capture(chosen.capture, **reading(chosen))
     print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
     rows = requirements(capture, method=chosen.method, progress=show_progress)

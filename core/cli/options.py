@@ -174,9 +174,9 @@ def colors_given(chosen: argparse.Namespace) -> RangeColors:
     return RangeColors(**{each.name: getattr(chosen, each.name) for each in fields(RangeColors)})
 
 
-def add_settings(command: Any, kind: type[Any]) -> None:
-    """Add an option for each setting of a method."""
-    group = command.add_argument_group("settings of the method")
+def add_settings(command: Any, kind: type[Any], title: str = "settings of the method") -> None:
+    """Add an option for each setting of a method, or of something else that the title names."""
+    group = command.add_argument_group(title)
     for each in fields(kind):
         spec = spec_of(each)
         parse = (int if spec.whole else float) if isinstance(spec, Number) else str

@@ -19,7 +19,7 @@ ROOMS = (
     {"trigger", "effects", "geometry", "labels", "metrics", "tracking_parameters"},
     {"scene", "tracking", "capture"},
     {"simulation", "reductions", "inference"},
-    {"corrections", "cost"},
+    {"corrections", "cost", "photon_budget"},
     {"estimators"},
     {"inspection", "pipeline", "io"},
     {"out_of_core", "report", "warmup"},

@@ -191,7 +191,7 @@ def _flux(report: Any) -> list[Fact]:
 def estimate_name(answer: Answer) -> str:
     """Return scene or capture, method, and all that differs from its default."""
     request = answer.request
-    light = (request.light,) if request.source.is_scene else ()
+    light = (request.illumination,) if request.source.is_scene else ()
     names = [request.source.title, method_title(answer.method)]
     for settings in (*light, request.less, answer.settings):
         names += changed_settings(settings)

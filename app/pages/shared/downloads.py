@@ -307,7 +307,7 @@ def looked_at(session: Session, request: Request) -> Subject:
     source, window = request.source, request.window
     capture = session.key(source) if source.is_scene else Path(source.title).stem
     absent = "".join(f" without {name}" for name in sorted(request.absent))
-    simulated = (request.light,) if source.is_scene else ()
+    simulated = filter(None, (request.illumination, request.budget)) if source.is_scene else ()
     part = ""
     if window is not None:
         part = _part(*((first, end - 1) for first, end in (window.rows, window.cols)))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import panel as pn
 import param
 
@@ -27,6 +30,14 @@ _HELD_HELP = (
 class IlluminationPanel(SettingsPanel[Illumination]):
     """The controls of `State.light`.
 
+    With a photon budget they show its flux; moving one of signal, background and SBR ends it.
+
+    Parameters
+    ----------
+    state : State
+    shown : callable, optional
+        Returns the illumination that the controls show, by default that of the state.
+
     Attributes
     ----------
     background : Knob
@@ -34,9 +45,10 @@ class IlluminationPanel(SettingsPanel[Illumination]):
         What stays when the signal moves.
     """
 
-    def __init__(self, state: State) -> None:
+    def __init__(self, state: State, shown: Callable[[], Illumination] | None = None) -> None:
         super().__init__(Illumination(), self._change)
         self._state = state
+        self._shown = shown or (lambda: state.light)
         self.background = Knob.of(_BACKGROUND, Illumination().flux.background, _BACKGROUND_HELP)
         self.background.param.watch(self._change_background, "value")
         self.held = select("When the signal moves, keep", list(HELD), state.held, _HELD_HELP)
@@ -54,21 +66,28 @@ class IlluminationPanel(SettingsPanel[Illumination]):
     def show(self, settings: Illumination) -> None:
         """Set every control without reporting a change."""
         super().show(settings)
-        self.background.value = settings.flux.background
+        self.background.value = _five_digits(settings.flux.background)
 
     def _change(self, settings: Illumination) -> None:
-        before = self._state.light
+        before, state = self._shown(), self._state
+        if state.budget is not None and settings.flux == before.flux:
+            state.light = replace(state.light, n_pulses=settings.n_pulses, seed=settings.seed)
+            return
         # Without signal there is no background that an SBR could state.
-        if self._state.held == "background" and 0 < settings.ppp != before.ppp > 0:
+        if state.held == "background" and 0 < settings.ppp != before.ppp > 0:
             settings = settings.with_background(before.flux.background)
-        self._state.light = settings
+        state.param.update(light=settings, budget=None)
 
     def _change_background(self, event: param.parameterized.Event) -> None:
-        light = self._state.light
-        if event.new == light.flux.background:
+        light = self._shown()
+        if event.new == _five_digits(light.flux.background):
             return  # set by `show`
         try:
             _BACKGROUND.check("Background", event.new)
-            self._state.light = light.with_background(event.new)
+            self._state.param.update(light=light.with_background(event.new), budget=None)
         except ValueError as error:
             self.doubts.text = str(error)
+
+
+def _five_digits(value: float) -> float:
+    return float(f"{value:.5g}")

@@ -87,13 +87,13 @@ class AblationSection(SettingsSection[Repetitions]):
     def work(self) -> Work[Verdicts]:
         """Return the study of the present scene or capture."""
         request, whole = self.session.answer.request, self.session.answer.whole
-        build, light, repetitions = request.source.scene, request.light, self.settings.repetitions
+        repetitions = self.settings.repetitions
 
         def work(progress: Callable[[int, int], None], cancelled: Callable[[], bool]) -> Verdicts:
             reports: dict[str, Any] = {"progress": progress, "cancelled": cancelled}
-            if build is None:
+            if not request.source.is_scene:
                 return Verdicts(request, 0, requirements(whole, **reports))
-            scene, seeds = build(), range(repetitions)
+            scene, light, seeds = request.whole_scene, request.illumination, range(repetitions)
             gate = light.acquisition(scene.acquisition)
             found = requirements(scene, light.flux, acquisition=gate, seeds=seeds, **reports)
             return Verdicts(request, repetitions, found)
@@ -110,8 +110,9 @@ class AblationSection(SettingsSection[Repetitions]):
     def refresh(self) -> None:
         """Write the table."""
         request = self.session.answer.request
-        build, absent = request.source.scene, self.session.state.absent
-        own = [*CORRECTIONS, *(parts_of(build()) if build is not None else ())]
+        absent = self.session.state.absent
+        parts = parts_of(request.whole_scene) if request.source.is_scene else ()
+        own = [*CORRECTIONS, *parts]
         with self.session.tasks.hold():
             self.subject.text = text.subject(
                 request.source.title, self._repetitions if self._found else 0, absent

@@ -16,7 +16,7 @@ from app.model.exports import table_file
 from app.model.methods import METHOD_PLACES, method_style
 from app.model.restore import parameters_of
 from app.model.state import ReductionSettings
-from app.model.store import Answer, Request, bare, same_capture
+from app.model.store import Answer, Request, same_capture
 from app.pages.session import Session
 from app.pages.shared.downloads import TABLE, Shown, Subject, below, looked_at
 from app.pages.shared.outputs import layers_of, spelled
@@ -300,7 +300,7 @@ def source_of(answer: Answer) -> Source:
     request = answer.request
     if request.source.scene is None:
         return answer.whole
-    scene, light = bare(request.source.scene(), request.absent), request.light
+    scene, light = request.scene, request.illumination
     acquisition = light.acquisition(scene.acquisition)
     return Simulation(request.source.title, scene, acquisition, light.flux)
 

@@ -1,0 +1,233 @@
+"""The photon budget against its own equations, published budgets, and the simulation."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import constants
+
+from core import Acquisition, Flux, PhotonBudget, Scene, scenes, simulate
+from core.acquisition import SPEED_OF_LIGHT_M_S
+from core.cli import main
+from core.effects import Backscatter, Falloff
+from core.photon_budget import (
+    GIVEN,
+    OF_SCENE,
+    OF_STANDARD,
+    PLANCK_J_S,
+    STANDARD_SUN_LUX,
+    predicted_rd,
+    reaching,
+    signal_extent,
+    steps,
+    with_falloff,
+)
+from core.studies.budget import steps_table
+from core.studies.outputs import as_markdown
+
+RESULTS = Path(__file__).resolve().parents[2] / "assets" / "results" / "budget.md"
+
+SPELLED = str.maketrans({"·": "*", "²": "**2"})
+NAMES = {"h": PLANCK_J_S, "c": SPEED_OF_LIGHT_M_S, "π": pi, "min": min}
+
+
+def values(budget: PhotonBudget, scene: Scene) -> dict[str, float]:
+    return {step.symbol: step.value for step in steps(budget, scene)}
+
+
+def one_pixel(range_m: float, pixel_angle_rad: float = 1e-3) -> Scene:
+    """A scene of one pixel, on which the whole beam falls."""
+    return Scene(np.full((1, 1), range_m), acquisition=Acquisition(pixel_angle_rad=pixel_angle_rad))
+
+
+@pytest.mark.parametrize(
+    "budget", [PhotonBudget(), PhotonBudget(beam_mrad=0.5, range_m=60.0, irradiance_w_m2_nm=0.3)]
+)
+def test_each_value_is_that_of_the_equation_shown_with_it(budget: PhotonBudget) -> None:
+    known: dict[str, object] = dict(NAMES)
+    computed = 0
+    for step in steps(budget, scenes["car"]()):
+        assert step.symbol not in known
+        if step.equation not in (GIVEN, OF_SCENE, OF_STANDARD):
+            found = eval(step.equation.translate(SPELLED), {}, known)
+            assert step.value == pytest.approx(found, rel=1e-12), step.name
+            computed += 1
+        known[step.symbol] = step.value
+    assert computed >= 15
+
+
+def test_constants_are_those_of_the_si() -> None:
+    assert constants.h == PLANCK_J_S
+    assert constants.c == SPEED_OF_LIGHT_M_S
+
+
+def test_a_published_signal_of_a_satellite() -> None:
+    """NASA on ICESat-2 (icesat-2.gsfc.nasa.gov/space-lasers): of about 20 trillion photons of a
+    pulse "only about a dozen return to the satellite's telescope", of 2.6 feet, from 500 km below.
+
+    Assumed: fresh snow of reflectivity 0.9, clear air.
+    """
+    photons, feet_m = 20e12, 0.3048
+    energy_j = photons * constants.h * constants.c / 532e-9
+    budget = PhotonBudget(
+        pulse_energy_uj=energy_j * 1e6,
+        wavelength_nm=532.0,
+        aperture_mm=2.6 * feet_m * 1e3,
+        reflectivity=0.9,
+        transmission=1.0,
+    )
+    found = values(budget, one_pixel(500e3))
+    assert found["N"] == pytest.approx(photons)
+    assert 10 < found["M"] < 14
+
+
+def test_a_published_signal_of_an_airborne_scanner() -> None:
+    """Baltsavias (1999), ISPRS J. Photogramm. Remote Sens. 54, 199-214: with a reflectivity of 0.5,
+    a transmission of the air of 0.8 each way and an aperture of 100 cm², 1e-9 of the power returns
+    from 1 km.
+    """
+    aperture_mm = 1e3 * np.sqrt(4 * 100e-4 / pi)
+    budget = PhotonBudget(aperture_mm=aperture_mm, reflectivity=0.5, transmission=0.8**2)
+    found = values(budget, one_pixel(1e3))
+    assert found["A"] == pytest.approx(100e-4)
+    assert found["M"] / found["N"] == pytest.approx(1e-9, rel=0.05)
+
+
+def test_a_background_worked_out_by_hand() -> None:
+    """0.5 · 2 W/m²/nm · 1 nm / π, times π · (2 cm)² / 4, 1e-6 sr and 0.5: 50 pW.
+
+    At 1000 nm, with 1.98645e-19 J a photon, these are 2.5171e8 photons a second: of them a tenth is
+    detected, and of 100 ns are counted 2.5171, with 10 million dark counts a second 3.5171.
+    """
+    budget = PhotonBudget(
+        wavelength_nm=1000.0,
+        aperture_mm=20.0,
+        filter_nm=1.0,
+        reflectivity=0.5,
+        transmission=0.5,
+        efficiency=0.1,
+        irradiance_w_m2_nm=2.0,
+        dark_count_hz=1e7,
+    )
+    found = values(budget, one_pixel(70.0))
+    assert found["P"] == pytest.approx(50e-12)
+    assert found["r"] == pytest.approx(2.5171e8, rel=1e-4)
+    assert found["B"] == pytest.approx(3.5171, rel=1e-4)
+
+
+def test_the_standard_sun_is_as_bright_as_its_spectrum() -> None:
+    """683 lm/W, with the luminosity V(λ) as Stockman's group fits it (Wyman et al. 2013)."""
+    step_nm = 1.0
+    wavelength_nm = np.arange(401.0, 760.0, step_nm)
+    irradiance = [
+        values(PhotonBudget(wavelength_nm=each, filter_nm=step_nm), one_pixel(50.0))["E_s"]
+        for each in wavelength_nm
+    ]
+    luminosity = 1.019 * np.exp(-285.4 * (wavelength_nm * 1e-3 - 0.559) ** 2)
+    lux = 683 * step_nm * float(np.dot(irradiance, luminosity))
+    assert lux == pytest.approx(STANDARD_SUN_LUX, rel=0.02)
+
+
+def test_signal_falls_with_range_and_reflectivity_over_the_scene() -> None:
+    range_m = np.array([[50.0, 100.0, np.nan]])
+    scene = Scene(range_m, np.array([[1.0, 0.5, 1.0]]), Acquisition(1000))
+    lit, flux = PhotonBudget(range_m=50.0).apply(scene)
+    capture = simulate(lit, lit.acquisition, flux)
+    assert capture.signal == pytest.approx(flux.signal * np.array([[1.0, 0.125, 0.0]]))
+    assert signal_extent(PhotonBudget(range_m=50.0), scene) == pytest.approx(
+        (flux.signal / 8, flux.signal)
+    )
+    found = values(PhotonBudget(range_m=50.0), scene)
+    assert (flux.signal, flux.sbr) == pytest.approx((found["S"], found["SBR"]), rel=1e-4)
+
+
+def test_fog_returns_what_a_white_target_would() -> None:
+    """The photons of the fog do not depend on the range and reflectivity of the budget."""
+    clear = scenes["car"]()
+    fog = replace(clear, backscatter=Backscatter(0.01))
+
+    def of_fog(**settings: float) -> np.ndarray:
+        lit, flux = PhotonBudget(**settings).apply(fog)
+        assert lit.backscatter is not None
+        pulse = simulate(lit, lit.acquisition, flux).pulse
+        return lit.backscatter.photons_before(flux.signal, pulse, lit.acquisition)
+
+    dim, bright = of_fog(range_m=100.0, reflectivity=0.1), of_fog(range_m=50.0)
+    assert dim == pytest.approx(bright, rel=1e-4)
+
+
+def test_the_default_range_is_the_median() -> None:
+    scene = scenes["car"]()
+    assert values(PhotonBudget(), scene)["R"] == pytest.approx(np.nanmedian(scene.range_m))
+    assert with_falloff(scene).falloff == Falloff(float(np.nanmedian(scene.range_m)))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PhotonBudget(pulse_energy_uj=0.0), "pulse_energy_uj = 0.0"),
+        (lambda: PhotonBudget(reflectivity=1.2), "reflectivity = 1.2"),
+        (lambda: PhotonBudget(wavelength_nm=10_600.0), "wavelength_nm = 10600.0"),
+        (lambda: Falloff(0.0), "reference_m = 0.0"),
+        (lambda: steps(PhotonBudget(), one_pixel(np.nan)), "no pixel with a target"),
+        (lambda: reaching(PhotonBudget(), one_pixel(50.0), 1.5), "target_rd = 1.5"),
+    ],
+)
+def test_bad_input_is_refused(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()  # type: ignore[operator]
+
+
+def test_an_unknown_pixel_angle_is_refused() -> None:
+    with pytest.raises(ValueError, match="pixel_angle_rad = None"):
+        steps(
+            PhotonBudget(),
+            Scene(np.full((1, 1), 50.0), acquisition=Acquisition(pixel_angle_rad=None)),
+        )
+
+
+def test_a_restoration_degree_is_reached_with_what_is_needed() -> None:
+    budget, scene = PhotonBudget(), scenes["car"](64)
+    energy, aperture, filter_ = reaching(budget, scene, 0.95)
+    for found in (energy, filter_):
+        changed = replace(budget, **{found.name: found.needed})
+        assert predicted_rd(*changed.apply(scene)) == pytest.approx(0.95, abs=0.002)
+    # Less of the one and more of the other are enough for less.
+    lower = reaching(budget, scene, 0.8)
+    assert lower[0].needed < energy.needed
+    assert lower[2].needed > filter_.needed
+    assert aperture.best_rd <= 1
+
+
+def test_a_restoration_degree_out_of_reach_is_stated() -> None:
+    dim = PhotonBudget(pulse_energy_uj=1e-3)
+    *_, filter_ = reaching(dim, scenes["car"]())
+    assert np.isnan(filter_.needed)
+    assert 0 < filter_.best_rd < 0.99
+
+
+def test_the_command_prints_steps_and_the_way_back(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["budget", "--json", "--pulse-energy-uj", "2", "--pulses", "500"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    expected = values(PhotonBudget(pulse_energy_uj=2.0), scenes["car"]())
+    assert found["S"] == pytest.approx(expected["S"])
+    assert set(found["needed"]) == {"pulse_energy_uj", "aperture_mm", "filter_nm"}
+
+
+def test_the_documented_budget_is_that_of_the_code() -> None:
+    table = steps_table(PhotonBudget(), scenes["car"](), "car")
+    assert as_markdown(table.columns, table.rows, table.formats) in RESULTS.read_text("utf-8")
+    assert table.note in RESULTS.read_text("utf-8")
+
+
+def test_an_absent_budget_changes_no_bit() -> None:
+    scene = scenes["car"]()
+    flat = replace(scene, range_m=np.where(np.isfinite(scene.range_m), 50.0, np.nan))
+    plain = simulate(flat, flat.acquisition, Flux())
+    falling = simulate(with_falloff(flat), flat.acquisition, Flux())
+    assert np.array_equal(plain.cube, falling.cube)
