@@ -625,18 +625,19 @@ WebSocket.prototype.send = function (part) {
 """
 
 
-NOTE_COLORS = """() => {
+NOTE_COLORS = """(label) => {
   window.seen = [];
   const look = () => {
     const style = getComputedStyle(document.documentElement);
     const names = ["--mui-palette-background-default", "--mui-palette-text-primary"];
-    const colors = names.map((name) => style.getPropertyValue(name)).join();
+    const ofPage = names.map((name) => style.getPropertyValue(name));
+    const colors = [...ofPage, getComputedStyle(label).color].join();
     if (seen.at(-1) !== colors) seen.push(colors);
     requestAnimationFrame(look);
   };
   look();
 }"""
-"""JavaScript that keeps the colours of paper and text of the page."""
+"""JavaScript that keeps the colours of paper and text of the page, and of a label on it."""
 
 
 def change_theme(page: Page) -> None:
@@ -649,7 +650,7 @@ def change_theme(page: Page) -> None:
     eventually(lambda: all_drawn_in(LIGHT))
     page.evaluate("sent.length = 0")
     for palette in (DARK, LIGHT):
-        page.evaluate(NOTE_COLORS)
+        page.get_by_text("Gate axes in", exact=True).evaluate(NOTE_COLORS)
         page.get_by_role("button", name="Toggle theme").click()
         eventually(lambda palette=palette: all_drawn_in(palette))
         assert len(page.evaluate("seen")) == 2  # no light text on light paper in between
