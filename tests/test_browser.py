@@ -625,19 +625,20 @@ WebSocket.prototype.send = function (part) {
 """
 
 
-NOTE_COLORS = """() => {
+NOTE_COLORS = """(label) => {
   const seen = (window.seen = []);
   const look = () => {
     if (window.seen !== seen) return;
     const style = getComputedStyle(document.documentElement);
     const names = ["--mui-palette-background-default", "--mui-palette-text-primary"];
-    const colors = names.map((name) => style.getPropertyValue(name)).join();
+    const ofPage = names.map((name) => style.getPropertyValue(name));
+    const colors = [...ofPage, getComputedStyle(label).color].join();
     if (seen.at(-1) !== colors) seen.push(colors);
     requestAnimationFrame(look);
   };
   look();
 }"""
-"""JavaScript that records background and text colours of the page when they change."""
+"""JavaScript that records colours of the page and of a label when they change."""
 
 
 def change_theme(page: Page) -> None:
@@ -650,7 +651,7 @@ def change_theme(page: Page) -> None:
     eventually(lambda: all_drawn_in(LIGHT))
     page.evaluate("sent.length = 0")
     for palette in (DARK, LIGHT):
-        page.evaluate(NOTE_COLORS)
+        page.get_by_text("Gate axes in", exact=True).evaluate(NOTE_COLORS)
         page.get_by_role("button", name="Toggle theme").click()
         eventually(lambda palette=palette: all_drawn_in(palette))
         assert len(page.evaluate("seen")) == 2  # no light text on light paper in between
@@ -798,7 +799,12 @@ def explore_another_method(page: Page) -> None:
 def answer_which_array_to_read(page: Page) -> None:
     counts = np.random.default_rng(3).poisson(0.2, (5, 7, 40)).astype(np.uint8)
     upload(page, "two.npz", saved_arrays(rates=counts / 7, spad=counts))
-    expect(page.get_by_text("Several arrays of two.npz could be the capture.")).to_be_visible()
+    question = page.get_by_role("alert").filter(has_text="two.npz")
+    expect(question).to_have_text("Two arrays of two.npz could be the capture. Which?")
+    details = page.get_by_text("each of which could be the capture")
+    expect(details).to_be_hidden()
+    unfold(page, "Details")
+    expect(details).to_be_visible()
     first, second = (page.get_by_role("button", name=name) for name in ("spad", "rates"))
     assert first.bounding_box()["x"] < second.bounding_box()["x"]
     expect(page.get_by_role("textbox", name="Variable")).to_have_value("")
@@ -827,7 +833,7 @@ def test_files_are_refused_or_shown_as_text(start_page, tmp_path, troubles):
     expect(warning(one)).to_be_hidden()
     trap, cube = "<img src='x' onerror='window.trapped = 1'>*", np.ones((3, 3, 40), np.uint16)
     upload(one, "two.npz", saved_arrays(**{trap: cube, "other": cube}))
-    expect(warning(one)).to_contain_text(trap)
+    expect(one.get_by_role("button", name=trap)).to_be_visible()
     upload(one, "one.npz", saved_arrays(format=FORMAT, cube=cube, source=trap))
     expect(one.get_by_text("3 × 3 pixels, 40 bins")).to_contain_text(trap)
     assert one.evaluate("window.trapped") is None

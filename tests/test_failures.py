@@ -399,7 +399,7 @@ def test_the_form_stays_open_for_a_file_that_is_refused(tmp_path):
         layout.tasks.run_until(lambda first=first: form.visible == (first == "sample"))
         layout.tasks.run_until(lambda: layout.alert.text == "")
         session.state.source = "two"
-        layout.tasks.run_until(lambda: "give day or night" in layout.alert.text)
+        layout.tasks.run_until(lambda: layout.alert.text.startswith("Two arrays of two.npz"))
         assert session.state.source == first
         assert form.visible and not form.collapsed
         assert control(layout, "Bin width").value == ""
@@ -434,12 +434,19 @@ def test_the_form_is_open_for_a_file_that_a_link_names_and_that_is_refused(tmp_p
     control(layout, "Read again").clicks += 1
     layout.tasks.run_until(lambda: layout.session.state.source == "frames")
     assert layout.next_answer().request.reading == ReadOptions(no_trigger=65535, bin_width_s=64e-12)
-    # The page stays where only other reading options of the file on screen are refused.
     link = {"source": "frames", "reading.no_trigger": "65535", "reading.bin_width_s": "64 ps"}
     link |= {"page": "Explore", "unread": "source=frames"}
     again = HeldLayout(sources, Link(link))
     assert f"“{label}” is empty" in again.alert.text
     assert again.session.state.page == "Explore"
+    # Back and Forward show the reason again, also where the page was reloaded in between.
+    refused, read = again.session.query(), layout.session.query()
+    for each in (again, HeldLayout(sources)):
+        for query, has_reason in ((read, False), (refused, True), (read, False), (refused, True)):
+            each.session.recall(query)
+            each.tasks.run_until(each.session.is_settled)
+            assert (f"“{label}” is empty" in each.alert.text) == has_reason
+            assert each.session.query() == query
 
 
 def test_a_link_to_an_unreadable_file_shows_no_folder(monkeypatch):

@@ -655,6 +655,17 @@ def test_the_capture_is_reported_and_suggestions_apply(capture, building):
     assert building.state.tracking.t_n == capture.report.suggestion.t_n
     building.tasks.run_until(lambda: apply_t_n.disabled)
 
+    def t_n_shown():
+        shown = capture.report is not None and capture.advice[1].visible and apply_t_n.visible
+        assert capture.counts.layers["suggested"]["glyph_renderer"].visible == shown
+        return shown
+
+    assert t_n_shown()
+    building.state.method = "likelihood"  # which has no T_n
+    building.tasks.run_until(lambda: not t_n_shown())
+    building.state.method = "tracking"
+    building.tasks.run_until(t_n_shown)
+
 
 def test_a_report_that_fails_removes_the_previous_one(capture, building, monkeypatch):
     shown = []

@@ -118,6 +118,7 @@ def pictures():
 def test_pictures_share_scale_and_view_and_compare_a_pixel(pictures):
     gallery = Gallery()
     gallery.show(pictures)
+    assert "**Title**" in [getattr(each, "object", None) for each in gallery.layout]
     one, other = gallery.figures
     assert one.x_range is other.x_range
     assert one.y_range is other.y_range

@@ -63,9 +63,9 @@ def test_a_file_of_several_arrays_is_served_and_the_page_asks_for_one(tmp_path, 
     assert "The page asks: two.mat: --variable is missing: give spad or rates" in said
     layout = HeldLayout(files | built_in_sources())
     assert layout.session.answer.request.source.title == "Car at 50 m"
-    assert "Several arrays of two.mat" in layout.alert.text
+    assert layout.alert.text == "Two arrays of two.mat could be the capture. Which?"
     layout = HeldLayout(files | built_in_sources(), link_to(layout.session.query()))
-    assert "Several arrays of two.mat" in layout.alert.text  # a reload asks again
+    assert "Two arrays of two.mat" in layout.alert.text  # a reload asks again
     control(layout, "spad").clicks += 1
     answer = layout.next_answer()
     assert answer.request.source.title == "two.mat"

@@ -52,7 +52,7 @@ def test_a_capture_is_found_once_when_it_is_written(tmp_path):
     assert arrival.refused[0].startswith("half.npz")
     assert folder.look() is None
     half.write_bytes(whole)
-    assert folder.look() is None
+    assert folder.look().refused == ()  # what was said of the file no longer holds
     ((key, source),) = folder.look().found.items()
     assert (source.title, source.read().counts.sum()) == ("half.npz", capture(1.0).counts.sum())
     write(tmp_path, "next.npz", counts=2.0, at_s=5)  # the same name, another capture
@@ -61,6 +61,11 @@ def test_a_capture_is_found_once_when_it_is_written(tmp_path):
     assert source.title == "next.npz" and other != key
     half.unlink()
     assert folder.look() is None
+    half.write_bytes(b"no archive")
+    assert folder.look() is None
+    assert len(folder.look().refused) == 1
+    half.unlink()
+    assert (folder.look().refused, folder.look()) == ((), None)
 
 
 def test_a_capture_of_several_arrays_is_offered_since_the_page_asks_for_one(tmp_path):
@@ -104,6 +109,11 @@ def test_an_open_page_follows_with_its_settings_unless_it_should_not(tmp_path):
     assert HeldLayout(served | built_in_sources(), arrivals=arrivals).alert.text == sentence
     session.choose_pixel(0, 0)  # other actions keep the message
     assert layout.alert.text == sentence
+    (tmp_path / "bad.npz").unlink()
+    arrivals.emit(folder.look())
+    layout.settle()
+    assert layout.alert.text == ""
+    assert session.answer.request.source is second
     control(layout, "Follow new captures").value = False
     shown = state.source
     for number in range(2, MOST_CAPTURES + 3):

@@ -45,11 +45,11 @@ def restore(
     state.param.update(places(link, answer))
     link.refuse_others()
     if refused is None and state.unread:
-        refused = _still_refused(state.unread, sources, link, own)
+        refused = still_refused(state.unread, sources, link, own)
     return answer, refused
 
 
-def _still_refused(
+def still_refused(
     query: str, sources: Mapping[str, Source], link: Link, own: Mapping[str, Any]
 ) -> Refused | None:
     """Return the file of a query that could not be read before, unless it can be or is gone."""
@@ -64,7 +64,7 @@ def _still_refused(
         compute(request, None)
     except Exception as error:  # the page reports any failure
         _report(error, link)
-        return Refused.of(request, error)
+        return Refused.of(request, error, text.failure(error))
     return None
 
 
@@ -119,7 +119,7 @@ def _first_answer(
         except Exception as error:  # the page reports any failure
             _report(error, link)
             if refused is None and not request.source.is_scene:
-                refused = Refused.of(request, error)
+                refused = Refused.of(request, error, text.failure(error))
         else:
             is_open = refused is None or answer.request.source is refused.request.source
             return answer, None if is_open else refused

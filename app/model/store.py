@@ -260,13 +260,15 @@ class Refused:
     """A file that could not be read."""
 
     request: Request
+    why: str
+    """What the page says about it."""
     variables: tuple[str, ...]
     """Names of its arrays of which the user must choose one; empty for other errors."""
 
     @classmethod
-    def of(cls, request: Request, error: Exception) -> Refused:
+    def of(cls, request: Request, error: Exception, why: str) -> Refused:
         """Return what an error says about the file of a request."""
-        return cls(request, _variables(error))
+        return cls(request, why, _variables(error))
 
 
 def is_ambiguous(error: Exception) -> bool:

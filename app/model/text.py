@@ -10,7 +10,7 @@ from concurrent.futures import BrokenExecutor
 from app.model.large import Grid
 from app.model.methods import METHOD_TITLES
 from app.model.state import AUTOMATIC
-from app.model.store import Answer, Pixel
+from app.model.store import Answer, Pixel, Refused
 from app.units import Quantity, Scale, between, plus_minus, with_margin
 from app.units import milliseconds as milliseconds  # noqa: PLC0414
 from app.units import number as number  # noqa: PLC0414
@@ -118,6 +118,15 @@ def failure(error: Exception) -> str:
     if isinstance(error, ValueError):
         return f"{shown}."
     return f"{shown}: undo the change, or choose another scene."
+
+
+def refusal(refused: Refused) -> str:
+    """Return why a file could not be read, or the question which of its arrays is the capture."""
+    n_arrays = len(refused.variables)
+    if n_arrays == 0:
+        return refused.why
+    file, number = refused.request.source.title, "Two" if n_arrays == 2 else n_arrays
+    return f"{number} arrays of {file} could be the capture. Which?"
 
 
 def unfinished(error: Exception) -> str:

@@ -27,14 +27,14 @@ _State = tuple[int, int]  # size in bytes, and time of the last change in ns
 
 @dataclass(frozen=True)
 class Arrival:
-    """Files that have just been written, and older captures that are no longer offered."""
+    """What a look at a folder found."""
 
     found: Mapping[str, Source]
-    """Captures by key, the newest last."""
+    """Captures that have just been written by key, the newest last."""
     outdated: tuple[str, ...]
-    """Keys."""
+    """Keys of older captures that are no longer offered."""
     refused: tuple[str, ...] = ()
-    """Name of each file that could not be opened, and why."""
+    """Name of each of the latest files that cannot be opened, and why."""
 
     @property
     def newest(self) -> str:
@@ -81,9 +81,13 @@ class WatchedFolder:
         newest = max(self._seen, key=lambda path: self._seen[path][1], default=None)
         self._handled = {path: at for path, at in self._seen.items() if path != newest}
         self._keys: list[str] = []
+        self._refused: dict[Path, str] = {}
 
     def look(self) -> Arrival | None:
-        """Return what has been written since the last look; None if nothing was."""
+        """Return what has changed since the last look; None if nothing has.
+
+        A file that could not be opened is named until it changes or others have been written.
+        """
         states = self._states()
         written = [
             path
@@ -92,7 +96,9 @@ class WatchedFolder:
         ]
         self._seen = states
         found: dict[str, Source] = {}
-        refused = []
+        refused: dict[Path, str] = {}
+        before, handled = self._refused, self._handled
+        still = {path: why for path, why in before.items() if states.get(path) == handled[path]}
         for path in sorted(written, key=lambda path: states[path][1]):
             self._handled[path] = states[path]
             try:
@@ -103,14 +109,15 @@ class WatchedFolder:
             except (ValueError, OSError) as error:
                 if not is_ambiguous(error):
                     log.warning("not opened: %s", error)
-                    refused.append(text.cause_in(path.name, error))
+                    refused[path] = text.cause_in(path.name, error)
                     continue
             found[key] = source  # of several arrays, the page asks for one
         keys = [key for key in self._keys if key not in found] + list(found)
         self._keys = keys[-MOST_CAPTURES:]
-        if not (found or refused):
+        self._refused = refused if found or refused else still
+        if not found and self._refused == before:
             return None
-        return Arrival(found, tuple(keys[:-MOST_CAPTURES]), tuple(refused))
+        return Arrival(found, tuple(keys[:-MOST_CAPTURES]), tuple(self._refused.values()))
 
     def _states(self) -> dict[Path, _State]:
         """Return size and time of each file that may be a capture."""

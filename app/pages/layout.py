@@ -32,7 +32,7 @@ from app.pages.session import Session
 from app.pages.shared.illumination import IlluminationPanel
 from app.pages.shared.method import MethodChoice
 from app.pages.shared.photon_budget import PhotonBudgetForm
-from app.pages.shared.reading import QUESTION, ReadingForm
+from app.pages.shared.reading import ReadingForm
 from app.pages.shared.truth import TruthForm, TruthOffer
 from app.tasks.page import PageTasks
 from app.tasks.signals import Signal
@@ -244,10 +244,8 @@ class Layout:
         self._listen()
         if arrivals is not None:
             session.failures.remark(text.not_opened(arrivals.refused))
-        if session.refused:
-            session.failures.show(text.not_restored(session.refused))
-        elif (refused := session.estimate.refused) is not None:
-            session.failures.show(QUESTION.format(file=refused.request.source.title))
+        if sentence := _about_link(session):
+            session.failures.show(sentence)
 
     def _view_of(self, page: Page) -> View:
         content = self.contents[page.name] = page.build(self.session)
@@ -341,6 +339,7 @@ class Layout:
             self._connection,
             self._busy,
             self.alert,
+            self._reading.question,
             sizing_mode="stretch_width",
             margin=(4, 12, 0, 12),
         )
@@ -364,7 +363,6 @@ class Layout:
             self._source,
             self._file,
             *([] if self._arrivals is None else [self._follow]),
-            self._reading.question,
             self._reading.records,
             self._truth_offer.layout,
             self._shared[Shared.UNIT],
@@ -454,7 +452,7 @@ class Layout:
         refused = self.session.estimate.refused
         if refused is not None:
             is_new = refused.request.source is not answer.request.source
-            self._reading.show_refused(refused.request, refused.variables, is_new)
+            self._reading.show_refused(refused, is_new)
         elif answer.request.source.is_scene:
             self._reading.question.visible = self._reading.records.visible = False
         else:
@@ -569,6 +567,13 @@ class Layout:
             if path is not None:
                 found[key] = with_truth(found[capture], truth, path)
         return found
+
+
+def _about_link(session: Session) -> str:
+    """Return what the page says about its link: what was not restored, and which array to read."""
+    refused = session.estimate.refused
+    asked = text.refusal(refused) if refused is not None and refused.variables else ""
+    return " ".join(filter(None, (text.not_restored(session.refused), asked)))
 
 
 def _preset_of(settings: TrackingParameters) -> str:

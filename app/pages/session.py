@@ -11,9 +11,17 @@ from urllib.parse import parse_qsl, urlencode
 from app.model.address import Link, query_of
 from app.model.capture_defaults import defaults_of
 from app.model.lessons import Lesson, built_in_lessons
-from app.model.restore import described, parameters_of, parsed, places, restore
+from app.model.restore import (
+    described,
+    parameters_of,
+    parsed,
+    places,
+    restore,
+    still_refused,
+)
 from app.model.state import State
 from app.model.store import Answer, Refused, Request, Source
+from app.model.text import no_estimates, refusal
 from app.pages.shared.estimate import CurrentEstimate
 from app.pages.shared.failures import FailureLog
 from app.plots.gate_cut import Cut
@@ -71,12 +79,12 @@ class Session:
         self.estimate = CurrentEstimate(
             self.state, self.sources, self.tasks, self.failures, first_answer, refused_file
         )
-        self._recalled: Link | None = None
+        self._recalled: tuple[Link, str] | None = None
         self._kept: tuple[str, Answer] | None = None
         self._unread: dict[str, Refused | None] = {}
         self._note_unread()
-        self.estimate.changed.subscribe(lambda _: self._note_unread())
         self.estimate.changed.subscribe(lambda _: self._find_places())
+        self.estimate.changed.subscribe(lambda _: self._note_unread())
 
     @property
     def answer(self) -> Answer:
@@ -145,8 +153,9 @@ class Session:
         except ValueError as error:
             self.failures.show(str(error))
             return
-        self._recalled = link
-        self._recall_unread(chosen["unread"])
+        self._recalled = link, chosen["unread"]
+        self.estimate.refused = None
+        self.failures.clear(no_estimates(self.answer))
         try:
             self.state.param.update(chosen)
         except Exception:
@@ -162,24 +171,28 @@ class Session:
         self._unread[query] = refused
         self.state.unread = query
 
-    def _recall_unread(self, query: str) -> None:
-        """Return to the file that could not be read, or to the page before it was requested."""
-        self.estimate.refused = self._unread.get(query)
-        if self.estimate.refused is None:
-            self.failures.resolve(None)
+    def _refuse_again(self, query: str, link: Link) -> None:
+        """Return to a file that could not be read, and show why."""
+        if query not in self._unread:  # refused before the page was loaded
+            self._unread[query] = still_refused(query, self.sources, link, self._own)
+        refused = self._unread[query]
+        if refused is not None:
+            self.estimate.refused = refused
+            self.failures.put(refusal(refused))
 
     def go_on_with(self, key: str) -> None:
         """Show another capture with the present settings, pixel and views."""
         entries = dict(parse_qsl(self.query()))
-        entries |= {"source": key, "pixel": json.dumps(self.state.pixel)}
+        entries |= {"source": key, "pixel": json.dumps(self.state.pixel), "unread": ""}
         self.recall(urlencode(entries))
 
     def _find_places(self) -> None:
         """Return to the recalled pixel, pins, region and views, once their estimate is there."""
-        link = self._recalled
-        if link is not None and self.estimate.is_settled:
-            self._recalled = None
+        if self._recalled is not None and self.estimate.is_settled:
+            (link, unread), self._recalled = self._recalled, None
             self.state.param.update(places(link, self.answer))
+            if unread:
+                self._refuse_again(unread, link)
 
     def key(self, source: Source) -> str:
         """Return the key of a source in the catalogue."""

@@ -13,6 +13,7 @@ import holoviews as hv
 import numpy as np
 from bokeh.models import (
     ColumnDataSource,
+    CustomJSHover,
     DataRange1d,
     HoverTool,
     Legend,
@@ -389,6 +390,21 @@ def curve_styles(item: items.Plot, colors: Palette) -> dict[str, tuple[str, list
     return styles
 
 
+# Column or value of the pixel under the pointer. Bokeh would write NaN without asking.
+READ_OUT = """
+if (format === "column") return String(Math.round(value));
+const found = source.data.image[0][special_vars.image_index.flat_index];
+return Number.isFinite(found) ? `${Number(found.toPrecision(5))} ${unit}` : "none shown";
+"""
+
+
+def value_read_out(picture: Any, unit: str = "") -> HoverTool:
+    """Return a tool that shows row, column and value of an image's pixel under the pointer."""
+    shown = CustomJSHover(args={"source": picture.data_source, "unit": unit}, code=READ_OUT)
+    tips = [("Row", "$y{0}"), ("Column", "$x{column}"), ("Value", "$x{value}")]
+    return HoverTool(renderers=[picture], tooltips=tips, formatters={"$x": shown})
+
+
 def pictures(item: items.Pictures) -> list[Any]:
     """Plot images (row, col), a figure each, row 0 at the top, with common colours and view.
 
@@ -416,6 +432,7 @@ def pictures(item: items.Pictures) -> list[Any]:
         )
         box = {"x": -0.5, "y": -0.5, "dw": cols, "dh": rows}
         shown.append(drawing.image([image], **box, color_mapper=mapper, name="picture"))
+        drawing.add_tools(value_read_out(shown[-1], "m"))
         left, bottom, right, top = ([side] for side in pixel_frame(0, 0))
         for layer, color, width in (("shadow", "#000000", 4), ("frame", "#ffffff", 1.6)):
             drawing.quad(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.events import Tap
-from bokeh.models import BasicTicker, BoxZoomTool, CustomJS, CustomJSHover, DataRange1d, HoverTool
+from bokeh.models import BasicTicker, BoxZoomTool, CustomJS, DataRange1d
 from numpy.typing import NDArray
 
 from app.model.large import Grid
@@ -17,14 +17,6 @@ from app.widgets.figures import Plot, around, color_bars, paint_frame, pane_of, 
 from core.io import ColorScale
 
 Array = NDArray[Any]
-
-# Column or value of the pixel under the pointer. Bokeh would write NaN without asking.
-READ_OUT = """
-if (format === "column") return String(Math.round(value));
-const found = source.data.image[0][special_vars.image_index.flat_index];
-return Number.isFinite(found) ? `${Number(found.toPrecision(5))} ${unit}` : "none shown";
-"""
-
 
 BORDER_PX = {"left": 52, "right": 66, "top": 26, "bottom": 40}
 """Room for axes, title and colour bar; the title leaves room for a download button."""
@@ -74,14 +66,9 @@ class ImageView:
         # Else Bokeh activates the first of the tools that HoloViews adds.
         self.figure.toolbar.active_drag = zoom
 
-        self._read_out = CustomJSHover(code=READ_OUT)
-        self.figure.add_tools(
-            HoverTool(
-                renderers=[picture["glyph_renderer"]],
-                tooltips=[("Row", "$y{0}"), ("Column", "$x{column}"), ("Value", "$x{value}")],
-                formatters={"$x": self._read_out},
-            )
-        )
+        hover = plots.value_read_out(picture["glyph_renderer"])
+        self._read_out = hover.formatters["$x"]
+        self.figure.add_tools(hover)
 
         def tap(event: Tap) -> None:
             row, col = self._grid.pixel(event.y, event.x)

@@ -172,7 +172,7 @@ def suggestion(capture: Capture) -> Suggestion:
     else:
         first = max(math.floor(echoes.first) + min(tap, 0) - TOLERANCE_BINS - _MARGIN_BINS, 0)
         side = "on either side"
-    why = f"{where}; a margin of {_MARGIN_BINS} bins lets the differentiators settle {side}."
+    why = f"{where}; a margin of {_MARGIN_BINS} bins lets filters settle {side}."
     if (first, end) == (0, n_bins):
         why = f"{where}; with a margin of {_MARGIN_BINS} bins this is the whole gate."
     t_n = max(math.floor(echoes.first + lag) - TOLERANCE_BINS, 0)

@@ -116,7 +116,7 @@ def page_of(
     """Return the page of `core.report.save_report`, whose arguments these are."""
     assert image.made_by is not None
     made_by = image.made_by
-    method = ESTIMATORS[made_by.method].title
+    method, has_t_n = ESTIMATORS[made_by.method].title, made_by.method == "tracking"
     step = math.ceil(math.sqrt(capture.counts.size / MOST_PIXELS))
     pixel_found = pixel_report(capture, image, *pixel, made_by.method, made_by.settings)
     capture_found = capture_report(capture)
@@ -125,9 +125,9 @@ def page_of(
     body = [
         *_heading(capture, image, title, method),
         *_recording(capture),
-        *_fluxes(capture, capture_found),
+        *_fluxes(capture, capture_found, has_t_n),
         *_maps(capture, image, shown, scale, pixel, step),
-        *_all_pixels(capture, capture_found),
+        *_all_pixels(capture, capture_found, has_t_n),
         *_pixel(capture, made_by, pixel_found),
         *_cloud(capture, image, shown, scale, pixel_angle_rad, box, step),
         *_reported(capture, image),
@@ -177,7 +177,7 @@ def _recording(capture: Capture) -> Iterator[str]:
     yield f"<ul>{''.join(f'<li>{_text(clause)}</li>' for clause in clauses)}</ul>"
 
 
-def _fluxes(capture: Capture, report: CaptureReport) -> Iterator[str]:
+def _fluxes(capture: Capture, report: CaptureReport, has_t_n: bool) -> Iterator[str]:
     unit, suggestion = report.flux_unit, report.suggestion
     first, end = suggestion.gate
     begin_m, end_m = capture.acquisition.bin_to_range_m([first, end]).tolist()
@@ -198,7 +198,8 @@ def _fluxes(capture: Capture, report: CaptureReport) -> Iterator[str]:
         f"<li>Gate: bins {_number(first)} to {_number(end)}, {_metres(begin_m, capture)} to "
         f"{_metres(end_m, capture)}. {_text(suggestion.why_gate)}</li>"
     )
-    yield f"<li>T_n: {_number(suggestion.t_n)}. {_text(suggestion.why_t_n)}</li>"
+    if has_t_n:
+        yield f"<li>T_n: {_number(suggestion.t_n)}. {_text(suggestion.why_t_n)}</li>"
     yield "</ul>"
 
 
@@ -268,12 +269,14 @@ def _map_reported(
     yield "Reported distance", capture.reported_range_m, of_sensor, caption
 
 
-def _all_pixels(capture: Capture, report: CaptureReport) -> Iterator[str]:
+def _all_pixels(capture: Capture, report: CaptureReport, has_t_n: bool) -> Iterator[str]:
     acquisition, suggestion = capture.acquisition, report.suggestion
     begin_m, end_m = acquisition.bin_to_range_m(suggestion.gate).tolist()
     gate = Mark(begin_m, end_m, SUGGESTED)
-    t_n = _line(float(acquisition.bin_to_range_m(suggestion.t_n)), ESTIMATE)
-    marks = {"suggested gate": gate, "suggested T_n": t_n}
+    marks = {"suggested gate": gate}
+    if has_t_n:
+        t_n_m = float(acquisition.bin_to_range_m(suggestion.t_n))
+        marks["suggested T_n"] = _line(t_n_m, ESTIMATE)
     curves = {"counts": report.histogram.astype(float)}
     yield _heading_2("Histogram of all pixels")
     drawn = gate_svg(acquisition, curves, marks, "Detections", "all pixels")

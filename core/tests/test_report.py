@@ -137,6 +137,12 @@ def test_each_plot_has_a_heading_and_a_text_of_its_own(page: Page) -> None:
     assert len(identifiers) == len(set(identifiers))
 
 
+def test_t_n_is_suggested_to_the_method_that_has_it() -> None:
+    for method in ("tracking", "peak"):
+        suggested = "T_n: " in written(CAPTURE, core.estimate(CAPTURE, method))
+        assert suggested == (method == "tracking")
+
+
 def test_texts_from_outside_stay_texts(page: Page) -> None:
     shown = HOSTILE.replace("\udcff", " ").replace("\0", " ")
     assert page.texts["h1"] == [shown]

@@ -52,7 +52,7 @@ class CaptureSection(Section):
     facts : Facts
     flux : Sentence
     advice : list of Sentence
-        Suggested gate, suggested T_n.
+        Suggested gate; suggested T_n, shown for the method that has this setting.
     apply : list of pmui.Button
         Buttons that apply these.
     pulses : Knob
@@ -231,6 +231,7 @@ class CaptureSection(Section):
         if not self.is_on_screen or answer is not self.session.answer or report is None:
             return
         gate, suggestion = answer.gate, report.suggestion
+        has_t_n = answer.method == "tracking"
         positions = {"t_n": answer.request.tracking.t_n, "suggested": suggestion.t_n}
         first, end = suggestion.gate
         marks = plots.marks(inspect_plots.NAMES, window=suggestion.gate, **positions)
@@ -239,10 +240,12 @@ class CaptureSection(Section):
             self.counts.source("window").data = {"left": [first], "right": [end]}
             for layer, position in positions.items():
                 self.counts.mark(layer, position)
+                self.counts.show(layer, has_t_n)  # else its file does not have it either
             self.facts.facts = text.capture_facts(answer, report)
             self.flux.text = text.flux_sentence(report)
             along = scale(self.session.state.unit, gate)
             for sentence, advice in zip(self.advice, text.advice(report, along), strict=True):
                 sentence.text = advice
+            self.advice[1].visible = self.apply[1].visible = has_t_n
             self.apply[0].disabled = suggestion.gate == (0, gate.n_bins)
             self.apply[1].disabled = suggestion.t_n == answer.request.tracking.t_n

@@ -22,7 +22,7 @@ from app.model.store import (
     same_subject,
     same_view,
 )
-from app.model.text import no_estimates
+from app.model.text import failure, no_estimates, refusal
 from app.pages.shared.failures import FailureLog
 from app.tasks.page import PageTasks
 from app.tasks.scheduler import GENERAL, PAGE, SHORT, Lane
@@ -125,6 +125,7 @@ class CurrentEstimate:
 
     def _restore(self, request: Request, error: Exception) -> None:
         """Return to the request that the page still shows, unless the user has moved on."""
+        why = failure(error)
         if request == self.request:
             # Sliders keep their values: the next move starts from there.
             kept = {name: getattr(request, name) for name in ("light", "tracking", "settings")}
@@ -132,10 +133,11 @@ class CurrentEstimate:
             with param.discard_events(self._state):
                 self._state.param.update(parameters_of(shown, self._sources))
             if not (request.source.is_scene or same_subject(request, self.answer.request)):
-                self.refused = Refused.of(request, error)
+                self.refused = Refused.of(request, error, why)
+                why = refusal(self.refused)
         self._end()
         self.changed.emit(self.answer)
-        self._failures.report(error)
+        self._failures.report(error, lambda _: why)
 
     # Progress bar
 

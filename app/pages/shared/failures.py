@@ -33,9 +33,13 @@ class FailureLog:
     ) -> None:
         """Log an error and show a sentence about it, until its part works again."""
         log.warning("a request failed", exc_info=error)
+        self.put(describe(error), part)
+
+    def put(self, sentence: str, part: object = None) -> None:
+        """Show a sentence about a part, until it works again."""
         self._sentences.pop(part, None)  # the latest failure comes last
-        self._sentences[part] = describe(error)
-        self.shown.emit(self._sentences[part])
+        self._sentences[part] = sentence
+        self.shown.emit(sentence)
 
     def resolve(self, part: object) -> None:
         """Remove the failure of a part that works again, or is tried again."""

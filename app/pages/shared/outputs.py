@@ -219,8 +219,10 @@ class Gallery:
             knob.param.watch(lambda _: self._mark(), "value")
         self._scale = ScaleBar()
         self._scale.pane.visible = False
+        self._title = pmui.Typography("", variant="subtitle2", margin=(6, 0))
         self._note = Sentence(text=NOT_COMPUTED, sizing_mode="stretch_width", margin=(4, 0))
         self.layout = pn.Column(
+            self._title,
             self._grid,
             self._scale.pane,
             self._note,
@@ -270,6 +272,7 @@ class Gallery:
         self._mark()
         self._scale.update(_look(item))
         self._scale.pane.visible, self._note.text = True, f"{item.note} {OUTSIDE_NOTE}"
+        self._title.object = f"**{item.title}**"
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,7 +11,7 @@ import panel as pn
 import panel_material_ui as pmui
 
 from app.model.reading import changed_options
-from app.model.store import Request
+from app.model.store import Refused
 from app.model.text import cause
 from app.widgets.cards import button, part, select
 from app.widgets.controls import Sentence
@@ -22,8 +22,6 @@ RECORD_MS = 1500
 
 # Those of panel-material-ui 0.16 are dark in the dark mode, too.
 PLAYER_BUTTONS = {"& .MuiIconButton-root:not(.MuiIconButton-colorPrimary)": {"color": "inherit"}}
-
-QUESTION = "Several arrays of {file} could be the capture. Which one?"
 
 ALL_RECORDS_HELP = "Add up all records of the file."
 
@@ -43,7 +41,7 @@ class ReadingForm:
     part : Part
         The form as a part of the sidebar.
     question : Column
-        A button for each array of a file that could be the capture.
+        A button for each array of a file that could be the capture, and what the file has.
     player : pmui.Player
         Steps through the records of a file that is a sequence in time.
     records : Column
@@ -70,7 +68,15 @@ class ReadingForm:
             is_open=False,
             is_shown=False,
         )
-        self.question = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+        self._choices = pn.FlexBox(margin=0)
+        self._details = Sentence(sizing_mode="stretch_width", margin=8)
+        self.question = pn.Column(
+            self._choices,
+            part("Details", self._details, is_open=False),
+            visible=False,
+            sizing_mode="stretch_width",
+            margin=0,
+        )
         self.player = pmui.Player(
             label="Record",
             show_value=True,
@@ -107,18 +113,16 @@ class ReadingForm:
         self._all.variant = "outlined" if reading.records is not None else "contained"
         self.records.visible = n_records is not None and n_records > 1
 
-    def show_refused(self, request: Request, variables: Sequence[str], is_new: bool) -> None:
-        """Open for a file that was refused, and ask for the array if several could be meant."""
-        name = request.source.title
+    def show_refused(self, refused: Refused, is_new: bool) -> None:
+        """Open for a file that was refused, and offer its arrays if several could be meant."""
+        name = refused.request.source.title
         if is_new:
-            self._fill(request.reading, {})
+            self._fill(refused.request.reading, {})
         self._about.param.update(text=f"For {name}, which could not be read.", visible=is_new)
         self.part.param.update(visible=True, collapsed=False)
-        self.question.visible = bool(variables)
-        self.question[:] = [
-            Sentence(text=QUESTION.format(file=name), sizing_mode="stretch_width", margin=(4, 8)),
-            pn.FlexBox(*map(self._choice, variables)),
-        ]
+        self._choices[:] = [self._choice(each) for each in refused.variables]
+        self._details.text = refused.why
+        self.question.visible = bool(refused.variables)
 
     def _choice(self, variable: str) -> pmui.Button:
         help = f"Read the array {variable}."
