@@ -21,8 +21,9 @@ from app.model.store import built_in_sources
 from app.model.uploads import MAX_UPLOAD_BYTES
 from app.pages.layout import MORE_TRACKING
 from app.pages.shared.illumination import MORE
+from app.pages.shared.photon_budget import TITLE as BUDGET
 from app.theme import DARK, LIGHT, RANGE_COLORS, WRONG_COLOR, Palette
-from core import PRESETS, TrackingParameters
+from core import PRESETS, PhotonBudget, TrackingParameters, scenes
 from core.io.readers.npz import FORMAT
 from core.parameters import spec_of
 from tests.browser import (
@@ -438,6 +439,21 @@ def use_the_controls(start_page: Page) -> None:
     expect(chosen(start_page, "Start")).to_have_text(printed.start)
     choose(start_page, "Weight", "none")
     expect(chosen(start_page, "Preset")).to_have_text("custom")
+    use_a_photon_budget(start_page)
+
+
+def use_a_photon_budget(page: Page) -> None:
+    """Set signal and background by a photon budget, and leave it by moving the signal."""
+    unfold(page, BUDGET)
+    switch = page.get_by_label("Use a photon budget")
+    switch.click()
+    expect(page.get_by_text("S = η · M")).to_be_visible()
+    enter(page, "Pulse energy", "0.8")
+    _, flux = PhotonBudget(0.8).apply(scenes["car"]())
+    expect(field(page, "Signal")).to_have_value(f"{flux.signal:g}")
+    enter(page, "Signal", "0.1041")
+    expect(switch).not_to_be_checked()
+    expect(page.get_by_text("S = η · M")).to_be_hidden()
 
 
 # -- fast moves ------------------------------------------------------------------------------------

@@ -365,10 +365,11 @@ def test_the_command_judges_a_scene_and_writes_a_page(
     tmp_path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "page"
-    arguments = ["requires", "--scene", "car", "--pulses", "50", "--seeds", "2"]
+    arguments = ["requires", "--scene", "car", "--pulses", "50", "--seeds", "2", "--falloff"]
     assert main([*arguments, "--folder", str(page)]) == ACCEPTED
     out = capsys.readouterr().out
     assert "| part or correction | verdict |" in out
+    assert "| fall of the signal with range | " in out
     assert "Cost of absent parts" in out
     assert {path.name for path in page.iterdir()} >= {"index.html", "requirements.csv"}
 
@@ -381,6 +382,7 @@ def test_the_command_judges_a_capture(capsys: pytest.CaptureFixture[str]) -> Non
     assert found["pile_up"]["verdict"] == "needed"
     assert found["motion"]["total_variation"] is None
     assert main(["requires", "--capture", sample, "--sbr", "1"]) == REFUSED
+    assert main(["requires", "--capture", sample, "--falloff"]) == REFUSED
     assert main(["requires", "--scene", "car", "--bins", "7"]) == REFUSED
 
 
