@@ -20,7 +20,8 @@ help: ## list the commands
 app: $(VENV)/.app ## serve the app; CAPTURE=path opens a file
 	$(BIN)/python -m app --port $(PORT) $(if $(CAPTURE),"$(CAPTURE)")
 
-# Tests that wait leave room for a third worker on two cores.
+# Tests that wait leave room for a third worker on two cores; more threads would wait for each other.
+test: export OPENBLAS_NUM_THREADS := 1
 test: $(VENV)/.test ## everything that CI checks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
