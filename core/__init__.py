@@ -90,6 +90,8 @@ PUBLIC_MODULES = (
     "core.studies.ablation",
     "core.studies.lessons",
     "core.studies.paper",
+    "core.studies.pulses",
+    "core.studies.report",
     "core.studies.sensitivity",
     "core.studies.tradeoff",
     "core.studies.trials",

@@ -25,6 +25,7 @@ from core.simulation import simulate
 from core.studies import range_prior
 from core.studies.outputs import Pictures, Plot
 from core.studies.paper.figures import pixel_signals
+from core.studies.pulses import Pulses, photon_times
 from core.tracking import PRESETS, TrackingParameters
 from core.trigger import rate_per_bin, trigger_probability
 
@@ -41,6 +42,9 @@ __all__ = [
 PULSE = Pulse()
 EXPOSURES = tuple(np.geomspace(0.01, 10, 13).tolist())
 """Factors on signal and background at which accuracy is shown."""
+
+MOST_PULSES = 1000
+"""Pulses that are shown one by one."""
 
 _SIDE = 24  # rows and columns of flat targets
 
@@ -71,6 +75,11 @@ class Bench(Settings):
         1000,
         Number("Pulses", 10, 8000, log=True, whole=True, least=1, most=50_000),
         "Pulses per pixel.",
+    )
+    seed: int = parameter(
+        0,
+        Number("Seed", 0, 999, whole=True, least=0, most=2**53),
+        "Random seed of the simulations: the same seed gives the same counts.",
     )
     preset: str = parameter(
         "recommended",
@@ -115,7 +124,7 @@ def _captured(bench: Bench, range_m: float, side: int = 1) -> Capture:
     else:  # the background is all that a scene without a surface returns
         range_m, flux = math.nan, Flux(bench.exposure * bench.background, 1.0)
     scene = Scene(np.full((side, side), range_m))
-    return simulate(scene, bench.acquisition, flux, PULSE)
+    return simulate(scene, bench.acquisition, flux, PULSE, bench.seed)
 
 
 def _centres(bench: Bench) -> Floats:
@@ -135,6 +144,19 @@ def light(bench: Bench) -> Plot:
         _centres(bench),
         {"photons that arrive": bench.n_pulses * _rate(bench)},
         note="What a detector that is always armed would count, on average.",
+    )
+
+
+def pulse_by_pulse(bench: Bench) -> Pulses:
+    """Show the photons of each pulse, and the histogram that their first photons fill."""
+    rate, n_pulses = _rate(bench), min(bench.n_pulses, MOST_PULSES)
+    return Pulses(
+        "pulse_by_pulse",
+        "One pulse, and the histogram so far",
+        *photon_times(rate, n_pulses, bench.seed),
+        trigger_probability(rate),
+        f"{rate.sum():.3g} photons per pulse arrive on average. The first one is recorded; the "
+        "later ones, hollow, are not.",
     )
 
 
@@ -177,7 +199,7 @@ def car_image(bench: Bench) -> Pictures:
     """Show the car by the tracking differentiator, next to its truth."""
     scene = car()
     acquisition = replace(scene.acquisition, n_pulses=bench.n_pulses)
-    capture = simulate(scene, acquisition, bench.flux, PULSE)
+    capture = simulate(scene, acquisition, bench.flux, PULSE, bench.seed)
     found_m = estimate(capture, "tracking", bench.tracking).range_m
     found_m = np.where(np.isfinite(scene.range_m), found_m, np.nan)
     degree = restoration_degree(found_m, scene.range_m, 3 * acquisition.bin_length_m)
@@ -235,12 +257,12 @@ LIMIT = "limit"
 
 def both_scales(bench: Bench) -> Plot:
     """Plot the two scales of a pixel with an echo."""
-    return pixel_signals(bench.onset_bin, bench.tracking, bench.flux)
+    return pixel_signals(bench.onset_bin, bench.tracking, bench.flux, seed=bench.seed)
 
 
 def both_scales_without_echo(bench: Bench) -> Plot:
     """Plot the two scales of a pixel without an echo."""
-    return pixel_signals(math.nan, bench.tracking, bench.flux)
+    return pixel_signals(math.nan, bench.tracking, bench.flux, seed=bench.seed)
 
 
 @lru_cache(maxsize=16)
@@ -267,7 +289,11 @@ PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
 }
 """Views on which a prediction can be drawn."""
 
-VIEWS: Mapping[str, Callable[[Bench], Plot | Pictures]] = {**PLOTS, "car_image": car_image}
+VIEWS: Mapping[str, Callable[[Bench], Plot | Pictures | Pulses]] = {
+    **PLOTS,
+    "car_image": car_image,
+    "pulse_by_pulse": pulse_by_pulse,
+}
 """Views that a lesson can name."""
 
 
