@@ -42,11 +42,14 @@ from app.widgets.cards import choice, part, select
 from app.widgets.connection import Connection
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import file_button
+from app.widgets.glossary import Glossary, explained
 from app.widgets.share import Share
 from core import PRESETS, TrackingParameters
 from core.io import SUFFIXES, ReadOptions, pattern_of
 
 CUSTOM = "custom"
+LEARN = "Learn"
+"""The page with a presenter mode."""
 
 HELP = "About this page"
 MORE_TRACKING = "More tracking settings"
@@ -104,6 +107,9 @@ PRINT = """
 }
 """
 """Style of the printed page: the content alone, with all that is out of view on screen."""
+
+PRESENT = "header, nav, .MuiToolbar-root { display: none !important; }"
+"""Style of presenter mode, which covers the window."""
 
 SKIP_LINK = (Path(__file__).parent.parent / "widgets" / "skip_link.js").read_text("utf-8")
 
@@ -315,7 +321,7 @@ class Layout:
         if self.session.answer.request.reading != ReadOptions():
             self._reading.part.collapsed = False
         self._helps = {
-            each.name: part(HELP, pmui.Typography(each.explanation, margin=8), is_open=False)
+            each.name: part(HELP, explained(each.explanation, margin=8), is_open=False)
             for each in PAGES
             if each.explanation
         }
@@ -340,6 +346,7 @@ class Layout:
         head = pn.Column(
             self._link,
             self._connection,
+            Glossary(margin=0),
             self._busy,
             self.alert,
             sizing_mode="stretch_width",
@@ -399,6 +406,8 @@ class Layout:
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
         self._fit_sidebar()
         state.param.watch(lambda *_: self._follow_unit(), "unit")
+        state.param.watch(lambda *_: self._show_bars(), ["page", "present"])
+        self._show_bars()
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if self._arrivals is not None:
             self._arrivals.subscribe(self._hear_of)
@@ -418,6 +427,12 @@ class Layout:
         if page.is_standalone == self._provenance.visible:
             self._provenance.visible = not page.is_standalone
             self.page.sidebar_open = not (page.is_standalone or self.page.is_narrow)
+
+    def _show_bars(self) -> None:
+        """Hide the header and the sidebar in presenter mode."""
+        state = self.session.state
+        is_presenting = state.present and state.page == LEARN
+        self.page.stylesheets = [PRINT, PRESENT] if is_presenting else [PRINT]
 
     def _show_failure(self, sentence: str) -> None:
         self.alert.text = sentence[:2000]
