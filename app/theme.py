@@ -137,3 +137,27 @@ STYLES: dict[str, dict[str, object]] = {
     },
 }
 """Styles of all plots by Bokeh's model; `paint_frame` sets the colours of a mode."""
+
+LARGE_STYLES: dict[str, dict[str, object]] = {
+    "Title": {"text_font_size": "26px"},
+    "Axis": {
+        "axis_label_text_font_size": "24px",
+        "axis_label_standoff": 6,
+        "major_label_text_font_size": "24px",
+        "major_tick_out": 8,
+        "major_tick_line_width": 2,
+    },
+    "Legend": {
+        "label_text_font_size": "24px",
+        "label_height": 28,
+        "glyph_height": 24,
+        "glyph_width": 40,
+        "spacing": 10,
+        "label_standoff": 8,
+    },
+    "ColorBar": {"title_text_font_size": "24px", "major_label_text_font_size": "24px"},
+}
+"""Sizes of plots in presenter mode, in place of those in `STYLES`."""
+
+LARGE = 2
+"""Width of lines and size of markers in presenter mode, over those elsewhere."""

@@ -93,6 +93,8 @@ PUBLIC_MODULES = (
     "core.studies.budget",
     "core.studies.lessons",
     "core.studies.paper",
+    "core.studies.pulses",
+    "core.studies.report",
     "core.studies.sensitivity",
     "core.studies.tradeoff",
     "core.studies.trials",

@@ -33,7 +33,7 @@ OTHERWISE: dict[str, list[Any]] = {
     ],
     "kept": ["source=car&method=coates", "tracking.l=0.006&light.sbr=2.0"],
     "unread": ["source=two.mat", "source=a%20b&reading.n_bins=40"],
-    "learning": [Learning("2-more-light", "0.3", "5.0"), Learning(answer="0.42")],
+    "learning": [Learning("2-more-light", "0.3", "5.0"), Learning(answer="0.42", step=3)],
     "reading": [ReadOptions(**{name: value}) for name, value in EXAMPLES.items()],
 }
 """Other values of parameters whose kind does not tell which there are."""

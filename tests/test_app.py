@@ -16,6 +16,7 @@ from app.model import colors as looks
 from app.model import text as model_text
 from app.model.address import Link, query_of
 from app.model.capture_defaults import enter
+from app.model.glossary import linked
 from app.model.range_prior import range_prior_of
 from app.model.script import script_of
 from app.model.state import Illumination, ReductionSettings, State, Viewing
@@ -943,7 +944,7 @@ def test_each_page_has_its_own_help_at_the_top_of_the_sidebar(layout):
         layout.session.state.page = page.name
         if help.visible:
             (found[page.name],) = (each.object for each in help.select(pmui.Typography))
-    assert found == {page.name: page.explanation for page in PAGES if page.explanation}
+    assert found == {page.name: linked(page.explanation) for page in PAGES if page.explanation}
     assert {"Explore", "Compare"} <= found.keys()
 
 

@@ -14,6 +14,7 @@ PACKAGE = Path(app.__file__).parent
 ROOMS = (
     {"theme", "units", "tasks"},
     {"model"},
+    {"handout"},
     {"plots"},
     {"widgets"},
     {"pages"},

@@ -12,11 +12,16 @@ import panel_material_ui as pmui
 import pytest
 from playwright.sync_api import Page, expect
 
+from app.handout import handout, main
+from app.model.glossary import ANCHOR, glossary, linked
 from app.model.lessons import PREDICTED, SHAPES, lesson_of, number_of, read_lesson, read_lessons
+from app.model.slides import demonstration, slides_of
 from app.model.state import Learning
 from app.model.store import built_in_sources
+from app.pages.learn.lesson import LessonView
 from app.pages.learn.page import Learn
 from app.pages.session import Session
+from app.widgets.qr_code import QrCode, qr_image
 from core.studies.lessons import CHECKS, NEED_SIGNAL, VIEWS, Bench, require_signal
 from core.studies.outputs import Pictures, Plot
 from tests.browser import enter, eventually, slider
@@ -270,17 +275,196 @@ def test_an_unknown_lesson_of_a_link_is_reported_with_the_first_one():
     assert layout.session.state.learning == Learning()
 
 
+@pytest.fixture
+def presenting(session):
+    """The page in presenter mode."""
+    session.state.present = True
+    page = Learn(session)
+    page.show(True)
+    return page
+
+
+def press(page: Learn, key: str) -> None:
+    page.shown.bar.pressed = [key, page.shown.bar.pressed[1] + 1]
+
+
+def test_a_lecturer_goes_through_the_demonstration_slide_by_slide(presenting):
+    state, seen = presenting.session.state, []
+    keys = demonstration(LESSONS)
+    while (place := (presenting.shown.lesson.key, state.learning.step)) not in seen[-1:]:
+        seen.append(place)
+        press(presenting, "next")
+    assert seen == [(key, at) for key in keys for at in range(len(slides_of(LESSONS[key])))]
+    press(presenting, "1")
+    assert state.learning == Learning(FIRST)
+    press(presenting, "reveal")
+    first_revealed = presenting.shown.slides[state.learning.step]
+    assert first_revealed.view == ("after", LESSONS[FIRST].after[0])
+    press(presenting, "reveal")
+    press(presenting, "back")
+    assert presenting.shown.slides[state.learning.step].reveals
+    press(presenting, "end")
+    assert not state.present
+    assert isinstance(presenting.shown, LessonView)
+
+
+def test_a_slide_is_legible_across_a_room(presenting):
+    for name in LESSONS[FIRST].after:
+        press(presenting, "reveal")
+        shown = presenting.shown.views["after", name]
+        presenting.session.tasks.run_until(lambda shown=shown: shown.item)
+        (figure,) = shown.figures
+        axis, legend = figure.xaxis[0], figure.legend[0]
+        sizes = (axis.axis_label_text_font_size, axis.major_label_text_font_size)
+        assert {*sizes, legend.label_text_font_size} == {"24px"}
+        widths = [each.glyph.line_width for each in figure.renderers]
+        assert all(width >= 3 for width in widths if width)  # bars have no line
+
+
+def test_the_answer_of_a_check_is_computed_when_it_is_revealed(presenting):
+    steps = presenting.shown.slides
+    presenting.session.state.learning = Learning(FIRST, step=len(steps) - 1)
+    answer = f"{LESSONS[FIRST].check.answer:.3g}"
+    text = presenting.shown.layout[1]
+    presenting.session.tasks.run_until(lambda: answer in text.object)
+
+
+def test_a_link_leads_to_a_slide_and_one_beyond_the_last_to_the_last(session):
+    layout = HeldLayout(built_in_sources(), link_to("page=Learn&present=1&learning.step=99"))
+    assert layout.session.refused == []
+    shown = layout.contents["Learn"].shown
+    assert shown.bar.place == f"{len(shown.slides)} / {len(shown.slides)}"
+    refused = link_to("page=Learn&present=1&learning.step=1.5")
+    assert (
+        "learning.step = 1.5 is not accepted" in HeldLayout(built_in_sources(), refused).alert.text
+    )
+
+
+# -- glossary, handout and QR code -----------------------------------------------------------------
+
+
+def test_the_first_occurrence_of_a_term_opens_its_entry():
+    found = linked("# Pile-up\n\nTwo pulses pile up. *Pile-up*: `bin`, [a gate](x), gates, pulse.")
+    pulse, pile_up, gate = (f"]({ANCHOR}{key})" for key in ("pulse", "pile-up", "gate"))
+    assert found == (
+        f"# Pile-up\n\nTwo [pulses{pulse} [pile up{pile_up}. *Pile-up*: `bin`, [a gate](x), "
+        f"[gates{gate}, pulse."
+    )
+    assert linked("the signal-to-background\nratio").endswith(f"ratio]({ANCHOR}sbr)")
+
+
+def test_the_glossary_explains_terms_of_the_lessons():
+    terms = glossary()
+    assert len(terms) >= 25
+    assert len({each.key for each in terms}) == len(terms)
+    assert all(each.meaning.endswith(".") for each in terms)
+    texts = " ".join(each.introduction + each.explanation for each in LESSONS.values())
+    assert linked(texts).count(ANCHOR) > 10
+
+
+def test_a_handout_has_room_for_answers_and_the_key_has_the_answers(tmp_path):
+    first = LESSONS[FIRST]
+    answer = f"<strong>{first.check.answer:.3g}</strong>"
+    sheet, key = handout([first], 3), handout([first], 3, is_key=True)
+    assert "Your answer" in sheet and answer not in sheet
+    assert answer in key and all(escape(hint.text) in key for hint in first.check.hints)
+    assert "http" not in re.sub(r"data:image[^\"]*", "", sheet + key)  # needs no network
+    assert handout([first], 4) != sheet == handout([first], 3)
+    path = tmp_path / "mine.html"
+    assert main([FIRST, "--student", "3", "--key", "-o", str(path)]) == 0
+    assert path.read_text("utf-8") == key
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["9-none"], "LESSON = '9-none' is not accepted: give 1-first-photon"),
+        (["--student", "-1"], "seed = -1 is not accepted"),
+        (["-o", "nowhere/x.html"], "nowhere"),
+    ],
+)
+def test_a_handout_that_cannot_be_made_is_refused(capsys, arguments, message):
+    with pytest.raises(SystemExit):
+        main([FIRST, *arguments] if arguments[0].startswith("-") else arguments)
+    assert message in capsys.readouterr().err
+
+
+def test_a_qr_code_is_an_image_and_long_links_have_none():
+    assert qr_image("http://lab.example.org/?page=Learn").startswith("data:image/svg+xml")
+    code = QrCode()
+    code.asked = ["x" * 2000, 7]
+    assert code.image == ["", 7]
+    assert "at most 600 characters" in code.problem
+
+
 # -- in a browser ----------------------------------------------------------------------------------
+
+
+def fill_the_histogram(here: Page) -> None:
+    """Add pulses one by one, play, pause, and show all of them, by keyboard."""
+    player = here.get_by_role("group", name=re.compile("^Histogram that fills"))
+    said = player.get_by_role("status")
+    expect(said).to_contain_text("Pulse 1 of 1,000")
+    player.press("ArrowRight")
+    expect(said).to_contain_text("Pulse 2 of 1,000")
+    player.press("Space")
+    expect(said).to_contain_text(re.compile(r"Pulse \d\d of"))
+    player.press("Space")
+    expect(player.get_by_role("button", name="Play")).to_be_visible()
+    player.press("Home")
+    expect(said).to_contain_text("Pulse 1 of 1,000")
+    here.emulate_media(reduced_motion="reduce")
+    player.press("Space")
+    expect(said).to_contain_text("Pulse 1,000 of 1,000")
+
+
+def present_the_first_lesson(here: Page) -> None:
+    """Step through slides on a projector by keyboard, and return."""
+    here.set_viewport_size({"width": 1024, "height": 768})
+    here.get_by_role("button", name=re.compile("^Present:")).press("Enter")
+    slides = here.get_by_role("navigation", name="Slides")
+    expect(slides.get_by_role("status")).to_have_text("1 / 8")
+    expect(here.get_by_role("button", name="Toggle theme")).to_be_hidden()
+    here.keyboard.press("ArrowRight")
+    expect(slides.get_by_role("status")).to_have_text("2 / 8")
+    here.keyboard.press("r")
+    said = here.get_by_role("status").filter(has_text="Pulse")
+    expect(said).to_contain_text("Pulse 1 of 1,000")
+    here.keyboard.press("Space")
+    expect(said).to_contain_text("Pulse 1,000 of 1,000")
+    sizes = here.locator("p, h1, li").filter(visible=True).evaluate_all(FONT_SIZES)
+    assert min(sizes) >= 24
+    here.keyboard.press("b")
+    expect(slides.locator(".blank")).to_be_visible()
+    here.keyboard.press("b")
+    here.keyboard.press("2")
+    expect(here.get_by_role("heading", name="More light, worse picture")).to_be_visible()
+    here.keyboard.press("Escape")
+    expect(here.get_by_role("button", name="Toggle theme")).to_be_visible()
+
+
+FONT_SIZES = "all => all.map((each) => parseFloat(getComputedStyle(each).fontSize))"
+
+
+def look_up_a_term(here: Page) -> None:
+    """Open the glossary from a dotted word, and close it, by keyboard."""
+    here.get_by_role("link", name="bin", exact=True).first.press("Enter")
+    glossary = here.get_by_role("dialog", name="Glossary")
+    expect(glossary.get_by_text("Interval of the gate")).to_be_in_viewport()
+    here.keyboard.press("Escape")
+    expect(glossary).to_be_hidden()
 
 
 def take_the_first_lesson(here: Page) -> None:
     """Predict, move the control and answer, wrongly and then rightly, by keyboard."""
     expect(here.get_by_text("Now move this control")).to_be_hidden()
+    look_up_a_term(here)
     here.get_by_role("button", name="falling", exact=True).press("Enter")
     predict = here.get_by_role("button", name=re.compile("^Predict"))
     predict.press("Enter")
     expect(here.get_by_text("Now move this control")).to_be_visible()
     expect(predict).to_be_disabled()
+    fill_the_histogram(here)
     moved = slider(here, "Background (per pulse)").filter(visible=True)
     moved.press("ArrowRight")
     expect(here.get_by_text("The light has no slope")).to_be_visible()
@@ -290,3 +474,4 @@ def take_the_first_lesson(here: Page) -> None:
     eventually(lambda: "learning.answer=0.42" in here.evaluate("location.href"))
     here.reload()
     expect(here.get_by_role("status").filter(has_text="Right: 0.42.")).to_be_visible()
+    present_the_first_lesson(here)

@@ -32,11 +32,11 @@ PAGE_NAMES = [page.name for page in PAGES]
 
 NOT_CODE = {
     *("cloud_color", "unit", "kept", "unread", "study", "reported", "held", "echo_free"),
-    "learning",
+    *("learning", "present"),
 }
 """Parameters without an effect on arrays: colours, units on axes, the estimate kept as A, a file
 that could not be read, the sections of Trade-off and Paper, whose scripts name a command, what a
-slider leaves alone, whether estimates are simulated without an echo, and lessons."""
+slider leaves alone, whether estimates are simulated without an echo, lessons, and slides."""
 
 RUN_EACH = """
 import os, runpy, sys

@@ -22,6 +22,10 @@ from core.checks import require
 from core.parameters import Choice, spec_of
 from core.studies import outputs
 from core.studies.lessons import CHECKS, PLOTS, VIEWS, Bench, arguments_of, require_signal
+from core.studies.pulses import Pulses
+
+Item = outputs.Plot | outputs.Pictures | Pulses
+"""What a view shows."""
 
 FENCE, RULE = "+++", "\n---\n"
 BUILT_IN = Path(str(resources.files("app"))) / "lessons"
@@ -157,9 +161,7 @@ class Lesson:
             require_signal(name, bench)
         return bench
 
-    def seen(
-        self, name: str, bench: Bench, committed: str | float | None
-    ) -> outputs.Plot | outputs.Pictures:
+    def seen(self, name: str, bench: Bench, committed: str | float | None) -> Item:
         """Return a view, with the prediction if it belongs there."""
         if committed is not None and name == self.prediction.view:
             return self.prediction.drawn(PLOTS[name](bench), committed)

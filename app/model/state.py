@@ -257,6 +257,12 @@ class Learning:
     """Value of the lesson's control."""
     answer: str = ""
     """Answer to the lesson's check."""
+    step: int = 0
+    """Slide in presenter mode."""
+
+    def __post_init__(self) -> None:
+        accepted = isinstance(self.step, int) and self.step >= 0
+        require("learning.step", self.step, accepted, "an integer, 0 or more")
 
 
 IMAGES = ("Estimate", "Truth", "Error", "Counts")
@@ -424,6 +430,9 @@ class State(param.Parameterized):
     comparison = param.ClassSelector(class_=Comparison, default=Comparison())
 
     learning = param.ClassSelector(class_=Learning, default=Learning())
+    present = param.Boolean(
+        default=False, doc="Whether the Learn page shows one slide, in the whole window."
+    )
 
     @property
     def box(self) -> Box:

@@ -16,6 +16,7 @@ from panel_material_ui.template.base import Meta
 
 from app.model import text
 from app.model.address import Link
+from app.model.glossary import linked
 from app.model.lessons import Lesson
 from app.model.methods import doubts_hold
 from app.model.reading import options_in_use
@@ -43,11 +44,14 @@ from app.widgets.cards import choice, part, select
 from app.widgets.connection import Connection
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import file_button
+from app.widgets.glossary import Glossary, explained
 from app.widgets.share import Share
 from core import PRESETS, TrackingParameters
 from core.io import SUFFIXES, ReadOptions, pattern_of
 
 CUSTOM = "custom"
+LEARN = "Learn"
+"""The page with a presenter mode."""
 
 HELP = "About this page"
 MORE_TRACKING = "More tracking settings"
@@ -105,6 +109,9 @@ PRINT = """
 }
 """
 """Style of the printed page: the content alone, with all that is out of view on screen."""
+
+PRESENT = "header, nav, .MuiToolbar-root { display: none !important; }"
+"""Style of presenter mode, which covers the window."""
 
 SKIP_LINK = (Path(__file__).parent.parent / "widgets" / "skip_link.js").read_text("utf-8")
 
@@ -314,7 +321,7 @@ class Layout:
         self._light_part = part("Simulation", self._panels["light"].layout, is_shown=False)
         if self.session.answer.request.reading != ReadOptions():
             self._reading.part.collapsed = False
-        self._explanation = pmui.Typography(margin=8)
+        self._explanation = explained("", margin=8)
         self._help = part(HELP, self._explanation, is_open=False)
         tracking = self._panels["tracking"]
         rare = [name for name in tracking.controls if name not in COMMON]
@@ -337,6 +344,7 @@ class Layout:
         head = pn.Column(
             self._link,
             self._connection,
+            Glossary(margin=0),
             self._busy,
             self.alert,
             self._reading.question,
@@ -397,6 +405,8 @@ class Layout:
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
         self._fit_sidebar()
         state.param.watch(lambda *_: self._follow_unit(), "unit")
+        state.param.watch(lambda *_: self._show_bars(), ["page", "present"])
+        self._show_bars()
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if self._arrivals is not None:
             self._arrivals.subscribe(self._hear_of)
@@ -408,13 +418,20 @@ class Layout:
         """Show the controls that affect the open page."""
         page = self._pages[self.pages.choice.value]
         shows_other = Shared.METHOD in page.shared and self.session.answer.method != "tracking"
-        self._explanation.object, self._help.visible = page.explanation, bool(page.explanation)
+        self._explanation.object = linked(page.explanation)
+        self._help.visible = bool(page.explanation)
         for each, content in self._shared.items():
             is_other = each is Shared.TRACKING and shows_other
             content.visible = each in page.shared and not is_other
         if page.is_standalone == self._provenance.visible:
             self._provenance.visible = not page.is_standalone
             self.page.sidebar_open = not (page.is_standalone or self.page.is_narrow)
+
+    def _show_bars(self) -> None:
+        """Hide the header and the sidebar in presenter mode."""
+        state = self.session.state
+        is_presenting = state.present and state.page == LEARN
+        self.page.stylesheets = [PRINT, PRESENT] if is_presenting else [PRINT]
 
     def _show_failure(self, sentence: str) -> None:
         self.alert.text = sentence[:2000]

@@ -19,6 +19,7 @@ from bokeh.models import (
     Legend,
     LegendItem,
     LinearColorMapper,
+    Range1d,
     Span,
 )
 from bokeh.plotting import figure
@@ -32,6 +33,7 @@ from app.units import Scale
 from core.io import OUTSIDE_COLOR
 from core.studies import outputs as items
 from core.studies.paper import figures as paper
+from core.studies.pulses import Pulses
 
 Array = NDArray[Any]
 
@@ -315,6 +317,7 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "theory, flux known": ("text", [2, 4]),
     "estimates, no echo": ("estimate", []),
     "even": ("muted", [6, 3]),
+    "exposure": ("muted", [6, 3]),
     "echoes found": ("truth", []),
     "photons that arrive": ("large", []),
     "expected": ("expected", [2, 2]),
@@ -403,6 +406,62 @@ def value_read_out(picture: Any, unit: str = "") -> HoverTool:
     shown = CustomJSHover(args={"source": picture.data_source, "unit": unit}, code=READ_OUT)
     tips = [("Row", "$y{0}"), ("Column", "$x{column}"), ("Value", "$x{value}")]
     return HoverTool(renderers=[picture], tooltips=tips, formatters={"$x": shown})
+
+
+PULSE_LAYERS = {
+    "histogram": ("raw", "first photons so far"),
+    "expected": ("expected", "expected"),
+    "first photon": ("large", "first photon of this pulse"),
+    "later photons": ("muted", "its later photons, lost"),
+}
+"""Layers of `pulse_figure`: colour in the palette, and name in the legend."""
+
+
+def pulse_figure(item: Pulses) -> Any:
+    """Plot a histogram that the browser fills, below the photons of one pulse.
+
+    Its renderers have the names of `PULSE_LAYERS`; `paint_pulses` sets their colours.
+    """
+    n_bins = item.probability.size
+    drawing = figure(
+        title=item.title,
+        x_axis_label="Bin (1 ns)",
+        y_axis_label="Counts",
+        x_range=Range1d(0, n_bins),
+        y_range=Range1d(0, 1),
+        extra_y_ranges={"photons": Range1d(0, 1)},
+        sizing_mode="stretch_both",
+        min_height=120,
+        tools="",
+        toolbar_location=None,
+    )
+    places = {"source": _empty("x", "y"), "y_range_name": "photons", "size": 9, "line_width": 1.5}
+    drawn = {
+        "histogram": drawing.vbar("x", 1.0, "top", source=_empty("x", "top"), line_width=0),
+        "expected": drawing.line("x", "y", source=_empty("x", "y"), line_width=2, line_dash=[2, 2]),
+        "first photon": drawing.scatter("x", "y", **places),
+        "later photons": drawing.scatter(
+            "x", "y", **places | {"source": _empty("x", "y")}, fill_alpha=0
+        ),
+    }
+    for name, renderer in drawn.items():
+        renderer.name = name
+    entries = [LegendItem(label=PULSE_LAYERS[name][1], renderers=[drawn[name]]) for name in drawn]
+    drawing.add_layout(
+        Legend(items=entries, orientation="horizontal", ncols=2, background_fill_alpha=0.0), "above"
+    )
+    drawing.min_border_right = 32
+    drawing.yaxis.ticker.min_interval = 1
+    return drawing
+
+
+def paint_pulses(drawing: Any, colors: Palette) -> None:
+    """Set the colours of the layers of `pulse_figure`."""
+    for name, (color, _) in PULSE_LAYERS.items():
+        glyph = drawing.select_one({"name": name}).glyph
+        glyph.line_color = getattr(colors, color)
+        if hasattr(glyph, "fill_color"):
+            glyph.fill_color = getattr(colors, color)
 
 
 def pictures(item: items.Pictures) -> list[Any]:

@@ -266,9 +266,10 @@ class Sentence(Component):
     _stylesheets: ClassVar = [
         """
         .note, .warning {
-          font: 12px/1.4 var(--mui-font-family, Roboto, system-ui, sans-serif);
+          font: var(--type-size, 12px)/1.4 var(--mui-font-family, Roboto, system-ui, sans-serif);
           color: var(--mui-palette-text-primary, #1c2430);
         }
+        .note { display: var(--note-display, block); }
         .warning {
           font-size: 14px; margin: 4px 0; padding: 8px 12px; border-radius: 4px;
           border: 1px solid #ed6c02; border-left-width: 6px;

@@ -15,7 +15,7 @@ from bokeh.models import ColorBar, CustomJS, Range1d
 from numpy.typing import ArrayLike
 
 from app.model.exports import Curve, Write, plot_file
-from app.theme import RAISED, STYLES, WRAPPED, Palette
+from app.theme import LARGE, LARGE_STYLES, RAISED, STYLES, WRAPPED, Palette
 from app.units import ShownGate
 
 
@@ -121,16 +121,33 @@ def pane_of(figure: Any) -> pn.pane.Bokeh:
     for renderer in figure.renderers:
         # Nothing can be selected in a plot: these glyphs would only be sent and built.
         renderer.update(selection_glyph=None, nonselection_glyph=None, muted_glyph=None)
-    for model in (figure, figure.title, *figure.axis, *figure.legend, *color_bars(figure)):
-        for kind, sizes in STYLES.items():
-            if isinstance(model, getattr(bokeh.models, kind)):
-                model.update(**sizes)
+    _style(figure, STYLES)
     for legend in figure.legend:
         if legend in figure.center:
             legend.stylesheets = [WRAPPED]
         elif legend in figure.above:
             legend.stylesheets = [RAISED]
     return pn.pane.Bokeh(figure, sizing_mode="stretch_both", margin=0)
+
+
+def enlarge(figure: Any) -> None:
+    """Make the text, lines and markers of a figure legible across a room."""
+    _style(figure, LARGE_STYLES)
+    for renderer in figure.renderers:
+        glyph = renderer.glyph
+        if getattr(glyph, "line_width", 0):
+            glyph.line_width = LARGE * glyph.line_width
+            glyph.line_dash = [round(LARGE * each) for each in glyph.line_dash]
+        if hasattr(glyph, "size"):
+            glyph.size = LARGE * glyph.size
+
+
+def _style(figure: Any, styles: Mapping[str, Mapping[str, object]]) -> None:
+    """Apply the styles of each kind of model to a figure and its parts."""
+    for model in (figure, figure.title, *figure.axis, *figure.legend, *color_bars(figure)):
+        for kind, sizes in styles.items():
+            if isinstance(model, getattr(bokeh.models, kind)):
+                model.update(**sizes)
 
 
 def around(border_px: Mapping[str, int]) -> tuple[int, int]:

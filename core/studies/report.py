@@ -30,9 +30,14 @@ from core.studies.outputs import (
     as_text,
     columns_and_rows,
 )
+from core.studies.pulses import Pulses
+
+__all__ = ["picture", "write"]
 
 _STYLES = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
+_DRAWN_PULSES = 10
+_KEPT = "kept"  # what blank axes keep
 _MAX_FINE_SPAN = 1e4  # longer logarithmic axes are labelled at powers of ten only
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
@@ -90,6 +95,21 @@ def write(items: Sequence[Item], folder: Path, title: str, introduction: Sequenc
     return page
 
 
+def picture(item: Plot | Scatter | Pictures | Pulses, is_blank: bool = False) -> str:
+    """Return an item as the address of an image, which holds the image itself.
+
+    With `is_blank`, axes alone are drawn, to sketch on; of pulses, also the photons.
+    """
+    figure = _draw(item)
+    if is_blank:
+        for axes in figure.axes:
+            for drawn in (*axes.lines, *axes.patches, *axes.collections, axes.get_legend()):
+                if drawn is not None and drawn.get_gid() != _KEPT:
+                    drawn.set_visible(False)
+    kind, media = ("png", "png") if isinstance(item, Pictures) else ("svg", "svg+xml")
+    return f"data:image/{media};base64,{b64encode(_saved(figure, kind)).decode()}"
+
+
 def _html_table(table: Table) -> str:
     forms = [table.formats.get(name, "") for name in table.columns]
     lines = ["".join(f"<th>{html.escape(name)}</th>" for name in table.columns)]
@@ -107,9 +127,11 @@ def _html_cell(value: Any, form: str) -> str:
     return f"<td{attribute}>{text}</td>"
 
 
-def _draw(item: Plot | Scatter | Pictures) -> Figure:
+def _draw(item: Plot | Scatter | Pictures | Pulses) -> Figure:
     if isinstance(item, Plot):
         figure = _draw_curves(item)
+    elif isinstance(item, Pulses):
+        figure = _draw_pulses(item)
     else:
         figure = _draw_scatter(item) if isinstance(item, Scatter) else _draw_pictures(item)
     ConstrainedLayoutEngine().execute(figure)  # once, instead of once per format
@@ -139,6 +161,26 @@ def _draw_curves(plot: Plot) -> Figure:
     if plot.x_is_log:
         _log(axes, "x")
     _label(axes, plot)
+    return figure
+
+
+def _draw_pulses(item: Pulses) -> Figure:
+    """Draw the photons of the first pulses above the histogram of the first photons of all."""
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    begins = [0, *item.ends]
+    for pulse in range(min(_DRAWN_PULSES, item.ends.size)):
+        times = item.times[begins[pulse] : begins[pulse + 1]]
+        row = np.full(times.size, pulse + 1)
+        above.scatter(times, row, 70, facecolors="none", edgecolors="black", gid=_KEPT)
+        above.scatter(times[:1], row[:1], 70, color="C1")
+    above.set(title=item.title, ylabel="Pulse", ylim=(_DRAWN_PULSES + 0.7, 0.3))
+    above.set_yticks(range(1, _DRAWN_PULSES + 1))
+    bins = np.arange(item.probability.size) + 0.5
+    below.bar(bins, item.histogram, 1.0, color="C7")
+    below.set(xlabel="Bin (1 ns)", ylabel="Counts", xlim=(0, item.probability.size))
+    for axes in (above, below):
+        axes.grid(alpha=0.3)
     return figure
 
 

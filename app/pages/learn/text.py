@@ -9,6 +9,9 @@ SHAPES_HELP = "Shape of the histogram that you expect."
 AGAIN_HELP = "Start again: clear the prediction and the answer of this lesson."
 CHECK_HELP = "Check: compares your answer with a computation."
 
+PRESENT_HELP = "Present: this lesson in the whole window, one slide at a time, by keyboard."
+DEMONSTRATION_HELP = "Twenty-minute demonstration: lessons 1, 2, 4 and 7 as slides."
+
 MOVE = "Now move this control; everything else stays."
 
 NO_SIDEBAR = "This page has its own controls; the other pages' controls are hidden."

@@ -31,7 +31,15 @@ from app.plots import elements as plots
 from app.theme import LIGHT, RANGE_COLORS, Palette
 from app.widgets.cards import card
 from app.widgets.controls import Knob, Sentence, Table
-from app.widgets.figures import Layers, around, paint_frame, pane_of, proportioned, round_up
+from app.widgets.figures import (
+    Layers,
+    around,
+    enlarge,
+    paint_frame,
+    pane_of,
+    proportioned,
+    round_up,
+)
 from app.widgets.image_view import CONTAINER, JOINED_BORDER_PX
 from app.widgets.method_picture import ScaleBar
 from core.io import ColorScale
@@ -51,6 +59,13 @@ GRID = """
 PICTURE_HEIGHT = 300
 BORDER_PX = {**JOINED_BORDER_PX, "top": 26}
 """Room around a picture of a gallery, with its title."""
+
+FILLED = ":host { display: flex !important; flex-direction: column; height: 100% !important; }"
+FILLING = ":host { flex: 1 1 0 !important; min-height: 0; grid-template-rows: 100%; }"
+FULL = ":host { height: 100% !important; min-height: 0 !important; }"
+LARGE_BORDER_PX = {"left": 4, "right": 4, "top": 40, "bottom": 4}
+LARGE_SCALE_PX = 88
+"""Room and style where pictures fill their container."""
 
 FORMATS = {"SBR": "g", "ms": ".1f"}
 """Formats of columns whose numbers need no four decimals."""
@@ -80,6 +95,11 @@ class CurveCard:
     def figure(self) -> Any:
         """The figure; None before the first curves."""
         return self._plot and self._plot.figure
+
+    @property
+    def figures(self) -> list[Any]:
+        """The figure, once there are curves."""
+        return [] if self._plot is None else [self._plot.figure]
 
     def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
         """Add a download button, shown with the first curves."""
@@ -203,14 +223,23 @@ class TableCard:
 
 
 class Gallery:
-    """Pictures on one colour scale; a tap, or row and column, compare one pixel in all of them."""
+    """Pictures on one colour scale; a tap, or row and column, compare one pixel in all of them.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    is_large : bool
+        Whether they fill their container, without axes, under titles legible across a room.
+    """
+
+    def __init__(self, is_large: bool = False) -> None:
+        self._is_large = is_large
+        self._border_px = LARGE_BORDER_PX if is_large else BORDER_PX
         self._drawn: list[Layers] = []
         self._item: items.Pictures | None = None
         self._colors = LIGHT
         self._framed: Callable[[Any, str], Any] = lambda pane, _: pane
-        self._grid = pn.Column(stylesheets=[GRID], sizing_mode="stretch_width", margin=0)
+        styles = [GRID, FILLING] if is_large else [GRID]
+        self._grid = pn.Column(stylesheets=styles, sizing_mode="stretch_width", margin=0)
         self.place = [
             Knob.of(Number(symbol, 0, 63, whole=True), 32, PLACE_HELP)
             for symbol in ("Row", "Column")
@@ -218,7 +247,7 @@ class Gallery:
         for knob in self.place:
             knob.param.watch(lambda _: self._mark(), "value")
         self._scale = ScaleBar()
-        self._scale.pane.visible = False
+        self._scale.figure.visible = False
         self._title = pmui.Typography("", variant="subtitle2", margin=(6, 0))
         self._note = Sentence(text=NOT_COMPUTED, sizing_mode="stretch_width", margin=(4, 0))
         self.layout = pn.Column(
@@ -226,10 +255,14 @@ class Gallery:
             self._grid,
             self._scale.pane,
             self._note,
-            stylesheets=[FREE],
+            stylesheets=[FREE, FILLED] if is_large else [FREE],
             sizing_mode="stretch_width",
             margin=0,
         )
+        if is_large:
+            self._framed = lambda pane, _: self._held(pane)
+            self._scale.figure.height = LARGE_SCALE_PX
+            enlarge(self._scale.figure)
 
     def offer(self, session: Session, subject: Callable[[], Subject]) -> None:
         """Add a download button to each picture."""
@@ -244,14 +277,16 @@ class Gallery:
             files = {"csv": image_file(item.images[name], look, pane.object, Grid())}
             return Shown(subject(), f"{item.key} {name}", files, scale=look)
 
-        holder = pn.Column(
+        return downloadable(self._held(pane), session, spelled(name), show, PLOT)
+
+    def _held(self, pane: Any) -> pn.Column:
+        return pn.Column(
             pane,
-            stylesheets=[CONTAINER, FREE],
+            stylesheets=[CONTAINER, FREE, *([FULL] if self._is_large else [])],
             sizing_mode="stretch_width",
-            height=PICTURE_HEIGHT,
+            height=None if self._is_large else PICTURE_HEIGHT,
             margin=0,
         )
-        return downloadable(holder, session, spelled(name), show, PLOT)
 
     @property
     def figures(self) -> list[Any]:
@@ -271,7 +306,7 @@ class Gallery:
         self._item = item
         self._mark()
         self._scale.update(_look(item))
-        self._scale.pane.visible, self._note.text = True, f"{item.note} {OUTSIDE_NOTE}"
+        self._scale.figure.visible, self._note.text = True, f"{item.note} {OUTSIDE_NOTE}"
         self._title.object = f"**{item.title}**"
 
     def paint(self, colors: Palette) -> None:
@@ -286,8 +321,9 @@ class Gallery:
         panes = [pane_of(drawing) for drawing in self.figures]
         rows, cols = next(iter(item.images.values())).shape
         for drawing in self.figures:
-            drawing.update(**{f"min_border_{side}": px for side, px in BORDER_PX.items()})
-            drawing.stylesheets = [proportioned(cols / rows, *around(BORDER_PX))]
+            drawing.update(**{f"min_border_{side}": px for side, px in self._border_px.items()})
+            drawing.stylesheets = [proportioned(cols / rows, *around(self._border_px))]
+            drawing.axis.visible = not self._is_large
             paint_frame(drawing, self._colors)
             drawing.on_event(Tap, self._tapped)
         self._grid.objects = [
@@ -311,7 +347,8 @@ class Gallery:
             text = "no target" if math.isnan(range_m) else number(range_m, "m")
             for layer in ("shadow", "frame"):
                 drawn.write(layer, **{side: [at] for side, at in sides.items()})
-            drawn.figure.title.text = f"{spelled(name)}: {text}"
+            title = spelled(name)
+            drawn.figure.title.text = title if self._is_large else f"{title}: {text}"
 
 
 def _required(item: Item | None) -> Item:

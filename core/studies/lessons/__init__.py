@@ -12,6 +12,7 @@ from core.checks import require
 from core.studies.lessons import accuracy, images, pile_up, tracking
 from core.studies.lessons.bench import Bench
 from core.studies.outputs import Pictures, Plot
+from core.studies.pulses import Pulses
 
 __all__ = [
     "CHECKS",
@@ -60,11 +61,16 @@ PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
 }
 """Views on which a prediction can be drawn."""
 
-VIEWS: Mapping[str, Callable[[Bench], Plot | Pictures]] = {
+VIEWS: Mapping[str, Callable[[Bench], Plot | Pictures | Pulses]] = {
     **PLOTS,
     **{
         each.__name__: each
-        for each in (pile_up.car_image, images.agreement, images.neighbours_image)
+        for each in (
+            pile_up.car_image,
+            pile_up.pulse_by_pulse,
+            images.agreement,
+            images.neighbours_image,
+        )
     },
 }
 """Views that a lesson can name."""
@@ -117,6 +123,7 @@ NEED_SIGNAL = frozenset({*VIEWS, *CHECKS}) - {
         share_of_gate,
         pile_up.light,
         pile_up.first_photons,
+        pile_up.pulse_by_pulse,
         pile_up.still_armed,
         pile_up.share_armed,
         pile_up.share_fired,

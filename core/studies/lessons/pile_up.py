@@ -16,10 +16,14 @@ from core.inference.limits import best_exposure, right_bin_probability
 from core.metrics import restoration_degree
 from core.studies.lessons.bench import PULSE, SIDE, Bench, captured, centres, flat_target, rate_of
 from core.studies.outputs import Pictures, Plot
+from core.studies.pulses import Pulses, photon_times
 from core.trigger import trigger_probability
 
 EXPOSURES = tuple(np.geomspace(0.01, 10, 13).tolist())
 """Factors on signal and background at which accuracy is shown."""
+
+MOST_PULSES = 1000
+"""Pulses that are shown one by one."""
 
 
 def light(bench: Bench) -> Plot:
@@ -32,6 +36,19 @@ def light(bench: Bench) -> Plot:
         centres(bench),
         {"photons that arrive": bench.n_pulses * rate_of(bench)},
         note="What a detector that is always armed would count, on average.",
+    )
+
+
+def pulse_by_pulse(bench: Bench) -> Pulses:
+    """Show the photons of each pulse, and the histogram that their first photons fill."""
+    rate, n_pulses = rate_of(bench), min(bench.n_pulses, MOST_PULSES)
+    return Pulses(
+        "pulse_by_pulse",
+        "One pulse, and the histogram so far",
+        *photon_times(rate, n_pulses, bench.seed),
+        trigger_probability(rate),
+        f"{rate.sum():.3g} photons per pulse arrive on average. The first one is recorded; the "
+        "later ones, hollow, are not.",
     )
 
 

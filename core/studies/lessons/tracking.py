@@ -30,12 +30,12 @@ WEIGHTS: tuple[Weight, ...] = ("cubic", "exponential")
 
 def both_scales(bench: Bench) -> Plot:
     """Plot the two scales of a pixel with an echo."""
-    return pixel_signals(bench.onset_bin, bench.tracking, bench.flux)
+    return pixel_signals(bench.onset_bin, bench.tracking, bench.flux, seed=bench.seed)
 
 
 def both_scales_without_echo(bench: Bench) -> Plot:
     """Plot the two scales of a pixel without an echo."""
-    return pixel_signals(math.nan, bench.tracking, bench.flux)
+    return pixel_signals(math.nan, bench.tracking, bench.flux, seed=bench.seed)
 
 
 @lru_cache(maxsize=16)
