@@ -68,6 +68,16 @@ def test_bounds_contain_the_target_without_scattered_points(rng):
     assert bounds[3] - bounds[2] < 2 * (exact[3] - exact[2])
 
 
+def test_bounds_contain_a_slope_before_a_wall_of_more_points(rng):
+    row, col = np.mgrid[0:64, 0:64]
+    truth = np.where(col < 24, 50 + 0.05 * row, 56.0)
+    false = rng.random(truth.shape) < 0.005
+    range_m = np.where(false, rng.uniform(30, 300, truth.shape), truth)
+    cloud = point_cloud(range_m, ANGLE, confidence=np.where(false, 0.1, 0.95))
+    _, _, near, far, _, _ = view_bounds(cloud)
+    assert (near, far) == (pytest.approx(50, abs=0.5), pytest.approx(56, abs=0.5))
+
+
 def test_bounds_of_a_target_that_fills_the_gate_contain_nearly_all(rng):
     _, _, near, far, _, _ = view_bounds(point_cloud(rng.uniform(100, 200, (64, 64)), ANGLE))
     assert (near, far) == (pytest.approx(100, abs=1.5), pytest.approx(200, abs=1.5))

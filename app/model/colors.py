@@ -178,7 +178,7 @@ def cloud_of(
     range_m = np.where(visible, answer.run.image.range_m, np.nan)
     wrong = is_wrong(answer)
     return (
-        point_cloud(range_m, angle_rad),
+        point_cloud(range_m, angle_rad, confidence=answer.run.image.confidence),
         look.rgb(values[visible]),
         None if wrong is None else wrong[visible],
     )

@@ -7,6 +7,7 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 from core.geometry import points_m
+from core.inspection import CONFIDENT
 
 Floats = NDArray[np.float64]
 
@@ -69,16 +70,18 @@ def spacing_m(cloud: pv.PolyData) -> float:
 def view_bounds(cloud: pv.PolyData, keep: ArrayLike | None = None) -> list[float]:
     """Return a box around the target that leaves out points scattered through the gate.
 
-    False detections are spread evenly over the gate. A slice of range therefore belongs to the
-    target where it holds clearly more points than the median slice. If most points lie outside such
-    slices, the target fills the gate, and nearly all ranges are included.
+    It holds nearly all points to keep. Without any, since false detections are spread evenly over
+    the gate, a slice of range belongs to the target where it holds clearly more points than the
+    median slice. If most points lie outside such slices, the target fills the gate, and nearly all
+    ranges are included.
 
     Parameters
     ----------
     cloud : pyvista.PolyData
         From `point_cloud`.
     keep : array_like of bool, shape (point,), optional
-        Points to use, such as those known to be right; all points if none is set.
+        Points to keep, such as those known to be right; by default those whose point data
+        ``confidence`` is high.
 
     Returns
     -------
@@ -87,11 +90,16 @@ def view_bounds(cloud: pv.PolyData, keep: ArrayLike | None = None) -> list[float
     """
     if cloud.n_points == 0:
         return []
-    kept = np.ones(cloud.n_points, bool) if keep is None else np.asarray(keep, bool)
-    if not kept.any():
-        kept = ~kept
-    points, ranges = np.asarray(cloud.points)[kept], np.asarray(cloud["range_m"])[kept]
-    low, high = _target_ranges(ranges)
+    points, ranges = np.asarray(cloud.points), np.asarray(cloud["range_m"])
+    if keep is None and "confidence" in cloud.point_data:
+        keep = cloud["confidence"] >= CONFIDENT
+    if keep is not None and np.any(keep):
+        kept = np.asarray(keep, bool)
+        points, ranges = points[kept], ranges[kept]
+        low = np.percentile(ranges, 1, method="lower")
+        high = np.percentile(ranges, 99, method="higher")
+    else:
+        low, high = _target_ranges(ranges)
     inside = points[(ranges >= low) & (ranges <= high)]
     margin = spacing_m(cloud)
     box = np.column_stack([inside.min(axis=0) - margin, inside.max(axis=0) + margin])

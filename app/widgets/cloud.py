@@ -92,7 +92,8 @@ class PointCloud(Component):
         scene_id : str, optional
             Name of the scene; a new name resets the camera.
         bounds : sequence of float, optional
-            Box for the home view; for a new scene by default `view_bounds` of the right points.
+            Box for the home view; for a new scene by default `view_bounds` of the points that are
+            not wrong.
 
         Raises
         ------
@@ -115,7 +116,7 @@ class PointCloud(Component):
         if scene_id is not None and scene_id != self.scene_id:
             update["scene_id"] = scene_id
         if "scene_id" in update or not self.bounds:
-            update["bounds"] = view_bounds(cloud, ~mask)
+            update["bounds"] = view_bounds(cloud, None if wrong is None else ~mask)
         if bounds is not None:
             update["bounds"] = [float(value) for value in bounds]
         self.param.update(**update)

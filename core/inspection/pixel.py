@@ -245,7 +245,9 @@ def _candidates(
     """Return the candidates and the probability of the estimate, whether it is one of them."""
     estimate_bin, confidence = float(image.bin[row, col]), float(image.confidence[row, col])
     peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
-    peaks = peaks[curve[peaks] > 0]
+    # A signal far below the image's mean makes all scores of the likelihood negative.
+    base = 0.0 if curve.max() > 0 else float(np.median(curve))
+    peaks = peaks[curve[peaks] > base]
     peaks = peaks[np.argsort(-curve[peaks], kind="stable")]
     if not peaks.size or not capture.counts[row, col]:
         return (), confidence
@@ -264,7 +266,8 @@ def _candidates(
         confidence = float(probability[is_estimate][0])
     range_m = capture.acquisition.bin_to_range_m(bins)
     interval_m = delay_range_interval(capture, row, col, bins)
-    columns = (bins, range_m, *interval_m, score, score / score[0], probability)
+    relative = (score - base) / (score[0] - base)
+    columns = (bins, range_m, *interval_m, score, relative, probability)
     found = tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
     return found, confidence
 

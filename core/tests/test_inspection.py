@@ -141,6 +141,21 @@ def test_the_candidate_at_the_estimate_is_the_estimate(method: str, settings: An
             assert each.probability == report.confidence
 
 
+def test_a_pixel_far_below_the_mean_signal_has_candidates() -> None:
+    taps = np.diff(stats.norm.cdf(np.arange(61), 40.5, 1.5))
+    signal = np.where(np.arange(32).reshape(4, 8) == 0, 5e3, 2e4)
+    rate = 3000.0 + signal[..., np.newaxis] * taps
+    counts = np.random.default_rng(1).poisson(rate).astype(np.uint32)
+    pulse = Pulse(shape="gaussian", tau_s=1.5e-9)
+    capture = Capture(counts, Acquisition(60, 1e-9, n_pulses=None), pulse=pulse, detection="all")
+    image = estimate(capture, "likelihood")
+    report = inspection.pixel_report(capture, image, 0, 0, "likelihood")
+    assert report.curve.max() < 0  # the echo that it expects is four times as strong
+    (at,) = (each for each in report.candidates if each.bin == image.bin[0, 0])
+    assert at.probability == report.confidence > 0.99
+    assert 0 < at.relative <= 1
+
+
 def test_candidates_within_one_pulse_are_one() -> None:
     acquisition = Acquisition(n_bins=60, n_pulses=400)
     pulse = Pulse.gaussian(2e-9)
