@@ -13,7 +13,6 @@ from core.capture import Capture, cached_per_capture
 from core.estimators import RangeImage, estimate
 from core.inference.posterior import posterior_of
 from core.inspection import pixel_report
-from core.metrics import Interval
 from core.scene import scenes
 from core.studies.lessons.bench import PIXELS, Bench, captured
 from core.studies.methods.neighbours import at_edges
@@ -40,18 +39,8 @@ def outdoor_pixel(bench: Bench) -> Plot:
         np.arange(capture.acquisition.n_bins, dtype=float) + 0.5,
         {"histogram": capture.cube[row, col].astype(float)},
         bins,
-        f"Row {row}, column {col}. {_description(capture, row, col)}",
+        ", ".join(f"{name.capitalize()}: bin {at:.0f}" for name, at in bins.items()) + ".",
     )
-
-
-def _description(capture: Capture, row: int, col: int) -> str:
-    report = pixel_report(capture, _estimate(capture, "likelihood"), row, col, "likelihood")
-    surfaces = " and ".join(f"{each:.0f}" for each in report.surfaces_bin) or "none"
-    return f"{report.verdict.why} SBR {_text(report.flux.sbr)} (95 %). Surfaces: {surfaces}."
-
-
-def _text(found: Interval) -> str:
-    return f"{found.value:.2g}, {found.low:.2g} to {found.high:.2g}"
 
 
 def surface_probability(bench: Bench) -> Plot:
@@ -66,8 +55,18 @@ def surface_probability(bench: Bench) -> Plot:
         "Probability",
         np.arange(near.size, dtype=float),
         {"surface within 3 bins": near},
-        note=f"Of a surface anywhere in the gate: {posterior.surface[row, col]:.3f}.",
+        note=f"Probability of any surface: {posterior.surface[row, col]:.3f}. "
+        f"{_description(capture, row, col)}",
     )
+
+
+def _description(capture: Capture, row: int, col: int) -> str:
+    """Return surfaces and SBR of a pixel, and how its counts compare with its neighbours'."""
+    report = pixel_report(capture, _estimate(capture, "likelihood"), row, col, "likelihood")
+    surfaces = " and ".join(f"in bin {each:.0f}" for each in sorted(report.surfaces_bin)) or "none"
+    sbr = report.flux.sbr
+    interval = f"{sbr.value:.2g} ({sbr.low:.2g} to {sbr.high:.2g}, 95 %)"
+    return f"Likely surfaces: {surfaces}. SBR {interval}. {report.verdict.why}"
 
 
 def agreement(bench: Bench) -> Pictures:

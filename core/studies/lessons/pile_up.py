@@ -40,9 +40,10 @@ def first_photons(bench: Bench) -> Plot:
     """Plot the first photons of all pulses, which are all that is recorded."""
     capture = flat_target(bench, float(bench.acquisition.bin_to_range_m(bench.onset_bin)))
     rate = rate_of(bench)
+    echo = f", echo at bin {bench.onset_bin}" if bench.signal else ""
     return Plot(
         "first_photons",
-        f"First photons of {bench.n_pulses:,} pulses",
+        f"First photons of {bench.n_pulses:,} pulses{echo}",
         "Bin (1 ns)",
         "Counts",
         centres(bench),

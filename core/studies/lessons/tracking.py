@@ -87,7 +87,8 @@ def pixels_moved(bench: Bench) -> Plot:
             for weight in WEIGHTS
         },
         {"α": bench.alpha},
-        "The bin of the largest residual, weighted. All other settings are the recommended ones.",
+        "The bin in which signal times weight is largest. All other settings are the recommended "
+        "ones.",
         x_is_log=True,
     )
 
