@@ -91,6 +91,16 @@ def test_numbers_of_the_built_in_lessons():
     assert answers["10-neighbours"] == pytest.approx(0.71, abs=0.03)
 
 
+def test_links_of_the_lessons_lead_to_other_pages():
+    texts = " ".join(each.explanation for each in LESSONS.values())
+    queries = re.findall(r"\]\(\?([^)]+)\)", texts)
+    for query in queries:
+        session = Session(built_in_sources(), link_to(query), HeldTasks())
+        assert session.refused == []
+        assert session.state.page in query
+    assert len(queries) > 5
+
+
 TEXT = """+++
 title = "T"
 before = ["light"]

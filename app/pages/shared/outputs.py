@@ -218,9 +218,11 @@ class Gallery:
         for knob in self.place:
             knob.param.watch(lambda _: self._mark(), "value")
         self._scale = ScaleBar()
+        self._scale.figure.visible = False
         self._note = Sentence(text=NOT_COMPUTED, sizing_mode="stretch_width", margin=(4, 0))
         self.layout = pn.Column(
             self._grid,
+            self._scale.pane,
             self._note,
             stylesheets=[FREE],
             sizing_mode="stretch_width",
@@ -267,9 +269,7 @@ class Gallery:
         self._item = item
         self._mark()
         self._scale.update(_look(item))
-        if before is None:  # a figure that was hidden when it was sent would stay hidden
-            self.layout.insert(1, self._scale.pane)
-        self._note.text = f"{item.note} {OUTSIDE_NOTE}"
+        self._scale.figure.visible, self._note.text = True, f"{item.note} {OUTSIDE_NOTE}"
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme."""

@@ -55,6 +55,11 @@ class Bench(Settings):
         Number("Pulses", 10, 8000, log=True, whole=True, least=1, most=50_000),
         "Pulses per pixel.",
     )
+    seed: int = parameter(
+        0,
+        Number("Seed", 0, 999, whole=True, least=0, most=2**53),
+        "Random seed of the simulations: the same seed gives the same counts.",
+    )
     preset: str = parameter(
         "recommended",
         Choice("Preset", tuple(PRESETS)),
@@ -123,18 +128,18 @@ def flat_target(bench: Bench, range_m: float, side: int = 1) -> Capture:
     else:  # the background is all that a scene without a surface returns
         range_m, flux = math.nan, Flux(bench.exposure * bench.background, 1.0)
     scene = Scene(np.full((side, side), range_m))
-    return simulate(scene, bench.acquisition, flux, PULSE)
+    return simulate(scene, bench.acquisition, flux, PULSE, bench.seed)
 
 
 def captured(name: str, bench: Bench) -> Capture:
     """Simulate a built-in scene with these fluxes and pulses, once for all that needs it."""
-    return _captured(name, bench.n_pulses, bench.flux)
+    return _captured(name, bench.n_pulses, bench.flux, bench.seed)
 
 
 @lru_cache(maxsize=8)
-def _captured(name: str, n_pulses: int, flux: Flux) -> Capture:
+def _captured(name: str, n_pulses: int, flux: Flux, seed: int) -> Capture:
     scene = scenes[name]()
-    return simulate(scene, replace(scene.acquisition, n_pulses=n_pulses), flux, PULSE)
+    return simulate(scene, replace(scene.acquisition, n_pulses=n_pulses), flux, PULSE, seed)
 
 
 def centres(bench: Bench) -> Floats:

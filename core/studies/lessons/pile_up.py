@@ -150,12 +150,13 @@ def noise_along_gate(bench: Bench) -> Plot:
     on, off = (_noise(replace(bench, correction=each)) for each in ("on", "off"))
     return Plot(
         "noise_along_gate",
-        f"Noise of a bin, standard deviation over {_NOISY_PIXELS**2:,} pixels",
+        "Noise of each bin",
         "Bin (1 ns)",
         "Photons per pulse and bin",
         centres(bench),
         {"correction on": on, "correction off": off},
-        note="The pixels are alike: what differs between them is chance.",
+        note=f"Standard deviation over {_NOISY_PIXELS**2:,} pixels. They are alike: what differs "
+        "between them is chance.",
     )
 
 

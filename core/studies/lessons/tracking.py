@@ -30,12 +30,12 @@ WEIGHTS: tuple[Weight, ...] = ("cubic", "exponential")
 
 def both_scales(bench: Bench) -> Plot:
     """Plot the two scales of a pixel with an echo."""
-    return pixel_signals(bench.onset_bin, bench.tracking, bench.flux)
+    return pixel_signals(bench.onset_bin, bench.tracking, bench.flux, seed=bench.seed)
 
 
 def both_scales_without_echo(bench: Bench) -> Plot:
     """Plot the two scales of a pixel without an echo."""
-    return pixel_signals(math.nan, bench.tracking, bench.flux)
+    return pixel_signals(math.nan, bench.tracking, bench.flux, seed=bench.seed)
 
 
 @lru_cache(maxsize=16)
@@ -78,7 +78,7 @@ def pixels_moved(bench: Bench) -> Plot:
     capture, base = captured("car", bench), ALPHAS[0]
     return Plot(
         "pixels_moved",
-        f"Pixels of the car with another bin than at α = {base:g}",
+        f"Pixels of the car that move from α = {base:g}",
         "α",
         "Share of pixels",
         np.array(ALPHAS),
@@ -99,7 +99,7 @@ def found_by_t_n(bench: Bench) -> Plot:
     truth_bin = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
     return Plot(
         "found_by_t_n",
-        "Pixels of the car within 3 bins, against T_n",
+        "Pixels of the car within 3 bins",
         "T_n, first bin in which an echo may lie",
         "Share of pixels",
         np.array(T_NS, float),
