@@ -14,7 +14,15 @@ from playwright.sync_api import Page, expect
 
 from app.handout import handout, main
 from app.model.glossary import ANCHOR, glossary, linked
-from app.model.lessons import PREDICTED, SHAPES, lesson_of, number_of, read_lesson, read_lessons
+from app.model.lessons import (
+    PREDICTED,
+    SHAPES,
+    SPECS,
+    lesson_of,
+    number_of,
+    read_lesson,
+    read_lessons,
+)
 from app.model.slides import demonstration, slides_of
 from app.model.state import Learning
 from app.model.store import built_in_sources
@@ -22,8 +30,8 @@ from app.pages.learn.lesson import LessonView
 from app.pages.learn.page import Learn
 from app.pages.session import Session
 from app.widgets.qr_code import QrCode, qr_image
+from core.parameters import Choice
 from core.studies.lessons import CHECKS, NEED_SIGNAL, VIEWS, Bench, require_signal
-from core.studies.outputs import Pictures, Plot
 from tests.browser import enter, eventually, slider
 from tests.states import link_to
 from tests.threads import HeldLayout, HeldTasks
@@ -35,29 +43,67 @@ FIRST = "1-first-photon"
 # -- files -----------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def session():
+    return Session(built_in_sources(), tasks=HeldTasks())
+
+
 @pytest.mark.parametrize("key", LESSONS)
-def test_a_lesson_has_views_a_drawn_prediction_and_a_check_with_hints(key):
-    lesson = LESSONS[key]
-    predicted = "flat" if not lesson.prediction.axis else lesson.prediction.high
-    for name in lesson.before:
-        assert isinstance(lesson.seen(name, lesson.bench, None), Plot | Pictures)
-    plot = lesson.seen(lesson.prediction.view, lesson.bench, predicted)
-    assert PREDICTED in {*plot.curves, *plot.marks}
-    check = lesson.check
-    assert check.verdict(check.answer)[0]
+def test_a_lesson_leads_from_its_question_to_a_right_answer(key, session):
+    lesson, check = LESSONS[key], LESSONS[key].check
+    assert lesson.introduction and lesson.explanation
     for hint in check.hints:
         wrong = replace(check, function=hint.function, arguments=hint.arguments).answer
         assert check.verdict(wrong) == (False, hint.text)
-    assert lesson.introduction and lesson.explanation
+    asked, spec = lesson.prediction, SPECS[lesson.control]
+    predicted = str(asked.high) if asked.axis else "flat"
+    moved = spec.options[-1] if isinstance(spec, Choice) else str(lesson.ends[1])
+    state = Learning(key, predicted, moved, repr(wrong))
+    page, session.state.learning = Learn(session), state
+    page.show(True)
+    session.tasks.run_until(lambda: page.shown.verdict.text == hint.text)
+    views = page.shown.views
+    session.tasks.run_until(lambda: all(view.item for view in views.values()))
+    plot = views["after", asked.view].item
+    assert PREDICTED in {*plot.curves, *plot.marks}
+    session.state.learning = replace(state, answer=repr(check.answer))
+    session.tasks.run_until(lambda: page.shown.verdict.text.startswith("Right: "))
 
 
-def test_expected_answers_of_the_built_in_lessons():
+def test_numbers_of_the_built_in_lessons():
     answers = {key: lesson.check.answer for key, lesson in LESSONS.items()}
     assert [*answers] == sorted(answers, key=lambda key: int(key.partition("-")[0]))
     assert answers[FIRST] == pytest.approx(np.exp(-1.735 / 2), abs=1e-4)
     assert answers["2-more-light"] == pytest.approx(0.115, abs=0.002)
     assert answers["3-coates"] == pytest.approx(np.exp(1.735 * 0.8 / 2), rel=0.05)
     assert answers["4-two-scales"] > 3 * 0.2  # of a fifth of the gate
+    assert answers["5-knobs"] == pytest.approx(0.74, abs=0.03)
+    assert CHECKS["share_moved_by_cubic"](LESSONS["5-knobs"].bench, 0.1, 30.0) == 0
+    found = VIEWS["found_by_t_n"](LESSONS["5-knobs"].bench)
+    assert np.interp(52, found.x, found.curves["found"]) == pytest.approx(0.847, abs=0.03)
+    assert answers["6-pulses"] == pytest.approx(2.25, abs=0.1)
+    pulses = VIEWS["accuracy_by_pulses"](LESSONS["6-pulses"].bench)
+    assert np.interp(400, pulses.x, pulses.curves["likelihood"]) == pytest.approx(0.9, abs=0.02)
+    assert answers["7-who-wins-where"] == pytest.approx(46, abs=2)
+    along = VIEWS["found_along_gate"](LESSONS["7-who-wins-where"].bench)
+    at = {name: partial(np.interp, xp=along.x, fp=curve) for name, curve in along.curves.items()}
+    assert at["peak"](25) == pytest.approx(0.98, abs=0.015)
+    assert at["peak"](80) < 0.02 and at["coates"](80) > 0.97 and at["tracking"](10) == 0
+    assert answers["8-confidence"] > 0.98
+    sure = VIEWS["reliability_diagram"](LESSONS["8-confidence"].bench)
+    assert np.interp(0.85, sure.x, sure.curves["right"]) == pytest.approx(0.85, abs=0.05)
+    assert answers["9-real-capture"] == pytest.approx(0.16, abs=0.02)
+    assert answers["10-neighbours"] == pytest.approx(0.71, abs=0.03)
+
+
+def test_links_of_the_lessons_lead_to_other_pages():
+    texts = " ".join(each.explanation for each in LESSONS.values())
+    queries = re.findall(r"\]\(\?([^)]+)\)", texts)
+    for query in queries:
+        session = Session(built_in_sources(), link_to(query), HeldTasks())
+        assert session.refused == []
+        assert session.state.page in query
+    assert len(queries) > 5
 
 
 TEXT = """+++
@@ -161,11 +207,6 @@ def test_typed_numbers():
 
 
 # -- the page without a browser --------------------------------------------------------------------
-
-
-@pytest.fixture
-def session():
-    return Session(built_in_sources(), tasks=HeldTasks())
 
 
 def test_nothing_is_shown_before_the_prediction(session):

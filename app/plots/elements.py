@@ -322,6 +322,8 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "photons that arrive": ("large", []),
     "expected": ("expected", [2, 2]),
     "your prediction": ("estimate", [8, 4]),
+    "calibrated": ("muted", [6, 3]),
+    **dict.fromkeys(("exposure", "pulses", "α", "least confidence"), ("muted", [4, 2])),
     "echo's onset": ("truth", [4, 2]),
     "truth": ("truth", [4, 2]),
     ESTIMATES_NAME: ("estimate", []),

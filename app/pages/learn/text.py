@@ -5,7 +5,7 @@ from __future__ import annotations
 LESSON_HELP = "Each lesson asks first, and shows what happens after your prediction."
 
 COMMIT_HELP = "Predict: the prediction stays drawn on the plot."
-SHAPES_HELP = "Shape of the histogram that you expect."
+SHAPES_HELP = "Shape that you expect along the gate."
 AGAIN_HELP = "Start again: clear the prediction and the answer of this lesson."
 CHECK_HELP = "Check: compares your answer with a computation."
 

@@ -52,8 +52,9 @@ def accuracy_by_pulses(bench: Bench) -> Plot:
         np.array(PULSES, float),
         {"theory, flux known": known, "likelihood": found},
         {"pulses": bench.n_pulses},
-        f"PPP {bench.flux.signal:.3g}. Likelihood: {_SIDE} × {_SIDE} simulated pixels at each "
-        "point, with the 95 % interval of their share.",
+        f"With {bench.n_pulses:,} pulses, {theory(_random_depths(bench)):.1%} by theory. "
+        f"Likelihood: {_SIDE} × {_SIDE} simulated pixels at each point, with the 95 % interval of "
+        "their share.",
         {"likelihood": band},
         x_is_log=True,
     )
@@ -100,7 +101,7 @@ def found_along_gate(bench: Bench) -> Plot:
         "Share of pixels",
         np.array(PLACES),
         _found(bench.acquisition, bench.flux, bench.seed),
-        {"the echo": bench.onset_bin},
+        {"echo's onset": bench.onset_bin},
         f"Flat targets of {SIDE} × {SIDE} pixels, one at each fifth bin. The paper's "
         "car stands in bins 45 to 70.",
     )
@@ -129,7 +130,7 @@ def reliability_diagram(bench: Bench) -> Plot:
     counts = ", ".join(f"{each.count:,}" for each in tenths)
     return Plot(
         "reliability_diagram",
-        f"Right estimates against their confidence, SBR {bench.flux.sbr:.2g}",
+        f"Right estimates by confidence, SBR {bench.flux.sbr:.2g}",
         "Confidence, mean of a tenth",
         "Share right within 3 bins",
         stated,

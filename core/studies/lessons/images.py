@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,6 @@ from core.capture import Capture, cached_per_capture
 from core.estimators import RangeImage, estimate
 from core.inference.posterior import posterior_of
 from core.inspection import pixel_report
-from core.metrics import Interval
 from core.scene import scenes
 from core.studies.lessons.bench import PIXELS, Bench, captured
 from core.studies.methods.neighbours import at_edges
@@ -28,9 +28,14 @@ AGREEING = ("likelihood", "coates")
 """Methods whose estimates are compared."""
 
 
+def _recorded(bench: Bench) -> Capture:
+    """Return the field capture; being a recording, it is the same for every seed."""
+    return captured("field", replace(bench, seed=0))
+
+
 def outdoor_pixel(bench: Bench) -> Plot:
     """Plot the histogram of a pixel of the field capture, with the estimates of two methods."""
-    capture, (row, col) = captured("field", bench), PLACES[bench.pixel]
+    capture, (row, col) = _recorded(bench), PLACES[bench.pixel]
     bins = {name: float(_estimate(capture, name).bin[row, col]) for name in AGREEING}
     return Plot(
         "outdoor_pixel",
@@ -40,23 +45,13 @@ def outdoor_pixel(bench: Bench) -> Plot:
         np.arange(capture.acquisition.n_bins, dtype=float) + 0.5,
         {"histogram": capture.cube[row, col].astype(float)},
         bins,
-        f"Row {row}, column {col}. {_description(capture, row, col)}",
+        ", ".join(f"{name.capitalize()}: bin {at:.0f}" for name, at in bins.items()) + ".",
     )
-
-
-def _description(capture: Capture, row: int, col: int) -> str:
-    report = pixel_report(capture, _estimate(capture, "likelihood"), row, col, "likelihood")
-    surfaces = " and ".join(f"{each:.0f}" for each in report.surfaces_bin) or "none"
-    return f"{report.verdict.why} SBR {_text(report.flux.sbr)} (95 %). Surfaces: {surfaces}."
-
-
-def _text(found: Interval) -> str:
-    return f"{found.value:.2g}, {found.low:.2g} to {found.high:.2g}"
 
 
 def surface_probability(bench: Bench) -> Plot:
     """Plot the probability of a surface near each bin of a pixel of the field capture."""
-    capture, (row, col) = captured("field", bench), PLACES[bench.pixel]
+    capture, (row, col) = _recorded(bench), PLACES[bench.pixel]
     posterior = posterior_of(capture)
     near = posterior.tolerance_probability[row, col].astype(float)
     return Plot(
@@ -66,13 +61,23 @@ def surface_probability(bench: Bench) -> Plot:
         "Probability",
         np.arange(near.size, dtype=float),
         {"surface within 3 bins": near},
-        note=f"Of a surface anywhere in the gate: {posterior.surface[row, col]:.3f}.",
+        note=f"Probability of any surface: {posterior.surface[row, col]:.3f}. "
+        f"{_description(capture, row, col)}",
     )
+
+
+def _description(capture: Capture, row: int, col: int) -> str:
+    """Return surfaces and SBR of a pixel, and how its counts compare with its neighbours'."""
+    report = pixel_report(capture, _estimate(capture, "likelihood"), row, col, "likelihood")
+    surfaces = " and ".join(f"in bin {each:.0f}" for each in sorted(report.surfaces_bin)) or "none"
+    sbr = report.flux.sbr
+    interval = f"{sbr.value:.2g} ({sbr.low:.2g} to {sbr.high:.2g}, 95 %)"
+    return f"Likely surfaces: {surfaces}. SBR {interval}. {report.verdict.why}"
 
 
 def agreement(bench: Bench) -> Pictures:
     """Show where two methods agree on the field capture, and where they agree and are wrong."""
-    capture = captured("field", bench)
+    capture = _recorded(bench)
     range_m, agreed, right = _agreement(capture)
     return Pictures(
         "agreement",
@@ -105,12 +110,12 @@ def _agreement(capture: Capture) -> tuple[Floats, NDArray[np.bool_], NDArray[np.
 
 def share_agreed(bench: Bench) -> float:
     """Share of the pixels of the field capture in which two methods agree."""
-    return float(_agreement(captured("field", bench))[1].mean())
+    return float(_agreement(_recorded(bench))[1].mean())
 
 
 def share_wrong_of_agreed(bench: Bench) -> float:
     """Share of the pixels without a surface where two methods agree on one, of all they do."""
-    _, agreed, right = _agreement(captured("field", bench))
+    _, agreed, right = _agreement(_recorded(bench))
     return float((agreed & ~right).sum() / agreed.sum())
 
 
@@ -180,7 +185,7 @@ def found_by_distance(bench: Bench) -> Plot:
     counts = np.bincount(np.minimum(distance, DISTANCES[-1]).astype(int).ravel())
     return Plot(
         "found_by_distance",
-        "Pixels found within 1 bin, against their distance from an edge",
+        "Pixels found within 1 bin",
         "Distance from the nearest edge (pixels)",
         "Share of pixels",
         DISTANCES,

@@ -56,9 +56,10 @@ def first_photons(bench: Bench) -> Plot:
     """Plot the first photons of all pulses, which are all that is recorded."""
     capture = flat_target(bench, float(bench.acquisition.bin_to_range_m(bench.onset_bin)))
     rate = rate_of(bench)
+    echo = f", echo at bin {bench.onset_bin}" if bench.signal else ""
     return Plot(
         "first_photons",
-        f"First photons of {bench.n_pulses:,} pulses",
+        f"First photons of {bench.n_pulses:,} pulses{echo}",
         "Bin (1 ns)",
         "Counts",
         centres(bench),
@@ -164,12 +165,13 @@ def noise_along_gate(bench: Bench) -> Plot:
     on, off = (_noise(replace(bench, correction=each)) for each in ("on", "off"))
     return Plot(
         "noise_along_gate",
-        f"Noise of a bin, standard deviation over {_NOISY_PIXELS**2:,} pixels",
+        "Noise of each bin",
         "Bin (1 ns)",
         "Photons per pulse and bin",
         centres(bench),
         {"correction on": on, "correction off": off},
-        note="The pixels are alike: what differs between them is chance.",
+        note=f"Standard deviation over {_NOISY_PIXELS**2:,} pixels. They are alike: what differs "
+        "between them is chance.",
     )
 
 

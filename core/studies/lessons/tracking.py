@@ -78,7 +78,7 @@ def pixels_moved(bench: Bench) -> Plot:
     capture, base = captured("car", bench), ALPHAS[0]
     return Plot(
         "pixels_moved",
-        f"Pixels of the car with another bin than at α = {base:g}",
+        f"Pixels of the car that move from α = {base:g}",
         "α",
         "Share of pixels",
         np.array(ALPHAS),
@@ -87,7 +87,8 @@ def pixels_moved(bench: Bench) -> Plot:
             for weight in WEIGHTS
         },
         {"α": bench.alpha},
-        "The bin of the largest residual, weighted. All other settings are the recommended ones.",
+        "The bin in which signal times weight is largest. All other settings are the recommended "
+        "ones.",
         x_is_log=True,
     )
 
@@ -98,7 +99,7 @@ def found_by_t_n(bench: Bench) -> Plot:
     truth_bin = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
     return Plot(
         "found_by_t_n",
-        "Pixels of the car within 3 bins, against T_n",
+        "Pixels of the car within 3 bins",
         "T_n, first bin in which an echo may lie",
         "Share of pixels",
         np.array(T_NS, float),

@@ -17,7 +17,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS
-from core.inference.limits import ACCURACY, ASSUMES, Limit, approximation_error, limit
+from core.inference.limits import (
+    ACCURACY,
+    ASSUMES,
+    Limit,
+    approximation_error,
+    limit,
+    right_bin_probability,
+)
 from core.inspection.echoes import CONFIDENT
 from core.inspection.maps import likeliest
 from core.metrics import Interval
@@ -435,15 +442,17 @@ def by_place(
     sbr: float = 0.06, size: int = 64, onset: Sequence[float] = PLACES, seed: int = 0
 ) -> Plot:
     """Plot the restoration degree against the position of the echo, equal in all pixels."""
-    found = found_by_place(GATE, Flux(sbr=sbr), COMPARED, onset, size, seed)
+    flux, onset_bin = Flux(sbr=sbr), np.asarray(onset, dtype=float)
+    found = found_by_place(GATE, flux, COMPARED, onset, size, seed)
+    bound = right_bin_probability(onset_bin, flux.signal, flux.background, PULSE, GATE)
     chance = 1.96 * math.sqrt(0.25 / size**2)
     return Plot(
         f"by_place_{sbr:g}",
         f"Restoration degree against the position of the echo (SBR {sbr:g}, 3 bins)",
         "Bin of the echo's onset",
         "Share of pixels within 3 bins",
-        np.asarray(onset, dtype=float),
-        found,
+        onset_bin,
+        {**found, "limit: probability of the right bin": bound},
         note="The paper's targets lie in bins 45 to 70. Tracking excludes bins before T_n. "
         f"Limit: {ASSUMES}, {ACCURACY}. "
         f"Sampling error of a share of {size**2:,} pixels: at most ± {chance:.2g} (95 %).",
@@ -458,21 +467,18 @@ def found_by_place(
     size: int = 64,
     seed: int = 0,
 ) -> dict[str, Floats]:
-    """Return the share of pixels found within 3 bins at each position of the echo.
+    """Return the share of pixels that each method finds within 3 bins, by the echo's position.
 
-    Of flat targets of `size` x `size` pixels, by each method; last, the limit.
+    At each position, all of `size` x `size` pixels see the same flat target.
     """
     curves: dict[str, list[float]] = {each.name: [] for each in methods}
-    bounds = []
     for onset_bin in onset:
         scene = Scene(np.full((size, size), gate.bin_to_range_m(onset_bin)))
         capture = simulate(scene, gate, flux, PULSE, seed)
         for method in methods:
             error = np.abs(_delays(capture, method) - onset_bin)
             curves[method.name].append(float((error <= 3).mean()))
-        bounds.append(float(limit(capture).right_bin_probability[0, 0]))
-    found = {name: np.array(shares) for name, shares in curves.items()}
-    return {**found, "limit: probability of the right bin": np.array(bounds)}
+    return {name: np.array(shares) for name, shares in curves.items()}
 
 
 def flat_target(size: int = 64, onset_bin: float = 50.0, seeds: Sequence[int] = range(2)) -> Table:
