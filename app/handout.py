@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from markdown_it import MarkdownIt
 
@@ -36,14 +37,16 @@ h2 { font-size: 12pt; margin: 0 0 1mm; }
   border-radius: 2mm; }
 .part p { margin: 0 0 2mm; }
 figure { margin: 2mm 0 0; }
-figure img { display: block; max-width: 100%; max-height: 78mm; margin: 0 auto; }
-figcaption { font-size: 9pt; color: #333; }
+figure img { display: block; max-width: 100%; max-height: 105mm; margin: 0 auto; }
+figcaption { font-size: 9pt; color: #333; margin-bottom: 2mm; }
 .line { display: inline-block; min-width: 35mm; border-bottom: 0.3mm solid #000; }
 .ruled { height: 8mm; border-bottom: 0.2mm solid #888; }
 .key { color: #a4133c; }
 table { border-collapse: collapse; font-size: 10pt; }
 th, td { padding: 1mm 3mm; border: 0.2mm solid #888; text-align: left; vertical-align: top; }
 """
+
+CIRCLE = "Circle the first photon of each pulse, and count them in the histogram."
 
 _MARKDOWN = MarkdownIt("commonmark", {"html": False})
 
@@ -147,28 +150,42 @@ def _prediction(lesson: Lesson, bench: Bench, is_key: bool) -> str:
 
 def _observation(lesson: Lesson, bench: Bench, is_key: bool) -> str:
     """Return what to do and room for notes; in the key, the other views and the explanation."""
-    others = [
-        lesson.seen(name, bench, None) for name in lesson.after if name != lesson.prediction.view
-    ]
-    if is_key:
-        return "".join(map(_figure, others)) + _MARKDOWN.render(lesson.explanation)
-    exercises = [each for each in others if isinstance(each, Pulses)]
-    circle = "<p>Circle the first photon of each pulse, and count them in the histogram.</p>"
-    return (
-        "".join(circle + _figure(each, True) for each in exercises)
-        + f"<p>{_moving(lesson)} What happens, and why?</p>"
-        + '<p class="ruled"></p>' * 3
+    others = [name for name in lesson.after if name != lesson.prediction.view]
+    seen = [lesson.seen(name, bench, None) for name in others]
+    exercises = "".join(
+        f"<p>{CIRCLE}</p>{_figure(each, is_blank=not is_key)}"
+        for each in seen
+        if isinstance(each, Pulses)
     )
+    question = _paragraph(f"{_moving(lesson)} What happens, and why?")
+    if not is_key:
+        return exercises + question + '<p class="ruled"></p>' * 4
+    moved = _moved(lesson, bench)
+    plots = "".join(
+        _figure(lesson.seen(name, moved, None))
+        for name, each in zip(others, seen, strict=True)
+        if not isinstance(each, Pulses)
+    )
+    return exercises + question + plots + _MARKDOWN.render(lesson.explanation)
 
 
 def _moving(lesson: Lesson) -> str:
     """Return a sentence about the one control."""
     spec = SPECS[lesson.control]
     if isinstance(spec, Choice):
-        return f"Choose another {escape(spec.symbol.lower())}: {' or '.join(spec.options)}."
+        return f"Choose another {spec.symbol.lower()}: {' or '.join(spec.options)}."
     low, high = lesson.ends or (spec.low, spec.high)
-    unit = f" {escape(spec.unit)}" if spec.unit else ""
-    return f"Move {escape(spec.symbol)} from {low:g} to {high:g}{unit}."
+    return f"Move {spec.symbol} from {low:g} to {high:g} {spec.unit}".rstrip() + "."
+
+
+def _moved(lesson: Lesson, bench: Bench) -> Bench:
+    """Return the state at the end of the control's range, or with its next option."""
+    spec, present = SPECS[lesson.control], getattr(bench, lesson.control)
+    if isinstance(spec, Choice):
+        value: Any = next(each for each in spec.options if each != present)
+    else:
+        value = (lesson.ends or (spec.low, spec.high))[1]
+    return replace(bench, **{lesson.control: value})
 
 
 def _check(lesson: Lesson, is_key: bool) -> str:

@@ -319,7 +319,7 @@ def test_an_unknown_lesson_of_a_link_is_reported_with_the_first_one():
 @pytest.fixture
 def presenting(session):
     """The page in presenter mode."""
-    session.state.present = True
+    session.state.present = 1
     page = Learn(session)
     page.show(True)
     return page

@@ -211,8 +211,6 @@ def _like(base: Any, value: Any) -> Any:
         return float(value)
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError
-    if isinstance(base, bool) and value in (0, 1):  # typed by hand
-        return bool(value)
     if isinstance(base, frozenset):
         return frozenset(value)
     return _tuples(value)

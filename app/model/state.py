@@ -430,8 +430,10 @@ class State(param.Parameterized):
     comparison = param.ClassSelector(class_=Comparison, default=Comparison())
 
     learning = param.ClassSelector(class_=Learning, default=Learning())
-    present = param.Boolean(
-        default=False, doc="Whether the Learn page shows one slide, in the whole window."
+    present = param.Selector(
+        default=0,
+        objects=[0, 1],  # written by hand into links
+        doc="Whether the Learn page shows one slide, in the whole window.",
     )
 
     @property

@@ -36,7 +36,8 @@ __all__ = ["picture", "write"]
 
 _STYLES = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
-_DRAWN_PULSES = 10
+_DRAWN_PULSES, _COUNTED = 10, 4  # pulses to be counted by hand, and the counts that fit
+_PRINTED_INCHES = (7.0, 3.2)  # on a sheet of A4, at the size of its text
 _KEPT = "kept"  # what blank axes keep
 _MAX_FINE_SPAN = 1e4  # longer logarithmic axes are labelled at powers of ten only
 _PAGE = """<!doctype html>
@@ -81,7 +82,8 @@ def write(items: Sequence[Item], folder: Path, title: str, introduction: Sequenc
         if isinstance(item, Table):
             parts.append(_html_table(item))
         else:
-            figure = _draw(item)
+            figure = _drawn(item)
+            _lay_out(figure)
             png = _saved(figure, "png")
             (folder / f"{item.key}.png").write_bytes(png)
             if not isinstance(item, Pictures):
@@ -100,14 +102,26 @@ def picture(item: Plot | Scatter | Pictures | Pulses, is_blank: bool = False) ->
 
     With `is_blank`, axes alone are drawn, to sketch on; of pulses, also the photons.
     """
-    figure = _draw(item)
+    figure = _drawn(item)
+    if isinstance(item, Plot):
+        figure.set_size_inches(_PRINTED_INCHES)
+        low, _ = figure.axes[0].get_ylim()
+        figure.axes[0].set_ylim(bottom=min(low, 0.0))  # a constant shall not fill the axis
     if is_blank:
-        for axes in figure.axes:
-            for drawn in (*axes.lines, *axes.patches, *axes.collections, axes.get_legend()):
-                if drawn is not None and drawn.get_gid() != _KEPT:
-                    drawn.set_visible(False)
+        _erase(figure)
+        if isinstance(item, Pulses):
+            figure.axes[-1].set_ylim(0, _COUNTED)
+    _lay_out(figure)
     kind, media = ("png", "png") if isinstance(item, Pictures) else ("svg", "svg+xml")
     return f"data:image/{media};base64,{b64encode(_saved(figure, kind)).decode()}"
+
+
+def _erase(figure: Figure) -> None:
+    """Remove what is drawn on axes, but not what is to be kept."""
+    for axes in figure.axes:
+        for drawn in (*axes.lines, *axes.patches, *axes.collections, axes.get_legend()):
+            if drawn is not None and drawn.get_gid() != _KEPT:
+                drawn.remove()
 
 
 def _html_table(table: Table) -> str:
@@ -127,16 +141,18 @@ def _html_cell(value: Any, form: str) -> str:
     return f"<td{attribute}>{text}</td>"
 
 
-def _draw(item: Plot | Scatter | Pictures | Pulses) -> Figure:
+def _drawn(item: Plot | Scatter | Pictures | Pulses) -> Figure:
     if isinstance(item, Plot):
-        figure = _draw_curves(item)
-    elif isinstance(item, Pulses):
-        figure = _draw_pulses(item)
-    else:
-        figure = _draw_scatter(item) if isinstance(item, Scatter) else _draw_pictures(item)
-    ConstrainedLayoutEngine().execute(figure)  # once, instead of once per format
+        return _draw_curves(item)
+    if isinstance(item, Pulses):
+        return _draw_pulses(item)
+    return _draw_scatter(item) if isinstance(item, Scatter) else _draw_pictures(item)
+
+
+def _lay_out(figure: Figure) -> None:
+    """Lay a figure out once, instead of once per format."""
+    ConstrainedLayoutEngine().execute(figure)
     figure.set_layout_engine("none")
-    return figure
 
 
 def _saved(figure: Figure, format: str) -> bytes:
@@ -166,15 +182,16 @@ def _draw_curves(plot: Plot) -> Figure:
 
 def _draw_pulses(item: Pulses) -> Figure:
     """Draw the photons of the first pulses above the histogram of the first photons of all."""
-    figure = Figure(figsize=(10, 6), layout="constrained")
+    figure = Figure(figsize=(7, 4.6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     begins = [0, *item.ends]
     for pulse in range(min(_DRAWN_PULSES, item.ends.size)):
         times = item.times[begins[pulse] : begins[pulse + 1]]
         row = np.full(times.size, pulse + 1)
-        above.scatter(times, row, 70, facecolors="none", edgecolors="black", gid=_KEPT)
-        above.scatter(times[:1], row[:1], 70, color="C1")
-    above.set(title=item.title, ylabel="Pulse", ylim=(_DRAWN_PULSES + 0.7, 0.3))
+        above.scatter(times, row, 40, facecolors="none", edgecolors="black", gid=_KEPT)
+        above.scatter(times[:1], row[:1], 40, color="C1")
+    above.set(title=f"Photons of {_DRAWN_PULSES} pulses", ylabel="Pulse")
+    above.set_ylim(_DRAWN_PULSES + 0.7, 0.3)  # the first one above
     above.set_yticks(range(1, _DRAWN_PULSES + 1))
     bins = np.arange(item.probability.size) + 0.5
     below.bar(bins, item.histogram, 1.0, color="C7")

@@ -102,13 +102,13 @@ class Learn(Section):
     def _present(self, key: str | None) -> None:
         """Present a lesson from its beginning; by default the one on screen."""
         learning = Learning(lesson=key or self.shown.lesson.key)
-        self.session.state.param.update(learning=learning, present=True)
+        self.session.state.param.update(learning=learning, present=1)
 
     def _demonstrate(self) -> None:
         self._present(next(iter(demonstration(self.lessons)), None))
 
     def _end(self) -> None:
-        self.session.state.present = False
+        self.session.state.present = 0
 
     def _change(self, **parts: Any) -> None:
         state = self.session.state
