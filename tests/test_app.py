@@ -36,7 +36,6 @@ from app.pages.shared.illumination import MORE, IlluminationPanel
 from app.plots import elements as plots
 from app.plots.gate_cut import Cut
 from app.tasks.scheduler import GENERAL, PAGE, SHORT
-from app.theme import LIGHT
 from app.widgets.cards import Part
 from app.widgets.controls import Knob, SettingsPanel
 from app.widgets.figures import Plot
@@ -404,8 +403,8 @@ def test_every_plot_has_a_title_a_legend_and_labels_with_units():
 
 def test_only_changed_columns_travel_and_as_float32():
     ones = np.ones(8)
-    plot = Plot(plots.residual(ones, ones, LIGHT), plots.RESIDUAL_LAYERS)
-    plot.write("residual", residual=ones)
+    plot = Plot(plots.residual, plots.RESIDUAL_LAYERS)
+    plot.write("residual", residual=ones, bin=plots.centres(8))
     page, sent = Document(), []
     page.add_root(plot.figure)
     page.on_change(sent.append)

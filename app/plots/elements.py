@@ -1,4 +1,4 @@
-"""Plots as pure functions: arrays in, HoloViews elements or Bokeh figures out.
+"""Plots as pure functions that return HoloViews elements, without values, or Bokeh figures.
 
 Each plot is built once. When values change, `app.widgets.figures` writes the changed columns to it:
 building a plot again would take ten times as long as drawing it.
@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from app.model.exports import Curve
 from app.model.methods import METHOD_PLACES
 from app.model.store import Pixel
-from app.theme import RANGE_COLORS, Palette, line_style
+from app.theme import LIGHT, RANGE_COLORS, Palette, line_style
 from app.units import Scale
 from core.io import OUTSIDE_COLOR
 from core.studies import outputs as items
@@ -42,6 +42,8 @@ hv.extension("bokeh")
 hv.renderer("bokeh").webgl = False
 
 BIN = hv.Dimension("bin", label="Bin")
+NOTHING = np.zeros(1)
+"""In place of the values of a plot, which come later."""
 
 # Layers of each plot, by their colours' names in the palette, in drawing order.
 HISTOGRAM_LAYERS = ("raw", "expected", "small", "large", "truth", "estimate")
@@ -118,56 +120,47 @@ def centres(n_bins: int) -> Array:
     return np.arange(n_bins) + 0.5
 
 
-def histogram(
-    counts: Array, expected: Array, small: Array, large: Array, colors: Palette
-) -> hv.Overlay:
-    """Plot raw counts with the expected counts of the model and both scales.
-
-    Parameters
-    ----------
-    counts, expected, small, large : ndarray, shape (bin,)
-        In counts; NaN is not drawn.
-    """
+def histogram() -> hv.Overlay:
+    """Plot raw counts with the expected counts of the model and both scales."""
     unit = hv.Dimension("counts", label="Counts")
-    data = edges(counts.size), counts
     names = HISTOGRAM_NAMES
-    bars = hv.Histogram(data, kdims=BIN, vdims=unit, label=names["raw"])
+    bars = hv.Histogram((edges(1), NOTHING), kdims=BIN, vdims=unit, label=names["raw"])
     layers = [
-        bars.opts(color=colors.raw, line_width=0),
-        _signal(expected, unit, "expected", colors.expected, 1.5, "dotted"),
-        _signal(small, unit, names["small"], colors.small),
-        _signal(large, unit, names["large"], colors.large),
-        *_markers(unit, colors),
+        bars.opts(color=LIGHT.raw, line_width=0),
+        _signal(unit, "expected", LIGHT.expected, 1.5, "dotted"),
+        _signal(unit, names["small"], LIGHT.small),
+        _signal(unit, names["large"], LIGHT.large),
+        *_markers(unit),
     ]
     return _panel(layers, HISTOGRAM_TITLES[True])
 
 
-def residual(values: Array, difference: Array, colors: Palette) -> hv.Overlay:
+def residual() -> hv.Overlay:
     """Plot the positive difference of the scales, and the first difference of the histogram."""
     unit = hv.Dimension("residual", label="Counts")
     layers = [
-        _signal(difference, unit, RESIDUAL_NAMES["raw"], colors.raw, 1.2),
-        _signal(values, unit, "residual", colors.residual),
-        *_markers(unit, colors),
+        _signal(unit, RESIDUAL_NAMES["raw"], LIGHT.raw, 1.2),
+        _signal(unit, "residual", LIGHT.residual),
+        *_markers(unit),
     ]
     return _panel(layers, "Residual: large minus small scale")
 
 
-def enhanced(values: Array, weight: Array, colors: Palette) -> hv.Overlay:
+def enhanced() -> hv.Overlay:
     """Plot the residual times its weight, and the weight scaled to the plot."""
     unit = hv.Dimension("enhanced", label="Counts × weight")
     layers = [
-        _signal(weight, unit, "weight (scaled to fit)", colors.weight, 1.2, "dashed"),
-        _signal(values, unit, "enhanced", colors.enhanced),
-        *_markers(unit, colors),
+        _signal(unit, "weight (scaled to fit)", LIGHT.weight, 1.2, "dashed"),
+        _signal(unit, "enhanced", LIGHT.enhanced),
+        *_markers(unit),
     ]
     return _panel(layers, f"{ENHANCED_TITLE}: residual × weight")
 
 
-def score(values: Array, colors: Palette) -> hv.Overlay:
+def score() -> hv.Overlay:
     """Plot the score of a method in each bin."""
     unit = hv.Dimension("score", label="Score")
-    layers = [_signal(values, unit, "score", colors.enhanced), *_markers(unit, colors)]
+    layers = [_signal(unit, "score", LIGHT.enhanced), *_markers(unit)]
     return _panel(layers, SCORE_TITLE)
 
 
@@ -183,10 +176,10 @@ def score_ends(values: Array) -> tuple[float, float]:
 
 
 def _signal(
-    y: Array, unit: hv.Dimension, label: str, color: str, width: float = 2, dash: str = "solid"
+    unit: hv.Dimension, label: str, color: str, width: float = 2, dash: str = "solid"
 ) -> hv.Curve:
     """Draw values of the bins (bin,)."""
-    return _curve(centres(y.size), y, unit, label, color, width, dash)
+    return _curve(centres(1), NOTHING, unit, label, color, width, dash)
 
 
 def _curve(
@@ -196,13 +189,13 @@ def _curve(
     return curve.opts(color=color, line_width=width, line_dash=dash)
 
 
-def _truth(unit: hv.Dimension, colors: Palette) -> hv.Curve:
-    return _curve(*marker_line(np.nan, 1.0), unit, "truth", colors.truth, 2.5, "4 2")
+def _truth(unit: hv.Dimension) -> hv.Curve:
+    return _curve(*marker_line(np.nan, 1.0), unit, "truth", LIGHT.truth, 2.5, "4 2")
 
 
-def _markers(unit: hv.Dimension, colors: Palette) -> list[hv.Curve]:
+def _markers(unit: hv.Dimension) -> list[hv.Curve]:
     line = marker_line(np.nan, 1.0)
-    return [_truth(unit, colors), _curve(*line, unit, "estimate", colors.estimate, 1.5, "solid")]
+    return [_truth(unit), _curve(*line, unit, "estimate", LIGHT.estimate, 1.5, "solid")]
 
 
 def _panel(layers: list[Any], title: str) -> hv.Overlay:
@@ -225,20 +218,11 @@ def _panel(layers: list[Any], title: str) -> hv.Overlay:
     )
 
 
-def range_image(image: Array, low: float, high: float) -> hv.Overlay:
-    """Plot an image (row, col) with row 0 at the top, and a frame around the selected pixel.
-
-    Parameters
-    ----------
-    image : ndarray, shape (row, col)
-        NaN is transparent.
-    low, high : float
-        Values at the ends of the colour scale.
-    """
-    rows, cols = image.shape
-    value = hv.Dimension("value", label="Range (m)", range=(low, high))
+def range_image() -> hv.Overlay:
+    """Plot an image with row 0 at the top, and a frame around the selected pixel."""
+    value = hv.Dimension("value", label="Range (m)", range=(0.0, 1.0))
     picture = hv.Image(
-        (np.arange(cols), np.arange(rows), image),
+        (np.arange(2), np.arange(2), np.zeros((2, 2))),
         kdims=[hv.Dimension("col", label="Column"), hv.Dimension("row", label="Row")],
         vdims=value,
     ).opts(
@@ -270,13 +254,13 @@ def pixel_frame(row: float, col: float, half: float = 1.5) -> tuple[float, float
     return col - half, row - half, col + half, row + half
 
 
-def score_curves(colors: Palette) -> hv.Overlay:
+def score_curves() -> hv.Overlay:
     """Plot the scores of each bin, a line for each method, with the truth and the estimates."""
     unit = hv.Dimension("score", label="Score, scaled")
     nothing = np.full(1, np.nan)
     layers = [
         hv.Path([np.full((1, 2), np.nan)], [BIN, unit]).opts(line_width=1.8),
-        _truth(unit, colors),
+        _truth(unit),
         hv.Scatter((nothing, nothing), BIN, unit, label=ESTIMATES_NAME).opts(
             marker="inverted_triangle", size=9, line_width=0
         ),
@@ -286,14 +270,14 @@ def score_curves(colors: Palette) -> hv.Overlay:
     )
 
 
-def reliability(colors: Palette) -> hv.Overlay:
+def reliability() -> hv.Overlay:
     """Plot the share of right pixels against the confidence, a line for each method."""
     stated = hv.Dimension("confidence", label="Confidence")
     right = hv.Dimension("right", label="Share right within 3 bins")
     ends, nothing = np.array([0.0, 1.0]), np.full(1, np.nan)
     layers = [
         hv.Curve((ends, ends), stated, right, label="calibrated").opts(
-            color=colors.muted, line_width=1, line_dash="dashed"
+            color=LIGHT.muted, line_width=1, line_dash="dashed"
         ),
         hv.Path([np.full((1, 2), np.nan)], [stated, right]).opts(line_width=1.8),
         hv.Scatter((nothing, nothing), stated, right).opts(size=6, line_width=0),

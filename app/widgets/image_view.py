@@ -40,9 +40,7 @@ class ImageView:
     """
 
     def __init__(self, tapped: Callable[[int, int], None]) -> None:
-        self._plot = Plot(
-            plots.range_image(np.zeros((2, 2)), 0.0, 1.0), ("picture", "shadow", "frame")
-        )
+        self._plot = Plot(plots.range_image, ("picture", "shadow", "frame"))
         self._shape, self._grid = (0, 0), Grid()
         self._look: ColorScale | None = None
         self.figure = self._plot.figure

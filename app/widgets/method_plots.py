@@ -13,7 +13,7 @@ from app.model.exports import Curve
 from app.model.methods import METHOD_TITLES
 from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes
-from app.theme import LIGHT, Palette
+from app.theme import Palette
 from app.units import ShownGate
 from app.widgets.figures import Plot, cover, fit, paint_frame, pane_of
 
@@ -62,7 +62,7 @@ class CurvePlot:
     """
 
     def __init__(self) -> None:
-        self.plot = Plot(plots.score_curves(LIGHT), ("lines", "truth", "estimates"))
+        self.plot = Plot(plots.score_curves, ("lines", "truth", "estimates"))
         self._lines = Lines(self.plot)
         self._estimates = self.plot.source("estimates")
         self._estimates.data = {"bin": [], "score": [], "color": []}
@@ -132,7 +132,7 @@ class ReliabilityPlot:
     """
 
     def __init__(self) -> None:
-        self.plot = Plot(plots.reliability(LIGHT), ("honest", "lines", "dots"))
+        self.plot = Plot(plots.reliability, ("honest", "lines", "dots"))
         self._lines = Lines(self.plot)
         self._dots = self.plot.source("dots")
         self._dots.data = {"confidence": [], "right": [], "color": []}

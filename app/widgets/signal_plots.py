@@ -13,7 +13,7 @@ from app.model.store import Pixel
 from app.plots import elements as plots
 from app.plots.gate_axes import GateAxes, GateReadOut
 from app.plots.gate_cut import GateCut
-from app.theme import LIGHT, Palette
+from app.theme import Palette
 from app.units import ShownGate, scale
 from app.widgets.figures import Plot, fit, round_up
 from core import Signals
@@ -40,11 +40,10 @@ class SignalPlots:
     """
 
     def __init__(self) -> None:
-        one = np.zeros(1)
-        self.histogram = Plot(plots.histogram(one, one, one, one, LIGHT), plots.HISTOGRAM_LAYERS)
-        self.residual = Plot(plots.residual(one, one, LIGHT), plots.RESIDUAL_LAYERS)
-        self.enhanced = Plot(plots.enhanced(one, one, LIGHT), plots.ENHANCED_LAYERS)
-        self.score = Plot(plots.score(one, LIGHT), plots.SCORE_LAYERS)
+        self.histogram = Plot(plots.histogram, plots.HISTOGRAM_LAYERS)
+        self.residual = Plot(plots.residual, plots.RESIDUAL_LAYERS)
+        self.enhanced = Plot(plots.enhanced, plots.ENHANCED_LAYERS)
+        self.score = Plot(plots.score, plots.SCORE_LAYERS)
         self._bins = Range1d(0, 1)
         for plot in self.plots:
             figure = plot.figure
