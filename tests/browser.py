@@ -76,6 +76,7 @@ def launched(kind: BrowserType) -> Iterator[Browser]:
         context = kind.launch_persistent_context(
             folder, executable_path=browser_path(), args=ARGUMENTS
         )
+        context.set_default_timeout(TIMEOUT_MS)
         assert context.browser is not None
         yield context.browser
         context.close()
@@ -118,7 +119,6 @@ def open_page(
     `prepare` is a script to run first; `watch` is called with the page before it loads anything.
     """
     page = browser.contexts[0].new_page()
-    page.set_default_timeout(TIMEOUT_MS)
     page.set_viewport_size({"width": width, "height": height})
     watch(page)
     page.add_init_script(prepare)
