@@ -51,6 +51,7 @@ def test_expected_answers_of_the_built_in_lessons():
     assert answers[FIRST] == pytest.approx(np.exp(-1.735 / 2), abs=1e-4)
     assert answers["2-more-light"] == pytest.approx(0.115, abs=0.002)
     assert answers["4-two-scales"] > 3 * 0.2  # of a fifth of the gate
+    assert answers["11-where-light-comes-from"] == pytest.approx(2 * 0.1041 / 16)
 
 
 TEXT = """+++

@@ -16,6 +16,7 @@ import numpy as np
 from core.acquisition import Acquisition, Floats, Flux, Pulse
 from core.capture import Capture
 from core.checks import require
+from core.effects import Falloff
 from core.estimators import ESTIMATORS, estimate
 from core.inference.limits import best_exposure, right_bin_probability
 from core.metrics import restoration_degree
@@ -43,6 +44,7 @@ EXPOSURES = tuple(np.geomspace(0.01, 10, 13).tolist())
 """Factors on signal and background at which accuracy is shown."""
 
 _SIDE = 24  # rows and columns of flat targets
+_BENCH_RANGE_M = 50.0  # of the surface that the fluxes of a bench belong to
 
 
 @dataclass(frozen=True)
@@ -253,6 +255,26 @@ def estimates_without_echo(bench: Bench) -> Plot:
     return range_prior.range_prior(simulated, "tracking", bench.tracking)
 
 
+def fluxes_by_range(bench: Bench) -> Plot:
+    """Plot signal and background of a surface that is moved away, both as the bench has at 50 m."""
+    range_m = np.geomspace(40.0, 400.0, 60)
+    signal = bench.exposure * bench.signal * Falloff(_BENCH_RANGE_M).transmission(range_m)
+    return Plot(
+        "fluxes_by_range",
+        "Signal and background of a surface against its range",
+        "Range (m)",
+        "Photons per pulse",
+        range_m,
+        {
+            "signal": signal,
+            "background": np.full(range_m.size, bench.exposure * bench.background),
+        },
+        {"50 m": _BENCH_RANGE_M},
+        "A surface that fills the pixel, in sunlight. The background is that of the whole gate.",
+        x_is_log=True,
+    )
+
+
 PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
     each.__name__: each
     for each in (
@@ -263,6 +285,7 @@ PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
         both_scales,
         both_scales_without_echo,
         estimates_without_echo,
+        fluxes_by_range,
     )
 }
 """Views on which a prediction can be drawn."""
@@ -308,6 +331,12 @@ def share_of_gate(bench: Bench, first: float, end: float) -> float:
     return (end - first) / bench.acquisition.n_bins
 
 
+def signal_at(bench: Bench, range_m: float) -> float:
+    """Signal of the surface at another range than 50 m."""
+    share = Falloff(_BENCH_RANGE_M).transmission(np.array(range_m))
+    return float(bench.exposure * bench.signal * share)
+
+
 def number(bench: Bench, value: float) -> float:
     """Return a number as it is, for a hint."""
     return value
@@ -322,6 +351,7 @@ CHECKS: Mapping[str, Callable[..., float]] = {
         sbr,
         share_without_echo,
         share_of_gate,
+        signal_at,
         number,
     )
 }
