@@ -137,30 +137,25 @@ class PhotonBudget(Settings):
     )
     beam_mrad: float | None = parameter(
         None,
-        _optional(_positive("Beam angle", 0.01, 3000.0, "mrad", 3000.0), "the whole image"),
+        _optional(_positive("Beam angle", 0.01, 3000.0, "mrad", 3000.0), "image"),
         "Side of a square beam. Empty: the beam floods the whole image. One no wider than a pixel "
         "is that of a scanner.",
     )
-    range_m: float | None = parameter(
-        None,
-        _optional(_positive("Target range", 1.0, 1e5, "m"), "median of the scene"),
-        "Range to which signal and background refer. Nearer pixels get more signal.",
-    )
     irradiance_w_m2_nm: float | None = parameter(
         None,
-        _optional(_positive("Spectral irradiance", 1e-4, 10.0, "W/m²/nm", 1e6), "from sunlight"),
-        "Sunlight on the target at the laser's wavelength, where it is known better than by its "
-        "illuminance.",
+        _optional(_positive("Irradiance", 1e-4, 10.0, "W/m²/nm", 1e6), "from lux"),
+        "Sunlight on the target at the laser's wavelength, if it is known better than by its "
+        "illuminance. Empty: from the illuminance.",
     )
 
     def apply(self, scene: Scene) -> tuple[Scene, Flux]:
-        """Return a scene whose signal falls with range, and the flux at the range of the budget.
+        """Return a scene whose signal falls with range, and the flux at its median range.
 
         The flux has five digits, so that it can be read and typed.
         """
         found = {step.symbol: step.value for step in steps(self, scene)}
         signal, sbr = (float(f"{found[symbol]:.5g}") for symbol in ("S", "SBR"))
-        return with_falloff(scene, found["R"], self.reflectivity), Flux(signal, sbr)
+        return with_falloff(scene, self.reflectivity), Flux(signal, sbr)
 
 
 class Step(NamedTuple):
@@ -186,7 +181,7 @@ def steps(budget: PhotonBudget, scene: Scene) -> tuple[Step, ...]:
     Raises
     ------
     ValueError
-        If the pixel angle is unknown, or no pixel has a target and the budget states no range.
+        If the pixel angle is unknown, or no pixel has a target.
     """
     found = _Sheet()
     _add_inputs(found, budget, scene)
@@ -222,10 +217,7 @@ def _add_inputs(at: _Sheet, budget: PhotonBudget, scene: Scene) -> None:
     at.add("Detection efficiency", "η", GIVEN, budget.efficiency)
     at.add("Filter width", "Δλ", GIVEN, budget.filter_nm, "nm")
     at.add("Dark counts", "d", GIVEN, budget.dark_count_hz, "1/s")
-    if budget.range_m is None:
-        at.add("Range of the target", "R", OF_SCENE, _median_range_m(scene), "m")
-    else:
-        at.add("Range of the target", "R", GIVEN, budget.range_m, "m")
+    at.add("Median range", "R", OF_SCENE, _median_range_m(scene), "m")
     at.add("Angle of a pixel", "φ", OF_SCENE, angle_rad, "rad")
     at.add("Solid angle of a pixel", "Ω", "φ²", at["φ"] ** 2, "sr")
     if budget.beam_mrad is None:
@@ -270,24 +262,22 @@ def _add_background(at: _Sheet, budget: PhotonBudget) -> None:
     at.add("Signal over background", "SBR", "S / B", at["S"] / at["B"])
 
 
-def with_falloff(scene: Scene, range_m: float | None = None, reflectivity: float = 1.0) -> Scene:
-    """Return a scene whose signal falls with ``1 / R²``.
+def with_falloff(scene: Scene, reflectivity: float = 1.0) -> Scene:
+    """Return a scene whose signal falls with ``1 / R²`` from that at its median range.
 
     Parameters
     ----------
     scene : Scene
-    range_m : float, optional
-        Range to which the signal refers; by default the median of the scene.
     reflectivity : float
-        Reflectivity to which it refers. Fog returns as much as a surface of reflectivity 1 would at
-        a range that is larger by the root.
+        Reflectivity to which the signal refers. A surface of reflectivity 1 returns as much from a
+        range that is larger by the root, to which the signal of fog refers.
 
     Raises
     ------
     ValueError
-        If no pixel has a target, and `range_m` is None.
+        If no pixel has a target.
     """
-    reference_m = _median_range_m(scene) if range_m is None else range_m
+    reference_m = _median_range_m(scene)
     fog = scene.backscatter
     if fog is not None:
         fog = replace(fog, reference_m=reference_m / math.sqrt(reflectivity))
@@ -300,11 +290,10 @@ def signal_extent(budget: PhotonBudget, scene: Scene) -> tuple[float, float]:
     Raises
     ------
     ValueError
-        If there are none; as `steps`.
+        As `steps`.
     """
     range_m, signal = next(echoes(*budget.apply(scene)))
     known = signal[np.isfinite(range_m)]
-    require("range_m", "no pixel with a target", known.size > 0, "a scene with a target")
     return float(known.min()), float(known.max())
 
 
@@ -400,7 +389,7 @@ def _reach(budget: PhotonBudget, scene: Scene, name: str, target_rd: float, puls
 
 def _median_range_m(scene: Scene) -> float:
     known = scene.range_m[np.isfinite(scene.range_m)]
-    require("range_m", "no pixel with a target", known.size > 0, "a scene with a target, or metres")
+    require("range_m", "no pixel with a target", known.size > 0, "a scene with a target")
     return float(np.median(known))
 
 

@@ -29,7 +29,7 @@ OTHERWISE: dict[str, list[Any]] = {
     "region": [((1, 2), (1, 9), (7, 5)), ((0.5, 1.25), (-3.0, 9.0), (7.0, 5.1))],
     "budget": [
         PhotonBudget(),
-        PhotonBudget(0.5, 20.0, 1.0, 2e4, 0.5, 0.3, 0.8, 1550.0, 10.0, 2.0, 60.0, 0.2),
+        PhotonBudget(0.5, 20.0, 1.0, 2e4, 0.5, 0.3, 0.8, 1550.0, 10.0, 2.0, 0.2),
     ],
     "kept": ["source=car&method=coates", "tracking.l=0.006&light.sbr=2.0"],
     "unread": ["source=two.mat", "source=a%20b&reading.n_bins=40"],

@@ -94,6 +94,7 @@ def test_numbers_of_the_built_in_lessons():
     assert np.interp(0.85, sure.x, sure.curves["right"]) == pytest.approx(0.85, abs=0.05)
     assert answers["9-real-capture"] == pytest.approx(0.16, abs=0.02)
     assert answers["10-neighbours"] == pytest.approx(0.71, abs=0.03)
+    assert answers["11-where-light-comes-from"] == pytest.approx(2 * 0.1041 / 16)
 
 
 def test_links_of_the_lessons_lead_to_other_pages():

@@ -134,7 +134,7 @@ def same_pixel(found: dict, name: str, pixel: Pixel) -> None:
 
 STATES = {
     "first": "",
-    "budget": "budget.filter_nm=0.5&budget.range_m=48.0&light.n_pulses=300",
+    "budget": "budget.filter_nm=0.5&budget.reflectivity=0.3&light.n_pulses=300",
     "changed": "source=worn&light.sbr=0.3&light.n_pulses=500&light.seed=4&less.merge=2&less.pool=2"
     "&less.gate_from=0.1&less.pulses=0.7&absent=[%22jitter%22,%22pile_up%22]&tracking.l=0.01"
     "&tracking.n=500&tracking.m=1.5&tracking.alpha=0.3&tracking.t_n=10&tracking.weight=cubic"

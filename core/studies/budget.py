@@ -32,7 +32,7 @@ def steps_table(budget: PhotonBudget, scene: Scene, name: str) -> Table:
         },
         "What is given is a setting; h and c are Planck's constant and the speed of light. Signal "
         "and background are those of a surface at the range R with the reflectivity ρ. Nearer "
-        f"pixels and brighter ones get more signal: {low:.3g} to {high:.3g} per pulse.",
+        f"and brighter pixels get more signal: {low:.3g} to {high:.3g} per pulse.",
         {"value": ".4g"},
     )
 

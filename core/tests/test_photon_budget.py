@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import constants
 
-from core import Acquisition, Flux, PhotonBudget, Scene, scenes, simulate
+from core import Acquisition, Flux, PhotonBudget, Pulse, Scene, scenes, simulate
 from core.acquisition import SPEED_OF_LIGHT_M_S
 from core.cli import main
 from core.effects import Backscatter, Falloff
@@ -46,7 +46,7 @@ def one_pixel(range_m: float, pixel_angle_rad: float = 1e-3) -> Scene:
 
 
 @pytest.mark.parametrize(
-    "budget", [PhotonBudget(), PhotonBudget(beam_mrad=0.5, range_m=60.0, irradiance_w_m2_nm=0.3)]
+    "budget", [PhotonBudget(), PhotonBudget(beam_mrad=0.5, irradiance_w_m2_nm=0.3)]
 )
 def test_each_value_is_that_of_the_equation_shown_with_it(budget: PhotonBudget) -> None:
     known: dict[str, object] = dict(NAMES)
@@ -134,34 +134,32 @@ def test_the_standard_sun_is_as_bright_as_its_spectrum() -> None:
 
 
 def test_signal_falls_with_range_and_reflectivity_over_the_scene() -> None:
-    range_m = np.array([[50.0, 100.0, np.nan]])
-    scene = Scene(range_m, np.array([[1.0, 0.5, 1.0]]), Acquisition(1000))
-    lit, flux = PhotonBudget(range_m=50.0).apply(scene)
-    capture = simulate(lit, lit.acquisition, flux)
-    assert capture.signal == pytest.approx(flux.signal * np.array([[1.0, 0.125, 0.0]]))
-    assert signal_extent(PhotonBudget(range_m=50.0), scene) == pytest.approx(
-        (flux.signal / 8, flux.signal)
-    )
-    found = values(PhotonBudget(range_m=50.0), scene)
+    range_m = np.array([[50.0, 100.0, np.nan, 25.0]])
+    scene = Scene(range_m, np.array([[1.0, 0.5, 1.0, 1.0]]), Acquisition(1000))
+    lit, flux = PhotonBudget().apply(scene)
+    signal = flux.signal * np.array([[1.0, 0.125, 0.0, 4.0]])
+    assert simulate(lit, lit.acquisition, flux).signal == pytest.approx(signal)
+    extent = (flux.signal / 8, 4 * flux.signal)
+    assert signal_extent(PhotonBudget(), scene) == pytest.approx(extent)
+    found = values(PhotonBudget(), scene)
     assert (flux.signal, flux.sbr) == pytest.approx((found["S"], found["SBR"]), rel=1e-4)
 
 
 def test_fog_returns_what_a_white_target_would() -> None:
-    """The photons of the fog do not depend on the range and reflectivity of the budget."""
-    clear = scenes["car"]()
-    fog = replace(clear, backscatter=Backscatter(0.01))
+    """The photons of the fog depend neither on the target's reflectivity nor on its range."""
+    car = scenes["car"]()
 
-    def of_fog(**settings: float) -> np.ndarray:
-        lit, flux = PhotonBudget(**settings).apply(fog)
+    def of_fog(scene: Scene, reflectivity: float) -> np.ndarray:
+        fog = replace(scene, backscatter=Backscatter(0.01))
+        lit, flux = PhotonBudget(reflectivity=reflectivity).apply(fog)
         assert lit.backscatter is not None
-        pulse = simulate(lit, lit.acquisition, flux).pulse
-        return lit.backscatter.photons_before(flux.signal, pulse, lit.acquisition)
+        return lit.backscatter.photons_before(flux.signal, Pulse(), lit.acquisition)
 
-    dim, bright = of_fog(range_m=100.0, reflectivity=0.1), of_fog(range_m=50.0)
-    assert dim == pytest.approx(bright, rel=1e-4)
+    farther = replace(car, range_m=1.1 * car.range_m)
+    assert of_fog(car, 0.1) == pytest.approx(of_fog(farther, 0.5), rel=1e-4)
 
 
-def test_the_default_range_is_the_median() -> None:
+def test_the_signal_is_that_at_the_median_range() -> None:
     scene = scenes["car"]()
     assert values(PhotonBudget(), scene)["R"] == pytest.approx(np.nanmedian(scene.range_m))
     assert with_falloff(scene).falloff == Falloff(float(np.nanmedian(scene.range_m)))

@@ -37,12 +37,6 @@ from core.studies.budget import NEEDED_NOTE, steps_table
 from core.typesetting import scientific
 
 TITLE = "From watts and sunlight"
-MORE = "More of the photon budget"
-RARE = (
-    *("transmission", "wavelength_nm", "dark_count_hz"),
-    *("beam_mrad", "range_m", "irradiance_w_m2_nm"),
-)
-"""Settings that are folded."""
 
 OFF = (
     "Signal and background follow from pulse energy, aperture, filter, target and sun. Nearer "
@@ -54,7 +48,7 @@ ON = (
 )
 STEPS_COLUMNS = (
     ("Step", "Each quantity and its equation, in the symbols of the steps before.", 1),
-    ("Value", "Per pulse and pixel, for the range of the target.", -1),
+    ("Value", "For one pulse and pixel, at the median range of the scene.", -1),
 )
 NEEDED_COLUMNS = (
     ("Setting", "One at a time, the others unchanged.", 1),
@@ -133,7 +127,7 @@ class Content:
         self._found_for: Any = None
         self._jobs = session.tasks.latest()
         self._body = pn.Column(
-            self.settings.folded(MORE, *RARE),
+            self.settings.layout,
             downloadable(below(self.steps), session, "photon budget", self.shown, TABLE),
             self.find,
             self.needed_note,

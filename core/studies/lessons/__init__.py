@@ -9,7 +9,7 @@ import inspect
 from collections.abc import Callable, Mapping
 
 from core.checks import require
-from core.studies.lessons import accuracy, images, pile_up, tracking
+from core.studies.lessons import accuracy, falloff, images, pile_up, tracking
 from core.studies.lessons.bench import Bench
 from core.studies.outputs import Pictures, Plot
 from core.studies.pulses import Pulses
@@ -57,6 +57,7 @@ PLOTS: Mapping[str, Callable[[Bench], Plot]] = {
         images.outdoor_pixel,
         images.surface_probability,
         images.found_by_distance,
+        falloff.fluxes_by_range,
     )
 }
 """Views on which a prediction can be drawn."""
@@ -80,6 +81,7 @@ CHECKS: Mapping[str, Callable[..., float]] = {
     for each in (
         number,
         share_of_gate,
+        falloff.signal_at,
         pile_up.share_armed,
         pile_up.share_fired,
         pile_up.best_attenuation,
