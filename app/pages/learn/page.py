@@ -42,8 +42,11 @@ class Learn(Section):
     def __init__(self, session: Session) -> None:
         super().__init__(session, "learning", "present")
         self.lessons: Mapping[str, Lesson] = session.lessons
+        linked = session.state.learning.lesson
+        key = linked if linked in self.lessons else next(iter(self.lessons))
+        self.shown = self._made(key, session.state.present)
         titles = {lesson.title: key for key, lesson in self.lessons.items()}
-        self.choice = select("Lesson", titles, next(iter(self.lessons)), text.LESSON_HELP)
+        self.choice = select("Lesson", titles, key, text.LESSON_HELP)
         self.choice.max_width = 480
         self.choice.param.watch(lambda event: self._choose(event.new), "value")
         tools = pn.Row(
@@ -55,10 +58,9 @@ class Learn(Section):
             margin=(0, 8),
         )
         self._head = pn.Column(self.choice, tools, sizing_mode="stretch_width", margin=0)
-        self._stage = pn.Column(sizing_mode="stretch_width", margin=0)
+        self._stage = pn.Column(self.shown.layout, sizing_mode="stretch_width", margin=0)
         self._channels: defaultdict[str, Latest] = defaultdict(session.tasks.latest)
         self._requested: dict[str, Any] = {}  # what each channel last computed from
-        self.shown = self._made(next(iter(self.lessons)), session.state.present)
 
     def layout(self) -> tuple[Any, Any]:
         """Return the lesson, and a note in place of controls."""
@@ -85,7 +87,7 @@ class Learn(Section):
         key = learning.lesson or next(iter(self.lessons))
         with self.session.tasks.hold():
             is_same = isinstance(self.shown, Presenter) == state.present
-            if key != self.shown.lesson.key or not is_same or not self._stage.objects:
+            if key != self.shown.lesson.key or not is_same:
                 self.shown, self._requested = self._made(key, state.present), {}
                 self.choice.value = key
                 self._stage[:] = [self.shown.layout]
@@ -175,7 +177,7 @@ class Learn(Section):
 PAGE = Page(
     "Learn",
     Learn,
-    "asks before it shows: short lessons",
+    "teaches the measurement in short lessons",
     shared=frozenset(),
     is_standalone=True,
 )

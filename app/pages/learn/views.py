@@ -112,7 +112,7 @@ class View:
         self._session, self._lesson, self._is_large = session, lesson.key, is_large
         self.bench = lesson.bench
         self.item: Item | None = None
-        self._colors: Palette | None = None
+        self._colors = LIGHT
         self._enlarged: list[Any] = []
         self._shown: CurveCard | Gallery | PulseCard | None = None
         self.holder = pn.Column(
@@ -159,8 +159,7 @@ class View:
             shown = CurveCard()
         else:
             shown = PulseCard() if isinstance(item, Pulses) else Gallery(self._is_large)
-        if self._colors is not None:
-            shown.paint(self._colors)
+        shown.paint(self._colors)
         if self._is_large:
             self.holder.styles = UNNOTED
         else:

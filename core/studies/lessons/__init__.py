@@ -123,6 +123,8 @@ NEED_SIGNAL = frozenset({*VIEWS, *CHECKS}) - {
     for each in (
         number,
         share_of_gate,
+        falloff.fluxes_by_range,
+        falloff.signal_at,
         pile_up.light,
         pile_up.first_photons,
         pile_up.pulse_by_pulse,
