@@ -14,7 +14,7 @@ from app.model.state import Viewing
 from app.model.store import Answer, Request, compute
 from app.model.text import Fact, cause
 from app.pages.inspect import text
-from app.pages.inspect.pixel import FACTS, stage
+from app.pages.inspect.pixel import FACTS, FILLING, stage
 from app.pages.inspect.results import Pair, pair_of
 from app.pages.session import Session
 from app.pages.shared.downloads import IMAGE, PLOT, Shown, ranged, viewed
@@ -33,6 +33,8 @@ GRID = f"""
   :host {{ grid-template-columns: minmax(0, 1fr); }}
 }}
 """
+# Long legends would push the colour scales over what stands below the page.
+SCROLLED = ":host { overflow-y: auto; }"
 
 
 class PairSection(Section):
@@ -64,7 +66,9 @@ class PairSection(Section):
         self.note = Sentence(live=True, text=text.NO_A, sizing_mode="stretch_width", margin=0)
         self._forget = button("Forget A", text.FORGET_HELP, session.forget)
         self._of_images: list[Fact] = []
-        self._content = pn.Column(visible=False, sizing_mode="stretch_width")
+        self._content = pn.Column(
+            visible=False, stylesheets=[FILLING, SCROLLED], sizing_mode="stretch_width"
+        )
         session.state.param.watch(lambda *_: self._mark(), "pixel")
 
     def layout(self) -> tuple[Any, Any]:
