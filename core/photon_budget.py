@@ -132,7 +132,7 @@ class PhotonBudget(Settings):
     )
     dark_count_hz: float = parameter(
         1000.0,
-        _positive("Dark counts", 1.0, 1e6, "per second"),
+        _positive("Dark counts", 1.0, 1e6, "1/s"),
         "Detections per second of an armed pixel in the dark.",
     )
     beam_mrad: float | None = parameter(
