@@ -8,10 +8,10 @@ import errno
 import io
 import json
 import os
+import resource
 import struct
-import subprocess
-import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -371,45 +371,40 @@ def fails_with_an_error_of_its_own(product: Product, file: BinaryIO) -> None:
         raise RuntimeError("Failed to call write") from None
 
 
-WRITES_TOO_MUCH = """
-import resource, signal, sys
-from dataclasses import replace
-from pathlib import Path
-from core.io.writers import CAPTURE_SUFFIXES, FOLDER_WRITERS, WRITERS, save_capture, save_image
-from core.tests.test_export import CAPTURE, IMAGE, fails_with_an_error_of_its_own
-
-kept = replace(CAPTURE, source="a wall")
-WRITERS[".own"] = fails_with_an_error_of_its_own
-folder = Path(sys.argv[1])
-saves = [(save_image, (CAPTURE, IMAGE), folder / f"image{s}") for s in (*WRITERS, *FOLDER_WRITERS)]
-saves += [(save_capture, (kept,), folder / f"capture{s}") for s in CAPTURE_SUFFIXES]
-for save, of, path in saves:
-    save(*of, path)  # loads its library
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
-for save, of, path in saves:
+@contextmanager
+def files_of_at_most(n_bytes: int) -> Iterator[None]:
+    """Let the system refuse to write more into a file; Python ignores the signal that it sends."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
     try:
-        save(*of, path, overwrite=True)
-    except OSError as error:
-        print(error)
-"""
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_disk_that_is_full_is_reported_and_nothing_is_left(tmp_path: Path) -> None:
-    """A limit on the size of files stands for the disk: the system then refuses to write more."""
-    done = subprocess.run(
-        [sys.executable, "-c", WRITES_TOO_MUCH, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    names = [f"image{suffix}" for suffix in (*WRITERS, ".own", ".zarr")]
-    names += [f"capture{suffix}" for suffix in CAPTURE_SUFFIXES]
-    for name, line in zip(names, done.stdout.splitlines(), strict=True):
-        assert line.startswith(f"{tmp_path / name} cannot be written (")
-        assert "): free some space, or give " in line
-    assert sorted(os.listdir(tmp_path)) == sorted(names)  # the older ones
+def test_a_disk_that_is_full_is_reported_and_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A limit on the size of files stands for the disk."""
+    monkeypatch.setitem(WRITERS, ".own", fails_with_an_error_of_its_own)
+    kept = replace(CAPTURE, source="a wall")
+    saves: list[tuple[Callable[..., object], tuple[Any, ...], Path]] = [
+        *((save_image, (CAPTURE, IMAGE), tmp_path / f"image{s}") for s in WRITERS),
+        *((save_image, (CAPTURE, IMAGE), tmp_path / f"image{s}") for s in FOLDER_WRITERS),
+        *((save_capture, (kept,), tmp_path / f"capture{s}") for s in CAPTURE_SUFFIXES),
+    ]
+    for save, of, path in saves:
+        save(*of, path)  # loads its library
+    refused = []
+    with files_of_at_most(100):
+        for save, of, path in saves:
+            with pytest.raises(OSError) as caught:
+                save(*of, path, overwrite=True)
+            refused.append((path, str(caught.value)))
+    for path, message in refused:
+        assert message.startswith(f"{path} cannot be written (")
+        assert "): free some space, or give " in message
+    assert sorted(tmp_path.iterdir()) == sorted(path for *_, path in saves)  # the older ones
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".zarr"])

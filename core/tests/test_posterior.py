@@ -337,6 +337,7 @@ def test_fluxes_and_posterior_are_always_defined(
         assert_probabilities(capture)
 
 
+@pytest.mark.uncounted
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
 @pytest.mark.parametrize("n_pulses", [None, 1000, 2**32 - 1])
 def test_full_counters_give_probabilities(dtype: type, n_pulses: int | None) -> None:
