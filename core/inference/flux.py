@@ -3,6 +3,10 @@
 The distributions of signal levels and of delays are estimated from a sample of the pixels
 (nonparametric maximum likelihood of a mixing distribution, Kiefer & Wolfowitz 1956, on a grid of
 levels that includes "no echo"). The background of a pixel is its total rate minus the signal level.
+
+At a low SBR a single pixel hardly shows its level. If no level is found, the background is too high
+by the signal, which hides it further. Then each level is tried with the distribution of delays that
+it makes likeliest, which many pixels show together.
 """
 
 from __future__ import annotations
@@ -43,6 +47,8 @@ SAMPLE = 512  # pixels from which the levels of signal are estimated
 DEPTH_SAMPLE = 1024  # pixels from which the distribution of delays is estimated
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
 _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
+_CLEAR = 1.0  # mean gain in log likelihood of pixels that show their signal levels one by one
+_LEAST_JOINT_GAIN = 15.0  # of a level with its delays; without echoes 11 at most in 224 captures
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
@@ -164,28 +170,28 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
         own_weight=_own_weight(total, chance),
         background_shape=shape,
     )
+    start = found
     for some in (_sampled(total.size, SAMPLE // 4)[np.newaxis], pixels):
         flux = found.model(total.ravel()[some], least)
-        share = _shares(level_evidence(prepare(capture, flat[some], flux, 1)))
+        evidence = level_evidence(prepare(capture, flat[some], flux, 1))
+        share = _shares(evidence)
         mean = np.asarray(share @ levels)
         variance = float(share @ (levels - mean) ** 2)
         found = found._replace(
             background=total.ravel()[some].mean() - mean,
             own_weight=_own_weight(total, chance + variance),
         )
+    if _mean_log_likelihood(evidence, share) < _CLEAR:
+        share = _shares_if_depths_are_alike(capture, start, share)
+        mean = share @ levels
     levels, share, pair = _halved(levels, share, _kept(share))
     found = found._replace(levels=levels, share=share, background=total.mean() - mean)
-    # Delays need a table of all levels of the sample: fewer pixels in a long gate.
-    each = found.share.size * flat.shape[1]
-    most = sampled_numbers(found.share.size, flat.shape[1]) // each
-    pixels = _sampled(total.size, min(most, DEPTH_SAMPLE))[np.newaxis]
-    flux = found.model(total.ravel()[pixels], least)
-    density = level_densities(prepare(capture, flat[pixels], flux, 1))
+    pixels, density = _sampled_densities(capture, found)
     share, depth = shares_and_depths(density, found.share)
     # Given the delays, and one background for all levels, faint levels are less plausible.
-    evidence = np.log(np.maximum(density @ depth.astype(np.float32), _TINY))
+    evidence = _evidence(density, depth)
     found = found._replace(share=share, depth=depth)
-    free = _background(capture, found, pixels[0], density)
+    free = _background(capture, found, pixels, density)
     share = _shares(evidence)
     learn_shares(_likelihood(evidence), share)  # of the levels that are left
     levels, share = _joined(found.levels, share, pair)
@@ -198,6 +204,59 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
         levels = levels * ((total.mean() - background) / (share @ levels))
     found = found._replace(levels=levels, share=share, background=np.asarray(background))
     return found._replace(contrast=found.model(total, least).contrast), free.shape
+
+
+def _sampled_densities(
+    capture: Capture, flux_prior: FluxPrior
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Return the flat indices of a sample of the pixels, and their `level_densities`."""
+    total, n_bins = _totals(capture)[0].ravel(), capture.acquisition.n_bins
+    # A table of all levels and delays: fewer pixels in a long gate.
+    n_levels = flux_prior.share.size
+    most = sampled_numbers(n_levels, n_bins) // (n_levels * n_bins)
+    pixels = _sampled(total.size, min(most, DEPTH_SAMPLE))
+    flux = flux_prior.model(total[np.newaxis, pixels], _least_background(capture))
+    cube = capture.cube.reshape(-1, n_bins)[np.newaxis, pixels]
+    return pixels, level_densities(prepare(capture, cube, flux, 1))
+
+
+def _evidence(density: NDArray[np.float32], depth: Floats) -> Floats:
+    """Logarithm of the mean of densities (pixel, level, bin) over the delays, (pixel, level)."""
+    return np.asarray(np.log(np.maximum(density @ depth.astype(np.float32), _TINY)))
+
+
+def _mean_log_likelihood(evidence: Floats, share: Floats) -> float:
+    """Mean over the pixels, given the evidence (pixel, level) and the shares of the levels."""
+    return float((np.log(_likelihood(evidence) @ share) + evidence.max(axis=1)).mean())
+
+
+def _shares_if_depths_are_alike(capture: Capture, start: FluxPrior, share: Floats) -> Floats:
+    """Estimate the shares of signal levels that pixels hardly show one by one, but together.
+
+    Each level is tried as the signal of all pixels with an echo, and so are the levels with the
+    shares found so far, `share`, with the distribution of delays that makes each likeliest. Returns
+    `share` unless one level is clearly likelier.
+    """
+    _, density = _sampled_densities(capture, start)
+
+    def fitted(share: Floats) -> tuple[float, Floats]:
+        some, found = np.flatnonzero(share), np.zeros_like(share)
+        part = np.ascontiguousarray(density[:, some])
+        of_levels, depth = shares_and_depths(part, share[some] / share.sum())
+        evidence = _evidence(part, depth)
+        learn_shares(_likelihood(evidence), of_levels)
+        found[some] = of_levels
+        return _mean_log_likelihood(evidence, of_levels), found
+
+    before = share.copy()
+    most, best = fitted(np.where(_kept(before), before, 0.0))[0], share
+    most += _LEAST_JOINT_GAIN / len(density)
+    for echo in np.eye(share.size)[1:]:
+        echo[0] = 1.0  # no echo is as likely at first
+        here, found = fitted(echo)
+        if here > most:
+            most, best = here, found
+    return best
 
 
 def _sampled(n_pixels: int, most: int) -> NDArray[np.intp]:

@@ -15,8 +15,10 @@ from core.estimators import estimate
 from core.inference.flux import LEVEL_SPAN, LEVELS, flux_model_of, total_rates
 from core.inference.flux_model import FluxModel
 from core.inference.posterior import TOLERANCE_BINS, posterior_of, tolerance_probability
+from core.metrics import restoration_degree
 from core.scene import Scene
 from core.simulation import simulate
+from core.studies.trials import Condition
 from core.trigger import draw_counts, rate_per_bin, trigger_probability
 
 SIZE = 32  # rows and columns where fluxes are estimated
@@ -108,6 +110,20 @@ def test_an_echo_free_image_has_no_signal() -> None:
     assert flux.share[0] > 0.99
     assert len(flux.share) == 2  # one that the sample may have missed, and no more
     assert (posterior_of(capture).surface < 0.5).all()
+
+
+@pytest.mark.parametrize(("scene", "seed"), [("wall", 0), ("car", 3)])
+def test_a_signal_is_found_that_pixels_show_only_together(scene: str, seed: int) -> None:
+    capture = Condition(scene, 0.02).capture(seed)
+    flux, signal = flux_model_of(capture), Condition(scene, 0.02).signal
+    assert flux.share[0] == pytest.approx(np.isnan(capture.truth_range_m).mean(), abs=0.1)
+    assert signal / HALF_A_STEP < flux.typical_signal.mean() < signal * HALF_A_STEP
+    tolerance_m = TOLERANCE_BINS * capture.acquisition.bin_length_m
+    right, best = (
+        restoration_degree(estimate(capture, method).range_m, capture.truth_range_m, tolerance_m)
+        for method in ("likelihood", "oracle")
+    )
+    assert right > best - 0.05
 
 
 def test_two_reflectivities_are_found() -> None:
