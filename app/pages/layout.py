@@ -110,6 +110,7 @@ PRINT = """
 
 PRESENT = "header, nav, .MuiToolbar-root { display: none !important; }"
 """Style of presenter mode, which covers the window."""
+ABOVE_SLIDES = {"position": "relative", "z-index": "1400"}
 
 SKIP_LINK = (Path(__file__).parent.parent / "widgets" / "skip_link.js").read_text("utf-8")
 
@@ -433,6 +434,7 @@ class Layout:
         state = self.session.state
         is_presenting = state.present and state.page == LEARN
         self.page.stylesheets = [PRINT, PRESENT] if is_presenting else [PRINT]
+        self.alert.styles = ABOVE_SLIDES if is_presenting else {}
 
     def _show_failure(self, sentence: str) -> None:
         self.alert.text = sentence[:2000]
