@@ -410,6 +410,8 @@ class Layout:
         state.param.watch(lambda *_: self._show_bars(), ["page", "present"])
         self._show_bars()
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
+        if self.page.dark_theme:  # by its address
+            self.pages.paint(True)
         if self._arrivals is not None:
             self._arrivals.subscribe(self._hear_of)
         if tasks.is_served:
