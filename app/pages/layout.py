@@ -112,6 +112,7 @@ PRINT = """
 
 PRESENT = "header, nav, .MuiToolbar-root { display: none !important; }"
 """Style of presenter mode, which covers the window."""
+ABOVE_SLIDES = {"position": "relative", "z-index": "1400"}
 
 SKIP_LINK = (Path(__file__).parent.parent / "widgets" / "skip_link.js").read_text("utf-8")
 
@@ -408,6 +409,8 @@ class Layout:
         state.param.watch(lambda *_: self._show_bars(), ["page", "present"])
         self._show_bars()
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
+        if self.page.dark_theme:  # by its address
+            self.pages.paint(True)
         if self._arrivals is not None:
             self._arrivals.subscribe(self._hear_of)
         if tasks.is_served:
@@ -432,6 +435,7 @@ class Layout:
         state = self.session.state
         is_presenting = state.present and state.page == LEARN
         self.page.stylesheets = [PRINT, PRESENT] if is_presenting else [PRINT]
+        self.alert.styles = ABOVE_SLIDES if is_presenting else {}
 
     def _show_failure(self, sentence: str) -> None:
         self.alert.text = sentence[:2000]

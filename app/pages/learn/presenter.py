@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import panel as pn
+import panel_material_ui as pmui
 
 from app.model.glossary import linked
 from app.model.lessons import Item, Lesson
@@ -29,8 +30,10 @@ STAGE = """
   --type-size: 24px; }
 """
 PLOT = ":host { flex: 1 1 0 !important; min-height: 0; width: 100%; }"
-SCALED = {"zoom": "1.9"}
-"""Style of controls, which are made for a page that is read from near by."""
+SCALED = {"zoom": "2.2"}
+"""Style of controls, whose smallest type has 11 px."""
+LABEL = {"& .MuiInputLabel-shrink, & .MuiOutlinedInput-notchedOutline": {"fontSize": "15px"}}
+"""Style of the labels of fields, which else are drawn at three quarters."""
 TYPE = {
     "&, & p": {"fontSize": "26px", "lineHeight": 1.3},
     "& p": {"margin": "0 0 6px"},
@@ -85,6 +88,10 @@ class Presenter:
         self.bar.param.watch(lambda event: self._act(event.new[0]), "pressed")
         self.prediction = prediction_field(lesson)
         self.panel = settings_panel(lesson, self._moved)
+        control = self.panel.controls[lesson.control]
+        for each in (self.prediction, control):
+            if isinstance(each, pmui.TextInput | pmui.Select):
+                each.sx = LABEL
         self._text = markdown("", TYPE)
         asking = pn.Row(
             self.prediction,
@@ -93,9 +100,7 @@ class Presenter:
             margin=0,
         )
         self._asking = pn.Column(asking, styles=SCALED)  # the style of the row keeps it visible
-        self._control = pn.Column(
-            self.panel.controls[lesson.control], sizing_mode="stretch_width", styles=SCALED
-        )
+        self._control = pn.Column(control, sizing_mode="stretch_width", styles=SCALED)
         self._stage = pn.Column(stylesheets=[PLOT], sizing_mode="stretch_both", margin=0)
         self.layout = pn.Column(
             markdown(f"# {lesson.title}", TYPE),
