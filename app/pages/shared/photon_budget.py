@@ -124,7 +124,7 @@ class Content:
         )
         self.needed_note = Sentence(live=True, sizing_mode="stretch_width", margin=(0, 8, 4, 8))
         self.needed = _table(f"What reaches RD {TARGET_RD:g}", NEEDED_COLUMNS)
-        self._found_for: Any = None
+        self._shown_for: Any = None
         self._jobs = session.tasks.latest()
         self._body = pn.Column(
             self.settings.layout,
@@ -140,20 +140,21 @@ class Content:
         )
 
     def show(self, request: Request) -> None:
-        """Show the budget of a request."""
-        budget = request.budget
+        """Show the budget of a request, unless it is shown already."""
+        budget, conditions = request.budget, _conditions(request)
+        if conditions == self._shown_for:
+            return
+        self._shown_for = conditions
         self.switch.value = self._body.visible = budget is not None
+        self.needed.rows, self.needed.visible, self.needed_note.text = [], False, ""
         if budget is None:
             self.note.text = OFF
             return
         self._last, scene = budget, _scene(request)
         self.settings.show(budget)
         self.note.text = ON.format(*map(scientific, signal_extent(budget, scene)))
-        self.steps.rows = [
-            step_row(each) for each in steps(budget, scene) if each.equation != GIVEN
-        ]
-        if self._found_for != _conditions(request):
-            self.needed.rows, self.needed.visible, self.needed_note.text = [], False, ""
+        computed = (each for each in steps(budget, scene) if each.equation != GIVEN)
+        self.steps.rows = [step_row(each) for each in computed]
 
     def shown(self) -> Shown:
         """Return the steps, for a download."""
@@ -169,13 +170,13 @@ class Content:
 
     def _find(self) -> None:
         request = self._session.request
-        self._found_for = _conditions(request)
         self.needed_note.text = COMPUTING
         work = partial(reaching, request.budget or self._last, _scene(request))
-        self._jobs.submit(work, partial(self._draw, self._found_for), self._refuse)
+        self._jobs.submit(work, partial(self._draw, _conditions(request)), self._refuse)
 
     def _draw(self, conditions: Any, found: tuple[Reach, ...]) -> None:
-        if conditions == _conditions(self._session.request):
+        self._session.failures.resolve(self)
+        if conditions == self._shown_for:
             self.needed_note.text = NEEDED_NOTE
             self.needed.rows = [needed_row(each) for each in found]
             self.needed.visible = True
@@ -186,7 +187,7 @@ class Content:
 
 
 def _conditions(request: Request) -> Any:
-    """Return what the search depends on."""
+    """Return what the form and its search depend on."""
     return request.budget, request.source, request.light.n_pulses, request.absent
 
 
