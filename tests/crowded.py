@@ -10,7 +10,7 @@ from app.server.limits import HTTP_LIMITS
 from app.server.serve import server_of
 from app.server.sessions import Bounds
 
-BOUNDS = Bounds(sessions=4, unconnected=2, unconnected_s=4.0, check_s=0.5, retry_s=2, queued=3)
+BOUNDS = Bounds(sessions=3, unconnected=2, unconnected_s=4.0, check_s=0.5, retry_s=2, queued=3)
 
 HTTP = {name: n / 5 if name.endswith("timeout") else n for name, n in HTTP_LIMITS.items()}
 """Limits of the HTTP server, with a fifth of its times."""

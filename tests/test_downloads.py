@@ -359,8 +359,7 @@ def test_intervals_that_would_take_too_long_are_left_out_and_the_file_says_so(
     assert str(arrays["remark"]) == NO_INTERVALS
 
 
-@pytest.mark.parametrize("kind", ["Range", "Error", "Counts"])
-@pytest.mark.parametrize("least", [0.0, 0.9])
+@pytest.mark.parametrize(("kind", "least"), [("Range", 0.0), ("Error", 0.9), ("Counts", 0.9)])
 def test_a_clouds_files_hold_the_points_on_screen_in_their_colours(explore, session, kind, least):
     viewing = replace(session.state.viewing, least_confidence=least)
     session.state.param.update(cloud_color=kind, viewing=viewing)

@@ -319,9 +319,9 @@ def move_the_slider_of_figure_4(here: Page) -> None:
     assert "Both scales, echo at bin 50, SBR 0.08" in titles(here)
     before = pixel.screenshot(), curve.screenshot()
     slider(here, "Bin of the echo").focus()
-    for _ in range(20):
+    for _ in range(5):
         here.keyboard.press("ArrowRight")
-    eventually(lambda: "Both scales, echo at bin 70, SBR 0.08" in titles(here))
+    eventually(lambda: "Both scales, echo at bin 55, SBR 0.08" in titles(here))
     eventually(lambda: pixel.screenshot() != before[0] and curve.screenshot() != before[1])
 
 

@@ -173,7 +173,7 @@ def test_a_full_server_refuses_a_page_open_pages_go_on_and_closed_ones_leave_no_
         return full_bytes
 
     full_bytes = asyncio.run(use())
-    # Eight live sessions take 80 MB.
+    # Six live sessions take 60 MB.
     eventually(lambda: server.memory_info().rss - full_bytes < 50e6)
 
 

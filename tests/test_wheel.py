@@ -62,10 +62,11 @@ def _take_compiled_kernels(installed):
         shutil.copy2(cached, copy)
 
 
-def test_every_python_of_this_machine_accepts_the_wheel(wheel, tmp_path):
+def test_every_other_python_of_this_machine_accepts_the_wheel(wheel, tmp_path):
     """Only metadata and syntax: the dependencies are installed for one Python."""
     found = pythons()
     assert found
+    found.pop("{}.{}".format(*sys.version_info), None)  # as above
     for version, python in found.items():
         commands = install(wheel, python, tmp_path / version, dependencies=False)
         (packages,) = commands.parent.glob("lib/python*/site-packages")

@@ -51,7 +51,11 @@ def install(wheel: Path, python: str, folder: Path, *, dependencies: bool) -> Pa
     """Install the wheel into a new environment and return its folder of commands."""
     subprocess.run([python, "-m", "venv", "--without-pip", folder], check=True)
     commands = folder / "bin"
-    options = ("--constraint", str(ROOT / "constraints.txt")) if dependencies else ("--no-deps",)
+    options = (
+        ("--constraint", str(ROOT / "constraints.txt"))
+        if dependencies
+        else ("--no-deps", "--no-compile")
+    )
     requirement = f"{wheel}[app]" if dependencies else str(wheel)
     _pip("--python", str(commands / "python"), "install", *options, requirement)
     return commands

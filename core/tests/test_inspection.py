@@ -131,7 +131,7 @@ def test_the_best_candidate_is_the_estimate(method: str) -> None:
 def test_the_candidate_at_the_estimate_is_the_estimate(method: str, settings: Any) -> None:
     capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)
     image = estimate(capture, method, settings)
-    for row, col in np.ndindex(8, 8):
+    for row, col in np.ndindex(4, 8):
         report = inspection.pixel_report(capture, image, row, col, method, settings)
         near = [c for c in report.candidates if abs(c.bin - report.answer_bin) < capture.echo_bins]
         # Neighbours may move a spatial method's estimate away from all peaks.
