@@ -55,7 +55,7 @@ export function render({ model }) {
 
   const place = element("span", "", { role: "status", class: "place" });
   const root = element("nav", "", { "aria-label": "Slides" });
-  const keys = `Space play · R reveal · F full screen · B blank · ${model.digits.join(" ")} lesson`;
+  const keys = `Space play · R reveal · F full screen · B blank · digit lesson`;
   root.append(
     button("←", "Back (←)", () => send("back")),
     place,

@@ -12,7 +12,7 @@ import panel as pn
 
 from app.model.glossary import ANCHOR
 from app.model.lessons import Lesson, number_of
-from app.model.slides import demonstration
+from app.model.slides import demonstration, number_of_lesson
 from app.model.state import Learning
 from app.pages.learn import text
 from app.pages.learn.lesson import PAGE_STYLE, ROW, Job, LessonView, markdown
@@ -45,7 +45,7 @@ class Learn(Section):
         linked = session.state.learning.lesson
         key = linked if linked in self.lessons else next(iter(self.lessons))
         self.shown = self._made(key, session.state.present)
-        titles = {lesson.title: key for key, lesson in self.lessons.items()}
+        titles = {numbered(lesson): key for key, lesson in self.lessons.items()}
         self.choice = select("Lesson", titles, key, text.LESSON_HELP)
         self.choice.max_width = 480
         self.choice.param.watch(lambda event: self._choose(event.new), "value")
@@ -172,6 +172,12 @@ class Learn(Section):
                     job.draw(result)
 
         self._channels[name].submit(job.work, arrived, partial(failures.report, part=failed))
+
+
+def numbered(lesson: Lesson) -> str:
+    """Return the title of a lesson, after its number if it has one."""
+    number = number_of_lesson(lesson.key)
+    return lesson.title if number is None else f"{number}. {lesson.title}"
 
 
 PAGE = Page(
