@@ -4,9 +4,9 @@ The distributions of signal levels and of delays are estimated from a sample of 
 (nonparametric maximum likelihood of a mixing distribution, Kiefer & Wolfowitz 1956, on a grid of
 levels that includes "no echo"). The background of a pixel is its total rate minus the signal level.
 
-At a low SBR a single pixel hardly shows its level. If no level is found, the background is too high
-by the signal, which hides it further. Then each level is tried with the distribution of delays that
-it makes likeliest, which many pixels show together.
+At a low SBR single pixels hardly show their level, and a signal that is not found raises the
+background, which hides it further. Then the distribution of delays, which many pixels show
+together, is estimated for each level, and the likeliest level is tried as that of all echoes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ DEPTH_SAMPLE = 1024  # pixels from which the distribution of delays is estimated
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
 _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _CLEAR = 1.0  # mean gain in log likelihood of pixels that show their signal levels one by one
-_LEAST_JOINT_GAIN = 15.0  # of a level with its delays; without echoes 11 at most in 224 captures
+_LEAST_JOINT_GAIN = 15.0  # of all pixels; without echoes it was at most 9 in 96 captures
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
@@ -181,10 +181,21 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
             background=total.ravel()[some].mean() - mean,
             own_weight=_own_weight(total, chance + variance),
         )
+    prior, free_shape = _completed(capture, found, share)
     if _mean_log_likelihood(evidence, share) < _CLEAR:
-        share = _shares_if_depths_are_alike(capture, start, share)
-        mean = share @ levels
-    levels, share, pair = _halved(levels, share, _kept(share))
+        other, other_shape = _completed(capture, found, _shares_of_one_level(capture, start))
+        gain = _log_likelihood(capture, other) - _log_likelihood(capture, prior)
+        if gain > _LEAST_JOINT_GAIN:
+            return other, other_shape
+    return prior, free_shape
+
+
+def _completed(
+    capture: Capture, found: FluxPrior, share: Floats
+) -> tuple[FluxPrior, Floats | None]:
+    """Return `_flux_prior`, given the shares of the coarse grid of levels that `found` has."""
+    total, mean = _totals(capture)[0], share @ found.levels
+    levels, share, pair = _halved(found.levels, share, _kept(share))
     found = found._replace(levels=levels, share=share, background=total.mean() - mean)
     pixels, density = _sampled_densities(capture, found)
     share, depth = shares_and_depths(density, found.share)
@@ -203,7 +214,8 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
         background = free.mean
         levels = levels * ((total.mean() - background) / (share @ levels))
     found = found._replace(levels=levels, share=share, background=np.asarray(background))
-    return found._replace(contrast=found.model(total, least).contrast), free.shape
+    contrast = found.model(total, _least_background(capture)).contrast
+    return found._replace(contrast=contrast), free.shape
 
 
 def _sampled_densities(
@@ -230,32 +242,28 @@ def _mean_log_likelihood(evidence: Floats, share: Floats) -> float:
     return float((np.log(_likelihood(evidence) @ share) + evidence.max(axis=1)).mean())
 
 
-def _shares_if_depths_are_alike(capture: Capture, start: FluxPrior, share: Floats) -> Floats:
-    """Estimate the shares of signal levels that pixels hardly show one by one, but together.
+def _log_likelihood(capture: Capture, flux_prior: FluxPrior) -> float:
+    """Log likelihood of a sample of the pixels."""
+    pixels = _sampled(capture.counts.size, DEPTH_SAMPLE)
+    background = np.maximum(flux_prior.background, _least_background(capture))
+    log = level_likelihoods(capture, pixels, flux_prior._replace(background=background), 1)
+    return pixels.size * _mean_log_likelihood(log, flux_prior.share)
 
-    Each level is tried as the signal of all pixels with an echo, and so are the levels with the
-    shares found so far, `share`, with the distribution of delays that makes each likeliest. Returns
-    `share` unless one level is clearly likelier.
+
+def _shares_of_one_level(capture: Capture, start: FluxPrior) -> Floats:
+    """Estimate the shares of no echo and of the likeliest level, as if all echoes had that one.
+
+    The likelihood of a level is that with the distribution of delays that suits it best.
     """
     _, density = _sampled_densities(capture, start)
-
-    def fitted(share: Floats) -> tuple[float, Floats]:
-        some, found = np.flatnonzero(share), np.zeros_like(share)
-        part = np.ascontiguousarray(density[:, some])
-        of_levels, depth = shares_and_depths(part, share[some] / share.sum())
-        evidence = _evidence(part, depth)
-        learn_shares(_likelihood(evidence), of_levels)
-        found[some] = of_levels
-        return _mean_log_likelihood(evidence, of_levels), found
-
-    before = share.copy()
-    most, best = fitted(np.where(_kept(before), before, 0.0))[0], share
-    most += _LEAST_JOINT_GAIN / len(density)
-    for echo in np.eye(share.size)[1:]:
-        echo[0] = 1.0  # no echo is as likely at first
-        here, found = fitted(echo)
+    most, best = -math.inf, start.share
+    for level in range(1, start.share.size):
+        pair = np.ascontiguousarray(density[:, [0, level]])
+        share, depth = shares_and_depths(pair, np.array([0.5, 0.5]))
+        here = _mean_log_likelihood(_evidence(pair, depth), share)
         if here > most:
-            most, best = here, found
+            most, best = here, np.zeros_like(best)
+            best[[0, level]] = share
     return best
 
 
