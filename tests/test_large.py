@@ -270,18 +270,19 @@ def test_a_page_reads_on_until_the_preview_is_whole(app):
     assert app.session.answer.cutout.read == 1.0
     assert control(app, "Rows shown").value == f"0 to {ROWS - 1}"
     assert control(app, "Columns shown").value == f"0 to {COLS - 1}"
-    app.tasks.run_until(lambda: control(app, "Cancel").disabled)
+    cancel = control(app, "Cancel")
+    app.tasks.run_until(lambda: cancel.disabled)
 
 
 def test_a_window_keeps_the_pixel_and_shows_its_place_in_the_file(app):
-    session, explore = app.session, app.contents["Explore"]
-    app.tasks.run_until(lambda: session.answer.cutout.is_final and control(app, "Cancel").disabled)
+    session, explore, cancel = app.session, app.contents["Explore"], control(app, "Cancel")
+    app.tasks.run_until(lambda: session.answer.cutout.is_final and cancel.disabled)
     session.choose_pixel(10, 12)
     app.settle()
     place = session.answer.grid.place(10, 12)
     histogram = session.answer.capture.cube[10, 12]
     read_window(app, "30 to 69", "20 to 79")
-    assert not control(app, "Cancel").disabled
+    assert not cancel.disabled
     app.tasks.run_until(lambda: not session.answer.cutout.is_preview)
     assert session.state.window == session.answer.cutout.window == Window((30, 70), (20, 80))
     assert session.answer.grid.place(*session.state.pixel) == place
@@ -310,7 +311,8 @@ def test_reading_ends_when_another_source_is_chosen(app):
 
 
 def test_wrong_bounds_are_refused_and_nothing_is_read(app):
-    app.tasks.run_until(lambda: control(app, "Cancel").disabled)
+    cancel = control(app, "Cancel")
+    app.tasks.run_until(lambda: cancel.disabled)
     control(app, "Rows shown").value = "90 to 200"
     with pytest.raises(ValueError, match=r"rows = '90 to 200'"):  # Panel hands it to the page
         control(app, "Read window").clicks += 1
@@ -318,8 +320,8 @@ def test_wrong_bounds_are_refused_and_nothing_is_read(app):
 
 
 def test_a_damaged_part_is_reported_and_the_page_continues(app, path):
-    session = app.session
-    app.tasks.run_until(lambda: session.answer.cutout.is_final and control(app, "Cancel").disabled)
+    session, cancel = app.session, control(app, "Cancel")
+    app.tasks.run_until(lambda: session.answer.cutout.is_final and cancel.disabled)
     before = session.answer
     chunk = path / "counts" / "c" / "0" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:-9])
