@@ -27,7 +27,7 @@ from tornado.ioloop import IOLoop, PeriodicCallback
 import core
 from app import THRESHOLD
 from app.model import text
-from app.model.lessons import Lesson, read_lessons
+from app.model.lessons import Lesson, add_lessons_option, read_lessons
 from app.model.store import (
     Source,
     built_in_sources,
@@ -172,14 +172,7 @@ def parser_of_arguments() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="open each capture that is written to this folder, beginning with the newest there",
     )
-    parser.add_argument(
-        "--lessons",
-        action="append",
-        default=[],
-        type=Path,
-        metavar="FOLDER",
-        help="add the lessons (*.md) of a folder to the page Learn; may be repeated",
-    )
+    add_lessons_option(parser)
     add_truth_options(parser)
     add_read_options(parser)
     return parser

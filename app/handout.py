@@ -16,7 +16,14 @@ from typing import Any
 
 from markdown_it import MarkdownIt
 
-from app.model.lessons import SHAPES, SPECS, Item, Lesson, read_lessons
+from app.model.lessons import (
+    SHAPES,
+    SPECS,
+    Item,
+    Lesson,
+    add_lessons_option,
+    read_lessons,
+)
 from core.checks import require
 from core.parameters import Choice
 from core.studies.lessons import CHECKS, Bench
@@ -72,14 +79,7 @@ def main(arguments: list[str] | None = None) -> int:
         metavar="N",
         help="number of the student: the seed of the simulations (default: 0)",
     )
-    parser.add_argument(
-        "--lessons",
-        action="append",
-        default=[],
-        type=Path,
-        metavar="FOLDER",
-        help="add the lessons (*.md) of a folder; may be repeated",
-    )
+    add_lessons_option(parser)
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("handout.html"), help="default: handout.html"
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+from argparse import ArgumentParser
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -186,6 +187,18 @@ def number_of(text: str, name: str) -> float:
 
 
 # -- Files -----------------------------------------------------------------------------------------
+
+
+def add_lessons_option(parser: ArgumentParser) -> None:
+    """Add the option for the folders of `read_lessons`."""
+    parser.add_argument(
+        "--lessons",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="FOLDER",
+        help="add the lessons (*.md) of a folder; may be repeated",
+    )
 
 
 def read_lessons(folders: Sequence[Path] = ()) -> dict[str, Lesson]:
