@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -254,7 +255,9 @@ def _candidates(
     bins = np.clip(peaks - lag_bins, 0.0, capture.acquisition.n_bins)
     width_bins = same_echo_bins(capture)
     is_estimate = np.abs(bins - estimate_bin) < width_bins
-    if is_estimate.any():
+    # A refined estimate may have moved farther; it began at the highest peak.
+    is_moved = ESTIMATORS[method].refine is not None and math.isfinite(estimate_bin)
+    if is_estimate.any() or is_moved:
         bins[is_estimate.argmax()] = estimate_bin
     kept = _apart(bins, width_bins)
     bins, score = bins[kept], curve[peaks[kept]]
