@@ -56,12 +56,14 @@ def degree(condition: Condition, method: str, seed: int = 900) -> float:
     )
 
 
+@pytest.mark.compiled
 def test_neighbours_raise_the_restoration_degree() -> None:
     condition = Condition("piecewise", 0.02)
     assert degree(condition, "likelihood") < 0.35
     assert degree(condition, "image_posterior") > 0.85
 
 
+@pytest.mark.compiled
 def test_unrelated_pixels_are_estimated_independently() -> None:
     capture = Condition("uniform", 0.03).capture(900)
     alone = estimate(capture, "likelihood", depths="learned")
@@ -71,6 +73,7 @@ def test_unrelated_pixels_are_estimated_independently() -> None:
     assert "each pixel is estimated by itself" in found.made_by.remark
 
 
+@pytest.mark.compiled
 def test_merged_bins_keep_the_background_per_bin() -> None:
     capture = Condition("car", 0.06).capture(900)
     flux = image_model_of(capture)
@@ -78,6 +81,7 @@ def test_merged_bins_keep_the_background_per_bin() -> None:
     np.testing.assert_allclose(merged.background / (3 * 30), flux.background / 100)
 
 
+@pytest.mark.compiled
 def test_confidence_is_the_share_of_right_estimates() -> None:
     capture = Condition("piecewise", 0.03).capture(901)
     image = estimate(capture, "image_posterior")
@@ -87,6 +91,7 @@ def test_confidence_is_the_share_of_right_estimates() -> None:
     assert calibration_error(calibration) < 0.03
 
 
+@pytest.mark.compiled
 @pytest.mark.usefixtures("threads")
 def test_messages_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("core.kernels.parallel.SERIAL_BELOW", 0)
@@ -98,6 +103,7 @@ def test_messages_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_array_equal(found[0].confidence, found[1].confidence)
 
 
+@pytest.mark.compiled
 def test_the_sky_is_empty_if_empty_pixels_are_allowed() -> None:
     capture = Condition("car", 0.03).capture(902)
     is_sky = np.isnan(np.asarray(capture.truth_range_m))
