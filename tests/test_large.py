@@ -14,8 +14,8 @@ from app.model import large
 from app.model.address import Link
 from app.model.colors import image_of
 from app.model.large import LIMIT, Grid, most_whole_bytes
-from app.model.state import Illumination, ReductionSettings, Viewing
-from app.model.store import built_in_sources, compute, file_source
+from app.model.state import ReductionSettings, Viewing
+from app.model.store import Request, built_in_sources, compute, file_source
 from app.pages.shared import downloads
 from app.pages.shared.large_view import bounds_of
 from core import Window
@@ -92,15 +92,16 @@ def test_captures_up_to_the_limit_are_held_in_memory(path, building, monkeypatch
     monkeypatch.setenv(LIMIT, str(building.cube.nbytes))
     source = file_source(path)
     assert source.large(reading) is None
-    np.testing.assert_array_equal(source.load(Illumination(), reading, ()).cube, building.cube)
+    np.testing.assert_array_equal(source.load(Request(source)).cube, building.cube)
     monkeypatch.delenv(LIMIT)
     assert 0 < most_whole_bytes() <= large.WHOLE_BYTES
 
 
 def test_a_format_without_windows_is_refused_with_a_remedy_that_works(building, small, tmp_path):
     core.save_capture(building, tmp_path / "b.npz")
+    source = file_source(tmp_path / "b.npz")
     with pytest.raises(ValueError, match=r"python -m core export b\.npz b\.zarr") as refused:
-        file_source(tmp_path / "b.npz").load(Illumination(), ReadOptions(), ())
+        source.load(Request(source))
     assert f"= {building.cube.nbytes} " in str(refused.value)
     core.save_capture(core.read_capture(tmp_path / "b.npz"), tmp_path / "b.zarr")
     assert file_source(tmp_path / "b.zarr").large(ReadOptions()) is not None
