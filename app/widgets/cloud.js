@@ -401,7 +401,7 @@ class CloudView {
     this.surface.setContainer(this.stage)
     this.box = new Box(vtk, this.renderer, this.stage)
     this.good = new Points(vtk, this.renderer, DISC, 1.5 * this.ratio)
-    this.bad = new Points(vtk, this.renderer, CROSS, 4.5 * this.ratio)
+    this.bad = new Points(vtk, this.renderer, CROSS, 6 * this.ratio)
     this.ring = new Points(vtk, this.renderer, RING, 24 * this.ratio)
   }
 
