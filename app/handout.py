@@ -26,7 +26,7 @@ from app.model.lessons import (
 )
 from core.checks import require
 from core.parameters import Choice
-from core.studies.lessons import CHECKS, Bench
+from core.studies.lessons import CHECKS, PLOTS, Bench
 from core.studies.pulses import Pulses
 from core.studies.report import picture
 
@@ -105,7 +105,7 @@ def handout(lessons: Sequence[Lesson], student: int = 0, is_key: bool = False) -
     student : int
         Number of the student, which is the seed of the simulations.
     is_key : bool
-        Whether answers are printed in place of the room for them.
+        Whether answers are printed instead of blank space.
 
     Raises
     ------
@@ -151,10 +151,10 @@ def _prediction(lesson: Lesson, bench: Bench, is_key: bool) -> str:
 def _observation(lesson: Lesson, bench: Bench, is_key: bool) -> str:
     """Return what to do and room for notes; in the key, the other views and the explanation."""
     others = [name for name in lesson.after if name != lesson.prediction.view]
-    seen = [lesson.seen(name, bench, None) for name in others]
+    seen = {name: lesson.seen(name, bench, None) for name in others if name not in PLOTS}
     exercises = "".join(
         f"<p>{CIRCLE}</p>{_figure(each, is_blank=not is_key)}"
-        for each in seen
+        for each in seen.values()
         if isinstance(each, Pulses)
     )
     question = _paragraph(f"{_moving(lesson)} What happens, and why?")
@@ -163,8 +163,8 @@ def _observation(lesson: Lesson, bench: Bench, is_key: bool) -> str:
     moved = _moved(lesson, bench)
     plots = "".join(
         _figure(lesson.seen(name, moved, None))
-        for name, each in zip(others, seen, strict=True)
-        if not isinstance(each, Pulses)
+        for name in others
+        if not isinstance(seen.get(name), Pulses)
     )
     return exercises + question + plots + _MARKDOWN.render(lesson.explanation)
 
@@ -214,7 +214,7 @@ def _part(title: str, content: str) -> str:
 
 
 def _paragraph(text: str) -> str:
-    return f"<p>{escape(text)}</p>"
+    return str(_MARKDOWN.render(text))
 
 
 def _figure(item: Item, is_blank: bool = False) -> str:

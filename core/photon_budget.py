@@ -46,7 +46,7 @@ STANDARD_SUN_LUX = 109_500.0
 """Illuminance of the spectrum of ASTM G173-03 (global): 683 lm/W times its integral with V(λ)."""
 
 TARGET_RD = 0.99
-"""Restoration degree that `reaching` looks for, unless told otherwise."""
+"""Default restoration degree of `reaching`."""
 
 GIVEN = "given"
 """In place of the equation of a `Step` that is a setting."""
@@ -187,22 +187,20 @@ def steps(budget: PhotonBudget, scene: Scene) -> tuple[Step, ...]:
     _add_inputs(found, budget, scene)
     _add_signal(found)
     _add_background(found, budget)
-    return tuple(found.steps)
+    return tuple(found.steps.values())
 
 
 class _Sheet:
-    """Steps as they are added; the value of each by its symbol."""
+    """Steps by symbol, in the order in which they are added."""
 
     def __init__(self) -> None:
-        self.steps: list[Step] = []
-        self._values: dict[str, float] = {}
+        self.steps: dict[str, Step] = {}
 
     def __getitem__(self, symbol: str) -> float:
-        return self._values[symbol]
+        return self.steps[symbol].value
 
     def add(self, name: str, symbol: str, equation: str, value: float, unit: str = "") -> None:
-        self.steps.append(Step(name, symbol, equation, value, unit))
-        self._values[symbol] = value
+        self.steps[symbol] = Step(name, symbol, equation, value, unit)
 
 
 def _add_inputs(at: _Sheet, budget: PhotonBudget, scene: Scene) -> None:
@@ -317,13 +315,15 @@ def predicted_rd(scene: Scene, flux: Flux, pulse: Pulse = Pulse()) -> float:
 
 
 class Reach(NamedTuple):
-    """The value of a setting with which a restoration degree is reached, others unchanged."""
+    """The values of a setting that reach a restoration degree, others unchanged."""
 
     name: str
     """Field of `PhotonBudget`."""
     now: float
-    needed: float
-    """The value nearest to the present one; NaN if none between the ends of its slider suffices."""
+    low: float
+    """Smallest such value on its slider; NaN if there is none."""
+    high: float
+    """Largest such value on its slider; NaN if there is none."""
     best_rd: float
     """Largest restoration degree that it reaches."""
     best: float
@@ -332,9 +332,13 @@ class Reach(NamedTuple):
     @property
     def spec(self) -> Number:
         """Symbol and unit of the setting."""
-        (spec,) = (spec_of(each) for each in fields(PhotonBudget) if each.name == self.name)
-        assert isinstance(spec, Number)
-        return spec
+        return _spec_of(self.name)
+
+
+def _spec_of(name: str) -> Number:
+    (spec,) = (spec_of(each) for each in fields(PhotonBudget) if each.name == name)
+    assert isinstance(spec, Number)
+    return spec
 
 
 def reaching(
@@ -359,7 +363,7 @@ def _reach(budget: PhotonBudget, scene: Scene, name: str, target_rd: float, puls
         return predicted_rd(*changed.apply(scene), pulse) - target_rd
 
     now = float(getattr(budget, name))
-    spec = Reach(name, now, math.nan, math.nan, math.nan).spec
+    spec = _spec_of(name)
     logs = np.linspace(math.log(spec.low), math.log(spec.high), _VALUES)
     margins = np.array([margin(each) for each in logs])
     best = int(margins.argmax())
@@ -371,17 +375,19 @@ def _reach(budget: PhotonBudget, scene: Scene, name: str, target_rd: float, puls
         if -top.fun > margins[best]:
             best = int(np.searchsorted(logs, top.x))
             logs, margins = np.insert(logs, best, top.x), np.insert(margins, best, -top.fun)
-    needed = [
-        math.exp(scipy.optimize.brentq(margin, *logs[i : i + 2], xtol=_TOLERANCE))
-        for i in np.flatnonzero(np.diff(margins >= 0))
-    ]
-    return Reach(
-        name,
-        now,
-        min(needed, key=lambda value: abs(math.log(value / now)), default=math.nan),
-        float(margins[best] + target_rd),
-        math.exp(logs[best]),
-    )
+
+    def end(step: int) -> float:
+        """Follow the values that suffice from the best one, down (-1) or up (1)."""
+        i = best
+        while 0 <= i + step < logs.size and margins[i + step] >= 0:
+            i += step
+        if not 0 <= i + step < logs.size:
+            return math.exp(logs[i])
+        root = scipy.optimize.brentq(margin, *sorted(logs[[i, i + step]]), xtol=_TOLERANCE)
+        return math.exp(root)
+
+    low, high = (end(-1), end(1)) if margins[best] >= 0 else (math.nan, math.nan)
+    return Reach(name, now, low, high, float(margins[best] + target_rd), math.exp(logs[best]))
 
 
 # -- Inputs ----------------------------------------------------------------------------------------
@@ -396,7 +402,7 @@ def _median_range_m(scene: Scene) -> float:
 def _standard_sun(budget: PhotonBudget) -> float:
     """Mean spectral irradiance of the standard sun within the filter, in W/m²/nm.
 
-    That of 400 and 1700 nm stands for wavelengths beyond.
+    Beyond 400 and 1700 nm, the value at that end is used.
     """
     wavelength_nm, irradiance = _sunlight()
     half = budget.filter_nm / 2

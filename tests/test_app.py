@@ -898,7 +898,8 @@ def test_points_of_the_cloud_are_pinned_and_measured(layout, explore):
         cloud.selected = int(row * 64 + col)
         layout.settle()
         control(layout, "Pin").clicks += 1
-    layout.tasks.run_until(lambda: "Distance from" in note.text)
+    # The distance may be known before the second pin is drawn.
+    layout.tasks.run_until(lambda: "Distance from" in note.text and len(cloud.pinned) == 2)
     assert cloud.pinned == [row * 64 + col for row, col in places]
     points = np.frombuffer(cloud.positions, "<f4").reshape(-1, 3)
     pixels = np.frombuffer(cloud.pixels, "<i4").tolist()

@@ -78,7 +78,7 @@ def test_a_link_restores_a_budget_and_another_scene_keeps_it():
 
 def test_the_form_finds_what_reaches_a_restoration_degree():
     layout = opened("budget.pulse_energy_uj=0.3")
-    control(layout, "What reaches RD 0.99?").param.trigger("clicks")
+    control(layout, "What reaches RD 0.99?").clicks += 1
     layout.tasks.run_until(lambda: rows_of(layout, "What reaches"))
     energy, _, filter_ = rows_of(layout, "What reaches")
     assert energy["name"] == "Pulse energy"

@@ -67,6 +67,8 @@ def test_every_other_python_of_this_machine_accepts_the_wheel(wheel, tmp_path):
     found = pythons()
     assert found
     found.pop("{}.{}".format(*sys.version_info), None)  # as above
+    if not found:
+        pytest.skip("no other supported Python is installed here")
     for version, python in found.items():
         commands = install(wheel, python, tmp_path / version, dependencies=False)
         (packages,) = commands.parent.glob("lib/python*/site-packages")

@@ -1,4 +1,4 @@
-"""The glossary, and texts of which the terms open it."""
+"""The glossary, and texts whose terms open it."""
 
 from __future__ import annotations
 
@@ -60,6 +60,7 @@ _UNTOUCHED = re.compile(r"(^#.*$|`[^`]*`|!?\[[^\]]*\]\([^)]*\))", re.MULTILINE)
 """Headings, code and links of Markdown."""
 
 
+@cache
 def linked(source: str) -> str:
     """Return Markdown in which the first occurrence of each term is a link to its entry."""
     keys, pattern = _spellings()

@@ -26,7 +26,7 @@ from core.studies.lessons import CHECKS, PLOTS, VIEWS, Bench, arguments_of, requ
 from core.studies.pulses import Pulses
 
 Item = outputs.Plot | outputs.Pictures | Pulses
-"""What a view shows."""
+"""Content of a view."""
 
 FENCE, RULE = "+++", "\n---\n"
 BUILT_IN = Path(str(resources.files("app"))) / "lessons"
@@ -226,10 +226,16 @@ def read_lessons(folders: Sequence[Path] = ()) -> dict[str, Lesson]:
     return found
 
 
+def number_of_lesson(key: str) -> int | None:
+    """Return the number at the beginning of a lesson's key; None if it has none."""
+    number = re.match(r"\d+", key)
+    return int(number.group()) if number else None
+
+
 def _place(path: Path) -> tuple[float, str]:
-    """Return what sorts files by their number, those without one last, and then by name."""
-    number = re.match(r"\d+", path.name)
-    return (int(number.group()) if number else math.inf), path.name
+    """Return the sort key of a file: its number, or infinity without one, then its name."""
+    number = number_of_lesson(path.stem)
+    return (math.inf if number is None else number), path.name
 
 
 @cache

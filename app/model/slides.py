@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from app.model.lessons import Lesson
+from app.model.lessons import Lesson, number_of_lesson
 
 DEMONSTRATION = (1, 2, 4, 7)
 """Numbers of the lessons for a demonstration of twenty minutes."""
@@ -47,12 +47,6 @@ def next_revealed(slides: tuple[Slide, ...], step: int) -> int:
     return next((at for at, each in enumerate(slides) if at > step and each.reveals), step)
 
 
-def number_of_lesson(key: str) -> int | None:
-    """Return the number at the beginning of a lesson's key; None if it has none."""
-    number = key.partition("-")[0]
-    return int(number) if number.isdecimal() else None
-
-
 def by_digit(keys: Iterable[str]) -> dict[str, str]:
     """Return the lesson that each digit opens: that of its number, 0 for lesson 10."""
     numbers = {key: number_of_lesson(key) for key in keys}
@@ -64,7 +58,7 @@ def demonstration(keys: Iterable[str]) -> list[str]:
     return [key for key in keys if number_of_lesson(key) in DEMONSTRATION]
 
 
-def following(keys: Iterable[str], key: str, by: int = 1) -> str | None:
+def following(keys: Iterable[str], key: str, by: int) -> str | None:
     """Return the lesson after another, `by` steps on, in the demonstration or among all lessons."""
     order = [*keys]
     if key in demonstration(order):

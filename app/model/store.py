@@ -261,7 +261,7 @@ class Refused:
 
     request: Request
     why: str
-    """What the page says about it."""
+    """Reason, as shown on the page."""
     variables: tuple[str, ...]
     """Names of its arrays of which the user must choose one; empty for other errors."""
 

@@ -27,7 +27,7 @@ _State = tuple[int, int]  # size in bytes, and time of the last change in ns
 
 @dataclass(frozen=True)
 class Arrival:
-    """What a look at a folder found."""
+    """Changes in a folder since it was last read."""
 
     found: Mapping[str, Source]
     """Captures that have just been written by key, the newest last."""

@@ -43,7 +43,7 @@ hv.renderer("bokeh").webgl = False
 
 BIN = hv.Dimension("bin", label="Bin")
 NOTHING = np.zeros(1)
-"""In place of the values of a plot, which come later."""
+"""Placeholder for values that are written later."""
 
 # Layers of each plot, by their colours' names in the palette, in drawing order.
 HISTOGRAM_LAYERS = ("raw", "expected", "small", "large", "truth", "estimate")
@@ -301,7 +301,6 @@ STUDY_COLORS: dict[str, tuple[str, list[int]]] = {
     "theory, flux known": ("text", [2, 4]),
     "estimates, no echo": ("estimate", []),
     "even": ("muted", [6, 3]),
-    "exposure": ("muted", [6, 3]),
     "echoes found": ("truth", []),
     "photons that arrive": ("large", []),
     "expected": ("expected", [2, 2]),
@@ -406,7 +405,7 @@ PULSE_LAYERS = {
 def pulse_figure(item: Pulses) -> Any:
     """Plot a histogram that the browser fills, below the photons of one pulse.
 
-    Its renderers have the names of `PULSE_LAYERS`; `paint_pulses` sets their colours.
+    Its renderers have the names of `PULSE_LAYERS`.
     """
     n_bins = item.probability.size
     drawing = figure(
@@ -439,15 +438,6 @@ def pulse_figure(item: Pulses) -> Any:
     drawing.min_border_right = 32
     drawing.yaxis.ticker.min_interval = 1
     return drawing
-
-
-def paint_pulses(drawing: Any, colors: Palette) -> None:
-    """Set the colours of the layers of `pulse_figure`."""
-    for name, (color, _) in PULSE_LAYERS.items():
-        glyph = drawing.select_one({"name": name}).glyph
-        glyph.line_color = getattr(colors, color)
-        if hasattr(glyph, "fill_color"):
-            glyph.fill_color = getattr(colors, color)
 
 
 def pictures(item: items.Pictures) -> list[Any]:

@@ -1,12 +1,5 @@
 // Coloured labels, each with a button that selects it and one that removes it.
 
-const element = (tag, text, attributes) => {
-  const node = document.createElement(tag);
-  node.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-  return node;
-};
-
 export function render({ model }) {
   const root = element("div", "", { role: "list", class: "chips" });
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import panel as pn
@@ -53,6 +54,12 @@ def _plain(kind: Any) -> frozenset[str]:
     """Return the names of a component's own values, without children and events."""
     own = set(kind.param) - set(JSComponent.param)
     return frozenset(n for n in own if not isinstance(kind.param[n], Child | param.Event))
+
+
+def script(name: str) -> str:
+    """Return the script of a component, after the functions that these scripts share."""
+    folder = Path(__file__).parent
+    return "".join((folder / each).read_text("utf-8") for each in ("element.js", name))
 
 
 def until_session_ends(callback: Callback) -> None:

@@ -23,7 +23,7 @@ from panel.custom import Child
 
 from app.units import Scale
 from app.widgets.cards import part, select
-from app.widgets.component import Component
+from app.widgets.component import Component, script
 from core.parameters import Number, joint_doubts, spec_of
 
 Settings = TypeVar("Settings")
@@ -238,7 +238,7 @@ class Table(Component):
     )
     acted = param.List(default=[], doc="Key of the row whose button was pressed, and when.")
 
-    _esm = Path(__file__).with_name("table.js")
+    _esm = script("table.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("table.css")]
 
 
@@ -292,7 +292,7 @@ class Chips(Component):
     chosen = param.List(default=[], doc="Key of the chip that was pressed, and when.")
     removed = param.List(default=[], doc="Key of the chip that was removed, and when.")
 
-    _esm = Path(__file__).with_name("chips.js")
+    _esm = script("chips.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("chips.css")]
 
 

@@ -45,6 +45,13 @@ class Layers:
         """Return the data source of a layer."""
         return self.layers[layer]["source"]
 
+    def color(self, layer: str, color: str) -> None:
+        """Set the colour of a layer."""
+        glyph = self.layers[layer]["glyph"]
+        glyph.line_color = color
+        if hasattr(glyph, "fill_color"):
+            glyph.fill_color = color
+
     def write(self, layer: str, **columns: ArrayLike) -> None:
         """Replace columns of a layer; only changed ones are sent, as float32."""
         data = self.source(layer).data
@@ -126,11 +133,8 @@ class Plot(Layers):
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme."""
         paint_frame(self.figure, colors)
-        for layer, handles in self.layers.items():
-            glyph, color = handles["glyph"], getattr(colors, layer)
-            glyph.line_color = color
-            if hasattr(glyph, "fill_color"):
-                glyph.fill_color = color
+        for layer in self.layers:
+            self.color(layer, getattr(colors, layer))
 
 
 def paint_frame(figure: Any, colors: Palette) -> None:

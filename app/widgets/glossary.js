@@ -1,12 +1,5 @@
 // A dialog with all terms. A link to a term, wherever it is, opens the dialog there.
 
-const element = (tag, text = "", attributes = {}) => {
-  const node = document.createElement(tag);
-  node.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-  return node;
-};
-
 export function render({ model }) {
   const title = element("h2", "Glossary", { id: "title" });
   const search = element("input", "", { type: "text", "aria-label": "Search the glossary" });

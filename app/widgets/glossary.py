@@ -1,4 +1,4 @@
-"""The glossary as a dialog, and text of which the terms open it."""
+"""The glossary as a dialog, and text whose terms open it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import panel_material_ui as pmui
 import param
 
 from app.model.glossary import ANCHOR, glossary, linked
-from app.widgets.component import Component
+from app.widgets.component import Component, script
 
 DOTTED = {f"& a[href^='{ANCHOR}']": {"color": "inherit", "textDecoration": "underline dotted"}}
 
@@ -20,7 +20,7 @@ class Glossary(Component):
     anchor = param.String(default=ANCHOR, doc="Beginning of the links.")
     terms = param.List(default=[], doc="Key, name, symbol, unit, synonyms and meaning of each.")
 
-    _esm = Path(__file__).with_name("glossary.js")
+    _esm = script("glossary.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("glossary.css")]
 
     def __init__(self, **params: Any) -> None:

@@ -7,13 +7,6 @@ const MOST_FRAME_S = 0.1; // a tab in the background draws no frames
 const HELP = "Space: play or pause · →: one pulse · Home: restart";
 const LEAST_TOP = 4; // counts
 
-const element = (tag, text = "", attributes = {}) => {
-  const node = document.createElement(tag);
-  node.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-  return node;
-};
-
 const button = (label, help, act) => {
   const node = element("button", label, { type: "button", title: help });
   node.addEventListener("click", act);
@@ -54,11 +47,10 @@ export function render({ model }) {
       if (first !== undefined) counts[Math.floor(first)] += 1;
     }
   };
-  const bins = () => Float32Array.from(probability, (_, bin) => bin + 0.5);
   // Without a point, its symbol would be missing in the legend.
   const strip = (at) => at.length ? { x: [...at], y: Array(at.length).fill(0.93) } : { x: [NaN], y: [NaN] };
   const draw = () => {
-    const x = bins();
+    const x = probability.map((_, bin) => bin + 0.5);
     const own = photonsOf(shown - 1);
     const most = counts.reduce((high, each) => Math.max(high, each), 1);
     set("histogram", { data: { x, top: counts.slice() } });
@@ -141,7 +133,7 @@ export function render({ model }) {
     KEYS[event.key]();
   });
 
-  // Other photons: the same pulses are shown of them. All parts change at once.
+  // New photons: keep the number of pulses shown. Values change together: draw once.
   let isDue = false;
   const renew = () => {
     isDue = false;

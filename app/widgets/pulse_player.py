@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import param
 
-from app.widgets.component import Component
+from app.widgets.component import Component, script
 from core.studies.pulses import Pulses
 
 
@@ -16,7 +16,7 @@ class PulsePlayer(Component):
     """Buttons and keys that add pulses to a histogram.
 
     All photons are sent once. The browser writes each pulse into the sources of the figure, which
-    is drawn with the next frame; the server neither takes part nor hears of it.
+    is drawn with the next frame; the server is not involved.
     """
 
     times = param.Bytes(default=b"", doc="float32 times of the photons in bins, pulse by pulse.")
@@ -26,7 +26,7 @@ class PulsePlayer(Component):
         default={}, doc="Bokeh's names of the sources of the layers and of the range of counts."
     )
 
-    _esm = Path(__file__).with_name("pulse_player.js")
+    _esm = script("pulse_player.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("pulse_player.css")]
 
     def follow(self, layers: Mapping[str, Any], counts: Any) -> None:

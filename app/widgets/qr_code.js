@@ -5,13 +5,6 @@ const LOCAL =
   "This address works on this machine only. For others, serve with --address and --origin.";
 const SHARED = "A device that opens it for the first time is asked for the server's token.";
 
-const element = (tag, text = "", attributes = {}) => {
-  const node = document.createElement(tag);
-  node.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-  return node;
-};
-
 function address() {
   const here = new URL(location.href);
   for (const each of ["present", "learning.step"]) here.searchParams.delete(each);

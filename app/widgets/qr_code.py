@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import param
 
-from app.widgets.component import Component
+from app.widgets.component import Component, script
 from core.checks import require
 
 MOST_CHARACTERS = 600
@@ -17,14 +17,14 @@ MOST_CHARACTERS = 600
 class QrCode(Component):
     """A button that shows the address of the page as a QR code, in a dialog.
 
-    Presenter mode and slide are left out: those who scan it take the lesson themselves.
+    The address omits presenter mode and slide, so that it opens the lesson itself.
     """
 
     asked = param.List(default=["", 0], doc="Address, and when the button was pressed.")
     image = param.List(default=["", 0], doc="The code as the address of an image, and that time.")
     problem = param.String(default="", doc="Why there is no code.")
 
-    _esm = Path(__file__).with_name("qr_code.js")
+    _esm = script("qr_code.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("qr_code.css")]
 
     @param.depends("asked", watch=True)
@@ -45,7 +45,7 @@ def qr_image(address: str) -> str:
     ValueError
         If the address is too long.
     """
-    import segno  # noqa: PLC0415 - few ask for it
+    import segno  # noqa: PLC0415 - rarely needed
 
     fits = len(address) <= MOST_CHARACTERS
     require("link", f"{address[:40]}…", fits, f"at most {MOST_CHARACTERS} characters for a QR code")

@@ -10,19 +10,12 @@ const ACTIONS = {
   Escape: "end",
 };
 
-const element = (tag, text = "", attributes = {}) => {
-  const node = document.createElement(tag);
-  node.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-  return node;
-};
-
 export function render({ model }) {
   const send = (what) => (model.pressed = [what, Date.now()]);
   const button = (label, help, act) => {
     const node = element("button", label, { type: "button", title: help, "aria-label": help });
     node.addEventListener("click", (event) => {
-      if (event.detail > 0) node.blur(); // of a mouse: Space shall not press it once more
+      if (event.detail > 0) node.blur(); // after a mouse click, so that Space does not press it again
       act();
     });
     return node;

@@ -7,11 +7,11 @@ from typing import ClassVar
 
 import param
 
-from app.widgets.component import Component
+from app.widgets.component import Component, script
 
 
 class SlideBar(Component):
-    """Keys and buttons that change the slide; full screen and a blank one are the browser's.
+    """Keys and buttons that change the slide; the browser handles full screen and blank screen.
 
     Space sends ``firstphoton:play`` to the document, which a `PulsePlayer` on screen follows.
     """
@@ -22,5 +22,5 @@ class SlideBar(Component):
         default=["", 0], doc="``back``, ``next``, ``reveal``, ``end`` or a digit, and when."
     )
 
-    _esm = Path(__file__).with_name("slide_bar.js")
+    _esm = script("slide_bar.js")
     _stylesheets: ClassVar = [Path(__file__).with_name("slide_bar.css")]

@@ -1,12 +1,5 @@
 // A table with sortable columns and, where a row has an action, a button in that row.
 
-const element = (tag, text = "", attributes = {}) => {
-  const node = document.createElement(tag);
-  node.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-  return node;
-};
-
 // A sample of the row's line, as the plots draw it.
 function sample({ color, dash }) {
   const picture = element("span");

@@ -55,7 +55,7 @@ def add(commands: Any) -> None:
         "--falloff",
         action="store_true",
         default=None,
-        help="judge the fall of a scene's signal with range (1/R²), too, around its median range",
+        help="also judge the 1/R² falloff of a scene's signal, relative to its median range",
     )
     command.add_argument("--method", choices=ESTIMATORS, default="likelihood", help="(likelihood)")
     command.add_argument(

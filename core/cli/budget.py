@@ -45,6 +45,7 @@ def _budget(chosen: argparse.Namespace) -> None:
     needed = reaching(budget, scene, chosen.rd)
     if chosen.json:
         facts: dict[str, Any] = {step.symbol: step.value for step in steps(budget, scene)}
-        show(facts | {"needed": {each.name: each.needed for each in needed}}, as_json=True)
+        facts["needed"] = {each.name: (each.low, each.high) for each in needed}
+        show(facts, as_json=True)
     tables = (steps_table(budget, scene, chosen.scene), needed_table(needed, chosen.rd))
     publish(tables, chosen, quiet=chosen.json)

@@ -22,7 +22,7 @@ Refused = Mapping[Path, Exception]
 
 
 def add_further_values(command: argparse.ArgumentParser) -> None:
-    """Add the options for what `save_ranges` writes beside the ranges."""
+    """Add the options for what `save_ranges` writes in addition to the ranges."""
     command.add_argument(
         "--intervals",
         action="store_true",

@@ -95,6 +95,7 @@ def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, 
                 begin = max(math.floor(at - reach * steps) + 1, -first * steps)
                 end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
                 found = _highest(score, begin, end)
-                is_highest = begin < found < end - 1 or score[int(found)] <= highest
+                is_higher = score[int(found)] > highest  # which NaN is not
+                is_highest = begin < found < end - 1 or not is_higher
                 highest = score[int(found)]
                 delay[b, i] = first + (found + 0.5) / steps

@@ -38,7 +38,7 @@ def steps_table(budget: PhotonBudget, scene: Scene, name: str) -> Table:
 
 
 def needed_table(found: Sequence[Reach], target_rd: float) -> Table:
-    """Return one row per setting, with the value that reaches a restoration degree."""
+    """Return one row per setting, with the values that reach a restoration degree."""
     return table(
         "needed",
         f"What reaches a restoration degree of {target_rd:g}",
@@ -46,11 +46,12 @@ def needed_table(found: Sequence[Reach], target_rd: float) -> Table:
         {
             "setting": lambda reach: reach.spec.symbol,
             "now": lambda reach: reach.now,
-            "needed": lambda reach: reach.needed,
+            "from": lambda reach: reach.low,
+            "to": lambda reach: reach.high,
             "unit": lambda reach: reach.spec.unit,
             "largest RD": lambda reach: reach.best_rd,
             "with": lambda reach: reach.best,
         },
-        f"{NEEDED_NOTE} A dash: no value on the slider suffices.",
-        dict.fromkeys(("now", "needed", "with"), ".3g"),
+        f"{NEEDED_NOTE} Values between the ends of the slider; a dash: none of them suffices.",
+        dict.fromkeys(("now", "from", "to", "with"), ".3g"),
     )

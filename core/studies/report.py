@@ -97,7 +97,7 @@ def write(items: Sequence[Item], folder: Path, title: str, introduction: Sequenc
     return page
 
 
-def picture(item: Plot | Scatter | Pictures | Pulses, is_blank: bool = False) -> str:
+def picture(item: Plot | Pictures | Pulses, is_blank: bool = False) -> str:
     """Return an item as the address of an image, which holds the image itself.
 
     With `is_blank`, axes alone are drawn, to sketch on; of pulses, also the photons.
@@ -106,7 +106,7 @@ def picture(item: Plot | Scatter | Pictures | Pulses, is_blank: bool = False) ->
     if isinstance(item, Plot):
         figure.set_size_inches(_PRINTED_INCHES)
         low, _ = figure.axes[0].get_ylim()
-        figure.axes[0].set_ylim(bottom=min(low, 0.0))  # a constant shall not fill the axis
+        figure.axes[0].set_ylim(bottom=min(low, 0.0))  # so that a constant does not fill the axis
     if is_blank:
         _erase(figure)
         if isinstance(item, Pulses):
@@ -184,15 +184,14 @@ def _draw_pulses(item: Pulses) -> Figure:
     """Draw the photons of the first pulses above the histogram of the first photons of all."""
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
-    begins = [0, *item.ends]
-    for pulse in range(min(_DRAWN_PULSES, item.ends.size)):
-        times = item.times[begins[pulse] : begins[pulse + 1]]
-        row = np.full(times.size, pulse + 1)
+    drawn = np.split(item.times, item.ends[:_DRAWN_PULSES])[:-1]
+    for pulse, times in enumerate(drawn, 1):
+        row = np.full(times.size, pulse)
         above.scatter(times, row, 40, facecolors="none", edgecolors="black", gid=_KEPT)
         above.scatter(times[:1], row[:1], 40, color="C1")
-    above.set(title=f"Photons of {_DRAWN_PULSES} pulses", ylabel="Pulse")
-    above.set_ylim(_DRAWN_PULSES + 0.7, 0.3)  # the first one above
-    above.set_yticks(range(1, _DRAWN_PULSES + 1))
+    above.set(title=f"Photons of {len(drawn)} pulses", ylabel="Pulse")
+    above.set_ylim(len(drawn) + 0.7, 0.3)  # the first one above
+    above.set_yticks(range(1, len(drawn) + 1))
     bins = np.arange(item.probability.size) + 0.5
     below.bar(bins, item.histogram, 1.0, color="C7")
     below.set(xlabel="Bin (1 ns)", ylabel="Counts", xlim=(0, item.probability.size))

@@ -113,7 +113,7 @@ def test_an_echo_free_image_has_no_signal() -> None:
 
 
 @pytest.mark.parametrize(("scene", "seed"), [("wall", 0), ("car", 3)])
-def test_a_signal_is_found_that_pixels_show_only_together(scene: str, seed: int) -> None:
+def test_a_signal_too_faint_for_single_pixels_is_found(scene: str, seed: int) -> None:
     capture = Condition(scene, 0.02).capture(seed)
     flux, signal = flux_model_of(capture), Condition(scene, 0.02).signal
     assert flux.share[0] == pytest.approx(np.isnan(capture.truth_range_m).mean(), abs=0.1)
@@ -123,6 +123,7 @@ def test_a_signal_is_found_that_pixels_show_only_together(scene: str, seed: int)
         restoration_degree(estimate(capture, method).range_m, capture.truth_range_m, tolerance_m)
         for method in ("likelihood", "oracle")
     )
+    # Four standard deviations of the difference of two shares of 4,096 pixels are 0.044 at most.
     assert right > best - 0.05
 
 

@@ -90,7 +90,7 @@ def test_parts_are_known_by_name() -> None:
 
 def test_each_part_is_needed_by_a_built_in_scene() -> None:
     built_in = {part for build in scenes.values() for part in parts_of(build())}
-    assert built_in | {"falloff"} == set(PARTS)  # which a photon budget adds
+    assert built_in | {"falloff"} == set(PARTS)  # added by a photon budget
 
 
 # -- what each part does ---------------------------------------------------------------------------

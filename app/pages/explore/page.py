@@ -70,7 +70,7 @@ BOARD = (
 """
 )
 COLUMN = column(8, BREAK_PX)
-# As high as the switch, which has no height until it is drawn: the plots keep theirs.
+# Reserve the height of the switch, which is drawn late, so that the plots keep theirs.
 ROW = (
     ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 0 12px; "
     "min-height: 24px; }"

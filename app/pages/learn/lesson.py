@@ -36,7 +36,7 @@ class Job(NamedTuple):
     """Something to compute in the background for what is on screen."""
 
     given: Any
-    """What it is computed from: while that is the same, it is not computed again."""
+    """Input of the computation, which is not repeated while this stays equal."""
     work: Callable[[], Any]
     draw: Callable[[Any], None]
     """Called with the result."""
@@ -60,7 +60,7 @@ class LessonView:
         Has the one control.
     moving : pn.Column
         That control, shown after the prediction.
-    views : dict of str to View
+    views : dict of (str, str) to View
         By position and name: a view may stand before and after the prediction.
     verdict : Sentence
     """
@@ -82,7 +82,7 @@ class LessonView:
         self.commit = button("Predict", text.COMMIT_HELP, self._commit)
         self.commit.variant = "contained"
         self.again = button("Start again", text.AGAIN_HELP, self._start_again)
-        self.panel = settings_panel(lesson, self._moved)
+        self.panel = settings_panel(lesson, change)
         control = self.panel.controls[lesson.control]
         self.answer = _field("Your answer")
         self.answer.param.watch(lambda _: self._answer(), "value")
@@ -129,9 +129,6 @@ class LessonView:
 
     def _commit(self) -> None:
         self._change(prediction=self.prediction.value)
-
-    def _moved(self, bench: Any) -> None:
-        self._change(moved=str(getattr(bench, self.lesson.control)))
 
     def _answer(self) -> None:
         self._change(answer=self.answer.value)
@@ -205,8 +202,12 @@ def prediction_field(lesson: Lesson) -> Any:
     )
 
 
-def settings_panel(lesson: Lesson, moved: Callable[[Any], None]) -> SettingsPanel[Bench]:
+def settings_panel(lesson: Lesson, change: Callable[..., None]) -> SettingsPanel[Bench]:
     """Return the settings of a lesson, of which the one control is shown."""
+
+    def moved(bench: Bench) -> None:
+        change(moved=str(getattr(bench, lesson.control)))
+
     panel = SettingsPanel(lesson.bench, moved)
     if lesson.ends is not None:
         low, high = lesson.ends

@@ -11,8 +11,8 @@ from typing import Any
 import panel as pn
 
 from app.model.glossary import ANCHOR
-from app.model.lessons import Lesson, number_of
-from app.model.slides import demonstration, number_of_lesson
+from app.model.lessons import Lesson, number_of, number_of_lesson
+from app.model.slides import demonstration
 from app.model.state import Learning
 from app.pages.learn import text
 from app.pages.learn.lesson import PAGE_STYLE, ROW, Job, LessonView, markdown

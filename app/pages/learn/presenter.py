@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
@@ -33,7 +32,7 @@ PLOT = ":host { flex: 1 1 0 !important; min-height: 0; width: 100%; }"
 SCALED = {"zoom": "2.2"}
 """Style of controls, whose smallest type has 11 px."""
 LABEL = {"& .MuiInputLabel-shrink, & .MuiOutlinedInput-notchedOutline": {"fontSize": "15px"}}
-"""Style of the labels of fields, which else are drawn at three quarters."""
+"""Style of the labels of fields, which are otherwise drawn at 75 %."""
 TYPE = {
     "&, & p": {"fontSize": "26px", "lineHeight": 1.3},
     "& p": {"margin": "0 0 6px"},
@@ -65,7 +64,7 @@ class Presenter:
     prediction : pmui.RadioButtonGroup or pmui.TextInput
     panel : SettingsPanel
         Has the one control.
-    views : dict of str to View
+    views : dict of (str, str) to View
         Those that have been on screen, by position and name.
     """
 
@@ -87,7 +86,7 @@ class Presenter:
         self.bar = SlideBar(digits=sorted(by_digit(keys)), sizing_mode="stretch_width", margin=0)
         self.bar.param.watch(lambda event: self._act(event.new[0]), "pressed")
         self.prediction = prediction_field(lesson)
-        self.panel = settings_panel(lesson, self._moved)
+        self.panel = settings_panel(lesson, change)
         control = self.panel.controls[lesson.control]
         for each in (self.prediction, control):
             if isinstance(each, pmui.TextInput | pmui.Select):
@@ -187,6 +186,3 @@ class Presenter:
     def _commit(self) -> None:
         step = next_revealed(self.slides, self._step)
         self._change(prediction=self.prediction.value, step=step)
-
-    def _moved(self, bench: Any) -> None:
-        self._change(moved=str(getattr(bench, self.lesson.control)))

@@ -12,7 +12,7 @@ CHECK_HELP = "Check: compares your answer with a computation."
 PRESENT_HELP = "Present: this lesson in the whole window, one slide at a time, by keyboard."
 DEMONSTRATION_HELP = "Twenty-minute demonstration: lessons 1, 2, 4 and 7 as slides."
 
-MOVE = "Now move this control; everything else stays."
+MOVE = "Now move this control; everything else stays the same."
 
 NO_SIDEBAR = "This page has its own controls; the other pages' controls are hidden."
 

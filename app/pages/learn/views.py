@@ -52,10 +52,11 @@ class PulseCard:
         downloadable(self.card, session, "photons", show, PLOT)
 
     def show(self, item: Pulses) -> None:
-        """Show the photons of other pulses in place of the last ones."""
+        """Replace the pulses shown."""
         self._item = item
         if self._plot is None:
             self._plot = self._built(item)
+            self.paint(self._colors)
         counts, expected = item.histogram, item.ends.size * item.probability
         bins = plots.centres(counts.size)
         self._plot.keep(
@@ -73,12 +74,11 @@ class PulseCard:
         self._colors = colors
         if self._plot is not None:
             paint_frame(self._plot.figure, colors)
-            plots.paint_pulses(self._plot.figure, colors)
+            for layer, (color, _) in plots.PULSE_LAYERS.items():
+                self._plot.color(layer, getattr(colors, color))
 
     def _built(self, item: Pulses) -> Layers:
         layers = layers_of(plots.pulse_figure(item))
-        paint_frame(layers.figure, self._colors)
-        plots.paint_pulses(layers.figure, self._colors)
         self.card.insert(0, pane_of(layers.figure))
         sources = {name: layers.source(name) for name in layers.layers}
         self._player.follow(sources, layers.figure.y_range)
@@ -89,7 +89,7 @@ UNNOTED = {"--note-display": "none"}
 
 
 class View:
-    """One view of a lesson, whichever kind it turns out to be.
+    """One view of a lesson, of any kind.
 
     Parameters
     ----------

@@ -52,7 +52,8 @@ STEPS_COLUMNS = (
 )
 NEEDED_COLUMNS = (
     ("Setting", "One at a time, the others unchanged.", 1),
-    ("Needed", "The value nearest to the present one that reaches it.", -1),
+    ("From", "Smallest value on the slider that reaches it.", -1),
+    ("To", "Largest value on the slider that reaches it.", -1),
 )
 
 NARROW = "tbody th { min-width: 0; } td { padding-left: 0; }"
@@ -216,11 +217,11 @@ def step_row(step: Step) -> dict[str, object]:
 
 
 def needed_row(found: Reach) -> dict[str, object]:
-    """Return the row of a setting that is sought."""
+    """Return the row of a setting and the values that it may have."""
     unit = found.spec.unit
     note = f"now {scientific(found.now)} {unit}"
-    value = Quantity(f"{scientific(found.needed)} {unit}", found.needed, unit)
-    below = ""
-    if math.isnan(found.needed):
-        below = f"at most RD {found.best_rd:.3f}, with {scientific(found.best)} {unit}"
-    return {"name": found.spec.symbol, "note": note, "cells": [(value, found.needed, below)]}
+    if math.isnan(found.low):
+        note += f"; at most RD {found.best_rd:.3f}, with {scientific(found.best)} {unit}"
+    ends = (found.low, found.high)
+    cells = [(Quantity(scientific(end), end, unit), end, unit) for end in ends]
+    return {"name": found.spec.symbol, "note": note, "cells": cells}

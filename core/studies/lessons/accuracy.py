@@ -1,4 +1,4 @@
-"""How often an estimate is right, and whether its confidence says so (lessons 6 to 8)."""
+"""Share of right estimates, and calibration of their confidence (lessons 6 to 8)."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def _found(acquisition: Acquisition, flux: Flux, seed: int) -> dict[str, Floats]
 
 
 def place_of_half(bench: Bench) -> float:
-    """Bin of the echo from which on the peak is right in less than half of the pixels."""
+    """Bin of the echo beyond which the peak is right in less than half of the pixels."""
     falling = np.minimum.accumulate(_found(bench.acquisition, bench.flux, bench.seed)["peak"])
     return float(np.interp(0.5, falling[::-1], PLACES[::-1]))
 
@@ -136,7 +136,7 @@ def reliability_diagram(bench: Bench) -> Plot:
         stated,
         {"right": value, "calibrated": stated},
         {"least confidence": bench.least_confidence},
-        "Random depths, by the likelihood. Estimates in each tenth, from the least sure on: "
+        "Random depths, by the likelihood. Estimates in each tenth, in ascending order: "
         f"{counts}. Band: 95 % interval of the share.",
         {"right": (low, high)},
     )

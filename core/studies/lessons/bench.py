@@ -1,4 +1,4 @@
-"""What a lesson can set, and what its views and checks draw from it."""
+"""Settings of a lesson, and the rates and captures that its views share."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def flat_target(bench: Bench, range_m: float, side: int = 1) -> Capture:
 
 
 def captured(name: str, bench: Bench) -> Capture:
-    """Simulate a built-in scene with these fluxes and pulses, once for all that needs it."""
+    """Simulate a built-in scene with these fluxes and pulses, and cache it."""
     return _captured(name, bench.n_pulses, bench.flux, bench.seed)
 
 

@@ -9,11 +9,11 @@ from core.studies.lessons.bench import Bench
 from core.studies.outputs import Plot
 
 BENCH_RANGE_M = 50.0
-"""Range of the surface that the fluxes of a bench belong to."""
+"""Range to which the fluxes of a bench refer."""
 
 
 def fluxes_by_range(bench: Bench) -> Plot:
-    """Plot signal and background of a surface that is moved away, both as the bench has at 50 m."""
+    """Plot signal and background of a surface that moves away; at 50 m they are the bench's."""
     range_m = np.geomspace(40.0, 400.0, 60)
     signal = bench.exposure * bench.signal * Falloff(BENCH_RANGE_M).transmission(range_m)
     return Plot(

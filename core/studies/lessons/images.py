@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_cdt
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
@@ -114,7 +114,7 @@ def share_agreed(bench: Bench) -> float:
 
 
 def share_wrong_of_agreed(bench: Bench) -> float:
-    """Share of the pixels without a surface where two methods agree on one, of all they do."""
+    """Share of the pixels in which two methods agree that have no surface there."""
     _, agreed, right = _agreement(_recorded(bench))
     return float((agreed & ~right).sum() / agreed.sum())
 
@@ -132,7 +132,7 @@ METHODS = {"off": "likelihood", "on": "image_posterior"}
 TITLES = {"off": "each pixel alone", "on": "with neighbours"}
 
 DISTANCES = np.arange(6.0)
-"""Distances to the nearest edge in pixels; the last one stands for itself and all beyond."""
+"""Distances to the nearest edge in pixels; the last one includes all larger ones."""
 
 
 class _Found(NamedTuple):
@@ -141,16 +141,19 @@ class _Found(NamedTuple):
     range_m: Floats
     right: NDArray[np.bool_]
     """Whether each is within 1 bin of the truth."""
-    distance: NDArray[np.int32]
-    """Pixels to the nearest one that is next to an edge, 0 for itself."""
 
 
 @cached_per_capture
 def _found(capture: Capture, method: str) -> _Found:
     image, truth_m = estimate(capture, method), np.asarray(capture.truth_range_m)
     right = np.abs(image.bin - capture.acquisition.range_m_to_bin(truth_m)) <= 1
-    distance = distance_transform_cdt(~at_edges(capture), "chessboard")
-    return _Found(image.range_m, right, distance)
+    return _Found(image.range_m, right)
+
+
+@cached_per_capture
+def _edge_distance(capture: Capture) -> NDArray[np.int32]:
+    """Return the distance in pixels to the nearest one next to an edge, 0 for itself."""
+    return np.asarray(scipy.ndimage.distance_transform_cdt(~at_edges(capture), "chessboard"))
 
 
 def neighbours_image(bench: Bench) -> Pictures:
@@ -177,12 +180,12 @@ def neighbours_image(bench: Bench) -> Pictures:
 def found_by_distance(bench: Bench) -> Plot:
     """Plot the share of pixels found against their distance from the nearest edge."""
     capture = captured("piecewise", bench)
+    distance = np.minimum(_edge_distance(capture), DISTANCES[-1])
     curves = {}
     for switch, title in TITLES.items():
-        found = _found(capture, METHODS[switch])
-        distance = np.minimum(found.distance, DISTANCES[-1])
-        curves[title] = np.array([found.right[distance == each].mean() for each in DISTANCES])
-    counts = np.bincount(np.minimum(distance, DISTANCES[-1]).astype(int).ravel())
+        right = _found(capture, METHODS[switch]).right
+        curves[title] = np.array([right[distance == each].mean() for each in DISTANCES])
+    counts = np.bincount(distance.astype(int).ravel())
     return Plot(
         "found_by_distance",
         "Pixels found within 1 bin",
@@ -197,8 +200,9 @@ def found_by_distance(bench: Bench) -> Plot:
 
 
 def _share(bench: Bench, switch: str, is_edge: bool) -> float:
-    found = _found(captured("piecewise", bench), METHODS[switch])
-    return float(found.right[(found.distance == 0) == is_edge].mean())
+    capture = captured("piecewise", bench)
+    right = _found(capture, METHODS[switch]).right
+    return float(right[at_edges(capture) == is_edge].mean())
 
 
 def share_at_edges(bench: Bench) -> float:

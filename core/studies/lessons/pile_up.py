@@ -170,8 +170,8 @@ def noise_along_gate(bench: Bench) -> Plot:
         "Photons per pulse and bin",
         centres(bench),
         {"correction on": on, "correction off": off},
-        note=f"Standard deviation over {_NOISY_PIXELS**2:,} pixels. They are alike: what differs "
-        "between them is chance.",
+        note=f"Standard deviation over {_NOISY_PIXELS**2:,} pixels, which are alike and differ "
+        "only by chance.",
     )
 
 

@@ -23,7 +23,7 @@ ALPHAS = tuple(np.geomspace(0.1, 30, 16).tolist())
 """Strengths of the weight at which the car is estimated."""
 
 T_NS = tuple(range(0, 80, 4))
-"""First bins in which the residual may peak, likewise."""
+"""First bins in which the residual may peak, for which the car is estimated."""
 
 WEIGHTS: tuple[Weight, ...] = ("cubic", "exponential")
 

@@ -152,7 +152,7 @@ def face_tables(
 def tmf8820_table(folder: Path) -> Table:
     """Return median and spread of the errors of the middle zone, for each method.
 
-    Rows are records in time here: the image posterior would take them for neighbours.
+    Rows are records in time here: the image posterior would treat them as neighbours.
 
     Raises
     ------

@@ -18,6 +18,7 @@ from scipy.special import logit
 from core.acquisition import Floats, Flux
 from core.inference.limits import best_exposure, right_bin_probability
 from core.metrics import Interval
+from core.simulation import echoes
 from core.studies.tradeoff.measure import Candidate, Piece, scored
 from core.studies.tradeoff.surrogate import Simulation
 from core.studies.trials import Score, default_methods, mapped, summary
@@ -116,11 +117,8 @@ def exposure(simulation: Simulation, most: float = EXPOSURES[-1]) -> float:
 
 def _targets(simulation: Simulation) -> tuple[Floats, Floats]:
     """Return delays in bins and signals of a sample of the targets, even in their delay."""
-    onset = simulation.acquisition.range_m_to_bin(simulation.scene.range_m).ravel()
-    reflectivity = simulation.scene.reflectivity
-    signal = np.full(onset.size, simulation.flux.signal)
-    if reflectivity is not None:
-        signal = signal * np.ravel(reflectivity)
+    range_m, signal = (each.ravel() for each in next(echoes(simulation.scene, simulation.flux)))
+    onset = simulation.acquisition.range_m_to_bin(range_m)
     order = np.argsort(onset)[: np.isfinite(onset).sum()]  # NaN last
     sample = order[np.linspace(0, order.size - 1, min(_PIXELS, order.size)).round().astype(int)]
     return onset[sample], signal[sample]
