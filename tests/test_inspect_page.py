@@ -274,6 +274,26 @@ def test_hot_and_dead_pixels_are_listed_marked_and_shown_by_a_press():
     assert places[session.state.pixel] == row["cells"][0][0] == "dead"
 
 
+def test_the_image_posterior_shows_what_neighbours_tell():
+    session = Session({"car": built_in_sources()["car"]}, tasks=HeldTasks())
+    session.state.param.update(method="image_posterior", pixel=(32, 32))
+    section = on_screen(PixelSection(session, "pixel"))
+    found = section.found.report
+    assert found.evidence is not None
+    assert section.downloads.keys() >= {"pixel and neighbours"}
+    names = {"the pixel alone": 0, "its neighbours": 1, "both (posterior)": 2}
+    saved, n_bins = table_of(section, "pixel and neighbours"), found.counts.size
+    for name, which in names.items():
+        column = saved[f"{name} (probability)"][:n_bins]
+        np.testing.assert_array_equal(column, found.evidence[which])
+    np.testing.assert_allclose(
+        section.plots.evidence.curve("posterior"), found.evidence.posterior, 1e-6
+    )
+    session.state.method = "likelihood"
+    session.tasks.run_until(lambda: section.found.report.method == "likelihood")
+    assert section.found.report.evidence is None
+
+
 def test_everything_about_a_pixel_is_cores(building):
     section = on_screen(PixelSection(building, "pixel"))
     building.choose_pixel(40, 30)
@@ -577,7 +597,7 @@ def test_region_pins_and_capture_are_saved_as_shown(name, request):
     assert section.view.main
     is_tracking = session.answer.method == "tracking"
     hidden, shown = ("score", "residual and enhanced")[:: 1 if is_tracking else -1]
-    visible = section.downloads.keys() - {hidden, "residuals of the fit"}
+    visible = section.downloads.keys() - {hidden, "pixel and neighbours", "residuals of the fit"}
     assert visible >= {"rate", shown}
     saved = {button: section.downloads[button]() for button in visible}
     assert saved.keys() >= {"counts", "numbers", "table"}

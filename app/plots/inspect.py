@@ -30,6 +30,7 @@ STAGES_TITLE = "Residual, and enhanced"
 COUNTS_TITLES = {True: "Counts, and the two scales that follow them", False: "Counts"}
 """Titles with and without the scales."""
 FIT_TITLE = "Counts, and those that the model expects"
+EVIDENCE_TITLE = "Where the surface is: by the pixel, its neighbours, and both"
 RESIDUAL_TITLE = "Residuals: counts minus expected ones"
 FIT_COLUMNS = ("bin", "fit", "low", "high")
 CANDIDATE_HEIGHT = 0.05
@@ -53,6 +54,9 @@ NAMES = {
     "window": "suggested gate",
     "fit": "expected (fit)",
     "band": "95 % band",
+    "alone": "the pixel alone",
+    "neighbours": "its neighbours",
+    "posterior": "both (posterior)",
     "deviation": "residual",
     "limits": "±2",
     "t_n": "T_n",
@@ -124,6 +128,16 @@ def score(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
     """Plot the score of a method in each bin."""
     drawing = _over_the_gate(SCORE_TITLE, "Score", bins)
     _line(drawing, empty("bin", "score"), "score")
+    return _marked(drawing, marks)
+
+
+def evidence(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
+    """Plot where the surface is by the pixel alone, by its neighbours, and by both."""
+    drawing = _over_the_gate(EVIDENCE_TITLE, "Probability per bin", bins)
+    source = empty("bin", "alone", "neighbours", "posterior")
+    _line(drawing, source, "alone")
+    _line(drawing, source, "neighbours", line_dash=[6, 3])
+    _line(drawing, source, "posterior")
     return _marked(drawing, marks)
 
 

@@ -208,6 +208,21 @@ NULL_SIDE = 256
 """Rows and columns of the echo-free image from which a detection threshold is found."""
 
 
+class Evidence(NamedTuple):
+    """Where the surface of a pixel is, by itself and by its neighbours.
+
+    Probability of a surface in each bin, of shape (bin,); its sum is that of a surface at all. The
+    posterior is proportional to the product of the others over the prior.
+    """
+
+    alone: Floats
+    """By the pixel alone."""
+    neighbours: Floats
+    """By its neighbours alone."""
+    posterior: Floats
+    """By both."""
+
+
 class Calibration(NamedTuple):
     """Quantities of an estimator that all pixels of an image share."""
 
@@ -264,6 +279,9 @@ class Estimator:
     confidence : callable, optional
         ``(capture, flux_model, delay_bin, parameters) -> probability``, likewise: the confidence by
         a posterior of the estimator's own instead of `core.inference.posterior`.
+    evidence : callable, optional
+        ``(capture, flux_model, row, col) -> Evidence``, or None where neighbours have no
+        influence: what the posterior of a pixel is made of.
     """
 
     title: str
@@ -282,6 +300,7 @@ class Estimator:
     whole_image: bool = False
     refine: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
     confidence: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
+    evidence: Callable[[Capture, FluxModel, int, int], Evidence | None] | None = None
 
     light = renamed("flux_model")
     reach = renamed("window_size")
@@ -377,6 +396,12 @@ class Estimator:
         conditions = given._replace(signal=given.signal[here], background=given.background[here])
         one = around[np.newaxis, np.newaxis].astype(float)
         return np.asarray(self.curve(one, conditions, parameters)[0, 0])
+
+    def evidence_at(self, capture: Capture, row: int, col: int) -> Evidence | None:
+        """Return what neighbours add to a pixel; None for a method of single pixels."""
+        if self.evidence is None:
+            return None
+        return self.evidence(capture, self.flux_model(capture), row, col)
 
     def threshold(self, capture: Capture, parameters: Any, false_alarm: float) -> float:
         """Score that a share `false_alarm` of echo-free pixels exceeds.

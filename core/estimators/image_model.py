@@ -113,11 +113,8 @@ def _agreement(capture: Capture, flux: FluxModel) -> Agreement:
         return UNRELATED
     at = np.random.default_rng(0).permutation((rows - 1) * (cols - 1))[:_PAIRS]
     one = at // (cols - 1) * cols + at % (cols - 1)
-    pixels = np.concatenate([one, one + 1, one + cols])
-    cube = capture.cube.reshape(-1, capture.cube.shape[2])[pixels][np.newaxis]
-    prepared = prepare(capture, cube, flux.of_pixels(pixels[np.newaxis]), 1)
+    found = states_of_pixels(capture, flux, np.concatenate([one, one + 1, one + cols]))
     prior = Prior.of(flux)
-    found = states_of(prepared, prior.nothing, _LEAST_EVIDENCE)
     q = found.surface.reshape(3, one.size, -1).astype(float)
     dark = found.nothing.reshape(3, one.size).astype(float)
     best, chance = UNRELATED, 0.0
@@ -170,6 +167,13 @@ def states_of_image(capture: Capture, flux: FluxModel) -> States:
     for pixels, prepared in prepared_groups(capture, flux, 1):
         surface[pixels], nothing[pixels] = states_of(prepared, none, _LEAST_EVIDENCE)
     return States(surface.reshape(rows, cols, -1), nothing.reshape(rows, cols))
+
+
+def states_of_pixels(capture: Capture, flux: FluxModel, pixels: NDArray[np.intp]) -> States:
+    """Return `states_of_image` of some pixels (n,), by flat index, of shape (n, ...)."""
+    cube = capture.cube.reshape(-1, capture.cube.shape[2])[pixels][np.newaxis]
+    prepared = prepare(capture, cube, flux.of_pixels(pixels[np.newaxis]), 1)
+    return states_of(prepared, Prior.of(flux).nothing, _LEAST_EVIDENCE)
 
 
 def laplace(scale_bins: float) -> Floats:

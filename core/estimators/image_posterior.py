@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
-from core.estimators.base import Estimator
+from core.estimators.base import Estimator, Evidence
 from core.estimators.image_model import (
     FEWEST_PIXELS,
     Prior,
@@ -40,6 +40,7 @@ from core.estimators.image_model import (
     merged_bins,
     merged_flux,
     states_of_image,
+    states_of_pixels,
 )
 from core.estimators.likelihood import Depths, LikelihoodParameters, curve
 from core.estimators.likelihood import locate as locate_alone
@@ -106,8 +107,10 @@ class ImagePosterior(NamedTuple):
 
     delay: Floats
     """Likeliest delay in bins, shape (row, col)."""
-    tolerance_probability: NDArray[np.float32]
-    """As in `core.inference.posterior.Posterior`."""
+    by_bin: NDArray[np.float32]
+    """Probability of a surface in each merged bin, shape (row, col, merged bin)."""
+    factor: int
+    """Bins in a merged one."""
     surface: Floats
     """Probability of a surface anywhere in the gate, shape (row, col)."""
 
@@ -119,8 +122,7 @@ def image_posterior_of(capture: Capture, flux: FluxModel) -> ImagePosterior:
     posterior = _posterior(merged, merged_flux(flux, factor))
     delay, _ = peaks(posterior.surface)
     surface = 1.0 - posterior.nothing.astype(float)
-    window = _windows(posterior.surface, factor, capture.acquisition.n_bins)
-    return ImagePosterior(delay * factor, window, surface)
+    return ImagePosterior(delay * factor, posterior.surface, factor, surface)
 
 
 @cached_per_capture
@@ -151,15 +153,6 @@ def _posterior(capture: Capture, flux: FluxModel) -> States:
         if k < _ROUNDS - 1:
             _, per_row, per_col = np.ascontiguousarray(planes(*peaks(both.surface)))
     return both
-
-
-def _windows(posterior: NDArray[np.float32], factor: int, n_bins: int) -> NDArray[np.float32]:
-    """Probability within the tolerance of each bin (row, col, bin) of merged bins."""
-    merged = posterior.reshape(-1, posterior.shape[2])
-    window = np.empty((len(merged), n_bins), np.float32)
-    with entering(window.size):
-        fill_window_masses(merged, factor, TOLERANCE_BINS, window)
-    return window.reshape(*posterior.shape[:2], n_bins)
 
 
 def peaks(posterior: NDArray[np.float32]) -> tuple[Floats, Floats]:
@@ -206,7 +199,36 @@ def _confidence(
     if not _neighbours_agree(flux):
         return tolerance_probability(capture, delay_bin)
     found = image_posterior_of(capture, flux)
-    return probability_at(found.tolerance_probability, delay_bin)
+    merged = found.by_bin.reshape(delay_bin.size, -1)
+
+    def masses(first: NDArray[np.intp]) -> NDArray[np.float32]:
+        window = np.empty((first.size, 2), np.float32)
+        with entering(2 * window.size * TOLERANCE_BINS):
+            fill_window_masses(merged, found.factor, TOLERANCE_BINS, first, window)
+        return window
+
+    return probability_at(delay_bin, capture.acquisition.n_bins - 1, masses)
+
+
+def _evidence(capture: Capture, flux: FluxModel, row: int, col: int) -> Evidence | None:
+    if not _neighbours_agree(flux):
+        return None
+    merged, factor = merged_bins(capture)
+    own = merged_flux(flux, factor)
+    prior, found = Prior.of(own), image_posterior_of(capture, flux)
+    alone = _with_nothing(*states_of_pixels(merged, own, np.array([row * merged.shape[1] + col])))
+    posterior = np.append(found.by_bin[row, col].astype(float), 1 - found.surface[row, col])
+    neighbours = posterior / alone * np.append(prior.surface, prior.nothing)
+    by_bin = np.zeros((3, capture.acquisition.n_bins))
+    for filled, states in zip(by_bin, (alone, neighbours, posterior), strict=True):
+        each = np.repeat(states[:-1] / (factor * states.sum()), factor)
+        filled[: each.size] = each
+    return Evidence(*by_bin)
+
+
+def _with_nothing(surface: NDArray[np.float32], nothing: NDArray[np.float32]) -> Floats:
+    """Return the states of one pixel (1, ...) as one array, nothing last."""
+    return np.append(surface[0], nothing[0]).astype(float)
 
 
 def _omits(capture: Capture) -> str:
@@ -231,4 +253,5 @@ ESTIMATOR = Estimator(
     undoes_pile_up=True,
     whole_image=True,
     confidence=_confidence,
+    evidence=_evidence,
 )

@@ -7,7 +7,7 @@ mass around an estimate is its confidence, for any estimator.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
 from weakref import WeakSet
 
@@ -137,22 +137,36 @@ def tolerance_probability(capture: Capture, bins: Floats) -> Floats:
     bins : ndarray, shape (row, col)
         Delays in fractional bins, from 0 to n_bins; NaN gives 0.
     """
-    if has_posterior(capture) or capture in _estimated:
-        return probability_at(posterior_of(capture).tolerance_probability, bins)
     last = capture.cube.shape[2] - 1
-    below = _bin_below(bins.ravel(), last)
-    ends, _ = _masses(capture, below, min(2, last + 1))
+
+    def from_table(below: NDArray[np.intp]) -> NDArray[np.float32]:
+        # Flat indices: `numpy.take_along_axis` takes longer than everything else.
+        first = np.arange(bins.size)[:, np.newaxis] * (last + 1)
+        table = posterior_of(capture).tolerance_probability
+        return np.asarray(table.take(first + _both(below, last)))
+
+    if has_posterior(capture) or capture in _estimated:
+        return probability_at(bins, last, from_table)
     _estimated.add(capture)
-    return _between(bins, below, ends)
+    return probability_at(bins, last, lambda below: _masses(capture, below, min(2, last + 1))[0])
 
 
-def probability_at(table: NDArray[np.float32], bins: Floats) -> Floats:
-    """Interpolate a `Posterior.tolerance_probability` at a delay (row, col) of each pixel."""
-    last = table.shape[2] - 1
+def probability_at(
+    bins: Floats, last: int, masses: Callable[[NDArray[np.intp]], NDArray[np.float32]]
+) -> Floats:
+    """Interpolate the probability of a surface within `TOLERANCE_BINS` of a delay of each pixel.
+
+    Parameters
+    ----------
+    bins : ndarray, shape (row, col)
+        Delays in fractional bins; NaN gives 0.
+    last : int
+        Last bin of the gate.
+    masses : callable
+        ``bin (pixel,) -> probability (pixel, 2)`` around this bin and the next one.
+    """
     below = _bin_below(bins.ravel(), last)
-    # Flat indices: `numpy.take_along_axis` takes longer than everything else.
-    first = np.arange(bins.size)[:, np.newaxis] * (last + 1)
-    return _between(bins, below, table.take(first + _both(below, last)))
+    return _between(bins, below, masses(below))
 
 
 def tolerance_probability_at(capture: Capture, row: int, col: int, bins: Floats) -> Floats:

@@ -17,10 +17,15 @@ from core.capture import Capture, cached_per_capture
 from core.checks import require
 from core.deprecation import renamed
 from core.estimators import ESTIMATORS, RangeImage, settings_of
+from core.estimators.base import Evidence
 from core.inference.faults import PixelVerdict, pixel_verdict
 from core.inference.intervals import delay_range_interval, pixel_range_intervals
 from core.inference.likelihood import rate_and_n_armed
-from core.inference.posterior import same_echo_bins
+from core.inference.posterior import (
+    TOLERANCE_BINS,
+    same_echo_bins,
+    tolerance_probability_at,
+)
 from core.inspection.flux import METHOD, estimate_flux
 from core.inspection.profile import FluxEstimate, OldFluxNames
 from core.inspection.surfaces import LIKELY, surface_probabilities
@@ -33,7 +38,7 @@ _FEWEST_BINS = 5  # of an echo in a plot around it
 
 @dataclass(frozen=True)
 class RangeCandidate:
-    """A possible delay of the surface: a peak of an estimator's score.
+    """A possible delay of the surface: a peak of an estimator's score, or of its posterior.
 
     Peaks within one pulse, or 3 bins, of each other or of the estimate are one candidate, that of
     the highest score.
@@ -72,6 +77,9 @@ class PixelReport(OldFluxNames):
     """Key of `core.ESTIMATORS`."""
     curve: Floats
     """Score of each bin, not corrected for the lag, shape (bin,)."""
+    evidence: Evidence | None
+    """What the pixel and its neighbours tell by the method "image_posterior"; None for methods of
+    single pixels, and where neighbours have no influence."""
     lag_bins: float
     """Distance from the delay of the surface to the maximum of the score."""
     answer_bin: float
@@ -163,9 +171,10 @@ def pixel_report(
     settings = settings_of(method, settings)
     counts = capture.cube[row, col].astype(float)
     curve = ESTIMATORS[method].curves(capture, row, col, settings)
+    evidence = ESTIMATORS[method].evidence_at(capture, row, col)
     lag = lag_bins(capture, method, settings)
     interval_68_m, interval_95_m = pixel_range_intervals(capture, image, row, col, (0.68, 0.95))
-    candidates, confidence = _candidates(capture, image, row, col, curve, method, lag)
+    candidates, confidence = _candidates(capture, image, row, col, curve, evidence, method, lag)
     answer_bin = float(image.bin[row, col])
     likely = [each.bin for each in candidates if each.probability >= LIKELY]
     surfaces_bin = tuple(sorted(likely, key=lambda at: at != answer_bin))
@@ -177,6 +186,7 @@ def pixel_report(
         rate_unit="photons" if capture.gated_pulses is None else "photons per pulse",
         method=method,
         curve=curve,
+        evidence=evidence,
         lag_bins=lag,
         answer_bin=answer_bin,
         answer_m=float(image.range_m[row, col]),
@@ -240,11 +250,13 @@ def _candidates(
     row: int,
     col: int,
     curve: Floats,
+    evidence: Evidence | None,
     method: str,
     lag_bins: float,
 ) -> tuple[tuple[RangeCandidate, ...], float]:
     """Return the candidates and the probability of the estimate, whether it is one of them."""
     estimate_bin, confidence = float(image.bin[row, col]), float(image.confidence[row, col])
+    curve = curve if evidence is None else evidence.posterior
     peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
     # A signal far below the image's mean makes all scores of the likelihood negative.
     base = 0.0 if curve.max() > 0 else float(np.median(curve))
@@ -261,7 +273,12 @@ def _candidates(
         bins[is_estimate.argmax()] = estimate_bin
     kept = _apart(bins, width_bins)
     bins, score = bins[kept], curve[peaks[kept]]
-    probability = surface_probabilities(capture, row, col, bins)
+    of_one = (
+        tolerance_probability_at(capture, row, col, bins)
+        if evidence is None
+        else _mass_around(evidence.posterior, bins)
+    )
+    probability = surface_probabilities(capture, row, col, bins, of_one)
     is_estimate = bins == estimate_bin
     if ESTIMATORS[method].confidence is not None:  # which knows more than the pixel
         probability[is_estimate] = confidence
@@ -273,6 +290,13 @@ def _candidates(
     columns = (bins, range_m, *interval_m, score, relative, probability)
     found = tuple(RangeCandidate(*map(float, each)) for each in zip(*columns, strict=True))
     return found, confidence
+
+
+def _mass_around(by_bin: Floats, bins: Floats) -> Floats:
+    """Add probabilities (bin,) within `TOLERANCE_BINS` of delays (n,) in fractional bins."""
+    up_to, edges = np.cumsum(np.append(0.0, by_bin)), np.arange(by_bin.size + 1)
+    low, high = (np.interp(bins + side, edges, up_to) for side in (-TOLERANCE_BINS, TOLERANCE_BINS))
+    return np.asarray(high - low)
 
 
 def _apart(bins: Floats, width_bins: float) -> list[int]:

@@ -37,7 +37,7 @@ from core.inference.likelihood import (
     log_rate_ratio,
     rate_and_n_armed,
 )
-from core.inference.posterior import TOLERANCE_BINS, same_echo_bins, tolerance_probability_at
+from core.inference.posterior import TOLERANCE_BINS, same_echo_bins
 
 LIKELY = 0.5
 """Probability from which a surface is accepted."""
@@ -58,7 +58,9 @@ _PRIOR_PIXELS = _N_LEVELS
 _LEARNING_STEPS = 50
 
 
-def surface_probabilities(capture: Capture, row: int, col: int, bins: Floats) -> Floats:
+def surface_probabilities(
+    capture: Capture, row: int, col: int, bins: Floats, of_one: Floats
+) -> Floats:
     """Probability of a surface within `TOLERANCE_BINS` of each delay (n,), shape (n,).
 
     Parameters
@@ -67,9 +69,10 @@ def surface_probabilities(capture: Capture, row: int, col: int, bins: Floats) ->
     row, col : int
     bins : ndarray, shape (n,)
         Delays in fractional bins, at least `same_echo_bins` apart.
+    of_one : ndarray, shape (n,)
+        The probabilities if the pixel has at most one surface.
     """
-    alone = tolerance_probability_at(capture, row, col, bins)
-    probability, likely = alone.copy(), alone
+    left_of_one, probability, likely = of_one.copy(), of_one.copy(), of_one
     histogram = capture.cube[row, col].astype(float)
     windows = np.abs(np.arange(histogram.size) - bins[:, np.newaxis]) <= TOLERANCE_BINS
     left = np.ones(bins.size, bool)
@@ -82,10 +85,10 @@ def surface_probabilities(capture: Capture, row: int, col: int, bins: Floats) ->
         likeliest = int(np.where(left, likely, -1.0).argmax())
         left[likeliest] = False
         accepted[likeliest] = int(np.where(windows[likeliest], log_ratio, -np.inf).argmax())
-        alone[windows[:, accepted[likeliest]]] = 0.0  # probability of the surface just accepted
+        left_of_one[windows[:, accepted[likeliest]]] = 0.0  # that of the one accepted
         log_ratio = _log_ratio(capture, histogram, list(accepted.values()))
         likely = _within(log_ratio, windows)
-        probability[left] = np.maximum(alone, likely)[left]
+        probability[left] = np.maximum(left_of_one, likely)[left]
         is_likely = likely[left].max(initial=0.0) >= LIKELY
     if len(accepted) > 1:
         for i in accepted:

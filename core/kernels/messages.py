@@ -159,20 +159,17 @@ def fill_modes(posterior, delay, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def fill_window_masses(posterior, factor, half, window):  # type: ignore[no-untyped-def]
-    """Fill `window` with the mass of `half` bins on either side of the beginning of each bin.
+def fill_window_masses(posterior, factor, half, first, window):  # type: ignore[no-untyped-def]
+    """Fill `window` with the mass of `half` bins on either side of the beginning of some bins.
 
-    `posterior` (pixel, merged bin) is of `factor` bins each, which share it alike, and `window` is
-    of shape (pixel, bin).
+    `posterior` (pixel, merged bin) is of `factor` bins each, which share it alike. The bins of a
+    pixel are those from `first` (pixel,), as many as `window` (pixel, n) has columns.
     """
-    n_pixels, n_bins = window.shape
-    for i in prange(n_pixels):
-        mass = np.zeros(n_bins + 2 * half, np.float32)
-        for d in range(posterior.shape[1] * factor):
-            mass[half + d] = posterior[i, d // factor] / np.float32(factor)
-        here = window[i]
-        here[:] = 0.0
-        for j in range(2 * half):
-            met = mass[j : j + n_bins]
-            for d in range(n_bins):
-                here[d] += met[d]
+    n_bins = posterior.shape[1] * factor
+    for i in prange(window.shape[0]):
+        for n in range(window.shape[1]):
+            mass = np.float32(0.0)
+            begin = first[i] + n - half
+            for d in range(max(begin, 0), min(begin + 2 * half, n_bins)):
+                mass += posterior[i, d // factor] / np.float32(factor)
+            window[i, n] = mass

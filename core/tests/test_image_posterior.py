@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 import pytest
 
-from core.estimators import estimate
-from core.estimators.image_model import Prior, image_model_of, merged_flux
+from core.acquisition import Pulse
+from core.estimators import ESTIMATORS, estimate
+from core.estimators.image_model import Prior, image_model_of, merged_bins, merged_flux
 from core.estimators.image_posterior import Link, planes
+from core.inspection import pixel_report
 from core.kernels.messages import fill_posterior
 from core.metrics import calibration_error, reliability, restoration_degree
 from core.studies.trials import Condition
@@ -114,3 +118,40 @@ def test_the_sky_is_empty_if_empty_pixels_are_allowed() -> None:
     assert every.all()
     assert some[is_sky].mean() < 0.08  # next to the car, neighbours favour a surface
     assert some[~is_sky].mean() > 0.85
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("sigma_s", [1e-9, 6e-9])  # of the second, bins are merged
+def test_a_posterior_is_made_of_the_pixel_and_its_neighbours(sigma_s: float) -> None:
+    condition = Condition("piecewise", 0.03)
+    capture = replace(condition.capture(900), pulse=Pulse(sigma_s))
+    image = estimate(capture, "image_posterior", pixels="allow empty pixels")
+    flux = image_model_of(capture)
+    assert flux.agreement.alike > 0
+    row, col = np.argwhere(image.confidence > 0.9)[0]
+    alone, neighbours, posterior = ESTIMATORS["image_posterior"].evidence_at(capture, row, col)
+    for each in (alone, neighbours, posterior):
+        assert each.shape == (capture.acquisition.n_bins,) and 0 < each.sum() < 1 + 1e-6
+    _, factor = merged_bins(capture)
+    assert (factor > 1) == (sigma_s > 5e-9)
+    product = alone * neighbours / np.repeat(Prior.of(merged_flux(flux, factor)).surface, factor)
+    np.testing.assert_allclose(product / product.sum(), posterior / posterior.sum(), 1e-3, 1e-6)
+    assert abs(np.argmax(posterior) + 0.5 - image.bin[row, col]) < 3
+    report = pixel_report(capture, image, int(row), int(col), "image_posterior")
+    np.testing.assert_array_equal(report.evidence.posterior, posterior)
+    assert report.candidates[0].bin == image.bin[row, col]
+    assert report.candidates[0].probability == image.confidence[row, col]
+
+
+@pytest.mark.compiled
+def test_neighbours_find_what_a_pixel_alone_does_not_show() -> None:
+    capture = Condition("piecewise", 0.02).capture(900)
+    image = estimate(capture, "image_posterior")
+    right = np.abs(image.range_m - capture.truth_range_m) < capture.acquisition.bin_length_m
+    found = [
+        ESTIMATORS["image_posterior"].evidence_at(capture, row, col)
+        for row, col in np.argwhere(right & (image.confidence > 0.9))[:200]
+    ]
+    agree = [np.abs(each.alone.argmax() - each.posterior.argmax()) <= 1 for each in found]
+    assert len(found) == 200 and np.mean(agree) < 0.6
+    assert ESTIMATORS["likelihood"].evidence_at(capture, 0, 0) is None

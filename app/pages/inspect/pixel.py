@@ -54,7 +54,10 @@ FACTS_ACROSS, FACT_ROWS = 4, 3
 TABLE_PX = 217
 """Height of the table with the largest number of candidates, reserved from the start."""
 
-BUTTONS = ("counts", "rate", "residual and enhanced", "score", "residuals of the fit")
+BUTTONS = (
+    *("counts", "rate", "residual and enhanced", "score", "pixel and neighbours"),
+    "residuals of the fit",
+)
 """Names of the plots of `PixelPlots` on their download buttons."""
 
 IMMEDIATE_BINS = 1000

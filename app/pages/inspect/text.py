@@ -82,8 +82,9 @@ MODE_HELP = (
     "line of a profile. A tap always selects a pixel."
 )
 PLOT_HELP = (
-    "Plot below the histogram: the estimator's score or its stages, the rate corrected for "
-    "pile-up, or the residuals of the counts from those that the model expects."
+    "Plot below the histogram: the estimator's score or its stages (of the image posterior, what "
+    "the pixel and its neighbours tell), the rate corrected for pile-up, or the residuals of the "
+    "counts from those that the model expects."
 )
 SUBJECT_HELP = (
     "What to inspect: one pixel, the region, the pinned pixels, the line that joins them, or the "

@@ -235,6 +235,9 @@ PALETTE_NAMES = {
     "candidates": "text",
     "ranks": "text",
     "score": "enhanced",
+    "alone": "large",
+    "neighbours": "small",
+    "posterior": "enhanced",
     "window": "residual",
     "t_n": "estimate",
     "present": "estimate",
@@ -343,6 +346,8 @@ class PixelPlots:
         Residual and enhanced signal of the tracking differentiator.
     score : GatePlot
         Score of another method, in its place.
+    evidence : GatePlot
+        Likewise, of one that uses neighbours: what they and the pixel tell.
     residuals : GatePlot
         Residuals of the counts from those that the model expects.
     plots : tuple of GatePlot
@@ -368,9 +373,12 @@ class PixelPlots:
         self.rate = GatePlot(inspect_plots.rate(self.bins, marks), {"Rate": "rate"})
         self.stages = GatePlot(inspect_plots.stages(self.bins, marks), stages)
         self.score = GatePlot(inspect_plots.score(self.bins, marks), {"Score": "score"})
+        told = {"Pixel alone": "alone", "Neighbours": "neighbours", "Both": "posterior"}
+        self.evidence = GatePlot(inspect_plots.evidence(self.bins, marks), told)
         deviation = {"Residual": "deviation", "Expected": "fit", "95 % from": "low", "to": "high"}
         self.residuals = GatePlot(inspect_plots.residuals(self.bins, marks), deviation)
-        self.plots = self.counts, self.rate, self.stages, self.score, self.residuals
+        scores = self.stages, self.score, self.evidence
+        self.plots = self.counts, self.rate, *scores, self.residuals
         self.cut = GateCut(self.counts.figure, self.bins)
 
     def paint(self, colors: Palette) -> None:
@@ -382,8 +390,11 @@ class PixelPlots:
 
     def below(self, found: Inspected, name: str) -> GatePlot:
         """Return the plot of one of `app.model.state.PLOTS`."""
-        score = self.score if found.pixel.signals is None else self.stages
-        return {"Score": score, "Rate": self.rate, "Fit": self.residuals}[name]
+        if name != "Score":
+            return {"Rate": self.rate, "Fit": self.residuals}[name]
+        if found.report.evidence is not None:
+            return self.evidence
+        return self.score if found.pixel.signals is None else self.stages
 
     def update(self, found: Inspected, unit: str, with_fit: bool) -> None:
         """Show a pixel or a region, with positions in a unit.
@@ -416,6 +427,9 @@ class PixelPlots:
             self.stages.draw(gate, residual + enhanced + marks)
             self.stages.frame(pixel.signals.residual)
             self.stages.frame(pixel.signals.enhanced, axis="enhanced")
+        if report.evidence is not None:
+            self.evidence.draw(gate, curves("probability", **report.evidence._asdict()) + marks)
+            self.evidence.frame(*report.evidence)
         for name, position in positions.items():
             self.counts.write(name, x=np.full(2, position))
             for plot in self.plots:

@@ -234,7 +234,9 @@ def save_pixel(
 
     The columns are ``bin``, ``time_s`` and ``range_m`` (where the bin begins), ``counts`` (whole
     numbers), and the stages of `core.Signals` in counts: ``raw``, ``small``, ``large``,
-    ``residual``, ``enhanced``; of methods other than the tracking differentiator, ``score``.
+    ``residual``, ``enhanced``; of methods other than the tracking differentiator, ``score``, and of
+    the image posterior also the probabilities of `core.estimators.base.Evidence`: ``alone``,
+    ``neighbours`` and ``posterior``.
 
     Parameters
     ----------

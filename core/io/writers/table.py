@@ -96,6 +96,8 @@ def write_pixel(
         columns |= {stage: getattr(signals, stage) for stage in stages}
     else:
         columns["score"] = ESTIMATORS[method].curves(capture, row, col, settings)
+        evidence = ESTIMATORS[method].evidence_at(capture, row, col)
+        columns |= {} if evidence is None else evidence._asdict()
     about = Provenance(method, settings).facts
     about |= {"software": software(), "source": plain(capture.source)}
     write_columns(columns, file, [f"{name}: {fact}" for name, fact in about.items()])
