@@ -12,7 +12,7 @@ KERNELS := blocks fit image_posterior more_estimators posterior reductions refin
 # Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform neighbours tuning calibration fit results field large fuzz attack wheel clean
+.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform neighbours tuning tuned calibration fit results field large fuzz attack wheel clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z0-9]*\):.* ## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -64,6 +64,9 @@ neighbours: $(VENV)/.app ## what neighbouring pixels add, inside surfaces and at
 tuning: $(VENV)/.app ## the same search for the settings of every method
 	$(BIN)/python -m core tuning
 
+tuned: $(VENV)/.app ## what settings chosen for each capture gain
+	$(BIN)/python -m core tuned
+
 calibration: $(VENV)/.app ## are confidences and intervals right as often as they say?
 	$(BIN)/python -m core calibration
 
@@ -76,6 +79,7 @@ results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core neighbours --results assets/results/neighbours.md
 	$(BIN)/python -m core budget --results assets/results/budget.md
 	$(BIN)/python -m core tuning --results assets/results/tuning.md
+	$(BIN)/python -m core tuned --results assets/results/tuned.md
 	$(BIN)/python -m core calibration --only confidence ranges --results assets/results/calibration.md
 	$(BIN)/python -m core calibration --only fluxes --captures 40 --results assets/results/fluxes.md
 	$(BIN)/python -m core calibration --only alarms --captures 10 --results assets/results/alarms.md

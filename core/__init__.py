@@ -69,6 +69,7 @@ from core.trigger import (
     rate_per_bin,
     trigger_probability,
 )
+from core.tuning import Tuning, tuned
 from core.version import __version__ as __version__
 from core.warmup import warm_up
 
@@ -98,6 +99,7 @@ PUBLIC_MODULES = (
     "core.studies.sensitivity",
     "core.studies.tradeoff",
     "core.studies.trials",
+    "core.tuning",
     "core.typesetting",
 )
 """Modules whose ``__all__`` is public, too."""
@@ -124,6 +126,7 @@ __all__ = [
     "Signals",
     "StatedFlux",
     "TrackingParameters",
+    "Tuning",
     "Window",
     "as_image",
     "coates_rate",
@@ -157,6 +160,7 @@ __all__ = [
     "simulate",
     "tracking_signals",
     "trigger_probability",
+    "tuned",
     "warm_up",
     "without",
     "without_correction",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -80,10 +80,15 @@ from core.pipeline import figures_of, run
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.tracking import PRESETS
+from core.tuning import tuned
 
 _CONFIDENT = 0.9
 _MAX_REPORTED = 2**27  # counts; a report on more takes minutes
 _CLOUD_HELP = "; a cloud of a file without a pixel angle gets about as wide as it is deep"
+_TUNED_HELP = (
+    "choose the settings for this capture: the default ones, unless others restore clearly more of "
+    "a simulated capture that resembles it"
+)
 _VIEW = ("unit_m", "distance_m", "pixel_angle_rad")
 
 
@@ -287,6 +292,9 @@ def _add_estimate(commands: Any) -> None:
             "--scheduler", help="address of a Dask cluster to use, such as tcp://host:8786"
         )
         _add_json(method)
+        if not estimator.knows_flux and fields(estimator.parameters):
+            method.add_argument("--tuned", action="store_true", help=_TUNED_HELP)
+        method.set_defaults(tuned=False)
         add_settings(method, estimator.parameters)
         add_read_options(method)
         method.set_defaults(work=_estimate)
@@ -298,6 +306,9 @@ def _estimate(chosen: argparse.Namespace) -> None:
     settings = settings_given(chosen, ESTIMATORS[chosen.method].parameters)
     colors, box = colors_given(chosen), crop_given(chosen)
     in_tiles = chosen.scheduler or _exceeds_memory(chosen)
+    if chosen.tuned and (in_tiles or settings != type(settings)()):
+        why = "a capture that fits into memory" if in_tiles else "no settings beside it"
+        raise ValueError(f"tuned needs {why}.")
     if in_tiles:
         refuse_further_values(chosen.intervals, chosen.fit)
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
@@ -314,11 +325,12 @@ def _estimate(chosen: argparse.Namespace) -> None:
     written, refused = save_each(chosen.out, refused, save)
     has_cloud = any(path.suffix.lower() in CLOUD_SUFFIXES for path in written)
     view = guessed_view(described, image) if has_cloud else {}
+    used = settings if image.made_by is None else image.made_by.settings
     known = {
         "source": described.source,
         "remark": facts.pop("remark"),
-        "settings": str(settings),
-        "in_doubt": " ".join(doubts(settings)),
+        "settings": str(used),
+        "in_doubt": " ".join(doubts(used)),
         "pixels": image.valid.size,
         "pixels_estimated": int(image.valid.sum()),
         f"pixels_at_confidence_{_CONFIDENT}": int((image.confidence >= _CONFIDENT).sum()),
@@ -343,6 +355,10 @@ def _range_at_once(
     if truth := truth_options_from(chosen, chosen.capture):
         capture = read_truth(capture=capture, **truth)
     print(capture.source, file=sys.stderr)  # with assumptions, before anything depends on them
+    if chosen.tuned:
+        tuning = tuned(capture, chosen.method)
+        print(tuning.why, file=sys.stderr)
+        settings = tuning.settings
     found = run(capture, chosen.method, settings, chosen.false_alarm)
     facts: dict[str, Any] = found.figures | {
         "remark": ESTIMATORS[chosen.method].remark(capture, chosen.false_alarm),

@@ -11,7 +11,7 @@ from typing import Any
 from core.cli.options import add_processes, show_progress, whole_from_to
 from core.cli.results import CheckFailed, add_results, publish
 from core.io.readers import read_capture
-from core.studies.methods import alarms, calibration, field, fit, neighbours, tuning, uniform
+from core.studies.methods import alarms, calibration, field, fit, neighbours, tuned, tuning, uniform
 from core.studies.outputs import Table, as_markdown
 from core.studies.paper import figures as paper
 from core.studies.paper import page, recommend
@@ -48,6 +48,10 @@ def add(commands: Any) -> None:
 
     command = _added(commands, "tuning", "search the settings of every method alike", _tuning)
     _add_count(command, "--seeds", 2, MAX_SEEDS, 8)
+
+    command = _added(commands, "tuned", "table what settings chosen for each capture gain", _tuned)
+    _add_count(command, "--seeds", 2, MAX_SEEDS, 10)
+    add_processes(command)
 
     command = _added(
         commands, "calibration", "compare confidences and intervals with errors", _calibration
@@ -144,6 +148,10 @@ def _tuning(chosen: argparse.Namespace) -> None:
     found = tuning.tuning_table(range(chosen.seeds), progress=show_progress)
     print(file=sys.stderr)
     publish([found], chosen)
+
+
+def _tuned(chosen: argparse.Namespace) -> None:
+    publish([tuned.tuned_table(range(chosen.seeds), chosen.processes)], chosen)
 
 
 def _calibration(chosen: argparse.Namespace) -> None:

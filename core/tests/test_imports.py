@@ -21,7 +21,7 @@ ROOMS = (
     {"simulation", "reductions", "inference"},
     {"corrections", "cost", "photon_budget"},
     {"estimators"},
-    {"inspection", "pipeline", "io"},
+    {"inspection", "pipeline", "io", "tuning"},
     {"out_of_core", "report", "warmup"},
     {"studies"},
     {"cli"},

@@ -12,6 +12,7 @@ from app.model.methods import OTHERS, doubts_hold, method_title
 from app.model.state import AUTOMATIC
 from app.model.store import Answer
 from app.pages.session import Session
+from app.pages.shared.tuning import SettingsChooser
 from app.widgets.cards import part, select
 from app.widgets.controls import Sentence, SettingsPanel
 from core import ESTIMATORS
@@ -33,6 +34,7 @@ class MethodChoice:
         Which estimator is shown, and why it was chosen.
     panels : dict of str to SettingsPanel
         The settings of each estimator that has been shown.
+    chooser : SettingsChooser
     part : Part
         All of it.
     """
@@ -45,7 +47,8 @@ class MethodChoice:
         self.note = Sentence(live=True, sizing_mode="stretch_width", margin=(0, 8, 4, 8))
         self.panels: dict[str, SettingsPanel[Any]] = {}
         self._settings = pn.Column(sizing_mode="stretch_width", margin=0)
-        self.part = part("Method", self.menu, self.note, self._settings)
+        self.chooser = SettingsChooser(session)
+        self.part = part("Method", self.menu, self.note, self._settings, self.chooser.part)
         self.menu.param.watch(lambda event: setattr(self._state, "method", event.new), "value")
 
     def show(self, answer: Answer) -> None:
@@ -57,6 +60,7 @@ class MethodChoice:
         for method, panel in self.panels.items():
             panel.show(self._state.settings[method])
             panel.mark_doubts(doubts_hold(answer.capture))
+        self.chooser.follow(answer)
         for method, layout in zip(self.panels, self._settings, strict=True):
             layout.visible = method == answer.method
 

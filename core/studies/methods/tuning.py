@@ -1,16 +1,15 @@
 """The same search for the settings of every method, on seeds that no table reports.
 
-From the defaults, one parameter after the other is multiplied by each of `FACTORS`, or takes each
-of its options; what restores most pixels, on average over `SBRS`, is kept. This is repeated until
-nothing changes. Depths are random for methods that look at single pixels, and those of oblique
+`core.tuning.searched` from the defaults, for what restores most pixels on average over `SBRS`.
+Depths are random for methods that look at single pixels, and those of oblique
 walls for methods that use neighbours. What is found is then compared with the defaults on other
 seeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import Field, dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -19,22 +18,16 @@ import numpy as np
 from core.capture import Capture
 from core.estimators import ESTIMATORS
 from core.metrics import Interval
-from core.parameters import Choice, spec_of
 from core.scripts import literal
 from core.studies.methods.uniform import SBRS
 from core.studies.outputs import Table, table
 from core.studies.paper.figures import LITERAL, RECOMMENDED, WHOLE_BINS
 from core.studies.paper.recommend import SEEDS
 from core.studies.trials import Condition, Method, default_methods, score, summary
+from core.tuning import FIXED, searched
 
 SEARCHED = SEEDS[:4]
-FACTORS = (0.25, 0.5, 0.7, 1.4, 2.0, 4.0)
 MOST_ROUNDS = 3
-FIXED = {
-    RECOMMENDED.name: {"h", "refine"},  # only (m·h)²·l matters; whole bins, as in the paper
-    LITERAL.name: {each.name for each in fields(LITERAL.settings)} - {"l"},  # what it is
-    "likelihood": {"steps_per_bin"},  # finer steps cost time only
-}
 METHODS = [RECOMMENDED, LITERAL] + [
     each
     for each in default_methods()
@@ -76,7 +69,7 @@ def search(method: Method, seeds: Sequence[int] = SEARCHED) -> Tuned:
     """Search the settings of a method."""
     scene = scene_of(method)
     captures = [Condition(scene, sbr).capture(seed) for sbr in SBRS for seed in seeds]
-    free = [f for f in fields(method.settings) if f.name not in FIXED.get(method.name, ())]
+    free = [each for each in fields(method.settings) if each.name not in _fixed(method)]
     known: dict[Any, float] = {}
 
     def restored(settings: Any) -> float:
@@ -84,32 +77,20 @@ def search(method: Method, seeds: Sequence[int] = SEARCHED) -> Tuned:
             known[settings] = _mean_rd(captures, replace(method, settings=settings))
         return known[settings]
 
-    best, before = method.settings, None
-    for _ in range(MOST_ROUNDS):
-        if best == before:
-            break
-        before = best
-        for each in free:
-            best = max([best, *_neighbours(best, each)], key=restored)
+    best = searched(method.settings, free, restored, MOST_ROUNDS)
     return Tuned(method, scene, best, len(known))
+
+
+def _fixed(method: Method) -> Sequence[str]:
+    if method.name == LITERAL.name:
+        return [each.name for each in fields(method.settings) if each.name != "l"]
+    return FIXED.get(method.estimator, ())
 
 
 def _mean_rd(captures: Sequence[Capture], method: Method) -> float:
     """Return the restoration degree within 3 bins over captures of equally many targets."""
     scores = [score(capture, method) for capture in captures]
     return float(np.mean([each.restored[2] / each.targets for each in scores]))
-
-
-def _neighbours(settings: Any, of: Field[Any]) -> Iterator[Any]:
-    """Yield the same settings with other values of one field."""
-    spec, now = spec_of(of), getattr(settings, of.name)
-    if isinstance(spec, Choice):
-        yield from (replace(settings, **{of.name: each}) for each in spec.options)
-        return
-    start = now or 0.05 * (spec.high - spec.low)  # a multiple of 0 would be 0
-    for factor in FACTORS:
-        value = min(max(factor * start, spec.low), spec.high)
-        yield replace(settings, **{of.name: round(value) if spec.whole else value})
 
 
 def tuning_table(
