@@ -143,7 +143,10 @@ def tuned(
 
     def restored(settings: Any) -> float:
         if settings not in rd_of:
-            rd_of[settings] = float(right_targets(first, method, settings).mean())
+            try:
+                rd_of[settings] = float(right_targets(first, method, settings).mean())
+            except ValueError:  # they need what the capture does not have, such as its pulses
+                rd_of[settings] = -math.inf
             progress(len(rd_of), n_settings)
         return rd_of[settings]
 
@@ -153,7 +156,8 @@ def tuned(
     progress(len(rd_of), len(rd_of))
     before, after = (right_targets(second, method, each) for each in (default, best))
     gain, error = float(after.mean() - before.mean()), _error(after, before)
-    trials = sorted((Trial(*each) for each in rd_of.items()), key=lambda each: -each.rd)
+    possible = (Trial(*each) for each in rd_of.items() if math.isfinite(each[1]))
+    trials = sorted(possible, key=lambda each: -each.rd)
     return Tuning(
         method,
         best if gain > SURE * error else default,

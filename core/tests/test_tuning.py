@@ -66,6 +66,13 @@ def test_a_large_capture_is_judged_by_patches() -> None:
     assert tuned(large).n_targets <= 64**2 < large.counts.size
 
 
+def test_settings_that_a_capture_does_not_allow_are_passed_over() -> None:
+    capture = Condition("car", 0.3).capture(0)
+    photons = replace(capture, acquisition=replace(capture.acquisition, n_pulses=None))
+    weights = {each.settings.weight for each in tuned(photons).trials}
+    assert "survival" not in weights and len(weights) > 1
+
+
 def test_a_capture_without_a_surface_keeps_the_defaults() -> None:
     empty = Capture(np.zeros((8, 8, 50), np.uint16), Acquisition(50, 1e-9, n_pulses=100))
     found = tuned(empty)
