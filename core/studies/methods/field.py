@@ -28,6 +28,7 @@ from core.io.readers.arrivals import NATIVE_BIN_S
 from core.metrics import Interval, wilson
 from core.studies.outputs import Table
 from core.studies.statistics import median_interval
+from core.tuning import tuned
 
 FACE, FACE_TRUTH = "data_face.mat", "data_mannequin_face_truth.mat"
 TMF8820 = "tmf8820_distance_data.json"
@@ -39,6 +40,8 @@ WITHIN_M = 0.03, 0.15
 
 GAUSSIAN = Pulse.gaussian(45 * NATIVE_BIN_S)
 METHODS = tuple(name for name in ESTIMATORS if name != "oracle")  # the true flux is unknown
+TUNED = "tracking, tuned"
+"""Tracking with settings that are chosen for each capture (`core.tuned`)."""
 
 KNOWN = {
     "all photons": (0.824, 0.940, 0.914, 0.966),
@@ -112,14 +115,18 @@ def face_tables(
         If a capture is absent.
     """
     truth = face_truth(folder)
-    cells: dict[tuple[float, str], list[Interval]] = {(w, m): [] for w in WITHIN_M for m in METHODS}
-    spent_s, has_photon = dict.fromkeys(METHODS, 0.0), []
+    methods = (*METHODS, TUNED)
+    cells: dict[tuple[float, str], list[Interval]] = {(w, m): [] for w in WITHIN_M for m in methods}
+    spent_s, has_photon = dict.fromkeys(methods, 0.0), []
     for condition, capture in face_captures(folder, pulse):
         posterior_of(capture)  # computed once per capture, whatever the method
-        for method in METHODS:
+        for method in methods:
             progress(f"{title}, {condition}: {method}")
             started = perf_counter()
-            range_m = estimate(capture, method).range_m
+            if method == TUNED:
+                range_m = estimate(capture, "tracking", tuned(capture).settings).range_m
+            else:
+                range_m = estimate(capture, method).range_m
             spent_s[method] += perf_counter() - started
             error_m = (range_m - truth.range_m)[truth.is_face]
             error_m = np.abs(error_m - np.nanmedian(error_m))
@@ -131,7 +138,7 @@ def face_tables(
     for at, within_m in enumerate(WITHIN_M):
         rows = [
             (method, *cells[within_m, method], f"{spent_s[method] / len(KNOWN):.1f}")
-            for method in METHODS
+            for method in methods
         ]
         for name, first in (("peak", 0), ("matched filter", 2)):
             known = (values[first + at] for values in KNOWN.values())
