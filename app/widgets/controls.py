@@ -242,6 +242,10 @@ class Table(Component):
     _stylesheets: ClassVar = [Path(__file__).with_name("table.css")]
 
 
+NARROW_TABLE = "tbody th { min-width: 0; } td { padding-left: 0; }"
+"""Style of tables that are as wide as the sidebar."""
+
+
 class Sentence(Component):
     """Plain text: a file's name, say, is never interpreted as HTML."""
 

@@ -20,7 +20,7 @@ from app.pages.session import Session
 from app.pages.shared.downloads import TABLE, Shown, below, downloadable, looked_at
 from app.units import Quantity
 from app.widgets.cards import button, part
-from app.widgets.controls import Sentence, SettingsPanel, Table
+from app.widgets.controls import NARROW_TABLE, Sentence, SettingsPanel, Table
 from core import PhotonBudget, Scene
 from core.photon_budget import (
     GIVEN,
@@ -55,9 +55,6 @@ NEEDED_COLUMNS = (
     ("From", "Smallest value on the slider that reaches it.", -1),
     ("To", "Largest value on the slider that reaches it.", -1),
 )
-
-NARROW = "tbody th { min-width: 0; } td { padding-left: 0; }"
-"""Style of tables that are as wide as the sidebar."""
 
 
 class PhotonBudgetForm:
@@ -202,7 +199,7 @@ def _table(title: str, columns: Any) -> Table:
     return Table(
         title=title,
         columns=[list(column) for column in columns],
-        stylesheets=[NARROW],
+        stylesheets=[NARROW_TABLE],
         sizing_mode="stretch_width",
         margin=(4, 0),
     )

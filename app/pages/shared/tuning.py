@@ -12,7 +12,7 @@ from app.pages.session import Session
 from app.pages.shared.studies import OnePiece
 from app.tasks.scheduler import Work
 from app.widgets.cards import part
-from app.widgets.controls import Sentence, Table
+from app.widgets.controls import NARROW_TABLE, Sentence, Table
 from core import ESTIMATORS, Tuning, tuned
 from core.parameters import spec_of
 from core.scripts import changed_fields
@@ -28,7 +28,6 @@ COLUMNS = (
     ("RD", "Share of the simulated targets within 3 bins.", -1),
 )
 MOST_SHOWN = 8
-NARROW = "tbody th { min-width: 0; } td { padding-left: 0; }"
 
 
 class SettingsChooser:
@@ -64,7 +63,7 @@ class SettingsChooser:
         self.table = Table(
             title=TITLE,
             columns=[list(column) for column in COLUMNS],
-            stylesheets=[NARROW],
+            stylesheets=[NARROW_TABLE],
             sizing_mode="stretch_width",
             visible=False,
             margin=0,
