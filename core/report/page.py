@@ -536,14 +536,22 @@ def _between(interval: Interval, capture: Capture, decimals: int | None) -> str:
 
 
 def _interval(found: Interval) -> str:
-    return f"{_number(found.value)} [{_number(found.low)} to {_number(found.high)}]"
+    value, ends = _value_and_ends(found)
+    return f"{value} [{ends}]"
+
+
+def _value_and_ends(found: Interval) -> tuple[str, str]:
+    """Return a number and its interval; where it is infinite, the lower end alone."""
+    if math.isinf(found.value):
+        return "–", f"&gt; {_number(found.low)}"
+    return _number(found.value), f"{_number(found.low)} to {_number(found.high)}"
 
 
 def _intervals(flux: FluxEstimate, unit: str, caption: str) -> str:
     """Return signal, background and their ratio with their intervals as a table."""
     units = (unit, unit, "")
     rows = [
-        (title, _number(each.value), f"{_number(each.low)} to {_number(each.high)}", of)
+        (title, *_value_and_ends(each), of)
         for title, of, each in zip(_FLUXES.values(), units, flux, strict=True)
     ]
     return _table(caption, ("Quantity", "Value", "Interval", "Unit"), rows)

@@ -210,6 +210,15 @@ def test_a_capture_without_photons_has_a_report() -> None:
     assert "Pixel in row 1, column 2" in page.texts["h2"]
 
 
+def test_a_ratio_without_an_upper_end_is_shown_by_its_lower_one() -> None:
+    cube = np.zeros((2, 3, 40), np.uint8)
+    cube[..., 20] = 9  # no background
+    clear = core.Capture(cube, core.Acquisition(40, 1e-9, 0.0, 100))
+    page = Page(written(clear, image := core.estimate(clear, "likelihood"), pixel=(0, 0)))
+    assert page.values["SBR"][-1:] == [pixel_report(clear, image, 0, 0, "likelihood").flux.sbr.low]
+    assert not any("∞" in text for text in page.texts["td"])
+
+
 def test_a_large_image_is_thinned_and_its_file_stays_small() -> None:
     cube = np.zeros((400, 300, 8), np.uint8)
     rng = np.random.default_rng(0)
