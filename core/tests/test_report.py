@@ -194,6 +194,9 @@ def test_the_cloud_has_the_confident_estimates(page: Page, image: core.RangeImag
     assert len(decoded("data-rgb", "u1")) == len(xyz) == len(expected_m) > 100
     scale = np.linalg.norm(expected_m) / np.linalg.norm(xyz)
     np.testing.assert_allclose(xyz * scale, expected_m, atol=2e-4 * np.abs(expected_m).max())
+    width_m, depth_m, height_m = np.ptp(expected_m, axis=0)
+    size = f"{width_m:.3g} m wide, {height_m:.3g} m high and {depth_m:.3g} m deep."
+    assert any(size in text for text in page.texts["figcaption"])
     hidden = int(image.valid.sum()) - len(xyz)
     caption = page.texts["figcaption"][0]
     assert f"{len(xyz):,} of" in caption
