@@ -240,8 +240,8 @@ def source_is_gone(key: str, known: Iterable[str]) -> str:
     name = key.partition("~")[0]
     if any(each.startswith(f"{name}~") for each in known):
         return (
-            f"The link is to another file than {name[:40]!r} here: its content is another. "
-            "Choose the one here in the list, or open the other."
+            f"The link is not to the {name[:40]!r} here: its content is another, or not stated. "
+            "Choose this one in the list, or open the other."
         )
     return (
         f"There is no scene or capture {key[:40]!r} here. Uploaded files are removed when no page "
