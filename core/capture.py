@@ -28,6 +28,7 @@ from core.deprecation import renamed
 from core.kernels.blocks import Blocks, to_blocks
 from core.labels import dataset
 from core.notebook import html_table
+from core.typesetting import typeset
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -214,13 +215,14 @@ class Capture:
         """Size, gate, pulses, photons, kind of detection, truth and source as text, by name."""
         (rows, cols), acquisition = self.shape, self.acquisition
         photons, n_pulses = int(self.counts.sum()), acquisition.n_pulses
+        mean = photons / self.counts.size
         begin_m, end_m = acquisition.bin_to_range_m([0, acquisition.n_bins]).tolist()
         return {
             "shape": f"{rows} × {cols} pixels",
             "bins": f"{acquisition.n_bins} of {acquisition.bin_width_s * 1e9:.6g} ns, "
             f"{begin_m:.6g} to {end_m:.6g} m",
             "pulses": "not known" if n_pulses is None else f"{n_pulses:,}",
-            "photons": f"{photons:,}, {photons / self.counts.size:.4g} per pixel",
+            "photons": f"{photons:,}, {typeset(f'{mean:.4g}')} per pixel",
             "detection": "first photons" if self.detection == "first" else "all photons",
             "truth": "not known" if self.truth_range_m is None else "known",
             "source": self.source,

@@ -190,7 +190,7 @@ def test_a_session_returns_to_what_it_has_shown():
     assert {*layout.heard} == {""}
     before = chosen(state)
     session.recall("source=nowhere&light.sbr=2")
-    assert layout.heard[-1] == text.source_is_gone("nowhere")
+    assert layout.heard[-1] == text.source_is_gone("nowhere", session.sources)
     assert chosen(state) == before
     with pytest.raises(KeyError, match="Nowhere"):
         session.recall("page=Nowhere")

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import core
 from app.model.colors import map_of
 from app.model.script import script_of
 from app.model.state import MAPS, NEEDED, Crop, Illumination, ReductionSettings, Viewing
@@ -564,6 +565,30 @@ def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, mon
     assert section.note.text == text.NO_A and building.state.kept == ""
     building.state.kept = kept  # as by Undo
     assert building.kept_answer is None  # A does not stay in memory
+
+
+def test_two_captures_are_subtracted_and_the_script_reads_both(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate(("before.npz", "after.npz")):
+        scene, acquisition = core.scenes["staircase"](16), Acquisition()
+        cube = core.simulate(scene, acquisition, core.Flux(0.3, sbr=1.0), seed=seed).cube
+        np.savez(name, counts=cube, bin_width_s=1e-9, n_pulses=acquisition.n_pulses)
+    sources = {each: file_source(tmp_path / f"{each}.npz") for each in ("before", "after")}
+    session = Session(sources, link_to("source=before"), tasks=HeldTasks())
+    section = PairSection(session)
+    section.show(True)
+    press(button(section, "Keep as A"))
+    change(session, source="after")
+    section.refresh()
+    session.tasks.run_until(lambda: section.pair and section.pair.b is session.answer)
+    assert "before.npz" in section.a.title.text and "after.npz" in section.b.title.text
+    assert np.nanmax(np.abs(section.pair.difference_m)) > 0
+    session.state.param.update(page="Inspect", subject="A/B")
+    (tmp_path / "script.py").write_text(
+        script_of(session.answer, session.state, session.kept_answer), "utf-8"
+    )
+    found = runpy.run_path("script.py")["difference_m"]
+    np.testing.assert_array_equal(found, section.pair.difference_m)
 
 
 def test_estimates_of_other_sizes_are_not_subtracted(building):

@@ -104,7 +104,7 @@ def _first_answer(
 ) -> tuple[Answer, Refused | None]:
     before, changed = {**defaults(), **own}, choices(link, own)
     if changed["source"] not in sources:
-        link.refused.append(text.source_is_gone(changed["source"]))
+        link.refused.append(text.source_is_gone(changed["source"], sources))
         of_source = ("source", "reading", "window", "less")
         changed = {name: value for name, value in changed.items() if name not in of_source}
     plain = {name: value for name, value in changed.items() if name not in COMPUTED_FROM}
@@ -139,7 +139,7 @@ def parsed(
     link = Link(dict(parse_qsl(query)))
     chosen = choices(link, own)
     if chosen["source"] not in sources:
-        raise ValueError(text.source_is_gone(chosen["source"]))
+        raise ValueError(text.source_is_gone(chosen["source"], sources))
     return link, chosen
 
 

@@ -235,11 +235,17 @@ def progress(done: int, of: int, noun: str, is_running: bool) -> str:
     return f"Done: {of} {noun if of != 1 else noun.removesuffix('s')}."
 
 
-def source_is_gone(key: str) -> str:
-    """Return the message about a missing scene or capture of a link."""
+def source_is_gone(key: str, known: Iterable[str]) -> str:
+    """Return the message about a scene or capture of a link that is not among the known keys."""
+    name = key.partition("~")[0]
+    if any(each.startswith(f"{name}~") for each in known):
+        return (
+            f"The link is not to the {name[:40]!r} here: its content is another, or not stated. "
+            "Choose this one in the list, or open the other."
+        )
     return (
-        f"There is no scene or capture {key[:40]!r} here, or its content is another. Uploaded "
-        "files are removed when no page uses them: upload the file again."
+        f"There is no scene or capture {key[:40]!r} here. Uploaded files are removed when no page "
+        "uses them: upload the file again."
     )
 
 

@@ -23,6 +23,8 @@ class Cloud:
     Parameters
     ----------
     n_points : int
+    size_m : tuple of float
+        Width, depth and height between the outermost points.
     xyz, rgb : str
         Coordinates as int16 and colours as uint8, shape (point, 3), in Base64.
     unit : float
@@ -32,6 +34,7 @@ class Cloud:
     """
 
     n_points: int
+    size_m: tuple[float, float, float]
     xyz: str
     rgb: str
     unit: float
@@ -64,7 +67,9 @@ def cloud_of(range_m: Floats, scale: ColorScale, pixel_angle_rad: float, step: i
     unit = max(float(np.abs(centred_m).max()) / radius_m, 1.0) / _STEPS
     steps = np.round(centred_m / (radius_m * unit)).astype("<i2")
     rgb = scale.rgb(found_m)
-    return Cloud(len(steps), _base64(steps), _base64(rgb), unit, spacing_m / radius_m)
+    width_m, depth_m, height_m = np.ptp(points.xyz_m, axis=0).tolist()
+    size_m = width_m, depth_m, height_m
+    return Cloud(len(steps), size_m, _base64(steps), _base64(rgb), unit, spacing_m / radius_m)
 
 
 def _base64(values: NDArray[np.generic]) -> str:

@@ -6,7 +6,7 @@ import math
 import platform
 from base64 import b64encode
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from hashlib import sha256
 from html import escape
 from importlib.metadata import version
@@ -54,7 +54,7 @@ from core.report.figures import (
     image_svg,
 )
 from core.tracking import tracking_signals
-from core.typesetting import typeset
+from core.typesetting import three_digits, typeset
 
 MOST_PIXELS = 2**16
 """Pixels of maps and cloud; larger images are thinned."""
@@ -386,15 +386,17 @@ def _cloud(
         yield _paragraph(f"There are no points: no estimate is confident enough{_text(where)}.")
         return
     thinned = f", of 1 of {step} rows and 1 of {step} columns" if step > 1 else ""
-    data = {name: value for name, value in asdict(cloud).items() if name != "n_points"}
+    data = {name: getattr(cloud, name) for name in ("xyz", "rgb", "unit", "spacing")}
     attributes = " ".join(f'data-{name}="{value}"' for name, value in data.items())
+    width, depth, height = (f"{three_digits(each)} m" for each in cloud.size_m)
     where = "" if box == WHOLE else f" in the box ({_text(box)})"
     label = f"Point cloud of {cloud.n_points:,} estimates{where}"
     yield (
         f'<figure><canvas id="cloud" tabindex="0" role="img" aria-label="{label}" {attributes}>'
-        f"</canvas><figcaption>{label}{thinned}, in the colours of the map of range.{_text(remark)}"
-        " Drag to turn, with Shift to move; pinch, or click and use the wheel, to zoom. Keys: "
-        "arrows, + and −, 0 for the first view.</figcaption></figure>"
+        f"</canvas><figcaption>{label}{thinned}, in the colours of the map of range, "
+        f"{width} wide, {height} high and {depth} deep.{_text(remark)} Drag "
+        "to turn, with Shift to move; pinch, or click and use the wheel, to zoom. Keys: arrows, "
+        "+ and −, 0 for the first view.</figcaption></figure>"
     )
     yield "<noscript><p>The cloud needs JavaScript.</p></noscript>"
 
@@ -536,14 +538,22 @@ def _between(interval: Interval, capture: Capture, decimals: int | None) -> str:
 
 
 def _interval(found: Interval) -> str:
-    return f"{_number(found.value)} [{_number(found.low)} to {_number(found.high)}]"
+    value, ends = _value_and_ends(found)
+    return f"{value} [{ends}]"
+
+
+def _value_and_ends(found: Interval) -> tuple[str, str]:
+    """Return a number and its interval; where it is infinite, the lower end alone."""
+    if math.isinf(found.value):
+        return "–", f"&gt; {_number(found.low)}"
+    return _number(found.value), f"{_number(found.low)} to {_number(found.high)}"
 
 
 def _intervals(flux: FluxEstimate, unit: str, caption: str) -> str:
     """Return signal, background and their ratio with their intervals as a table."""
     units = (unit, unit, "")
     rows = [
-        (title, _number(each.value), f"{_number(each.low)} to {_number(each.high)}", of)
+        (title, *_value_and_ends(each), of)
         for title, of, each in zip(_FLUXES.values(), units, flux, strict=True)
     ]
     return _table(caption, ("Quantity", "Value", "Interval", "Unit"), rows)

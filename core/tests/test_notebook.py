@@ -107,6 +107,8 @@ def test_a_notebook_shows_a_capture_as_a_table() -> None:
     assert facts["pulses"] == "300"
     assert facts["photons"].startswith(f"{CAPTURE.counts.sum():,}, ")
     assert facts["truth"] == "not known"
+    bright = Capture(np.full((1, 1, 4), 60_000, np.uint16), Acquisition(n_bins=4, n_pulses=None))
+    assert bright.facts["photons"] == "240,000, 240,000 per pixel"
 
 
 def test_a_notebook_shows_a_range_image_as_a_table() -> None:

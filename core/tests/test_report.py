@@ -194,6 +194,9 @@ def test_the_cloud_has_the_confident_estimates(page: Page, image: core.RangeImag
     assert len(decoded("data-rgb", "u1")) == len(xyz) == len(expected_m) > 100
     scale = np.linalg.norm(expected_m) / np.linalg.norm(xyz)
     np.testing.assert_allclose(xyz * scale, expected_m, atol=2e-4 * np.abs(expected_m).max())
+    width_m, depth_m, height_m = np.ptp(expected_m, axis=0)
+    size = f"{width_m:.3g} m wide, {height_m:.3g} m high and {depth_m:.3g} m deep."
+    assert any(size in text for text in page.texts["figcaption"])
     hidden = int(image.valid.sum()) - len(xyz)
     caption = page.texts["figcaption"][0]
     assert f"{len(xyz):,} of" in caption
@@ -208,6 +211,15 @@ def test_a_capture_without_photons_has_a_report() -> None:
     assert "canvas" not in page.texts
     assert "Estimate" not in page.values
     assert "Pixel in row 1, column 2" in page.texts["h2"]
+
+
+def test_a_ratio_without_an_upper_end_is_shown_by_its_lower_one() -> None:
+    cube = np.zeros((2, 3, 40), np.uint8)
+    cube[..., 20] = 9  # no background
+    clear = core.Capture(cube, core.Acquisition(40, 1e-9, 0.0, 100))
+    page = Page(written(clear, image := core.estimate(clear, "likelihood"), pixel=(0, 0)))
+    assert page.values["SBR"][-1:] == [pixel_report(clear, image, 0, 0, "likelihood").flux.sbr.low]
+    assert not any("∞" in text for text in page.texts["td"])
 
 
 def test_a_large_image_is_thinned_and_its_file_stays_small() -> None:
