@@ -122,6 +122,8 @@ def page_of(
     capture_found = capture_report(capture)
     shown = image.confident(least_confidence)
     scale = range_scale(capture, shown, colors)
+    # Before plots, which take seconds: it refuses an angle that is out of range.
+    cloud = [*_cloud(capture, image, shown, scale, pixel_angle_rad, box, step)]
     body = [
         *_heading(capture, image, title, method),
         *_recording(capture),
@@ -129,7 +131,7 @@ def page_of(
         *_maps(capture, image, shown, scale, pixel, step),
         *_all_pixels(capture, capture_found, has_t_n),
         *_pixel(capture, made_by, pixel_found),
-        *_cloud(capture, image, shown, scale, pixel_angle_rad, box, step),
+        *cloud,
         *_reported(capture, image),
         *_accuracy(capture, image),
         *_settings(made_by, least_confidence),

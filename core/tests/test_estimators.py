@@ -108,6 +108,7 @@ CAPTURES: dict[str, Callable[[], Capture]] = {
 }
 
 
+@pytest.mark.uncounted
 @every_case
 @pytest.mark.parametrize("build", CAPTURES.values(), ids=CAPTURES)
 def test_estimates_keep_the_contract(build: Callable[[], Capture], case: tuple[str, Any]) -> None:

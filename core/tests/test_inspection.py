@@ -589,6 +589,7 @@ def _counts(shape: tuple[int, int, int], kind: str, n_pulses: int | None) -> np.
     return cube
 
 
+@pytest.mark.uncounted
 @pytest.mark.parametrize("kind", ["empty", "full", "one"])
 @pytest.mark.parametrize("n_pulses", [1, 1000, None])
 @pytest.mark.parametrize("shape", [(1, 1, 1), (5, 5, 1), (5, 6, 30)])

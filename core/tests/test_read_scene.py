@@ -376,6 +376,7 @@ WHOLE: dict[str, Callable[[], bytes]] = {
 }
 
 
+@pytest.mark.uncounted
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", WHOLE)
 def test_damaged_bytes_give_nothing_but_a_scene_error(

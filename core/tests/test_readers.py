@@ -174,6 +174,7 @@ def test_contract_cut_files_are_refused(kept: Format, tmp_path: Path) -> None:
                 read_capture(put(tmp_path / kept.name, content[:n_bytes]), **kept.needs)
 
 
+@pytest.mark.uncounted
 @pytest.mark.filterwarnings("ignore")
 @every_format
 def test_contract_damaged_bytes_give_nothing_but_a_capture_error(

@@ -137,12 +137,6 @@ def test_each_plot_has_a_heading_and_a_text_of_its_own(page: Page) -> None:
     assert len(identifiers) == len(set(identifiers))
 
 
-def test_t_n_is_suggested_to_the_method_that_has_it() -> None:
-    for method in ("tracking", "peak"):
-        suggested = "T_n: " in written(CAPTURE, core.estimate(CAPTURE, method))
-        assert suggested == (method == "tracking")
-
-
 def test_texts_from_outside_stay_texts(page: Page) -> None:
     shown = HOSTILE.replace("\udcff", " ").replace("\0", " ")
     assert page.texts["h1"] == [shown]
@@ -152,7 +146,7 @@ def test_texts_from_outside_stay_texts(page: Page) -> None:
     assert page.texts["code"][0].endswith("\n1 < 2\n")
 
 
-def test_numbers_are_those_of_the_reports(page: Page, image: core.RangeImage) -> None:
+def test_numbers_are_those_of_the_reports(source: str, page: Page, image: core.RangeImage) -> None:
     whole, pixel = capture_report(CAPTURE), pixel_report(CAPTURE, image, *PIXEL)
     fluxes = whole.target_flux, whole.flux, pixel.flux
     for name, *found in zip(("Signal", "Background", "SBR"), *fluxes, strict=True):
@@ -166,6 +160,7 @@ def test_numbers_are_those_of_the_reports(page: Page, image: core.RangeImage) ->
     fit = f"{share_below(fit_p_values(CAPTURE))} {fit_of(CAPTURE).verdict}"
     assert fit in page.texts["figcaption"]
     assert f"{pixel.answer_m:.{pixel.interval_68_m.decimals}f}" in page.texts["data"]
+    assert "T_n: " in source
     check = reported_check(CAPTURE, image)
     assert check is not None and check.n_pixels > 0
     assert page.values["Reported by the sensor"] == [REPORTED_M[PIXEL]]
@@ -280,6 +275,7 @@ def test_the_command_and_its_script_write_the_same_report(
     assert main([*command, *options, *more]) == 2
     assert "--overwrite" in capsys.readouterr().err
     page = Page(first)
+    assert "T_n: " not in first  # which only tracking has
     assert page.texts["h1"] == ["a 'b' <c>.npz"]
     assert "Pixel in row 3, column 4" in page.texts["h2"]
     assert "guard_bins=2" in page.texts["code"][0]

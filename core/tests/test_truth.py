@@ -162,6 +162,7 @@ def test_pickles_are_refused_and_absent_files_named(tmp_path: Path) -> None:
         read_truth(tmp_path / "b.npy", CAPTURE)
 
 
+@pytest.mark.uncounted
 @pytest.mark.parametrize("name", WRITE)
 def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
     path, rng = tmp_path / name, random.Random(1)

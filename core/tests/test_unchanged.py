@@ -10,7 +10,7 @@ import pytest
 from core.tests import unchanged
 from core.tests.unchanged import CASES, Record
 
-pytestmark = pytest.mark.compiled
+pytestmark = [pytest.mark.compiled, pytest.mark.uncounted]
 
 STORED, WRITTEN_BY = unchanged.stored()
 SAME_MACHINE = unchanged.fingerprint() == WRITTEN_BY
