@@ -767,6 +767,7 @@ def test_a_phone_shows_everything_stacked(page):
     take_the_tour(new)
     new.keyboard.press("Enter")
     expect(new.get_by_role("heading", name="The first photon wins")).to_be_visible()
+    expect(new.get_by_role("region", name="Tour")).to_be_hidden()
 
 
 # -- files -----------------------------------------------------------------------------------------

@@ -362,7 +362,7 @@ class Layout:
             sizing_mode="stretch_width",
             margin=(4, 12, 0, 12),
         )
-        tour = button("Tour", text.TOUR_HELP, self._start_tour)
+        tour = button("Tour", text.TOUR_HELP, self._start_tour, (3, 0, 0, 4))
         tour.sx = TOUR_BUTTON
         return Template(
             title="firstphoton",

@@ -74,7 +74,8 @@ export function render({ model }) {
     if (at < 0) return;
     if (now - sought > SEEK_MS) {
       const [selectors] = model.stops[at];
-      target = selectors.map((each) => visible(each)).find(Boolean);
+      const isHere = visible(model.shown_with); // else another page is on screen
+      target = isHere && selectors.map((each) => visible(each)).find(Boolean);
       sought = now;
     }
     for (const each of [frame, card]) each.togglePopover(Boolean(target));

@@ -65,6 +65,7 @@ class Tour(Component):
     """
 
     stops = param.List(default=[list(each) for each in STOPS], doc="Selectors, title and text.")
+    shown_with = param.String(default=f".{PIXEL}", doc="Selector of what is on this page alone.")
     onward = param.String(default="Lesson 1", doc="Label of the button after the last stop.")
     is_offered = param.Boolean(default=False, doc="Whether it starts by itself the first time.")
     started = param.Integer(default=0, doc="Number of times that it was asked for.")
