@@ -33,6 +33,7 @@ __all__ = [
     "PhotonBudget",
     "Reach",
     "Step",
+    "background_extent",
     "predicted_rd",
     "reaching",
     "signal_extent",
@@ -149,13 +150,15 @@ class PhotonBudget(Settings):
     )
 
     def apply(self, scene: Scene) -> tuple[Scene, Flux]:
-        """Return a scene whose signal falls with range, and the flux at its median range.
+        """Return a scene lit by laser and sun, and the flux at its median range.
 
-        The flux has five digits, so that it can be read and typed.
+        Its signal falls with range, and its bright surfaces also reflect more sunlight. The flux
+        has five digits, so that it can be read and typed.
         """
         found = {step.symbol: step.value for step in steps(self, scene)}
         signal, sbr = (float(f"{found[symbol]:.5g}") for symbol in ("S", "SBR"))
-        return with_falloff(scene, self.reflectivity), Flux(signal, sbr)
+        sunlit = _sunlit(scene, found["η"] * found["r"] / found["b"])
+        return with_falloff(sunlit, self.reflectivity), Flux(signal, sbr)
 
 
 class Step(NamedTuple):
@@ -260,6 +263,19 @@ def _add_background(at: _Sheet, budget: PhotonBudget) -> None:
     at.add("Signal over background", "SBR", "S / B", at["S"] / at["B"])
 
 
+def _sunlit(scene: Scene, share: float) -> Scene:
+    """Return a scene whose surfaces reflect sunlight as they reflect the laser.
+
+    `share` is that of sunlight in the background of a surface of reflectivity 1; the rest are dark
+    counts. Where there is no target, the background stays what it is.
+    """
+    if scene.reflectivity is None:
+        return scene
+    reflected = np.where(np.isfinite(scene.range_m), scene.reflectivity, 1.0)
+    ambient = 1.0 if scene.ambient is None else scene.ambient
+    return replace(scene, ambient=ambient * (1.0 - share + share * reflected))
+
+
 def with_falloff(scene: Scene, reflectivity: float = 1.0) -> Scene:
     """Return a scene whose signal falls with ``1 / R²`` from that at its median range.
 
@@ -295,12 +311,31 @@ def signal_extent(budget: PhotonBudget, scene: Scene) -> tuple[float, float]:
     return float(known.min()), float(known.max())
 
 
+def background_extent(budget: PhotonBudget, scene: Scene) -> tuple[float, float]:
+    """Return the smallest and the largest background of the pixels with a target, per pulse.
+
+    Raises
+    ------
+    ValueError
+        As `steps`.
+    """
+    lit, flux = budget.apply(scene)
+    known = _background(lit, flux)[np.isfinite(lit.range_m)]
+    return float(known.min()), float(known.max())
+
+
+def _background(scene: Scene, flux: Flux) -> Floats:
+    """Background of each pixel per pulse, shape (row, col)."""
+    ambient = 1.0 if scene.ambient is None else scene.ambient
+    return np.broadcast_to(flux.background * np.asarray(ambient), np.shape(scene.range_m))
+
+
 def predicted_rd(scene: Scene, flux: Flux, pulse: Pulse = Pulse()) -> float:
     """Predict the restoration degree of the likelihood with known fluxes.
 
     The mean of `core.limits.right_bin_probability` over pixels with a target, for their own signal:
     within 0.015 of simulations with 300 pulses or more. Only reflectivity, fog and the fall of the
-    signal with range are taken into account; the background is uniform.
+    signal with range are taken into account, and the background of each pixel.
     """
     range_m, signal = (each.ravel() for each in next(echoes(scene, flux)))
     target = np.flatnonzero(np.isfinite(range_m))
@@ -308,9 +343,12 @@ def predicted_rd(scene: Scene, flux: Flux, pulse: Pulse = Pulse()) -> float:
     count = min(target.size, _MOST_PIXELS)
     some = target[((np.arange(count) + 0.5) * target.size / count).astype(int)]
     onset_bin = scene.acquisition.range_m_to_bin(range_m[some])
-    found = right_bin_probability(
-        onset_bin, signal[some], flux.background, pulse, scene.acquisition
-    )
+    background, found = _background(scene, flux).ravel()[some], np.empty(count)
+    for level in np.unique(background):
+        at = background == level
+        found[at] = right_bin_probability(
+            onset_bin[at], signal[some][at], level, pulse, scene.acquisition
+        )
     return float(found.mean())
 
 

@@ -55,6 +55,9 @@ def browser_path() -> str | None:
 TIMEOUT_MS = 60_000
 """Limit of each wait for a page: pages are drawn in software, on few cores."""
 
+TOUR = "firstphoton.tour"
+"""Name under which the browser keeps that the tour was ended; else it starts by itself."""
+
 READY = ".stage[data-camera], [aria-label='Pinned pixels']"
 """Part of a page that is drawn late: Explore's cloud, or the pins of Inspect."""
 
@@ -121,6 +124,7 @@ def open_page(
     page = browser.contexts[0].new_page()
     page.set_viewport_size({"width": width, "height": height})
     watch(page)
+    page.add_init_script(f"localStorage['{TOUR}'] ??= 'ended'")
     page.add_init_script(prepare)
     page.goto(address)
     page.locator(ready).first.wait_for(state="attached")

@@ -6,13 +6,13 @@ import json
 import re
 from collections import Counter
 from dataclasses import fields
-from functools import cache
+from functools import cache, partial
 from io import BytesIO
 from itertools import cycle
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 import core
 from app.model.mesh import point_cloud
@@ -23,10 +23,12 @@ from app.pages.layout import MORE_TRACKING
 from app.pages.shared.illumination import MORE
 from app.pages.shared.photon_budget import TITLE as BUDGET
 from app.theme import DARK, LIGHT, RANGE_COLORS, WRONG_COLOR, Palette
+from app.widgets.tour import STOPS
 from core import PRESETS, PhotonBudget, TrackingParameters, scenes
 from core.io.readers.npz import FORMAT
 from core.parameters import spec_of
 from tests.browser import (
+    TOUR,
     VIEWS,
     choose,
     chosen,
@@ -730,9 +732,35 @@ look();
 """
 
 
+FIRST_VISIT = f"delete localStorage['{TOUR}'];"
+
+
+def take_the_tour(page: Page) -> None:
+    """Go from stop to stop by keyboard; each points at a part of the page that is on screen."""
+    card, frame = page.get_by_role("region", name="Tour"), page.locator(".frame")
+
+    def is_framed(part: Locator) -> bool:
+        inner, outer = part.bounding_box(), frame.bounding_box()
+        return all(abs(inner[each] - outer[each]) < 10 for each in ("x", "y", "width", "height"))
+
+    for number, stop in enumerate(STOPS, 1):
+        expect(card.get_by_role("heading")).to_have_text(stop.title)
+        parts = page.locator(", ".join(stop.selectors)).filter(visible=True)
+        eventually(partial(is_framed, parts.first))
+        expect(frame).to_be_in_viewport(ratio=1)
+        expect(card).to_be_in_viewport(ratio=1)
+        if number < len(STOPS):
+            card.get_by_role("button", name="Next").press("Enter")
+
+
 def test_a_phone_shows_everything_stacked(page):
-    new = page(width=390, height=844, prepare=COVERED)
+    new = page(width=390, height=844, prepare=COVERED + FIRST_VISIT)
     assert not new.evaluate("was_covered")
+    take_the_tour(new)
+    new.keyboard.press("Escape")
+    expect(new.get_by_role("region", name="Tour")).to_be_hidden()
+    assert new.evaluate(f"localStorage['{TOUR}']") == "ended"
+    image(new).scroll_into_view_if_needed()
     assert new.evaluate("document.documentElement.scrollWidth") <= 390
     expect(slider(new, "SBR")).not_to_be_in_viewport()
     bottom = 0
@@ -745,6 +773,13 @@ def test_a_phone_shows_everything_stacked(page):
         assert len(colors(pixels(part.screenshot()))) > 20
     new.get_by_role("button", name="Open drawer").click()
     expect(slider(new, "SBR")).to_be_in_viewport()
+    new.keyboard.press("Escape")
+    new.get_by_role("button", name=re.compile("^Tour")).press("Enter")
+    expect(new.get_by_role("button", name="Next", exact=True)).to_be_focused()
+    take_the_tour(new)
+    new.keyboard.press("Enter")
+    expect(new.get_by_role("heading", name="The first photon wins")).to_be_visible()
+    expect(new.get_by_role("region", name="Tour")).to_be_hidden()
 
 
 # -- files -----------------------------------------------------------------------------------------

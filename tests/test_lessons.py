@@ -479,6 +479,9 @@ def present_the_first_lesson(here: Page) -> None:
     here.keyboard.press("Space")
     expect(said).to_contain_text("Pulse 1,000 of 1,000")
     assert min(here.locator(TYPE).filter(visible=True).evaluate_all(FONT_SIZES)) >= 24
+    here.set_viewport_size({"width": 390, "height": 844})
+    eventually(lambda: here.locator(".bk-Legend").evaluate_all(LEGENDS_FIT))
+    here.set_viewport_size({"width": 1024, "height": 768})
     here.keyboard.press("b")
     expect(slides.locator(".blank")).to_be_visible()
     here.keyboard.press("b")
@@ -487,6 +490,11 @@ def present_the_first_lesson(here: Page) -> None:
     here.keyboard.press("Escape")
     expect(here.get_by_role("button", name="Toggle theme")).to_be_visible()
 
+
+LEGENDS_FIT = """all => all.length > 0 && all.every((each) => {
+  const { left, right } = each.getBoundingClientRect();
+  return 0 <= left && right <= innerWidth;
+})"""
 
 TYPE = "p:not(:empty), h1, nav span, button:not([aria-label^=Reset]), input[type=text], .label"
 FONT_SIZES = """all => all.map((each) =>

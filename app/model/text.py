@@ -33,6 +33,8 @@ FIELD_OF_VIEW_UNKNOWN = (
 
 ONE_LINE = "Range estimation from first-photon lidar at a low signal-to-background ratio"
 
+TOUR_HELP = "Tour: five stops that explain the page Explore."
+
 CONFIDENCE_HELP = (
     "Probability of a surface within 3 bins of the estimate. In a pixel of several surfaces, the "
     "report's confidence may exceed that of the map, which assumes one."

@@ -40,18 +40,19 @@ from app.tasks.signals import Signal
 from app.theme import DARK, LIGHT, STYLES
 from app.units import ShownGate, scale
 from app.widgets.address_bar import AddressBar
-from app.widgets.cards import choice, part, select
+from app.widgets.cards import button, choice, part, select
 from app.widgets.connection import Connection
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.file_input import file_button
 from app.widgets.glossary import Glossary, explained
 from app.widgets.share import Share
+from app.widgets.tour import SCENE, Tour
 from core import PRESETS, TrackingParameters
 from core.io import SUFFIXES, ReadOptions, pattern_of
 
 CUSTOM = "custom"
-LEARN = "Learn"
-"""The page with a presenter mode."""
+EXPLORE, LEARN = "Explore", "Learn"
+"""The page of the tour, and the page with a presenter mode."""
 
 HELP = "About this page"
 MORE_TRACKING = "More tracking settings"
@@ -98,6 +99,12 @@ PAGE_BUTTONS = {
     },
 }
 
+TOUR_BUTTON = {
+    "color": "#ffffff",
+    "borderColor": "#ffffff80",
+    "textTransform": "none",
+    "@media (max-width: 500px)": {"minWidth": 0, "padding": "5px 2px", "fontSize": "9px"},
+}
 
 PRINT = """
 @media print {
@@ -274,6 +281,7 @@ class Layout:
             state.source,
             "A built-in scene to simulate, or a capture from a file.",
         )
+        self._source.css_classes = [SCENE]
         self._file = file_button(
             "Open a capture file",
             SUFFIXES,
@@ -316,6 +324,7 @@ class Layout:
         self._link = AddressBar()
         session_id = session.page.session_context.id if session.tasks.is_served else ""
         self._connection = Connection(session_id)
+        self._tour = Tour(is_offered=state.page == EXPLORE, margin=0)
 
     def _make_parts(self, unit: Any) -> None:
         """Make the parts of the sidebar that pages share; `_show_answer` shows one of the first."""
@@ -346,17 +355,20 @@ class Layout:
             self._link,
             self._connection,
             Glossary(margin=0),
+            self._tour,
             self._busy,
             self.alert,
             self._reading.question,
             sizing_mode="stretch_width",
             margin=(4, 12, 0, 12),
         )
+        tour = button("Tour", text.TOUR_HELP, self._start_tour, (3, 0, 0, 4))
+        tour.sx = TOUR_BUTTON
         return Template(
             title="firstphoton",
             template=TEMPLATE,
             sidebar=self._sidebar(),
-            header=[self.pages.choice],  # not in `main`: plots keep the height
+            header=[self.pages.choice, tour],  # not in `main`: plots keep the height
             main=[head, *self.pages.mains.values(), self._provenance],
             sidebar_width=330,
             stylesheets=[PRINT],
@@ -407,6 +419,7 @@ class Layout:
         self._fit_sidebar()
         state.param.watch(lambda *_: self._follow_unit(), "unit")
         state.param.watch(lambda *_: self._show_bars(), ["page", "present"])
+        self._tour.param.watch(lambda _: setattr(state, "page", LEARN), "finished")
         self._show_bars()
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if self.page.dark_theme:  # by its address
@@ -490,6 +503,10 @@ class Layout:
         self._preset.value = _preset_of(state.tracking)
 
     # Actions of the user
+
+    def _start_tour(self) -> None:
+        self.session.state.page = EXPLORE
+        self._tour.started += 1
 
     def _go_to(self, key: str) -> None:
         session, state = self.session, self.session.state

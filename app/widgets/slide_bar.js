@@ -46,6 +46,12 @@ export function render({ model }) {
   addEventListener("keydown", press);
   model.on("remove", () => removeEventListener("keydown", press));
 
+  const narrow = matchMedia("(width < 700px)");
+  const measure = () => (model.is_narrow = narrow.matches);
+  narrow.addEventListener("change", measure);
+  model.on("remove", () => narrow.removeEventListener("change", measure));
+  measure();
+
   const place = element("span", "", { role: "status", class: "place" });
   const root = element("nav", "", { "aria-label": "Slides" });
   const keys = `Space play · R reveal · F full screen · B blank · digit lesson`;

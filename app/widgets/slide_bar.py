@@ -18,6 +18,9 @@ class SlideBar(Component):
 
     place = param.String(default="", doc="Place in the lesson, read out by screen readers.")
     digits = param.List(default=[], item_type=str, doc="Digits that open lessons.")
+    is_narrow = param.Boolean(
+        default=False, doc="Whether the window is that of a phone; set in the browser."
+    )
     pressed = param.List(
         default=["", 0], doc="``back``, ``next``, ``reveal``, ``end`` or a digit, and when."
     )

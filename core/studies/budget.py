@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from core.photon_budget import PhotonBudget, Reach, signal_extent, steps
+from core.photon_budget import PhotonBudget, Reach, background_extent, signal_extent, steps
 from core.scene import Scene
 from core.studies.outputs import Table, table
 
@@ -32,9 +32,18 @@ def steps_table(budget: PhotonBudget, scene: Scene, name: str) -> Table:
         },
         "What is given is a setting; h and c are Planck's constant and the speed of light. Signal "
         "and background are those of a surface at the range R with the reflectivity ρ. Nearer "
-        f"and brighter pixels get more signal: {low:.3g} to {high:.3g} per pulse.",
+        f"and brighter pixels get more signal: {low:.3g} to {high:.3g} per pulse. "
+        f"{background_note(budget, scene)}",
         {"value": ".4g"},
     )
+
+
+def background_note(budget: PhotonBudget, scene: Scene) -> str:
+    """Return a sentence on the background of the pixels."""
+    low, high = background_extent(budget, scene)
+    if low == high:
+        return f"The background is {low:.3g} in all pixels."
+    return f"The background is {low:.3g} to {high:.3g}: bright surfaces reflect more sunlight."
 
 
 def needed_table(found: Sequence[Reach], target_rd: float) -> Table:

@@ -46,7 +46,7 @@ def range_prior(simulated: Simulated, method: str, settings: Any) -> Plot:
         found[n], n_echoes = (error <= TOLERANCE_BINS).mean(), error.size
     return Plot(
         "range_prior",
-        f"Estimates without an echo; echoes found within {TOLERANCE_BINS} bins",
+        "Estimates with and without an echo",
         "Bin",
         "Share of pixels",
         places,
@@ -78,8 +78,8 @@ def _note(bins: Floats, places: Floats, found: Floats, n_echoes: int, n_bins: in
     return (
         f"Without an echo, {share:.1%} of {bins.size:,} estimates lie in bins {first} to {end} "
         f"({(end - first) / n_bins:.0%} if even): there, echoes are found by luck, "
-        f"too. Of {n_echoes:,} echoes at bin {places[middle]:g}, {found[middle]:.1%} are found, of "
-        f"those at bin {places[late]:g}, {found[late]:.1%}."
+        f"too. Of {n_echoes:,} echoes at bin {places[middle]:g}, {found[middle]:.1%} are found "
+        f"within {TOLERANCE_BINS} bins, of those at bin {places[late]:g}, {found[late]:.1%}."
     )
 
 

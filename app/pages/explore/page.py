@@ -56,6 +56,7 @@ from app.widgets.controls import (
 from app.widgets.figures import pane_of
 from app.widgets.image_view import CONTAINER, ImageView
 from app.widgets.signal_plots import BESIDE_PX, LEFT_PX, SignalPlots
+from app.widgets.tour import CONFIDENCE, ESTIMATE, HISTOGRAM, PIXEL
 from core.inference import fit_of, has_fit
 from core.studies import outputs
 
@@ -125,7 +126,10 @@ class Explore(Section):
         self.image = ImageView(session.choose_pixel)
         self._painted = [self.signals, self.image]
         self.image_keys = PixelKeys(
-            child=self.image.pane, stylesheets=[CONTAINER], sizing_mode="stretch_both"
+            child=self.image.pane,
+            stylesheets=[CONTAINER],
+            css_classes=[PIXEL],
+            sizing_mode="stretch_both",
         )
         self.cloud = PointCloud(wrong_color=WRONG_COLOR, sizing_mode="stretch_both")
         self.cards = [
@@ -134,6 +138,10 @@ class Explore(Section):
                 self.signals.plots, ("histogram", "residual", "enhanced", "score"), strict=True
             )
         ]
+        histogram, _, *answers = self.cards
+        histogram.css_classes = [HISTOGRAM]
+        for each in answers:  # only one is visible
+            each.css_classes = [ESTIMATE]
         self.zoom = EchoZoom(self.signals.histogram.figure.x_range)
         self.cards[0].append(self.zoom.button)
         state = session.state
@@ -153,7 +161,7 @@ class Explore(Section):
         self._large = LargeView(session, self.image.figure)
         self._viewing = SettingsPanel(Viewing(), partial(setattr, state, "viewing"))
         self._least_confidence = self._viewing.controls["least_confidence"]
-        self._least_confidence.min_height = KNOB_PX
+        self._least_confidence.param.update(min_height=KNOB_PX, css_classes=[CONFIDENCE])
         self.legend = legend_line()
         self._difference = pmui.Switch.from_param(
             state.param.difference, label="First difference", size="small", margin=(0, 8)

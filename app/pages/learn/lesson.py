@@ -31,6 +31,12 @@ VIEWS = """
 """
 ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 8px 12px; }"
 
+# Beside the plots that it changes, also where they need scrolling.
+MOVING = """
+:host { position: sticky !important; top: 0; z-index: 2;
+  background: var(--mui-palette-background-default, #fff); }
+"""
+
 
 class Job(NamedTuple):
     """Something to compute in the background for what is on screen."""
@@ -103,6 +109,7 @@ class LessonView:
         self.moving = pn.Column(
             markdown(text.MOVE),
             control,
+            stylesheets=[MOVING],
             max_width=480,
             sizing_mode="stretch_width",
             margin=0,

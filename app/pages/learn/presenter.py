@@ -27,9 +27,10 @@ STAGE = """
   width: 100vw !important; height: 100vh !important; max-height: none !important;
   background: var(--mui-palette-background-default, #fff);
   --type-size: 24px; }
+@media (width < 700px) { :host { padding: 8px; --type-size: 15px; } }
 """
-PLOT = ":host { flex: 1 1 0 !important; min-height: 0; width: 100%; }"
-SCALED = {"zoom": "2.2"}
+PLOT = ":host { flex: 1 1 0 !important; min-height: 0; width: 100%; overflow-y: auto; }"
+SCALED = ":host { zoom: 2.2; } @media (width < 700px) { :host { zoom: 1.3; } }"
 """Style of controls, whose smallest type has 11 px."""
 LABEL = {"& .MuiInputLabel-shrink, & .MuiOutlinedInput-notchedOutline": {"fontSize": "15px"}}
 """Style of the labels of fields, which are otherwise drawn at 75 %."""
@@ -37,6 +38,7 @@ TYPE = {
     "&, & p": {"fontSize": "26px", "lineHeight": 1.3},
     "& p": {"margin": "0 0 6px"},
     "& h1": {"fontSize": "30px", "margin": 0},
+    "@media (width < 700px)": {"&, & p": {"fontSize": "18px"}, "& h1": {"fontSize": "22px"}},
 }
 
 
@@ -98,8 +100,9 @@ class Presenter:
             stylesheets=[ROW],
             margin=0,
         )
-        self._asking = pn.Column(asking, styles=SCALED)  # the style of the row keeps it visible
-        self._control = pn.Column(control, sizing_mode="stretch_width", styles=SCALED)
+        # The style of the row keeps it visible.
+        self._asking = pn.Column(asking, stylesheets=[SCALED])
+        self._control = pn.Column(control, sizing_mode="stretch_width", stylesheets=[SCALED])
         self._stage = pn.Column(stylesheets=[PLOT], sizing_mode="stretch_both", margin=0)
         self.layout = pn.Column(
             markdown(f"# {lesson.title}", TYPE),
@@ -152,13 +155,14 @@ class Presenter:
 
     def _view(self, place: tuple[str, str]) -> View:
         if place not in self.views:
-            made = self.views[place] = View(self._session, self.lesson, is_large=True)
+            is_large = not self.bar.is_narrow
+            made = self.views[place] = View(self._session, self.lesson, is_large)
             if self._colors is not None:
                 made.paint(self._colors)
         return self.views[place]
 
     def _draw(self, place: tuple[str, str], bench: Bench, item: Item) -> None:
-        self.views[place].show(item, bench)
+        self._view(place).show(item, bench)
 
     def _show_answer(self, answer: float) -> None:
         if self.slides[self._step].answers:

@@ -33,7 +33,7 @@ from core.photon_budget import (
     signal_extent,
     steps,
 )
-from core.studies.budget import NEEDED_NOTE, steps_table
+from core.studies.budget import NEEDED_NOTE, background_note, steps_table
 from core.typesetting import scientific
 
 TITLE = "From watts and sunlight"
@@ -44,7 +44,7 @@ OFF = (
 )
 ON = (
     "Signal, background and SBR above are those of this budget. Moving one of them switches it "
-    "off. Over the scene, the signal is {} to {} per pulse: it falls with 1/R²."
+    "off. Over the scene, the signal is {} to {} per pulse: it falls with 1/R². {}"
 )
 STEPS_COLUMNS = (
     ("Step", "Each quantity and its equation, in the symbols of the steps before.", 1),
@@ -150,7 +150,8 @@ class Content:
             return
         self._last, scene = budget, _scene(request)
         self.settings.show(budget)
-        self.note.text = ON.format(*map(scientific, signal_extent(budget, scene)))
+        extent = map(scientific, signal_extent(budget, scene))
+        self.note.text = ON.format(*extent, background_note(budget, scene))
         computed = (each for each in steps(budget, scene) if each.equation != GIVEN)
         self.steps.rows = [step_row(each) for each in computed]
 

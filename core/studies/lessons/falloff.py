@@ -18,7 +18,7 @@ def fluxes_by_range(bench: Bench) -> Plot:
     signal = bench.exposure * bench.signal * Falloff(BENCH_RANGE_M).transmission(range_m)
     return Plot(
         "fluxes_by_range",
-        "Signal and background of a surface against its range",
+        "Signal and background against range",
         "Range (m)",
         "Photons per pulse",
         range_m,

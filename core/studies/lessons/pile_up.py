@@ -98,7 +98,7 @@ def car_image(bench: Bench) -> Pictures:
     low, high = float(np.nanmin(truth_m)), float(np.nanmax(truth_m))
     return Pictures(
         "car_image",
-        f"The car at PPP {bench.flux.signal:.3g}",
+        f"The car at a signal of {bench.flux.signal:.3g} photons per pulse",
         "Range (m)",
         {"truth": truth_m, f"{degree:.1%} within 3 bins": found_m},
         low - 0.5,
@@ -118,7 +118,7 @@ def accuracy_by_exposure(bench: Bench) -> Plot:
         np.array(EXPOSURES),
         curves,
         {"exposure": bench.exposure},
-        f"A flat target, {SIDE} × {SIDE} pixels. PPP {bench.signal:g} at an exposure of 1. The "
+        f"A flat target, {SIDE} × {SIDE} pixels. Signal {bench.signal:g} at an exposure of 1. The "
         "limit is approximate, for one pixel with known fluxes and depths anywhere in the gate.",
         x_is_log=True,
     )
