@@ -92,15 +92,15 @@ def test_a_published_signal_of_a_satellite() -> None:
 
 
 def test_a_published_number_of_detections_of_a_satellite() -> None:
-    """Sea ice ATBD of ICESat-2 (Kwok et al., doi:10.5067/KPMXUOH7TNIY): about 6 signal photons per
-    pulse are detected in a strong beam over snow-covered ice, and 1.5 in a weak one; three beams of
-    each kind share the energy 4 to 1. NASA (climate.nasa.gov/news/2814): a pulse is 300 trillion
-    photons; telescope and altitude as above.
+    """Sea ice ATBD of ICESat-2 (Kwok et al., doi:10.5067/KPMXUOH7TNIY; read in a summary only):
+    about 6 signal photons per pulse are detected in a strong beam over snow-covered ice, and 1.5 in
+    a weak one; three beams of each kind share the energy 4 to 1. NASA (climate.nasa.gov/news/2814):
+    a pulse is 300 trillion photons; telescope and altitude as above.
 
     The losses in air, optics and detector are not stated there, so that only their product can be
     compared: it must be that of an instrument, 0.05 to 0.3 (an optical throughput of a half, twice
-    through air of 0.8, a detector of 0.15 to 0.5). No published budget with all of its numbers was
-    found in the public texts at hand; none for the background.
+    through air of 0.8, a detector of 0.15 to 0.5). A published budget that states all of its
+    numbers was not found, nor one of the background.
     """
     strong = 300e12 * 4 / 15
     budget = PhotonBudget(
