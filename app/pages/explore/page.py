@@ -9,7 +9,7 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 
-from app.model.colors import cloud_of, color_values, image_of, legend
+from app.model.colors import cloud_legend, cloud_of, color_values, image_of, legend
 from app.model.exports import cloud_files, facts_file
 from app.model.range_prior import has_range_prior, range_prior_of, slow_start
 from app.model.state import Viewing
@@ -63,8 +63,8 @@ from core.studies import outputs
 BOARD = (
     board(820, 125, BREAK_PX)
     + f"""
-@media (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
-  :host {{ height: max(940px, calc(100vh - 125px)) !important;
+@media screen and (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
+  :host {{ height: max(940px, calc(var(--window-height, 100vh) - 125px)) !important;
     grid-template-columns: repeat(2, minmax(0, 1fr)) !important; }}
 }}
 """
@@ -360,9 +360,9 @@ class Explore(Section):
             # Another box is framed by the camera, like another scene.
             self.cloud.draw(cloud, rgb, crosses, scene_id=f"{self.session.scene_id()} {box}")
             n_wrong = None if crosses is None else int(crosses.sum())
-            self.cloud.caption = text.cloud_caption(
-                answer, cloud.n_points, n_wrong, box, is_guessed
-            )
+            caption = text.cloud_caption(answer, cloud.n_points, n_wrong, box, is_guessed)
+            unseen = cloud_legend(answer, state.cloud_color, state.viewing, box)
+            self.cloud.caption = f"{caption}\n{unseen}".rstrip()
         self._request_fit()
 
     def _draw_legend(self) -> None:
