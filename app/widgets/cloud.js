@@ -50,7 +50,7 @@ const STYLE = `
   font-size: 11px; font-variant-numeric: tabular-nums; }
 .tick, .caption { text-shadow: 0 0 3px var(--paper), 0 0 3px var(--paper); }
 .caption { position: absolute; left: 8px; bottom: 6px; right: 8px; pointer-events: none;
-  white-space: pre-line; }
+  white-space: pre-line; background: color-mix(in srgb, var(--paper) 85%, transparent); }
 .tools { position: absolute; top: 6px; right: 6px; display: flex; gap: 2px; }
 .tools button { all: unset; box-sizing: border-box; width: 28px; height: 28px; padding: 5px;
   border-radius: 6px; cursor: pointer; opacity: 0.75; background: var(--paper); }

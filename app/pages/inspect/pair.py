@@ -26,7 +26,7 @@ from app.widgets.method_picture import Picture, ScaleBar
 from core.inference import fit_of
 from core.io import ColorScale, Product
 
-HEIGHT_PX = 240
+HEIGHT_PX = 228
 GRID = f"""
 :host {{ display: grid !important; gap: 8px; grid-template-columns: repeat(2, minmax(0, 1fr)); }}
 @media screen and (max-width: {BREAK_PX}px) {{
