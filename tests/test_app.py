@@ -610,6 +610,7 @@ def test_a_page_is_complete(layout, explore):
     shown = looks.shown(session.answer, 0.9).sum()
     assert len(explore.cloud.positions) == 12 * shown
     assert f"{shown:,} of 4,096" in explore.cloud.caption
+    assert f"Hidden: {4096 - shown:,} below confidence 0.9." in explore.cloud.caption
     model = layout.page.get_root()
     kinds = [type(part).__name__ for part in model.references()]
     assert kinds.count("figure") == 5  # one of them is hidden

@@ -6,7 +6,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from app.pages.catalog import PAGES
-from tests.browser import VIEWS, eventually, slider, stage
+from tests.browser import VIEWS, eventually, image, slider, stage
 from tests.test_browser import use_the_controls
 from tests.test_compare import compare_the_methods
 from tests.test_inspect_browser import inspect_the_building
@@ -18,6 +18,8 @@ pytestmark = pytest.mark.browser
 
 SIZES_PX = ((1440, 900), (1024, 768), (390, 844))
 LEAST_HEIGHT_PX = 200
+
+PRINT_ZOOM = "document.documentElement.style.getPropertyValue('--print-zoom')"
 
 PLOTS = f"""() => {{
   {VIEWS}
@@ -59,13 +61,22 @@ def expect_readable(page: Page, name: str) -> None:
 
 
 def expect_a_print_of_the_content(page: Page) -> None:
+    described = page.get_by_text("method: tracking; settings:")
+    expect(described).to_be_hidden()
+    frame = image(page).bounding_box()
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
     page.emulate_media(media="print")
+    expect(described).to_be_visible()
+    printed, zoom = image(page).bounding_box(), float(page.evaluate(PRINT_ZOOM))
+    for side in ("width", "height"):  # else what is drawn there would be cut off
+        assert printed[side] == pytest.approx(zoom * frame[side], abs=1.5)
     expect(page.get_by_role("button", name="Toggle theme")).to_be_hidden()
     expect(slider(page, "SBR")).to_be_hidden()
     content = page.locator(".main-content")
     expect(stage(page)).to_be_visible()
     assert content.evaluate("(each) => each.scrollHeight <= each.clientHeight")  # all of it
     page.emulate_media(media="screen")
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
 
 
 def expect_the_sidebar_to_be_skipped(page: Page) -> None:

@@ -510,6 +510,13 @@ def test_the_box_says_what_is_inside_refuses_crossed_limits_and_is_in_the_link(b
 # -- A and B ---------------------------------------------------------------------------------------
 
 
+def test_each_doubt_about_a_and_b_is_stated_once():
+    assert text.pair_doubts("Tail.", "Tail.", "Tail.") == ""
+    assert text.pair_doubts("Tail.", "Tail.", "") == "Tail."
+    assert text.pair_doubts("Two surfaces.", "Tail.", "Tail.") == "A: Two surfaces."
+    assert text.pair_doubts("", "Tail.", "") == "B: Tail."
+
+
 def test_an_estimate_is_kept_and_subtracted_from_another(building, tmp_path, monkeypatch):
     section, sources = PairSection(building), building.sources
     section.show(True)

@@ -385,7 +385,7 @@ def expect_a_phone_to_show_figure_and_sliders(here: Page) -> None:
     expect(below).to_be_visible()
     eventually(lambda: bottom(above) <= below.bounding_box()["y"])
     here.get_by_role("button", name="Explore", exact=True).click()
-    expect(here.get_by_text(re.compile("^simulated, seed 0"))).to_be_visible()
+    expect(here.get_by_text(re.compile("^car, simulated, seed 0"))).to_be_visible()
     here.wait_for_function("Bokeh.documents[0].is_idle")
     expect(here.get_by_role("button", name="Open drawer")).to_be_visible()
     expect(slider(here, "SBR")).not_to_be_in_viewport()

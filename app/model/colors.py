@@ -67,18 +67,37 @@ def unseen(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
     return Unseen(int(np.isnan(values).sum()) - n_hidden, n_hidden, look.n_outside(values))
 
 
+DOUBTED = ("Estimate", "Error", "Confidence")
+"""Kinds of images that a model which does not describe the capture affects."""
+
+
 def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
     """Return why pixels of an image (row, col) of a kind of `map_of` are blank, or grey.
 
-    Where the model is known not to describe the capture (`core.inference.has_fit`), also that
-    confidences are not to be relied on. Of p-values, how many are small, and whether the model fits
-    the capture.
+    Also the `doubt` about the confidences of `DOUBTED`. Of p-values, how many are small, and
+    whether the model fits the capture.
 
     Parameters
     ----------
     values, look
         Of `map_of`.
     """
+    sentences = [left_out(answer, kind, viewing, values, look)]
+    if kind in DOUBTED:
+        sentences.append(doubt(answer))
+    if kind == FIT:
+        sentences += [share_below(values), fit_of(answer.capture).verdict]
+    return " ".join(filter(None, sentences))
+
+
+def doubt(answer: Answer) -> str:
+    """Return why confidences are not to be relied on; empty unless known (`has_fit`)."""
+    misfit = fit_of(answer.capture).remark if has_fit(answer.capture) else ""
+    return f"{misfit.capitalize()}." if misfit else ""
+
+
+def left_out(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
+    """Return why pixels of an image are blank, or grey; parameters are those of `legend`."""
     found, reasons, sentences = unseen(answer, kind, viewing, values, look), [], []
     if found.n_hidden:
         reasons.append(hidden(answer, viewing.least_confidence))
@@ -90,11 +109,6 @@ def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
         sentences.append("Lower “Show from confidence”.")
     if found.n_outside:
         sentences.append(f"Grey: {found.n_outside:,} beyond the colour scale.")
-    if kind in ("Estimate", "Error", "Confidence") and has_fit(answer.capture):
-        misfit = fit_of(answer.capture).remark
-        sentences += [f"{misfit.capitalize()}."] if misfit else []
-    if kind == FIT:
-        sentences += [share_below(values), fit_of(answer.capture).verdict]
     return " ".join(sentences)
 
 
@@ -182,6 +196,19 @@ def cloud_of(
         look.rgb(values[visible]),
         None if wrong is None else wrong[visible],
     )
+
+
+def cloud_legend(answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE) -> str:
+    """Return which estimates the cloud of `cloud_of` hides, and which of its points are grey."""
+    values, look = color_values(answer, kind, viewing)
+    n_hidden = n_below(answer, viewing.least_confidence)
+    n_outside = look.n_outside(values[shown(answer, viewing.least_confidence, box)])
+    sentences = []
+    if n_hidden:
+        sentences.append(f"Hidden: {n_hidden:,} below confidence {viewing.least_confidence:g}.")
+    if n_outside:
+        sentences.append(f"Grey: {n_outside:,} beyond the colours.")
+    return " ".join(sentences)
 
 
 def _count_scale(counts: Array) -> ColorScale:

@@ -122,9 +122,10 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
 
 
 def simulated(request: Request) -> Capture:
-    """Return a capture of the scene of a request."""
+    """Return a capture of the scene of a request, which its source names."""
     scene, light = request.scene, request.illumination
-    return simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
+    made = simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
+    return replace(made, source=f"{request.source.name}, {made.source}")
 
 
 def file_source(

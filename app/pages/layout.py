@@ -30,6 +30,7 @@ from app.model.watched import Arrival
 from app.pages.catalog import PAGES
 from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
+from app.pages.shared.downloads import explored
 from app.pages.shared.illumination import IlluminationPanel
 from app.pages.shared.method import MethodChoice
 from app.pages.shared.photon_budget import PhotonBudgetForm
@@ -111,22 +112,24 @@ PRINT = """
   header, nav, .MuiToolbar-root { display: none !important; }
   .page > div > div, main, main > div, .main-content {
     display: block !important; height: auto !important; overflow: visible !important; }
-  /* The content of a wide window fits on a sheet. */
-  main { zoom: 0.7; margin: 0 !important; width: auto !important; }
+  /* See `app/widgets/content.js`. */
+  main { zoom: var(--print-zoom, 0.7); margin: 0 !important;
+    width: var(--print-width, auto) !important; }
 }
 """
 """Style of the printed page: the content alone, with all that is out of view on screen."""
+PRINTED_ONLY = "@media screen { :host { display: none !important } }"
 
 PRESENT = "header, nav, .MuiToolbar-root { display: none !important; }"
 """Style of presenter mode, which covers the window."""
 ABOVE_SLIDES = {"position": "relative", "z-index": "1400"}
 
-SKIP_LINK = (Path(__file__).parent.parent / "widgets" / "skip_link.js").read_text("utf-8")
+CONTENT = (Path(__file__).parent.parent / "widgets" / "content.js").read_text("utf-8")
 
 TEMPLATE = (
     '{% extends "base.html" %}{% block postamble %}{{ super() }}'
     "<style>@page { size: landscape; margin: 8mm; }</style><script>{{ scripts | safe }}"
-    + SKIP_LINK
+    + CONTENT
     # Load the widgets' module now, not only when the page has loaded.
     + f'importShim("{pmui.Button._render_esm(server=True)}");'
     + "</script>{% endblock %}"
@@ -272,6 +275,9 @@ class Layout:
         session, state = self.session, self.session.state
         self.alert = Sentence(warning=True, sizing_mode="stretch_width", margin=0)
         self._provenance = Sentence(sizing_mode="stretch_width", margin=(4, 12))
+        self._printed = Sentence(
+            stylesheets=[PRINTED_ONLY], sizing_mode="stretch_width", margin=(4, 12)
+        )
         self._busy = pmui.LinearProgress(
             visible=False, variant="indeterminate", sizing_mode="stretch_width", margin=0
         )
@@ -369,7 +375,7 @@ class Layout:
             template=TEMPLATE,
             sidebar=self._sidebar(),
             header=[self.pages.choice, tour],  # not in `main`: plots keep the height
-            main=[head, *self.pages.mains.values(), self._provenance],
+            main=[head, *self.pages.mains.values(), self._provenance, self._printed],
             sidebar_width=330,
             stylesheets=[PRINT],
             theme_config=THEME,
@@ -439,6 +445,7 @@ class Layout:
         for each, content in self._shared.items():
             is_other = each is Shared.TRACKING and shows_other
             content.visible = each in page.shared and not is_other
+        self._describe_print()
         if page.is_standalone == self._provenance.visible:
             self._provenance.visible = not page.is_standalone
             self.page.sidebar_open = not (page.is_standalone or self.page.is_narrow)
@@ -449,6 +456,12 @@ class Layout:
         is_presenting = state.present and state.page == LEARN
         self.page.stylesheets = [PRINT, PRESENT] if is_presenting else [PRINT]
         self.alert.styles = ABOVE_SLIDES if is_presenting else {}
+
+    def _describe_print(self) -> None:
+        """State on the printed page what is behind the estimate, where it shows one."""
+        shows_one = Shared.METHOD in self._pages[self.pages.choice.value].shared
+        about = explored(self.session).about("printed page") if shows_one else ""
+        self._printed.text = about[:2000]
 
     def _show_failure(self, sentence: str) -> None:
         self.alert.text = sentence[:2000]

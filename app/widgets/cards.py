@@ -23,8 +23,8 @@ def board(least_px: int, rest_px: int, break_px: int) -> str:
     """Return the style of two columns that fill the screen except for the last `rest_px`."""
     return f"""
 :host {{ display: grid !important; grid-template: minmax(0, 1fr) / minmax(0, 2fr) minmax(0, 3fr);
-  gap: 10px; flex: none !important; height: max({least_px}px, calc(100vh - {rest_px}px)) !important;
-}}
+  gap: 10px; flex: none !important;
+  height: max({least_px}px, calc(var(--window-height, 100vh) - {rest_px}px)) !important; }}
 @media screen and (max-width: {break_px}px) {{
   :host {{ display: flex !important; flex-direction: column; height: auto !important;
     max-height: none !important; }}

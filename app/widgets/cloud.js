@@ -49,7 +49,8 @@ const STYLE = `
 .tick { position: absolute; left: 0; top: 0; white-space: nowrap; pointer-events: none;
   font-size: 11px; font-variant-numeric: tabular-nums; }
 .tick, .caption { text-shadow: 0 0 3px var(--paper), 0 0 3px var(--paper); }
-.caption { position: absolute; left: 8px; bottom: 6px; right: 8px; pointer-events: none; }
+.caption { position: absolute; left: 8px; bottom: 6px; right: 8px; pointer-events: none;
+  white-space: pre-line; background: color-mix(in srgb, var(--paper) 85%, transparent); }
 .tools { position: absolute; top: 6px; right: 6px; display: flex; gap: 2px; }
 .tools button { all: unset; box-sizing: border-box; width: 28px; height: 28px; padding: 5px;
   border-radius: 6px; cursor: pointer; opacity: 0.75; background: var(--paper); }
@@ -624,7 +625,10 @@ class CloudView {
       pen.fillText(text, x + anchor * pen.measureText(text).width, y)
     }
     const {clientWidth: width, clientHeight: height} = this.stage
-    pen.fillText(this.model.caption, 8, height - 14)
+    const lines = this.model.caption.split("\n")
+    lines.forEach((line, k) => {
+      pen.fillText(line, 8, height - 14 - 16 * (lines.length - 1 - k), width - 16)
+    })
     return {canvas, width, height}
   }
 

@@ -61,7 +61,7 @@ class PointCloud(Component):
         default="Point cloud. Arrow keys rotate it, plus and minus zoom, 0 resets the view.",
         doc="Name of the picture for screen readers.",
     )
-    caption = param.String(default="", doc="A line of text in the lower left corner.")
+    caption = param.String(default="", doc="Lines of text in the lower left corner.")
 
     _esm = Path(__file__).with_name("cloud.js")
 

@@ -9,7 +9,7 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 
-from app.model.colors import cloud_of, color_values, image_of, legend
+from app.model.colors import cloud_legend, cloud_of, color_values, image_of, legend
 from app.model.exports import cloud_files, facts_file
 from app.model.range_prior import has_range_prior, range_prior_of, slow_start
 from app.model.state import Viewing
@@ -41,7 +41,7 @@ from app.plots.gate_axes import GateAxes
 from app.plots.gate_cut import Cut
 from app.tasks.turns import TURNS
 from app.theme import WRONG_COLOR
-from app.widgets.cards import BREAK_PX, board, card, choice, column, part
+from app.widgets.cards import BREAK_PX, board, card, choice, column, part, unrolled
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import (
     FACTS_PX,
@@ -64,13 +64,15 @@ from core.studies import outputs
 BOARD = (
     board(820, 125, BREAK_PX)
     + f"""
-@media (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
-  :host {{ height: max(940px, calc(100vh - 125px)) !important;
+@media screen and (min-width: {BREAK_PX + 1}px) and (max-width: 1280px) {{
+  :host {{ height: max(940px, calc(var(--window-height, 100vh) - 125px)) !important;
     grid-template-columns: repeat(2, minmax(0, 1fr)) !important; }}
 }}
 """
 )
 COLUMN = column(8, BREAK_PX)
+LONG_LEGEND = unrolled(BREAK_PX, "390px")
+"""Style of the image's card on a phone, where its legend takes six lines."""
 # Reserve the height of the switch, which is drawn late, so that the plots keep theirs.
 ROW = (
     ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 0 12px; "
@@ -184,9 +186,11 @@ class Explore(Section):
     def layout(self) -> tuple[Any, Any]:
         """Return the two columns of the page, and its part of the sidebar."""
         state = self.session.state
+        image = card(choice(text.IMAGE_HELP, state.param.image), self.image_keys, self.legend)
+        image.stylesheets = [*image.stylesheets, LONG_LEGEND]
         left = (
             self.offer(
-                card(choice(text.IMAGE_HELP, state.param.image), self.image_keys, self.legend),
+                image,
                 "image",
                 self.image_shown,
                 IMAGE_AND_REPORT,
@@ -368,9 +372,9 @@ class Explore(Section):
             # Another box is framed by the camera, like another scene.
             self.cloud.draw(cloud, rgb, crosses, scene_id=f"{self.session.scene_id()} {box}")
             n_wrong = None if crosses is None else int(crosses.sum())
-            self.cloud.caption = text.cloud_caption(
-                answer, cloud.n_points, n_wrong, box, is_guessed
-            )
+            caption = text.cloud_caption(answer, cloud.n_points, n_wrong, box, is_guessed)
+            unseen = cloud_legend(answer, state.cloud_color, state.viewing, box)
+            self.cloud.caption = f"{caption}\n{unseen}".rstrip()
         self._request_fit()
 
     def _draw_legend(self) -> None:

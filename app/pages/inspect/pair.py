@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import panel as pn
 
-from app.model.colors import ERROR_SCALE_BINS, image_of, legend
+from app.model.colors import DOUBTED, ERROR_SCALE_BINS, doubt, image_of, left_out
 from app.model.exports import image_file, image_files
 from app.model.state import Viewing
 from app.model.store import Answer, Request, compute
@@ -33,7 +33,7 @@ GRID = f"""
   :host {{ grid-template-columns: minmax(0, 1fr); }}
 }}
 """
-# Long legends would push the colour scales over what stands below the page.
+# Stacked maps would push the colour scales over what stands below the page.
 SCROLLED = ":host { overflow-y: auto; }"
 
 
@@ -47,11 +47,12 @@ class PairSection(Section):
     a, b, difference : Picture
     facts : Facts
     note : Sentence
-        What to do where there is nothing to compare, or why it cannot be.
+        What to do where there is nothing to compare, or why it cannot be; else doubts about the
+        confidences that the page does not state elsewhere.
     """
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session, "kept", "viewing")
+        super().__init__(session, "kept", "viewing", "map")
         self.pair: Pair | None = None
         self.a, self.b, self.difference = self._pictures = [
             Picture(session.choose_pixel, session.pick, HEIGHT_PX) for _ in range(3)
@@ -130,12 +131,14 @@ class PairSection(Section):
             self.session.keep(kept, pair.a)
         viewing = self.session.state.viewing
         names = [text.estimate_name(each) for each in (pair.a, pair.b)]
-        self.note.text = ""
+        doubt_a, doubt_b = doubt(pair.a), doubt(pair.b)
+        said = doubt_b if self.session.state.map in DOUBTED else ""  # below the map of the page
+        self.note.text = text.pair_doubts(doubt_a, doubt_b, said)
         values_b, look = image_of(pair.b, "Estimate", viewing)
         values_a, _ = image_of(pair.a, "Estimate", viewing)
         of_difference = difference_scale(pair)
-        why_a = legend(pair.a, "Estimate", viewing, values_a, look)
-        why_b = legend(pair.b, "Estimate", viewing, values_b, look)
+        why_a = left_out(pair.a, "Estimate", viewing, values_a, look)
+        why_b = left_out(pair.b, "Estimate", viewing, values_b, look)
         blank = text.difference_legend(pair)
         drawn = (
             (self.a, f"A: {names[0]}", why_a, values_a, look),

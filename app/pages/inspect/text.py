@@ -199,6 +199,14 @@ def estimate_name(answer: Answer) -> str:
     return ", ".join(names)
 
 
+def pair_doubts(of_a: str, of_b: str, said: str) -> str:
+    """Return doubts about the confidences of two estimates, each once and without one `said`."""
+    if of_a == of_b:
+        return "" if of_a == said else of_a
+    named = {"A": of_a, "B": of_b}
+    return " ".join(f"{name}: {why}" for name, why in named.items() if why and why != said)
+
+
 def difference_legend(pair: Pair) -> str:
     """Return why pixels of the difference of two estimates are blank."""
     n_blank = int(np.isnan(pair.difference_m).sum())

@@ -43,7 +43,7 @@ BOARD = """
 STACK = """
 :host { display: flex !important; flex-direction: column; gap: 8px;
   flex: none !important; max-height: none !important;
-  height: max(640px, calc(100vh - 122px)) !important; }
+  height: max(640px, calc(var(--window-height, 100vh) - 122px)) !important; }
 @media screen and (max-width: 900px) { :host { height: auto !important; } }
 """
 
