@@ -219,6 +219,16 @@ class Pulse:
         return samples, samples.sum()
 
     @cached_property
+    def sigma_s(self) -> float:
+        """Standard deviation of the photons' arrival times in seconds."""
+        if self.shape == "measured":
+            at, weights = np.arange(len(self.samples)), np.asarray(self.samples)
+            mean = np.average(at, weights=weights)
+            variance = np.average((at - mean) ** 2, weights=weights) + 1 / 12
+            return float(self.tau_s * math.sqrt(variance))
+        return self.tau_s * (math.sqrt(2.0) if self.shape == "gamma" else 1.0)
+
+    @cached_property
     def span_s(self) -> tuple[float, float]:
         """Times after time zero by which 10 % and 90 % of the photons have arrived."""
         return self.quantile_s(0.1), self.quantile_s(0.9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, update_wrapper
 from typing import (
@@ -48,9 +48,14 @@ class CaptureError(ValueError):
     """A file that cannot be read as a capture; names file, field, value and remedy."""
 
     @property
-    def variables(self) -> tuple[str, ...]:
-        """Names of the arrays of which ``variable`` must choose one; empty for other errors."""
-        return tuple(getattr(self.__cause__, "variables", ()))
+    def choices(self) -> Mapping[str, Mapping[str, str]]:
+        """Reading options as text that would open the file, by title; empty for other errors."""
+        return dict(getattr(self.__cause__, "choices", {}))
+
+    @property
+    def question(self) -> str:
+        """Question that `choices` answer; empty for other errors."""
+        return str(getattr(self.__cause__, "question", ""))
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,9 @@ class Capture:
         None for a file without a sequence.
     stated_flux : StatedFlux, optional
         Fluxes that the file states. No estimate uses them; reductions that change them drop them.
+    guesses : mapping, optional
+        Options that the reader of the file chose and no other field holds, such as the array's
+        name as ``variable``, by their names in `core.io.ReadOptions`.
 
     Raises
     ------
@@ -130,6 +138,7 @@ class Capture:
     reported_range_m: Floats | None = None
     n_records: int | None = None
     stated_flux: StatedFlux | None = None
+    guesses: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         cube = self.cube

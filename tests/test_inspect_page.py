@@ -386,6 +386,34 @@ def test_a_region_shows_the_sum_of_its_histograms(building):
     assert not section.facts.facts
 
 
+def test_pixel_region_pins_profile_and_files_follow_the_method(building):
+    region, pins = rectangle((40, 44), (30, 33)), ((40, 30), (41, 31))
+    cfar = core.ESTIMATORS["cfar"].parameters(guard_bins=5)
+    building.state.param.update(region=region, pins=pins, pixel=(40, 30))
+    change(building, method="cfar", settings={**building.state.settings, "cfar": cfar})
+    answer = building.answer
+    capture, image = answer.capture, core.estimate(answer.capture, "cfar", cfar)
+    np.testing.assert_array_equal(answer.run.image.range_m, image.range_m)
+    pixel = on_screen(PixelSection(building, "pixel"))
+    summed = on_screen(PixelSection(building, "region"))
+    at = inspection.pixel_report(capture, image, 40, 30, "cfar", cfar)
+    inside = inspection.pixels_in(region, capture.shape)
+    of_sum = inspection.region_report(capture, image, inside, "cfar", cfar)
+    for section, report in ((pixel, at), (summed, of_sum.pixel)):
+        assert section.view.main
+        marks = section.plots.candidates.data["x"]
+        np.testing.assert_allclose(marks, [each.bin for each in report.candidates], rtol=1e-6)
+        np.testing.assert_allclose(section.plots.score.curve("score"), report.curve, rtol=1e-5)
+        saved = section.downloads["score"]()
+        assert f"settings: {cfar}" in " ".join(saved.subject.lines(saved.what))
+    pinned = on_screen(PinsSection(building))
+    scores = [core.ESTIMATORS["cfar"].curves(capture, *pin, cfar) for pin in pins]
+    np.testing.assert_allclose(pinned.score.source("lines").data["ys"], scores, rtol=1e-5)
+    along = on_screen(ProfileSection(building)).plot.source("points").data
+    at_ends = [image.confident(0.9).range_m[pin] for pin in pins]
+    np.testing.assert_array_equal([along["range"][0], along["range"][-1]], at_ends)
+
+
 # -- pins ------------------------------------------------------------------------------------------
 
 

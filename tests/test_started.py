@@ -47,7 +47,11 @@ def test_options_hold_until_others_are_chosen(paths):
     session = Session(files | {"car": built_in_sources()["car"]})
     assert session.answer.capture.acquisition.bin_width_s == 64e-12
     assert session.state.reading == ReadOptions()
-    assert options_in_use(session.answer)["bin_width_s"] == "64 ps"
+    used = options_in_use(session.answer)
+    assert (used["bin_width_s"], used["axes"]) == ("64 ps", "row col bin")
+    assert used["variable"] == "day"
+    pulse = session.answer.capture.pulse
+    assert float(used["pulse"].split()[0]) * 1e-12 == pytest.approx(pulse.sigma_s, rel=1e-3)
     assert 'variable="day")' in script_of(session.answer, session.state)
     session.state.reading = ReadOptions(bin_width_s=1e-9)
     eventually(lambda: session.answer.capture.acquisition.bin_width_s == 1e-9)
@@ -66,7 +70,9 @@ def test_a_file_of_several_arrays_is_served_and_the_page_asks_for_one(tmp_path, 
     assert layout.alert.text == "Two arrays of two.mat could be the capture. Which?"
     layout = HeldLayout(files | built_in_sources(), link_to(layout.session.query()))
     assert "Two arrays of two.mat" in layout.alert.text  # a reload asks again
-    control(layout, "spad").clicks += 1
+    control(layout, "rates").clicks += 1
+    layout.tasks.run_until(lambda: "give whole counts" in layout.alert.text)
+    control(layout, "spad").clicks += 1  # the question stays
     answer = layout.next_answer()
     assert answer.request.source.title == "two.mat"
     assert answer.capture.counts.sum() == CUBE.sum()
@@ -74,6 +80,21 @@ def test_a_file_of_several_arrays_is_served_and_the_page_asks_for_one(tmp_path, 
     again = HeldLayout(files | built_in_sources(), link_to(layout.session.query()))
     assert again.session.answer.request.source.title == "two.mat"
     assert again.alert.text == ""
+
+
+def test_the_page_asks_whether_an_array_holds_raw_frames(tmp_path):
+    rng, path = np.random.default_rng(4), tmp_path / "frames.npy"
+    bins = np.where(rng.random((200, 16, 16)) < 0.5, 30, rng.integers(1, 60, (200, 16, 16)))
+    fired = rng.random(bins.shape) < 0.3
+    np.save(path, np.where(fired, bins, 0).astype(np.uint8))
+    layout = HeldLayout(readable([path], ReadOptions()) | built_in_sources())
+    assert layout.alert.text.startswith("frames.npy seems to hold raw frames (pulse, row, col)")
+    assert control(layout, "Counts").visible
+    control(layout, "Raw frames").clicks += 1
+    answer = layout.next_answer()
+    assert answer.capture.counts.sum() == fired.sum()
+    assert answer.capture.acquisition.n_pulses == 200
+    assert options_in_use(answer)["axes"] == "pulse row col"
 
 
 def test_without_a_readable_file_each_is_reported_and_nothing_is_served(paths, capsys):

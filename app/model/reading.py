@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from app.model.store import Answer
+from core import Pulse
 from core.io import ReadOptions
 
 
@@ -12,11 +13,12 @@ def options_in_use(answer: Answer) -> dict[str, str]:
     """Return the options that describe a capture as text, whether stated by its file or guessed."""
     capture, acquisition = answer.whole, answer.whole.acquisition
     used = ReadOptions(
+        **capture.guesses,
         bin_width_s=acquisition.bin_width_s,
         gate_delay_s=acquisition.gate_delay_s,
         n_bins=acquisition.n_bins,
         n_pulses=acquisition.n_pulses,
-        pulse=capture.pulse if capture.pulse.shape == "gaussian" else None,
+        pulse=Pulse.gaussian(float(f"{capture.pulse.sigma_s:.4g}")),
         detection=capture.detection,
         # The pixels of a preview are not those of the file.
         pixel_angle_rad=acquisition.pixel_angle_rad if answer.cutout is None else None,

@@ -263,23 +263,21 @@ class Refused:
     request: Request
     why: str
     """Reason, as shown on the page."""
-    variables: tuple[str, ...]
-    """Names of its arrays of which the user must choose one; empty for other errors."""
+    question: str
+    """What the user must choose; empty for other errors."""
+    choices: Mapping[str, Mapping[str, str]]
+    """Options as text that answer the question, by title."""
 
     @classmethod
     def of(cls, request: Request, error: Exception, why: str) -> Refused:
         """Return what an error says about the file of a request."""
-        return cls(request, why, _variables(error))
+        question = getattr(error, "question", "").format(file=request.source.title)
+        return cls(request, why, question, getattr(error, "choices", {}))
 
 
 def is_ambiguous(error: Exception) -> bool:
-    """Return whether a file was refused because the user must choose one of its arrays."""
-    return bool(_variables(error))
-
-
-def _variables(error: Exception) -> tuple[str, ...]:
-    """Return the arrays of which the user must choose one."""
-    return getattr(error, "variables", ())
+    """Return whether a file was refused because the user must choose how to read it."""
+    return bool(getattr(error, "question", ""))
 
 
 @dataclass(frozen=True)

@@ -123,12 +123,8 @@ def failure(error: Exception) -> str:
 
 
 def refusal(refused: Refused) -> str:
-    """Return why a file could not be read, or the question which of its arrays is the capture."""
-    n_arrays = len(refused.variables)
-    if n_arrays == 0:
-        return refused.why
-    file, number = refused.request.source.title, "Two" if n_arrays == 2 else n_arrays
-    return f"{number} arrays of {file} could be the capture. Which?"
+    """Return the question how a file is to be read, else why it could not be."""
+    return refused.question or refused.why
 
 
 def unfinished(error: Exception) -> str:

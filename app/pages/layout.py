@@ -621,9 +621,9 @@ class Layout:
 
 
 def _about_link(session: Session) -> str:
-    """Return what the page says about its link: what was not restored, and which array to read."""
+    """Return what the page says about its link: what was not restored, and how to read the file."""
     refused = session.estimate.refused
-    asked = text.refusal(refused) if refused is not None and refused.variables else ""
+    asked = "" if refused is None else refused.question
     return " ".join(filter(None, (text.not_restored(session.refused), asked)))
 
 

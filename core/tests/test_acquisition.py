@@ -113,6 +113,12 @@ def test_quantiles_are_when_a_share_has_arrived(pulse: Pulse, share: float) -> N
     assert pulse.span_s == (pulse.quantile_s(0.1), pulse.quantile_s(0.9))
 
 
+@any_pulse
+def test_the_standard_deviation_is_that_of_the_photons(pulse: Pulse) -> None:
+    times_s = [pulse.quantile_s(share) for share in (np.arange(1000) + 0.5) / 1000]
+    assert pulse.sigma_s == pytest.approx(np.std(times_s), rel=0.01)
+
+
 def test_quantiles_know_where_time_zero_lies() -> None:
     gaussian = Pulse.gaussian(1.3e-9)
     assert gaussian.quantile_s(0.5) == pytest.approx(0, abs=1e-20)

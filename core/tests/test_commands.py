@@ -294,6 +294,7 @@ def test_a_pixel_or_a_capture_is_exported(frames: Path, capsys: pytest.CaptureFi
             2,
             "--first-detections",
         ),
+        (("info", "{frames}", "--records", "0"), 2, "leave it out: the file holds no sequence"),
         (("info", "{frames}", "--bin-width", "64"), 2, "give a time such as 64ps"),
         (("info", "{frames}", "--pixel-angle", "20 km"), 2, "give an angle such as 20urad"),
         (("field", "nowhere"), 2, "data_face.mat"),

@@ -60,8 +60,11 @@ def test_frames_are_no_cube(no_trigger: int, dtype: str, name: str, write: Write
     stack = np.where(FRAMES < 0, no_trigger, FRAMES).astype(dtype)[:40]
     content = npy_bytes(stack) if name.endswith("npy") else npz_bytes(data=stack)
     path = write(name, content)
-    with pytest.raises(CaptureError, match=f"no_trigger = None .* give {no_trigger}.* raw frames"):
+    given = f"no_trigger = None .* give {no_trigger}.* raw frames"
+    with pytest.raises(CaptureError, match=given) as refused:
         read_capture(path)
+    assert refused.value.choices == {"Raw frames": {"no_trigger": str(no_trigger)}}
+    assert f"in which {no_trigger} marks no trigger" in refused.value.question
     assert read_capture(path, no_trigger=no_trigger).acquisition.n_pulses == 40
 
 
@@ -82,9 +85,12 @@ def test_frames_in_which_0_is_no_trigger_are_no_cube(
 ) -> None:
     stack = camera_frames(share, n_pulses)
     path = write(name, npy_bytes(stack) if name.endswith("npy") else npz_bytes(data=stack))
-    with pytest.raises(CaptureError, match=r"no_trigger = None .* give 0 if .* raw frames .* axes"):
+    given = r"no_trigger = None .* give 0 if .* raw frames .* axes"
+    with pytest.raises(CaptureError, match=given) as refused:
         read_capture(path)
+    assert list(refused.value.choices) == ["Raw frames", "Counts"]
     capture = read_capture(path, no_trigger=0)
+    assert capture.guesses["axes"] == "pulse row col"
     assert capture.acquisition.n_pulses == n_pulses
     assert capture.counts.sum() == np.count_nonzero(stack)
     np.testing.assert_array_equal(read_capture(path, axes="row col bin").cube, stack)

@@ -148,10 +148,12 @@ def test_where_counts_and_rates_fit_the_refusal_names_counts_first(
     path = write(save(rates=counts / 7.0, spad=list_of(counts)))
     with pytest.raises(CaptureError, match=r"variable = None .* give spad or rates") as refused:
         read_capture(path)
-    assert refused.value.variables == ("spad", "rates")
+    assert list(refused.value.choices.items()) == [
+        (name, {"variable": name}) for name in ("spad", "rates")
+    ]
     capture = read_capture(path, variable="spad")
     np.testing.assert_array_equal(capture.cube, counts)
-    assert CaptureError("other").variables == ()
+    assert CaptureError("other").choices == {}
 
 
 # -- the width of a bin in another variable --------------------------------------------------------

@@ -11,7 +11,7 @@ import panel as pn
 import panel_material_ui as pmui
 
 from app.model.reading import changed_options
-from app.model.store import Refused
+from app.model.store import Refused, Source
 from app.model.text import cause
 from app.widgets.cards import button, part, select
 from app.widgets.controls import Sentence
@@ -41,7 +41,7 @@ class ReadingForm:
     part : Part
         The form as a part of the sidebar.
     question : Column
-        A button for each array of a file that could be the capture, and what the file has.
+        A button for each way to read a file that can be read in several, and what the file has.
     player : pmui.Player
         Steps through the records of a file that is a sequence in time.
     records : Column
@@ -69,6 +69,7 @@ class ReadingForm:
             is_shown=False,
         )
         self._choices = pn.FlexBox(margin=0)
+        self._asked: Source | None = None
         self._details = Sentence(sizing_mode="stretch_width", margin=8)
         self.question = pn.Column(
             self._choices,
@@ -114,19 +115,26 @@ class ReadingForm:
         self.records.visible = n_records is not None and n_records > 1
 
     def show_refused(self, refused: Refused, is_new: bool) -> None:
-        """Open for a file that was refused, and offer its arrays if several could be meant."""
+        """Open for a file that was refused, and offer the ways to read it if there are several.
+
+        They stay until the file can be read: one of them may be refused, too.
+        """
         name = refused.request.source.title
         if is_new:
             self._fill(refused.request.reading, {})
         self._about.param.update(text=f"For {name}, which could not be read.", visible=is_new)
         self.part.param.update(visible=True, collapsed=False)
-        self._choices[:] = [self._choice(each) for each in refused.variables]
+        if refused.choices or refused.request.source is not self._asked:
+            self._choices[:] = [self._choice(*each) for each in refused.choices.items()]
+            self._asked = refused.request.source
         self._details.text = refused.why
-        self.question.visible = bool(refused.variables)
+        self.question.visible = bool(self._choices.objects)
 
-    def _choice(self, variable: str) -> pmui.Button:
-        help = f"Read the array {variable}."
-        return button(variable, help, partial(self._apply, {"variable": variable}), (2, 0, 6, 8))
+    def _choice(self, title: str, options: Mapping[str, str]) -> pmui.Button:
+        labels = {name: reading_options()[name].label for name in options}
+        given = " and ".join(f"“{labels[name]}” = {value}" for name, value in options.items())
+        help = f"{title}: read the file with {given}."
+        return button(title, help, partial(self._apply, options), (2, 0, 6, 8))
 
     def _step(self, record: int) -> None:
         if record != self._record:  # else it is not the user who has moved the player

@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from core.acquisition import LONGEST_S, MOST_BINS, Floats
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import capture_of, count_dtype, description_of
+from core.io.readers.dense import capture_of, count_dtype, description_of, with_guesses
 from core.io.readers.guards import require_fits
 from core.io.readers.options import ReadOptions
 from core.io.readers.quantities import time_text
@@ -123,7 +123,7 @@ def arrivals_capture(
         gate_delay_s=opening * tick_s,
         remark=dropped if n_dropped else "",
     )
-    return capture_of(cube, known)
+    return with_guesses(capture_of(cube, known), time_unit_s=unit_s)
 
 
 def _require_times(

@@ -138,7 +138,8 @@ def cube_capture(
         require_cube(cube, name)
         cube = cube.transpose(order)
     guessed = [] if order else [f"axes ({', '.join(AXES)})"]
-    return dense_capture(whole_counts(cube, name), origin, request, guessed=guessed, **more)
+    capture = dense_capture(whole_counts(cube, name), origin, request, guessed=guessed, **more)
+    return capture if order else with_guesses(capture, axes=" ".join(AXES))
 
 
 def dense_capture(
@@ -183,6 +184,11 @@ def capture_of(counts: Counts, known: Description) -> Capture:
     """Return counts as a capture of that description."""
     acquisition, pulse, detection, source = known
     return Capture(counts, acquisition, pulse, source=source, detection=detection)
+
+
+def with_guesses(capture: Capture, **options: Any) -> Capture:
+    """Return a capture with further `Capture.guesses`."""
+    return replace(capture, guesses={**capture.guesses, **options})
 
 
 def whole_counts(

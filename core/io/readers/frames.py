@@ -12,9 +12,10 @@ of the first 65,536 bins: a larger number more likely stands for no trigger. Eac
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import prod
+from types import MappingProxyType
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -22,10 +23,10 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import count_dtype, dense_capture
+from core.io.readers.dense import count_dtype, dense_capture, with_guesses
 from core.io.readers.frame_guess import resembles_frames
 from core.io.readers.guards import decoding, require_fits
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import AmbiguousError, ReadOptions
 from core.io.readers.records import chosen_records, described
 
 AXES = ("pulse", "row", "col")
@@ -70,10 +71,14 @@ def frames_from(
             pulse, row, col = (box[axis].start for axis in order)
             yield (pulse, row, col), frames.transpose(order)
 
-    guessed = [f"axes ({', '.join(AXES)})"] if request.axes is None and name != "frames" else []
+    is_guessed = request.axes is None and name != "frames"
+    guessed = [f"axes ({', '.join(AXES)})"] if is_guessed else []
     counted = n_pulses, n_rows, n_cols
     no_trigger = int(request.no_trigger or 0)
-    return frames_capture(stretches(), counted, no_trigger, name, origin, request, guessed=guessed)
+    capture = frames_capture(
+        stretches(), counted, no_trigger, name, origin, request, guessed=guessed
+    )
+    return with_guesses(capture, axes=" ".join(AXES)) if is_guessed else capture
 
 
 def frames_capture(
@@ -148,7 +153,7 @@ def require_counts(array: NDArray[Any], name: str, axes: str | None) -> None:
 
     Raises
     ------
-    ValueError
+    AmbiguousError
         If more than half of the array is one value that hardly is a count (its least one if that
         is negative, its largest one above 255): such a value probably marks the pulses without a
         trigger. Without `axes` also if `core.io.readers.frame_guess` takes 0 for that value.
@@ -160,13 +165,25 @@ def require_counts(array: NDArray[Any], name: str, axes: str | None) -> None:
     for value in (least, largest):
         is_count = 0 <= value <= _LARGEST_USUAL_COUNT
         if not is_count and np.count_nonzero(array == value) > array.size / 2:
-            what = f"{value} if {name} holds {frames}: more than half of its values are {value}"
-            require("no_trigger", None, False, what)
+            raise _are_frames(
+                value, f"if {name} holds {frames}: more than half of its values are {value}"
+            )
     if axes is None and least == 0 and resembles_frames(array):
-        what = (
-            f"0 if {name} holds {frames}, as it seems, or axes = 'row col bin' if it holds counts"
-        )
-        require("no_trigger", None, False, what)
+        counts = {"Counts": {"axes": "row col bin"}}
+        what = f"if {name} holds {frames}, as it seems, or axes = 'row col bin' if it holds counts"
+        raise _are_frames(0, what, counts)
+
+
+def _are_frames(
+    no_trigger: float, why: str, others: Mapping[str, Mapping[str, str]] = MappingProxyType({})
+) -> AmbiguousError:
+    """Return the error that asks whether an array holds raw frames, or one of `others`."""
+    return AmbiguousError(
+        f"no_trigger = None is not accepted: give {no_trigger:.0f} {why}.",
+        "{file} seems to hold raw frames (" + ", ".join(AXES) + f"), in which {no_trigger:.0f} "
+        "marks no trigger. What does it hold?",
+        {"Raw frames": {"no_trigger": f"{no_trigger:.0f}"}, **others},
+    )
 
 
 def _count_triggers(

@@ -35,6 +35,7 @@ from core.io.readers.dense import (
     require_sums,
     stored_counts,
     whole_counts,
+    with_guesses,
 )
 from core.io.readers.guards import require_fits
 from core.io.readers.layout import (
@@ -220,9 +221,10 @@ def read(path: Path, request: ReadOptions) -> Capture:
     counts = file.labelled(cube)
     require_sums(counts.shape)
     known = describe(counts, request, file.origin, file.guessed)
-    is_own = file.counts.stored.name.rpartition("/")[2] == "counts"
+    name, axes = file.counts.stored.name, {"axes": " ".join(AXES)} if file.guessed else {}
+    is_own = name.rpartition("/")[2] == "counts"
     return replace(
-        capture_of(np.ascontiguousarray(counts.data), known),
+        with_guesses(capture_of(np.ascontiguousarray(counts.data), known), variable=name, **axes),
         truth_range_m=file.image("truth_range_m"),
         reported_range_m=file.image("reported_range_m"),
         signal=file.image("signal"),

@@ -33,7 +33,13 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers import guards
 from core.io.readers.arrivals import BYTES_A_PHOTON, arrivals_capture
-from core.io.readers.dense import LARGEST_COUNT, count_dtype, cube_capture, dense_capture
+from core.io.readers.dense import (
+    LARGEST_COUNT,
+    count_dtype,
+    cube_capture,
+    dense_capture,
+    with_guesses,
+)
 from core.io.readers.guards import FileVersion, decoding, require_fits
 from core.io.readers.isolation import isolated
 from core.io.readers.layout import completed, stated_flux, stating, timing
@@ -186,7 +192,8 @@ def read(path: Path, request: ReadOptions) -> Capture:
 
     origin = f"{path.name}, variable {variable.name}"
     capture = _capture(file, variable, origin, completed(request, values(timing(numbers))))
-    return replace(capture, stated_flux=stated_flux(values(stating(numbers))))
+    capture = replace(capture, stated_flux=stated_flux(values(stating(numbers))))
+    return with_guesses(capture, variable=variable.name)
 
 
 def _capture(

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 from core.acquisition import Floats, Pulse
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import AXES, cube_capture, dense_capture, stored_counts
+from core.io.readers.dense import AXES, cube_capture, dense_capture, stored_counts, with_guesses
 from core.io.readers.frames import Header, require_counts
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.layout import (
@@ -107,7 +107,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
             numbers = [each for each in timing(names) if _is_number(archive, each)]
             known = {each: _field(archive, each) for each in numbers}
             capture = cube_capture(counts, name, origin, completed(request, known))
-            return replace(capture, stated_flux=stated)
+            return with_guesses(replace(capture, stated_flux=stated), variable=name)
         known = {field: _field(archive, field) for field in names if field in _FIELDS}
         version = known.get("format", FORMAT)
         require("format", version, str(version) == FORMAT, FORMAT)
@@ -132,7 +132,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
         if request.pulse is None:
             require_pulse_in_gate(capture.pulse, capture.acquisition)
         return replace(
-            capture,
+            with_guesses(capture, variable=name),
             truth_range_m=_image(archive, "truth_range_m", capture.shape),
             reported_range_m=_image(archive, "reported_range_m", capture.shape),
             signal=_image(archive, "signal", capture.shape),

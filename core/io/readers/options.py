@@ -117,7 +117,7 @@ _ANGLE = Kind(
     "float",
     parsed_angle,
     EXAMPLE_OF_ANGLE,
-    _required("between 0 and 1 radian", lambda value: 0 < value < 1),
+    _required("an angle between 0 and 1 radian", lambda value: 0 < value < 1),
     angle_as_typed,
 )
 _WHOLE = Kind("int", int, "a whole number", _required("a whole number", _is_whole))
@@ -193,7 +193,7 @@ class ReadOptions:
         "Echo's standard deviation",
         "pulse-sigma",
         _PULSE,
-        "Shape of an echo; as text, the standard deviation of a Gaussian, such as 150ps.",
+        "Standard deviation of an echo, such as 150ps; one that is given is that of a Gaussian.",
     )
     pixel_angle_rad: float | None = _option(
         "Pixel angle", "pixel-angle", _ANGLE, "Angle between neighbouring pixels, such as 20urad."
@@ -314,21 +314,34 @@ class ReadOptions:
 
 
 class AmbiguousError(ValueError):
-    """Several arrays of a file could be the capture.
+    """A file that can be read in several ways, of which the user must choose one.
 
-    Attributes
+    Parameters
     ----------
-    variables : tuple of str
-        Their names, the most likely first.
+    message : str
+    question : str
+        Question for the user, with ``{file}`` in place of the file's name.
+    choices : mapping of str to mapping
+        Options as text of each way, by its title, the most likely first.
     """
 
-    def __init__(self, variables: Sequence[str], listed: str) -> None:
-        self.variables = tuple(variables)
-        names = " or ".join((", ".join(variables[:-1]), variables[-1]))
-        super().__init__(
-            f"variable = None is not accepted: give {names}, each of which could be the capture; "
-            f"the file has {listed}."
-        )
+    def __init__(
+        self, message: str, question: str, choices: Mapping[str, Mapping[str, str]]
+    ) -> None:
+        super().__init__(message)
+        self.question, self.choices = question, choices
+
+
+def _which_variable(variables: Sequence[str], listed: str) -> AmbiguousError:
+    """Return the error that asks for one of several arrays, the most likely first."""
+    names = " or ".join((", ".join(variables[:-1]), variables[-1]))
+    number = "Two" if len(variables) == 2 else len(variables)
+    return AmbiguousError(
+        f"variable = None is not accepted: give {names}, each of which could be the capture; "
+        f"the file has {listed}.",
+        f"{number} arrays of {{file}} could be the capture. Which?",
+        {name: {"variable": name} for name in variables},
+    )
 
 
 def choose_variable(
@@ -363,7 +376,7 @@ def choose_variable(
         require("variable", requested, requested in names, what)
         return requested
     if len(fitting) > 1:
-        raise AmbiguousError(sorted(fitting, key=lambda name: not fitting[name]), listed)
+        raise _which_variable(sorted(fitting, key=lambda name: not fitting[name]), listed)
     require("variable", None, len(fitting) == 1, f"as variable {what}")
     return next(iter(fitting))
 
@@ -412,7 +425,8 @@ def with_flags(message: str, *others: str) -> str:
     flags = {name: option.flag for name, option in reading_options().items()}
     flags |= {name: name.replace("_", "-") for name in others}
     found = _renamed(message, {name: f"--{flag}" for name, flag in flags.items()})
-    return re.sub(r"(--[\w-]+) = None is not accepted", r"\1 is missing", found)
+    found = re.sub(r"(--[\w-]+) = None is not accepted", r"\1 is missing", found)
+    return found.replace("give None: ", "leave it out: ")
 
 
 def with_labels(message: str, others: Mapping[str, str] = MappingProxyType({})) -> str:
@@ -422,7 +436,8 @@ def with_labels(message: str, others: Mapping[str, str] = MappingProxyType({})) 
     """
     labels = {name: option.label for name, option in reading_options().items()} | {**others}
     found = _renamed(message, {name: f"“{label}”" for name, label in labels.items()})
-    return found.replace("” = None is not accepted", "” is empty")
+    found = found.replace("” = None is not accepted", "” is empty")
+    return found.replace("give None: ", "leave it empty: ")
 
 
 def _renamed(message: str, names: Mapping[str, str]) -> str:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import AXES, cube_capture
+from core.io.readers.dense import AXES, cube_capture, with_guesses
 from core.io.readers.guards import require_fits
 from core.io.readers.isolation import isolated
 from core.io.readers.options import ReadOptions, choose_variable
@@ -52,7 +52,8 @@ def read(path: Path, request: ReadOptions) -> Capture:
         detection=request.detection or "all",
     )
     cube = _image(histograms, name)
-    return cube_capture(cube, name, f"{path.name}, {name}", known, axes=" ".join(AXES))
+    capture = cube_capture(cube, name, f"{path.name}, {name}", known, axes=" ".join(AXES))
+    return with_guesses(capture, variable=name)
 
 
 def _choose(types: list[int], variable: str | None) -> int:

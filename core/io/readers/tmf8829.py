@@ -55,7 +55,7 @@ from numpy.typing import NDArray
 
 from core.capture import Capture
 from core.checks import require
-from core.io.readers.dense import AXES, dense_capture
+from core.io.readers.dense import AXES, dense_capture, with_guesses
 from core.io.readers.isolation import isolated
 from core.io.readers.layout import require_pulse_in_gate
 from core.io.readers.options import ReadOptions, choose_variable
@@ -104,7 +104,7 @@ def read(path: Path, request: ReadOptions) -> Capture:
     capture = dense_capture(cube, origin, known, guessed=guessed)
     if request.pulse is None:
         require_pulse_in_gate(capture.pulse, capture.acquisition)
-    capture = replace(capture, n_records=n_records)
+    capture = with_guesses(replace(capture, n_records=n_records), variable=name)
     in_metres = settings.get("select") != _DISTANCES_ARE_BINS
     if in_metres and "reported_m" in parts and parts["reported_m"].shape[1:] == capture.shape:
         return replace(capture, reported_range_m=median_m(parts["reported_m"]))
