@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["interval_text", "scientific", "three_digits", "typeset", "value_and_bounds"]
+__all__ = [
+    "interval_text",
+    "probability_text",
+    "scientific",
+    "three_digits",
+    "typeset",
+    "value_and_bounds",
+]
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -41,6 +48,23 @@ def scientific(value: float) -> str:
     digits, _, power = f"{value:.3g}".partition("e")
     raised = f"×10{str(int(power)).translate(_RAISED)}" if power else ""
     return typeset(digits) + raised
+
+
+LEAST_PROBABILITY = 1e-6
+"""Smaller ones are text as a bound: their size rests on the tails of a model."""
+
+
+def probability_text(value: float) -> str:
+    """Format a probability with two digits, or as a bound.
+
+    Examples
+    --------
+    >>> probability_text(0.0312), probability_text(5e-169)
+    ('0.031', 'below 0.000001')
+    """
+    if value < LEAST_PROBABILITY:
+        return f"below {LEAST_PROBABILITY:f}"
+    return f"{value:.2g}" if value >= 1e-4 else f"{value:.6f}"
 
 
 def value_and_bounds(value: float, low: float, high: float) -> tuple[str, str]:

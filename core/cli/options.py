@@ -230,6 +230,7 @@ def show_progress(done: int, of: int, what: str = "pieces") -> None:
     print(f"\r[{bar:<40}] {done} of {of} {what}", end="", file=sys.stderr, flush=True)
 
 
+_LEAST = 1e-15
 MOST_LISTED = 10
 """Items of a list that are printed as lines."""
 
@@ -253,7 +254,10 @@ def _lines(value: Any) -> list[str]:
         return [*lines, f"and {n_more} more: --json has all"] if n_more > 0 else lines
     if isinstance(value, Mapping):
         return [", ".join(f"{name} {each}" for name, each in value.items())]
-    return [f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)]
+    if not isinstance(value, float | np.floating):
+        return [str(value)]
+    # Of the quantities in SI units none is so small: a probability in the tails of a model.
+    return [f"< {_LEAST:g}" if 0 < value < _LEAST else f"{value:.6g}"]
 
 
 def _plain(value: Any) -> Any:

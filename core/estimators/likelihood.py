@@ -20,6 +20,7 @@ from core.inference.flux import detailed_flux_prior_of, flux_prior_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions, log_likelihood_ratio
 from core.inference.posterior import Rule, least_loss
+from core.inference.refinement import sharpened
 from core.parameters import Choice, Number, Settings, parameter
 
 Depths = Literal["alike", "learned"]
@@ -32,7 +33,8 @@ class LikelihoodParameters(Settings):
     steps_per_bin: int = parameter(
         2,
         Number("Steps per bin", 1, 8, whole=True, least=1, most=64),
-        "Delays tried within each bin; a parabola refines between them.",
+        "Delays tried within each bin; a parabola refines between them, and finer steps the delays "
+        "of bright echoes.",
     )
     depths: Depths = parameter(
         "alike",
@@ -52,10 +54,16 @@ class LikelihoodParameters(Settings):
 def locate(
     capture: Capture, flux: FluxModel, parameters: LikelihoodParameters
 ) -> tuple[Floats, Floats]:
-    """Return the delay by the rule and the largest log likelihood ratio."""
+    """Return the delay by the rule and the largest log likelihood ratio.
+
+    The rules "density" and "window" answer with a peak, which bright echoes resolve in finer steps.
+    """
     if parameters.depths == "alike":
         flux = replace(flux, depth=np.ones_like(flux.depth))
-    return least_loss(capture, flux, parameters.steps_per_bin, parameters.rule)
+    delay, score = least_loss(capture, flux, parameters.steps_per_bin, parameters.rule)
+    if parameters.rule in ("density", "window"):
+        delay = sharpened(capture, flux, delay)
+    return delay, score
 
 
 def curve(histogram: Floats, conditions: Conditions, parameters: LikelihoodParameters) -> Floats:

@@ -391,12 +391,12 @@ def _some_rows(pixels: NDArray[Any]) -> Iterator[slice]:
 
 
 def _own_weight(total: Floats, unrelated: float) -> float:
-    """Share of the variance of the totals that exceeds the variance `unrelated` to background."""
-    scatter = float(total.var())
-    own_weight = max(0.0, 1 - unrelated / scatter) if scatter > 0 else 0.0
-    return (
-        own_weight if own_weight >= 3 * math.sqrt(2 / total.size) else 0.0
-    )  # it is known no better
+    """Share of the variance of the totals that exceeds the variance `unrelated` to background.
+
+    0 where chance explains it: less than three standard deviations of a variance more.
+    """
+    scatter, chance = float(total.var()), 3 * math.sqrt(2 / total.size)
+    return 1 - unrelated / scatter if scatter > (1 + chance) * unrelated else 0.0
 
 
 def _levels(pixels: NDArray[np.unsignedinteger], capture: Capture, shape: Floats | None) -> Floats:

@@ -9,6 +9,10 @@ over the signal levels ``l`` of `core.inference.flux`, with the likelihood ``L_l
 histogram (`core.inference.likelihood`). The levels are a grid, whose errors would bias intervals of
 many photons: signal and background of each are fitted to the pixel. The interval is about the
 surface and not about the method: it is the same for all estimates with the same window.
+
+Where the counts near the echo differ from the model by more than chance (another pulse, a second
+surface), the density is raised to the power ``1 / φ``, with the dispersion φ of these counts
+(quasi-likelihood, McCullagh & Nelder 1989): many photons do not make up for a model that is wrong.
 """
 
 from __future__ import annotations
@@ -36,6 +40,8 @@ _DROP = 12.0  # log density below the maximum, at which a delay is negligible
 _MOST_ZOOMS = 12
 _LEVEL_ERROR = LEVEL_SPAN ** (0.5 / (LEVELS - 1)) - 1  # relative, of half a step between levels
 _FITTING_STEPS = 5
+_N_FITTED = 3  # delay, signal and background
+_CLEAR_DEVIATIONS = 5.0  # of the dispersion of the counts, beyond which it is no chance
 _TAIL = 1e-6  # share of the photons of an echo that is left out on either side
 _AT_ONCE = 2**17  # numbers that fit in the cache
 
@@ -139,7 +145,11 @@ def _quantiles_bins(
     delay = _nodes(low, high, _COARSE_NODES)
     best = np.argmax(_log_density(window, delay), axis=1)[:, np.newaxis]
     window = _fitted(window, np.take_along_axis(delay, best, axis=1))
-    delay, density = _zoomed(window, low, high)
+    delay, density = _zoomed(window, low, high, 1.0)
+    best = np.argmax(density, axis=1)[:, np.newaxis]
+    dispersion = _dispersion(window, np.take_along_axis(delay, best, axis=1))
+    if (dispersion > 1).any():
+        delay, density = _zoomed(window, low, high, dispersion)
     # Cumulative density by trapezoids, relative to the whole: the steps of a pixel are equal.
     mass = np.zeros_like(density)
     np.cumsum((density[:, 1:] + density[:, :-1]) / 2, axis=1, out=mass[:, 1:])
@@ -235,6 +245,34 @@ def _share(window: _Window, delay: Floats) -> Floats:
     return share
 
 
+def _dispersion(window: _Window, delay: Floats) -> Floats:
+    """Mean squared deviation of counts from the model in units of the variance, shape (pixel, 1).
+
+    It is that of the level that fits best, in the bins of the window, given delays (pixel, 1); 1
+    where it may be chance.
+    """
+    # The last bin stands for the rest of the gate.
+    share, fired, unfired = (
+        each[:, :-1] for each in (_share(window, delay)[:, 0], window.fired, window.unfired)
+    )
+    rate = window.background[..., np.newaxis] + window.signal[..., np.newaxis] * share
+    if window.is_first:
+        armed, fires = unfired + fired, -np.expm1(-rate)
+        expected, variance = armed * fires, armed * fires * (1 - fires)
+    else:
+        expected = variance = unfired * rate
+    is_seen = variance > 0
+    squares = (fired - expected) ** 2 / np.where(is_seen, variance, 1.0)
+    n_free = np.maximum(is_seen.sum(axis=-1) - _N_FITTED, 1)
+    dispersion = (squares * is_seen).sum(axis=-1) / n_free
+    # A squared deviation of mean μ in its variance has the variance 2 + 1 / μ.
+    chance = (
+        np.sqrt((2.0 * is_seen + is_seen / np.where(is_seen, variance, 1.0)).sum(axis=-1)) / n_free
+    )
+    dispersion = np.where(dispersion > 1 + _CLEAR_DEVIATIONS * chance, dispersion, 1.0)
+    return np.asarray(dispersion.min(axis=0)[:, np.newaxis])
+
+
 def _log_density(window: _Window, delay: Floats) -> Floats:
     """Logarithm of ``p(d)`` up to a constant of each pixel, at delays (pixel, node)."""
     share, fired = _share(window, delay), window.fired[:, np.newaxis]
@@ -289,12 +327,14 @@ def _nodes(low: Floats, high: Floats, n_nodes: int) -> Floats:
     return np.linspace(low, high, n_nodes, axis=1)
 
 
-def _zoomed(window: _Window, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+def _zoomed(
+    window: _Window, low: Floats, high: Floats, dispersion: Floats | float
+) -> tuple[Floats, Floats]:
     """Delays between limits (pixel,) that matter, and their relative densities, (pixel, node)."""
     for _ in range(_MOST_ZOOMS):
         delay = _nodes(low, high, _NODES)
         log = _log_density(window, delay)
-        log -= log.max(axis=1, keepdims=True)
+        log = (log - log.max(axis=1, keepdims=True)) / dispersion
         inside = log > -_DROP
         first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
         last = np.minimum(_NODES - np.argmax(inside[:, ::-1], axis=1), _NODES - 1)

@@ -54,17 +54,19 @@ def _fill_score(signal, echo, gain, steps, fired, unfired, score):  # type: igno
 
 @njit(**COMPILED)
 def _highest(score, begin, end):  # type: ignore[no-untyped-def]
-    """Position of the maximum of `score` from `begin` to `end`, refined by a parabola."""
+    """Maximum of `score` from `begin` to `end` by a parabola, and its curvature; 0 at the ends."""
     best = begin + score[begin:end].argmax()
     if not begin < best < end - 1:
-        return float(best)
+        return float(best), 0.0
     left, middle, right = score[best - 1], score[best], score[best + 1]
     curvature = min(left - 2.0 * middle + right, -1e-9)
-    return best + min(max(0.5 * (left - right) / curvature, -0.5), 0.5)
+    return best + min(max(0.5 * (left - right) / curvature, -0.5), 0.5), curvature
 
 
 @njit(**PARALLEL)
-def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, reach, delay):  # type: ignore[no-untyped-def]
+def refine_delays(  # type: ignore[no-untyped-def]
+    blocks, n_pulses, signal, background, echo, steps, first_tap, reach, delay, curvature
+):
     """Move each delay (block, lane) to the maximum of ``T(d)`` less than `reach` bins from it.
 
     A maximum at the end of that window is on the slope of one outside: the window moves there, as
@@ -72,7 +74,8 @@ def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, 
 
     `blocks` holds counts (block, bin, lane); `signal` and `background`, per bin, have the shape
     (block, lane); `n_pulses` is 0 if unknown; `echo` has `steps` samples a bin, see the module,
-    and begins `first_tap` bins from a delay. NaN remains.
+    and begins `first_tap` bins from a delay. NaN remains. `curvature` (block, lane) is set to that
+    of ``T(d)`` per step squared, 0 at an end of the gate.
     """
     n_blocks, n_bins, lanes = blocks.shape
     n_delays = (2 * reach + 1) * steps
@@ -94,7 +97,7 @@ def refine_delays(blocks, n_pulses, signal, background, echo, steps, first_tap, 
                 at = (delay[b, i] - first) * steps - 0.5
                 begin = max(math.floor(at - reach * steps) + 1, -first * steps)
                 end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
-                found = _highest(score, begin, end)
+                found, curvature[b, i] = _highest(score, begin, end)
                 is_higher = score[int(found)] > highest  # which NaN is not
                 is_highest = begin < found < end - 1 or not is_higher
                 highest = score[int(found)]

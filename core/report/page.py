@@ -54,7 +54,7 @@ from core.report.figures import (
     image_svg,
 )
 from core.tracking import tracking_signals
-from core.typesetting import three_digits, typeset
+from core.typesetting import probability_text, three_digits, typeset
 
 MOST_PIXELS = 2**16
 """Pixels of maps and cloud; larger images are thinned."""
@@ -357,7 +357,7 @@ def _candidates(capture: Capture, report: PixelReport) -> str:
             _metres(each.range_m, capture),
             _number(each.score),
             _number(each.relative),
-            _number(each.probability),
+            _number(each.probability, probability_text(each.probability)),
         )
         for rank, each in enumerate(report.candidates, 1)
     ]

@@ -14,7 +14,7 @@ from core.acquisition import Acquisition, Pulse
 from core.capture import Capture
 from core.estimators import estimate
 from core.inference import TOLERANCE_BINS, flux_model_of
-from core.inference.refinement import STEPS_PER_BIN, refined
+from core.inference.refinement import FINE_STEPS_PER_BIN, SHARP_BINS, STEPS_PER_BIN, refined
 from core.studies.methods.calibration import Regime
 from core.tests.twins import log_likelihood
 from core.tracking import PRESETS, tracking_signals
@@ -40,17 +40,19 @@ def drawn(pulse: Pulse, n_pulses: int | None, rows: int = 3) -> Capture:
     return Capture(cube, acquisition, pulse, detection="first" if n_pulses else "all")
 
 
-def twin(capture: Capture, row: int, col: int, delay_bin: float) -> float:
-    """Refine one delay as described, one likelihood at a time."""
+def searched(
+    capture: Capture, row: int, col: int, delay_bin: float, steps: int, reach: int
+) -> tuple[float, float]:
+    """Find one delay and its standard deviation in steps, one likelihood at a time."""
     flux, acquisition = flux_model_of(capture), capture.acquisition
     counts, n_pulses = capture.cube[row, col].astype(float), capture.gated_pulses
     signal = float(flux.typical_signal[row, col])
     background = float(flux.typical_background[row, col])
-    within = (np.arange(STEPS_PER_BIN) + 0.5) / STEPS_PER_BIN
+    within = (np.arange(steps) + 0.5) / steps
     taps, first = capture.pulse.taps(N_BINS, acquisition.bin_width_s, within)
     delays, log = [], []
     for k in range(N_BINS):
-        for step in range(STEPS_PER_BIN):
+        for step in range(steps):
             rate = np.full(N_BINS, background / N_BINS)
             for tap, share in enumerate(taps[step]):
                 if 0 <= k + first + tap < N_BINS:
@@ -59,16 +61,26 @@ def twin(capture: Capture, row: int, col: int, delay_bin: float) -> float:
             delays.append(k + within[step])
     while True:
         distance = np.abs(np.array(delays) - delay_bin)
-        near = np.flatnonzero(distance < max(TOLERANCE_BINS, capture.echo_bins))
+        near = np.flatnonzero(distance < reach)
         best = int(near[np.take(log, near).argmax()])
         if near[0] < best < near[-1]:
             break
         if delays[best] == delay_bin:
-            return delay_bin
+            return delay_bin, math.inf
         delay_bin = delays[best]
     left, middle, right = log[best - 1 : best + 2]
     curvature = min(left - 2 * middle + right, -1e-9)
-    return float(delays[best] + 0.5 * (left - right) / curvature / STEPS_PER_BIN)
+    found = delays[best] + 0.5 * (left - right) / curvature / steps
+    return float(found), 1 / (steps * math.sqrt(-curvature))
+
+
+def twin(capture: Capture, row: int, col: int, delay_bin: float) -> float:
+    """Refine one delay as described."""
+    reach = max(TOLERANCE_BINS, capture.echo_bins)
+    found, spread = searched(capture, row, col, delay_bin, STEPS_PER_BIN, reach)
+    if spread < SHARP_BINS:
+        found, _ = searched(capture, row, col, found, FINE_STEPS_PER_BIN, 1)
+    return found
 
 
 @pytest.mark.parametrize(
@@ -79,7 +91,8 @@ def test_delays_move_to_the_largest_likelihood(pulse: str, n_pulses: int | None)
     start = np.random.default_rng(5).uniform(0, N_BINS, capture.shape)
     start[0, :3] = 0.0, N_BINS, np.nan
     before = start.copy()
-    found = refined(capture, flux_model_of(capture), start)
+    reach = max(TOLERANCE_BINS, capture.echo_bins)
+    found = refined(capture, flux_model_of(capture), start, reach)
     np.testing.assert_array_equal(start, before)
     assert math.isnan(found[0, 2])
     for row, col in [(0, 0), (0, 1), *((r, c) for r in range(3) for c in range(4, 30, 5))]:

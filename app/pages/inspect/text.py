@@ -51,7 +51,7 @@ from core.inspection import (
 )
 from core.io import changed_settings
 from core.metrics import Interval
-from core.typesetting import typeset, value_and_bounds
+from core.typesetting import probability_text, typeset, value_and_bounds
 
 EXPLANATION = """
 **Choose.** Tap the map, use the arrow keys (with Shift: eight pixels), or type a row and a column.
@@ -275,7 +275,8 @@ def remark(found: Inspected) -> str:
 
 def fit_explanation(p_value: float) -> str:
     """Return how to read the fit, with the p-value of a pixel if it is known."""
-    known = "" if math.isnan(p_value) else f" Goodness of fit of the pixel: p-value {p_value:.2g}."
+    p_text = probability_text(p_value)
+    known = "" if math.isnan(p_value) else f" Goodness of fit of the pixel: p-value {p_text}."
     return (
         "Expected: one echo over the background, with range and flux from the posterior. If that "
         f"holds, 95 % of the counts are within the band and of the residuals within ±2.{known}"
