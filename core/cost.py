@@ -151,12 +151,13 @@ def predicted(
         seconds += _LEARNED_S * learned
         seconds += (entry_s + _LANE_S / lanes) * n_bins * levels * _filled(n_sampled, lanes)
         seconds += (entry_s + _LANE_S / lanes) * n_bins * _USUAL_LEVELS * _filled(n_pixels, lanes)
-    if method == "tracking" or (not posterior_is_cached and lanes == LANES):
+    if method == "tracking" or steps or (not posterior_is_cached and lanes == LANES):
         n_bytes += 2 * n_bins * _filled(n_pixels, LANES)
     if method == "tracking" and (settings is None or settings.refine == "likelihood"):
         n_bytes += _REFINED_BYTES * n_pixels
         seconds += _REFINED_S * n_taps**2 * n_pixels
     if steps:
+        n_bytes += _REFINED_BYTES * n_pixels
         lanes = lanes_of(_USUAL_LEVELS, n_bins * steps)
         n_bytes += 8 * lanes * _USUAL_LEVELS * n_bins * steps
         n_entries = n_bins * steps * _USUAL_LEVELS * _filled(n_pixels, lanes)

@@ -687,6 +687,7 @@ def change_theme(page: Page) -> None:
         assert len(page.evaluate("seen")) == 2  # no light text on light paper in between
         page.evaluate("seen = null")
         assert (pixels(page.screenshot()).mean() < 60) == (palette is DARK)
+        assert ("theme=dark" in page.url) == (palette is DARK)  # a reload keeps it
     sent = [event for part in page.evaluate("sent") for event in json.loads(part).get("events", ())]
     # The server paints the plots: the browser need not report the colour of each line.
     assert {event["attr"] for event in sent} == {"dark_theme"}

@@ -427,6 +427,8 @@ class Layout:
         state.param.watch(lambda *_: self._show_bars(), ["page", "present"])
         self._tour.param.watch(lambda _: setattr(state, "page", LEARN), "finished")
         self._show_bars()
+        self.page.link(self._link, dark_theme="dark")
+        self._link.dark = self.page.dark_theme
         self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
         if self.page.dark_theme:  # by its address
             self.pages.paint(True)
@@ -472,7 +474,8 @@ class Layout:
             self._uploaded, self.session.state.page = "", "Inspect"
         self._source.value = self.session.state.source
         self._light_part.visible = is_scene
-        self._reading.part.visible = self._truth.part.visible = not is_scene
+        self._reading.part.visible = not is_scene
+        self._truth.show(answer)
         self._show_reading(answer)
         self._truth_offer.show(answer)
         self._provenance.text = text.provenance(answer)[:2000]

@@ -28,6 +28,7 @@ class AddressBar(Component):
     entry = param.List(
         default=["", 0], doc="Part of the address after the question mark, and the latest visit."
     )
+    dark = param.Boolean(default=False, doc="Whether the address asks for dark mode.")
     visited = param.List(
         default=["", 0], doc="Query of the entry that was returned to, and the number of the visit."
     )
@@ -36,11 +37,15 @@ class AddressBar(Component):
     export function render({ model }) {
       const step = () => history.state?.step ?? 0;
       let isNew = false;  // whether the next address is an entry of its own
+      const addressOf = (query) => {
+        const entries = [query, model.dark ? "theme=dark" : ""].filter(Boolean).join("&");
+        const search = entries ? `?${entries}` : "";
+        return new URL(location.pathname + search + location.hash, location.href);
+      };
       const show = () => {
         const [query, visit] = model.entry;
         if (visit !== model.visited[1]) return;  // written before the latest visit was known
-        const search = query ? `?${query}` : "";
-        const address = new URL(location.pathname + search + location.hash, location.href);
+        const address = addressOf(query);
         if (address.href !== location.href) {
           if (isNew) history.pushState({ step: step() + 1 }, "", address);
           else history.replaceState(history.state, "", address);
@@ -48,6 +53,8 @@ class AddressBar(Component):
         isNew = true;
       };
       model.on("entry", show);
+      // Not an entry of its own: Back does not change the mode.
+      model.on("dark", () => history.replaceState(history.state, "", addressOf(model.entry[0])));
       show();
 
       const visit = () => {

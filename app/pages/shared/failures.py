@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from app.model.text import failure
 from app.tasks.signals import Signal
+from core import CaptureError
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +33,10 @@ class FailureLog:
         part: object = None,
     ) -> None:
         """Log an error and show a sentence about it, until its part works again."""
-        log.warning("a request failed", exc_info=error)
+        if isinstance(error, CaptureError):  # which says all that there is to know
+            log.warning("%s", error)
+        else:
+            log.warning("a request failed", exc_info=error)
         self.put(describe(error), part)
 
     def put(self, sentence: str, part: object = None) -> None:

@@ -109,8 +109,9 @@ class ReadingForm:
         self.question.visible = self._about.visible = False
         self._fill(reading, used)
         # With all records it stands at the first one.
-        self._record = reading.records if isinstance(reading.records, int) else 0
-        self.player.param.update(end=max((n_records or 1) - 1, 1), value=self._record)
+        record = reading.records if isinstance(reading.records, int) else None
+        self._record, last = record or 0, max((n_records or 1) - 1, 1)
+        self.player.param.update(end=last, value=self._record, show_value=record is not None)
         self._all.variant = "outlined" if reading.records is not None else "contained"
         self.records.visible = n_records is not None and n_records > 1
 

@@ -11,7 +11,7 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 
-from app.model.store import Answer
+from app.model.store import Answer, Source
 from app.model.text import cause
 from app.model.truth import SUFFIXES, Truth, check_truth, offered_truths
 from app.model.uploads import Uploads
@@ -63,6 +63,7 @@ class TruthForm:
     ) -> None:
         self._session, self._uploads, self._user, self._add = session, uploads, user, add
         self._key = ""
+        self._refused_for: Source | None = None
         self._jobs = session.tasks.latest()
         self.status = Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8))
         self.file = file_button(TRUTH_OPTIONS["truth"], SUFFIXES, self._upload, self._refuse)
@@ -90,6 +91,13 @@ class TruthForm:
         for control, event in ((self.unit, "value"), (self.variable, "enter_pressed")):
             control.param.watch(lambda _: self._try(), event)
 
+    def show(self, answer: Answer) -> None:
+        """Show the form for a capture; what was refused for another one is forgotten."""
+        source = answer.request.source
+        self.part.visible = not source.is_scene
+        if source is not self._refused_for:
+            self.status.text = ""
+
     def _upload(self, files: dict[str, bytes]) -> None:
         try:
             self._key = self._uploads.add(files, self._user)
@@ -112,6 +120,7 @@ class TruthForm:
         self._add(truth)
 
     def _refuse(self, reason: str) -> None:
+        self._refused_for = self._session.answer.request.source
         self.status.text = f"Not added: {reason}"
 
 
