@@ -12,9 +12,11 @@ from core.kernels.parallel import entering
 from core.kernels.refinement import refine_delays
 
 STEPS_PER_BIN = 4
-FINE_STEPS_PER_BIN = 16
+FINE_STEPS_PER_BIN = 8
 SHARP_BINS = 0.15
 """Standard deviation of a delay below which the error of a parabola between steps matters."""
+
+FEWEST = 1 / 3  # Cramér-Rao bound of a gamma pulse's delay, over its variance, for one photon
 
 
 def refined(capture: Capture, flux: FluxModel, delay_bin: Floats, reach: int) -> Floats:
@@ -23,8 +25,8 @@ def refined(capture: Capture, flux: FluxModel, delay_bin: Floats, reach: int) ->
     The likelihood ``T(d)`` of `core.inference.likelihood` with the typical fluxes of each pixel is
     computed at four delays in each bin, those less than `reach` bins away; a parabola refines
     between them. From an end of this window the search goes on as long as the likelihood
-    increases, since an estimator may find only the flank of an echo. Delays that are then known to
-    less than `SHARP_BINS` are refined in finer steps.
+    increases, since an estimator may find only the flank of an echo. Bright echoes are then
+    `sharpened`.
 
     Parameters
     ----------
@@ -39,32 +41,36 @@ def refined(capture: Capture, flux: FluxModel, delay_bin: Floats, reach: int) ->
     -------
     ndarray, shape (row, col)
     """
-    delay, spread_bin = _moved(capture, flux, delay_bin, STEPS_PER_BIN, reach)
-    bright = np.where(spread_bin < SHARP_BINS, delay, np.nan)
-    if np.isnan(bright).all():
-        return delay
-    fine, _ = _moved(capture, flux, bright, FINE_STEPS_PER_BIN, 1)
-    return np.where(np.isnan(bright), delay, fine)
+    delay, _ = _moved(capture, flux, flux.typical_signal, delay_bin, STEPS_PER_BIN, reach)
+    return sharpened(capture, flux, delay)
 
 
 def sharpened(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
-    """Search again in finer steps near the delays of bright echoes.
+    """Search again in finer steps, and with a signal of their own, near delays of bright echoes.
 
     A parabola through the logarithm of the likelihood in steps of half a bin errs by up to a tenth
     of a bin, however many photons there are. Delays known to less than `SHARP_BINS` move to the
     largest likelihood, if that is less than half a bin away. Parameters and result as `refined`.
     """
-    fine, spread_bin = _moved(capture, flux, delay_bin, FINE_STEPS_PER_BIN, 1)
+    fitted = np.full(delay_bin.shape, np.nan)
+    fine, spread_bin = _moved(capture, flux, fitted, delay_bin, FINE_STEPS_PER_BIN, 1)
     is_near = (spread_bin < SHARP_BINS) & (np.abs(fine - delay_bin) < 0.5)
     return np.where(is_near, fine, delay_bin)
 
 
 def _moved(
-    capture: Capture, flux: FluxModel, delay_bin: Floats, steps_per_bin: int, reach: int
+    capture: Capture,
+    flux: FluxModel,
+    signal: Floats,
+    delay_bin: Floats,
+    steps_per_bin: int,
+    reach: int,
 ) -> tuple[Floats, Floats]:
     """Move delays as `refined` in steps; also return their standard deviations in bins.
 
-    These follow from the curvature of the likelihood, and are infinite at an end of the gate.
+    Where a signal (row, col) is NaN, it is fitted, too, if the echo has so many photons that its
+    delay may be known to `SHARP_BINS`. The deviations follow from the curvature of the likelihood,
+    and are infinite at an end of the gate.
     """
     acquisition, n_pixels = capture.acquisition, delay_bin.size
     within = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
@@ -87,12 +93,13 @@ def _moved(
         refine_delays(
             counts,
             capture.gated_pulses or 0,
-            in_blocks(flux.typical_signal),
+            in_blocks(signal),
             in_blocks(background),
             echo,
             steps_per_bin,
             first,
             reach,
+            FEWEST * (capture.pulse.sigma_s / acquisition.bin_width_s / SHARP_BINS) ** 2,
             delay,
             curvature,
         )

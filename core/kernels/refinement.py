@@ -14,6 +14,9 @@ from numba import njit, prange
 
 from core.kernels.parallel import COMPILED, PARALLEL
 
+FITTING_ROUNDS = 2  # of the fit of a signal and its delay
+_NEWTON_STEPS = 6
+
 
 @njit(**COMPILED)
 def _fill_gain(signal, background, is_first, echo, gain):  # type: ignore[no-untyped-def]
@@ -53,6 +56,41 @@ def _fill_score(signal, echo, gain, steps, fired, unfired, score):  # type: igno
 
 
 @njit(**COMPILED)
+def _signal_in(background, is_first, fired, unfired):  # type: ignore[no-untyped-def]
+    """Signal and counts of a window beyond its background, 0 or more.
+
+    The signal is corrected for pile-up (Coates 1968); of the pulses that were armed, half a one is
+    left at least.
+    """
+    signal, counts = 0.0, 0.0
+    for p in range(fired.size):
+        armed = unfired[p] + (fired[p] if is_first else 0.0)
+        signal += math.log1p(fired[p] / max(unfired[p], 0.5)) if is_first else fired[p]
+        signal -= background if armed > 0.0 else 0.0
+        counts += fired[p] - background * armed
+    return max(signal, 0.0), counts
+
+
+@njit(**COMPILED)
+def _fitted_signal(signal, background, is_first, sample, fired, unfired):  # type: ignore[no-untyped-def]
+    """Likeliest signal by Newton's method from a first one, for an echo with samples of each bin.
+
+    `sample` (bin,) is in reverse order, as `echo` in `_fill_score`.
+    """
+    for _ in range(_NEWTON_STEPS):
+        slope, curvature = 0.0, -1e-30
+        for p in range(fired.size):
+            share = sample[fired.size - 1 - p]
+            rate = background + signal * share
+            odds = math.expm1(rate) if is_first else rate
+            grown = odds + 1.0 if is_first else 1.0
+            slope += share * (fired[p] / odds - unfired[p])
+            curvature -= share * share * fired[p] * grown / (odds * odds)
+        signal = min(max(signal - slope / curvature, 0.25 * signal), 4.0 * signal)
+    return signal
+
+
+@njit(**COMPILED)
 def _highest(score, begin, end):  # type: ignore[no-untyped-def]
     """Maximum of `score` from `begin` to `end` by a parabola, and its curvature; 0 at the ends."""
     best = begin + score[begin:end].argmax()
@@ -65,7 +103,7 @@ def _highest(score, begin, end):  # type: ignore[no-untyped-def]
 
 @njit(**PARALLEL)
 def refine_delays(  # type: ignore[no-untyped-def]
-    blocks, n_pulses, signal, background, echo, steps, first_tap, reach, delay, curvature
+    blocks, n_pulses, signal, background, echo, steps, first_tap, reach, fewest, delay, curvature
 ):
     """Move each delay (block, lane) to the maximum of ``T(d)`` less than `reach` bins from it.
 
@@ -76,6 +114,10 @@ def refine_delays(  # type: ignore[no-untyped-def]
     (block, lane); `n_pulses` is 0 if unknown; `echo` has `steps` samples a bin, see the module,
     and begins `first_tap` bins from a delay. NaN remains. `curvature` (block, lane) is set to that
     of ``T(d)`` per step squared, 0 at an end of the gate.
+
+    Where the signal is NaN, it is fitted together with the delay, if the counts beyond background
+    exceed their noise as much as `fewest` counts without background do; otherwise the delay
+    remains.
     """
     n_blocks, n_bins, lanes = blocks.shape
     n_delays = (2 * reach + 1) * steps
@@ -86,19 +128,29 @@ def refine_delays(  # type: ignore[no-untyped-def]
         for i in range(lanes):
             if math.isnan(delay[b, i]):
                 continue
-            if signal[b, i] != last_signal or background[b, i] != last_background:
-                last_signal, last_background = signal[b, i], background[b, i]
-                _fill_gain(last_signal, last_background, n_pulses > 0, echo, gain)
-            highest, is_highest = -math.inf, False
-            while not is_highest:
-                first = min(int(delay[b, i]), n_bins - 1) - reach
-                _fill_window(blocks[b, :, i], n_pulses, first + first_tap, fired, unfired)
-                _fill_score(last_signal, echo, gain, steps, fired, unfired, score)
-                at = (delay[b, i] - first) * steps - 0.5
-                begin = max(math.floor(at - reach * steps) + 1, -first * steps)
-                end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
-                found, curvature[b, i] = _highest(score, begin, end)
-                is_higher = score[int(found)] > highest  # which NaN is not
-                is_highest = begin < found < end - 1 or not is_higher
-                highest = score[int(found)]
-                delay[b, i] = first + (found + 0.5) / steps
+            is_own, here = math.isnan(signal[b, i]), signal[b, i]
+            for _ in range(FITTING_ROUNDS if is_own else 1):
+                highest, is_highest = -math.inf, False
+                while not is_highest:
+                    first = min(int(delay[b, i]), n_bins - 1) - reach
+                    _fill_window(blocks[b, :, i], n_pulses, first + first_tap, fired, unfired)
+                    at = (delay[b, i] - first) * steps - 0.5
+                    if is_own:
+                        here, counts = _signal_in(background[b, i], n_pulses > 0, fired, unfired)
+                        if counts * abs(counts) < fewest * fired.sum():
+                            break
+                        sample = echo[min(max(round(at), 0), n_delays - 1) :: steps][: fired.size]
+                        here = _fitted_signal(
+                            here, background[b, i], n_pulses > 0, sample, fired, unfired
+                        )
+                    if here != last_signal or background[b, i] != last_background:
+                        last_signal, last_background = here, background[b, i]
+                        _fill_gain(last_signal, last_background, n_pulses > 0, echo, gain)
+                    _fill_score(last_signal, echo, gain, steps, fired, unfired, score)
+                    begin = max(math.floor(at - reach * steps) + 1, -first * steps)
+                    end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
+                    found, curvature[b, i] = _highest(score, begin, end)
+                    is_higher = score[int(found)] > highest  # which NaN is not
+                    is_highest = begin < found < end - 1 or not is_higher
+                    highest = score[int(found)]
+                    delay[b, i] = first + (found + 0.5) / steps

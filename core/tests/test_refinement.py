@@ -9,12 +9,20 @@ from typing import get_args
 
 import numpy as np
 import pytest
+import scipy
 
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture
 from core.estimators import estimate
 from core.inference import TOLERANCE_BINS, flux_model_of
-from core.inference.refinement import FINE_STEPS_PER_BIN, SHARP_BINS, STEPS_PER_BIN, refined
+from core.inference.refinement import (
+    FEWEST,
+    FINE_STEPS_PER_BIN,
+    SHARP_BINS,
+    STEPS_PER_BIN,
+    refined,
+)
+from core.kernels.refinement import FITTING_ROUNDS
 from core.studies.methods.calibration import Regime
 from core.tests.twins import log_likelihood
 from core.tracking import PRESETS, tracking_signals
@@ -41,12 +49,18 @@ def drawn(pulse: Pulse, n_pulses: int | None, rows: int = 3) -> Capture:
 
 
 def searched(
-    capture: Capture, row: int, col: int, delay_bin: float, steps: int, reach: int
+    capture: Capture,
+    row: int,
+    col: int,
+    delay_bin: float,
+    steps: int,
+    reach: int,
+    signal: float | None = None,
 ) -> tuple[float, float]:
     """Find one delay and its standard deviation in steps, one likelihood at a time."""
     flux, acquisition = flux_model_of(capture), capture.acquisition
     counts, n_pulses = capture.cube[row, col].astype(float), capture.gated_pulses
-    signal = float(flux.typical_signal[row, col])
+    signal = float(flux.typical_signal[row, col]) if signal is None else signal
     background = float(flux.typical_background[row, col])
     within = (np.arange(steps) + 0.5) / steps
     taps, first = capture.pulse.taps(N_BINS, acquisition.bin_width_s, within)
@@ -77,10 +91,47 @@ def searched(
 def twin(capture: Capture, row: int, col: int, delay_bin: float) -> float:
     """Refine one delay as described."""
     reach = max(TOLERANCE_BINS, capture.echo_bins)
-    found, spread = searched(capture, row, col, delay_bin, STEPS_PER_BIN, reach)
-    if spread < SHARP_BINS:
-        found, _ = searched(capture, row, col, found, FINE_STEPS_PER_BIN, 1)
-    return found
+    found, _ = searched(capture, row, col, delay_bin, STEPS_PER_BIN, reach)
+    fine, spread = sharp(capture, row, col, found)
+    return fine if spread < SHARP_BINS and abs(fine - found) < 0.5 else found
+
+
+def sharp(capture: Capture, row: int, col: int, delay_bin: float) -> tuple[float, float]:
+    """Fit signal and delay in turn, if there are enough photons near the delay."""
+    background = float(flux_model_of(capture).typical_background[row, col]) / N_BINS
+    counts, n_pulses = capture.cube[row, col].astype(float), capture.gated_pulses
+    width_s = capture.acquisition.bin_width_s
+    fewest = FEWEST * (capture.pulse.sigma_s / width_s / SHARP_BINS) ** 2
+    within = (np.arange(FINE_STEPS_PER_BIN) + 0.5) / FINE_STEPS_PER_BIN
+    taps, first = capture.pulse.taps(N_BINS, width_s, within)
+    spread = math.inf
+    for _ in range(FITTING_ROUNDS):
+        begin = min(int(delay_bin), N_BINS - 1) + first - 1
+        bins = np.arange(max(begin, 0), min(begin + taps.shape[1] + 2, N_BINS))
+        armed = (n_pulses or 0) - (np.cumsum(counts) - counts)[bins]
+        fired = counts[bins]
+        rate = np.log1p(fired / np.maximum(armed - fired, 0.5)) if n_pulses else fired
+        is_armed = armed > 0 if n_pulses else np.ones(bins.size, bool)
+        signal = max(float((rate - background * is_armed).sum()), 0.0)
+        excess = (fired - background * (armed if n_pulses else 1.0)).sum()
+        if excess * abs(excess) < fewest * fired.sum():
+            return delay_bin, math.inf
+        step = round((delay_bin - int(delay_bin)) * FINE_STEPS_PER_BIN - 0.5)
+        share = np.zeros(N_BINS + 2 * taps.shape[1])
+        at = int(delay_bin) + first + taps.shape[1] + step // FINE_STEPS_PER_BIN
+        share[at : at + taps.shape[1]] = taps[step % FINE_STEPS_PER_BIN]
+        share = share[taps.shape[1] : -taps.shape[1]]
+
+        def loss(signal: float, share: np.ndarray = share) -> float:
+            return -log_likelihood(counts, background + signal * share, n_pulses)
+
+        best = scipy.optimize.minimize_scalar(
+            loss, bounds=(signal / 64, 64 * signal), method="bounded", options={"xatol": 1e-9}
+        )
+        delay_bin, spread = searched(
+            capture, row, col, delay_bin, FINE_STEPS_PER_BIN, 1, float(best.x)
+        )
+    return delay_bin, spread
 
 
 @pytest.mark.parametrize(
