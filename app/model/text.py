@@ -45,6 +45,11 @@ RANGE_HELP = (
     "estimate: {} of such intervals contain it."
 )
 
+ESTIMATE_HELP = (
+    "Of the method, lag removed. It may lie outside the intervals: they are those of the surface, "
+    "whatever the method."
+)
+
 PER_PULSE, PER_PIXEL = "PPP", "Photons per pixel"
 """Signal flux per pulse, and of all pulses together where their number is not known. Elsewhere PPP
 often stands for photons per pixel; here it never does."""
@@ -197,7 +202,7 @@ def estimate_facts(pixel: Pixel, along: Scale, has_truth: bool) -> list[Fact]:
     facts: list[Fact] = [
         ("Range (68 %)", plus_minus(inner.low, inner.high, "m"), RANGE_HELP.format("68 %")),
         ("Range (95 %)", between(outer.low, outer.high, "m"), RANGE_HELP.format("95 %")),
-        ("Estimate", number(pixel.range_m, "m", decimals=decimals), "Of the method, lag removed."),
+        ("Estimate", number(pixel.range_m, "m", decimals=decimals), ESTIMATE_HELP),
     ]
     if along.name != "m":
         facts.append(("Position", along.place(pixel.answer_bin), "The estimate along the gate."))
