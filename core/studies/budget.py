@@ -8,7 +8,7 @@ from core.photon_budget import PhotonBudget, Reach, background_extent, signal_ex
 from core.scene import Scene
 from core.studies.outputs import Table, table
 
-__all__ = ["NEEDED_NOTE", "needed_table", "steps_table"]
+__all__ = ["NEEDED_NOTE", "background_note", "needed_table", "steps_table"]
 
 NEEDED_NOTE = (
     "One setting at a time, the others unchanged. RD within 3 bins of the likelihood with known "
