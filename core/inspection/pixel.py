@@ -38,7 +38,7 @@ _FEWEST_BINS = 5  # of an echo in a plot around it
 
 @dataclass(frozen=True)
 class RangeCandidate:
-    """A possible delay of the surface: a peak of an estimator's score, or of its posterior.
+    """A possible delay of the surface: a peak of an estimator's score, or of its log posterior.
 
     Peaks within one pulse, or 3 bins, of each other or of the estimate are one candidate, that of
     the highest score.
@@ -256,7 +256,8 @@ def _candidates(
 ) -> tuple[tuple[RangeCandidate, ...], float]:
     """Return the candidates and the probability of the estimate, whether it is one of them."""
     estimate_bin, confidence = float(image.bin[row, col]), float(image.confidence[row, col])
-    curve = curve if evidence is None else evidence.posterior
+    if evidence is not None:
+        curve = np.log(np.maximum(evidence.posterior, np.finfo(float).tiny))
     peaks = scipy.signal.find_peaks(np.pad(curve, 1, constant_values=-np.inf))[0] - 1
     # A signal far below the image's mean makes all scores of the likelihood negative.
     base = 0.0 if curve.max() > 0 else float(np.median(curve))
