@@ -139,13 +139,13 @@ def _prediction(lesson: Lesson, bench: Bench, is_key: bool) -> str:
     asked = lesson.prediction
     seen = lesson.seen(asked.view, bench, None)
     if is_key:
-        return _paragraph(asked.question) + _figure(seen)
+        return _rendered(asked.question) + _figure(seen)
     if asked.axis:
         room = f"Your prediction: {_LINE} {escape(asked.unit)}"
     else:
         room = " &emsp; ".join(f"☐ {each}" for each in SHAPES)
     sketch = "Sketch it before you go on; draw over it, in another colour, what happens."
-    return _paragraph(asked.question) + f"<p>{room}</p><p>{sketch}</p>" + _figure(seen, True)
+    return _rendered(asked.question) + f"<p>{room}</p><p>{sketch}</p>" + _figure(seen, True)
 
 
 def _observation(lesson: Lesson, bench: Bench, is_key: bool) -> str:
@@ -157,7 +157,7 @@ def _observation(lesson: Lesson, bench: Bench, is_key: bool) -> str:
         for each in seen.values()
         if isinstance(each, Pulses)
     )
-    question = _paragraph(f"{_moving(lesson)} What happens, and why?")
+    question = _rendered(f"{_moving(lesson)} What happens, and why?")
     if not is_key:
         return exercises + question + '<p class="ruled"></p>' * 4
     moved = _moved(lesson, bench)
@@ -192,7 +192,7 @@ def _check(lesson: Lesson, is_key: bool) -> str:
     """Return the question and room for the answer; in the key, the right and wrong answers."""
     check = lesson.check
     if not is_key:
-        return _paragraph(check.question) + f"<p>Your answer: {_LINE}</p>"
+        return _rendered(check.question) + f"<p>Your answer: {_LINE}</p>"
     wrong = "".join(
         f"<tr><td>{CHECKS[hint.function](check.bench, **hint.arguments):.3g}</td>"
         f"<td>{escape(hint.text)}</td></tr>"
@@ -200,7 +200,7 @@ def _check(lesson: Lesson, is_key: bool) -> str:
     )
     hints = f"<table><tr><th>Wrong answer</th><th>What to say</th></tr>{wrong}</table>"
     return (
-        _paragraph(check.question)
+        _rendered(check.question)
         + f'<p class="key"><strong>{check.answer:.3g}</strong> ± {check.tolerance:g}</p>'
         + (hints if wrong else "")
     )
@@ -213,7 +213,7 @@ def _part(title: str, content: str) -> str:
     return f'<div class="part"><h2>{title}</h2>{content}</div>'
 
 
-def _paragraph(text: str) -> str:
+def _rendered(text: str) -> str:
     return str(_MARKDOWN.render(text))
 
 

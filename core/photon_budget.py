@@ -33,10 +33,9 @@ __all__ = [
     "PhotonBudget",
     "Reach",
     "Step",
-    "background_extent",
+    "flux_extents",
     "predicted_rd",
     "reaching",
-    "signal_extent",
     "steps",
     "with_falloff",
 ]
@@ -298,21 +297,10 @@ def with_falloff(scene: Scene, reflectivity: float = 1.0) -> Scene:
     return replace(scene, falloff=Falloff(reference_m), backscatter=fog)
 
 
-def signal_extent(budget: PhotonBudget, scene: Scene) -> tuple[float, float]:
-    """Return the smallest and the largest signal of the pixels with a target, per pulse.
-
-    Raises
-    ------
-    ValueError
-        As `steps`.
-    """
-    range_m, signal = next(echoes(*budget.apply(scene)))
-    known = signal[np.isfinite(range_m)]
-    return float(known.min()), float(known.max())
-
-
-def background_extent(budget: PhotonBudget, scene: Scene) -> tuple[float, float]:
-    """Return the smallest and the largest background of the pixels with a target, per pulse.
+def flux_extents(
+    budget: PhotonBudget, scene: Scene
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the smallest and largest signal, and background, of pixels with a target, per pulse.
 
     Raises
     ------
@@ -320,8 +308,12 @@ def background_extent(budget: PhotonBudget, scene: Scene) -> tuple[float, float]
         As `steps`.
     """
     lit, flux = budget.apply(scene)
-    known = _background(lit, flux)[np.isfinite(lit.range_m)]
-    return float(known.min()), float(known.max())
+    is_target = np.isfinite(lit.range_m)
+    signal, background = next(echoes(lit, flux))[1][is_target], _background(lit, flux)[is_target]
+    return (
+        (float(signal.min()), float(signal.max())),
+        (float(background.min()), float(background.max())),
+    )
 
 
 def _background(scene: Scene, flux: Flux) -> Floats:
@@ -404,15 +396,14 @@ def _reach(budget: PhotonBudget, scene: Scene, name: str, target_rd: float, puls
     spec = _spec_of(name)
     logs = np.linspace(math.log(spec.low), math.log(spec.high), _VALUES)
     margins = np.array([margin(each) for each in logs])
-    best = int(margins.argmax())
-    if margins[best] < 0:  # the maximum may lie between two values
-        ends = logs[max(best - 1, 0)], logs[min(best + 1, _VALUES - 1)]
-        top = scipy.optimize.minimize_scalar(
-            lambda at: -margin(at), bounds=ends, options={"xatol": 0.02}
-        )
-        if -top.fun > margins[best]:
-            best = int(np.searchsorted(logs, top.x))
-            logs, margins = np.insert(logs, best, top.x), np.insert(margins, best, -top.fun)
+    best = int(margins.argmax())  # the maximum may lie between two values
+    ends = logs[max(best - 1, 0)], logs[min(best + 1, _VALUES - 1)]
+    top = scipy.optimize.minimize_scalar(
+        lambda at: -margin(at), bounds=ends, options={"xatol": 0.02}
+    )
+    if -top.fun > margins[best]:
+        best = int(np.searchsorted(logs, top.x))
+        logs, margins = np.insert(logs, best, top.x), np.insert(margins, best, -top.fun)
 
     def end(step: int) -> float:
         """Follow the values that suffice from the best one, down (-1) or up (1)."""

@@ -49,6 +49,7 @@ def simulate(
     flux: Flux,
     pulse: Pulse = Pulse(),
     seed: int = 0,
+    name: str = "",
 ) -> Capture:
     """Draw one first-photon histogram for each pixel of a scene.
 
@@ -64,6 +65,8 @@ def simulate(
         Shape of the echo; its time zero is the delay of the surface.
     seed : int
         The same seed gives the same capture, for any number of threads.
+    name : str, optional
+        Name of the scene, which the source of the capture states.
 
     Returns
     -------
@@ -91,6 +94,7 @@ def simulate(
     else:
         _draw_multinomial(triggered, n_pulses, seed, cube)
     is_plain = set(parts_of(scene)) <= {"reflectivity", "falloff"}
+    source = f"simulated, seed {seed}, SBR {flux.sbr:g}, PPP {flux.signal:g}"
     return Capture(
         cube.reshape(*shape, acquisition.n_bins),
         acquisition,
@@ -98,7 +102,7 @@ def simulate(
         truth_range_m=np.array(scene.range_m, float),
         signal=next(echoes(scene, flux))[1] if is_plain else None,
         background=flux.background if is_plain else None,
-        source=f"simulated, seed {seed}, SBR {flux.sbr:g}, PPP {flux.signal:g}",
+        source=f"{name}, {source}" if name else source,
     )
 
 

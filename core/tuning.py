@@ -1,9 +1,9 @@
-"""Settings of a method that choose themselves for a capture, by a twin whose truth is known.
+"""Choice of the settings of a method for a capture, on a simulated twin whose truth is known.
 
-The twin is simulated from what the capture shows: the ranges of the image posterior, the signal of
-its pixels, its background and its pulse. A search from the default settings finds those that
-restore most pixels of the twin. They are compared with the defaults on a second twin, of other
-noise; the defaults are kept unless they are beaten by two standard errors.
+The twin is simulated from what the capture shows: the ranges of the image posterior, the mean
+signal of pixels with an echo, the background and the pulse. A search from the default settings
+finds those that restore most pixels of the twin. They are compared with the defaults on a second
+twin, of other noise; the defaults are kept unless they are beaten by two standard errors.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from core.checks import require
 from core.estimators import ESTIMATORS, estimate, require_capture, settings_of
 from core.estimators.image_model import image_model_of
 from core.inference.flux import flux_prior_of
+from core.inference.neighbours import random_patches
 from core.inference.posterior import TOLERANCE_BINS
 from core.parameters import Choice, spec_of
 from core.trigger import draw_counts, rate_per_bin
@@ -31,6 +32,8 @@ __all__ = [
     "SURE",
     "Trial",
     "Tuning",
+    "free_fields",
+    "is_tunable",
     "right_targets",
     "searched",
     "tuned",
@@ -50,7 +53,8 @@ SURE = 2.0
 """Standard errors by which other settings have to beat the default ones."""
 
 _COARSE = {"tracking": {"refine": "none"}}  # settings that make a trial faster
-_SIDE = 64  # rows and columns of a twin; of larger images, patches
+_MOST_PIXELS = 64 * 64  # of a twin; of larger images, patches
+_MOST_COUNTS = 2**23
 _PATCH = 32
 
 
@@ -64,7 +68,7 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True)
 class Tuning:
-    """What `tuned` chose, and why."""
+    """Result of `tuned`, with the figures behind it."""
 
     method: str
     settings: Any
@@ -96,7 +100,7 @@ class Tuning:
             f"{len(self.trials)} settings were tried on a capture simulated from the surfaces, "
             "signal and background that this one shows."
         )
-        if self.best_rd == self.default_rd:
+        if self.best == type(self.best)():
             return f"{tried} None restored more than the defaults: RD {self.default_rd:.3f}."
         compared = (
             f"On a second one of {self.n_targets:,} targets, the best restored {self.best_rd:.3f} "
@@ -133,13 +137,12 @@ def tuned(
     """
     require_capture(capture)
     default = settings_of(method, None)
-    free = [each for each in fields(default) if each.name not in FIXED.get(method, ())]
-    usable = bool(free) and not ESTIMATORS[method].knows_flux
-    require("method", method, usable, "a method with settings to choose")
+    require("method", method, is_tunable(method), "a method with settings to choose")
+    free = free_fields(method)
     part = _part(capture)
     first, second = (twin(part, seed) for seed in (0, 1))
     rd_of: dict[Any, float] = {}
-    n_settings = 1 + sum(1 for each in free for other in _others(default, each) if other != default)
+    n_settings = len({default, *(other for each in free for other in _others(default, each))})
 
     def restored(settings: Any) -> float:
         if settings not in rd_of:
@@ -150,7 +153,7 @@ def tuned(
             progress(len(rd_of), n_settings)
         return rd_of[settings]
 
-    if not _n_targets(second) or not _n_targets(first):
+    if not np.isfinite(np.asarray(first.truth_range_m)).any():
         return Tuning(method, default, default, (), 0.0, 0.0, 0.0, 0)
     best = searched(default, free, restored, 1)
     progress(len(rd_of), len(rd_of))
@@ -168,6 +171,17 @@ def tuned(
         error,
         before.size,
     )
+
+
+def is_tunable(method: str) -> bool:
+    """Return whether `tuned` can choose settings of a method of `core.ESTIMATORS`."""
+    return bool(free_fields(method)) and not ESTIMATORS[method].knows_flux
+
+
+def free_fields(method: str) -> list[Field[Any]]:
+    """Return the settings of a method that a search changes."""
+    fixed = FIXED.get(method, ())
+    return [each for each in fields(ESTIMATORS[method].parameters) if each.name not in fixed]
 
 
 def twin(capture: Capture, seed: int) -> Capture:
@@ -234,15 +248,13 @@ def _others(settings: Any, of: Field[Any]) -> Iterator[Any]:
 
 def _part(capture: Capture) -> Capture:
     """Return a capture, or random patches of a larger one below each other."""
-    if capture.counts.size <= _SIDE**2:
+    most = max(1, min(_MOST_PIXELS, _MOST_COUNTS // capture.acquisition.n_bins))
+    if capture.counts.size <= most:
         return capture
-    (rows, cols), rng = capture.shape, np.random.default_rng(0)
-    high, wide = min(_PATCH, rows), min(_PATCH, cols)
-    corners = rng.integers((rows - high + 1, cols - wide + 1), size=(_SIDE**2 // (high * wide), 2))
-    patches = [capture.cube[top : top + high, left : left + wide] for top, left in corners]
+    patches = random_patches(capture.shape, most, min(_PATCH, math.isqrt(most)))
     return replace(
         capture,
-        cube=np.concatenate(patches),
+        cube=np.concatenate([capture.cube[patch] for patch in patches]),
         **capture.images(lambda _: None),
         flux_prior=None,
         stated_flux=None,
@@ -258,10 +270,9 @@ def right_targets(capture: Capture, method: str, settings: Any) -> NDArray[np.bo
     return np.asarray(np.abs(delay_bin - truth_bin)[target] <= TOLERANCE_BINS)
 
 
-def _n_targets(capture: Capture) -> int:
-    return int(np.isfinite(np.asarray(capture.truth_range_m)).sum())
-
-
 def _error(after: NDArray[np.bool_], before: NDArray[np.bool_]) -> float:
-    """Standard error of the difference of two shares of the same targets (McNemar 1947)."""
-    return float((after.astype(float) - before).std() / math.sqrt(after.size))
+    """Standard error of the difference of two shares of the same targets, if they are equal.
+
+    From the targets in which they differ (McNemar 1947).
+    """
+    return math.sqrt(np.count_nonzero(after != before)) / after.size

@@ -51,19 +51,21 @@ def scientific(value: float) -> str:
 
 
 LEAST_PROBABILITY = 1e-6
-"""Smaller ones are text as a bound: their size rests on the tails of a model."""
+"""Smaller probabilities are shown as a bound, since they depend on the tails of a model."""
 
 
 def probability_text(value: float) -> str:
-    """Format a probability with two digits, or as a bound.
+    """Format a probability with two digits, four above 0.1, or as a bound.
 
     Examples
     --------
-    >>> probability_text(0.0312), probability_text(5e-169)
-    ('0.031', 'below 0.000001')
+    >>> probability_text(0.9963), probability_text(0.0312), probability_text(5e-169)
+    ('0.9963', '0.031', '< 0.000001')
     """
     if value < LEAST_PROBABILITY:
-        return f"below {LEAST_PROBABILITY:f}"
+        return f"< {LEAST_PROBABILITY:f}"
+    if value >= 0.1:
+        return f"{value:.4g}"
     return f"{value:.2g}" if value >= 1e-4 else f"{value:.6f}"
 
 

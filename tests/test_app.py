@@ -42,6 +42,7 @@ from app.widgets.figures import Plot
 from app.widgets.image_view import ImageView
 from app.widgets.signal_plots import SignalPlots
 from core import PRESETS, Acquisition, Capture, TrackingParameters, save_capture, tracking_signals
+from core.geometry import Box
 from core.inference import fit_of, has_fit
 from core.io import OUTSIDE_COLOR, ColorScale, ReadOptions, reading_options
 from core.parameters import Number, spec_of
@@ -236,6 +237,20 @@ def test_what_an_image_hides_is_said(car):
     assert looks.legend(car, "Counts", Viewing(), values, look) == ""
 
 
+def test_a_cloud_states_what_its_box_hides_and_shows_grey(car):
+    image, box = car.run.image, Box(to_m=50.0)
+    viewing = Viewing(0.9, color_from_m=49.0)
+    found = looks.cloud_of(car, "Range", viewing, box)
+    inside, sure = image.valid & (image.range_m <= 50.0), image.confidence >= 0.9
+    n_hidden, n_grey = (inside & ~sure).sum(), (inside & sure & (image.range_m < 49.0)).sum()
+    assert found.points.n_points == len(found.rgb) == len(found.wrong) == (inside & sure).sum()
+    assert 0 < n_hidden < (image.valid & ~sure).sum() and n_grey > 0
+    assert looks.cloud_legend(found.unseen, 0.9) == (
+        f"Hidden: {n_hidden:,} below confidence 0.9. Grey: {n_grey:,} beyond the colour scale."
+    )
+    assert looks.cloud_legend(looks.Unseen(0, 0), 0.9) == ""
+
+
 def test_a_misfit_is_stated_once_it_is_known():
     worn, kind = compute(ask("worn"), None), "Estimate"
     drawn = looks.image_of(worn, kind, Viewing())
@@ -252,7 +267,7 @@ def test_image_and_cloud_take_the_chosen_limits_and_colours(car):
     outside = (values < 48.5) | (values > 50.0)
     said = looks.legend(car, "Estimate", viewing, values, look)
     assert f"Grey: {outside.sum():,} beyond the colour scale." in said
-    _, rgb, _ = looks.cloud_of(car, "Range", viewing)
+    rgb = looks.cloud_of(car, "Range", viewing).rgb
     known = np.isfinite(values)
     np.testing.assert_array_equal(rgb, look.rgb(values[known]))
     grey = tuple(bytes.fromhex(OUTSIDE_COLOR[1:]))
@@ -646,7 +661,7 @@ def test_a_source_with_or_without_truth_is_drawn_in_every_way(layout, explore, k
     for kind in session.state.param.cloud_color.objects:
         session.state.cloud_color = kind
         layout.settle()
-        _, rgb, _ = looks.cloud_of(session.answer, kind, session.state.viewing)
+        rgb = looks.cloud_of(session.answer, kind, session.state.viewing).rgb
         assert explore.cloud.colors == rgb.tobytes()
     assert {*layout.heard} == {""}
 

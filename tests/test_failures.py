@@ -8,6 +8,7 @@ import re
 import signal
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import cycle
 from pkgutil import resolve_name
 
@@ -486,7 +487,7 @@ def test_messages_name_files_without_folders(path, name):
     for describe in (
         model_text.failure,
         model_text.reason,
-        model_text.unfinished,
+        partial(model_text.unfinished, button="Compute"),
         compare_text.failure,
         compare_text.no_reference,
         download_text.not_saved,
@@ -526,7 +527,7 @@ def test_a_killed_process_is_reported_and_the_next_works(monkeypatch, session, s
         patched.setattr("core.studies.tradeoff.measure.held_bytes", killed)
         start()
         session.tasks.run_until(lambda: shown and "BrokenProcessPool" in shown[-1])
-    assert "Press Compute" in shown[-1]
+    assert "Press “Compute”" in shown[-1]
     start()
     session.tasks.run_until(lambda: has_succeeded() and has_succeeded()[0] == "Done")
     assert shown[-1] == ""

@@ -10,7 +10,7 @@ import pytest
 from app.model.store import built_in_sources
 from app.pages.shared.photon_budget import TITLE
 from core import PhotonBudget, scenes
-from core.photon_budget import signal_extent, steps
+from core.photon_budget import flux_extents, steps
 from tests.states import link_to
 from tests.threads import HeldLayout, control
 
@@ -38,8 +38,8 @@ def test_a_budget_sets_signal_and_background_until_a_slider_moves():
     assert control(layout, "Signal").value == pytest.approx(found["S"], rel=1e-4)
     assert control(layout, "Background").value == pytest.approx(found["B"], rel=1e-4)
     signal = answer.capture.signal
-    low, high = signal_extent(PhotonBudget(), scenes["car"]())
-    assert (signal[signal > 0].min(), signal.max()) == pytest.approx((low, high), rel=1e-4)
+    extent, _ = flux_extents(PhotonBudget(), scenes["car"]())
+    assert (signal[signal > 0].min(), signal.max()) == pytest.approx(extent, rel=1e-4)
     (shown,) = (row for row in rows_of(layout, "Steps") if row["name"] == "Signal")
     assert shown["note"] == "S = η · M"
     assert shown["cells"][0][1:] == (pytest.approx(found["S"]), "per pulse")

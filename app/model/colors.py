@@ -68,13 +68,13 @@ def unseen(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
 
 
 DOUBTED = ("Estimate", "Error", "Confidence")
-"""Kinds of images that a model which does not describe the capture affects."""
+"""Kinds of images that are affected if the model does not describe the capture."""
 
 
 def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> str:
-    """Return why pixels of an image (row, col) of a kind of `map_of` are blank, or grey.
+    """Return why pixels of an image (row, col) of a kind of `map_of` are blank or grey.
 
-    Also the `doubt` about the confidences of `DOUBTED`. Of p-values, how many are small, and
+    For `DOUBTED` kinds, also the `doubt` about confidences; for p-values, how many are small, and
     whether the model fits the capture.
 
     Parameters
@@ -182,32 +182,41 @@ def color_values(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, Co
     return image_of(answer, "Estimate" if kind == "Range" else kind, viewing)
 
 
-def cloud_of(
-    answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE
-) -> tuple[pv.PolyData, NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Return the points inside a box, their colours, and which are wrong; None without a truth."""
-    visible = shown(answer, viewing.least_confidence, box)
+class ColoredCloud(NamedTuple):
+    """The shown points of an estimate."""
+
+    points: pv.PolyData
+    rgb: NDArray[np.uint8]
+    """Shape (point, 3)."""
+    wrong: NDArray[np.bool_] | None
+    """Shape (point,); None without a truth."""
+    unseen: Unseen
+    """Estimates inside the box that are hidden, and points that are grey."""
+
+
+def cloud_of(answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE) -> ColoredCloud:
+    """Return the confident points inside a box, with their colours."""
+    image = answer.run.image
+    inside, visible = (shown(answer, least, box) for least in (0.0, viewing.least_confidence))
     values, look = color_values(answer, kind, viewing)
     angle_rad = pixel_angle_of(answer.field_of_view_deg(viewing), answer.capture.shape[1])
-    range_m = np.where(visible, answer.run.image.range_m, np.nan)
+    range_m = np.where(visible, image.range_m, np.nan)
     wrong = is_wrong(answer)
-    return (
-        point_cloud(range_m, angle_rad, confidence=answer.run.image.confidence),
+    return ColoredCloud(
+        point_cloud(range_m, angle_rad, confidence=image.confidence),
         look.rgb(values[visible]),
         None if wrong is None else wrong[visible],
+        Unseen(n_hidden=int((inside & ~visible).sum()), n_outside=look.n_outside(values[visible])),
     )
 
 
-def cloud_legend(answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE) -> str:
-    """Return which estimates the cloud of `cloud_of` hides, and which of its points are grey."""
-    values, look = color_values(answer, kind, viewing)
-    n_hidden = n_below(answer, viewing.least_confidence)
-    n_outside = look.n_outside(values[shown(answer, viewing.least_confidence, box)])
+def cloud_legend(unseen: Unseen, least_confidence: float) -> str:
+    """Return which estimates a cloud hides, and which of its points are grey."""
     sentences = []
-    if n_hidden:
-        sentences.append(f"Hidden: {n_hidden:,} below confidence {viewing.least_confidence:g}.")
-    if n_outside:
-        sentences.append(f"Grey: {n_outside:,} beyond the colours.")
+    if unseen.n_hidden:
+        sentences.append(f"Hidden: {unseen.n_hidden:,} below confidence {least_confidence:g}.")
+    if unseen.n_outside:
+        sentences.append(f"Grey: {unseen.n_outside:,} beyond the colour scale.")
     return " ".join(sentences)
 
 

@@ -349,7 +349,7 @@ def cloud_files(answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE) -
 
 def _cloud(answer: Answer, kind: str, viewing: Viewing, box: Box, remark: str) -> Product:
     """Return the pixels inside a box with their intervals and an image of their colours."""
-    cloud, rgb, wrong = cloud_of(answer, kind, viewing, box)
+    cloud, rgb, wrong, _ = cloud_of(answer, kind, viewing, box)
     rgb = rgb.copy()
     if wrong is not None:
         rgb[wrong] = tuple(bytes.fromhex(WRONG_COLOR[1:]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from app.model.store import Answer
 from core import Pulse
@@ -12,8 +13,8 @@ from core.io import ReadOptions
 def options_in_use(answer: Answer) -> dict[str, str]:
     """Return the options that describe a capture as text, whether stated by its file or guessed."""
     capture, acquisition = answer.whole, answer.whole.acquisition
-    used = ReadOptions(
-        **capture.guesses,
+    used = replace(
+        ReadOptions(**capture.guesses),
         bin_width_s=acquisition.bin_width_s,
         gate_delay_s=acquisition.gate_delay_s,
         n_bins=acquisition.n_bins,

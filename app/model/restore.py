@@ -20,6 +20,7 @@ from app.model.store import (
     compute,
     is_ambiguous,
 )
+from core import CaptureError
 
 log = logging.getLogger(__name__)
 
@@ -69,9 +70,10 @@ def still_refused(
 
 
 def _report(error: Exception, link: Link) -> None:
-    """Describe why a link could not be restored, unless the page asks for an array instead."""
+    """Add to a link why it could not be restored, unless the page asks which array to read."""
     if not is_ambiguous(error):
-        log.warning("could not restore the link", exc_info=error)
+        unforeseen = None if isinstance(error, CaptureError) else error
+        log.warning("could not restore the link: %s", error, exc_info=unforeseen)
         why = text.reason(error)
         link.refused += [] if why in link.refused else [why]
 

@@ -124,8 +124,8 @@ def scene_source(title: str, name: str, **arguments: Any) -> Source:
 def simulated(request: Request) -> Capture:
     """Return a capture of the scene of a request, which its source names."""
     scene, light = request.scene, request.illumination
-    made = simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=light.seed)
-    return replace(made, source=f"{request.source.name}, {made.source}")
+    acquisition, name = light.acquisition(scene.acquisition), request.source.name
+    return simulate(scene, acquisition, light.flux, seed=light.seed, name=name)
 
 
 def file_source(

@@ -46,8 +46,8 @@ RANGE_HELP = (
 )
 
 ESTIMATE_HELP = (
-    "Of the method, lag removed. It may lie outside the intervals: they are those of the surface, "
-    "whatever the method."
+    "Estimate of the method, corrected for its lag. It may lie outside the intervals, which "
+    "describe the surface whatever the method."
 )
 
 PER_PULSE, PER_PIXEL = "PPP", "Photons per pixel"
@@ -132,10 +132,10 @@ def refusal(refused: Refused) -> str:
     return refused.question or refused.why
 
 
-def unfinished(error: Exception) -> str:
-    """Return why long work ended, and what to do."""
+def unfinished(error: Exception, button: str) -> str:
+    """Return why long work ended, and what to do; `button` starts it."""
     return (
-        f"{reason(error)} Results computed before that are kept. Press Compute to run it again; if "
+        f"{reason(error)} Results shown before that are kept. Press “{button}” to run it again; if "
         "it fails again, reduce the settings, or choose another scene."
     )
 
@@ -243,8 +243,8 @@ def source_is_gone(key: str, known: Iterable[str]) -> str:
     name = key.partition("~")[0]
     if any(each.startswith(f"{name}~") for each in known):
         return (
-            f"The link is not to the {name[:40]!r} here: its content is another, or not stated. "
-            "Choose this one in the list, or open the other."
+            f"The link is to another {name[:40]!r} than the one here, or does not state which. "
+            "Choose the one here in the list, or open the other."
         )
     return (
         f"There is no scene or capture {key[:40]!r} here. Uploaded files are removed when no page "

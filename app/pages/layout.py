@@ -30,7 +30,7 @@ from app.model.watched import Arrival
 from app.pages.catalog import PAGES
 from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
-from app.pages.shared.downloads import explored
+from app.pages.shared.downloads import explored, viewed
 from app.pages.shared.illumination import IlluminationPanel
 from app.pages.shared.method import MethodChoice
 from app.pages.shared.photon_budget import PhotonBudgetForm
@@ -423,15 +423,14 @@ class Layout:
         self.pages.choice.link(state, value="page", bidirectional=True)
         self.pages.choice.param.watch(lambda *_: self._fit_sidebar(), "value")
         self._fit_sidebar()
+        state.param.watch(lambda *_: self._describe_print(), ["page", "viewing"])
         state.param.watch(lambda *_: self._follow_unit(), "unit")
         state.param.watch(lambda *_: self._show_bars(), ["page", "present"])
         self._tour.param.watch(lambda _: setattr(state, "page", LEARN), "finished")
         self._show_bars()
-        self.page.link(self._link, dark_theme="dark")
-        self._link.dark = self.page.dark_theme
-        self.page.param.watch(lambda event: self.pages.paint(event.new), "dark_theme")
+        self.page.param.watch(lambda _: self._paint(), "dark_theme")
         if self.page.dark_theme:  # by its address
-            self.pages.paint(True)
+            self._paint()
         if self._arrivals is not None:
             self._arrivals.subscribe(self._hear_of)
         if tasks.is_served:
@@ -447,7 +446,6 @@ class Layout:
         for each, content in self._shared.items():
             is_other = each is Shared.TRACKING and shows_other
             content.visible = each in page.shared and not is_other
-        self._describe_print()
         if page.is_standalone == self._provenance.visible:
             self._provenance.visible = not page.is_standalone
             self.page.sidebar_open = not (page.is_standalone or self.page.is_narrow)
@@ -462,8 +460,14 @@ class Layout:
     def _describe_print(self) -> None:
         """State on the printed page what is behind the estimate, where it shows one."""
         shows_one = Shared.METHOD in self._pages[self.pages.choice.value].shared
-        about = explored(self.session).about("printed page") if shows_one else ""
-        self._printed.text = about[:2000]
+        session = self.session
+        subject = viewed(session, explored(session), session.state.viewing)
+        self._printed.text = subject.about("printed page")[:2000] if shows_one else ""
+
+    def _paint(self) -> None:
+        """Change between light and dark mode, which the address keeps."""
+        is_dark = self._link.dark = self.page.dark_theme
+        self.pages.paint(is_dark)
 
     def _show_failure(self, sentence: str) -> None:
         self.alert.text = sentence[:2000]
@@ -483,6 +487,7 @@ class Layout:
         self._budget.refresh()
         self._panels["tracking"].mark_doubts(doubts_hold(answer.capture))
         self._fit_sidebar()
+        self._describe_print()
         self._show_settings()
         self._panels["tracking"].controls["t_n"].high = max(
             answer.capture.acquisition.n_bins - 1, 1

@@ -30,7 +30,7 @@ STAGES_TITLE = "Residual, and enhanced"
 COUNTS_TITLES = {True: "Counts, and the two scales that follow them", False: "Counts"}
 """Titles with and without the scales."""
 FIT_TITLE = "Counts, and those that the model expects"
-EVIDENCE_TITLE = "Where the surface is: by the pixel, its neighbours, and both"
+EVIDENCE_TITLE = "Probability of the surface from the pixel, its neighbours and both"
 RESIDUAL_TITLE = "Residuals: counts minus expected ones"
 FIT_COLUMNS = ("bin", "fit", "low", "high")
 CANDIDATE_HEIGHT = 0.05
@@ -132,7 +132,7 @@ def score(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
 
 
 def evidence(bins: Range1d, marks: Mapping[str, ColumnDataSource]) -> Any:
-    """Plot where the surface is by the pixel alone, by its neighbours, and by both."""
+    """Plot the probability of the surface from a pixel alone, from its neighbours, and both."""
     drawing = _over_the_gate(EVIDENCE_TITLE, "Probability per bin", bins)
     source = empty("bin", "alone", "neighbours", "posterior")
     _line(drawing, source, "alone")

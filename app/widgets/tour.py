@@ -46,8 +46,9 @@ STOPS = (
     Stop(
         (f".{ESTIMATE}",),
         "The estimate",
-        "The method turns the histogram into a curve. Its maximum, less a known lag, is the "
-        "estimate, the solid vertical line. The dashed one is the truth, which a simulation knows.",
+        "The method turns the histogram into a curve. Its maximum, corrected for a known lag, "
+        "is the estimate, the solid vertical line. The dashed one is the truth, which a "
+        "simulation knows.",
     ),
     Stop(
         (f".{CONFIDENCE}",),
@@ -66,7 +67,7 @@ class Tour(Component):
 
     stops = param.List(default=[list(each) for each in STOPS], doc="Selectors, title and text.")
     shown_with = param.String(default=f".{PIXEL}", doc="Selector of what is on this page alone.")
-    onward = param.String(default="Lesson 1", doc="Label of the button after the last stop.")
+    onward = param.String(default="Lessons", doc="Label of the button after the last stop.")
     is_offered = param.Boolean(default=False, doc="Whether it starts by itself the first time.")
     started = param.Integer(default=0, doc="Number of times that it was asked for.")
     finished = param.Integer(default=0, doc="Number of times that the button `onward` was pressed.")

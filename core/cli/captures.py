@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -80,7 +80,7 @@ from core.pipeline import figures_of, run
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.tracking import PRESETS
-from core.tuning import tuned
+from core.tuning import is_tunable, tuned
 
 _CONFIDENT = 0.9
 _MAX_REPORTED = 2**27  # counts; a report on more takes minutes
@@ -292,7 +292,7 @@ def _add_estimate(commands: Any) -> None:
             "--scheduler", help="address of a Dask cluster to use, such as tcp://host:8786"
         )
         _add_json(method)
-        if not estimator.knows_flux and fields(estimator.parameters):
+        if is_tunable(name):
             method.add_argument("--tuned", action="store_true", help=_TUNED_HELP)
         method.set_defaults(tuned=False)
         add_settings(method, estimator.parameters)
@@ -307,8 +307,8 @@ def _estimate(chosen: argparse.Namespace) -> None:
     colors, box = colors_given(chosen), crop_given(chosen)
     in_tiles = chosen.scheduler or _exceeds_memory(chosen)
     if chosen.tuned and (in_tiles or settings != type(settings)()):
-        why = "a capture that fits into memory" if in_tiles else "no settings beside it"
-        raise ValueError(f"tuned needs {why}.")
+        why = "a capture larger than memory" if in_tiles else "other settings"
+        raise ValueError(f"--tuned cannot be combined with {why}.")
     if in_tiles:
         refuse_further_values(chosen.intervals, chosen.fit)
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)

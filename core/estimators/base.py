@@ -209,18 +209,18 @@ NULL_SIDE = 256
 
 
 class Evidence(NamedTuple):
-    """Where the surface of a pixel is, by itself and by its neighbours.
+    """Probability of a surface in each bin of a pixel, from its own counts and its neighbours.
 
-    Probability of a surface in each bin, of shape (bin,); its sum is that of a surface at all. The
-    posterior is proportional to the product of the others over the prior.
+    Each has the shape (bin,); its sum is the probability of a surface at all. The posterior is
+    proportional to the product of the others over the prior.
     """
 
     alone: Floats
-    """By the pixel alone."""
+    """From the pixel alone."""
     neighbours: Floats
-    """By its neighbours alone."""
+    """From its neighbours alone."""
     posterior: Floats
-    """By both."""
+    """From both."""
 
 
 class Calibration(NamedTuple):
@@ -281,7 +281,7 @@ class Estimator:
         a posterior of the estimator's own instead of `core.inference.posterior`.
     evidence : callable, optional
         ``(capture, flux_model, row, col) -> Evidence``, or None where neighbours have no
-        influence: what the posterior of a pixel is made of.
+        influence: the parts of a pixel's posterior.
     """
 
     title: str
@@ -398,7 +398,7 @@ class Estimator:
         return np.asarray(self.curve(one, conditions, parameters)[0, 0])
 
     def evidence_at(self, capture: Capture, row: int, col: int) -> Evidence | None:
-        """Return what neighbours add to a pixel; None for a method of single pixels."""
+        """Return the evidence of a pixel and its neighbours; None for methods of single pixels."""
         if self.evidence is None:
             return None
         return self.evidence(capture, self.flux_model(capture), row, col)

@@ -218,7 +218,8 @@ def _evidence(capture: Capture, flux: FluxModel, row: int, col: int) -> Evidence
     prior, found = Prior.of(own), image_posterior_of(capture, flux)
     alone = _with_nothing(*states_of_pixels(merged, own, np.array([row * merged.shape[1] + col])))
     posterior = np.append(found.by_bin[row, col].astype(float), 1 - found.surface[row, col])
-    neighbours = posterior / alone * np.append(prior.surface, prior.nothing)
+    message = posterior / np.maximum(alone, np.finfo(np.float32).tiny)  # 0 is an underflow
+    neighbours = message * np.append(prior.surface, prior.nothing)
     by_bin = np.zeros((3, capture.acquisition.n_bins))
     for filled, states in zip(by_bin, (alone, neighbours, posterior), strict=True):
         each = np.repeat(states[:-1] / (factor * states.sum()), factor)

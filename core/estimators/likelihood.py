@@ -56,7 +56,7 @@ def locate(
 ) -> tuple[Floats, Floats]:
     """Return the delay by the rule and the largest log likelihood ratio.
 
-    The rules "density" and "window" answer with a peak, which bright echoes resolve in finer steps.
+    The rules "density" and "window" return a peak; for bright echoes it is refined in finer steps.
     """
     if parameters.depths == "alike":
         flux = replace(flux, depth=np.ones_like(flux.depth))

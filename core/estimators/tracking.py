@@ -11,7 +11,6 @@ from core.capture import Capture
 from core.estimators.base import Estimator
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
-from core.inference.posterior import same_echo_bins
 from core.inference.refinement import refined
 from core.tracking import TrackingParameters, track, tracking_signals
 
@@ -30,9 +29,7 @@ def _curve(histogram: Floats, conditions: Conditions, parameters: TrackingParame
 def _refine(
     capture: Capture, flux: FluxModel, delay_bin: Floats, parameters: TrackingParameters
 ) -> Floats:
-    if parameters.refine == "none":
-        return delay_bin
-    return refined(capture, flux, delay_bin, same_echo_bins(capture))
+    return refined(capture, flux, delay_bin) if parameters.refine == "likelihood" else delay_bin
 
 
 ESTIMATOR = Estimator(

@@ -41,7 +41,7 @@ _MOST_ZOOMS = 12
 _LEVEL_ERROR = LEVEL_SPAN ** (0.5 / (LEVELS - 1)) - 1  # relative, of half a step between levels
 _FITTING_STEPS = 5
 _N_FITTED = 3  # delay, signal and background
-_CLEAR_DEVIATIONS = 5.0  # of the dispersion of the counts, beyond which it is no chance
+_CLEAR_DEVIATIONS = 5.0  # of the dispersion of the counts, beyond which it is hardly chance
 _TAIL = 1e-6  # share of the photons of an echo that is left out on either side
 _AT_ONCE = 2**17  # numbers that fit in the cache
 
@@ -145,11 +145,13 @@ def _quantiles_bins(
     delay = _nodes(low, high, _COARSE_NODES)
     best = np.argmax(_log_density(window, delay), axis=1)[:, np.newaxis]
     window = _fitted(window, np.take_along_axis(delay, best, axis=1))
-    delay, density = _zoomed(window, low, high, 1.0)
+    delay, density = _zoomed(window, low, high)
     best = np.argmax(density, axis=1)[:, np.newaxis]
     dispersion = _dispersion(window, np.take_along_axis(delay, best, axis=1))
-    if (dispersion > 1).any():
-        delay, density = _zoomed(window, low, high, dispersion)
+    wide = dispersion[:, 0] > 1
+    if wide.any():
+        found = _zoomed(window.some(wide), low[wide], high[wide], dispersion[wide])
+        delay[wide], density[wide] = found
     # Cumulative density by trapezoids, relative to the whole: the steps of a pixel are equal.
     mass = np.zeros_like(density)
     np.cumsum((density[:, 1:] + density[:, :-1]) / 2, axis=1, out=mass[:, 1:])
@@ -190,6 +192,14 @@ class _Window(NamedTuple):
     """Logarithm of the prior probability of the level, likewise."""
     depth: Floats
     """`FluxModel.depth`."""
+
+    def some(self, pixels: NDArray[np.bool_]) -> _Window:
+        """Return the window of some pixels."""
+        of_pixels = {name: getattr(self, name)[pixels] for name in ("edges", "fired", "unfired")}
+        of_levels = {
+            name: getattr(self, name)[:, pixels] for name in ("signal", "background", "log_weight")
+        }
+        return self._replace(**of_pixels, **of_levels)
 
 
 def _n_window_bins(capture: Capture) -> int:
@@ -261,14 +271,11 @@ def _dispersion(window: _Window, delay: Floats) -> Floats:
         expected, variance = armed * fires, armed * fires * (1 - fires)
     else:
         expected = variance = unfired * rate
-    is_seen = variance > 0
-    squares = (fired - expected) ** 2 / np.where(is_seen, variance, 1.0)
+    is_seen, floored = variance > 0, np.maximum(variance, 1.0)  # one count contradicts no model
     n_free = np.maximum(is_seen.sum(axis=-1) - _N_FITTED, 1)
-    dispersion = (squares * is_seen).sum(axis=-1) / n_free
-    # A squared deviation of mean μ in its variance has the variance 2 + 1 / μ.
-    chance = (
-        np.sqrt((2.0 * is_seen + is_seen / np.where(is_seen, variance, 1.0)).sum(axis=-1)) / n_free
-    )
+    dispersion = (is_seen * (fired - expected) ** 2 / floored).sum(axis=-1) / n_free
+    # The squared deviation of a count of mean μ, in units of μ, has the variance 2 + 1 / μ.
+    chance = np.sqrt((is_seen * (2.0 + 1.0 / floored)).sum(axis=-1)) / n_free
     dispersion = np.where(dispersion > 1 + _CLEAR_DEVIATIONS * chance, dispersion, 1.0)
     return np.asarray(dispersion.min(axis=0)[:, np.newaxis])
 
@@ -328,13 +335,15 @@ def _nodes(low: Floats, high: Floats, n_nodes: int) -> Floats:
 
 
 def _zoomed(
-    window: _Window, low: Floats, high: Floats, dispersion: Floats | float
+    window: _Window, low: Floats, high: Floats, dispersion: Floats | None = None
 ) -> tuple[Floats, Floats]:
     """Delays between limits (pixel,) that matter, and their relative densities, (pixel, node)."""
     for _ in range(_MOST_ZOOMS):
         delay = _nodes(low, high, _NODES)
         log = _log_density(window, delay)
-        log = (log - log.max(axis=1, keepdims=True)) / dispersion
+        log -= log.max(axis=1, keepdims=True)
+        if dispersion is not None:
+            log /= dispersion
         inside = log > -_DROP
         first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
         last = np.minimum(_NODES - np.argmax(inside[:, ::-1], axis=1), _NODES - 1)

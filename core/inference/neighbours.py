@@ -55,6 +55,18 @@ Patch = tuple[slice, slice]
 """Rows and columns of an image."""
 
 
+def random_patches(shape: tuple[int, ...], most_pixels: int, side: int) -> list[Patch]:
+    """Return places of patches of an image (row, col, ...), the same ones at each call.
+
+    At least one, and as many as hold `most_pixels`, of at most `side` rows and columns.
+    """
+    high, wide = min(side, shape[0]), min(side, shape[1])
+    n_patches = max(1, most_pixels // (high * wide))
+    last = (shape[0] - high + 1, shape[1] - wide + 1)
+    corners = np.random.default_rng(0).integers(last, size=(n_patches, 2)).tolist()
+    return [(slice(top, top + high), slice(left, left + wide)) for top, left in corners]
+
+
 def widened(here: Patch, margin: int) -> tuple[Patch, Patch]:
     """Return a patch with a margin, clipped to the image, and the position of `here` in it."""
     first = [max(part.start - margin, 0) for part in here]

@@ -7,6 +7,7 @@ import numpy as np
 from core.acquisition import Floats
 from core.capture import Capture
 from core.inference.flux_model import FluxModel
+from core.inference.posterior import same_echo_bins
 from core.kernels.blocks import LANES
 from core.kernels.parallel import entering
 from core.kernels.refinement import refine_delays
@@ -16,14 +17,15 @@ FINE_STEPS_PER_BIN = 8
 SHARP_BINS = 0.15
 """Standard deviation of a delay below which the error of a parabola between steps matters."""
 
-FEWEST = 1 / 3  # Cramér-Rao bound of a gamma pulse's delay, over its variance, for one photon
+FEWEST = 1 / 3
+"""Variance of the delay of a gamma pulse from one photon in bins, over that of the pulse, about."""
 
 
-def refined(capture: Capture, flux: FluxModel, delay_bin: Floats, reach: int) -> Floats:
+def refined(capture: Capture, flux: FluxModel, delay_bin: Floats) -> Floats:
     """Move delays to the largest likelihood of the same echo.
 
     The likelihood ``T(d)`` of `core.inference.likelihood` with the typical fluxes of each pixel is
-    computed at four delays in each bin, those less than `reach` bins away; a parabola refines
+    computed at four delays in each bin, those less than `same_echo_bins` away; a parabola refines
     between them. From an end of this window the search goes on as long as the likelihood
     increases, since an estimator may find only the flank of an echo. Bright echoes are then
     `sharpened`.
@@ -34,14 +36,13 @@ def refined(capture: Capture, flux: FluxModel, delay_bin: Floats, reach: int) ->
     flux : FluxModel
     delay_bin : ndarray, shape (row, col)
         In fractional bins; NaN remains.
-    reach : int
-        In bins.
 
     Returns
     -------
     ndarray, shape (row, col)
     """
-    delay, _ = _moved(capture, flux, flux.typical_signal, delay_bin, STEPS_PER_BIN, reach)
+    signal, reach = flux.typical_signal, same_echo_bins(capture)
+    delay, _ = _moved(capture, flux, signal, delay_bin, STEPS_PER_BIN, reach)
     return sharpened(capture, flux, delay)
 
 

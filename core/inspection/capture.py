@@ -163,8 +163,9 @@ def suggestion(capture: Capture) -> Suggestion:
         return Suggestion((0, n_bins), why, t_n, f"The differentiators need {t_n} bins to settle.")
     lag = lag_bins(capture, "tracking", TrackingParameters())
     echo, tap = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s, 0.5)
-    between = f"in bins {echoes.first:.0f} to {echoes.last:.0f}"
-    where = f"The {echoes.n_found:,} confident estimates lie {between}"
+    ends = f"{echoes.first:.0f}", f"{echoes.last:.0f}"
+    bins = f"bin {ends[0]}" if ends[0] == ends[1] else f"bins {ends[0]} to {ends[1]}"
+    where = f"The {echoes.n_found:,} confident estimates lie in {bins}"
     end = min(math.ceil(echoes.last) + tap + echo.size + _MARGIN_BINS, n_bins)
     if capture.gated_pulses is not None:
         # A cut in front loses pulses, a different number in each pixel.

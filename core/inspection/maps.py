@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy  # loads a submodule when it is first used
 from numba import njit, prange
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.inference.fit import fit_p_values
-from core.inference.posterior import posterior_of
+from core.inference.posterior import TOLERANCE_BINS, posterior_of
 from core.kernels.parallel import PARALLEL, entering
 
 
@@ -30,9 +31,14 @@ def share_fired(capture: Capture) -> Floats:
 
 @cached_per_capture
 def likeliest(capture: Capture) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Bin with the highest probability of a surface within 3 bins, and that probability."""
+    """Most probable bin of a surface, and the probability of a surface within 3 bins of it.
+
+    Around a clear echo that probability is equal in seven bins, of which this is the middle.
+    """
     probability = posterior_of(capture).tolerance_probability
-    delay = probability.argmax(axis=2)
+    size = 2 * TOLERANCE_BINS + 1
+    sums = scipy.ndimage.uniform_filter1d(probability, size, axis=2, mode="constant")
+    delay = sums.argmax(axis=2)
     return delay, np.take_along_axis(probability, delay[..., np.newaxis], axis=2)[..., 0]
 
 

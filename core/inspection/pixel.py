@@ -78,8 +78,8 @@ class PixelReport(OldFluxNames):
     curve: Floats
     """Score of each bin, not corrected for the lag, shape (bin,)."""
     evidence: Evidence | None
-    """What the pixel and its neighbours tell by the method "image_posterior"; None for methods of
-    single pixels, and where neighbours have no influence."""
+    """Evidence of the pixel and of its neighbours, for the method "image_posterior"; None for
+    methods of single pixels, and where neighbours have no influence."""
     lag_bins: float
     """Distance from the delay of the surface to the maximum of the score."""
     answer_bin: float

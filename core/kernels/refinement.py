@@ -129,7 +129,9 @@ def refine_delays(  # type: ignore[no-untyped-def]
             if math.isnan(delay[b, i]):
                 continue
             is_own, here = math.isnan(signal[b, i]), signal[b, i]
-            for _ in range(FITTING_ROUNDS if is_own else 1):
+            rounds = FITTING_ROUNDS if is_own else 1
+            while rounds > 0:
+                rounds -= 1
                 highest, is_highest = -math.inf, False
                 while not is_highest:
                     first = min(int(delay[b, i]), n_bins - 1) - reach
@@ -138,6 +140,7 @@ def refine_delays(  # type: ignore[no-untyped-def]
                     if is_own:
                         here, counts = _signal_in(background[b, i], n_pulses > 0, fired, unfired)
                         if counts * abs(counts) < fewest * fired.sum():
+                            rounds = 0
                             break
                         sample = echo[min(max(round(at), 0), n_delays - 1) :: steps][: fired.size]
                         here = _fitted_signal(

@@ -524,14 +524,15 @@ def _number(value: float, text: str = "") -> str:
         return "∞" if value > 0 else "−∞"
     if not text and abs(value) >= 1000:
         text = f"{value if isinstance(value, int) else float(f'{value:.4g}'):,.0f}"
-    return f'<data value="{value}">{typeset(text or format(value, ".4g"))}</data>'
+    return f'<data value="{value}">{_text(text) or typeset(f"{value:.4g}")}</data>'
 
 
 def _metres(value_m: float, capture: Capture, decimals: int | None = None) -> str:
     """Return a range, by default with the decimals that resolve a hundredth of a bin."""
     if decimals is None:
         decimals = max(0, 2 - math.floor(math.log10(capture.acquisition.bin_length_m)))
-    return "–" if math.isnan(value_m) else f"{_number(value_m, f'{value_m:,.{decimals}f}')}\u00a0m"
+    text = typeset(f"{value_m:,.{decimals}f}")
+    return "–" if math.isnan(value_m) else f"{_number(value_m, text)}\u00a0m"
 
 
 def _between(interval: Interval, capture: Capture, decimals: int | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from core.photon_budget import PhotonBudget, Reach, background_extent, signal_extent, steps
+from core.photon_budget import PhotonBudget, Reach, flux_extents, steps
 from core.scene import Scene
 from core.studies.outputs import Table, table
 
@@ -18,7 +18,7 @@ NEEDED_NOTE = (
 
 def steps_table(budget: PhotonBudget, scene: Scene, name: str) -> Table:
     """Return one row per step of the photon budget of a scene that `name` names."""
-    low, high = signal_extent(budget, scene)
+    (low, high), background = flux_extents(budget, scene)
     return table(
         "budget",
         f"Photon budget of {name}",
@@ -33,17 +33,17 @@ def steps_table(budget: PhotonBudget, scene: Scene, name: str) -> Table:
         "What is given is a setting; h and c are Planck's constant and the speed of light. Signal "
         "and background are those of a surface at the range R with the reflectivity ρ. Nearer "
         f"and brighter pixels get more signal: {low:.3g} to {high:.3g} per pulse. "
-        f"{background_note(budget, scene)}",
+        f"{background_note(*background)}",
         {"value": ".4g"},
     )
 
 
-def background_note(budget: PhotonBudget, scene: Scene) -> str:
-    """Return a sentence on the background of the pixels."""
-    low, high = background_extent(budget, scene)
-    if low == high:
-        return f"The background is {low:.3g} in all pixels."
-    return f"The background is {low:.3g} to {high:.3g}: bright surfaces reflect more sunlight."
+def background_note(low: float, high: float) -> str:
+    """Return a sentence on the background of the pixels, from its extent per pulse."""
+    least, most = f"{low:.3g}", f"{high:.3g}"
+    if least == most:
+        return f"The background is {least} in all pixels."
+    return f"The background is {least} to {most}: bright surfaces reflect more sunlight."
 
 
 def needed_table(found: Sequence[Reach], target_rd: float) -> Table:

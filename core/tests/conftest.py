@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 from collections.abc import Callable, Generator, Iterator
@@ -87,7 +88,10 @@ def matplotlib_uncounted() -> Iterator[None]:
         try:
             savefig(*arguments, **options)
         finally:
-            sys._getframe().f_trace = tracer  # which otherwise misses the return from here
+            # Python calls a tracer on the return of a frame only if the frame has one, too.
+            frame = inspect.currentframe()
+            assert frame is not None
+            frame.f_trace = tracer
             sys.settrace(tracer)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -102,7 +102,8 @@ def test_papers_pulse_peaks_at_tau_and_is_as_wide_as_stated() -> None:
     share = Pulse(1e-9).bin_probability(0.0, 6000, 1e-12)
     assert abs(share.argmax() - 1000) <= 1
     above = np.flatnonzero(share >= share.max() / 2)
-    assert (above[-1] - above[0]) / 1000 == pytest.approx(2.446, abs=0.002)  # the grid is .001
+    # Each of the two ends is known to a bin of .001.
+    assert (above[-1] - above[0]) / 1000 == pytest.approx(2.446, abs=0.002)
 
 
 @any_pulse
@@ -116,7 +117,8 @@ def test_quantiles_are_when_a_share_has_arrived(pulse: Pulse, share: float) -> N
 @any_pulse
 def test_the_standard_deviation_is_that_of_the_photons(pulse: Pulse) -> None:
     times_s = [pulse.quantile_s(share) for share in (np.arange(1000) + 0.5) / 1000]
-    assert pulse.sigma_s == pytest.approx(np.std(times_s), rel=0.01)
+    # The middle of the last thousandth leaves out the tail beyond: 0.2 % of a gamma pulse's.
+    assert pulse.sigma_s == pytest.approx(np.std(times_s), rel=0.003)
 
 
 def test_quantiles_know_where_time_zero_lies() -> None:

@@ -8,15 +8,20 @@ import numba
 import numpy as np
 import pytest
 
-from core.acquisition import Pulse
+from core.acquisition import Acquisition, Flux, Pulse
+from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
 from core.estimators.image_model import Prior, image_model_of, merged_bins, merged_flux
 from core.estimators.image_posterior import Link, planes
+from core.inference.flux_model import FluxModel
 from core.inspection import pixel_report
 from core.kernels.messages import fill_posterior
 from core.metrics import calibration_error, reliability, restoration_degree
+from core.scene import scenes
+from core.simulation import simulate
 from core.studies.trials import Condition
-from core.tests.twins import posterior_of_chain
+from core.tests.twins import log_likelihood, posterior_of_chain
+from core.trigger import rate_per_bin
 
 ALIKE, SCALE = 0.7, 0.4
 
@@ -120,38 +125,76 @@ def test_the_sky_is_empty_if_empty_pixels_are_allowed() -> None:
     assert some[~is_sky].mean() > 0.85
 
 
+evidence_at = ESTIMATORS["image_posterior"].evidence_at
+
+
+def alone(capture: Capture, flux: FluxModel, row: int, col: int) -> np.ndarray:
+    """Probability of a surface in each bin from the counts of one pixel, with any signal level."""
+    acquisition, n_bins = capture.acquisition, capture.acquisition.n_bins
+    counts, nothing = capture.cube[row, col].astype(float), Prior.of(flux).nothing
+    center = np.arange(n_bins) + 0.5
+    echo = rate_per_bin(center, np.ones(n_bins), 0.0, capture.pulse, acquisition)
+    dark = flux.relative_background / n_bins
+    levels = zip(flux.signal[:, row, col], flux.background[:, row, col], strict=True)
+    log = [log_likelihood(counts, s * echo + b * dark, capture.gated_pulses) for s, b in levels]
+    likelihood = np.exp(np.array(log) - np.max(log))
+    surface = flux.depth / n_bins * (flux.share[1:] @ likelihood[1:])
+    return np.asarray(surface / (surface.sum() + nothing * likelihood[0, 0]))
+
+
 @pytest.mark.compiled
 @pytest.mark.parametrize("sigma_s", [1e-9, 6e-9])  # of the second, bins are merged
-def test_a_posterior_is_made_of_the_pixel_and_its_neighbours(sigma_s: float) -> None:
-    condition = Condition("piecewise", 0.03)
-    capture = replace(condition.capture(900), pulse=Pulse(sigma_s))
-    image = estimate(capture, "image_posterior", pixels="allow empty pixels")
-    flux = image_model_of(capture)
-    assert flux.agreement.alike > 0
-    row, col = np.argwhere(image.confidence > 0.9)[0]
-    alone, neighbours, posterior = ESTIMATORS["image_posterior"].evidence_at(capture, row, col)
-    for each in (alone, neighbours, posterior):
-        assert each.shape == (capture.acquisition.n_bins,) and 0 < each.sum() < 1 + 1e-6
-    _, factor = merged_bins(capture)
+def test_the_evidence_of_a_pixel_alone_is_its_likelihood(sigma_s: float) -> None:
+    capture = replace(Condition("piecewise", 0.03).capture(900), pulse=Pulse(sigma_s))
+    merged, factor = merged_bins(capture)
     assert (factor > 1) == (sigma_s > 5e-9)
-    product = alone * neighbours / np.repeat(Prior.of(merged_flux(flux, factor)).surface, factor)
-    np.testing.assert_allclose(product / product.sum(), posterior / posterior.sum(), 1e-3, 1e-6)
-    assert abs(np.argmax(posterior) + 0.5 - image.bin[row, col]) < 3
-    report = pixel_report(capture, image, int(row), int(col), "image_posterior")
-    np.testing.assert_array_equal(report.evidence.posterior, posterior)
-    assert report.candidates[0].bin == image.bin[row, col]
-    assert report.candidates[0].probability == image.confidence[row, col]
+    flux = merged_flux(image_model_of(capture), factor)
+    for row, col in ((3, 5), (40, 22)):
+        found = evidence_at(capture, row, col)
+        expected = np.repeat(alone(merged, flux, row, col) / factor, factor)
+        # Log likelihoods of 1000 pulses are rounded to float32; 0.6 % was the largest error found.
+        np.testing.assert_allclose(found.alone, expected, rtol=0.02, atol=1e-6)
+        assert found.alone.argmax() == expected.argmax()
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("sigma_s", [1e-9, 6e-9])
+def test_the_posterior_of_a_pixel_peaks_at_its_estimate(sigma_s: float) -> None:
+    capture = replace(Condition("piecewise", 0.03).capture(900), pulse=Pulse(sigma_s))
+    image = estimate(capture, "image_posterior", pixels="allow empty pixels")
+    _, factor = merged_bins(capture)
+    for row, col in np.argwhere(image.confidence > 0.9)[::500].tolist():
+        evidence = evidence_at(capture, row, col)
+        for each in evidence:
+            assert each.shape == (capture.acquisition.n_bins,)
+            assert (each >= 0).all() and 0 < each.sum() < 1 + 1e-6  # the rest is no surface
+        # The estimate is interpolated between (merged) bins.
+        assert abs(evidence.posterior.argmax() + factor / 2 - image.bin[row, col]) <= factor
+        report = pixel_report(capture, image, row, col, "image_posterior")
+        np.testing.assert_array_equal(report.evidence.posterior, evidence.posterior)
+        assert report.candidates[0].bin == image.bin[row, col]
+        assert report.candidates[0].probability == image.confidence[row, col]
 
 
 @pytest.mark.compiled
 def test_neighbours_find_what_a_pixel_alone_does_not_show() -> None:
     capture = Condition("piecewise", 0.02).capture(900)
     image = estimate(capture, "image_posterior")
-    right = np.abs(image.range_m - capture.truth_range_m) < capture.acquisition.bin_length_m
-    found = [
-        ESTIMATORS["image_posterior"].evidence_at(capture, row, col)
-        for row, col in np.argwhere(right & (image.confidence > 0.9))[:200]
-    ]
-    agree = [np.abs(each.alone.argmax() - each.posterior.argmax()) <= 1 for each in found]
-    assert len(found) == 200 and np.mean(agree) < 0.6
+    pixels = np.argwhere(image.confidence > 0.9)
+    found = [evidence_at(capture, row, col) for row, col in pixels[:: len(pixels) // 200]]
+    agree = [abs(int(each.alone.argmax() - each.neighbours.argmax())) <= 3 for each in found]
+    # These pixels alone, estimated by the likelihood, are right in two of five cases; neighbours
+    # nearly always are.
+    assert 0.2 < np.mean(agree) < 0.6
+    followed = [abs(int(each.posterior.argmax() - each.neighbours.argmax())) <= 3 for each in found]
+    assert np.mean(followed) > 0.9  # confidence above 0.9 comes from the neighbours
     assert ESTIMATORS["likelihood"].evidence_at(capture, 0, 0) is None
+
+
+@pytest.mark.compiled
+def test_the_evidence_of_bright_pixels_is_finite() -> None:
+    """That of no surface underflows in float32, both in the pixel alone and in the posterior."""
+    capture = simulate(scenes["piecewise"](32), Acquisition(), Flux(1.0, sbr=1.0), seed=1)
+    for row, col in ((0, 0), (16, 9)):
+        for each in evidence_at(capture, row, col):
+            assert np.isfinite(each).all() and each.sum() == pytest.approx(1.0)

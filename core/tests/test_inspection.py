@@ -22,6 +22,7 @@ from core.geometry import Box
 from core.inference import TOLERANCE_BINS
 from core.inference.posterior import same_echo_bins
 from core.inspection import estimate_flux, pixels_in
+from core.inspection.maps import likeliest
 from core.inspection.profile import Box as Bounds
 from core.inspection.profile import difference_of, ratio_of, zoomed
 from core.metrics import Interval, restored
@@ -629,6 +630,16 @@ def test_maps_are_of_each_pixel() -> None:
     assert inspection.maps["SBR"](capture) is inspection.maps["SBR"](capture)  # found once
 
 
+def test_the_most_probable_bin_is_that_of_the_surface() -> None:
+    """Although a surface is equally probable within 3 bins of each of seven bins."""
+    capture = simulate(random_depths(40), ACQUISITION, Flux(0.5, 3.0), seed=7)
+    delay, probability = likeliest(capture)
+    truth_bin = capture.acquisition.range_m_to_bin(np.asarray(capture.truth_range_m))
+    off = (delay + 0.5 - truth_bin)[probability > 0.999]
+    assert off.size > 0.9 * capture.counts.size
+    assert np.abs(off).max() <= 1
+
+
 def test_suggested_settings_improve_the_estimate() -> None:
     scene = scenes["building"](32)
     capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.05), seed=1)
@@ -654,7 +665,7 @@ def test_a_gate_is_cut_in_front_only_without_loss_of_pulses() -> None:
     assert 90 + 8 < first.gate[1] == photons.gate[1] < 200
     assert photons.gate[0] < photons.t_n
     assert first.t_n == photons.t_n <= 92
-    assert "64 confident estimates lie in bins 8" in first.why_gate
+    assert "64 confident estimates lie in bin 90;" in first.why_gate
 
 
 # -- fewer pulses ----------------------------------------------------------------------------------

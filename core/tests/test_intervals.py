@@ -249,22 +249,45 @@ def test_the_flux_study_has_a_row_for_each_regime_and_bin_width(
         assert all(0 <= each.low <= each.value <= each.high <= 1 for each in row[5:])
 
 
+def deviations(capture: Capture, image: RangeImage) -> np.ndarray:
+    """Distances of the truth from the middle of the 68 % interval, over half its width.
+
+    Of estimates within the tolerance whose echo the gate holds as a whole.
+    """
+    truth_m, (low_m, high_m) = capture.truth_range_m, core.range_interval(capture, image, 0.68)
+    end_m = capture.acquisition.bin_to_range_m(N_BINS - capture.echo_bins)
+    tolerance_m = TOLERANCE_BINS * capture.acquisition.bin_length_m
+    kept = (np.abs(image.range_m - truth_m) <= tolerance_m) & (truth_m < end_m)
+    return np.asarray((2 * truth_m - low_m - high_m) / (high_m - low_m))[kept]
+
+
+def is_as_wide_as_the_errors(deviation: np.ndarray) -> bool:
+    """Return whether deviations have a mean square of 1, but for chance: four deviations of it."""
+    return bool(abs((deviation**2).mean() - 1) < 4 * math.sqrt(2 / deviation.size))
+
+
 @pytest.mark.parametrize("method", ["likelihood", "tracking"])
 def test_estimates_of_bright_echoes_lie_in_their_intervals(method: str) -> None:
     """Their errors are those of the photons, and not of the steps in which they are found."""
     capture = drawn(Pulse(1e-9), 1000, signal=3.0, background=1.0)
     image = estimate(capture, method)
     right = np.abs(image.range_m - capture.truth_range_m) < capture.acquisition.bin_length_m
-    found = core.range_interval(capture, image)
-    outside = (image.range_m < found.low_m) | (image.range_m > found.high_m)
+    low_m, high_m = (each[right] for each in core.range_interval(capture, image))
+    outside = (image.range_m[right] < low_m) | (image.range_m[right] > high_m)
+    truth_m = np.asarray(capture.truth_range_m)[right]
     assert right.sum() > 80
     # It is a third of them where a parabola refines between half bins.
-    assert outside[right].mean() < 0.05
+    assert outside.mean() < 0.05
+    assert is_covered(((low_m <= truth_m) & (truth_m <= high_m)).sum(), right.sum(), 0.95)
+    assert is_as_wide_as_the_errors(deviations(capture, image))
 
 
 def test_intervals_allow_for_a_wrong_pulse() -> None:
     """Many photons do not make up for a pulse that differs from the echoes."""
     capture = replace(drawn(Pulse.gaussian(2e-9), None, signal=3.0), pulse=Pulse.gaussian(1.2e-9))
-    low, high = core.range_interval(capture, estimate(capture, "likelihood"))
+    image = estimate(capture, "likelihood")
+    low, high = core.range_interval(capture, image)
     covered = (low <= capture.truth_range_m) & (capture.truth_range_m <= high)
-    assert covered.mean() > 0.85  # .65 with the spread of the photons alone
+    # With the spread of the photons alone, 65 % were covered.
+    assert is_covered(covered.sum(), covered.size, 0.95)
+    assert is_as_wide_as_the_errors(deviations(capture, image))

@@ -82,7 +82,9 @@ def test_an_alpha_of_the_cubic_weight_moves_no_pixel() -> None:
 def test_both_scales_are_drawn_with_and_without_an_echo() -> None:
     echo, none = curves("both_scales"), curves("both_scales_without_echo")
     assert echo.keys() == none.keys()
-    assert echo["residual"][50:56].max() > 2 * none["residual"].max()
+    # The residual peaks in the echo, higher than anywhere in noise.
+    assert 50 <= echo["residual"].argmax() < 56
+    assert echo["residual"].max() > none["residual"].max()
     shares = curves("estimates_without_echo")
     assert shares["estimates, no echo"].sum() == pytest.approx(1)
     assert check("share_without_echo", first=0, end=100) == pytest.approx(1)
@@ -93,7 +95,8 @@ def test_ten_times_fewer_misses_take_less_than_ten_times_the_pulses() -> None:
     found = curves("accuracy_by_pulses")
     for name in ("theory, flux known", "likelihood"):
         assert found[name][0] < 0.5 and found[name][-1] > 0.99
-    assert 1.5 < check("pulses_ratio", share=0.99, over=0.9) < 3.2
+    # If misses fell exponentially with the pulses, it would be 2; if as 1 / pulses², √10.
+    assert 2 < check("pulses_ratio", share=0.99, over=0.9) < np.sqrt(10)
 
 
 def test_the_peak_is_lost_late_in_the_gate() -> None:

@@ -19,6 +19,7 @@ from core.cli import main
 from core.inference import fit_of, fit_p_values, share_below
 from core.inspection import capture_report, pixel_report, reported_check
 from core.report import telling_pixel, write_report
+from core.typesetting import LEAST_PROBABILITY
 
 pytestmark = pytest.mark.files
 
@@ -75,10 +76,10 @@ def written(capture: core.Capture, image: core.RangeImage, **options: Any) -> st
     return file.getvalue().decode()
 
 
-def simulated(sbr: float = 1.0) -> core.Capture:
+def simulated(sbr: float = 1.0, n_pulses: int = 400) -> core.Capture:
     return core.simulate(
         core.scenes["staircase"](12),
-        core.Acquisition(n_pulses=400, pixel_angle_rad=2e-3),
+        core.Acquisition(n_pulses=n_pulses, pixel_angle_rad=2e-3),
         core.Flux(0.5, sbr=sbr),
         seed=4,
     )
@@ -176,6 +177,19 @@ def test_numbers_are_those_of_the_reports(source: str, page: Page, image: core.R
     assert page.values["Root mean square error"] == [core.metrics.rmse_m(image.range_m, truth_m)]
     known = core.metrics.wilson(*core.metrics.restored(image.range_m, truth_m, 3 * bin_m))
     assert page.values["Restoration degree, 3 bins"] == list(astuple(known))
+
+
+def test_a_tiny_probability_is_shown_as_a_bound() -> None:
+    capture = simulated(n_pulses=20_000)  # so many that noise is hardly ever the surface
+    image = core.estimate(capture, "tracking")
+    found = [each.probability for each in pixel_report(capture, image, *PIXEL).candidates]
+    least = min(found)
+    assert 0 < least < LEAST_PROBABILITY
+    source = written(capture, image, pixel=PIXEL)
+    assert f'<data value="{least}">&lt; 0.000001</data>' in source
+    assert Page(source).texts["data"].count("< 0.000001") == sum(
+        each < LEAST_PROBABILITY for each in found
+    )
 
 
 def test_the_cloud_has_the_confident_estimates(page: Page, image: core.RangeImage) -> None:

@@ -377,7 +377,7 @@ class Compare(Section):
             self._scene_id = session.scene_id()
             self._viewing.show(self._chosen.viewing)
             show_own_width(self._viewing, session.answer)
-            cloud, _, wrong = cloud_of(session.answer, "Range", session.state.viewing)
+            cloud, _, wrong, _ = cloud_of(session.answer, "Range", session.state.viewing)
             self._bounds = view_bounds(cloud, None if wrong is None else ~wrong)
         for picture in self.pictures:
             picture.enter(*self._capture.shape, session.answer.grid)
@@ -516,7 +516,7 @@ class Compare(Section):
             self.legend.text = text.legend(found, viewing.least_confidence)
 
     def _draw_cloud(self, picture: Picture, method: str, answer: Answer) -> None:
-        cloud, rgb, wrong = cloud_of(answer, "Range", self._chosen.viewing)
+        cloud, rgb, wrong, _ = cloud_of(answer, "Range", self._chosen.viewing)
         view = picture.show_cloud(self.is_dark)
         view.label = f"Point cloud: {method_title(method)}. Arrow keys turn all clouds together."
         view.draw(cloud, rgb, wrong, scene_id=self._scene_id, bounds=self._bounds)

@@ -368,13 +368,14 @@ class Explore(Section):
             self.image.update(values, look)
             self.legend.text = legend(answer, state.image, state.viewing, values, look)
             box, is_guessed = state.box, answer.is_width_guessed(state.viewing)
-            cloud, rgb, crosses = cloud_of(answer, state.cloud_color, state.viewing, box)
+            drawn = cloud_of(answer, state.cloud_color, state.viewing, box)
+            cloud, rgb, crosses, unseen = drawn
             # Another box is framed by the camera, like another scene.
             self.cloud.draw(cloud, rgb, crosses, scene_id=f"{self.session.scene_id()} {box}")
             n_wrong = None if crosses is None else int(crosses.sum())
             caption = text.cloud_caption(answer, cloud.n_points, n_wrong, box, is_guessed)
-            unseen = cloud_legend(answer, state.cloud_color, state.viewing, box)
-            self.cloud.caption = f"{caption}\n{unseen}".rstrip()
+            hidden = cloud_legend(unseen, state.viewing.least_confidence)
+            self.cloud.caption = f"{caption}\n{hidden}".rstrip()
         self._request_fit()
 
     def _draw_legend(self) -> None:

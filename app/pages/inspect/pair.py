@@ -52,7 +52,7 @@ class PairSection(Section):
     """
 
     def __init__(self, session: Session) -> None:
-        super().__init__(session, "kept", "viewing", "map")
+        super().__init__(session, "kept", "viewing")
         self.pair: Pair | None = None
         self.a, self.b, self.difference = self._pictures = [
             Picture(session.choose_pixel, session.pick, HEIGHT_PX) for _ in range(3)
@@ -71,6 +71,7 @@ class PairSection(Section):
             visible=False, stylesheets=[FILLING, SCROLLED], sizing_mode="stretch_width"
         )
         session.state.param.watch(lambda *_: self._mark(), "pixel")
+        session.state.param.watch(lambda *_: self._note_doubts(), "map")
 
     def layout(self) -> tuple[Any, Any]:
         """Return buttons, maps and numbers; nothing stands below the map of the page."""
@@ -131,9 +132,7 @@ class PairSection(Section):
             self.session.keep(kept, pair.a)
         viewing = self.session.state.viewing
         names = [text.estimate_name(each) for each in (pair.a, pair.b)]
-        doubt_a, doubt_b = doubt(pair.a), doubt(pair.b)
-        said = doubt_b if self.session.state.map in DOUBTED else ""  # below the map of the page
-        self.note.text = text.pair_doubts(doubt_a, doubt_b, said)
+        self._note_doubts()
         values_b, look = image_of(pair.b, "Estimate", viewing)
         values_a, _ = image_of(pair.a, "Estimate", viewing)
         of_difference = difference_scale(pair)
@@ -154,6 +153,12 @@ class PairSection(Section):
         self._content.visible = True
         self._of_images = text.pair_facts(pair)
         self._mark()
+
+    def _note_doubts(self) -> None:
+        if self.pair is not None:
+            of_a, of_b = doubt(self.pair.a), doubt(self.pair.b)
+            elsewhere = of_b if self.session.state.map in DOUBTED else ""  # below the map
+            self.note.text = text.pair_doubts(of_a, of_b, elsewhere)
 
     def _mark(self) -> None:
         pair, pixel = self.pair, self.session.state.pixel

@@ -82,9 +82,9 @@ MODE_HELP = (
     "line of a profile. A tap always selects a pixel."
 )
 PLOT_HELP = (
-    "Plot below the histogram: the estimator's score or its stages (of the image posterior, what "
-    "the pixel and its neighbours tell), the rate corrected for pile-up, or the residuals of the "
-    "counts from those that the model expects."
+    "Plot below the histogram: the estimator's score or its stages (for the image posterior, the "
+    "evidence of the pixel and of its neighbours), the rate corrected for pile-up, or the "
+    "residuals of the counts from those that the model expects."
 )
 SUBJECT_HELP = (
     "What to inspect: one pixel, the region, the pinned pixels, the line that joins them, or the "
@@ -199,12 +199,12 @@ def estimate_name(answer: Answer) -> str:
     return ", ".join(names)
 
 
-def pair_doubts(of_a: str, of_b: str, said: str) -> str:
-    """Return doubts about the confidences of two estimates, each once and without one `said`."""
+def pair_doubts(of_a: str, of_b: str, elsewhere: str) -> str:
+    """Return doubts about the confidences of A and B, except one that is stated elsewhere."""
     if of_a == of_b:
-        return "" if of_a == said else of_a
+        return "" if of_a == elsewhere else of_a
     named = {"A": of_a, "B": of_b}
-    return " ".join(f"{name}: {why}" for name, why in named.items() if why and why != said)
+    return " ".join(f"{name}: {why}" for name, why in named.items() if why not in ("", elsewhere))
 
 
 def difference_legend(pair: Pair) -> str:

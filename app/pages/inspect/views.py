@@ -347,7 +347,7 @@ class PixelPlots:
     score : GatePlot
         Score of another method, in its place.
     evidence : GatePlot
-        Likewise, of one that uses neighbours: what they and the pixel tell.
+        Likewise, of a method that uses neighbours: their evidence and that of the pixel.
     residuals : GatePlot
         Residuals of the counts from those that the model expects.
     plots : tuple of GatePlot
@@ -373,8 +373,8 @@ class PixelPlots:
         self.rate = GatePlot(inspect_plots.rate(self.bins, marks), {"Rate": "rate"})
         self.stages = GatePlot(inspect_plots.stages(self.bins, marks), stages)
         self.score = GatePlot(inspect_plots.score(self.bins, marks), {"Score": "score"})
-        told = {"Pixel alone": "alone", "Neighbours": "neighbours", "Both": "posterior"}
-        self.evidence = GatePlot(inspect_plots.evidence(self.bins, marks), told)
+        parts = {"Pixel alone": "alone", "Neighbours": "neighbours", "Both": "posterior"}
+        self.evidence = GatePlot(inspect_plots.evidence(self.bins, marks), parts)
         deviation = {"Residual": "deviation", "Expected": "fit", "95 % from": "low", "to": "high"}
         self.residuals = GatePlot(inspect_plots.residuals(self.bins, marks), deviation)
         scores = self.stages, self.score, self.evidence
@@ -415,7 +415,10 @@ class PixelPlots:
         self.rate.figure.yaxis[0].axis_label = report.rate_unit.capitalize()
         self.rate.figure.title.text = inspect_plots.RATE_TITLES[report.rate_unit]
         along = scale(unit, gate)
-        if pixel.signals is None:
+        if report.evidence is not None:
+            self.evidence.draw(gate, curves("probability", **report.evidence._asdict()) + marks)
+            self.evidence.frame(*report.evidence)
+        elif pixel.signals is None:
             self.score.figure.title.text = plots.score_title(plots.SCORE_TITLE, pixel, along)
             self.score.draw(gate, curves("", score=pixel.score) + marks)
             fit(self.score.figure, *plots.score_ends(pixel.score))
@@ -427,9 +430,6 @@ class PixelPlots:
             self.stages.draw(gate, residual + enhanced + marks)
             self.stages.frame(pixel.signals.residual)
             self.stages.frame(pixel.signals.enhanced, axis="enhanced")
-        if report.evidence is not None:
-            self.evidence.draw(gate, curves("probability", **report.evidence._asdict()) + marks)
-            self.evidence.frame(*report.evidence)
         for name, position in positions.items():
             self.counts.write(name, x=np.full(2, position))
             for plot in self.plots:

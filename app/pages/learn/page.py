@@ -149,17 +149,18 @@ class Learn(Section):
             made = Presenter(
                 self.session, lesson, self._change, [*self.lessons], self._choose, self._end
             )
-            made.bar.param.watch(lambda _: self._fit(), "is_narrow")
+            made.bar.param.watch(lambda _: self._fit(made), "is_narrow")
         else:
             made = LessonView(self.session, lesson, self._change)
         made.paint(palette(self.is_dark))
         return made
 
-    def _fit(self) -> None:
+    def _fit(self, presenter: Presenter) -> None:
         """Draw the slides in the size that the window needs."""
-        self.shown.views.clear()
-        self._requested = {}
-        self.refresh()
+        if presenter is self.shown:
+            presenter.views.clear()
+            self._requested = {}
+            self.refresh()
 
     def _compute(self, jobs: Mapping[str, Job]) -> None:
         """Compute what is not on screen yet."""

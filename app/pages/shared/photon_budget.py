@@ -29,8 +29,8 @@ from core.photon_budget import (
     TARGET_RD,
     Reach,
     Step,
+    flux_extents,
     reaching,
-    signal_extent,
     steps,
 )
 from core.studies.budget import NEEDED_NOTE, background_note, steps_table
@@ -150,8 +150,8 @@ class Content:
             return
         self._last, scene = budget, _scene(request)
         self.settings.show(budget)
-        extent = map(scientific, signal_extent(budget, scene))
-        self.note.text = ON.format(*extent, background_note(budget, scene))
+        signal, background = flux_extents(budget, scene)
+        self.note.text = ON.format(*map(scientific, signal), background_note(*background))
         computed = (each for each in steps(budget, scene) if each.equation != GIVEN)
         self.steps.rows = [step_row(each) for each in computed]
 

@@ -106,6 +106,7 @@ class ReadingForm:
         self, reading: ReadOptions, used: Mapping[str, str], n_records: int | None = None
     ) -> None:
         """Show the options of the file on screen; keep what was typed if they are the same."""
+        self._asked = None
         self.question.visible = self._about.visible = False
         self._fill(reading, used)
         # With all records it stands at the first one.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import panel as pn
@@ -14,6 +15,7 @@ from app.pages.session import Session
 from app.tasks.scheduler import Step, Work
 from app.widgets.cards import button
 from app.widgets.controls import Sentence
+from core.studies.tradeoff import Cancelled
 
 Result = TypeVar("Result")
 
@@ -42,7 +44,7 @@ class _ControlledWork(ABC):
         label: str = "Compute",
         help: str = "Compute: starts again with the settings above.",
     ) -> None:
-        self._session, self._noun = session, noun
+        self._session, self._noun, self._label = session, noun, label
         self._work = session.tasks.long_work(self._show_progress, self._failed)
         self._start = button(label, help, self.start, margin=(6, 4, 6, 8))
         self._start.variant = "contained"
@@ -68,7 +70,8 @@ class _ControlledWork(ABC):
         self._work.cancel()
 
     def _failed(self, error: Exception) -> None:
-        self._session.failures.report(error, describe=unfinished, part=self)
+        describe = partial(unfinished, button=self._label)
+        self._session.failures.report(error, describe=describe, part=self)
 
     def _show_progress(self) -> None:
         work = self._work
@@ -170,6 +173,19 @@ class OnePiece(_ControlledWork, Generic[Result]):
     def _failed(self, error: Exception) -> None:
         self._starts_by_itself = False
         super()._failed(error)
+
+
+def cancellable(
+    progress: Callable[[int, int], None], cancelled: Callable[[], bool]
+) -> Callable[[int, int], None]:
+    """Return a progress function that raises `Cancelled` once the work is cancelled."""
+
+    def report(done: int, of: int) -> None:
+        if cancelled():
+            raise Cancelled
+        progress(done, of)
+
+    return report
 
 
 def aside(explanation: str, *controls: Any) -> pn.Column:

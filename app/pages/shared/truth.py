@@ -63,7 +63,7 @@ class TruthForm:
     ) -> None:
         self._session, self._uploads, self._user, self._add = session, uploads, user, add
         self._key = ""
-        self._refused_for: Source | None = None
+        self._source: Source | None = None
         self._jobs = session.tasks.latest()
         self.status = Sentence(live=True, sizing_mode="stretch_width", margin=(4, 8))
         self.file = file_button(TRUTH_OPTIONS["truth"], SUFFIXES, self._upload, self._refuse)
@@ -95,8 +95,8 @@ class TruthForm:
         """Show the form for a capture; what was refused for another one is forgotten."""
         source = answer.request.source
         self.part.visible = not source.is_scene
-        if source is not self._refused_for:
-            self.status.text = ""
+        if source is not self._source:
+            self._source, self.status.text = source, ""
 
     def _upload(self, files: dict[str, bytes]) -> None:
         try:
@@ -112,15 +112,21 @@ class TruthForm:
         if path is None:
             return
         truth = Truth(self._key, self.unit.value, self.variable.value_input.strip())
-        check = partial(check_truth, self._session.answer, truth, path)
-        self._jobs.submit(check, partial(self._accept, truth), lambda e: self._refuse(cause(e)))
+        answer = self._session.answer
+        source = answer.request.source
 
-    def _accept(self, truth: Truth, _: Any) -> None:
-        self.status.text = ""
-        self._add(truth)
+        def accept(_: Any) -> None:
+            if source is self._session.answer.request.source:  # else it was checked for another
+                self.status.text = ""
+                self._add(truth)
+
+        def refuse(error: Exception) -> None:
+            if source is self._session.answer.request.source:
+                self._refuse(cause(error))
+
+        self._jobs.submit(partial(check_truth, answer, truth, path), accept, refuse)
 
     def _refuse(self, reason: str) -> None:
-        self._refused_for = self._session.answer.request.source
         self.status.text = f"Not added: {reason}"
 
 

@@ -1,4 +1,4 @@
-"""Settings that choose themselves: a part of the sidebar that folds."""
+"""Part of the sidebar that tunes the settings of a method to the capture on screen."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from typing import Any
 from app.model.methods import METHOD_TITLES
 from app.model.store import Answer, Request, same_capture
 from app.pages.session import Session
-from app.pages.shared.studies import OnePiece
+from app.pages.shared.studies import OnePiece, cancellable
 from app.tasks.scheduler import Work
 from app.widgets.cards import part
 from app.widgets.controls import NARROW_TABLE, Sentence, Table
-from core import ESTIMATORS, Tuning, tuned
+from core import Tuning, tuned
 from core.parameters import spec_of
-from core.scripts import changed_fields
-from core.tuning import Trial
+from core.tuning import Trial, is_tunable
 
 TITLE = "Settings for this capture"
 EXPLANATION = (
@@ -31,7 +30,7 @@ MOST_SHOWN = 8
 
 
 class SettingsChooser:
-    """The button that chooses settings for the capture and the method on screen, and why.
+    """Button that tunes the method on screen to the capture, with the result and the reason.
 
     Parameters
     ----------
@@ -39,9 +38,9 @@ class SettingsChooser:
 
     Attributes
     ----------
-    work : OnePiece of (Request, Tuning)
+    work : OnePiece of Tuning
     note : Sentence
-        What was chosen, and why.
+        Settings chosen, and why.
     table : Table
         The best of the settings that were tried.
     part : Part
@@ -49,7 +48,7 @@ class SettingsChooser:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._shown_for: Request | None = None
+        self._subject: Request | None = None
         self.work = OnePiece(
             session,
             self._work,
@@ -75,47 +74,37 @@ class SettingsChooser:
 
     def follow(self, answer: Answer) -> None:
         """Show another estimate: what was chosen holds for one capture and one method."""
-        estimator = ESTIMATORS[answer.method]
-        self.part.visible = not estimator.knows_flux and bool(fields(estimator.parameters))
-        if self._shown_for is not None and not _same_subject(self._shown_for, answer):
-            self._shown_for = None
+        self.part.visible = is_tunable(answer.method)
+        if self._subject is not None and not _same_subject(self._subject, answer.request):
+            self._subject = None
+            self.work.cancel()
             self.note.text, self.table.visible = "", False
 
-    def _work(self) -> Work[tuple[Answer, Tuning]]:
+    def _work(self) -> Work[Tuning]:
         answer = self._session.answer
+        self._subject = answer.request
 
-        def work(
-            progress: Callable[[int, int], None], cancelled: Callable[[], bool]
-        ) -> tuple[Answer, Tuning]:
-            def report(done: int, of: int) -> None:
-                if cancelled():
-                    raise InterruptedError
-                progress(done, of)
-
-            return answer, tuned(answer.capture, answer.method, report)
+        def work(progress: Callable[[int, int], None], cancelled: Callable[[], bool]) -> Tuning:
+            return tuned(answer.capture, answer.method, cancellable(progress, cancelled))
 
         return work
 
-    def _draw(self, result: tuple[Answer, Tuning]) -> None:
-        answer, found = result
-        session = self._session
-        if not _same_subject(answer.request, session.answer):
-            return
-        self._shown_for = answer.request
+    def _draw(self, found: Tuning) -> None:
+        if self._subject is None or not _same_subject(self._subject, self._session.request):
+            return  # another capture was chosen, and its estimate is on the way
         chosen = "" if found.is_default else f" {_changes(found.settings)}."
         self.note.text = f"{METHOD_TITLES[found.method]}: {found.why}{chosen}"
         self.table.rows = [_row(each) for each in found.trials[:MOST_SHOWN]]
         self.table.visible = bool(found.trials)
-        state = session.state
+        state = self._session.state
         if found.method == "tracking":
             state.tracking = found.settings
         else:
             state.settings = {**state.settings, found.method: found.settings}
 
 
-def _same_subject(request: Request, answer: Answer) -> bool:
-    """Whether settings chosen for a request are those for the estimate on screen."""
-    now = answer.request
+def _same_subject(request: Request, now: Request) -> bool:
+    """Whether settings chosen for a request hold for another one."""
     same = same_capture(request, now) and request.less == now.less
     return same and request.absent == now.absent and request.method == now.method
 
@@ -127,12 +116,9 @@ def _row(trial: Trial) -> dict[str, Any]:
 
 def _changes(settings: Any) -> str:
     """Return the settings that differ from the defaults, with their symbols."""
-    changed = changed_fields(settings)
-    return ", ".join(
-        f"{spec_of(each).symbol} {_short(getattr(settings, each.name))}"
-        for each in fields(settings)
-        if each.name in changed
-    )
+    values = ((each, getattr(settings, each.name)) for each in fields(settings))
+    changed = ((each, value) for each, value in values if value != each.default)
+    return ", ".join(f"{spec_of(each).symbol} {_short(value)}" for each, value in changed)
 
 
 def _short(value: Any) -> str:

@@ -13,14 +13,13 @@ from app.pages.session import Session
 from app.pages.shared.downloads import Subject, looked_at
 from app.pages.shared.outputs import CurveCard, TableCard
 from app.pages.shared.section import Repetitions, SettingsSection
-from app.pages.shared.studies import OnePiece
+from app.pages.shared.studies import OnePiece, cancellable
 from app.pages.tradeoff import text
 from app.pages.tradeoff.speed import affordable, source_of
 from app.tasks.scheduler import Work
 from app.widgets.cards import part
 from app.widgets.controls import Sentence
 from core.studies.tradeoff import (
-    Cancelled,
     Simulation,
     acquisition_items,
     acquisition_sweeps,
@@ -110,15 +109,11 @@ class AcquisitionSection(SettingsSection[Repetitions]):
         def work(
             progress: Callable[[int, int], None], cancelled: Callable[[], bool]
         ) -> tuple[Request, str, list[Any]]:
-            def report(done: int, of: int) -> None:
-                if cancelled():
-                    raise Cancelled
-                progress(done, of)
-
             affordable(source, ())
             simulation = (
                 source if isinstance(source, Simulation) else surrogate_of(source, source.source)
             )
+            report = cancellable(progress, cancelled)
             found = acquisition_sweeps([simulation], range(repetitions), progress=report)
             said = text.simulated(simulation.name, repetitions, simulation.note)
             return request, said, list(acquisition_items(found))

@@ -65,6 +65,7 @@ PATCHES = (
     Patch("immediate_paint", _BOKEH),
     Patch("latest_value", _BOKEH),
     Patch("legend_items", _BOKEH),
+    Patch("list_keys", {"panel-material-ui": "0.16"}),
     Patch("lost_graphics", _BOKEH),
     Patch("narrow_window", _PANEL),
     Patch("server_wins", _PANEL),

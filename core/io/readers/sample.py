@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.inference.neighbours import random_patches
+
 SAMPLE_COUNTS = 2**25
 """Largest sample, in counts of bins: 64 MiB of uint16. A smaller image is its own."""
 
@@ -23,9 +25,5 @@ def sample_of(array: Any) -> NDArray[Any]:
         return np.asarray(array)
     import dask  # noqa: PLC0415 - half a second that others should not pay
 
-    high, wide = min(_PATCH, rows), min(_PATCH, cols)
-    n_patches = max(1, SAMPLE_COUNTS // (high * wide * n_bins))
-    rng = np.random.default_rng(0)
-    corners = rng.integers((rows - high + 1, cols - wide + 1), size=(n_patches, 2)).tolist()
-    patches = [array[top : top + high, left : left + wide] for top, left in corners]
-    return np.concatenate(dask.compute(*patches))
+    patches = random_patches(array.shape, SAMPLE_COUNTS // n_bins, _PATCH)
+    return np.concatenate(dask.compute(*(array[patch] for patch in patches)))

@@ -27,6 +27,7 @@ from core.inference.resolution import ERROR, FEW, Difference
 from core.metrics import Interval
 from core.scene import PARTS
 from core.studies.ablation.evidence import POWER, Evidence, Verdict
+from core.typesetting import probability_text
 
 MARGIN_RD = 0.005
 """Smallest relevant change of the restoration degree within 3 bins: one pixel in 200."""
@@ -35,8 +36,6 @@ MARGIN_BINS = 0.5
 """Smallest relevant change of the RMSE, in bins: the largest error of rounding to whole bins."""
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
-
-_LEAST_P = 1e-6  # smaller p-values are not distinguished
 
 TITLES = CORRECTIONS | PARTS
 
@@ -127,7 +126,8 @@ def tested(
         Added to the reason.
     """
     verdict, smallest = evidence.verdict(margin, explained), evidence.smallest
-    chance = f"p = {evidence.p_value:.2g}" if evidence.p_value >= _LEAST_P else f"p < {_LEAST_P:g}"
+    p_value = probability_text(evidence.p_value)
+    chance = f"p {p_value}" if p_value.startswith("<") else f"p = {p_value}"
     seen = f"would have been seen with a probability of {_percent(POWER)}"
     if math.isfinite(smallest):
         seen = f"{_percent(smallest)} {seen}, and {_percent(margin)} matters"

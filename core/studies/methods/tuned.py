@@ -1,4 +1,4 @@
-"""What is gained by settings that are chosen for each capture (`core.tuned`)."""
+"""Gain from settings chosen for each capture (`core.tuned`)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Gain:
     default: int
     chosen: int
     best: int
-    """With the best settings that were tried, which only the truth tells."""
+    """With the best settings that were tried; to know them requires the truth."""
     targets: int
     is_default: bool
     """Whether the default settings were kept."""
@@ -41,12 +41,14 @@ def gain(piece: tuple[Condition, int]) -> Gain:
     condition, seed = piece
     capture = condition.capture(seed)
     found, default = tuned(capture, METHOD), settings_of(METHOD)
-    restored = [
-        right_targets(capture, METHOD, settings).sum()
-        for settings in (default, found.settings, *(each.settings for each in found.trials))
-    ]
-    targets = int(np.isfinite(np.asarray(capture.truth_range_m)).sum())
-    return Gain(int(restored[0]), int(restored[1]), int(max(restored)), targets, found.is_default)
+    right = {
+        settings: right_targets(capture, METHOD, settings)
+        for settings in {default, *(each.settings for each in found.trials)}
+    }
+    restored = {settings: int(each.sum()) for settings, each in right.items()}
+    best = max(restored.values())
+    chosen = found.settings
+    return Gain(restored[default], restored[chosen], best, right[chosen].size, found.is_default)
 
 
 def tuned_table(
@@ -82,7 +84,7 @@ def tuned_table(
         conditions,
         columns,
         f"Within 3 bins, {len(seeds)} captures a row; whole bins. Best tried: the settings of the "
-        "search that restore most of each capture itself, which only its truth tells. Kept: share "
+        "search that restore most of each capture itself, which requires its truth. Kept: share "
         "of the captures for which the defaults were kept. Worst change: of the restoration degree "
         "of one capture.",
         {"kept": ".2f", "worst change": "+.4f"},

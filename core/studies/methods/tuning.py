@@ -24,7 +24,7 @@ from core.studies.outputs import Table, table
 from core.studies.paper.figures import LITERAL, RECOMMENDED, WHOLE_BINS
 from core.studies.paper.recommend import SEEDS
 from core.studies.trials import Condition, Method, default_methods, score, summary
-from core.tuning import FIXED, searched
+from core.tuning import free_fields, searched
 
 SEARCHED = SEEDS[:4]
 MOST_ROUNDS = 3
@@ -69,7 +69,9 @@ def search(method: Method, seeds: Sequence[int] = SEARCHED) -> Tuned:
     """Search the settings of a method."""
     scene = scene_of(method)
     captures = [Condition(scene, sbr).capture(seed) for sbr in SBRS for seed in seeds]
-    free = [each for each in fields(method.settings) if each.name not in _fixed(method)]
+    free = free_fields(method.estimator)
+    if method.name == LITERAL.name:
+        free = [each for each in free if each.name == "l"]
     known: dict[Any, float] = {}
 
     def restored(settings: Any) -> float:
@@ -79,12 +81,6 @@ def search(method: Method, seeds: Sequence[int] = SEARCHED) -> Tuned:
 
     best = searched(method.settings, free, restored, MOST_ROUNDS)
     return Tuned(method, scene, best, len(known))
-
-
-def _fixed(method: Method) -> Sequence[str]:
-    if method.name == LITERAL.name:
-        return [each.name for each in fields(method.settings) if each.name != "l"]
-    return FIXED.get(method.estimator, ())
 
 
 def _mean_rd(captures: Sequence[Capture], method: Method) -> float:
