@@ -29,7 +29,7 @@ test: $(VENV)/.test ## everything that CI checks
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -n auto $(KERNELS:%=core/tests/test_%.py) --cov --cov-report=
 	$(BIN)/python -m pytest -n 3 --dist worksteal core/tests --cov --cov-append --cov-fail-under=95
 	$(BIN)/python -m pytest -n 3 --dist loadfile tests -m "not browser"
-	$(BIN)/python -m pytest -n auto --dist loadgroup tests -m browser
+	$(BIN)/python -m pytest -n 3 --dist loadgroup tests -m browser
 
 bench: $(VENV)/.test ## slider to changed pixels, through a real browser
 	$(BIN)/python -m tests.latency

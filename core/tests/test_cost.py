@@ -58,7 +58,7 @@ def empty(*shape: int) -> Capture:
     [
         ("tracking", (1, 1, 200_000)),
         ("likelihood", (1, 1, 200_000)),
-        ("kde", (8, 8, 50_000)),
+        ("kde", (24, 24, 5_000)),
         ("tracking", (1000, 1000, 1)),
         ("unmixing", (300, 300, 4)),
     ],
