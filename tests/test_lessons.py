@@ -143,6 +143,11 @@ After.
         ('"T"', '"T"\nauthor = "A"', "front matter = 'author' is not accepted: give 'title' or"),
         ('name = "background"', 'name = "colour"', "control.name = 'colour'"),
         ('view = "first_photons"', 'view = "light"', "prediction.view = 'light'"),
+        (
+            "[check]",
+            '[check]\nview = "light"',
+            r"check.view = 'light' .* of after, \['first_photons'\]",
+        ),
         ('"share_armed"', '"eval"', "check = 'eval' is not accepted"),
         ('view = "first_photons"', 'view = "first_photons"\nlow = "0"', "prediction: low = '0'"),
         ('"first_photons"', '"car_image"', r"view = 'first_photons' .* a plot of after, \[\]"),
@@ -367,11 +372,16 @@ def test_a_slide_is_legible_across_a_room(presenting):
 
 def test_the_answer_of_a_check_is_computed_when_it_is_revealed(presenting):
     slides, answer = presenting.shown.slides, f"{LESSONS[FIRST].check.answer:.3g}"
-    presenting.session.state.learning = Learning(FIRST, step=len(slides) - 2)
+    moved = Learning(FIRST, "flat", "5.0", step=len(slides) - 2)
+    presenting.session.state.learning = moved
     text = presenting.shown.layout[1]
     assert "?" in text.object and answer not in text.object
-    presenting.session.state.learning = Learning(FIRST, step=len(slides) - 1)
+    read = presenting.shown.views["check", "still_armed"]  # the plot that the question is about
+    presenting.session.tasks.run_until(lambda: read.item)
+    assert read.bench == LESSONS[FIRST].check.bench
+    presenting.session.state.learning = replace(moved, step=len(slides) - 1)
     presenting.session.tasks.run_until(lambda: answer in text.object)
+    assert read.holder in presenting.shown.layout[3]
 
 
 def test_a_link_leads_to_a_slide_and_one_beyond_the_last_to_the_last(session):

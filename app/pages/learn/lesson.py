@@ -14,6 +14,7 @@ from app.model.state import Learning
 from app.pages.learn import text
 from app.pages.learn.views import View
 from app.pages.session import Session
+from app.pages.shared.downloads import CORNER
 from app.theme import Palette
 from app.widgets.cards import button
 from app.widgets.controls import Sentence, SettingsPanel
@@ -31,10 +32,10 @@ VIEWS = """
 """
 ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 8px 12px; }"
 
-# Beside the plots that it changes, also where they need scrolling.
-MOVING = """
-:host { position: sticky !important; top: 0; z-index: 2;
-  background: var(--mui-palette-background-default, #fff); }
+# Beside the plots that it changes, also where they need scrolling: then above their buttons.
+MOVING = f"""
+:host {{ position: sticky !important; top: 0; z-index: {int(CORNER["z-index"]) + 1};
+  background: var(--mui-palette-background-default, #fff); }}
 """
 
 
@@ -90,6 +91,7 @@ class LessonView:
         self.again = button("Start again", text.AGAIN_HELP, self._start_again)
         self.panel = settings_panel(lesson, change)
         control = self.panel.controls[lesson.control]
+        control.max_width = 480
         self.answer = _field("Your answer")
         self.answer.param.watch(lambda _: self._answer(), "value")
         self.verdict = Sentence(live=True, margin=(4, 0))
@@ -110,7 +112,6 @@ class LessonView:
             markdown(text.MOVE),
             control,
             stylesheets=[MOVING],
-            max_width=480,
             sizing_mode="stretch_width",
             margin=0,
         )
