@@ -315,6 +315,10 @@ def test_a_link_opens_a_lesson_where_the_learner_was():
         page.shown.commit.clicks += 1
         assert page.shown.moving.visible
         assert refused not in "".join(heard[count:])
+    session.state.learning = Learning("2-more-light")
+    page.shown.prediction.value = ""
+    page.shown.commit.clicks += 1
+    assert "'nothing' is not accepted: give a number" in heard[-1]
 
 
 def test_an_unknown_lesson_of_a_link_is_reported_with_the_first_one():
@@ -425,6 +429,11 @@ def test_a_handout_has_room_for_answers_and_the_key_has_the_answers(tmp_path):
     assert answer in key and all(escape(hint.text) in key for hint in first.check.hints)
     assert "http" not in re.sub(r"data:image[^\"]*", "", sheet + key)  # needs no network
     assert handout([first], 4) != sheet == handout([first], 3)
+    keys = (handout([LESSONS["10-neighbours"]], each, is_key=True) for each in (3, 4))
+    pictures = [re.findall(r'src="([^"]*)"', each) for each in keys]
+    same = [one == other for one, other in zip(*pictures, strict=True)]
+    assert same == [False, True, True]  # the student's own data, then two of what the app shows
+    assert "In the app, set Coates correction to off or on." in handout([LESSONS["3-coates"]])
     path = tmp_path / "mine.html"
     assert main([FIRST, "--student", "3", "--key", "-o", str(path)]) == 0
     assert path.read_text("utf-8") == key
@@ -568,10 +577,10 @@ def test_a_lesson_is_taken_by_keyboard(key, page, address):
     asked = lesson.prediction
     if asked.axis:
         field(here, answer_label(asked.unit)).press_sequentially(f"{asked.high:g}")
-        here.keyboard.press("Tab")
+        here.keyboard.press("Enter")
     else:
         here.get_by_role("button", name="flat", exact=True).press("Enter")
-    here.get_by_role("button", name=re.compile("^Predict")).press("Enter")
+        here.get_by_role("button", name=re.compile("^Predict")).press("Enter")
     expect(here.get_by_text("Now move this control")).to_be_visible()
     move_the_control(here, lesson)
     hint = check.hints[0]

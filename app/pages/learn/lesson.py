@@ -16,7 +16,7 @@ from app.pages.learn.views import View
 from app.pages.session import Session
 from app.pages.shared.downloads import CORNER
 from app.theme import Palette
-from app.widgets.cards import button
+from app.widgets.cards import button, typed
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.glossary import explained
 from core.studies.lessons import Bench
@@ -85,7 +85,7 @@ class LessonView:
             for name in getattr(lesson, part)
         }
         self._answered = ""
-        self.prediction = prediction_field(lesson)
+        self.prediction = prediction_field(lesson, self._commit)
         self.commit = button("Predict", text.COMMIT_HELP, self._commit)
         self.commit.variant = "contained"
         self.again = button("Start again", text.AGAIN_HELP, self._start_again)
@@ -136,7 +136,7 @@ class LessonView:
         self._change(prediction="", moved="", answer="")
 
     def _commit(self) -> None:
-        self._change(prediction=self.prediction.value)
+        self._change(prediction=typed(self.prediction) or text.NOTHING)
 
     def _answer(self) -> None:
         self._change(answer=self.answer.value)
@@ -195,11 +195,13 @@ def _seen(
     return {name: lesson.seen(name, bench, committed) for name in getattr(lesson, part)}
 
 
-def prediction_field(lesson: Lesson) -> Any:
-    """Return the control with which a learner predicts."""
+def prediction_field(lesson: Lesson, commit: Callable[[], None]) -> Any:
+    """Return the control with which a learner predicts; Enter commits a number."""
     asked = lesson.prediction
     if asked.axis:
-        return _field(text.answer_label(asked.unit))
+        field = _field(text.answer_label(asked.unit))
+        field.param.watch(lambda _: commit(), "enter_pressed")
+        return field
     return pmui.RadioButtonGroup(
         options=list(SHAPES),
         value=next(iter(SHAPES)),

@@ -17,7 +17,7 @@ from app.pages.learn.lesson import ROW, Job, markdown, prediction_field, setting
 from app.pages.learn.views import View
 from app.pages.session import Session
 from app.theme import Palette
-from app.widgets.cards import button
+from app.widgets.cards import button, typed
 from app.widgets.slide_bar import SlideBar
 from core.studies.lessons import Bench
 
@@ -87,7 +87,7 @@ class Presenter:
         self.views: dict[tuple[str, str], View] = {}
         self.bar = SlideBar(digits=sorted(by_digit(keys)), sizing_mode="stretch_width", margin=0)
         self.bar.param.watch(lambda event: self._act(event.new[0]), "pressed")
-        self.prediction = prediction_field(lesson)
+        self.prediction = prediction_field(lesson, self._commit)
         self.panel = settings_panel(lesson, change)
         control = self.panel.controls[lesson.control]
         for each in (self.prediction, control):
@@ -189,4 +189,4 @@ class Presenter:
 
     def _commit(self) -> None:
         step = next_revealed(self.slides, self._step)
-        self._change(prediction=self.prediction.value, step=step)
+        self._change(prediction=typed(self.prediction), step=step)

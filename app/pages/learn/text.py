@@ -6,6 +6,7 @@ LESSON_HELP = "Each lesson asks first, and shows what happens after your predict
 
 COMMIT_HELP = "Predict: the prediction stays drawn on the plot."
 SHAPES_HELP = "Shape that you expect along the gate."
+NOTHING = "nothing"  # predicted where the field is empty
 AGAIN_HELP = "Start again: clear the prediction and the answer of this lesson."
 CHECK_HELP = "Check: compares your answer with a computation."
 
