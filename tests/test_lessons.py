@@ -222,12 +222,16 @@ def test_nothing_is_shown_before_the_prediction(session):
     page.show(True)
     shown = page.shown
     session.tasks.run_until(lambda: shown.views["before", "light"].item)
-    assert not shown.moving.visible  # it follows the prediction
+    assert not shown.moving.visible and not shown.past.visible  # they follow the prediction
     assert not shown.views["after", "first_photons"].holder.visible
     shown.prediction.value = "falling"
     shown.commit.clicks += 1
     assert session.state.learning == Learning(prediction="falling")
     assert shown.moving.visible
+    places = [shown.moving, shown.views["after", "still_armed"].holder, shown.past]
+    drawn = shown.layout.select()  # what moves is beside the control, what does not is below
+    assert shown.past.visible and sorted(places, key=drawn.index) == places
+    assert drawn.index(shown.views["before", "light"].holder) > drawn.index(shown.past)
     session.tasks.run_until(lambda: shown.views["after", "first_photons"].item)
     plot = shown.views["after", "first_photons"].item
     first, last = SHAPES["falling"]
@@ -499,7 +503,7 @@ def present_the_first_lesson(here: Page) -> None:
     expect(said).to_contain_text("Pulse 1 of 1,000")
     here.keyboard.press("Space")
     expect(said).to_contain_text("Pulse 1,000 of 1,000")
-    assert min(here.locator(TYPE).filter(visible=True).evaluate_all(FONT_SIZES)) >= 24
+    assert least_type(here) >= 24
     here.set_viewport_size({"width": 390, "height": 844})
     eventually(lambda: here.locator(".bk-Legend").evaluate_all(LEGENDS_FIT))
     here.set_viewport_size({"width": 1024, "height": 768})
@@ -508,6 +512,8 @@ def present_the_first_lesson(here: Page) -> None:
     here.keyboard.press("b")
     here.keyboard.press("2")
     expect(here.get_by_role("heading", name="More light, worse picture")).to_be_visible()
+    expect(here.get_by_text("The car at a signal")).to_be_visible()
+    assert least_type(here) >= 24
     here.keyboard.press("Escape")
     expect(here.get_by_role("button", name="Toggle theme")).to_be_visible()
 
@@ -517,9 +523,15 @@ LEGENDS_FIT = """all => all.length > 0 && all.every((each) => {
   return 0 <= left && right <= innerWidth;
 })"""
 
-TYPE = "p:not(:empty), h1, nav span, button:not([aria-label^=Reset]), input[type=text], .label"
+TYPE = "p:not(:empty), h1, h6, nav span, button:not([aria-label^=Reset]), input[type=text], .label"
 FONT_SIZES = """all => all.map((each) =>
   parseFloat(getComputedStyle(each).fontSize) * each.currentCSSZoom)"""
+
+
+def least_type(here: Page) -> float:
+    """Return the size of the smallest type on a slide, in pixels."""
+    sizes: list[float] = here.locator(TYPE).filter(visible=True).evaluate_all(FONT_SIZES)
+    return min(sizes)
 
 
 def look_up_a_term(here: Page) -> None:

@@ -67,6 +67,8 @@ class LessonView:
         Has the one control.
     moving : pn.Column
         That control, shown after the prediction.
+    past : pmui.Typography
+        Heading of the views from before the prediction, which stay as they were.
     views : dict of (str, str) to View
         By position and name: a view may stand before and after the prediction.
     verdict : Sentence
@@ -115,19 +117,26 @@ class LessonView:
             sizing_mode="stretch_width",
             margin=0,
         )
+        self.past = markdown(text.PAST)
         self.layout = pn.Column(
             markdown(f"## {lesson.title}\n\n{lesson.introduction}"),
             markdown(f"**Predict.** {lesson.prediction.question}"),
             pn.Row(self.prediction, self.commit, self.again, stylesheets=[ROW], margin=(0, 8)),
             self.moving,
-            pn.Column(
-                *(view.holder for view in self.views.values()),
-                stylesheets=[VIEWS],
-                sizing_mode="stretch_width",
-                margin=0,
-            ),
+            self._grid("after"),
             self._checked,
+            self.past,
+            self._grid("before"),
             stylesheets=[PAGE_STYLE],
+            sizing_mode="stretch_width",
+            margin=0,
+        )
+
+    def _grid(self, part: str) -> pn.Column:
+        """Return the views before or after the prediction, side by side where there is room."""
+        return pn.Column(
+            *(self.views[part, name].holder for name in getattr(self.lesson, part)),
+            stylesheets=[VIEWS],
             sizing_mode="stretch_width",
             margin=0,
         )
@@ -147,7 +156,7 @@ class LessonView:
         self.prediction.disabled = self.commit.disabled = is_committed
         if is_committed:
             self.prediction.value = learning.prediction
-        self.again.visible = self.moving.visible = is_committed
+        self.again.visible = self.moving.visible = self.past.visible = is_committed
         for (part, _), view in self.views.items():
             view.holder.visible = is_committed or part == "before"
         self._checked.visible = is_committed and bool(learning.moved)

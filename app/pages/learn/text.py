@@ -14,6 +14,7 @@ PRESENT_HELP = "Present: this lesson in the whole window, one slide at a time, b
 DEMONSTRATION_HELP = "Twenty-minute demonstration: lessons 1, 2, 4 and 7 as slides."
 
 MOVE = "Now move this control; everything else stays the same."
+PAST = "Before the control was moved:"
 
 NO_SIDEBAR = "This page has its own controls; the other pages' controls are hidden."
 
