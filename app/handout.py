@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
         type=int,
         default=0,
         metavar="N",
-        help="number of the student: the seed of the simulations (default: 0)",
+        help="number of the student: the seed of the data that are printed (default: 0)",
     )
     add_lessons_option(parser)
     parser.add_argument(
@@ -103,7 +103,7 @@ def handout(lessons: Sequence[Lesson], student: int = 0, is_key: bool = False) -
     ----------
     lessons : sequence of Lesson
     student : int
-        Number of the student, which is the seed of the simulations.
+        Number of the student, which is the seed of the data that are printed.
     is_key : bool
         Whether answers are printed instead of blank space.
 
@@ -127,17 +127,20 @@ def _sheet(lesson: Lesson, student: int, is_key: bool) -> str:
         f'<section><h1>{escape(lesson.title)}</h1><p class="who">{who}'
         f"<span>Student {student}</span></p>{_MARKDOWN.render(lesson.introduction)}"
         + "".join(_figure(lesson.seen(name, bench, None)) for name in lesson.before)
-        + _part("Predict", _prediction(lesson, bench, is_key))
+        + _part("Predict", _prediction(lesson, is_key))
         + _part("Observe", _observation(lesson, bench, is_key))
         + _part("Check", _check(lesson, is_key))
         + "</section>"
     )
 
 
-def _prediction(lesson: Lesson, bench: Bench, is_key: bool) -> str:
-    """Return the question, room for an answer, and blank axes; in the key, what happens."""
+def _prediction(lesson: Lesson, is_key: bool) -> str:
+    """Return the question, room for an answer, and blank axes; in the key, what happens.
+
+    It is what the app shows, whatever the student's number.
+    """
     asked = lesson.prediction
-    seen = lesson.seen(asked.view, bench, None)
+    seen = lesson.seen(asked.view, lesson.bench, None)
     if is_key:
         return _rendered(asked.question) + _figure(seen)
     if asked.axis:
@@ -157,10 +160,10 @@ def _observation(lesson: Lesson, bench: Bench, is_key: bool) -> str:
         for each in seen.values()
         if isinstance(each, Pulses)
     )
-    question = _rendered(f"{_moving(lesson)} What happens, and why?")
+    question = _rendered(f"In the app, {_moving(lesson)} What happens, and why?")
     if not is_key:
         return exercises + question + '<p class="ruled"></p>' * 4
-    moved = _moved(lesson, bench)
+    moved = _moved(lesson)
     plots = "".join(
         _figure(lesson.seen(name, moved, None))
         for name in others
@@ -170,22 +173,22 @@ def _observation(lesson: Lesson, bench: Bench, is_key: bool) -> str:
 
 
 def _moving(lesson: Lesson) -> str:
-    """Return a sentence about the one control."""
+    """Return the rest of a sentence about the one control."""
     spec = SPECS[lesson.control]
     if isinstance(spec, Choice):
-        return f"Choose another {spec.symbol.lower()}: {' or '.join(spec.options)}."
+        return f"set {spec.symbol} to {' or '.join(spec.options)}."
     low, high = lesson.ends or (spec.low, spec.high)
-    return f"Move {spec.symbol} from {low:g} to {high:g} {spec.unit}".rstrip() + "."
+    return f"move {spec.symbol} from {low:g} to {high:g} {spec.unit}".rstrip() + "."
 
 
-def _moved(lesson: Lesson, bench: Bench) -> Bench:
+def _moved(lesson: Lesson) -> Bench:
     """Return the state at the end of the control's range, or with its next option."""
-    spec, present = SPECS[lesson.control], getattr(bench, lesson.control)
+    spec, present = SPECS[lesson.control], getattr(lesson.bench, lesson.control)
     if isinstance(spec, Choice):
         value: Any = next(each for each in spec.options if each != present)
     else:
         value = (lesson.ends or (spec.low, spec.high))[1]
-    return replace(bench, **{lesson.control: value})
+    return replace(lesson.bench, **{lesson.control: value})
 
 
 def _check(lesson: Lesson, is_key: bool) -> str:

@@ -143,6 +143,11 @@ After.
         ('"T"', '"T"\nauthor = "A"', "front matter = 'author' is not accepted: give 'title' or"),
         ('name = "background"', 'name = "colour"', "control.name = 'colour'"),
         ('view = "first_photons"', 'view = "light"', "prediction.view = 'light'"),
+        (
+            "[check]",
+            '[check]\nview = "light"',
+            r"check.view = 'light' .* of after, \['first_photons'\]",
+        ),
         ('"share_armed"', '"eval"', "check = 'eval' is not accepted"),
         ('view = "first_photons"', 'view = "first_photons"\nlow = "0"', "prediction: low = '0'"),
         ('"first_photons"', '"car_image"', r"view = 'first_photons' .* a plot of after, \[\]"),
@@ -217,12 +222,16 @@ def test_nothing_is_shown_before_the_prediction(session):
     page.show(True)
     shown = page.shown
     session.tasks.run_until(lambda: shown.views["before", "light"].item)
-    assert not shown.moving.visible  # it follows the prediction
+    assert not shown.moving.visible and not shown.past.visible  # they follow the prediction
     assert not shown.views["after", "first_photons"].holder.visible
     shown.prediction.value = "falling"
     shown.commit.clicks += 1
     assert session.state.learning == Learning(prediction="falling")
     assert shown.moving.visible
+    places = [shown.moving, shown.views["after", "still_armed"].holder, shown.past]
+    drawn = shown.layout.select()  # what moves is beside the control, what does not is below
+    assert shown.past.visible and sorted(places, key=drawn.index) == places
+    assert drawn.index(shown.views["before", "light"].holder) > drawn.index(shown.past)
     session.tasks.run_until(lambda: shown.views["after", "first_photons"].item)
     plot = shown.views["after", "first_photons"].item
     first, last = SHAPES["falling"]
@@ -310,6 +319,10 @@ def test_a_link_opens_a_lesson_where_the_learner_was():
         page.shown.commit.clicks += 1
         assert page.shown.moving.visible
         assert refused not in "".join(heard[count:])
+    session.state.learning = Learning("2-more-light")
+    page.shown.prediction.value = ""
+    page.shown.commit.clicks += 1
+    assert "'nothing' is not accepted: give a number" in heard[-1]
 
 
 def test_an_unknown_lesson_of_a_link_is_reported_with_the_first_one():
@@ -367,11 +380,16 @@ def test_a_slide_is_legible_across_a_room(presenting):
 
 def test_the_answer_of_a_check_is_computed_when_it_is_revealed(presenting):
     slides, answer = presenting.shown.slides, f"{LESSONS[FIRST].check.answer:.3g}"
-    presenting.session.state.learning = Learning(FIRST, step=len(slides) - 2)
+    moved = Learning(FIRST, "flat", "5.0", step=len(slides) - 2)
+    presenting.session.state.learning = moved
     text = presenting.shown.layout[1]
     assert "?" in text.object and answer not in text.object
-    presenting.session.state.learning = Learning(FIRST, step=len(slides) - 1)
+    read = presenting.shown.views["check", "still_armed"]  # the plot that the question is about
+    presenting.session.tasks.run_until(lambda: read.item)
+    assert read.bench == LESSONS[FIRST].check.bench
+    presenting.session.state.learning = replace(moved, step=len(slides) - 1)
     presenting.session.tasks.run_until(lambda: answer in text.object)
+    assert read.holder in presenting.shown.layout[3]
 
 
 def test_a_link_leads_to_a_slide_and_one_beyond_the_last_to_the_last(session):
@@ -415,6 +433,11 @@ def test_a_handout_has_room_for_answers_and_the_key_has_the_answers(tmp_path):
     assert answer in key and all(escape(hint.text) in key for hint in first.check.hints)
     assert "http" not in re.sub(r"data:image[^\"]*", "", sheet + key)  # needs no network
     assert handout([first], 4) != sheet == handout([first], 3)
+    keys = (handout([LESSONS["10-neighbours"]], each, is_key=True) for each in (3, 4))
+    pictures = [re.findall(r'src="([^"]*)"', each) for each in keys]
+    same = [one == other for one, other in zip(*pictures, strict=True)]
+    assert same == [False, True, True]  # the student's own data, then two of what the app shows
+    assert "In the app, set Coates correction to off or on." in handout([LESSONS["3-coates"]])
     path = tmp_path / "mine.html"
     assert main([FIRST, "--student", "3", "--key", "-o", str(path)]) == 0
     assert path.read_text("utf-8") == key
@@ -480,7 +503,7 @@ def present_the_first_lesson(here: Page) -> None:
     expect(said).to_contain_text("Pulse 1 of 1,000")
     here.keyboard.press("Space")
     expect(said).to_contain_text("Pulse 1,000 of 1,000")
-    assert min(here.locator(TYPE).filter(visible=True).evaluate_all(FONT_SIZES)) >= 24
+    assert least_type(here) >= 24
     here.set_viewport_size({"width": 390, "height": 844})
     eventually(lambda: here.locator(".bk-Legend").evaluate_all(LEGENDS_FIT))
     here.set_viewport_size({"width": 1024, "height": 768})
@@ -489,6 +512,8 @@ def present_the_first_lesson(here: Page) -> None:
     here.keyboard.press("b")
     here.keyboard.press("2")
     expect(here.get_by_role("heading", name="More light, worse picture")).to_be_visible()
+    expect(here.get_by_text("The car at a signal")).to_be_visible()
+    assert least_type(here) >= 24
     here.keyboard.press("Escape")
     expect(here.get_by_role("button", name="Toggle theme")).to_be_visible()
 
@@ -498,9 +523,15 @@ LEGENDS_FIT = """all => all.length > 0 && all.every((each) => {
   return 0 <= left && right <= innerWidth;
 })"""
 
-TYPE = "p:not(:empty), h1, nav span, button:not([aria-label^=Reset]), input[type=text], .label"
+TYPE = "p:not(:empty), h1, h6, nav span, button:not([aria-label^=Reset]), input[type=text], .label"
 FONT_SIZES = """all => all.map((each) =>
   parseFloat(getComputedStyle(each).fontSize) * each.currentCSSZoom)"""
+
+
+def least_type(here: Page) -> float:
+    """Return the size of the smallest type on a slide, in pixels."""
+    sizes: list[float] = here.locator(TYPE).filter(visible=True).evaluate_all(FONT_SIZES)
+    return min(sizes)
 
 
 def look_up_a_term(here: Page) -> None:
@@ -558,10 +589,10 @@ def test_a_lesson_is_taken_by_keyboard(key, page, address):
     asked = lesson.prediction
     if asked.axis:
         field(here, answer_label(asked.unit)).press_sequentially(f"{asked.high:g}")
-        here.keyboard.press("Tab")
+        here.keyboard.press("Enter")
     else:
         here.get_by_role("button", name="flat", exact=True).press("Enter")
-    here.get_by_role("button", name=re.compile("^Predict")).press("Enter")
+        here.get_by_role("button", name=re.compile("^Predict")).press("Enter")
     expect(here.get_by_text("Now move this control")).to_be_visible()
     move_the_control(here, lesson)
     hint = check.hints[0]

@@ -102,6 +102,8 @@ class Check:
     tolerance: float
     """Largest accepted error."""
     bench: Bench
+    view: str
+    """View from which the answer can be read, in that state."""
     hints: tuple[Hint, ...] = ()
 
     @property
@@ -259,7 +261,7 @@ def read_lesson(path: Path) -> Lesson:
 
 
 _ENTRIES = ("title", "before", "after", "state", "control", "prediction", "check")
-_CHECK_ENTRIES = ("question", "function", "arguments", "tolerance", "state", "hints")
+_CHECK_ENTRIES = ("question", "view", "function", "arguments", "tolerance", "state", "hints")
 
 
 def lesson_of(key: str, text: str) -> Lesson:
@@ -272,6 +274,10 @@ def lesson_of(key: str, text: str) -> Lesson:
     control = moved.text("name")
     require("control.name", control, control in SPECS, " or ".join(map(repr, SPECS)))
     before, after = (_views(given.texts(name), bench) for name in ("before", "after"))
+    prediction = _prediction(
+        given.table("prediction", [each.name for each in fields(Prediction)]), after
+    )
+    check = _check(given.table("check", _CHECK_ENTRIES), bench, after, prediction.view)
     introduction, _, explanation = body.partition(RULE)
     return Lesson(
         key,
@@ -281,8 +287,8 @@ def lesson_of(key: str, text: str) -> Lesson:
         _ends(moved, control),
         before,
         after,
-        _prediction(given.table("prediction", [each.name for each in fields(Prediction)]), after),
-        _check(given.table("check", _CHECK_ENTRIES), bench),
+        prediction,
+        check,
         introduction.strip(),
         explanation.strip(),
     )
@@ -332,15 +338,19 @@ def _prediction(given: _Table, after: Sequence[str]) -> Prediction:
     return found
 
 
-def _check(given: _Table, bench: Bench) -> Check:
+def _check(given: _Table, bench: Bench, after: Sequence[str], view: str) -> Check:
+    """Return the check; `view` is that of the prediction, from which most answers can be read."""
     at = replace(bench, **given.table("state", SPECS, {}).values)
+    view = given.text("view", view)
+    require("check.view", view, view in after, f"a view of after, {[*after]}")
+    require_signal(view, at)
     tolerance = given.number("tolerance")
     require("check.tolerance", tolerance, tolerance > 0, "a number above 0")
     hints = [
         Hint(*_function(each, at), each.text("text"))
         for each in given.tables("hints", ("function", "arguments", "text"))
     ]
-    return Check(given.text("question"), *_function(given, at), tolerance, at, tuple(hints))
+    return Check(given.text("question"), *_function(given, at), tolerance, at, view, tuple(hints))
 
 
 def _function(given: _Table, bench: Bench) -> tuple[str, Mapping[str, float]]:

@@ -18,7 +18,7 @@ class Slide:
     text: str = ""
     """Markdown."""
     view: tuple[str, str] | None = None
-    """``"before"`` or ``"after"``, and the name of a view."""
+    """``"before"``, ``"after"`` or ``"check"``, and the name of a view."""
     asks: bool = False
     """Whether it asks for the prediction."""
     reveals: bool = False
@@ -31,14 +31,15 @@ def slides_of(lesson: Lesson) -> tuple[Slide, ...]:
     """Return the slides of a lesson: introduction, question, views, explanation, check, answer."""
     before = [("before", name) for name in lesson.before]
     asked = before[-1] if before else None
+    check, read = lesson.check, ("check", lesson.check.view)
     return (
         Slide(lesson.introduction, before[0] if before else None),
         *(Slide(view=each) for each in before[1:]),
         Slide(lesson.prediction.question, asked, asks=True),
         *(Slide(view=("after", name), reveals=True) for name in lesson.after),
         Slide(lesson.explanation, ("after", lesson.prediction.view)),
-        Slide(lesson.check.question),
-        Slide(lesson.check.question, reveals=True, answers=True),
+        Slide(check.question, read),
+        Slide(check.question, read, reveals=True, answers=True),
     )
 
 

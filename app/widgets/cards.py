@@ -52,6 +52,11 @@ CARD = """
 """ + unrolled(BREAK_PX, "330px")
 
 
+def typed(field: Any) -> str:
+    """Return the text of a field; Enter arrives before the value that it completes."""
+    return str(field.value_input if isinstance(field, pmui.TextInput) else field.value)
+
+
 def select(label: str, options: Any, value: str, help: str) -> pmui.Select:
     """Return a list from which to choose one option."""
     return pmui.Select(

@@ -18,7 +18,7 @@ EXPLANATION = """
 recorded. In daylight, background fires most pulses before the echo arrives: the histogram piles up
 at the front of the gate. Two tracking differentiators follow it: the *large scale* a sudden echo,
 the *small scale* the trend. Their positive difference, the *residual*, times a *weight*, has its
-maximum about two bins after the echo; this lag is known from the model and subtracted.
+maximum some three bins after the echo's onset; this lag is known from the model and subtracted.
 
 **What misleads.** With *start* zero (the literal preset) the small scale begins far below the
 histogram, and meets it only late in the gate. Until then there is a residual without any echo, and

@@ -14,8 +14,9 @@ from app.model.state import Learning
 from app.pages.learn import text
 from app.pages.learn.views import View
 from app.pages.session import Session
+from app.pages.shared.downloads import CORNER
 from app.theme import Palette
-from app.widgets.cards import button
+from app.widgets.cards import button, typed
 from app.widgets.controls import Sentence, SettingsPanel
 from app.widgets.glossary import explained
 from core.studies.lessons import Bench
@@ -31,10 +32,10 @@ VIEWS = """
 """
 ROW = ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 8px 12px; }"
 
-# Beside the plots that it changes, also where they need scrolling.
-MOVING = """
-:host { position: sticky !important; top: 0; z-index: 2;
-  background: var(--mui-palette-background-default, #fff); }
+# Beside the plots that it changes, also where they need scrolling: then above their buttons.
+MOVING = f"""
+:host {{ position: sticky !important; top: 0; z-index: {int(CORNER["z-index"]) + 1};
+  background: var(--mui-palette-background-default, #fff); }}
 """
 
 
@@ -66,6 +67,8 @@ class LessonView:
         Has the one control.
     moving : pn.Column
         That control, shown after the prediction.
+    past : pmui.Typography
+        Heading of the views from before the prediction, which stay as they were.
     views : dict of (str, str) to View
         By position and name: a view may stand before and after the prediction.
     verdict : Sentence
@@ -84,12 +87,13 @@ class LessonView:
             for name in getattr(lesson, part)
         }
         self._answered = ""
-        self.prediction = prediction_field(lesson)
+        self.prediction = prediction_field(lesson, self._commit)
         self.commit = button("Predict", text.COMMIT_HELP, self._commit)
         self.commit.variant = "contained"
         self.again = button("Start again", text.AGAIN_HELP, self._start_again)
         self.panel = settings_panel(lesson, change)
         control = self.panel.controls[lesson.control]
+        control.max_width = 480
         self.answer = _field("Your answer")
         self.answer.param.watch(lambda _: self._answer(), "value")
         self.verdict = Sentence(live=True, margin=(4, 0))
@@ -110,23 +114,29 @@ class LessonView:
             markdown(text.MOVE),
             control,
             stylesheets=[MOVING],
-            max_width=480,
             sizing_mode="stretch_width",
             margin=0,
         )
+        self.past = markdown(text.PAST)
         self.layout = pn.Column(
             markdown(f"## {lesson.title}\n\n{lesson.introduction}"),
             markdown(f"**Predict.** {lesson.prediction.question}"),
             pn.Row(self.prediction, self.commit, self.again, stylesheets=[ROW], margin=(0, 8)),
             self.moving,
-            pn.Column(
-                *(view.holder for view in self.views.values()),
-                stylesheets=[VIEWS],
-                sizing_mode="stretch_width",
-                margin=0,
-            ),
+            self._grid("after"),
             self._checked,
+            self.past,
+            self._grid("before"),
             stylesheets=[PAGE_STYLE],
+            sizing_mode="stretch_width",
+            margin=0,
+        )
+
+    def _grid(self, part: str) -> pn.Column:
+        """Return the views before or after the prediction, side by side where there is room."""
+        return pn.Column(
+            *(self.views[part, name].holder for name in getattr(self.lesson, part)),
+            stylesheets=[VIEWS],
             sizing_mode="stretch_width",
             margin=0,
         )
@@ -135,7 +145,7 @@ class LessonView:
         self._change(prediction="", moved="", answer="")
 
     def _commit(self) -> None:
-        self._change(prediction=self.prediction.value)
+        self._change(prediction=typed(self.prediction) or text.NOTHING)
 
     def _answer(self) -> None:
         self._change(answer=self.answer.value)
@@ -146,7 +156,7 @@ class LessonView:
         self.prediction.disabled = self.commit.disabled = is_committed
         if is_committed:
             self.prediction.value = learning.prediction
-        self.again.visible = self.moving.visible = is_committed
+        self.again.visible = self.moving.visible = self.past.visible = is_committed
         for (part, _), view in self.views.items():
             view.holder.visible = is_committed or part == "before"
         self._checked.visible = is_committed and bool(learning.moved)
@@ -194,11 +204,13 @@ def _seen(
     return {name: lesson.seen(name, bench, committed) for name in getattr(lesson, part)}
 
 
-def prediction_field(lesson: Lesson) -> Any:
-    """Return the control with which a learner predicts."""
+def prediction_field(lesson: Lesson, commit: Callable[[], None]) -> Any:
+    """Return the control with which a learner predicts; Enter commits a number."""
     asked = lesson.prediction
     if asked.axis:
-        return _field(text.answer_label(asked.unit))
+        field = _field(text.answer_label(asked.unit))
+        field.param.watch(lambda _: commit(), "enter_pressed")
+        return field
     return pmui.RadioButtonGroup(
         options=list(SHAPES),
         value=next(iter(SHAPES)),

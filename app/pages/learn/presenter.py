@@ -17,7 +17,7 @@ from app.pages.learn.lesson import ROW, Job, markdown, prediction_field, setting
 from app.pages.learn.views import View
 from app.pages.session import Session
 from app.theme import Palette
-from app.widgets.cards import button
+from app.widgets.cards import button, typed
 from app.widgets.slide_bar import SlideBar
 from core.studies.lessons import Bench
 
@@ -87,7 +87,7 @@ class Presenter:
         self.views: dict[tuple[str, str], View] = {}
         self.bar = SlideBar(digits=sorted(by_digit(keys)), sizing_mode="stretch_width", margin=0)
         self.bar.param.watch(lambda event: self._act(event.new[0]), "pressed")
-        self.prediction = prediction_field(lesson)
+        self.prediction = prediction_field(lesson, self._commit)
         self.panel = settings_panel(lesson, change)
         control = self.panel.controls[lesson.control]
         for each in (self.prediction, control):
@@ -122,7 +122,7 @@ class Presenter:
         self._text.object, self._text.visible = linked(slide.text), bool(slide.text)
         self._asking.visible = slide.asks
         self._text.styles = {} if slide.view else {"zoom": "1.5"}
-        self._control.visible = slide.view is not None and slide.reveals
+        self._control.visible = slide.reveals and not slide.answers
         if learning.prediction:
             self.prediction.value = learning.prediction
         shown = [] if slide.view is None else [self._view(slide.view).holder]
@@ -131,21 +131,21 @@ class Presenter:
         self.bar.place = f"{self._step + 1} / {len(self.slides)}"
 
     def jobs(self, learning: Learning) -> dict[str, Job]:
-        """Return what to compute for the slide: its view, or the answer to the check."""
-        slide, lesson = self.slides[self._step], self.lesson
-        bench = lesson.moved(learning.moved)
-        self.panel.show(bench)
+        """Return what to compute for the slide: its view, and the answer to the check."""
+        slide, lesson, check = self.slides[self._step], self.lesson, self.lesson.check
+        moved = lesson.moved(learning.moved)
+        self.panel.show(moved)
+        found = {}
         if slide.answers:
-            check = lesson.check
-            return {"answer": Job(None, lambda: check.answer, self._show_answer)}
-        if slide.view is None:
-            return {}
-        part, name = slide.view
-        committed = lesson.prediction.parsed(learning.prediction) if part == "after" else None
-        shown = bench if part == "after" else lesson.bench
-        work = partial(lesson.seen, name, shown, committed)
-        draw = partial(self._draw, slide.view, shown)
-        return {f"{part} {name}": Job((shown, committed), work, draw)}
+            found["answer"] = Job(None, lambda: check.answer, self._show_answer)
+        if slide.view is not None:
+            part, name = slide.view
+            committed = None if part == "before" else lesson.prediction.parsed(learning.prediction)
+            shown = {"before": lesson.bench, "after": moved, "check": check.bench}[part]
+            work = partial(lesson.seen, name, shown, committed)
+            draw = partial(self._draw, slide.view, shown)
+            found[f"{part} {name}"] = Job((shown, committed), work, draw)
+        return found
 
     def paint(self, colors: Palette) -> None:
         """Apply the colours of a theme."""
@@ -189,4 +189,4 @@ class Presenter:
 
     def _commit(self) -> None:
         step = next_revealed(self.slides, self._step)
-        self._change(prediction=self.prediction.value, step=step)
+        self._change(prediction=typed(self.prediction), step=step)

@@ -6,6 +6,7 @@ LESSON_HELP = "Each lesson asks first, and shows what happens after your predict
 
 COMMIT_HELP = "Predict: the prediction stays drawn on the plot."
 SHAPES_HELP = "Shape that you expect along the gate."
+NOTHING = "nothing"  # predicted where the field is empty
 AGAIN_HELP = "Start again: clear the prediction and the answer of this lesson."
 CHECK_HELP = "Check: compares your answer with a computation."
 
@@ -13,6 +14,7 @@ PRESENT_HELP = "Present: this lesson in the whole window, one slide at a time, b
 DEMONSTRATION_HELP = "Twenty-minute demonstration: lessons 1, 2, 4 and 7 as slides."
 
 MOVE = "Now move this control; everything else stays the same."
+PAST = "Before the control was moved:"
 
 NO_SIDEBAR = "This page has its own controls; the other pages' controls are hidden."
 

@@ -59,7 +59,7 @@ class Jump(Checked):
     onset_bin: int = parameter(50, _ECHO, "Where the echo begins: 50 in the paper.")
     signal: float = parameter(
         paper.FIGURE_1.signal,
-        Number("Signal", 0.01, 5.0, log=True, least=0.0, unit="photons per pulse"),
+        Number("Signal", 0.01, 5.0, log=True, least=0.0, unit="per pulse"),
         "Signal flux, if the detector were always armed: 0.5203 in the paper.",
     )
     sbr: float = parameter(0.08, _SBR, _SBR_HELP)

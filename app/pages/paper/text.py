@@ -54,7 +54,10 @@ READING_TRIALS = (
     "better, worse, or within chance. All methods use the same captures, one per repetition. "
     "Methods reconstructed from abstracts may differ from the paper's."
 )
-OUTSIDE_NOTE = "Grey: estimates beyond the ends of the colour scale."
+OUTSIDE_NOTE = (
+    "Grey: estimates beyond the ends of the colour scale. The titles end with the range of the "
+    "framed pixel; tap another."
+)
 PLACE_HELP = "Pixel whose range is shown above each image; a tap on an image also selects it."
 NEEDS_TWO = "The table appears after the second repetition: an interval needs two."
 

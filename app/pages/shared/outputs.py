@@ -248,7 +248,8 @@ class Gallery:
             knob.param.watch(lambda _: self._mark(), "value")
         self._scale = ScaleBar()
         self._scale.figure.visible = False
-        self._title = pmui.Typography("", variant="subtitle2", margin=(6, 0))
+        size = {"fontSize": "var(--type-size)"} if is_large else None
+        self._title = pmui.Typography("", variant="subtitle2", sx=size, margin=(6, 0))
         self._note = Sentence(text=NOT_COMPUTED, sizing_mode="stretch_width", margin=(4, 0))
         self.layout = pn.Column(
             self._title,

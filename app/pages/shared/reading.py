@@ -13,7 +13,7 @@ import panel_material_ui as pmui
 from app.model.reading import changed_options
 from app.model.store import Refused, Source
 from app.model.text import cause
-from app.widgets.cards import button, part, select
+from app.widgets.cards import button, part, select, typed
 from app.widgets.controls import Sentence
 from core.io import ReadOptions, reading_options
 
@@ -154,16 +154,11 @@ class ReadingForm:
             field.value = shown[name]
 
     def _apply(self, chosen: Mapping[str, str] | None = None) -> None:
-        typed = {name: _text(field) for name, field in self._fields.items()} | dict(chosen or {})
+        typed = {name: typed(field) for name, field in self._fields.items()} | dict(chosen or {})
         try:
             self._read(changed_options(self._reading, self._shown, typed))
         except ValueError as error:
             self._complain(cause(error))
-
-
-def _text(field: Any) -> str:
-    """Return the text of a field; Enter arrives before the value that it completes."""
-    return str(field.value_input if isinstance(field, pmui.TextInput) else field.value)
 
 
 def _field(name: str) -> Any:

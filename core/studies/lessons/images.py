@@ -168,7 +168,7 @@ def neighbours_image(bench: Bench) -> Pictures:
         {
             "truth": truth_m,
             TITLES[bench.neighbours]: found.range_m,
-            "pixels missed, their truth": np.where(found.right, np.nan, truth_m),
+            "missed pixels": np.where(found.right, np.nan, truth_m),
         },
         float(truth_m.min()) - 0.5,
         float(truth_m.max()) + 0.5,

@@ -30,12 +30,22 @@ WEIGHTS: tuple[Weight, ...] = ("cubic", "exponential")
 
 def both_scales(bench: Bench) -> Plot:
     """Plot the two scales of a pixel with an echo."""
-    return pixel_signals(bench.onset_bin, bench.tracking, bench.flux, seed=bench.seed)
+    return _signals(bench, bench.onset_bin)
 
 
 def both_scales_without_echo(bench: Bench) -> Plot:
     """Plot the two scales of a pixel without an echo."""
-    return pixel_signals(math.nan, bench.tracking, bench.flux, seed=bench.seed)
+    return _signals(bench, math.nan)
+
+
+def _signals(bench: Bench, onset_bin: float) -> Plot:
+    plot = pixel_signals(onset_bin, bench.tracking, bench.flux, seed=bench.seed)
+    return _named(plot, bench)
+
+
+def _named(plot: Plot, bench: Bench) -> Plot:
+    """Return a plot whose title has the preset, since plots of two are shown side by side."""
+    return replace(plot, title=f"{plot.title}, {bench.preset}")
 
 
 @lru_cache(maxsize=16)
@@ -45,7 +55,7 @@ def estimates_without_echo(bench: Bench) -> Plot:
     def simulated(range_m: float) -> Capture:
         return flat_target(bench, range_m, 2 * SIDE)
 
-    return range_prior.range_prior(simulated, "tracking", bench.tracking)
+    return _named(range_prior.range_prior(simulated, "tracking", bench.tracking), bench)
 
 
 def share_without_echo(bench: Bench, first: float, end: float) -> float:
