@@ -154,9 +154,9 @@ class ReadingForm:
             field.value = shown[name]
 
     def _apply(self, chosen: Mapping[str, str] | None = None) -> None:
-        typed = {name: typed(field) for name, field in self._fields.items()} | dict(chosen or {})
+        texts = {name: typed(field) for name, field in self._fields.items()} | dict(chosen or {})
         try:
-            self._read(changed_options(self._reading, self._shown, typed))
+            self._read(changed_options(self._reading, self._shown, texts))
         except ValueError as error:
             self._complain(cause(error))
 

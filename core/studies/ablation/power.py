@@ -27,6 +27,9 @@ _SIDE = 24  # rows and columns of a capture
 _SIGNAL, _PULSES = 0.1041, 1000
 _LATEST_BIN = 94
 _SEEN = f"p < {SIZE:g}"
+SURE = 0.995
+"""Level of the intervals that tell whether an absent property is found too often. Of the eight
+that are tried, one would be by chance in 2 % of the studies."""
 _SEEDS_PER_PIECE = 10
 
 _JUDGES: dict[str, Callable[[Capture], Requirement]] = {
@@ -122,16 +125,15 @@ class Outcome:
     case: Case
     found: tuple[Requirement, ...]
 
-    def share(self, verdict: Verdict) -> Interval:
+    def share(self, verdict: Verdict, level: float = 0.95) -> Interval:
         """Share of the captures with a verdict."""
-        return wilson(sum(each.verdict == verdict for each in self.found), len(self.found))
+        return wilson(sum(each.verdict == verdict for each in self.found), len(self.found), level)
 
-    @property
-    def seen(self) -> Interval:
+    def seen(self, level: float = 0.95) -> Interval:
         """Share of the captures in which a test of the property is significant; NaN without one."""
         if any(math.isnan(each.p_value) for each in self.found):
             return Interval(math.nan, math.nan, math.nan)
-        return wilson(sum(each.p_value < SIZE for each in self.found), len(self.found))
+        return wilson(sum(each.p_value < SIZE for each in self.found), len(self.found), level)
 
     def median(self, name: str) -> float:
         """Median of a field of `Requirement`."""
@@ -140,7 +142,7 @@ class Outcome:
     @property
     def holds(self) -> bool:
         """Whether an absent property is not found significantly more often than `SIZE`."""
-        shares = (self.seen, self.share("needed"))
+        shares = (self.seen(SURE), self.share("needed", SURE))
         return not (self.case.is_absent and any(each.low > SIZE for each in shares))
 
 
@@ -186,7 +188,7 @@ def power_table(found: Sequence[Outcome]) -> Table:
             "SBR": lambda of: f"{of.case.sbr:g}",
             "captures": lambda of: len(of.found),
             **{verdict: share(verdict) for verdict in verdicts},
-            _SEEN: lambda of: of.seen,
+            _SEEN: lambda of: of.seen(),
             "effect": lambda of: of.median("effect"),
             "seen from": lambda of: of.median("smallest_effect"),
         },
