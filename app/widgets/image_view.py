@@ -24,6 +24,9 @@ BORDER_PX = {"left": 52, "right": 66, "top": 26, "bottom": 40}
 JOINED_BORDER_PX = {"left": 36, "right": 12, "top": 6, "bottom": 24}
 """Room around one of several images, without labels and colour bar."""
 
+MOST_ELONGATED = 4
+"""Longer side of a frame over the shorter one; pixels of longer images are not square."""
+
 CONTAINER = ":host { container-type: size; }"
 """Style of the part of a page that an image fills as far as its proportions allow."""
 
@@ -122,7 +125,9 @@ class ImageView:
     def _keep_proportions(self) -> None:
         """Fit the frame to the image: a wider or higher one would show what is not there."""
         rows, cols = self._shape
-        aspect = max(cols, 1) / max(rows, 1)
+        own = max(cols, 1) / max(rows, 1)
+        aspect = min(max(own, 1 / MOST_ELONGATED), MOST_ELONGATED)
+        self.figure.match_aspect = aspect == own
         self.figure.stylesheets = [proportioned(aspect, *around(self._border_px))]
 
     def update(self, image: Array, look: ColorScale) -> None:
