@@ -9,7 +9,7 @@ from app.pages.catalog import PAGES
 from tests.browser import VIEWS, eventually, image, slider, stage
 from tests.test_browser import use_the_controls
 from tests.test_compare import compare_the_methods
-from tests.test_inspect_browser import inspect_the_building
+from tests.test_inspect_browser import expect_a_steady_frame, inspect_the_building
 from tests.test_lessons import take_the_first_lesson
 from tests.test_paper_page import read_part_by_part
 from tests.test_tradeoff_page import open_a_configuration
@@ -113,6 +113,7 @@ def expect_the_sidebar_to_be_skipped(page: Page) -> None:
 def explore(page: Page) -> None:
     expect_the_sidebar_to_be_skipped(page)
     expect_a_print_of_the_content(page)
+    expect_a_steady_frame(page)
     use_the_controls(page)
 
 

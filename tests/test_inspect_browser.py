@@ -231,6 +231,16 @@ def is_mapped(page: Page, values: np.ndarray) -> bool:
     )
 
 
+def expect_a_steady_frame(page: Page) -> None:
+    """Expect that the image keeps its size when its legend needs five lines."""
+    legend = page.get_by_text(re.compile("^Blank:")).filter(visible=True)
+    frame = picture(page).bounding_box()
+    legend.evaluate("each => { each.style.minHeight = '5lh' }")
+    assert legend.bounding_box()["height"] > 80
+    assert picture(page).bounding_box() == frame
+    legend.evaluate("each => { each.style.minHeight = '' }")
+
+
 READ_OUT = """(values) => {
   const Hover = Bokeh.Models.get("CustomJSHover");
   const source = { data: { image: [values] } };
@@ -252,12 +262,7 @@ def expect_maps(page: Page, subject: Subject) -> None:
     }
     read = page.evaluate(READ_OUT.replace("CODE", repr(VALUE_READ_OUT)), [12.345678, 3.2e-10, None])
     assert read == ["12.346 m", "3.2 × 10^-10 m", "none shown"]
-    legend = page.get_by_text(re.compile("^Blank:")).filter(visible=True)
-    frame = picture(page).bounding_box()
-    # A capture that the model does not fit has a legend of five lines.
-    legend.evaluate("each => { each.style.minHeight = '5lh' }")
-    assert legend.bounding_box()["height"] > 80
-    assert picture(page).bounding_box() == frame
+    expect_a_steady_frame(page)
     for name, values in expected.items():
         choose(page, "Map", name)
         eventually(lambda values=values: is_mapped(page, values))

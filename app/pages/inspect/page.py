@@ -30,7 +30,17 @@ from app.pages.shared.downloads import IMAGE_AND_REPORT, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.measure import pin_pixel
 from app.pages.shared.section import Section
-from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, choice, part, unrolled
+from app.widgets.cards import (
+    CHOICE_PX,
+    FIELD_PX,
+    SELECT_PX,
+    board,
+    button,
+    choice,
+    part,
+    steady,
+    unrolled,
+)
 from app.widgets.component import until_session_ends
 from app.widgets.controls import (
     KNOB_PX,
@@ -50,7 +60,7 @@ from core.io import ColorScale, RangeColors
 # The map with a table below on the left, plots on the right.
 BOARD = board(600, 88, BREAK_PX)
 # The map keeps its size, whatever is said below it: the table takes what is left.
-MAP = f"@media (min-width: {BREAK_PX + 1}px) {{ :host {{ flex: 0 1 46% !important; }} }}"
+MAP = steady(46, BREAK_PX)
 TABLES = """
 :host { flex: 1 1 0 !important; min-height: 96px; min-width: 0; overflow-y: auto; }
 """ + unrolled(BREAK_PX)
