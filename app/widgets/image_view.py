@@ -14,7 +14,7 @@ from app.model.large import Grid
 from app.plots import elements as plots
 from app.theme import Palette
 from app.widgets.figures import Plot, around, color_bars, paint_frame, pane_of, proportioned
-from core.io import ColorScale
+from core.io import MOST_ELONGATED, ColorScale
 
 Array = NDArray[Any]
 
@@ -23,9 +23,6 @@ BORDER_PX = {"left": 52, "right": 66, "top": 26, "bottom": 40}
 
 JOINED_BORDER_PX = {"left": 36, "right": 12, "top": 6, "bottom": 24}
 """Room around one of several images, without labels and colour bar."""
-
-MOST_ELONGATED = 4
-"""Longer side of a frame over the shorter one; pixels of longer images are not square."""
 
 CONTAINER = ":host { container-type: size; }"
 """Style of the part of a page that an image fills as far as its proportions allow."""
