@@ -509,6 +509,18 @@ def test_an_image_is_shown_with_its_scale_and_its_frame(car):
         assert middle == (5, 3)
 
 
+@pytest.mark.parametrize(
+    ("rows", "cols", "proportions"), [(64, 32, 0.5), (159, 9, 0.25), (1, 16, 4)]
+)
+def test_the_frame_of_a_narrow_image_is_wide_enough_to_be_read(car, rows, cols, proportions):
+    view = ImageView(lambda row, col: None)
+    view.enter(rows, cols, car.grid)
+    assert view.figure.match_aspect == (cols / rows == proportions)  # else axes exceed the image
+    (style,) = view.figure.stylesheets
+    assert f"* {proportions:g} +" in style
+    assert f"/ {proportions:g} +" in style
+
+
 # -- controls --------------------------------------------------------------------------------------
 
 

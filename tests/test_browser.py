@@ -908,9 +908,12 @@ def test_files_are_refused_or_shown_as_text(start_page, tmp_path, troubles):
     expect(one.get_by_text("3 × 3 pixels, 40 bins")).to_contain_text(trap)
     assert one.evaluate("window.trapped") is None
     expect(chosen(one, "Scene or capture")).to_have_text("one.npz")
-    large = tmp_path / "large.npz"
-    with large.open("wb") as file:
-        file.truncate(MAX_UPLOAD_BYTES + 1)
+    half, large = tmp_path / "half.npz", tmp_path / "large.npz"
+    for path, n_bytes in ((half, MAX_UPLOAD_BYTES // 2 + 1), (large, MAX_UPLOAD_BYTES + 1)):
+        with path.open("wb") as file:
+            file.truncate(n_bytes)
+    one.locator("input[type=file]").set_input_files(half)
+    expect(warning(one)).to_contain_text("half.npz: the archive cannot be read")
     one.locator("input[type=file]").set_input_files(large)
     alert = one.get_by_role("alert").filter(has_text="large.npz")
     expect(alert).to_contain_text("The limit is 100 MiB")

@@ -321,6 +321,7 @@ def test_a_file_has_no_oracle_no_limit_and_no_errors(stage):
     stage.page.show(True)
     stage.settle()
     assert "true signal" in stage.messages[ESTIMATORS["oracle"].title]
+    assert stage.page.status.text == "4 methods compared, 1 not usable here"
     assert stage.messages["Single-pixel limit"] == text.LIMIT_UNKNOWN
     assert "Error" not in stage.page.kind.options
     assert text.AGREEMENT_ONLY in stage.page.remarks.text

@@ -9,7 +9,7 @@ from app.pages.catalog import PAGES
 from tests.browser import VIEWS, eventually, image, slider, stage
 from tests.test_browser import use_the_controls
 from tests.test_compare import compare_the_methods
-from tests.test_inspect_browser import inspect_the_building
+from tests.test_inspect_browser import expect_a_steady_frame, inspect_the_building
 from tests.test_lessons import take_the_first_lesson
 from tests.test_paper_page import read_part_by_part
 from tests.test_tradeoff_page import open_a_configuration
@@ -29,6 +29,13 @@ PLOTS = f"""() => {{
 }}"""
 """Places of the plots on screen, without the figure that holds the colour bar of Compare."""
 
+
+PLOT_NAMES = f"""() => {{
+  {VIEWS}
+  const layers = views.map(({{ canvas_view }}) => canvas_view?.events_el).filter(Boolean);
+  return layers.map(({{ role, ariaLabel, tabIndex }}) => [role, ariaLabel, tabIndex]);
+}}"""
+"""Role, name and place among the tab stops of each plot."""
 
 LEGENDS_FIT = f"""() => {{
   {VIEWS}
@@ -56,28 +63,42 @@ def expect_readable(page: Page, name: str) -> None:
 
         eventually(fit)
         expect(page.get_by_role("button", name="Toggle theme")).to_be_in_viewport(ratio=1)
+    for role, label, tab_index in page.evaluate(PLOT_NAMES):
+        assert (role, tab_index) == ("img", -1)
+        assert label not in ("", "Plot")
     page.set_viewport_size({"width": 1440, "height": 900})
     expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
 
 
 def expect_a_print_of_the_content(page: Page) -> None:
     described = page.get_by_text("method: tracking; settings:")
-    expect(described).to_be_hidden()
-    frame = image(page).bounding_box()
-    page.evaluate("dispatchEvent(new Event('beforeprint'))")
-    page.emulate_media(media="print")
-    expect(described).to_be_visible()
-    printed, zoom = image(page).bounding_box(), float(page.evaluate(PRINT_ZOOM))
-    # Else what is drawn there would be cut off; less than a pixel is not seen.
-    for side in ("width", "height"):
-        assert printed[side] == pytest.approx(zoom * frame[side], abs=1)
-    expect(page.get_by_role("button", name="Toggle theme")).to_be_hidden()
-    expect(slider(page, "SBR")).to_be_hidden()
-    content = page.locator(".main-content")
-    expect(stage(page)).to_be_visible()
-    assert content.evaluate("(each) => each.scrollHeight <= each.clientHeight")  # all of it
-    page.emulate_media(media="screen")
-    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    content, skip = page.locator(".main-content"), page.get_by_role("link", name="Skip to the")
+    for width, height in SIZES_PX[:2]:  # wider and narrower than paper
+        page.set_viewport_size({"width": width, "height": height})
+        expect(described).to_be_hidden()
+        parts = (image(page), stage(page))
+        shown = [each.bounding_box() for each in parts]
+        page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        page.set_viewport_size({"width": 1062, "height": 733})
+        page.emulate_media(media="print")
+        expect(described).to_be_visible()
+        zoom = float(page.evaluate(PRINT_ZOOM))
+        # Else what is drawn there would be cut off; rounded borders are not seen.
+        for part, frame in zip(parts, shown, strict=True):
+            printed = part.bounding_box()
+            for side in ("width", "height"):
+                assert printed[side] == pytest.approx(zoom * frame[side], abs=2)
+        for unprinted in (
+            page.get_by_role("button", name="Toggle theme"),
+            slider(page, "SBR"),
+            skip,
+        ):
+            expect(unprinted).to_be_hidden()
+        assert content.evaluate("(each) => each.scrollHeight <= each.clientHeight")  # all of it
+        page.emulate_media(media="screen")
+        page.evaluate("dispatchEvent(new Event('afterprint'))")
+    page.set_viewport_size({"width": 1440, "height": 900})
+    expect(page.locator("html")).to_have_css("print-color-adjust", "exact")  # dark mode prints dark
 
 
 def expect_the_sidebar_to_be_skipped(page: Page) -> None:
@@ -92,6 +113,7 @@ def expect_the_sidebar_to_be_skipped(page: Page) -> None:
 def explore(page: Page) -> None:
     expect_the_sidebar_to_be_skipped(page)
     expect_a_print_of_the_content(page)
+    expect_a_steady_frame(page)
     use_the_controls(page)
 
 

@@ -19,6 +19,7 @@ import core
 from app.model.state import Illumination
 from app.pages.inspect import text
 from app.pages.shared.measure import TOO_MANY_PINS
+from app.plots.elements import READ_OUT as VALUE_READ_OUT
 from core import Capture, RangeImage, inspection
 from core.inference import predictive_of
 from tests.browser import VIEWS, choose, enter, eventually, fact, field, slider
@@ -230,6 +231,25 @@ def is_mapped(page: Page, values: np.ndarray) -> bool:
     )
 
 
+def expect_a_steady_frame(page: Page) -> None:
+    """Expect that the image keeps its size when its legend needs five lines."""
+    legend = page.get_by_text(re.compile("^Blank:")).filter(visible=True)
+    frame = picture(page).bounding_box()
+    legend.evaluate("each => { each.style.minHeight = '5lh' }")
+    assert legend.bounding_box()["height"] > 80
+    assert picture(page).bounding_box() == frame
+    legend.evaluate("each => { each.style.minHeight = '' }")
+
+
+READ_OUT = """(values) => {
+  const Hover = Bokeh.Models.get("CustomJSHover");
+  const source = { data: { image: [values] } };
+  const hover = new Hover({ args: { source, unit: "m" }, code: CODE });
+  return values.map((_, k) => hover.format(0, "value", { image_index: { flat_index: k } }));
+}"""
+"""What is shown under the pointer for each of some values of a map."""
+
+
 def expect_maps(page: Page, subject: Subject) -> None:
     """Expect maps of each kind, and that of the estimate saved."""
     capture, image = subject.capture, subject.image
@@ -240,6 +260,9 @@ def expect_maps(page: Page, subject: Subject) -> None:
         "Goodness of fit": inspection.maps["Goodness of fit"](capture),
         "Estimate": subject.visible_m,
     }
+    read = page.evaluate(READ_OUT.replace("CODE", repr(VALUE_READ_OUT)), [12.345678, 3.2e-10, None])
+    assert read == ["12.346 m", "3.2 × 10^-10 m", "none shown"]
+    expect_a_steady_frame(page)
     for name, values in expected.items():
         choose(page, "Map", name)
         eventually(lambda values=values: is_mapped(page, values))

@@ -128,7 +128,10 @@ CONTENT = (Path(__file__).parent.parent / "widgets" / "content.js").read_text("u
 
 TEMPLATE = (
     '{% extends "base.html" %}{% block postamble %}{{ super() }}'
-    "<style>@page { size: landscape; margin: 8mm; }</style><script>{{ scripts | safe }}"
+    # Without its background, the dark mode would be light text on white paper.
+    "<style>@page { size: landscape; margin: 8mm; } html { print-color-adjust: exact; }"
+    "@media print { .screen-only { display: none; } }</style>"
+    "<script>{{ scripts | safe }}"
     + CONTENT
     # Load the widgets' module now, not only when the page has loaded.
     + f'importShim("{pmui.Button._render_esm(server=True)}");'

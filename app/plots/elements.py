@@ -382,7 +382,8 @@ def curve_styles(item: items.Plot, colors: Palette) -> dict[str, tuple[str, list
 READ_OUT = """
 if (format === "column") return String(Math.round(value));
 const found = source.data.image[0][special_vars.image_index.flat_index];
-return Number.isFinite(found) ? `${Number(found.toPrecision(5))} ${unit}` : "none shown";
+if (!Number.isFinite(found)) return "none shown";
+return `${Number(found.toPrecision(5))} ${unit}`.replace(/e[+]?(-?\\d+)/, " × 10^$1");
 """
 
 

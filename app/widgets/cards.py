@@ -41,6 +41,14 @@ def column(gap_px: int, break_px: int) -> str:
 """
 
 
+def steady(share: int, break_px: int) -> str:
+    """Return the style of a card that has `share` % of its column, whatever is said below it."""
+    return (
+        f"@media screen and (min-width: {break_px + 1}px) {{ "
+        f":host {{ flex: 0 1 {share}% !important; }} }}"
+    )
+
+
 # Heights of small widgets, reserved from the start: the browser draws them one by one after the
 # plots, which would be resized and painted again for each.
 FIELD_PX, SELECT_PX, BUTTON_PX, CHOICE_PX = 37, 32, 34, 36

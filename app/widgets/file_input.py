@@ -75,9 +75,10 @@ class FileInput(pmui.FileInput):
     """
 
     def __init__(self, complain: Callable[[str], None], **params: Any) -> None:
-        super().__init__(
-            chunk_size=PART_BYTES, max_total_file_size=params.get("max_file_size"), **params
-        )
+        # panel-material-ui 0.16 adds each file to a sum that has it already, and would refuse one
+        # of more than half the limit. The sum itself is checked below.
+        most_bytes = 2 * params["max_file_size"]
+        super().__init__(chunk_size=PART_BYTES, max_total_file_size=most_bytes, **params)
         self._complain = complain
 
     def _handle_msg(self, msg: Mapping[str, Any]) -> None:

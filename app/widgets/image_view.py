@@ -14,7 +14,7 @@ from app.model.large import Grid
 from app.plots import elements as plots
 from app.theme import Palette
 from app.widgets.figures import Plot, around, color_bars, paint_frame, pane_of, proportioned
-from core.io import ColorScale
+from core.io import MOST_ELONGATED, ColorScale
 
 Array = NDArray[Any]
 
@@ -122,7 +122,9 @@ class ImageView:
     def _keep_proportions(self) -> None:
         """Fit the frame to the image: a wider or higher one would show what is not there."""
         rows, cols = self._shape
-        aspect = max(cols, 1) / max(rows, 1)
+        own = max(cols, 1) / max(rows, 1)
+        aspect = min(max(own, 1 / MOST_ELONGATED), MOST_ELONGATED)
+        self.figure.match_aspect = aspect == own
         self.figure.stylesheets = [proportioned(aspect, *around(self._border_px))]
 
     def update(self, image: Array, look: ColorScale) -> None:

@@ -85,6 +85,7 @@ class Picture:
         if self.cloud is not None:
             self.cloud.visible = False
         self.image.update(values, replace(look, title=""))
+        self.image.figure.name = f"{look.title}: {self.title.text}"
 
     def resize(self, height: int) -> None:
         """Set the height of image and cloud."""
@@ -114,6 +115,7 @@ class ScaleBar:
     def __init__(self) -> None:
         # A colour bar needs a figure; this one is empty.
         self.figure = figure(
+            name="Colour scale",
             height=52,
             sizing_mode="stretch_width",
             toolbar_location=None,

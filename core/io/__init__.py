@@ -24,6 +24,7 @@ from core.io.readers.truth import (
 from core.io.scene_files import SceneError, read_scene
 from core.io.writers import (
     COLOR_MAPS,
+    MOST_ELONGATED,
     OUTSIDE_COLOR,
     P_VALUE,
     WRITERS,
@@ -46,6 +47,7 @@ from core.io.writers import (
 
 __all__ = [
     "COLOR_MAPS",
+    "MOST_ELONGATED",
     "MOST_LETTERS",
     "OUTSIDE_COLOR",
     "P_VALUE",

@@ -32,6 +32,7 @@ from core.estimators import Provenance, RangeImage
 from core.estimators.base import NoParameters
 from core.geometry import Box, sight_lines
 from core.inference import fit_p_values
+from core.io import ColorScale, Picture
 from core.io.readers.labelled import dataset
 from core.io.writers import (
     CAPTURE_SUFFIXES,
@@ -793,6 +794,24 @@ def test_ranges_beyond_the_confident_ones_are_grey(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pixels[1, 1], pixels[5, 5])
     grey = np.all(pixels == pixels[1, 1], axis=-1)
     assert np.argwhere(grey).tolist() == [[1, 1], [5, 5]]
+
+
+@pytest.mark.parametrize(("shape", "proportions"), [((159, 9), 0.25), ((9, 159), 4), ((30, 60), 2)])
+def test_the_frame_of_a_narrow_image_is_wide_enough_to_be_read(
+    shape: tuple[int, int], proportions: float
+) -> None:
+    file, color = io.BytesIO(), "#ff00ff"
+    Picture(np.ones(shape), ColorScale("Range", "m", 0.0, 2.0, [color])).write(file, "png")
+    pixels = np.asarray(Image.open(file).convert("RGB"))
+    in_color = (pixels == tuple(bytes.fromhex(color[1:]))).all(axis=2)
+    # The bar at the right has the colour, too: a row and a column of the frame.
+    rows = np.flatnonzero(in_color.sum(axis=1) > 0)
+    first_run = in_color[rows[rows.size // 2]]
+    begin = int(first_run.argmax())
+    width = int((~first_run[begin:]).argmax())
+    height = int(in_color[:, begin + width // 2].sum())
+    assert width / height == pytest.approx(proportions, rel=0.03)
+    assert begin < 0.3 * pixels.shape[1]
 
 
 @pytest.mark.parametrize("color_map", ["bgyw", "viridis"])

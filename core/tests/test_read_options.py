@@ -12,7 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import core
-from core.io import ReadOptions, add_read_options, read_options_from, reading_options
+from core.io import (
+    ReadOptions,
+    add_read_options,
+    read_options_from,
+    reading_options,
+    with_flags,
+)
 from core.io.readers.quantities import angle_as_typed, parsed_angle, parsed_time, time_as_typed
 from core.tests.read_options import EXAMPLES
 
@@ -120,3 +126,9 @@ def test_quantities_are_written_with_a_suitable_unit() -> None:
 def test_text_that_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(ValueError):
         parsed_time(text)
+
+
+def test_options_are_named_as_on_the_command_line_and_arrays_as_in_the_file() -> None:
+    message = "variable = None is not accepted: give bin_width_s; the file has bin_width_s, counts."
+    expected = "--variable is missing: give --bin-width; the file has bin_width_s, counts."
+    assert with_flags(message) == expected

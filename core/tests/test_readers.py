@@ -496,6 +496,11 @@ REFUSED: tuple[tuple[str, bytes, str], ...] = (
     ("a.mat", bytes(200), "header.*-v7"),
     ("a.mat", b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF", "saved with -v"),
     ("a.mat", bytes(512) + b"\x89HDF\r\n\x1a\n", "file cannot be read"),
+    # A map of ranges
+    ("a.npy", npy_bytes(np.eye(3)), "shape \\(row, col, bin\\).*; a map .* as its truth"),
+    ("a.npz", npz_bytes(range_m=np.eye(3)), "the file has range_m; a map .* as its truth"),
+    ("a.mat", mat_bytes(D=cells_of([[5.5], [6.0]], (1, 2))), "or time_unit_s .*; a map .* as its"),
+    ("a.tif", b"II*\0", "like .*; a map .* as its truth"),
     # NumPy
     ("a.npy", npy_bytes(CUBE)[:-10], "bytes of the array = 2390 .*claims 2400"),
     ("a.npy", npy_bytes(PICKLED), "object.*pickled objects are refused"),

@@ -472,7 +472,8 @@ class Compare(Section):
         total, done = len(self.tasks), len(self.tasks) - len(missing)
         is_running = self._is_busy and bool(missing)
         running = missing[0].method if is_running else None
-        self.status.text = text.progress(done, total, running)
+        n_failed = sum(isinstance(self.results.get(each), str) for each in self.tasks.values())
+        self.status.text = text.progress(done, total, running, n_failed)
         for picture, method in zip(self.pictures, self.pictured, strict=False):
             if self.tasks[method] in missing:
                 picture.caption.text = text.waiting(method, running)

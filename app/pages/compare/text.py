@@ -240,13 +240,19 @@ def caption(answer: Answer, row: int, col: int) -> str:
     return f"{estimate}{error}, confidence {100 * confidence:.0f} %"
 
 
-def progress(done: int, total: int, method: str | None) -> str:
-    """Return the progress of the comparison; `method` is the one that is running."""
+def progress(done: int, total: int, method: str | None, n_failed: int = 0) -> str:
+    """Return the progress of the comparison.
+
+    `method` is the one that is running; `n_failed` could not be used, for which the table says why.
+    """
     if total == 0:
         return "Choose at least one method"
     if method is not None:
         return f"{done + 1} of {total}: {ESTIMATORS[method].title}"
-    return f"{total} methods compared" if done == total else f"Stopped: {done} of {total} done"
+    if done < total:
+        return f"Stopped: {done} of {total} done"
+    unusable = f", {n_failed} not usable here" if n_failed else ""
+    return f"{total - n_failed} methods compared{unusable}"
 
 
 def waiting(method: str, running: str | None) -> str:

@@ -41,7 +41,7 @@ from app.plots.gate_axes import GateAxes
 from app.plots.gate_cut import Cut
 from app.tasks.turns import TURNS
 from app.theme import WRONG_COLOR
-from app.widgets.cards import BREAK_PX, board, card, choice, column, part, unrolled
+from app.widgets.cards import BREAK_PX, board, card, choice, column, part, steady
 from app.widgets.cloud import PointCloud
 from app.widgets.controls import (
     FACTS_PX,
@@ -71,8 +71,8 @@ BOARD = (
 """
 )
 COLUMN = column(8, BREAK_PX)
-LONG_LEGEND = unrolled(BREAK_PX, "390px")
-"""Style of the image's card on a phone, where its legend takes six lines."""
+IMAGE = steady(41, BREAK_PX)
+"""Style of the image's card, which keeps its size; the cloud takes what the legend leaves."""
 # Reserve the height of the switch, which is drawn late, so that the plots keep theirs.
 ROW = (
     ":host { display: flex !important; flex-wrap: wrap; align-items: center; gap: 0 12px; "
@@ -186,8 +186,8 @@ class Explore(Section):
     def layout(self) -> tuple[Any, Any]:
         """Return the two columns of the page, and its part of the sidebar."""
         state = self.session.state
-        image = card(choice(text.IMAGE_HELP, state.param.image), self.image_keys, self.legend)
-        image.stylesheets = [*image.stylesheets, LONG_LEGEND]
+        image = card(choice(text.IMAGE_HELP, state.param.image), self.image_keys)
+        image.stylesheets = [*image.stylesheets, IMAGE]
         left = (
             self.offer(
                 image,
@@ -195,6 +195,7 @@ class Explore(Section):
                 self.image_shown,
                 IMAGE_AND_REPORT,
             ),
+            self.legend,
             self._least_confidence,
             self._large.layout,
             self.offer(

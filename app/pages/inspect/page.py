@@ -30,7 +30,17 @@ from app.pages.shared.downloads import IMAGE_AND_REPORT, Shown, image_on_show
 from app.pages.shared.large_view import LargeView
 from app.pages.shared.measure import pin_pixel
 from app.pages.shared.section import Section
-from app.widgets.cards import CHOICE_PX, FIELD_PX, SELECT_PX, board, button, choice, part, unrolled
+from app.widgets.cards import (
+    CHOICE_PX,
+    FIELD_PX,
+    SELECT_PX,
+    board,
+    button,
+    choice,
+    part,
+    steady,
+    unrolled,
+)
 from app.widgets.component import until_session_ends
 from app.widgets.controls import (
     KNOB_PX,
@@ -49,9 +59,10 @@ from core.io import ColorScale, RangeColors
 
 # The map with a table below on the left, plots on the right.
 BOARD = board(600, 88, BREAK_PX)
-# The same room below the map for all subjects, so that the map keeps its size.
+# The map keeps its size, whatever is said below it: the table takes what is left.
+MAP = steady(46, BREAK_PX)
 TABLES = """
-:host { flex: 0 0 20% !important; min-height: 0; min-width: 0; overflow-y: auto; }
+:host { flex: 1 1 0 !important; min-height: 96px; min-width: 0; overflow-y: auto; }
 """ + unrolled(BREAK_PX)
 MAP_DELAY_MS = 60
 """The map is drawn this long after the pixel's plots, which the eye follows."""
@@ -196,9 +207,11 @@ class Inspect(Section):
         for main, below in zip(sections.mains.values(), sections.asides.values(), strict=True):
             main.param.update(stylesheets=[FILLING], sizing_mode="stretch_both", margin=0)
             below.param.update(stylesheets=[TABLES], sizing_mode="stretch_width", margin=0)
+        map_card = self.offer(framed_map, "map", self._map_shown, IMAGE_AND_REPORT)
+        map_card.stylesheets = [*map_card.stylesheets, MAP]
         left = (
             _row(self._map, self._mode),
-            self.offer(framed_map, "map", self._map_shown, IMAGE_AND_REPORT),
+            map_card,
             self.legend,
             self.least_confidence,
             self._large.layout,

@@ -37,7 +37,7 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import capture_of, count_dtype, description_of, with_guesses
 from core.io.readers.guards import require_fits
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import TRUTH_HINT, ReadOptions
 from core.io.readers.quantities import time_text
 
 NATIVE_BIN_S = 8e-12
@@ -154,7 +154,9 @@ def _guess_time_unit(times: Floats, whole: bool, name: str) -> float:
     if whole:
         return 1e-12 if times.max() > PICOSECONDS_ABOVE else NATIVE_BIN_S
     fraction = float(times[times != np.floor(times)].max())
-    accepted = f"whole numbers, seconds below {SECONDS_BELOW}, or time_unit_s (1e-9 for ns)"
+    accepted = (
+        f"whole numbers, seconds below {SECONDS_BELOW}, or time_unit_s (1e-9 for ns); {TRUTH_HINT}"
+    )
     require(f"a time of {name}", fraction, bool(times.max() < SECONDS_BELOW), accepted)
     return 1.0
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from core.capture import Capture
 from core.checks import require
 from core.io.readers.guards import decoding, require_fits
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import TRUTH_HINT, ReadOptions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -80,9 +80,10 @@ def reader_of(path: Path, readers: Sequence[Reader]) -> Reader:
     if of_suffix:
         return of_suffix[0]
     require("path", str(path), not is_folder, "an existing file, or a Zarr folder")
+    hint = f"; {TRUTH_HINT}" if path.suffix.lower() in (".tif", ".tiff") else ""
     raise ValueError(
         f"suffix = {path.suffix!r} is not accepted, and the content looks like "
-        f"{_description(start)}: give one of {', '.join(suffixes_of(readers))}."
+        f"{_description(start)}: give one of {', '.join(suffixes_of(readers))}{hint}."
     )
 
 

@@ -18,7 +18,7 @@ from core.acquisition import MOST_BINS, Acquisition, Pulse
 from core.capture import COUNT_TYPES, Capture, Detection
 from core.checks import printable, require
 from core.io.readers.guards import require_fits
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import TRUTH_HINT, ReadOptions
 from core.io.readers.pulse_guess import guessed_pulse
 from core.io.readers.quantities import time_text
 
@@ -227,6 +227,8 @@ def require_cube(cube: NDArray[Any], name: str) -> None:
     """Raise ``ValueError`` unless `cube` is numbers of shape (row, col, bin), none of them 0."""
     fits = cube.ndim == 3 and cube.size > 0 and cube.dtype.kind in "biuf"
     accepted = "real numbers of shape (row, col, bin), none of them 0"
+    if cube.ndim == 2:
+        accepted += f"; {TRUTH_HINT}"
     require(name, f"{cube.dtype} array of shape {cube.shape}", fits, accepted)
     require(f"bins of {name}", n_bins := cube.shape[2], n_bins <= MOST_BINS, f"up to {MOST_BINS:,}")
 

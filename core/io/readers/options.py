@@ -344,6 +344,10 @@ def _which_variable(variables: Sequence[str], listed: str) -> AmbiguousError:
     )
 
 
+TRUTH_HINT = "a map of true ranges is no capture: add it to one as its truth"
+"""End of a message about a file that may hold the truth of a capture."""
+
+
 def choose_variable(
     requested: str | None,
     names: Container[str],
@@ -377,7 +381,7 @@ def choose_variable(
         return requested
     if len(fitting) > 1:
         raise _which_variable(sorted(fitting, key=lambda name: not fitting[name]), listed)
-    require("variable", None, len(fitting) == 1, f"as variable {what}")
+    require("variable", None, len(fitting) == 1, f"as variable {what}; {TRUTH_HINT}")
     return next(iter(fitting))
 
 
@@ -441,8 +445,12 @@ def with_labels(message: str, others: Mapping[str, str] = MappingProxyType({})) 
 
 
 def _renamed(message: str, names: Mapping[str, str]) -> str:
-    """Replace the names of arguments; one that is a common word only where a value follows."""
+    """Replace the names of arguments, but not those of arrays that a file has.
+
+    One that is a common word is replaced only where a value follows.
+    """
+    said, mark, listed = message.partition("the file has ")
     for name, other in names.items():
         end = r"\b" if "_" in name else r"(?= = )"
-        message = re.sub(rf"\b{name}{end}", other, message)
-    return message
+        said = re.sub(rf"\b{name}{end}", other, said)
+    return said + mark + listed

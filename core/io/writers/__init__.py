@@ -23,6 +23,7 @@ from core.io.readers.npz import fields
 from core.io.writers import las, netcdf, npz, pcd, picture, ply, table, tiff
 from core.io.writers.colors import (
     COLOR_MAPS,
+    MOST_ELONGATED,
     OUTSIDE_COLOR,
     ColorScale,
     RangeColors,
@@ -41,6 +42,7 @@ __all__ = [
     "CLOUD_SUFFIXES",
     "COLOR_MAPS",
     "FOLDER_WRITERS",
+    "MOST_ELONGATED",
     "OUTSIDE_COLOR",
     "P_VALUE",
     "WRITERS",

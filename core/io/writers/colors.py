@@ -26,6 +26,9 @@ COLOR_MAPS = {
 """Perceptually uniform colour maps of colorcet and Matplotlib, and the part of each that stays
 visible on a white and on a black page."""
 
+MOST_ELONGATED = 4
+"""Longer side of an image's frame over the shorter one; pixels of longer images are not square."""
+
 OUTSIDE_COLOR = "#8d949c"
 """Colour of ranges beyond the ends of the scale."""
 

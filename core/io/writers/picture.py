@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from core.io.writers.colors import ColorScale, range_scale
+from core.io.writers.colors import MOST_ELONGATED, ColorScale, range_scale
 from core.io.writers.product import Product, plain
 from core.labels import software
 
@@ -98,8 +98,9 @@ class Picture:
         colors = ListedColormap(scale.colors).with_extremes(
             bad=_INVALID, under=scale.outside, over=scale.outside
         )
-        height = float(np.clip(5.2 * rows / cols, 1.6, 10.0))
-        figure = Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
+        proportions = float(np.clip(rows / cols, 1 / MOST_ELONGATED, MOST_ELONGATED))
+        height = float(np.clip(5.2 * proportions, 1.6, 10.0))
+        figure = Figure(figsize=(_WIDTH_INCHES, height), layout="compressed")
         axes = figure.add_subplot()
         above, left = (at - self.step / 2 for at in self.first)
         shown = axes.imshow(
@@ -108,6 +109,7 @@ class Picture:
             vmax=scale.high,
             cmap=colors,
             interpolation="none",
+            aspect=proportions * cols / rows,
             extent=(left, left + cols * self.step, above + rows * self.step, above),
         )
         axes.set_title(self.title or scale.title, parse_math=False, wrap=True)
