@@ -101,6 +101,15 @@ def expect_a_print_of_the_content(page: Page) -> None:
     expect(page.locator("html")).to_have_css("print-color-adjust", "exact")  # dark mode prints dark
 
 
+def expect_a_print_that_states_its_link(page: Page) -> None:
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    page.emulate_media(media="print")
+    expect(page.get_by_text(": printed page")).to_be_visible()
+    expect(page.locator("body")).to_have_attribute("data-link", page.evaluate("location.href"))
+    page.emulate_media(media="screen")
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+
+
 def expect_the_sidebar_to_be_skipped(page: Page) -> None:
     page.locator("body").focus()
     page.keyboard.press("Tab")
@@ -135,4 +144,5 @@ OTHERWISE = {"Inspect": "&source=building&pixel=[30,20]"}
 def test_a_page_opens_first_has_plots_that_can_be_read_and_is_used(page, address, name):
     opened = page(f"{address}?page={name}{OTHERWISE.get(name, '')}", ready=".bk-Figure")
     expect_readable(opened, name)
+    expect_a_print_that_states_its_link(opened)
     JOURNEYS[name](opened)

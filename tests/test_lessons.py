@@ -54,6 +54,8 @@ def session():
 def test_a_lesson_leads_from_its_question_to_a_right_answer(key, session):
     lesson, check = LESSONS[key], LESSONS[key].check
     assert lesson.introduction and lesson.explanation
+    if lesson.further:
+        assert not any(lesson.further in each.text for each in slides_of(lesson))
     for hint in check.hints:
         wrong = replace(check, function=hint.function, arguments=hint.arguments).answer
         assert check.verdict(wrong) == (False, hint.text)
@@ -100,7 +102,7 @@ def test_numbers_of_the_built_in_lessons():
 
 
 def test_links_of_the_lessons_lead_to_other_pages():
-    texts = " ".join(each.explanation for each in LESSONS.values())
+    texts = " ".join(each.explanation + each.further for each in LESSONS.values())
     queries = re.findall(r"\]\(\?([^)]+)\)", texts)
     for query in queries:
         session = Session(built_in_sources(), link_to(query), HeldTasks())

@@ -1,7 +1,8 @@
 """Lessons: Markdown files with front matter (TOML between lines of +++), read and checked.
 
 A file names views and checks of `core.studies.lessons`; nothing in it is evaluated. The text below
-the front matter introduces the lesson; the text below a line of three dashes explains the result.
+the front matter introduces the lesson; the text below a line of three dashes explains the result,
+and that below a second one, which slides leave out, says where to go on.
 """
 
 from __future__ import annotations
@@ -144,6 +145,8 @@ class Lesson:
     check: Check
     introduction: str
     explanation: str
+    further: str
+    """Where to go on."""
 
     def moved(self, text: str) -> Bench:
         """Return the state after the control was moved; an empty text stands for not moved.
@@ -278,7 +281,7 @@ def lesson_of(key: str, text: str) -> Lesson:
         given.table("prediction", [each.name for each in fields(Prediction)]), after
     )
     check = _check(given.table("check", _CHECK_ENTRIES), bench, after, prediction.view)
-    introduction, _, explanation = body.partition(RULE)
+    introduction, explanation, further = (*body.split(RULE, 2), "", "")[:3]
     return Lesson(
         key,
         given.text("title"),
@@ -291,6 +294,7 @@ def lesson_of(key: str, text: str) -> Lesson:
         check,
         introduction.strip(),
         explanation.strip(),
+        further.strip(),
     )
 
 

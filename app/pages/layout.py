@@ -30,7 +30,7 @@ from app.model.watched import Arrival
 from app.pages.catalog import PAGES
 from app.pages.navigation import Content, Page, Pages, Shared, View
 from app.pages.session import Session
-from app.pages.shared.downloads import explored, viewed
+from app.pages.shared.downloads import Subject, explored, looked_at, viewed
 from app.pages.shared.illumination import IlluminationPanel
 from app.pages.shared.method import MethodChoice
 from app.pages.shared.photon_budget import PhotonBudgetForm
@@ -130,7 +130,8 @@ TEMPLATE = (
     '{% extends "base.html" %}{% block postamble %}{{ super() }}'
     # Without its background, the dark mode would be light text on white paper.
     "<style>@page { size: landscape; margin: 8mm; } html { print-color-adjust: exact; }"
-    "@media print { .screen-only { display: none; } }</style>"
+    "@media print { .screen-only { display: none; } body::after { content: attr(data-link); "
+    "font: 10px sans-serif; overflow-wrap: anywhere; } }</style>"
     "<script>{{ scripts | safe }}"
     + CONTENT
     # Load the widgets' module now, not only when the page has loaded.
@@ -461,11 +462,16 @@ class Layout:
         self.alert.styles = ABOVE_SLIDES if is_presenting else {}
 
     def _describe_print(self) -> None:
-        """State on the printed page what is behind the estimate, where it shows one."""
-        shows_one = Shared.METHOD in self._pages[self.pages.choice.value].shared
-        session = self.session
-        subject = viewed(session, explored(session), session.state.viewing)
-        self._printed.text = subject.about("printed page")[:2000] if shows_one else ""
+        """State on paper the version, and what is behind the page; the browser adds its link."""
+        page, session = self._pages[self.pages.choice.value], self.session
+        answer = session.answer
+        if Shared.METHOD in page.shared:
+            subject = viewed(session, explored(session), session.state.viewing)
+        elif page.is_standalone:
+            subject = Subject("")
+        else:
+            subject = replace(looked_at(session, answer.request), source=answer.capture.source)
+        self._printed.text = subject.about("printed page")[:2000]
 
     def _paint(self) -> None:
         """Change between light and dark mode, which the address keeps."""

@@ -55,6 +55,7 @@
     const content = find(".main-content");
     if (!content) return;
     const { clientWidth: width, scrollHeight: height } = content;
+    document.body.dataset.link = location.href; // with all that differs from the defaults
     const values = [`${innerHeight}px`, `${width}px`, zoomOf(width, height)];
     names.forEach((name, k) => style.setProperty(name, values[k]));
     kept = [...mediaRules(document)]

@@ -98,7 +98,7 @@ class LessonView:
         self.answer.param.watch(lambda _: self._answer(), "value")
         self.verdict = Sentence(live=True, margin=(4, 0))
         self._checked = pn.Column(
-            markdown(lesson.explanation),
+            markdown(f"{lesson.explanation}\n\n{lesson.further}"),
             markdown(f"**Check.** {lesson.check.question}"),
             pn.Row(
                 self.answer,
