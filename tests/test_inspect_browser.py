@@ -247,7 +247,7 @@ READ_OUT = """(values) => {
   const hover = new Hover({ args: { source, unit: "m" }, code: CODE });
   return values.map((_, k) => hover.format(0, "value", { image_index: { flat_index: k } }));
 }"""
-"""What is shown under the pointer for each of some values of a map."""
+"""Texts under the pointer for some values of a map."""
 
 
 def expect_maps(page: Page, subject: Subject) -> None:

@@ -586,7 +586,7 @@ def move_the_control(here: Page, lesson: Lesson) -> None:
 def test_a_lesson_is_taken_by_keyboard(key, page, address):
     """From the question to a wrong and a right answer; the first one by `take_the_first_lesson`."""
     lesson, check = LESSONS[key], LESSONS[key].check
-    here = page(f"{address}?page=Learn&learning.lesson={key}", ready=".bk-Figure, .bk-Row img")
+    here = page(f"{address}?page=Learn&learning.lesson={key}", ready=".bk-Figure")
     expect(here.get_by_role("heading", name=lesson.title)).to_be_visible()
     asked = lesson.prediction
     if asked.axis:

@@ -196,11 +196,14 @@ class _Window(NamedTuple):
 
     def some(self, pixels: NDArray[np.bool_]) -> _Window:
         """Return the window of some pixels."""
-        of_pixels = {name: getattr(self, name)[pixels] for name in ("edges", "fired", "unfired")}
-        of_levels = {
-            name: getattr(self, name)[:, pixels] for name in ("signal", "background", "log_weight")
-        }
-        return self._replace(**of_pixels, **of_levels)
+        return self._replace(
+            edges=self.edges[pixels],
+            fired=self.fired[pixels],
+            unfired=self.unfired[pixels],
+            signal=self.signal[:, pixels],
+            background=self.background[:, pixels],
+            log_weight=self.log_weight[:, pixels],
+        )
 
 
 def _n_window_bins(capture: Capture) -> int:

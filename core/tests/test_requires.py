@@ -7,6 +7,7 @@ import math
 import pickle
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -384,6 +385,18 @@ def test_the_command_judges_a_capture(capsys: pytest.CaptureFixture[str]) -> Non
     assert main(["requires", "--capture", sample, "--sbr", "1"]) == REFUSED
     assert main(["requires", "--capture", sample, "--falloff"]) == REFUSED
     assert main(["requires", "--scene", "car", "--bins", "7"]) == REFUSED
+
+
+@pytest.mark.parametrize(("n_seen", "holds"), [(11, True), (12, False)])
+def test_an_absent_property_is_seen_in_one_of_twenty_captures_but_for_chance(
+    n_seen: int, holds: bool
+) -> None:
+    """12 of 100 or more have a probability of 0.4 %."""
+    verdicts = (SimpleNamespace(verdict="not needed", p_value=p) for p in (0.01, 0.5))
+    seen, unseen = verdicts
+    found = (seen,) * n_seen + (unseen,) * (100 - n_seen)
+    assert power.Outcome(power.Case("pulse_shape", 1.0, 0.06), found).holds == holds
+    assert power.Outcome(power.Case("pulse_shape", 2.0, 0.06), found).holds
 
 
 @pytest.mark.compiled

@@ -126,8 +126,7 @@ def tested(
         Added to the reason.
     """
     verdict, smallest = evidence.verdict(margin, explained), evidence.smallest
-    p_value = probability_text(evidence.p_value)
-    chance = f"p {p_value}" if p_value.startswith("<") else f"p = {p_value}"
+    chance = f"p-value {probability_text(evidence.p_value)}"
     seen = f"would have been seen with a probability of {_percent(POWER)}"
     if math.isfinite(smallest):
         seen = f"{_percent(smallest)} {seen}, and {_percent(margin)} matters"
