@@ -14,7 +14,6 @@ from typing import Any
 import numba
 import pytest
 from hypothesis import settings
-from matplotlib.figure import Figure
 
 from core.tests.captures import real_capture_path
 from core.tests.garbage import pytest_collection, pytest_collection_finish  # noqa: F401 - hooks
@@ -79,6 +78,11 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
 @pytest.fixture(scope="session", autouse=True)
 def matplotlib_uncounted() -> Iterator[None]:
     """Count no lines while Matplotlib draws, which would take more than twice as long."""
+    if numba.config.DISABLE_JIT:  # nothing is drawn
+        yield
+        return
+    from matplotlib.figure import Figure  # noqa: PLC0415 - slow to import
+
     savefig = Figure.savefig
 
     @wraps(savefig)

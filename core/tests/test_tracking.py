@@ -212,11 +212,16 @@ CHANGED: list[dict[str, Any]] = [
     {"t_n": 99},
     {"alpha": 30.0, "weight": "exponential"},
 ]
-SETTINGS = {" ".join(variant): settings_of(variant) for variant in VARIANTS}
-SETTINGS |= PRESETS | {str(changed): TrackingParameters(**changed) for changed in CHANGED}
+SETTINGS = PRESETS | {str(changed): TrackingParameters(**changed) for changed in CHANGED}
 
 
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *(pytest.param(settings_of(variant), id=" ".join(variant)) for variant in VARIANTS),
+        *(pytest.param(of, id=name, marks=pytest.mark.compiled) for name, of in SETTINGS.items()),
+    ],
+)
 def test_track_finds_the_positions_of_the_signals(
     cube: np.ndarray, settings: TrackingParameters
 ) -> None:
