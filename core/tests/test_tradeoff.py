@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -86,6 +86,7 @@ def beats(one: Point, other: Point) -> bool:
 PLACES = st.lists(st.tuples(st.integers(0, 8), st.integers(1, 8)), max_size=12)
 
 
+@settings(max_examples=40)
 @given(PLACES)
 def test_the_front_is_what_nothing_beats(places: list[tuple[int, int]]) -> None:
     points = [steady(10 * hits, milliseconds) for hits, milliseconds in places]
