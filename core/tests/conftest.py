@@ -19,7 +19,7 @@ from core.tests.captures import real_capture_path
 from core.tests.garbage import pytest_collection, pytest_collection_finish  # noqa: F401 - hooks
 
 # The same examples on every run; a kernel's first call compiles it, so no example has a deadline.
-settings.register_profile("core", derandomize=True, deadline=None)
+settings.register_profile("core", derandomize=True, deadline=None, max_examples=50)
 settings.register_profile("thorough", max_examples=5000, deadline=None)
 settings.load_profile("core")
 
@@ -101,6 +101,12 @@ def matplotlib_uncounted() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", drawn)
         yield
+
+
+@pytest.fixture
+def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave figures blank: drawing takes half the time of a study in miniature."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
 
 
 @pytest.fixture

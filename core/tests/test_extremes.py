@@ -269,7 +269,6 @@ def test_estimates_are_valid_under_any_flux(case: FluxCase) -> None:
         assert_valid(capture, estimate(capture, method))
 
 
-@settings(max_examples=50)
 @given(st.sampled_from(SETTINGS), st.sampled_from(HISTOGRAMS))
 def test_estimates_are_valid_with_any_settings(chosen: tuple[str, Any], counts: Histograms) -> None:
     method, parameters = chosen

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -86,7 +86,6 @@ def beats(one: Point, other: Point) -> bool:
 PLACES = st.lists(st.tuples(st.integers(0, 8), st.integers(1, 8)), max_size=12)
 
 
-@settings(max_examples=40)
 @given(PLACES)
 def test_the_front_is_what_nothing_beats(places: list[tuple[int, int]]) -> None:
     points = [steady(10 * hits, milliseconds) for hits, milliseconds in places]
@@ -529,7 +528,7 @@ def test_the_command_recommends_and_writes(
 
 
 @pytest.mark.compiled
-@pytest.mark.usefixtures("small_car", "one_process")
+@pytest.mark.usefixtures("small_car", "one_process", "blank_figures")
 def test_the_command_studies_a_capture(
     stairs: Simulation,
     tmp_path: Path,
