@@ -93,7 +93,7 @@ def test_frames_in_which_0_is_no_trigger_are_no_cube(
 
 def surfaces(kind: str) -> NDArray[np.int64]:
     """Bins (row, col) at which echoes of a wall, a slope or random depths begin."""
-    row, col = np.indices((32, 24))
+    row, col = np.indices((64, 48))
     depths = np.random.default_rng(1).integers(0, 100, row.shape)
     return {"wall": 30 + 0 * col, "slope": row, "random": depths}[kind]
 
