@@ -14,13 +14,12 @@ from typing import Any
 import numba
 import pytest
 from hypothesis import settings
-from matplotlib.figure import Figure
 
 from core.tests.captures import real_capture_path
 from core.tests.garbage import pytest_collection, pytest_collection_finish  # noqa: F401 - hooks
 
 # The same examples on every run; a kernel's first call compiles it, so no example has a deadline.
-settings.register_profile("core", derandomize=True, deadline=None)
+settings.register_profile("core", derandomize=True, deadline=None, max_examples=50)
 settings.register_profile("thorough", max_examples=5000, deadline=None)
 settings.load_profile("core")
 
@@ -79,6 +78,11 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
 @pytest.fixture(scope="session", autouse=True)
 def matplotlib_uncounted() -> Iterator[None]:
     """Count no lines while Matplotlib draws, which would take more than twice as long."""
+    if numba.config.DISABLE_JIT:  # nothing is drawn
+        yield
+        return
+    from matplotlib.figure import Figure  # noqa: PLC0415 - slow to import
+
     savefig = Figure.savefig
 
     @wraps(savefig)
@@ -97,6 +101,12 @@ def matplotlib_uncounted() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", drawn)
         yield
+
+
+@pytest.fixture
+def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave figures blank: drawing takes half the time of a study in miniature."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
 
 
 @pytest.fixture

@@ -104,7 +104,7 @@ class Format:
     given: Mapping[str, Any] = field(default_factory=lambda: {"axes": "row col bin"})
     guesses: tuple[str, ...] = ("bin width 1 ns",)
     refuses: Sequence[Mapping[str, Any]] = CUBES_REFUSE
-    n_damaged: int = 20
+    n_damaged: int = 10
 
 
 def put(path: Path, content: Content) -> Path:
@@ -271,28 +271,28 @@ FORMATS |= {
         "c.mat", lambda: mat_bytes(True, spad=list_of(CUBE)), **SPARSE
     ),
     "mat 7.3 cells": Format(
-        "c.mat", lambda: matlab73(Ts=arrival_cells(CUBE), SBR=0.3, note="a"), **CELLS, n_damaged=4
+        "c.mat", lambda: matlab73(Ts=arrival_cells(CUBE), SBR=0.3, note="a"), **CELLS, n_damaged=2
     ),
-    "mat 7.3 cube of doubles": Format("c.mat", lambda: matlab73(counts=CUBE * 1.0), n_damaged=4),
-    "mat 7.3 sparse": Format("c.mat", lambda: matlab73(spad=list_of(CUBE)), **SPARSE, n_damaged=4),
-    "hdf5": Format("c.h5", lambda: hdf5_bytes(cube=CUBE, note=np.ones(3)), n_damaged=4),
+    "mat 7.3 cube of doubles": Format("c.mat", lambda: matlab73(counts=CUBE * 1.0), n_damaged=2),
+    "mat 7.3 sparse": Format("c.mat", lambda: matlab73(spad=list_of(CUBE)), **SPARSE, n_damaged=2),
+    "hdf5": Format("c.h5", lambda: hdf5_bytes(cube=CUBE, note=np.ones(3)), n_damaged=2),
     "hdf5, compressed": Format(
-        "c.hdf5", lambda: hdf5_bytes(c={"data": CUBE, "fletcher32": True, **GZIP}), n_damaged=4
+        "c.hdf5", lambda: hdf5_bytes(c={"data": CUBE, "fletcher32": True, **GZIP}), n_damaged=2
     ),
     "hdf5 by LZF, behind a user block": Format(
         "c.hdf5",
         lambda: hdf5_bytes(1024, c={"data": CUBE, "chunks": (2, 3, 64), "compression": "lzf"}),
-        n_damaged=4,
+        n_damaged=2,
     ),
     "hdf5 of floats, big-endian": Format(
-        "c.h5", lambda: hdf5_bytes(c=CUBE.astype(">f8")), n_damaged=4
+        "c.h5", lambda: hdf5_bytes(c=CUBE.astype(">f8")), n_damaged=2
     ),
-    "netCDF": Format("c.nc", lambda: netcdf_bytes(bare()), n_damaged=4),
+    "netCDF": Format("c.nc", lambda: netcdf_bytes(bare()), n_damaged=2),
     "netCDF-3": Format(
-        "c.nc", lambda: bytes(bare().astype("i4").to_netcdf(engine="scipy")), n_damaged=40
+        "c.nc", lambda: bytes(bare().astype("i4").to_netcdf(engine="scipy")), n_damaged=20
     ),
     "zarr 2": Format("c.zarr", lambda: zarr_files(bare(), 2, chunks=(2, 3, 64))),
     "zarr 3": Format("c.zarr", lambda: zarr_files(bare(), 3, chunks=(2, 3, 64))),
-    "own layout in netCDF": Format("c.nc", lambda: netcdf_bytes(known()), **OWN, n_damaged=4),
+    "own layout in netCDF": Format("c.nc", lambda: netcdf_bytes(known()), **OWN, n_damaged=2),
     "own layout in Zarr": Format("c.zarr", lambda: zarr_files(known(), 3), **OWN),
 }

@@ -545,7 +545,7 @@ def test_every_setting_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
             assert f"--{field.replace('_', '-')}" in printed
 
 
-@pytest.mark.usefixtures("small_scenes")
+@pytest.mark.usefixtures("small_scenes", "blank_figures")
 def test_the_paper_command_writes_a_page(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

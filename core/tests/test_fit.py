@@ -5,8 +5,8 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
 
+import numba
 import numpy as np
 import pytest
 from scipy import stats
@@ -129,23 +129,17 @@ def test_p_values_depend_on_the_pixel_alone() -> None:
     assert fit_in(capture, some).pixels.effect == max(few / some.size - SIGNIFICANCE, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("n_bins", "count"),
-    [
-        *product((1, 3), (0, 1, 7)),
-        (50, 7),
-        *(pytest.param(50, count, marks=pytest.mark.compiled) for count in (0, 1)),
-    ],
-)
+@pytest.mark.parametrize("n_bins", [1, 3, pytest.param(50, marks=pytest.mark.compiled)])
 @pytest.mark.parametrize("detection", ["first", "all"])
-def test_any_histogram_has_a_p_value(detection: Detection, n_bins: int, count: int) -> None:
-    cube = np.zeros((2, 3, n_bins), np.uint16)
-    cube[..., n_bins // 2] = count
-    capture = Capture(cube, Acquisition(n_bins, 1e-9, n_pulses=7), detection=detection)
-    p_values = fit_p_values(capture)
-    assert ((p_values >= 0) & (p_values <= 1)).all()
-    assert all(0 <= check.p_value <= 1 and check.effect >= 0 for check in fit_of(capture))
-    assert np.isfinite(predictive_of(capture, np.arange(6))).all()
+def test_any_histogram_has_a_p_value(detection: Detection, n_bins: int) -> None:
+    for count in (7,) if numba.config.DISABLE_JIT else (0, 1, 7):
+        cube = np.zeros((2, 3, n_bins), np.uint16)
+        cube[..., n_bins // 2] = count
+        capture = Capture(cube, Acquisition(n_bins, 1e-9, n_pulses=7), detection=detection)
+        p_values = fit_p_values(capture)
+        assert ((p_values >= 0) & (p_values <= 1)).all()
+        assert all(0 <= check.p_value <= 1 and check.effect >= 0 for check in fit_of(capture))
+        assert np.isfinite(predictive_of(capture, np.arange(6))).all()
 
 
 @pytest.mark.compiled

@@ -34,24 +34,19 @@ def stored_npz(**arrays: Any) -> bytes:
 
 
 @pytest.mark.parametrize("axes", list(itertools.permutations(frames.AXES)))
-@pytest.mark.parametrize("stretch", [1, 7, 50, 10**6])
-@pytest.mark.parametrize("layout", [np.ascontiguousarray, np.asfortranarray])
 def test_any_order_of_axes_in_any_stretch(
-    axes: tuple[str, ...],
-    stretch: int,
-    layout: Callable[[Any], Any],
-    write: Write,
-    monkeypatch: pytest.MonkeyPatch,
+    axes: tuple[str, ...], write: Write, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frames, "STRETCH", stretch)
-    order = [frames.AXES.index(name) for name in axes]
-    stack = layout(FRAMES[:30].transpose(order))
-    options = {"no_trigger": -1, "axes": " ".join(axes), "n_bins": 100}
-    capture = read_capture(write("f.npy", npy_bytes(stack)), **options)
     expected = np.zeros_like(CUBE)
     fired = np.argwhere(FRAMES[:30] >= 0)
     np.add.at(expected, (fired[:, 1], fired[:, 2], FRAMES[:30][FRAMES[:30] >= 0]), 1)
-    np.testing.assert_array_equal(capture.cube, expected)
+    stack = FRAMES[:30].transpose([frames.AXES.index(name) for name in axes])
+    for layout in (np.ascontiguousarray, np.asfortranarray):
+        path = write("f.npy", npy_bytes(layout(stack)))
+        for stretch in (1, 7, 50, 10**6):
+            monkeypatch.setattr(frames, "STRETCH", stretch)
+            capture = read_capture(path, no_trigger=-1, axes=" ".join(axes), n_bins=100)
+            np.testing.assert_array_equal(capture.cube, expected, f"{layout} {stretch}")
 
 
 @pytest.mark.parametrize(("no_trigger", "dtype"), [(-1, "i2"), (65535, "u2"), (-1, "f4")])
@@ -106,16 +101,16 @@ def surfaces(kind: str) -> NDArray[np.int64]:
 @pytest.mark.parametrize("kind", ["wall", "slope", "random"])
 @pytest.mark.parametrize("background", [0.0, 0.07, 3.0])
 @pytest.mark.parametrize(("echo", "width"), [(5, 1), (100, 8), (100, 50), (1000, 1)])
-@pytest.mark.parametrize("filled", [1.0, 0.3])
 def test_counts_are_not_taken_for_frames(
-    kind: str, background: float, echo: float, width: int, filled: float
+    kind: str, background: float, echo: float, width: int
 ) -> None:
     rng = np.random.default_rng(2)
     later = (np.arange(100) - surfaces(kind)[:, :, np.newaxis]) % 100
     counts = rng.poisson(background + echo * (later < width))
-    counts[rng.random(counts.shape[:2]) > filled] = 0
-    assert not resembles_frames(counts)
-    assert not resembles_frames(counts.transpose(1, 0, 2))
+    for empty in (np.zeros(counts.shape[:2], bool), rng.random(counts.shape[:2]) > 0.3):
+        counts[empty] = 0
+        assert not resembles_frames(counts)
+        assert not resembles_frames(counts.transpose(1, 0, 2))
 
 
 @pytest.mark.parametrize("flux", [0.5, 3.0, 8.0, 20.0, 160.0])

@@ -273,6 +273,7 @@ def test_the_tail_is_the_binomial_one() -> None:
     np.testing.assert_allclose(found, stats.binom.sf(least - 1, 10, 0.3), rtol=1e-9)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("sbr", [0.08, 0.03])
 @pytest.mark.parametrize("false_acceptance", [0.01, 0.1])
 def test_noise_seldom_makes_a_cluster(sbr: float, false_acceptance: float) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from importlib import import_module
+from itertools import product
 from typing import Any, NamedTuple
 
 import numba
@@ -312,9 +313,17 @@ def assert_probabilities(capture: Capture) -> None:
         assert ((chance >= 0) & (chance <= 1)).all()
 
 
-@pytest.mark.parametrize("n_pulses", [None, 1, 1000])
-@pytest.mark.parametrize("n_bins", [1, 9])
-@pytest.mark.parametrize("count", [0, 1, 3])
+FEW_COUNTS = product((0, 1, 3), (1, 9), (None, 1, 1000))
+IN_PLAIN_PYTHON = ((0, 1, 1000), (3, 1, None), (1, 9, None), (1, 9, 1000))
+
+
+@pytest.mark.parametrize(
+    ("count", "n_bins", "n_pulses"),
+    [
+        pytest.param(*each, marks=() if each in IN_PLAIN_PYTHON else pytest.mark.compiled)
+        for each in FEW_COUNTS
+    ],
+)
 def test_fluxes_and_posterior_are_always_defined(
     count: int, n_bins: int, n_pulses: int | None
 ) -> None:
@@ -337,6 +346,7 @@ def test_fluxes_and_posterior_are_always_defined(
         assert_probabilities(capture)
 
 
+@pytest.mark.compiled
 @pytest.mark.uncounted
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
 @pytest.mark.parametrize("n_pulses", [None, 1000, 2**32 - 1])

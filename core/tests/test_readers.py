@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -713,7 +713,6 @@ def captures(draw: st.DrawFn) -> Capture:
     )
 
 
-@settings(max_examples=60, deadline=None)
 @given(captures())
 def test_round_trip(capture: Capture) -> None:
     with tempfile.TemporaryDirectory() as folder:

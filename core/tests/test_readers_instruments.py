@@ -409,7 +409,7 @@ fields = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(fields | values, max_size=3) | values)
 def test_any_json_is_read_or_refused(tmp_path_factory: Any, records: Any) -> None:
     require_read_or_refused(tmp_path_factory, records)
@@ -422,7 +422,6 @@ log_fields = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(log_fields | values, max_size=3) | values, values)
 def test_any_log_is_read_or_refused(tmp_path_factory: Any, records: Any, settings: Any) -> None:
     require_read_or_refused(tmp_path_factory, {"Result_Set": records, "configuration": settings})

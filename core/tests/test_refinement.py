@@ -15,6 +15,7 @@ from core.acquisition import Acquisition, Pulse
 from core.capture import Capture
 from core.estimators import estimate
 from core.inference import TOLERANCE_BINS, flux_model_of
+from core.inference.flux_model import FluxPrior
 from core.inference.refinement import (
     FEWEST,
     FINE_STEPS_PER_BIN,
@@ -45,8 +46,19 @@ def drawn(pulse: Pulse, n_pulses: int | None, rows: int = 3) -> Capture:
     signal = np.broadcast_to(np.geomspace(0.2, 2.0, rows)[:, np.newaxis], onset.shape)
     rate = rate_per_bin(onset, signal, 0.0, pulse, acquisition)
     rate += np.linspace(0.2, 1.0, 30)[:, np.newaxis] / N_BINS
-    cube = draw_counts(rate if n_pulses else 300 * rate, n_pulses, rng)
-    return Capture(cube, acquisition, pulse, detection="first" if n_pulses else "all")
+    photons = 1.0 if n_pulses else 300.0
+    levels = photons * np.array([0.0, 0.3, 1.5])
+    # Given, since plain Python takes seconds to estimate it.
+    known = FluxPrior(
+        levels, np.array([0.1, 0.5, 0.4]), np.ones(N_BINS), np.asarray(0.6 * photons), 0.8
+    )
+    return Capture(
+        draw_counts(photons * rate, n_pulses, rng),
+        acquisition,
+        pulse,
+        detection="first" if n_pulses else "all",
+        flux_prior=known,
+    )
 
 
 def searched(
@@ -212,6 +224,7 @@ def test_refined_delays_take_all_fractions_of_a_bin() -> None:
     assert tenths.min() > 0.5 * tenths.mean()
 
 
+@pytest.mark.compiled
 def test_the_literal_preset_gives_whole_bins_minus_the_lag() -> None:
     capture = drawn(Pulse(), 300, rows=1)
     literal = replace(PRESETS["literal"], t_n=5)

@@ -362,6 +362,7 @@ def test_coates_corrects_pile_up_only_where_it_is_detectable() -> None:
 
 
 @pytest.mark.compiled
+@pytest.mark.usefixtures("blank_figures")
 def test_the_command_judges_a_scene_and_writes_a_page(
     tmp_path, capsys: pytest.CaptureFixture[str]
 ) -> None:

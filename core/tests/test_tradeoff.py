@@ -528,7 +528,7 @@ def test_the_command_recommends_and_writes(
 
 
 @pytest.mark.compiled
-@pytest.mark.usefixtures("small_car", "one_process")
+@pytest.mark.usefixtures("small_car", "one_process", "blank_figures")
 def test_the_command_studies_a_capture(
     stairs: Simulation,
     tmp_path: Path,
