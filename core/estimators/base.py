@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from core.inference.neighbours import patches, pooled_at, pooled_in
 from core.inference.posterior import tolerance_probability
 from core.labels import Plane, images_dataset, software
 from core.notebook import html_table
-from core.parameters import Number
+from core.parameters import Choice, Number
 from core.trigger import draw_counts, rate_per_bin, trigger_probability
 
 if TYPE_CHECKING:
@@ -201,6 +201,11 @@ class RangeImage:
         return replace(self, range_m=range_m, bin=bins, valid=kept, made_by=made_by)
 
 
+Pixels = Literal["estimate every pixel", "allow empty pixels"]
+"""Whether a method of whole images answers pixels in which it finds no surface of their own."""
+
+PIXELS = Choice("Pixels", get_args(Pixels))
+
 FALSE_ALARM = Number("False alarms", 1e-3, 1.0, log=True, least=1e-3, most=1.0)
 """Share of echo-free pixels that may get an estimate; with 1 all of them do."""
 
@@ -273,6 +278,8 @@ class Estimator:
     whole_image : bool
         Whether the estimate of a pixel depends on pixels outside its window, so that no part of an
         image can be estimated alone.
+    fills : bool
+        Whether a pixel without a detection may get an estimate from its neighbours.
     refine : callable, optional
         ``(capture, flux_model, delay_bin, parameters) -> delay_bin``, each of shape (row, col): a
         finer search in the neighbourhood of a delay that is corrected for the lag.
@@ -298,6 +305,7 @@ class Estimator:
     undoes_pile_up: bool = False
     omits: Callable[[Capture], str] = lambda _: ""
     whole_image: bool = False
+    fills: bool = False
     refine: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
     confidence: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
     evidence: Callable[[Capture, FluxModel, int, int], Evidence | None] | None = None
@@ -466,10 +474,12 @@ class Estimator:
     ) -> tuple[Floats, Floats]:
         """Bin and value of the largest score, each of shape (row, col), the lag not corrected.
 
-        NaN and 0 where a pixel has no detection.
+        NaN and 0 where a pixel has no detection, unless the method fills such pixels.
         """
         locate = self.locate or self._largest
         position, score = locate(capture, flux, parameters)
+        if self.fills:
+            return position, score
         seen = capture.counts > 0
         return np.where(seen, position, np.nan), np.where(seen, score, 0.0)
 

@@ -132,7 +132,7 @@ def repaired(position: Floats, intensity: Floats) -> Floats:
     -------
     ndarray, shape (row, col)
     """
-    around = neighbours(position, np.nan)
+    around = neighbours(position, 1, np.nan)
     away = np.nan_to_num(np.abs(around - position))  # 0 where either has none
     # Of the 8 neighbours, 1 and 6 are above and below, 3 and 4 to the left and right.
     steep = np.hypot(np.maximum(away[1], away[6]), np.maximum(away[3], away[4]))
@@ -144,7 +144,7 @@ def repaired(position: Floats, intensity: Floats) -> Floats:
     known = np.isfinite(around)
     alone = (away > TOLERANCE_BINS).sum(axis=0) > 2 / 3 * known.sum(axis=0)
     wrong = alone & (steep > limit)
-    weight = np.where(known, neighbours(intensity, 0.0), 0.0)
+    weight = np.where(known, neighbours(intensity, 1, 0.0), 0.0)
     better = position.copy()
     better[wrong] = weighted_median(around[:, wrong], weight[:, wrong])
     return better

@@ -24,14 +24,14 @@ Bins much shorter than an echo are merged first. Confidence is the mass of this 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
-from core.estimators.base import Estimator, Evidence
+from core.estimators.base import PIXELS, Estimator, Evidence, Pixels
 from core.estimators.image_model import (
     FEWEST_PIXELS,
     Prior,
@@ -55,15 +55,13 @@ from core.kernels.blocks import LANES
 from core.kernels.messages import fill_modes, fill_posterior, fill_window_masses
 from core.kernels.parallel import entering
 from core.kernels.planes import fill_planes
-from core.parameters import Choice, Settings, parameter
+from core.parameters import Settings, parameter
 
 _ROUNDS = 3
 _LEAST_ODDS = 1e-12
 _EMPTY_SHARE = 0.01  # of pixels without an echo, if every pixel is estimated
 _ALONG_PLANES = 0.8, 0.15  # ρ and the scale of K in bins
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
-
-Pixels = Literal["estimate every pixel", "allow empty pixels"]
 
 
 @dataclass(frozen=True)
@@ -72,10 +70,10 @@ class ImageParameters(Settings):
 
     pixels: Pixels = parameter(
         "estimate every pixel",
-        Choice("Pixels", ("estimate every pixel", "allow empty pixels")),
-        "Estimate every pixel: each with a detection gets its likeliest range, as if nearly all "
-        "had a surface. Allow empty pixels: only those get a range in which a surface is likelier "
-        "than none. Confidence never assumes a surface.",
+        PIXELS,
+        "Estimate every pixel: each gets its likeliest range, as if nearly all had a surface. "
+        "Allow empty pixels: only those get a range in which a surface is likelier than none. "
+        "Confidence never assumes a surface.",
     )
 
 
@@ -183,7 +181,9 @@ def _locate(
     """Return the likeliest delay and the log odds of a surface."""
     if not _neighbours_agree(flux):
         depths: Depths = "learned" if capture.counts.size >= FEWEST_PIXELS else "alike"
-        return locate_alone(capture, flux, LikelihoodParameters(depths=depths))
+        delay, score = locate_alone(capture, flux, LikelihoodParameters(depths=depths))
+        seen = capture.counts > 0
+        return np.where(seen, delay, np.nan), np.where(seen, score, 0.0)
     found = image_posterior_of(capture, flux)
     surface = np.clip(found.surface, _LEAST_ODDS, 1 - _LEAST_ODDS)
     if parameters.pixels == "allow empty pixels":
@@ -253,6 +253,7 @@ ESTIMATOR = Estimator(
     own_threshold="neighbours raise it next to a surface; choose 'allow empty pixels' instead",
     undoes_pile_up=True,
     whole_image=True,
+    fills=True,
     confidence=_confidence,
     evidence=_evidence,
 )

@@ -20,28 +20,33 @@ largest score is the cluster. It is kept if the probability that noise forms one
 the N windows is below τ_FA: ``N P(Binomial(n, p) >= c) < τ_FA``.
 
 **Superpixels.** A pixel without a cluster is pooled with its neighbours, 3 x 3, 5 x 5 and so on,
-until there is one. A pixel without a cluster in the largest superpixel has no target.
+until there is one.
 
 **Range.** The delay is that of the best matched filter around the window, after subtraction of the
 noise.
 
-**Censoring and smoothing.** The rank-ordered mean of the 8 neighbours is the median of the times of
-their clusters. An estimate more than two windows away from it is dropped, unless noise would not
-form its cluster anywhere in the image. The remaining estimates y are smoothed to the z that
-minimises ``Σ w (z - y)² / 2 + β TV(z)`` (Rudin, Osher & Fatemi 1992), with the precision w of each,
-``s² / (c T_pulse²)`` for s signal photons of c, and 0 where dropped.
+**Censoring.** The rank-ordered mean of the neighbours is the median of the times of their clusters.
+An estimate far away from it is dropped: more than two windows from that of the 8 neighbours, unless
+noise would not form its cluster anywhere in the image; or, as published, more than one window from
+that of the 24 neighbours. The latter drops more outliers, but also clear echoes of small and of
+steep surfaces.
+
+**Filling and smoothing.** A pixel without an estimate takes over that of the nearest one that has
+one. The estimates y are then smoothed to the z that minimises ``Σ w (z - y)² / 2 + β TV(z)``
+(Rudin, Osher & Fatemi 1992), with the precision w of each, ``s² / (c T_pulse²)`` for s signal
+photons of the c in the cluster of its superpixel, and 0 where y was taken over.
 
 Not included: the original forms superpixels only of neighbours of similar reflectivity, whose
-estimate needs another regularised image. Here, surfaces in front of an empty sky gain a rim of up
-to half a superpixel, with low confidence. Everything together takes about 200 ns per pixel and bin
-at an SBR of 0.05, where three of four pixels need superpixels.
+estimate needs another regularised image. Here, if empty pixels are allowed, surfaces in front of an
+empty sky gain a rim of up to half a superpixel, with low confidence. Everything together takes
+about 200 ns per pixel and bin at an SBR of 0.05, where three of four pixels need superpixels.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import scipy  # loads a submodule when it is first used
@@ -49,16 +54,19 @@ from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats, Pulse
 from core.capture import Capture
-from core.estimators.base import Estimator, conditions_of
+from core.estimators.base import PIXELS, Estimator, Pixels, conditions_of
 from core.estimators.filters import echo_shape
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions, rate_and_n_armed
 from core.inference.neighbours import box_sum, neighbours, patches, weighted_median, widened
-from core.parameters import Number, Settings, parameter
+from core.parameters import Choice, Number, Settings, parameter
 
 _LAGS = 65  # delays tried around a window
 _STEPS = 100  # of the smoothing
 NUMBERS_AT_ONCE = 2**20  # counts processed together, which bounds temporaries
+
+
+Neighbours = Literal["8 neighbours", "24 neighbours"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,18 @@ class UnmixingParameters(Settings):
         1.0,
         Number("β", 0.01, 10.0, log=True, unit="1/bin", least=0.0, most=1e6),
         "Weight of the total variation: large values smooth, 0 does not.",
+    )
+    censoring: Neighbours = parameter(
+        "8 neighbours",
+        Choice("Censoring", get_args(Neighbours)),
+        "Neighbours with which an estimate is compared. 8 never drop a clear echo; 24, as "
+        "published, drop more outliers, and small or steep surfaces.",
+    )
+    pixels: Pixels = parameter(
+        "estimate every pixel",
+        PIXELS,
+        "Estimate every pixel: one without a cluster takes over its neighbours' range, as "
+        "published. Allow empty pixels: it gets none.",
     )
 
 
@@ -189,7 +209,7 @@ class Clusters(NamedTuple):
     size: Floats
     """Triggers in it, per pixel."""
     precision: Floats
-    """Reciprocal variance of the delay in 1/bin², per pixel; 0 without a cluster."""
+    """Reciprocal variance of the delay in 1/bin²; 0 without a cluster."""
 
 
 def _clusters(
@@ -266,19 +286,21 @@ def find_clusters(capture: Capture, flux: FluxModel, parameters: UnmixingParamet
                     box_sum(x, size, "constant")[inner][open_pixels] for x in (counts, exposure)
                 )
                 of = _clusters(pooled, lasts, templates, parameters.false_acceptance)
-                # Per pixel: the estimate of a superpixel is repeated in each of its pixels.
-                of = of._replace(size=of.size / size**2, precision=of.precision / size**2)
+                of = of._replace(size=of.size / size**2)
                 found[:, *here][:, open_pixels] = of
     return Clusters(*found)
 
 
-def censored(clusters: Clusters, window: int, false_acceptance: float) -> NDArray[np.bool_]:
-    """Find clusters far from those of the neighbours and not significant; shape (row, col)."""
-    around, weight = neighbours(clusters.delay, np.nan), neighbours(clusters.size, 0.0)
+def censored(clusters: Clusters, window: int, parameters: UnmixingParameters) -> NDArray[np.bool_]:
+    """Find clusters that lie far from those of their neighbours; shape (row, col)."""
+    half = 2 if parameters.censoring == "24 neighbours" else 1
+    around, weight = neighbours(clusters.delay, half, np.nan), neighbours(clusters.size, half, 0.0)
     rank_ordered = weighted_median(around, np.where(np.isfinite(around), weight, 0.0))
-    doubtful = clusters.chance * clusters.chance.size >= false_acceptance
-    # The comparison is False for NaN, a pixel without neighbours.
-    return (np.abs(clusters.delay - rank_ordered) > 2 * window) & doubtful
+    away = np.abs(clusters.delay - rank_ordered)  # NaN without neighbours, and never too far
+    if half == 2:
+        return np.asarray(away > window)
+    doubtful = clusters.chance * clusters.chance.size >= parameters.false_acceptance
+    return np.asarray((away > 2 * window) & doubtful)
 
 
 def smoothed(values: Floats, precision: Floats, smoothness: float) -> Floats:
@@ -319,15 +341,16 @@ def _locate(
     """Return smoothed delays and the score of each pixel's cluster."""
     clusters = find_clusters(capture, flux, parameters)
     window = window_bins(capture.pulse, capture.acquisition)
-    dropped = censored(clusters, window, parameters.false_acceptance)
-    known = np.isfinite(clusters.delay) & ~dropped
+    known = np.isfinite(clusters.delay) & ~censored(clusters, window, parameters)
     if not known.any():
         return clusters.delay, clusters.score
     transform = scipy.ndimage.distance_transform_edt
     nearest = transform(~known, return_distances=False, return_indices=True)
     precision = np.where(known, clusters.precision, 0.0)
     delay = smoothed(clusters.delay[tuple(nearest)], precision, parameters.smoothness)
-    return np.where(np.isfinite(clusters.delay), delay, np.nan), clusters.score
+    if parameters.pixels == "allow empty pixels":
+        delay = np.where(np.isfinite(clusters.delay), delay, np.nan)
+    return delay, clusters.score
 
 
 def _curve(histogram: Floats, conditions: Conditions, parameters: UnmixingParameters) -> Floats:
@@ -346,7 +369,9 @@ ESTIMATOR = Estimator(
     _locate,
     finds_delay=True,
     reconstructed="public descriptions of IEEE Transactions on Computational Imaging 3, 445 (2017)",
-    own_threshold="clusters are kept by τ_FA, and superpixels share one",
+    own_threshold="clusters are kept by τ_FA, superpixels share one, and pixels without one take "
+    "over their neighbours' ranges unless empty pixels are allowed",
     undoes_pile_up=True,
     whole_image=True,
+    fills=True,
 )

@@ -123,18 +123,20 @@ def box_sum(
     return over_both
 
 
-def neighbours(image: Floats, missing: float) -> Floats:
-    """Values of the 8 neighbours of each pixel, shape (8, row, col).
+def neighbours(image: Floats, half: int, missing: float) -> Floats:
+    """Values of the pixels around each pixel, shape (n, row, col).
 
     Parameters
     ----------
     image : ndarray, shape (row, col)
+    half : int
+        Rows and columns on either side: 1 for the 8 neighbours, 2 for 24.
     missing : float
         Value beyond the edge of the image.
     """
-    wide = np.pad(image, 1, constant_values=missing)
+    wide, size = np.pad(image, half, constant_values=missing), 2 * half + 1
     rows, cols = image.shape
-    steps = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    steps = [(i, j) for i in range(size) for j in range(size) if (i, j) != (half, half)]
     return np.stack([wide[i : i + rows, j : j + cols] for i, j in steps])
 
 

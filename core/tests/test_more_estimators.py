@@ -278,7 +278,7 @@ def test_the_tail_is_the_binomial_one() -> None:
 @pytest.mark.parametrize("false_acceptance", [0.01, 0.1])
 def test_noise_seldom_makes_a_cluster(sbr: float, false_acceptance: float) -> None:
     cube = drawn(np.full((32, 32), np.nan), sbr, seed=3)
-    settings = UnmixingParameters(false_acceptance, growth=0)
+    settings = UnmixingParameters(false_acceptance, growth=0, pixels="allow empty pixels")
     position, score = locate("unmixing", cube, sbr, settings)
     alarms = np.count_nonzero(np.isfinite(position))
     assert alarms <= stats.binom.ppf(1 - 1e-4, 1024, false_acceptance)
@@ -289,7 +289,8 @@ def test_superpixels_grow_until_there_is_a_cluster() -> None:
     cube = np.ones((9, 9, 100), np.uint16)
     cube[3:6, 3:6, 40:43] += 2  # 9 of a total of 106: alone no cluster, all nine together one
     for growth, found in ((0, 0), (1, 1), (2, 1)):
-        position, _ = locate("unmixing", cube, 0.06, UnmixingParameters(growth=growth))
+        settings = UnmixingParameters(growth=growth, pixels="allow empty pixels")
+        position, _ = locate("unmixing", cube, 0.06, settings)
         assert np.isfinite(position[4, 4]) == found
         if growth < 2:  # no superpixel reaches the corner
             assert np.isnan(position[0, 0])
@@ -301,15 +302,41 @@ def clusters_at(delay: np.ndarray, chance: float) -> Clusters:
     return Clusters(delay, ones, chance * ones, ones, ones)
 
 
-def test_censoring_drops_doubtful_clusters_far_from_their_neighbours() -> None:
+def test_censoring_drops_clusters_far_from_their_neighbours() -> None:
+    cautious, published = UnmixingParameters(), UnmixingParameters(censoring="24 neighbours")
     delay = np.full((5, 5), 40.0)
     delay[2, 2] = 60.0
     delay[0, 0] = np.nan
-    dropped = unmixing.censored(clusters_at(delay, 1e-3), 3, 0.01)
-    assert np.argwhere(dropped).tolist() == [[2, 2]]
-    assert not unmixing.censored(clusters_at(delay, 1e-5), 3, 0.01).any()
-    delay[2, 2] = 45.0
-    assert not unmixing.censored(clusters_at(delay, 1e-3), 3, 0.01).any()
+    for settings in (published, cautious):
+        dropped = unmixing.censored(clusters_at(delay, 1e-3), 3, settings)
+        assert np.argwhere(dropped).tolist() == [[2, 2]]
+    clear = clusters_at(delay, 1e-5)
+    assert unmixing.censored(clear, 3, published).sum() == 1
+    assert not unmixing.censored(clear, 3, cautious).any()
+    delay[2, 2] = 45.0  # between one window and two
+    assert unmixing.censored(clusters_at(delay, 1e-3), 3, published).sum() == 1
+    assert not unmixing.censored(clusters_at(delay, 1e-3), 3, cautious).any()
+
+
+def test_a_steep_surface_is_censored_by_24_neighbours_only() -> None:
+    steep = clusters_at(40 + 4.0 * np.arange(9) * np.ones((9, 1)), 1e-3)
+    steep.delay[4, 4] += 4
+    for censoring, n_dropped in (("24 neighbours", 1), ("8 neighbours", 0)):
+        settings = UnmixingParameters(censoring=censoring)
+        assert unmixing.censored(steep, 3, settings)[2:7, 2:7].sum() == n_dropped
+
+
+def test_pixels_without_a_cluster_take_over_the_range_of_their_neighbours() -> None:
+    cube = drawn(np.full((8, 8), 53.6), 0.3, seed=8)
+    cube[2, 3] = 0
+    cube[5, 5] = 1  # too few photons for a cluster
+    alone = {"growth": 0}
+    position, score = locate("unmixing", cube, 0.3, UnmixingParameters(**alone))
+    assert np.abs(position - 53.6).max() < 2
+    assert score[2, 3] == score[5, 5] == 0
+    settings = UnmixingParameters(**alone, pixels="allow empty pixels")
+    position, _ = locate("unmixing", cube, 0.3, settings)
+    assert np.argwhere(np.isnan(position)).tolist() == [[2, 3], [5, 5]]
 
 
 def test_smoothing_keeps_a_step_but_for_what_the_definition_takes() -> None:
@@ -343,7 +370,8 @@ def test_nothing_near_a_smoothed_image_is_better() -> None:
 def test_a_surface_is_unmixed_where_single_pixels_are_lost() -> None:
     onset = np.full((16, 16), 53.6)
     cube = drawn(onset, 0.03, seed=6)
-    alone, _ = locate("unmixing", cube, 0.03, UnmixingParameters(growth=0))
+    settings = UnmixingParameters(growth=0, pixels="allow empty pixels")
+    alone, _ = locate("unmixing", cube, 0.03, settings)
     position, _ = locate("unmixing", cube, 0.03)
     assert (np.abs(alone - onset) <= 3).mean() < 0.4
     assert (np.abs(position - onset) <= 3).mean() > 0.95

@@ -538,12 +538,26 @@ def test_a_process_that_fails_is_a_refusal(tmp_path: Path, monkeypatch: pytest.M
     with monkeypatch.context() as patched:
         patched.setattr(isolation, "WORKER", script)
         patched.setattr(isolation, "LEAST_SECONDS", 1)
+        patched.setattr(isolation, "WAIT_FACTOR", 1)
         isolation.end_idle_processes()
         for does, message in FAILURES.items():
             script.write_text(does)
             with pytest.raises(CaptureError, match=f"^c.h5: .*{message}"):
                 read_capture(path)
     np.testing.assert_array_equal(read_capture(path).cube, CUBE)
+
+
+def test_a_process_may_wait_for_a_busy_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = tmp_path / "script.py"
+    script.write_text('import time; time.sleep(1.1); print(\'{"found": {}, "arrays": []}\')')
+    with monkeypatch.context() as patched:
+        patched.setattr(isolation, "WORKER", script)
+        patched.setattr(isolation, "LEAST_SECONDS", 1)
+        isolation.end_idle_processes()
+        assert isolation.isolated(script, "the file", "any") == ({}, [])
+    isolation.end_idle_processes()
 
 
 def test_a_process_has_limited_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

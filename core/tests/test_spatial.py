@@ -60,7 +60,7 @@ def test_pooled_counts_are_the_explicit_sum_however_narrow(dtype: type) -> None:
 
 def test_neighbours_are_the_eight_around() -> None:
     image = np.arange(12.0).reshape(3, 4)
-    found = neighbours(image, -1.0)
+    found = neighbours(image, 1, -1.0)
     assert found.shape == (8, 3, 4)
     assert found[:, 1, 1].tolist() == [0, 1, 2, 4, 6, 8, 9, 10]
     assert found[:, 0, 3].tolist() == [-1, -1, -1, 2, -1, 6, 7, -1]

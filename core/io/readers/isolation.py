@@ -36,6 +36,10 @@ BASE_BYTES = 2**30
 MAX_SECONDS = 120
 LEAST_SECONDS = 15
 SECONDS_PER_MIB = 2
+"""Processor time that a file may take: at most, at least, and for its size."""
+
+WAIT_FACTOR = 4
+"""Elapsed over processor time, at most: on a busy machine a process gets part of a processor."""
 
 WORKER = Path(__file__).with_name("file_worker.py")
 """Script of the processes."""
@@ -81,7 +85,7 @@ class _Process:
 
     def ask(self, request: dict[str, Any]) -> Reply:
         """Send a request; return the reply."""
-        timer = Timer(request["seconds"], self._process.kill)
+        timer = Timer(WAIT_FACTOR * request["seconds"], self._process.kill)
         timer.daemon = True
         timer.start()
         try:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from core.acquisition import Floats
 from core.capture import Capture
 from core.estimators import estimate
+from core.estimators.unmixing import smoothed
 from core.inference.neighbours import pooled
 from core.metrics import Interval
 from core.studies.outputs import Table
@@ -54,15 +55,27 @@ def pooled_likelihood(capture: Capture) -> Floats:
     ).bin
 
 
-def _estimated(method: str) -> Callable[[Capture], Floats]:
-    return lambda capture: estimate(capture, method).bin
+def smoothed_likelihood(capture: Capture) -> Floats:
+    """Delays in bins by the likelihood, smoothed by total variation, (row, col).
+
+    An estimate is weighted by its confidence, as the reciprocal of its variance in bins squared.
+    """
+    image = estimate(capture, "likelihood")
+    weight = np.where(image.valid, image.confidence, 0.0)
+    return smoothed(np.nan_to_num(image.bin), weight, smoothness=1.0)
+
+
+def _estimated(method: str, **settings: str) -> Callable[[Capture], Floats]:
+    return lambda capture: estimate(capture, method, **settings).bin
 
 
 METHODS: dict[str, Callable[[Capture], Floats]] = {
     "image posterior": _estimated("image_posterior"),
     "likelihood": _estimated("likelihood"),
     f"likelihood, {POOLED} x {POOLED} pixels added": pooled_likelihood,
+    "likelihood, smoothed": smoothed_likelihood,
     "unmixing": _estimated("unmixing"),
+    "unmixing, 24 neighbours": _estimated("unmixing", censoring="24 neighbours"),
 }
 
 Shares = dict[str, tuple[float, float, float]]
