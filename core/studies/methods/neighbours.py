@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,7 @@ def smoothed_likelihood(capture: Capture) -> Floats:
     return smoothed(np.nan_to_num(image.bin), weight, smoothness=1.0)
 
 
-def _estimated(method: str, **settings: str) -> Callable[[Capture], Floats]:
+def _estimated(method: str, **settings: Any) -> Callable[[Capture], Floats]:
     return lambda capture: estimate(capture, method, **settings).bin
 
 
