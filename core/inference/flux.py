@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from core.inference.likelihood import (
     prepare,
     rate_and_n_armed,
     sampled_numbers,
+    sums_before,
     windowed_sums,
 )
 from core.inference.neighbours import weighted_median
@@ -267,6 +269,7 @@ def _shares_of_one_level(capture: Capture, start: FluxPrior) -> Floats:
     return best
 
 
+@lru_cache(maxsize=64)
 def _sampled(n_pixels: int, most: int) -> NDArray[np.intp]:
     """Sample at most as many pixels, one at random of each of equal parts of the image.
 
@@ -274,7 +277,9 @@ def _sampled(n_pixels: int, most: int) -> NDArray[np.intp]:
     regular step could miss columns.
     """
     first = np.arange(min(most, n_pixels) + 1) * n_pixels // min(most, n_pixels)
-    return np.random.default_rng(0).integers(first[:-1], first[1:])
+    pixels = np.random.default_rng(0).integers(first[:-1], first[1:])
+    pixels.setflags(write=False)
+    return pixels
 
 
 def total_rates(capture: Capture) -> Floats:
@@ -413,7 +418,7 @@ def _strongest(
     excess, width = np.empty(len(pixels)), min(capture.echo_bins, n_bins)
     for some in _some_rows(pixels):
         rate, _ = rate_and_n_armed(pixels[some].astype(float), capture.gated_pulses)
-        until = np.pad(np.cumsum(rate, axis=1), ((0, 0), (1, 0)))
+        until = sums_before(rate)
         inside = until[:, width:] - until[:, :-width]
         if shape is not None:  # the background of each window, above the mean one
             inside -= until[:, -1:] * (windowed_sums(shape[np.newaxis], width) - width) / n_bins

@@ -18,6 +18,7 @@ all pixels, levels and delays in float32, a few blocks of pixels at a time.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ from core.inference.background import nodes_of
 from core.inference.flux_model import FluxModel
 from core.kernels.blocks import LANES, lane_counts
 from core.kernels.confidence import fill_densities, fill_evidence, fill_peaks
-from core.kernels.parallel import entering
+from core.kernels.parallel import entering, in_parts
 from core.kernels.posterior import fill_blocks
 from core.kernels.rates import fill_rates
 
@@ -39,6 +40,7 @@ TABLE_NUMBERS = 2**22  # likelihoods of the levels and delays of a block: 16 MiB
 _FEWEST_LANES = 2  # numpy sums a single lane pairwise, which rounds differently
 FLUX_NUMBERS = 2**20  # backgrounds of levels and pixels that are laid out at once
 _LEAST_BACKGROUND = 1e-100  # photons; without any, the likelihood ratio of one count is infinite
+_PASSES = 8  # over the counts that take as long as the likelihood of a level
 _NEGLIGIBLE = 1e-12  # signal of a bin as a share of its background
 
 
@@ -63,8 +65,15 @@ class Conditions(NamedTuple):
 
 def windowed_sums(values: Floats, width: int) -> Floats:
     """Sum each window of `width` bins inside the gate; from (pixel, bin) to (pixel, window)."""
-    until = np.pad(np.cumsum(values, axis=1), ((0, 0), (1, 0)))
+    until = sums_before(values)
     return np.asarray(until[:, width:] - until[:, :-width])
+
+
+def sums_before(values: Floats) -> Floats:
+    """Sum the bins before each edge; from (pixel, bin) to (pixel, edge)."""
+    until = np.zeros((len(values), values.shape[1] + 1))  # `numpy.pad` is slow
+    np.cumsum(values, axis=1, out=until[:, 1:])
+    return until
 
 
 def rate_and_n_armed(histogram: Floats, n_pulses: int | None) -> tuple[Floats, Floats]:
@@ -188,8 +197,8 @@ class LikelihoodInput(NamedTuple):
     node_weight: Floats
     """Likewise, shape (node, bin)."""
     n_pixels: int
-    n_counts: int
-    """Counts in the cube of the whole image."""
+    work: int
+    """Work of a likelihood of the whole image, in counts for `core.kernels.parallel.entering`."""
 
 
 def prepare(
@@ -264,10 +273,7 @@ def _with_echo(
 ) -> LikelihoodInput:
     """Combine a part of an image with the fluxes of the image."""
     acquisition, lanes = capture.acquisition, part.counts.shape[2]
-    # Delays are the centres of steps, so that steps fill the gate and every bin.
-    delay = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
-    echo, first = capture.pulse.taps(acquisition.n_bins, acquisition.bin_width_s, delay)
-    tail = np.cumsum(echo[:, ::-1], axis=1)[:, ::-1]
+    echo = _echo_of(capture.pulse, acquisition.n_bins, acquisition.bin_width_s, steps_per_bin)
     log_share = np.log(np.maximum(flux.share, np.finfo(float).tiny))
     return LikelihoodInput(
         part.counts,
@@ -275,15 +281,25 @@ def _with_echo(
         _in_lanes(flux.background, part.pixels, lanes),
         log_share,
         np.repeat(flux.depth, steps_per_bin).astype(np.float32),
-        echo.astype(np.float32),
-        np.pad(tail, ((0, 0), (0, 1))).astype(np.float32),
-        first,
+        *echo,
         capture.gated_pulses or 0,
         flux.relative_background,
         *nodes_of(flux.relative_background),
         part.pixels.stop - part.pixels.start,
-        part.n_counts,
+        part.n_counts * steps_per_bin * (flux.share.size - 1) * _PASSES,
     )
+
+
+@lru_cache(maxsize=64)
+def _echo_of(
+    pulse: Pulse, n_bins: int, bin_width_s: float, steps_per_bin: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
+    """Return `LikelihoodInput.echo`, `echo_tail` and `first_tap`, which must not be changed."""
+    # Delays are the centres of steps, so that steps fill the gate and every bin.
+    delay = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
+    echo, first = pulse.taps(n_bins, bin_width_s, delay)
+    tail = np.cumsum(echo[:, ::-1], axis=1)[:, ::-1]
+    return echo.astype(np.float32), np.pad(tail, ((0, 0), (0, 1))).astype(np.float32), first
 
 
 def _in_lanes(image: Floats, pixels: slice, lanes: int) -> Floats:
@@ -304,8 +320,7 @@ def level_evidence(prepared: LikelihoodInput, depth: NDArray[np.float32] | None 
     evidence = np.empty((n_blocks, lanes, n_levels))
     depth = np.ones_like(prepared.depth) if depth is None else depth
     in_steps = np.ascontiguousarray(depth.reshape(-1, len(prepared.echo)).T)
-    with entering(prepared.n_counts):
-        fill_evidence(prepared, in_steps, evidence)
+    in_parts(fill_evidence, n_blocks, prepared.work, prepared, in_steps, evidence)
     return evidence.reshape(-1, n_levels)[: prepared.n_pixels]
 
 
@@ -313,8 +328,7 @@ def level_densities(prepared: LikelihoodInput) -> NDArray[np.float32]:
     """Likelihood of each level and delay relative to the pixel's maximum (pixel, level, delay)."""
     n_levels, n_blocks, lanes = prepared.signal.shape
     density = np.empty((n_blocks, lanes, n_levels, prepared.depth.size), np.float32)
-    with entering(prepared.n_counts):
-        fill_densities(prepared, density)
+    in_parts(fill_densities, n_blocks, prepared.work, prepared, density)
     return density.reshape(-1, *density.shape[2:])[: prepared.n_pixels]
 
 
@@ -353,8 +367,7 @@ def likeliest_delays(prepared: LikelihoodInput) -> tuple[NDArray[np.intp], Float
     """
     shape = prepared.signal.shape[1:]
     best, around = np.empty(shape, np.intp), np.empty((*shape, 3))
-    with entering(prepared.n_counts):
-        fill_peaks(prepared, best, around)
+    in_parts(fill_peaks, len(best), prepared.work, prepared, best, around)
     return best, around
 
 
@@ -372,6 +385,6 @@ def _log_likelihoods(prepared: LikelihoodInput) -> Iterator[tuple[slice, NDArray
     for first in range(0, n_blocks, at_once):
         some = slice(first, min(first + at_once, n_blocks))
         log = np.empty((some.stop - first, n_levels, n_delays, lanes), np.float32)
-        with entering(prepared.n_counts):
+        with entering(prepared.work):
             fill_blocks(first, prepared, log)
         yield some, log

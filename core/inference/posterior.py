@@ -28,7 +28,7 @@ from core.inference.likelihood import (
     prepared_groups,
 )
 from core.kernels.confidence import fill_masses, fill_states
-from core.kernels.parallel import entering
+from core.kernels.parallel import in_parts
 
 TOLERANCE_BINS = 3
 """Tolerance within which an estimate is right; it reproduces the paper's tables."""
@@ -81,8 +81,8 @@ def _masses(
     within, surface = np.empty((*first.shape, n_windows), np.float32), np.empty(first.shape)
     for pixels, prepared in prepared_groups(capture, flux, 1):
         some = slice(pixels.start // lanes, -(-pixels.stop // lanes))
-        with entering(prepared.n_counts):
-            fill_masses(prepared, TOLERANCE_BINS, first[some], within[some], surface[some])
+        parts = TOLERANCE_BINS, first[some], within[some], surface[some]
+        in_parts(fill_masses, some.stop - some.start, prepared.work, prepared, *parts)
     return within.reshape(-1, n_windows)[:n_pixels], surface.ravel()[:n_pixels]
 
 
@@ -110,8 +110,8 @@ def states_of(prepared: LikelihoodInput, none: float, least: float) -> States:
     _, n_blocks, lanes = prepared.signal.shape
     surface = np.empty((n_blocks, lanes, prepared.depth.size), np.float32)
     nothing = np.empty((n_blocks, lanes), np.float32)
-    with entering(prepared.n_counts):
-        fill_states(prepared, none, np.float32(least), surface, nothing)
+    given = none, np.float32(least), surface, nothing
+    in_parts(fill_states, n_blocks, prepared.work, prepared, *given)
     pixels = slice(prepared.n_pixels)
     return States(surface.reshape(-1, surface.shape[2])[pixels], nothing.ravel()[pixels])
 

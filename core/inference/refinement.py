@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
-from core.acquisition import Floats
+from core.acquisition import Floats, Pulse
 from core.capture import Capture
 from core.inference.flux_model import FluxModel
 from core.inference.posterior import same_echo_bins
@@ -74,10 +76,8 @@ def _moved(
     and are infinite at an end of the gate.
     """
     acquisition, n_pixels = capture.acquisition, delay_bin.size
-    within = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
-    taps, first = capture.pulse.taps(acquisition.n_bins, acquisition.bin_width_s, within)
-    # In the order in which a bin meets it while the delay grows.
-    echo = np.pad(taps[:, ::-1].T.ravel(), 2 * reach * steps_per_bin)
+    width_s = acquisition.bin_width_s
+    echo, first = _samples_of(capture.pulse, acquisition.n_bins, width_s, steps_per_bin, reach)
 
     def in_blocks(image: Floats) -> Floats:
         filled = np.full(-(-n_pixels // LANES) * LANES, np.nan)
@@ -100,7 +100,7 @@ def _moved(
             steps_per_bin,
             first,
             reach,
-            FEWEST * (capture.pulse.sigma_s / acquisition.bin_width_s / SHARP_BINS) ** 2,
+            FEWEST * (capture.pulse.sigma_s / width_s / SHARP_BINS) ** 2,
             delay,
             curvature,
         )
@@ -108,3 +108,16 @@ def _moved(
         spread = 1 / (steps_per_bin * np.sqrt(np.abs(curvature)))
     delay, spread = (x.ravel()[:n_pixels].reshape(delay_bin.shape) for x in (delay, spread))
     return delay, spread
+
+
+@lru_cache(maxsize=64)
+def _samples_of(
+    pulse: Pulse, n_bins: int, bin_width_s: float, steps_per_bin: int, reach: int
+) -> tuple[Floats, int]:
+    """Return the samples of an echo for `refine_delays`, and its first tap.
+
+    In the order in which a bin meets them while the delay grows. They must not be changed.
+    """
+    within = (np.arange(steps_per_bin) + 0.5) / steps_per_bin
+    taps, first = pulse.taps(n_bins, bin_width_s, within)
+    return np.pad(taps[:, ::-1].T.ravel(), 2 * reach * steps_per_bin), first

@@ -10,6 +10,7 @@ from numba import njit
 from core.kernels.parallel import SUMMING
 
 _LEAST_SHARE = 1e-6  # probability that no echo is near, below which a bin is left out
+_SMALL_RATE = 0.125  # photons per bin, below which eleven terms of a series are exact
 
 
 @njit(**SUMMING)
@@ -25,8 +26,11 @@ def add_echo_free(density, prior, background, counts, n_pulses, echo_window, sha
     """
     n_pixels, n_levels, n_bins = density.shape
     first, end = echo_window
-    near, dimmed = np.empty((2, n_bins))
-    near_before, dimmed_before = np.zeros((2, n_bins + 1))
+    # Sums over the delays before each bin, continued beyond the gate: windows are slices of them.
+    near_before, dimmed_before = np.zeros((2, n_bins + end - first))
+    begin, until = slice(0, n_bins), slice(end - first, n_bins + end - first)
+    near, dimmed, alone, armed, fires = np.empty((5, n_bins))
+    brightest = shape.max() / n_bins
     for pixel in range(n_pixels):
         near[:], dimmed[:] = 0.0, 0.0
         for level in range(1, n_levels):
@@ -35,25 +39,59 @@ def add_echo_free(density, prior, background, counts, n_pulses, echo_window, sha
                 mass = prior[level, k] * density[pixel, level, k]
                 near[k] += mass
                 dimmed[k] += photons * mass
-        for k in range(n_bins):
-            near_before[k + 1] = near_before[k] + near[k]
-            dimmed_before[k + 1] = dimmed_before[k] + dimmed[k]
+        _fill_sums(near, near_before[end:])
+        _fill_sums(dimmed, dimmed_before[end:])
         dark = density[pixel, 0, 0] * prior[0].sum()
-        total = dark + near_before[n_bins]
-        photons = background[pixel, 0] * dark + dimmed_before[n_bins]
-        armed = float(n_pulses) if n_pulses > 0 else 1.0
+        total = dark + near_before[-1]
+        photons = background[pixel, 0] * dark + dimmed_before[-1]
+        left = float(n_pulses) if n_pulses > 0 else 1.0
         for k in range(n_bins):
-            # Echoes of these delays fill the bin.
-            begin, until = max(k + 1 - end, 0), min(k + 1 - first, n_bins)
-            alone = total - (near_before[until] - near_before[begin])
-            count = float(counts[pixel, k])
-            if alone > _LEAST_SHARE * total:
-                mean = (photons - (dimmed_before[until] - dimmed_before[begin])) / alone
-                rate = max(mean, 0.0) / n_bins * shape[k]
-                fires = -math.expm1(-rate) if n_pulses > 0 else rate
-                share = alone / total
-                sums[0, k] += share * count
-                sums[1, k] += share * armed * fires / shape[k]
-                sums[2, k] += share * armed
-            if n_pulses > 0:
-                armed -= count
+            armed[k] = left
+            left -= counts[pixel, k] if n_pulses > 0 else 0.0
+        behind, ahead = near_before[until], near_before[begin]
+        for k in range(n_bins):
+            alone[k] = total - (behind[k] - ahead[k])
+        behind, ahead = dimmed_before[until], dimmed_before[begin]
+        for k in range(n_bins):
+            mean = (photons - (behind[k] - ahead[k])) / alone[k]
+            is_alone = alone[k] > _LEAST_SHARE * total
+            fires[k] = mean / n_bins * shape[k] if is_alone and mean > 0.0 else 0.0
+        if n_pulses > 0:
+            _fill_firing(background[pixel].max() * brightest < _SMALL_RATE, fires)
+        for k in range(n_bins):
+            alone[k] = alone[k] / total if alone[k] > _LEAST_SHARE * total else 0.0
+        for k in range(n_bins):
+            sums[0, k] += alone[k] * counts[pixel, k]
+        for k in range(n_bins):
+            sums[1, k] += alone[k] * armed[k] * fires[k] / shape[k]
+        for k in range(n_bins):
+            sums[2, k] += alone[k] * armed[k]
+
+
+@njit(**SUMMING)
+def _fill_sums(numbers, sums):  # type: ignore[no-untyped-def]
+    """Fill `sums` with those of the first numbers, and its rest with that of all."""
+    total = 0.0
+    for k in range(numbers.size):
+        total += numbers[k]
+        sums[k] = total
+    sums[numbers.size :] = total
+
+
+@njit(**SUMMING)
+def _fill_firing(is_small, rate):  # type: ignore[no-untyped-def]
+    """Replace rates by ``1 - exp(-rate)``, those below `_SMALL_RATE` to double precision.
+
+    Small ones by the series, which the compiler vectorises.
+    """
+    if not is_small:
+        for k in range(rate.size):
+            rate[k] = -math.expm1(-rate[k])
+        return
+    for k in range(rate.size):
+        x = rate[k]
+        p = 1.0 - x * (1 / 10) * (1.0 - x * (1 / 11))
+        p = 1.0 - x * (1 / 8) * (1.0 - x * (1 / 9) * p)
+        p = 1.0 - x * (1 / 6) * (1.0 - x * (1 / 7) * p)
+        p = 1.0 - x * (1 / 4) * (1.0 - x * (1 / 5) * p)
+        rate[k] = x * (1.0 - x * (1 / 2) * (1.0 - x * (1 / 3) * p))

@@ -2,6 +2,8 @@
 
 The likelihood of a block of pixels stays in the cache. Signal levels are added one by one, in units
 of the largest term so far (Milakov & Gimelshein 2018).
+
+Kernels of an image process the blocks from `first` to `end`, see `core.kernels.parallel.in_parts`.
 """
 
 from __future__ import annotations
@@ -9,12 +11,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from core.kernels.blocks import PIXELS_AT_ONCE, lane_rows
 from core.kernels.elementary import exp32
-from core.kernels.parallel import COMPILED, PARALLEL
+from core.kernels.parallel import COMPILED
 from core.kernels.posterior import counts_of, fill_flat, fill_level
+
+_FEW_WINDOWS = 2  # of a pixel; more are computed for all delays of all pixels at once
 
 
 @njit(**COMPILED)
@@ -35,65 +39,77 @@ def _fill_highest(ratio, highest):  # type: ignore[no-untyped-def]
             highest[i] = here if here > most else most
 
 
-@njit(**PARALLEL)
-def fill_evidence(prepared, depth, evidence):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_evidence(first, end, prepared, depth, evidence):  # type: ignore[no-untyped-def]
     """Fill the log likelihood ratio of each level to no echo, (block, lane, level).
 
     `depth` is the prior of the delay relative to uniform, (step, bin).
     """
+    for b in range(first, end):
+        _fill_evidence(b, prepared, depth, evidence[b])
+
+
+@njit(**COMPILED)
+def _fill_evidence(b, prepared, depth, evidence):  # type: ignore[no-untyped-def]
+    """Fill `fill_evidence` of a block, (lane, level)."""
     n_steps, n_bins = depth.shape
-    n_blocks, lanes, n_levels = evidence.shape
-    for b in prange(n_blocks):
-        fired, all_fired, armed, all_unfired = counts_of(b, prepared)
-        ratio = lane_rows(depth.size, lanes).reshape(n_steps, n_bins, lanes)
-        (highest, row), offset = np.empty((2, lanes), np.float32), np.empty(lanes)
-        evidence[b, :, 0] = 0.0
-        for level in range(1, n_levels):
-            fill_level(b, level, prepared, fired, armed, ratio)
-            fill_flat(b, level, prepared, all_fired, all_unfired, offset)
-            _fill_highest(ratio.reshape(-1, lanes), highest)
-            total = np.zeros(lanes)
-            for step in range(n_steps):
-                for k in range(n_bins):
-                    for i in range(lanes):
-                        row[i] = depth[step, k] * exp32(ratio[step, k, i] - highest[i])
-                    for i in range(lanes):
-                        total[i] += row[i]
-            for i in range(lanes):
-                mean = total[i] / depth.size
-                evidence[b, i, level] = offset[i] + highest[i] + math.log(mean)
+    lanes, n_levels = evidence.shape
+    fired, all_fired, armed, all_unfired = counts_of(b, prepared)
+    ratio = lane_rows(depth.size, lanes).reshape(n_steps, n_bins, lanes)
+    (highest, row), offset = np.empty((2, lanes), np.float32), np.empty(lanes)
+    evidence[:, 0] = 0.0
+    for level in range(1, n_levels):
+        fill_level(b, level, prepared, fired, armed, ratio)
+        fill_flat(b, level, prepared, all_fired, all_unfired, offset)
+        _fill_highest(ratio.reshape(-1, lanes), highest)
+        total = np.zeros(lanes)
+        for step in range(n_steps):
+            for k in range(n_bins):
+                for i in range(lanes):
+                    row[i] = depth[step, k] * exp32(ratio[step, k, i] - highest[i])
+                for i in range(lanes):
+                    total[i] += row[i]
+        for i in range(lanes):
+            mean = total[i] / depth.size
+            evidence[i, level] = offset[i] + highest[i] + math.log(mean)
 
 
-@njit(**PARALLEL)
-def fill_densities(prepared, density):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_densities(first, end, prepared, density):  # type: ignore[no-untyped-def]
     """Fill the likelihood of each level and delay relative to the pixel's largest.
 
     `density` is of shape (block, lane, level, delay).
     """
-    n_blocks, lanes, n_levels, n_delays = density.shape
+    for b in range(first, end):
+        _fill_densities(b, prepared, density[b])
+
+
+@njit(**COMPILED)
+def _fill_densities(b, prepared, density):  # type: ignore[no-untyped-def]
+    """Fill `fill_densities` of a block, (lane, level, delay)."""
+    lanes, n_levels, n_delays = density.shape
     n_steps = len(prepared.echo)
-    for b in prange(n_blocks):
-        fired, all_fired, armed, all_unfired = counts_of(b, prepared)
-        ratio = lane_rows(n_delays, lanes).reshape(n_steps, -1, lanes)
-        highest, offset, top = np.empty(lanes, np.float32), np.empty(lanes), np.zeros(lanes)
-        for level in range(1, n_levels):
-            fill_level(b, level, prepared, fired, armed, ratio)
-            fill_flat(b, level, prepared, all_fired, all_unfired, offset)
-            _fill_highest(ratio.reshape(-1, lanes), highest)
-            for i in range(lanes):
-                top[i] = max(top[i], highest[i] + offset[i])
-            # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
-            for first in range(0, lanes, PIXELS_AT_ONCE):
-                for d in range(n_delays):
-                    for i in range(first, min(first + PIXELS_AT_ONCE, lanes)):
-                        log = ratio[d % n_steps, d // n_steps, i] + offset[i]
-                        density[b, i, level, d] = log
+    fired, all_fired, armed, all_unfired = counts_of(b, prepared)
+    ratio = lane_rows(n_delays, lanes).reshape(n_steps, -1, lanes)
+    highest, offset, top = np.empty(lanes, np.float32), np.empty(lanes), np.zeros(lanes)
+    for level in range(1, n_levels):
+        fill_level(b, level, prepared, fired, armed, ratio)
+        fill_flat(b, level, prepared, all_fired, all_unfired, offset)
+        _fill_highest(ratio.reshape(-1, lanes), highest)
         for i in range(lanes):
-            density[b, i, 0] = math.exp(-top[i])
-            for level in range(1, n_levels):
-                row, most = density[b, i, level], np.float32(top[i])
-                for d in range(n_delays):
-                    row[d] = exp32(row[d] - most)
+            top[i] = max(top[i], highest[i] + offset[i])
+        # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
+        for first in range(0, lanes, PIXELS_AT_ONCE):
+            for d in range(n_delays):
+                for i in range(first, min(first + PIXELS_AT_ONCE, lanes)):
+                    log = ratio[d % n_steps, d // n_steps, i] + offset[i]
+                    density[i, level, d] = log
+    for i in range(lanes):
+        density[i, 0] = math.exp(-top[i])
+        for level in range(1, n_levels):
+            row, most = density[i, level], np.float32(top[i])
+            for d in range(n_delays):
+                row[d] = exp32(row[d] - most)
 
 
 @njit(**COMPILED)
@@ -138,33 +154,39 @@ def _fill_density(b, prepared, ratio, offset, density, top):  # type: ignore[no-
             density[d, i] *= prepared.depth[d]
 
 
-@njit(**PARALLEL)
-def fill_peaks(prepared, best, around):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_peaks(first, end, prepared, best, around):  # type: ignore[no-untyped-def]
     """Fill the likeliest delay of each pixel, (block, lane).
 
     And the logarithms of the densities before, at and after it, (block, lane, 3): densities next to
     a strong echo underflow to 0.
     """
-    n_blocks, lanes = best.shape
+    for b in range(first, end):
+        _fill_peaks(b, prepared, best[b], around[b])
+
+
+@njit(**COMPILED)
+def _fill_peaks(b, prepared, best, around):  # type: ignore[no-untyped-def]
+    """Fill `fill_peaks` of a block, (lane,) and (lane, 3)."""
+    lanes = best.size
     n_steps, n_delays, n_levels = len(prepared.echo), prepared.depth.size, len(prepared.signal) - 1
-    for b in prange(n_blocks):
-        ratio = lane_rows(n_levels * n_delays, lanes).reshape(n_levels, n_steps, -1, lanes)
-        density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
-        top, offset = np.empty(lanes), np.empty((n_levels, lanes))
-        _fill_density(b, prepared, ratio, offset, density, top)
-        highest, at = np.full(lanes, -1.0, np.float32), np.zeros(lanes, np.int32)
-        for d in range(n_delays):
-            for i in range(lanes):
-                here, most, before = density[d, i], highest[i], at[i]
-                at[i] = d if here > most else before
-                highest[i] = here if here > most else most
+    ratio = lane_rows(n_levels * n_delays, lanes).reshape(n_levels, n_steps, -1, lanes)
+    density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+    top, offset = np.empty(lanes), np.empty((n_levels, lanes))
+    _fill_density(b, prepared, ratio, offset, density, top)
+    highest, at = np.full(lanes, -1.0, np.float32), np.zeros(lanes, np.int32)
+    for d in range(n_delays):
         for i in range(lanes):
-            best[b, i] = at[i]
-            for j in range(3):
-                d = min(max(at[i] + j - 1, 0), n_delays - 1)
-                log = ratio[:, d % n_steps, d // n_steps, i] + offset[:, i]
-                most = log.max()
-                around[b, i, j] = most + math.log(np.exp(log - most).sum() * prepared.depth[d])
+            here, most, before = density[d, i], highest[i], at[i]
+            at[i] = d if here > most else before
+            highest[i] = here if here > most else most
+    for i in range(lanes):
+        best[i] = at[i]
+        for j in range(3):
+            d = min(max(at[i] + j - 1, 0), n_delays - 1)
+            log = ratio[:, d % n_steps, d // n_steps, i] + offset[:, i]
+            most = log.max()
+            around[i, j] = most + math.log(np.exp(log - most).sum() * prepared.depth[d])
 
 
 @njit(**COMPILED)
@@ -178,57 +200,82 @@ def _fill_windows(half, density, window):  # type: ignore[no-untyped-def]
                 window[d, i] += density[near, i]
 
 
-@njit(**PARALLEL)
-def fill_masses(prepared, half, first, mass, surface):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def _sum_near(half, density, d, i):  # type: ignore[no-untyped-def]
+    """Return one number of `_fill_windows`."""
+    total = np.float32(0.0)
+    for near in range(max(d - half, 0), min(d + half, len(density))):
+        total += density[near, i]
+    return total
+
+
+@njit(**COMPILED)
+def fill_masses(first, end, prepared, half, begin, mass, surface):  # type: ignore[no-untyped-def]
     """Fill the posterior mass of windows of delays, and of all delays, of each pixel.
 
     `mass` (block, lane, window) is that of the `half` delays on either side of the beginning of the
-    delays from ``first[block, lane]``, and `surface` (block, lane) that of a surface anywhere.
+    delays from ``begin[block, lane]``, and `surface` (block, lane) that of a surface anywhere.
     """
-    n_delays, lanes = prepared.depth.size, first.shape[1]
+    for b in range(first, end):
+        _fill_masses(b, prepared, half, begin[b], mass[b], surface[b])
+
+
+@njit(**COMPILED)
+def _fill_masses(b, prepared, half, begin, mass, surface):  # type: ignore[no-untyped-def]
+    """Fill `fill_masses` of a block, (lane, window) and (lane,)."""
+    n_delays, (lanes, n_windows) = prepared.depth.size, mass.shape
     none = prepared.log_share[0]
-    for b in prange(len(first)):
-        density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
-        window = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
-        ratio = lane_rows(n_delays, lanes).reshape(1, 1, n_delays, lanes)
-        top, total, offset = np.empty(lanes), np.zeros(lanes), np.empty((1, lanes))
-        _fill_density(b, prepared, ratio, offset, density, top)
+    density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+    ratio = lane_rows(n_delays, lanes).reshape(1, 1, n_delays, lanes)
+    top, total, offset = np.empty(lanes), np.zeros(lanes), np.empty((1, lanes))
+    _fill_density(b, prepared, ratio, offset, density, top)
+    window = ratio[0, 0]  # whose numbers are no longer needed
+    if n_windows > _FEW_WINDOWS:
         _fill_windows(half, density, window)
-        for d in range(n_delays):
-            for i in range(lanes):
-                total[i] += density[d, i]
+    for d in range(n_delays):
         for i in range(lanes):
-            # Relative to the larger of the two, so that neither overflows.
-            unit = max(top[i], none)
-            seen = math.exp(top[i] - unit) * total[i] / n_delays
-            surface[b, i] = seen / (seen + math.exp(none - unit))
-            share = np.float32(surface[b, i] / total[i])
-            for j in range(mass.shape[2]):
-                mass[b, i, j] = share * window[first[b, i] + j, i]
+            total[i] += density[d, i]
+    for i in range(lanes):
+        # Relative to the larger of the two, so that neither overflows.
+        unit = max(top[i], none)
+        seen = math.exp(top[i] - unit) * total[i] / n_delays
+        surface[i] = seen / (seen + math.exp(none - unit))
+        share = np.float32(surface[i] / total[i])
+        for j in range(n_windows):
+            d = begin[i] + j
+            if n_windows <= _FEW_WINDOWS:
+                window[d, i] = _sum_near(half, density, d, i)
+            mass[i, j] = share * window[d, i]
 
 
-@njit(**PARALLEL)
-def fill_states(prepared, none, least, surface, nothing):  # type: ignore[no-untyped-def]
+@njit(**COMPILED)
+def fill_states(first, end, prepared, none, least, surface, nothing):  # type: ignore[no-untyped-def]
     """Fill the probability of a surface at each delay, and of nothing, of pixels by themselves.
 
     `none` is the prior of nothing, and no probability of a delay is below `least`. `surface` is of
     shape (block, lane, delay) and `nothing` (block, lane).
     """
-    n_blocks, lanes, n_delays = surface.shape
+    for b in range(first, end):
+        _fill_states(b, prepared, none, least, surface[b], nothing[b])
+
+
+@njit(**COMPILED)
+def _fill_states(b, prepared, none, least, surface, nothing):  # type: ignore[no-untyped-def]
+    """Fill `fill_states` of a block, (lane, delay) and (lane,)."""
+    lanes, n_delays = surface.shape
     n_steps, n_bins = len(prepared.echo), prepared.counts.shape[1]
-    for b in prange(n_blocks):
-        density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
-        ratio = lane_rows(n_delays, lanes).reshape(1, n_steps, n_bins, lanes)
-        top, total = np.empty(lanes), np.zeros(lanes)
-        _fill_density(b, prepared, ratio, np.empty((1, lanes)), density, top)
-        for d in range(n_delays):
-            for i in range(lanes):
-                total[i] += density[d, i]
+    density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
+    ratio = lane_rows(n_delays, lanes).reshape(1, n_steps, n_bins, lanes)
+    top, total = np.empty(lanes), np.zeros(lanes)
+    _fill_density(b, prepared, ratio, np.empty((1, lanes)), density, top)
+    for d in range(n_delays):
         for i in range(lanes):
-            unit = max(top[i], 0.0)  # so that neither overflows
-            seen, unseen = math.exp(top[i] - unit) / n_delays, none * math.exp(-unit)
-            every = seen * total[i] + unseen
-            nothing[b, i] = unseen / every
-            share = np.float32(seen / every)
-            for d in range(n_delays):
-                surface[b, i, d] = max(share * density[d, i], least)
+            total[i] += density[d, i]
+    for i in range(lanes):
+        unit = max(top[i], 0.0)  # so that neither overflows
+        seen, unseen = math.exp(top[i] - unit) / n_delays, none * math.exp(-unit)
+        every = seen * total[i] + unseen
+        nothing[i] = unseen / every
+        share = np.float32(seen / every)
+        for d in range(n_delays):
+            surface[i, d] = max(share * density[d, i], least)

@@ -1,11 +1,13 @@
-"""Compilation options of kernels, and the lock under which parallel ones run."""
+"""Compilation options of kernels, the lock of parallel ones, and threads for others."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 import numba
@@ -62,3 +64,29 @@ def entering(n_counts: int) -> Iterator[None]:
             yield
         finally:
             numba.set_num_threads(threads)
+
+
+def in_parts(kernel: Callable[..., None], n_blocks: int, work: int, *arguments: Any) -> None:
+    """Call ``kernel(first, end, *arguments)`` for all blocks, in parts on threads if work is large.
+
+    For kernels of much code, which numba compiles three times with ``parallel=True``.
+
+    Parameters
+    ----------
+    kernel : callable
+        Compiled with `COMPILED`.
+    n_blocks : int
+    work : int
+        As for `entering`.
+    *arguments
+    """
+    n_parts = min(numba.get_num_threads(), n_blocks) if work > SERIAL_BELOW else 1
+    if n_parts <= 1:
+        kernel(0, n_blocks, *arguments)
+        return
+    (first, end), *others = pairwise(n_blocks * part // n_parts for part in range(n_parts + 1))
+    with ThreadPoolExecutor(n_parts - 1) as threads:
+        running = [threads.submit(kernel, *other, *arguments) for other in others]
+        kernel(first, end, *arguments)
+    for each in running:
+        each.result()

@@ -210,19 +210,23 @@ def _fill_gain(b, level, node, prepared, gain):  # type: ignore[no-untyped-def]
     """
     n_bins, lanes = prepared.counts.shape[1:]
     n_steps, n_taps = prepared.echo.shape
-    unit, previous = np.empty(lanes, np.float32), 0.0
+    unit, background = np.empty(lanes, np.float32), prepared.background[level, b]
+    signal = prepared.signal[level, b]
+    # Neighbours are often alike, and exponentials are slow.
     for i in range(lanes):
-        background = node * prepared.background[level, b, i] / n_bins
-        unit[i] = 1.0 / (math.expm1(background) if prepared.n_pulses > 0 else background)
-        signal = prepared.signal[level, b, i]
-        for step in range(n_steps):
-            for tap in range(n_taps):
-                s = signal * prepared.echo[step, tap]
-                if i > 0 and signal == previous:
-                    gain[step, tap, i] = gain[step, tap, i - 1]
-                else:
-                    gain[step, tap, i] = -math.expm1(-s) if prepared.n_pulses > 0 else s
-        previous = signal
+        if i > 0 and background[i] == background[i - 1]:
+            unit[i] = unit[i - 1]
+        else:
+            rate = node * background[i] / n_bins
+            unit[i] = 1.0 / (math.expm1(rate) if prepared.n_pulses > 0 else rate)
+    for step in range(n_steps):
+        for tap in range(n_taps):
+            row, met = gain[step, tap], 0.0
+            for i in range(lanes):
+                if i == 0 or signal[i] != signal[i - 1]:
+                    s = signal[i] * prepared.echo[step, tap]
+                    met = -math.expm1(-s) if prepared.n_pulses > 0 else s
+                row[i] = met
     for step in range(n_steps):
         for tap in range(n_taps):
             missed = prepared.echo_tail[step, tap] if prepared.n_pulses > 0 else 0.0
@@ -271,18 +275,18 @@ def fill_flat(b, level, prepared, fired, unfired, flat):  # type: ignore[no-unty
     the background.
     """
     n_bins, lanes = prepared.counts.shape[1:]
+    here, bare = prepared.background[level, b] / n_bins, prepared.background[0, b] / n_bins
     for i in range(lanes):
-        here = prepared.background[level, b, i] / n_bins
-        bare = prepared.background[0, b, i] / n_bins
-        flat[i] = 0.0
-        if here == bare:
-            continue
-        flat[i] = -unfired[i] * (here - bare)
-        for node in range(len(fired)):
-            factor, odds = prepared.node[node], here / bare
-            if prepared.n_pulses > 0:
-                odds = math.expm1(-here * factor) / math.expm1(-bare * factor)
-            flat[i] += fired[node, i] * math.log(odds)
+        flat[i] = -unfired[i] * (here[i] - bare[i])
+    for node in range(len(fired)):
+        factor, gained = prepared.node[node], 0.0
+        for i in range(lanes):
+            if i == 0 or here[i] != here[i - 1] or bare[i] != bare[i - 1]:
+                odds = here[i] / bare[i]
+                if prepared.n_pulses > 0 and here[i] != bare[i]:
+                    odds = math.expm1(-here[i] * factor) / math.expm1(-bare[i] * factor)
+                gained = math.log(odds) if here[i] != bare[i] else 0.0
+            flat[i] += fired[node, i] * gained
 
 
 @njit(**COMPILED)

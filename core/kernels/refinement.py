@@ -56,19 +56,27 @@ def _fill_score(signal, echo, gain, steps, fired, unfired, score):  # type: igno
 
 
 @njit(**COMPILED)
-def _signal_in(background, is_first, fired, unfired):  # type: ignore[no-untyped-def]
-    """Signal and counts of a window beyond its background, 0 or more.
+def _excess_in(background, is_first, fired, unfired):  # type: ignore[no-untyped-def]
+    """Counts of a window beyond its background."""
+    counts = 0.0
+    for p in range(fired.size):
+        armed = unfired[p] + (fired[p] if is_first else 0.0)
+        counts += fired[p] - background * armed
+    return counts
 
-    The signal is corrected for pile-up (Coates 1968); of the pulses that were armed, half a one is
-    left at least.
+
+@njit(**COMPILED)
+def _signal_in(background, is_first, fired, unfired):  # type: ignore[no-untyped-def]
+    """Signal of a window beyond its background, 0 or more.
+
+    Corrected for pile-up (Coates 1968); of the pulses that were armed, half a one is left at least.
     """
-    signal, counts = 0.0, 0.0
+    signal = 0.0
     for p in range(fired.size):
         armed = unfired[p] + (fired[p] if is_first else 0.0)
         signal += math.log1p(fired[p] / max(unfired[p], 0.5)) if is_first else fired[p]
         signal -= background if armed > 0.0 else 0.0
-        counts += fired[p] - background * armed
-    return max(signal, 0.0), counts
+    return max(signal, 0.0)
 
 
 @njit(**COMPILED)
@@ -119,41 +127,60 @@ def refine_delays(  # type: ignore[no-untyped-def]
     exceed their noise as much as `fewest` counts without background do; otherwise the delay
     remains.
     """
-    n_blocks, n_bins, lanes = blocks.shape
+    for b in prange(len(blocks)):
+        _refine_block(
+            blocks[b],
+            n_pulses,
+            signal[b],
+            background[b],
+            echo,
+            steps,
+            first_tap,
+            reach,
+            fewest,
+            delay[b],
+            curvature[b],
+        )
+
+
+@njit(**COMPILED)
+def _refine_block(  # type: ignore[no-untyped-def]
+    counts, n_pulses, signal, background, echo, steps, first_tap, reach, fewest, delay, curvature
+):
+    """Move delays as `refine_delays` those of a block; (bin, lane) or (lane,) each."""
+    n_bins, lanes = counts.shape
     n_delays = (2 * reach + 1) * steps
-    for b in prange(n_blocks):
-        gain, score = np.empty(echo.size), np.empty(n_delays)
-        fired, unfired = np.empty((2, (echo.size - n_delays) // steps + 1))
-        last_signal, last_background = math.nan, math.nan
-        for i in range(lanes):
-            if math.isnan(delay[b, i]):
-                continue
-            is_own, here = math.isnan(signal[b, i]), signal[b, i]
-            rounds = FITTING_ROUNDS if is_own else 1
-            while rounds > 0:
-                rounds -= 1
-                highest, is_highest = -math.inf, False
-                while not is_highest:
-                    first = min(int(delay[b, i]), n_bins - 1) - reach
-                    _fill_window(blocks[b, :, i], n_pulses, first + first_tap, fired, unfired)
-                    at = (delay[b, i] - first) * steps - 0.5
-                    if is_own:
-                        here, counts = _signal_in(background[b, i], n_pulses > 0, fired, unfired)
-                        if counts * abs(counts) < fewest * fired.sum():
-                            rounds = 0
-                            break
-                        sample = echo[min(max(round(at), 0), n_delays - 1) :: steps][: fired.size]
-                        here = _fitted_signal(
-                            here, background[b, i], n_pulses > 0, sample, fired, unfired
-                        )
-                    if here != last_signal or background[b, i] != last_background:
-                        last_signal, last_background = here, background[b, i]
-                        _fill_gain(last_signal, last_background, n_pulses > 0, echo, gain)
-                    _fill_score(last_signal, echo, gain, steps, fired, unfired, score)
-                    begin = max(math.floor(at - reach * steps) + 1, -first * steps)
-                    end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
-                    found, curvature[b, i] = _highest(score, begin, end)
-                    is_higher = score[int(found)] > highest  # which NaN is not
-                    is_highest = begin < found < end - 1 or not is_higher
-                    highest = score[int(found)]
-                    delay[b, i] = first + (found + 0.5) / steps
+    gain, score = np.empty(echo.size), np.empty(n_delays)
+    fired, unfired = np.empty((2, (echo.size - n_delays) // steps + 1))
+    last_signal, last_background = math.nan, math.nan
+    for i in range(lanes):
+        if math.isnan(delay[i]):
+            continue
+        is_own, here = math.isnan(signal[i]), signal[i]
+        rounds = FITTING_ROUNDS if is_own else 1
+        while rounds > 0:
+            rounds -= 1
+            highest, is_highest = -math.inf, False
+            while not is_highest:
+                first = min(int(delay[i]), n_bins - 1) - reach
+                _fill_window(counts[:, i], n_pulses, first + first_tap, fired, unfired)
+                at = (delay[i] - first) * steps - 0.5
+                if is_own:
+                    more = _excess_in(background[i], n_pulses > 0, fired, unfired)
+                    if more * abs(more) < fewest * fired.sum():
+                        rounds = 0
+                        break
+                    here = _signal_in(background[i], n_pulses > 0, fired, unfired)
+                    sample = echo[min(max(round(at), 0), n_delays - 1) :: steps][: fired.size]
+                    here = _fitted_signal(here, background[i], n_pulses > 0, sample, fired, unfired)
+                if here != last_signal or background[i] != last_background:
+                    last_signal, last_background = here, background[i]
+                    _fill_gain(last_signal, last_background, n_pulses > 0, echo, gain)
+                _fill_score(last_signal, echo, gain, steps, fired, unfired, score)
+                begin = max(math.floor(at - reach * steps) + 1, -first * steps)
+                end = min(math.ceil(at + reach * steps), (n_bins - first) * steps)
+                found, curvature[i] = _highest(score, begin, end)
+                is_higher = score[int(found)] > highest  # which NaN is not
+                is_highest = begin < found < end - 1 or not is_higher
+                highest = score[int(found)]
+                delay[i] = first + (found + 0.5) / steps

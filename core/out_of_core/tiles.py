@@ -13,7 +13,7 @@ import logging
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
@@ -133,15 +133,17 @@ def range_part(
     calibration: Calibration,
 ) -> Floats:
     """Estimate the ranges of a part of an image; shape (row, col, len(IMAGES))."""
-    part = replace(captured(cube, description), flux_prior=flux_prior)
+    part = captured(cube, description, flux_prior)
     image = ESTIMATORS[method].ranged(part, settings, calibration)
     known = {name: getattr(image, name) for name in IMAGES if hasattr(image, name)}
     return np.stack([known.get(name, part.counts) for name in IMAGES], axis=2).astype(float)
 
 
-def captured(cube: NDArray[Any], description: Description) -> Capture:
+def captured(
+    cube: NDArray[Any], description: Description, flux_prior: FluxPrior | None = None
+) -> Capture:
     """Return counts that are in memory as a capture, with copied and checked counts."""
-    return capture_of(whole_counts(cube, "counts"), description)
+    return capture_of(whole_counts(cube, "counts"), description, flux_prior)
 
 
 def _dataset(images: Any, description: Description, made_by: Provenance) -> xr.Dataset:

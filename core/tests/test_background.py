@@ -9,7 +9,7 @@ from scipy import stats
 from core.acquisition import Acquisition, Pulse
 from core.capture import Capture
 from core.estimators.base import histogram_numbers
-from core.inference.background import SIZE, nodes_of, shape_text
+from core.inference.background import SIZE, echo_free, nodes_of, shape_text
 from core.inference.fit import fit_of
 from core.inference.flux import flux_prior_of
 from core.inspection import capture_report
@@ -51,6 +51,34 @@ def drawn(shape: np.ndarray, delays: tuple[float, float], n_pulses: int | None =
     counts = draw_counts(rate if n_pulses else 1000 * rate, n_pulses, rng)
     truth_m = acquisition.bin_to_range_m(onset)
     return Capture(counts, acquisition, Pulse(), truth_m, detection=detection)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(("n_pulses", "photons"), [(1000, 0.5), (1000, 40.0), (None, 3.0)])
+def test_bins_without_an_echo_add_up_as_written(n_pulses: int | None, photons: float) -> None:
+    rng, n_pixels, n_bins, (first, end) = np.random.default_rng(0), 5, 40, (-3, 6)
+    density = rng.uniform(0, 1, (n_pixels, 3, n_bins)).astype(np.float32)
+    density[:, 0] = density[:, :1, 0]  # no echo is the same at all delays
+    prior, shape = rng.uniform(0, 1, (3, n_bins)), rng.uniform(0.5, 1.5, n_bins)
+    background = photons * rng.uniform(0.5, 1.5, (n_pixels, 3))
+    counts = rng.integers(0, 9, (n_pixels, n_bins)).astype(np.uint16)
+    found = echo_free(density, prior, background, counts, n_pulses, (first, end), shape)
+    armed = np.ones((n_pixels, n_bins))
+    if n_pulses:
+        armed = n_pulses - (np.cumsum(counts, axis=1) - counts)
+    joint = prior * density.astype(float)
+    expected = np.zeros((3, n_bins))
+    for k in range(n_bins):
+        delay = np.arange(n_bins)
+        is_far = (k - delay < first) | (k - delay >= end)
+        alone = joint * np.where(np.arange(3)[:, np.newaxis] == 0, True, is_far)
+        share = alone.sum(axis=(1, 2)) / joint.sum(axis=(1, 2))
+        mean = (background * alone.sum(axis=2)).sum(axis=1) / alone.sum(axis=(1, 2))
+        rate = mean / n_bins * shape[k]
+        fires = -np.expm1(-rate) if n_pulses else rate
+        of_pixels = counts[:, k], armed[:, k] * fires / shape[k], armed[:, k]
+        expected[:, k] = [(share * each).sum() for each in of_pixels]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 @pytest.mark.compiled

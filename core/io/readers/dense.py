@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from core.io.readers.guards import require_fits
 from core.io.readers.options import TRUTH_HINT, ReadOptions
 from core.io.readers.pulse_guess import guessed_pulse
 from core.io.readers.quantities import time_text
+
+if TYPE_CHECKING:
+    from core.inference.flux_model import FluxPrior
 
 AXES = ("row", "col", "bin")
 LARGEST_COUNT = 2**32 - 1
@@ -180,10 +183,12 @@ def dense_capture(
     return capture_of(counts, known)
 
 
-def capture_of(counts: Counts, known: Description) -> Capture:
+def capture_of(counts: Counts, known: Description, flux_prior: FluxPrior | None = None) -> Capture:
     """Return counts as a capture of that description."""
     acquisition, pulse, detection, source = known
-    return Capture(counts, acquisition, pulse, source=source, detection=detection)
+    return Capture(
+        counts, acquisition, pulse, source=source, detection=detection, flux_prior=flux_prior
+    )
 
 
 def with_guesses(capture: Capture, **options: Any) -> Capture:

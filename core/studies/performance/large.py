@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -139,10 +140,19 @@ def _tile_by_tile(path: Path, progress: Progress) -> tuple[NDArray[Any], int]:
     flux_prior, calibration, _ = learned(counts.data, description, METHOD, settings, None)
     images = np.empty((*counts.shape[:2], len(IMAGES)))
     parts = list(da.core.slices_from_chunks(counts.data.chunks[:2]))
-    with _Memory(lambda: [os.getpid()]) as memory, dask.config.set(scheduler="synchronous"):
-        for done, part in enumerate(parts):
-            cube = counts[part].to_numpy()
-            images[part] = range_part(cube, description, METHOD, settings, flux_prior, calibration)
+    given = description, METHOD, settings, flux_prior, calibration
+    with (
+        _Memory(lambda: [os.getpid()]) as memory,
+        dask.config.set(scheduler="synchronous"),
+        ThreadPoolExecutor(1) as reader,
+    ):
+        # Decompression takes a third of the time: read the next tile meanwhile.
+        reading = reader.submit(counts[parts[0]].to_numpy)
+        for done, (part, after) in enumerate(zip(parts, [*parts[1:], None], strict=True)):
+            cube = reading.result()
+            if after is not None:
+                reading = reader.submit(counts[after].to_numpy)
+            images[part] = range_part(cube, *given)
             progress(done + 1, len(parts))
     return images, memory.peak_bytes
 

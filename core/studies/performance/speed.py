@@ -192,8 +192,8 @@ def variants_table(seconds: Mapping[str, Floats], n_counts: int, root_ns: Interv
             "speed-up": lambda name: speedup(seconds, name).value,
             **_per_count(lambda name: (float(np.median(seconds[name])), n_counts), root_ns),
         },
-        "One thread, except for the simulation and the flux of a new capture. Speed-up: over the "
-        f"{PLAIN}. {_ROOFLINE}",
+        "One thread, except for simulation, flux and confidence of a new capture. Speed-up: over "
+        f"the {PLAIN}. {_ROOFLINE}",
         _FORMATS,
     )
 
