@@ -480,17 +480,11 @@ def pin_pixels(page: Page, facade: Subject) -> None:
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
 
 
-def test_pixels_are_pinned_and_moved_and_regions_are_dragged(page, address):
-    opened, facade = page(f"{address}{LINK}"), simulated_building()
-    pin_pixels(opened, facade)
-    move_the_pixel(opened, facade)
-    drag_regions_and_a_line(opened, facade)
+REGION_AND_PINS = "&subject=Region&region=[[20,20],[20,40],[40,40],[40,20]]&pins=[[30,20],[30,21]]"
 
 
-def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other(page, address):
-    region = "[[20,20],[20,40],[40,40],[40,20]]"
-    link = f"{address}{LINK}&subject=Region&region={region}&pins=[[30,20],[30,21]]"
-    page = page(link, width=390, height=844)
+def show_all_parts_below_each_other(page: Page) -> None:
+    """Show the region and the pins of a link on a phone, and remove them."""
     expect(fact(page, "Pixels")).to_have_text("441")
     expect(page.get_by_text("Computing")).to_have_count(0)
 
@@ -519,3 +513,17 @@ def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other
     button(page, "Region").click()
     clear_region(page)
     rests(page, "pins=[[30,21]]")
+    button(page, "Pins").click()
+    button(page, "Remove 30, 21").press("Enter")
+    button(page, "Pixel").click()
+
+
+def test_a_link_opens_region_and_pins_and_others_are_chosen(page, address):
+    opened = page(f"{address}{LINK}{REGION_AND_PINS}", width=390, height=844)
+    show_all_parts_below_each_other(opened)
+    opened.set_viewport_size({"width": 1440, "height": 900})
+    opened.get_by_role("button", name="Open drawer").click()  # it stays closed in a wider window
+    facade = simulated_building()
+    pin_pixels(opened, facade)
+    move_the_pixel(opened, facade)
+    drag_regions_and_a_line(opened, facade)
