@@ -54,18 +54,6 @@ from tests.threads import HeldLayout, control
 NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
 
 
-@pytest.fixture(scope="module")
-def car():
-    """The estimate of the car, with truth and with pixels without a target."""
-    return compute(ask("car"), None)
-
-
-@pytest.fixture(scope="module")
-def sample():
-    """The estimate of a file, without truth."""
-    return compute(ask("sample"), None)
-
-
 @pytest.fixture
 def small_capture(rng):
     """Other sizes than the built-in scenes, and only the counts are known."""
@@ -644,6 +632,20 @@ def test_a_page_is_complete(layout, explore):
     assert sum(kind.startswith("PointCloud") for kind in kinds) == 1
 
 
+def draw_in_every_way(layout, explore):
+    session = layout.session
+    for kind in session.state.param.image.objects:
+        session.state.image = kind
+        layout.settle()
+        _, look = looks.image_of(session.answer, kind, session.state.viewing)
+        assert explore.image.figure.title.text == look.title
+    for kind in session.state.param.cloud_color.objects:
+        session.state.cloud_color = kind
+        layout.settle()
+        rgb = looks.cloud_of(session.answer, kind, session.state.viewing).rgb
+        assert explore.cloud.colors == rgb.tobytes()
+
+
 def test_every_source_is_estimated_and_drawn(layout, explore):
     session = layout.session
     for key, source in reversed(session.sources.items()):
@@ -656,25 +658,8 @@ def test_every_source_is_estimated_and_drawn(layout, explore):
         n_shown = looks.shown(answer, session.state.viewing.least_confidence).sum()
         assert len(explore.cloud.positions) == 12 * n_shown > 0
         assert explore.image.figure.title.text
-    assert {*layout.heard} == {""}
-
-
-def test_a_source_with_or_without_truth_is_drawn_in_every_way(layout, explore):
-    session = layout.session
-    for key in ("car", "sample"):
-        if key != session.state.source:
-            control(layout, "Scene or capture").value = key
-            layout.next_answer()
-        for kind in session.state.param.image.objects:
-            session.state.image = kind
-            layout.settle()
-            _, look = looks.image_of(session.answer, kind, session.state.viewing)
-            assert explore.image.figure.title.text == look.title
-        for kind in session.state.param.cloud_color.objects:
-            session.state.cloud_color = kind
-            layout.settle()
-            rgb = looks.cloud_of(session.answer, kind, session.state.viewing).rgb
-            assert explore.cloud.colors == rgb.tobytes()
+        if key in ("car", "sample"):  # with truth, and without
+            draw_in_every_way(layout, explore)
     assert {*layout.heard} == {""}
 
 

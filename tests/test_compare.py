@@ -34,17 +34,6 @@ from tests.threads import HeldTasks, change
 # -- what is computed ------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def car():
-    return compute(ask("car"), None)
-
-
-@pytest.fixture(scope="module")
-def sample():
-    """A file, without truth."""
-    return compute(ask("sample"), None)
-
-
 def task_of(method, **options):
     return Task(method, ESTIMATORS[method].parameters(), **options)
 
@@ -394,12 +383,6 @@ def save_pictures_and_table(here):
     name, png = download(here, "Peak of the histogram", "png")
     assert name == "car_peak_range-image.png"
     assert Image.open(BytesIO(png)).height > 216  # with heading and colour scale
-    name, arrays = download(here, "Peak of the histogram", "npz")
-    assert name == "car_peak_range-image.npz"
-    light, scene = Illumination(), core.scenes["car"]()
-    capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
-    peak = core.estimate(capture, "peak").confident(0.9)  # as on Explore
-    np.testing.assert_array_equal(np.load(BytesIO(arrays))["range_m"], peak.range_m)
     name, table = download(here, "table", "csv")
     assert name == "car_methods.csv"
     assert b"Single-pixel limit" in table
