@@ -419,23 +419,8 @@ def drag_regions_and_a_line(page: Page, facade: Subject) -> None:
         choose_drag(page, mode)
 
 
-def expect_every_unit(page: Page) -> None:
-    """Choose each unit; expect it at the axes of the pixel's plots and above its table."""
-    axes = "[...figure.below, ...figure.above].map((each) => each.axis_label)"
-    for unit, title, other in (
-        ("ns", "Time (ns)", "Range (m)"),
-        ("m", "Range (m)", "Bin"),
-        ("bins", "Bin", "Range (m)"),
-    ):
-        button(page, unit).click()
-        header = page.get_by_role("columnheader", name=title).filter(visible=True)
-        expect(header).to_be_visible()
-        assert in_figure(page, COUNTS, axes) == [title, other]
-        assert in_figure(page, STAGES, axes) == [title]
-
-
 def pin_pixels(page: Page, facade: Subject) -> None:
-    """Pin pixels and compare them, and show one in every unit."""
+    """Pin pixels and compare them."""
     row, col = facade.pixel
     picture(page).focus()
     pins = [(row, col + n) for n in range(4)]
@@ -468,7 +453,6 @@ def pin_pixels(page: Page, facade: Subject) -> None:
     expect(page.get_by_text(text.NO_PINS)).to_be_visible()
 
     button(page, "Pixel").click()
-    expect_every_unit(page)
     page.mouse.move(*within(page, 0.5, 0.6, figure=1))
     tip = page.locator(".bk-Tooltip").filter(visible=True)
     for each in ("Large scale", re.compile(r"\d ns"), re.compile(r"\d m")):
