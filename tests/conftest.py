@@ -10,10 +10,12 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
+from app.model.store import Answer, compute
 from app.server.patches import apply_patches
 from core.tests.captures import real_capture_path
 from core.tests.garbage import pytest_collection, pytest_collection_finish  # noqa: F401 - hooks
 from tests.browser import TIMEOUT_MS, chromium, open_page, serving
+from tests.states import ask
 
 expect.set_options(timeout=TIMEOUT_MS)
 
@@ -96,6 +98,18 @@ def page(open_watched: Callable[..., Page], troubles: list[str]) -> Iterator[Cal
 def start_page(page: Callable[..., Page]) -> Page:
     """The start page, just opened."""
     return page()
+
+
+@pytest.fixture(scope="module")
+def car() -> Answer:
+    """The estimate of the car, with truth and with pixels without a target."""
+    return compute(ask("car"), None)
+
+
+@pytest.fixture(scope="module")
+def sample() -> Answer:
+    """The estimate of a file, without truth."""
+    return compute(ask("sample"), None)
 
 
 @pytest.fixture

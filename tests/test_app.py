@@ -54,18 +54,6 @@ from tests.threads import HeldLayout, control
 NEED_TRUTH = {"RMSE", "Within 1 bin", "Within 3 bins", "Truth", "Error"}
 
 
-@pytest.fixture(scope="module")
-def car():
-    """The estimate of the car, with truth and with pixels without a target."""
-    return compute(ask("car"), None)
-
-
-@pytest.fixture(scope="module")
-def sample():
-    """The estimate of a file, without truth."""
-    return compute(ask("sample"), None)
-
-
 @pytest.fixture
 def small_capture(rng):
     """Other sizes than the built-in scenes, and only the counts are known."""
@@ -644,6 +632,20 @@ def test_a_page_is_complete(layout, explore):
     assert sum(kind.startswith("PointCloud") for kind in kinds) == 1
 
 
+def draw_in_every_way(layout, explore):
+    session = layout.session
+    for kind in session.state.param.image.objects:
+        session.state.image = kind
+        layout.settle()
+        _, look = looks.image_of(session.answer, kind, session.state.viewing)
+        assert explore.image.figure.title.text == look.title
+    for kind in session.state.param.cloud_color.objects:
+        session.state.cloud_color = kind
+        layout.settle()
+        rgb = looks.cloud_of(session.answer, kind, session.state.viewing).rgb
+        assert explore.cloud.colors == rgb.tobytes()
+
+
 def test_every_source_is_estimated_and_drawn(layout, explore):
     session = layout.session
     for key, source in reversed(session.sources.items()):
@@ -656,25 +658,8 @@ def test_every_source_is_estimated_and_drawn(layout, explore):
         n_shown = looks.shown(answer, session.state.viewing.least_confidence).sum()
         assert len(explore.cloud.positions) == 12 * n_shown > 0
         assert explore.image.figure.title.text
-    assert {*layout.heard} == {""}
-
-
-@pytest.mark.parametrize("key", ["car", "sample"])
-def test_a_source_with_or_without_truth_is_drawn_in_every_way(layout, explore, key):
-    session = layout.session
-    if key != session.state.source:
-        control(layout, "Scene or capture").value = key
-        layout.next_answer()
-    for kind in session.state.param.image.objects:
-        session.state.image = kind
-        layout.settle()
-        _, look = looks.image_of(session.answer, kind, session.state.viewing)
-        assert explore.image.figure.title.text == look.title
-    for kind in session.state.param.cloud_color.objects:
-        session.state.cloud_color = kind
-        layout.settle()
-        rgb = looks.cloud_of(session.answer, kind, session.state.viewing).rgb
-        assert explore.cloud.colors == rgb.tobytes()
+        if key in ("car", "sample"):  # with truth, and without
+            draw_in_every_way(layout, explore)
     assert {*layout.heard} == {""}
 
 
@@ -812,18 +797,21 @@ def test_a_capture_without_truth_hides_what_needs_one(layout, explore, real_capt
     assert session.state.param.image.objects == ["Estimate", "Truth", "Error", "Counts"]
 
 
-@pytest.mark.parametrize("counts", [0, 1])
-def test_a_capture_without_estimates_is_reported(layout, explore, tmp_path, counts):
-    path = tmp_path / "silence.npz"
-    save_capture(Capture(np.full((3, 5, 40), counts, np.uint16), Acquisition(40)), path)
-    open_file(layout, path)
-    answer = layout.next_answer()
-    assert answer.request.source.title == "silence.npz"
-    assert not answer.run.image.valid.any()
-    assert "No pixel has an estimate" in alert_of(layout)
-    assert values_of(explore.numbers)["Estimate"] == "–"
-    assert explore.cloud.positions == b""
-    assert explore.cloud.caption == "0 of 0 estimates shown"
+def test_a_capture_without_estimates_is_reported(layout, explore, tmp_path):
+    for counts in (0, 1):
+        path = tmp_path / f"silence {counts}.npz"
+        save_capture(Capture(np.full((3, 5, 40), counts, np.uint16), Acquisition(40)), path)
+        open_file(layout, path)
+        answer = layout.next_answer()
+        assert answer.request.source.title == path.name
+        assert not answer.run.image.valid.any()
+        assert "No pixel has an estimate" in alert_of(layout)
+        assert values_of(explore.numbers)["Estimate"] == "–"
+        assert explore.cloud.positions == b""
+        assert explore.cloud.caption == "0 of 0 estimates shown"
+        control(layout, "Scene or capture").value = "car"
+        layout.next_answer()
+        assert alert_of(layout) == "" and explore.cloud.positions
 
 
 def test_a_gate_that_ends_before_t_n_is_reported(layout, tmp_path):
@@ -956,24 +944,12 @@ def test_controls_fit_the_capture_they_are_for(layout, small_file):
 
 
 def test_a_link_unfolds_the_rarely_used_settings_that_it_changes():
-    folded = {"tracking.l": "0.006"}, {"light.seed": "3"}, {"tracking.m": "1.6"}
-    for entries, expected in zip(folded, (set(), {MORE}, {MORE_TRACKING}), strict=True):
-        parts = HeldLayout(built_in_sources(), Link(entries)).page.select(Part)
+    often_used = {"tracking.l": "0.006"}
+    for rarely_used, expected in (("light.seed", MORE), ("tracking.m", MORE_TRACKING)):
+        link = Link(often_used | {rarely_used: "2"})
+        parts = HeldLayout(built_in_sources(), link).page.select(Part)
         found = {each.title for each in parts if not each.collapsed}
-        assert found & {MORE, MORE_TRACKING} == expected
-
-
-def test_each_page_has_its_own_help_at_the_top_of_the_sidebar(layout):
-    help = layout.page.sidebar[0]
-    assert help.title == HELP
-    help.collapsed = False
-    found = {}
-    for page in PAGES:
-        layout.session.state.page = page.name
-        if help.visible:
-            (found[page.name],) = (each.object for each in help.select(pmui.Typography))
-    assert found == {page.name: linked(page.explanation) for page in PAGES if page.explanation}
-    assert {"Explore", "Compare"} <= found.keys()
+        assert found & {MORE, MORE_TRACKING} == {expected}
 
 
 def test_estimates_without_an_echo_are_shown_in_place_of_the_stages(layout, explore):
@@ -1032,8 +1008,17 @@ def test_estimates_without_an_echo_are_those_of_the_estimate_on_screen(
         np.testing.assert_allclose(drawn[name], values, rtol=1e-6)
 
 
+def help_on(layout):
+    """Return the texts of the help at the top of the sidebar."""
+    help = layout.page.sidebar[0]
+    assert help.title == HELP
+    help.collapsed = False
+    return [each.object for each in help.select(pmui.Typography)] if help.visible else []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_page_can_be_the_first_one(page):
+def test_every_page_can_be_the_first_one_and_has_its_own_help(page):
+    assert page.explanation or page.name not in ("Explore", "Compare")
     layout = HeldLayout(built_in_sources(), Link({"page": page.name}))
     assert (layout.pages.choice.value, [*layout.contents]) == (page.name, [page.name])
     assert layout.page.sidebar_open != page.is_standalone
@@ -1041,6 +1026,7 @@ def test_every_page_can_be_the_first_one(page):
         layout.pages.choice.value = chosen.name
         assert layout.session.state.page == chosen.name
         assert layout.page.sidebar_open != chosen.is_standalone
+        assert help_on(layout) == ([linked(chosen.explanation)] if chosen.explanation else [])
     assert layout.alert.text == ""
 
 

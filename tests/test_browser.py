@@ -9,6 +9,7 @@ from dataclasses import fields
 from functools import cache, partial
 from io import BytesIO
 from itertools import cycle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -804,7 +805,7 @@ def expect_the_building_at_21_km(page: Page) -> None:
     eventually(lambda: n_ranges(look(page)["image"]) > 50)
 
 
-def test_a_real_capture_is_ranged_inspected_and_its_reading_can_be_changed(page, real_capture):
+def test_files_are_ranged_inspected_read_again_or_refused(page, real_capture, tmp_path, troubles):
     new, path = page(), real_capture("21km_K11_night.mat")
     upload(new, path.name, path.read_bytes())
     inspect = new.get_by_role("button", name="Inspect", exact=True)
@@ -844,22 +845,19 @@ def test_a_real_capture_is_ranged_inspected_and_its_reading_can_be_changed(page,
     expect(slider(new, "SBR")).to_be_visible()
     explore_another_method(new)
     answer_which_array_to_read(new)
+    choose(new, "Scene or capture", "Car at 50 m")
+    go(new, "Explore")
+    refuse_files_and_show_names_as_text(new, tmp_path, troubles)
 
 
-def expect_score(page: Page) -> None:
-    """Expect the score of CFAR in place of the stages."""
+def explore_another_method(page: Page) -> None:
+    """Choose CFAR, whose score replaces the stages, and return."""
+    choose(page, "Method", "Cell-averaging CFAR")
     expect(field(page, "Guard")).to_be_visible()
     expect(field(page, "T_n")).to_be_hidden()
     expect_rmse(page, car(method="cfar"))
     expect(page.get_by_role("button", name="Download: score")).to_be_visible()
     expect(page.get_by_role("button", name="Download: residual")).to_be_hidden()
-
-
-def explore_another_method(page: Page) -> None:
-    choose(page, "Method", "Cell-averaging CFAR")
-    expect_score(page)
-    page.reload()
-    expect_score(page)
     choose(page, "Method", "Automatic, by the capture")
     expect_rmse(page, car())
     expect(page.get_by_role("button", name="Download: score")).to_be_hidden()
@@ -892,8 +890,8 @@ def saved_arrays(**arrays: np.ndarray | str) -> bytes:
     return content.getvalue()
 
 
-def test_files_are_refused_or_shown_as_text(start_page, tmp_path, troubles):
-    one = start_page
+def refuse_files_and_show_names_as_text(one: Page, folder: Path, troubles: list[str]) -> None:
+    """Upload files to a page that shows the car."""
     upload(one, "holiday.npz", b"nothing of the kind")
     expect(warning(one)).to_contain_text("holiday.npz")
     expect(warning(one)).to_contain_text("copy or save it again")
@@ -908,7 +906,7 @@ def test_files_are_refused_or_shown_as_text(start_page, tmp_path, troubles):
     expect(one.get_by_text("3 × 3 pixels, 40 bins")).to_contain_text(trap)
     assert one.evaluate("window.trapped") is None
     expect(chosen(one, "Scene or capture")).to_have_text("one.npz")
-    half, large = tmp_path / "half.npz", tmp_path / "large.npz"
+    half, large = folder / "half.npz", folder / "large.npz"
     for path, n_bytes in ((half, MAX_UPLOAD_BYTES // 2 + 1), (large, MAX_UPLOAD_BYTES + 1)):
         with path.open("wb") as file:
             file.truncate(n_bytes)

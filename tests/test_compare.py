@@ -34,17 +34,6 @@ from tests.threads import HeldTasks, change
 # -- what is computed ------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def car():
-    return compute(ask("car"), None)
-
-
-@pytest.fixture(scope="module")
-def sample():
-    """A file, without truth."""
-    return compute(ask("sample"), None)
-
-
 def task_of(method, **options):
     return Task(method, ESTIMATORS[method].parameters(), **options)
 
@@ -193,10 +182,7 @@ def test_nothing_is_computed_before_the_page_is_seen(stage):
     titles = [ESTIMATORS[m].title for m in ESTIMATORS if m in FIRST_METHODS]
     assert list(stage.figures) == [*titles, "Single-pixel limit"]
     assert stage.page.status.text == "5 methods compared"
-
-
-def test_pictures_share_one_view(shown):
-    figures = [picture.image.figure for picture in shown.page.pictures]
+    figures = [picture.image.figure for picture in stage.page.pictures]  # share one view
     assert len(figures) == 5
     assert len({(id(figure.x_range), id(figure.y_range)) for figure in figures}) == 1
     assert len(figures[0].x_range.renderers) == 5
@@ -316,6 +302,17 @@ def test_a_method_that_fails_shows_why_and_the_others_continue(stage, monkeypatc
     assert len(stage.page.pictured) == 4
 
 
+def show_in_every_way(page):
+    for kind in page.kind.options:
+        page.kind.value = kind
+    assert page.kind.value == CLOUDS
+    clouds = [picture.cloud for picture in page.pictures if picture.cloud is not None]
+    assert all(cloud.positions for cloud in clouds)
+    assert len({tuple(cloud.bounds) for cloud in clouds}) == 1
+    page.paint(True)
+    assert all(cloud.dark for cloud in clouds)
+
+
 def test_a_file_has_no_oracle_no_limit_and_no_errors(stage):
     change(stage.session, source="sample")
     stage.page.show(True)
@@ -327,6 +324,7 @@ def test_a_file_has_no_oracle_no_limit_and_no_errors(stage):
     assert text.AGREEMENT_ONLY in stage.page.remarks.text
     sentences = text.remarks(stage.session.answer.capture, 1, 1).split(". ")
     assert len(sentences) == len(set(sentences)) > 1
+    show_in_every_way(stage.page)
 
 
 def test_all_methods_fit_in_the_table_and_the_first_six_have_pictures(stage):
@@ -347,7 +345,8 @@ def test_the_legend_counts_what_pictures_do_not_show(stage):
     )
     stage.page.show(True)
     stage.settle()
-    stage.page.kind.value = CLOUDS  # blank pixels have no points
+    show_in_every_way(stage.page)
+    # The last are clouds: blank pixels have no points.
     assert re.fullmatch(r"Hidden below confidence 0.9: [^.]+\.", stage.page.legend.text)
 
 
@@ -356,23 +355,6 @@ def test_without_a_method_the_page_asks_for_one(stage):
     stage.page.show(True)
     stage.settle()
     assert stage.page.status.text == "Choose at least one method"
-
-
-@pytest.mark.parametrize("key", ["car", "sample"])
-def test_a_source_with_or_without_truth_can_be_shown_in_every_way(stage, key):
-    page = stage.page
-    if key != "car":
-        change(stage.session, source=key)
-    page.show(True)
-    stage.settle()
-    for kind in page.kind.options:
-        page.kind.value = kind
-    assert page.kind.value == CLOUDS
-    clouds = [picture.cloud for picture in page.pictures if picture.cloud is not None]
-    assert all(cloud.positions for cloud in clouds)
-    assert len({tuple(cloud.bounds) for cloud in clouds}) == 1
-    page.paint(True)
-    assert all(cloud.dark for cloud in clouds)
 
 
 # -- in a browser ----------------------------------------------------------------------------------
@@ -401,12 +383,6 @@ def save_pictures_and_table(here):
     name, png = download(here, "Peak of the histogram", "png")
     assert name == "car_peak_range-image.png"
     assert Image.open(BytesIO(png)).height > 216  # with heading and colour scale
-    name, arrays = download(here, "Peak of the histogram", "npz")
-    assert name == "car_peak_range-image.npz"
-    light, scene = Illumination(), core.scenes["car"]()
-    capture = core.simulate(scene, light.acquisition(scene.acquisition), light.flux, seed=0)
-    peak = core.estimate(capture, "peak").confident(0.9)  # as on Explore
-    np.testing.assert_array_equal(np.load(BytesIO(arrays))["range_m"], peak.range_m)
     name, table = download(here, "table", "csv")
     assert name == "car_methods.csv"
     assert b"Single-pixel limit" in table

@@ -419,23 +419,8 @@ def drag_regions_and_a_line(page: Page, facade: Subject) -> None:
         choose_drag(page, mode)
 
 
-def expect_every_unit(page: Page) -> None:
-    """Choose each unit; expect it at the axes of the pixel's plots and above its table."""
-    axes = "[...figure.below, ...figure.above].map((each) => each.axis_label)"
-    for unit, title, other in (
-        ("ns", "Time (ns)", "Range (m)"),
-        ("m", "Range (m)", "Bin"),
-        ("bins", "Bin", "Range (m)"),
-    ):
-        button(page, unit).click()
-        header = page.get_by_role("columnheader", name=title).filter(visible=True)
-        expect(header).to_be_visible()
-        assert in_figure(page, COUNTS, axes) == [title, other]
-        assert in_figure(page, STAGES, axes) == [title]
-
-
 def pin_pixels(page: Page, facade: Subject) -> None:
-    """Pin pixels and compare them, and show one in every unit."""
+    """Pin pixels and compare them."""
     row, col = facade.pixel
     picture(page).focus()
     pins = [(row, col + n) for n in range(4)]
@@ -468,7 +453,6 @@ def pin_pixels(page: Page, facade: Subject) -> None:
     expect(page.get_by_text(text.NO_PINS)).to_be_visible()
 
     button(page, "Pixel").click()
-    expect_every_unit(page)
     page.mouse.move(*within(page, 0.5, 0.6, figure=1))
     tip = page.locator(".bk-Tooltip").filter(visible=True)
     for each in ("Large scale", re.compile(r"\d ns"), re.compile(r"\d m")):
@@ -480,17 +464,11 @@ def pin_pixels(page: Page, facade: Subject) -> None:
     expect(fact(page, "Pixel")).to_have_text(f"{row}, {col}")
 
 
-def test_pixels_are_pinned_and_moved_and_regions_are_dragged(page, address):
-    opened, facade = page(f"{address}{LINK}"), simulated_building()
-    pin_pixels(opened, facade)
-    move_the_pixel(opened, facade)
-    drag_regions_and_a_line(opened, facade)
+REGION_AND_PINS = "&subject=Region&region=[[20,20],[20,40],[40,40],[40,20]]&pins=[[30,20],[30,21]]"
 
 
-def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other(page, address):
-    region = "[[20,20],[20,40],[40,40],[40,20]]"
-    link = f"{address}{LINK}&subject=Region&region={region}&pins=[[30,20],[30,21]]"
-    page = page(link, width=390, height=844)
+def show_all_parts_below_each_other(page: Page) -> None:
+    """Show the region and the pins of a link on a phone, and remove them."""
     expect(fact(page, "Pixels")).to_have_text("441")
     expect(page.get_by_text("Computing")).to_have_count(0)
 
@@ -519,3 +497,17 @@ def test_a_link_opens_region_and_pins_on_a_phone_with_all_parts_below_each_other
     button(page, "Region").click()
     clear_region(page)
     rests(page, "pins=[[30,21]]")
+    button(page, "Pins").click()
+    button(page, "Remove 30, 21").press("Enter")
+    button(page, "Pixel").click()
+
+
+def test_a_link_opens_region_and_pins_and_others_are_chosen(page, address):
+    opened = page(f"{address}{LINK}{REGION_AND_PINS}", width=390, height=844)
+    show_all_parts_below_each_other(opened)
+    opened.set_viewport_size({"width": 1440, "height": 900})
+    opened.get_by_role("button", name="Open drawer").click()  # it stays closed in a wider window
+    facade = simulated_building()
+    pin_pixels(opened, facade)
+    move_the_pixel(opened, facade)
+    drag_regions_and_a_line(opened, facade)

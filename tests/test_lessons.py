@@ -28,13 +28,13 @@ from app.model.slides import demonstration, slides_of
 from app.model.state import Learning
 from app.model.store import built_in_sources
 from app.pages.learn.lesson import LessonView
-from app.pages.learn.page import Learn
+from app.pages.learn.page import Learn, numbered
 from app.pages.learn.text import answer_label
 from app.pages.session import Session
 from app.widgets.qr_code import QrCode, qr_image
 from core.parameters import Choice
 from core.studies.lessons import CHECKS, NEED_SIGNAL, VIEWS, Bench, require_signal
-from tests.browser import chosen, enter, eventually, field, slider
+from tests.browser import choose, chosen, enter, eventually, field, slider
 from tests.states import link_to
 from tests.threads import HeldLayout, HeldTasks
 
@@ -66,6 +66,8 @@ def test_a_lesson_leads_from_its_question_to_a_right_answer(key, session):
     page, session.state.learning = Learn(session), state
     page.show(True)
     session.tasks.run_until(lambda: page.shown.verdict.text == hint.text)
+    controls, on_page = page.shown.panel.controls, page.shown.layout.select()
+    assert [name for name, each in controls.items() if each in on_page] == [lesson.control]
     views = page.shown.views
     session.tasks.run_until(lambda: all(view.item for view in views.values()))
     plot = views["after", asked.view].item
@@ -581,13 +583,10 @@ def move_the_control(here: Page, lesson: Lesson) -> None:
         slider(here, label).filter(visible=True).press("ArrowRight")
 
 
-@pytest.mark.browser
-@pytest.mark.parametrize("key", [key for key in LESSONS if key != FIRST])
-def test_a_lesson_is_taken_by_keyboard(key, page, address):
-    """From the question to a wrong and a right answer; the first one by `take_the_first_lesson`."""
-    lesson, check = LESSONS[key], LESSONS[key].check
-    here = page(f"{address}?page=Learn&learning.lesson={key}", ready=".bk-Figure")
+def take(here: Page, lesson: Lesson) -> None:
+    """Go from the question of a lesson to a wrong and a right answer, by keyboard."""
     expect(here.get_by_role("heading", name=lesson.title)).to_be_visible()
+    expect(here.get_by_text("Now move this control")).to_be_hidden()
     asked = lesson.prediction
     if asked.axis:
         field(here, answer_label(asked.unit)).press_sequentially(f"{asked.high:g}")
@@ -597,8 +596,22 @@ def test_a_lesson_is_taken_by_keyboard(key, page, address):
         here.get_by_role("button", name=re.compile("^Predict")).press("Enter")
     expect(here.get_by_text("Now move this control")).to_be_visible()
     move_the_control(here, lesson)
-    hint = check.hints[0]
+    check, hint = lesson.check, lesson.check.hints[0]
     wrong = replace(check, function=hint.function, arguments=hint.arguments).answer
     for answer, said in ((wrong, hint.text), (check.answer, "Right: ")):
         enter(here, "Your answer", repr(answer))
         expect(here.get_by_role("status").filter(has_text=said)).to_be_visible()
+
+
+@pytest.mark.browser
+def test_lessons_of_every_kind_are_taken_by_keyboard_one_after_another(page, address):
+    """`take_the_first_lesson` takes the first, and a test without a browser takes each."""
+    kinds = {}
+    for lesson in LESSONS.values():
+        kind = bool(lesson.prediction.axis), isinstance(SPECS[lesson.control], Choice)
+        kinds.setdefault(kind, lesson)
+    _, *others = kinds.values()
+    here = page(f"{address}?page=Learn&learning.lesson={others[0].key}", ready=".bk-Figure")
+    for lesson in others:
+        choose(here, "Lesson", numbered(lesson))
+        take(here, lesson)

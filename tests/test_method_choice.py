@@ -43,7 +43,7 @@ def choose(layout, method):
 def test_every_method_can_be_explored(layout, method):
     answer = choose(layout, method)
     layout.settle()
-    expected = core.estimate(answer.capture, method)
+    expected = core.estimate(answer.capture, method, answer.settings)  # the layout is shared
     np.testing.assert_array_equal(answer.run.image.range_m, expected.range_m)
     explore = layout.contents["Explore"]
     assert [card.visible for card in explore.cards] == [True, False, False, True]
@@ -123,3 +123,5 @@ def test_links_of_the_last_release_still_set_a_methods_settings(beginning):
     layout = HeldLayout(built_in_sources(), Link(entries))
     assert layout.session.refused == []
     assert layout.session.answer.settings.bandwidth_bins == 0.7
+    cards = layout.contents["Explore"].cards  # built for a method without stages
+    assert [card.visible for card in cards] == [True, False, False, True]
