@@ -47,11 +47,15 @@ _AT_ONCE = 2**19  # numbers that fit in the cache
 LEVELS = 12  # of signal, without "no echo"
 SAMPLE = 512  # pixels from which the levels of signal are estimated
 DEPTH_SAMPLE = 1024  # pixels from which the distribution of delays is estimated
+_MORE = 2  # times as many pixels, once the signal levels are known
+_DEPTH_STEPS = 60  # of expectation and maximisation
+_LAST_DEPTH_STEPS = 30  # likewise, from a distribution that is already found
 LEVEL_SPAN = 200.0  # ratio of the strongest level to the faintest
 _LEAST_GAIN = 2.0  # in log likelihood, for which faint levels are kept
 _CLEAR = 1.0  # mean gain in log likelihood of pixels that show their signal levels one by one
 _LEAST_JOINT_GAIN = 15.0  # of all pixels; without echoes it was at most 9 in 96 captures
 _TOO_FEW = 3  # unfired pulses, whose logarithm is unreliable
+_MANY_SPENT = 0.01  # share of the pixels with so few of them, which biases the mean total
 _SHAPE_ROUNDS = 4  # of the estimation of a background that varies over the gate
 _FEWEST_OF_SHAPE = 24  # pixels; in fewer, other surfaces might be taken for background
 _MOST_AT_ECHOES = 1.5  # of the mean background; more is light of echoes longer than the pulse
@@ -89,7 +93,11 @@ def flux_prior_over(capture: Capture, background_shape: Floats | None) -> FluxPr
 
 
 def _simplified(found: FluxPrior, capture: Capture) -> FluxPrior:
-    """Leave out of a detailed prior what the pulses of the capture do not resolve."""
+    """Leave out of a detailed prior what the pulses of the capture do not resolve.
+
+    Then the share of no echo and the distribution of delays are estimated for the levels that are
+    left: echoes of the grid on which these were found explain too many pixels without one.
+    """
     n_pulses = capture.gated_pulses
     if n_pulses is not None:
         # The more pulses fire, the clearer it is: of all but a few pixels, where most fire.
@@ -97,7 +105,11 @@ def _simplified(found: FluxPrior, capture: Capture) -> FluxPrior:
         most = np.partition(capture.counts, -1 - n_few, axis=None)[-1 - n_few]
         found = found._replace(pile_up=not pile_up(most / n_pulses, n_pulses).is_hidden)
     is_resolved = level_differences(found, capture).is_resolved
-    return found.with_one_level() if found.share[1:] @ is_resolved <= FEW else found
+    if found.share[1:] @ is_resolved <= FEW:
+        found = found.with_one_level()
+    _, density = _sampled_densities(capture, found, _MORE * DEPTH_SAMPLE)
+    share, depth = shares_and_depths(density, found.share, found.depth, _LAST_DEPTH_STEPS)
+    return found._replace(share=share, depth=depth)
 
 
 @cached_per_capture
@@ -157,9 +169,10 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     The total rate of a pixel (Coates 1968) is signal plus background. The total minus a signal
     level is shrunk towards the mean background of the image as far as its scatter is explained by
     chance (James & Stein 1961, with the variance of Greenwood 1926). If all pixels see the same
-    background, all get the same value.
+    background, all get the same value. Where all pulses fire, only the background of a pixel is
+    known (`_background_of`), from which no signal is subtracted.
     """
-    total, chance = _totals(capture)
+    total, chance, signal_share, _ = _totals(capture)
     flat = capture.cube.reshape(total.size, -1)
     pixels, least = _sampled(total.size, SAMPLE)[np.newaxis], _least_background(capture)
     levels = _levels(flat[pixels[0]], capture, shape)
@@ -168,7 +181,7 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
         levels,
         share=np.full(levels.size, 1 / levels.size),
         depth=np.ones(flat.shape[1]),
-        background=total.mean() - levels[:, np.newaxis, np.newaxis],
+        background=total.mean() - signal_share * levels[:, np.newaxis, np.newaxis],
         own_weight=_own_weight(total, chance),
         background_shape=shape,
     )
@@ -180,7 +193,7 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
         mean = np.asarray(share @ levels)
         variance = float(share @ (levels - mean) ** 2)
         found = found._replace(
-            background=total.ravel()[some].mean() - mean,
+            background=total.ravel()[some].mean() - signal_share * mean,
             own_weight=_own_weight(total, chance + variance),
         )
     prior, free_shape = _completed(capture, found, share)
@@ -196,10 +209,11 @@ def _completed(
     capture: Capture, found: FluxPrior, share: Floats
 ) -> tuple[FluxPrior, Floats | None]:
     """Return `_flux_prior`, given the shares of the coarse grid of levels that `found` has."""
-    total, mean = _totals(capture)[0], share @ found.levels
+    total, _, signal_share, spent = _totals(capture)
+    mean = signal_share * (share @ found.levels)
     levels, share, pair = _halved(found.levels, share, _kept(share))
     found = found._replace(levels=levels, share=share, background=total.mean() - mean)
-    pixels, density = _sampled_densities(capture, found)
+    pixels, density = _sampled_densities(capture, found, DEPTH_SAMPLE)
     share, depth = shares_and_depths(density, found.share)
     # Given the delays, and one background for all levels, faint levels are less plausible.
     evidence = _evidence(density, depth)
@@ -210,8 +224,11 @@ def _completed(
     levels, share = _joined(found.levels, share, pair)
     kept = _kept(share)
     levels, share = levels[kept], share[kept] / share[kept].sum()
-    background = float(total.mean() - share @ levels)
-    if background < share @ levels and free.mean < total.mean():
+    background = float(total.mean() - signal_share * (share @ levels))
+    is_biased = spent > _MANY_SPENT and found.own_weight == 0
+    if is_biased and math.isfinite(free.mean):
+        background = free.mean
+    elif background < share @ levels and free.mean < total.mean():
         # A small difference of large numbers, while the echoes stand out clearly.
         background = free.mean
         levels = levels * ((total.mean() - background) / (share @ levels))
@@ -221,14 +238,14 @@ def _completed(
 
 
 def _sampled_densities(
-    capture: Capture, flux_prior: FluxPrior
+    capture: Capture, flux_prior: FluxPrior, n_pixels: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Return the flat indices of a sample of the pixels, and their `level_densities`."""
+    """Return the flat indices of a sample of `n_pixels`, or fewer, and their `level_densities`."""
     total, n_bins = _totals(capture)[0].ravel(), capture.acquisition.n_bins
     # A table of all levels and delays: fewer pixels in a long gate.
     n_levels = flux_prior.share.size
     most = sampled_numbers(n_levels, n_bins) // (n_levels * n_bins)
-    pixels = _sampled(total.size, min(most, DEPTH_SAMPLE))
+    pixels = _sampled(total.size, min(most, n_pixels))
     flux = flux_prior.model(total[np.newaxis, pixels], _least_background(capture))
     cube = capture.cube.reshape(-1, n_bins)[np.newaxis, pixels]
     return pixels, level_densities(prepare(capture, cube, flux, 1))
@@ -257,7 +274,7 @@ def _shares_of_one_level(capture: Capture, start: FluxPrior) -> Floats:
 
     The likelihood of a level is that with the distribution of delays that suits it best.
     """
-    _, density = _sampled_densities(capture, start)
+    _, density = _sampled_densities(capture, start, DEPTH_SAMPLE)
     most, best = -math.inf, start.share
     for level in range(1, start.share.size):
         pair = np.ascontiguousarray(density[:, [0, level]])
@@ -349,9 +366,22 @@ def _least_background(capture: Capture) -> float:
     return 0.5 / (capture.gated_pulses or 1)
 
 
+class _Totals(NamedTuple):
+    """Total rates of the pixels of a capture."""
+
+    rate: Floats
+    """Shape (row, col)."""
+    chance: float
+    """Mean variance due to chance."""
+    signal_share: float
+    """Share of the pixels whose total includes their signal."""
+    spent: float
+    """Share of the pixels of which nearly all pulses fired."""
+
+
 @cached_per_capture
-def _totals(capture: Capture) -> tuple[Floats, float]:
-    """Total rate of each pixel (row, col), and the mean variance due to chance.
+def _totals(capture: Capture) -> _Totals:
+    """Estimate the total rate of each pixel.
 
     If u of M pulses do not fire, Coates' rates add up to ``ln(M / u)`` over the gate,
     and Greenwood's variances to ``1 / u - 1 / M``. The mean of the logarithm is biased; that of
@@ -359,14 +389,16 @@ def _totals(capture: Capture) -> tuple[Floats, float]:
     """
     n_pulses = capture.gated_pulses
     if n_pulses is None:
-        return capture.counts.astype(float), float(capture.counts.mean())  # Poisson
+        return _Totals(capture.counts.astype(float), float(capture.counts.mean()), 1.0, 0.0)
     unfired = np.maximum(n_pulses - capture.counts, 0)
     variance = 1 / np.maximum(unfired, 0.5) - 1 / n_pulses
     total = np.log((n_pulses + 0.5) / (unfired + 0.5))
-    spent = capture.counts > n_pulses - _TOO_FEW
+    spent, signal_share = capture.counts > n_pulses - _TOO_FEW, 1.0
     if spent.any():
-        total[spent] = np.maximum(total[spent], _background_of(capture.cube[spent], n_pulses))
-    return total, float(variance.mean())
+        background = _background_of(capture.cube[spent], n_pulses)
+        signal_share -= np.count_nonzero(background > total[spent]) / total.size
+        total[spent] = np.maximum(total[spent], background)
+    return _Totals(total, float(variance.mean()), signal_share, float(spent.mean()))
 
 
 def _background_of(pixels: NDArray[np.unsignedinteger], n_pulses: int) -> Floats:
@@ -492,15 +524,21 @@ def _shares(evidence: Floats) -> Floats:
     return share
 
 
-def shares_and_depths(density: NDArray[np.float32], share: Floats) -> tuple[Floats, Floats]:
+def shares_and_depths(
+    density: NDArray[np.float32],
+    share: Floats,
+    depth: Floats | None = None,
+    n_steps: int = _DEPTH_STEPS,
+) -> tuple[Floats, Floats]:
     """Estimate the share of no echo, and those of delays in each bin, from densities.
 
     Densities have shape (pixel, level, bin). The first level, no echo, has the same density at all
     delays; the other levels keep their ratios. There are too few pixels for an independent share of
     each bin: delays have a sparse prior, are smoothed over a bin in each step, and keep a uniform
-    part, as large as the pixels require.
+    part, as large as the pixels require. They begin uniform, or as `depth`.
     """
     n_bins = density.shape[2]
-    share, depth = share.copy(), np.full(n_bins, 1 / n_bins)
-    learn_shares_and_depths(density, share, depth)
+    share = share.copy()
+    depth = np.full(n_bins, 1 / n_bins) if depth is None else depth / n_bins
+    learn_shares_and_depths(density, n_steps, share, depth)
     return share, depth * n_bins

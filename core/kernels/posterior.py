@@ -12,7 +12,6 @@ from core.kernels.elementary import log1p32
 from core.kernels.parallel import COMPILED, PARALLEL, SUMMING
 
 _STEPS = 100  # of expectation and maximisation
-_DEPTH_STEPS = 60
 _DARK_PIXELS = 0.1  # additional pixels without an echo, so that their share is never 0
 _UNIFORM_SHARE = 0.1  # initial share of the surfaces with a delay that is uniform over the gate
 
@@ -47,12 +46,15 @@ def learn_shares(likelihood, share):  # type: ignore[no-untyped-def]
 
 
 @njit(**SUMMING)
-def learn_shares_and_depths(density, share, depth):  # type: ignore[no-untyped-def]
+def learn_shares_and_depths(density, n_steps, share, depth):  # type: ignore[no-untyped-def]
     """Estimate the share of no echo and the probabilities of delays likewise, in place.
 
     The shares of the other levels keep their ratios. Some delays are uniform over the gate, the
     others distributed smoothly. The share of the uniform ones is estimated, too; one additional
     surface counts as uniform, so that it is never 0.
+
+    In each step the probabilities of the smooth delays add up to less than 1, by what `_credit`
+    takes: so many more pixels would show an echo only because delays are fitted to them.
     """
     n_pixels, n_levels, n_bins = density.shape
     none, echo = np.empty(n_pixels), np.zeros((n_pixels, n_bins), np.float32)
@@ -64,7 +66,7 @@ def learn_shares_and_depths(density, share, depth):  # type: ignore[no-untyped-d
                 echo[pixel, k] += weight * density[pixel, level, k]
     some, uniform, before = depth.copy(), _UNIFORM_SHARE, share[0]
     dark = before
-    for _ in range(_DEPTH_STEPS):
+    for _ in range(n_steps):
         likely = depth.astype(np.float32)
         found, reweighted = _DARK_PIXELS, np.zeros(n_bins, np.float32)
         for pixel in range(n_pixels):
@@ -82,13 +84,15 @@ def learn_shares_and_depths(density, share, depth):  # type: ignore[no-untyped-d
             surfaces += depth[k] * reweighted[k]
             anywhere += uniform / n_bins * reweighted[k]
         smooth = smoothed((1 - uniform) * some * reweighted)
+        fitted = smooth.sum()
         for k in range(n_bins):
             smooth[k] *= _credit(smooth[k] * _CELL_BINS)
         whole = smooth.sum()  # 0 if the pixels require no delay but uniform ones
         uniform = (anywhere + 1) / (surfaces + 1) if whole > 0 else 1.0
         for k in range(n_bins):
-            some[k] = smooth[k] / whole if whole > 0 else 0.0
+            some[k] = smooth[k] / fitted if whole > 0 else 0.0
             depth[k] = (1 - uniform) * some[k] + uniform / n_bins
+    depth /= depth.sum()
     for level in range(1, n_levels):
         share[level] *= (1 - dark) / (1 - before)
     share[0] = dark

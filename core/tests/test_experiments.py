@@ -462,6 +462,33 @@ def test_confidence_is_calibrated_over_the_six_sbrs() -> None:
         calibration.confidence_and_right(capture, estimate(capture, "peak"))
 
 
+def answers(count: int, right: int, confidence: float = 0.55) -> calibration.Pair:
+    """Estimates of one confidence, of which some are right."""
+    return np.full(count, confidence), np.arange(count) < right
+
+
+def test_gaps_that_differ_between_captures_have_wider_intervals() -> None:
+    (alike,) = calibration.tenths_over([answers(100, 47)] * 4)
+    assert alike.right == metrics.wilson(188, 400)  # captures differ by less than chance
+    assert alike.gap.value == pytest.approx(-0.08)
+    assert calibration.verdict(alike) == "chance"
+    (apart,) = calibration.tenths_over([answers(100, right) for right in (97, 97, 0, 0)])
+    # Sums over captures: standard deviation of 97, 97, 0 and 0 hits, Student's with 3 degrees.
+    half = stats.t.ppf(0.975, 3) * np.std([97, 97, 0, 0], ddof=1) / math.sqrt(4) / 100
+    assert apart.right.value == pytest.approx(0.485)
+    assert apart.right.low == max(0.485 - half, 0)
+    assert apart.right.high == min(0.485 + half, 1)
+
+
+def test_a_gap_is_judged_where_there_are_enough_estimates() -> None:
+    (sure,) = calibration.tenths_over([answers(1000, 400)] * 4)
+    assert calibration.verdict(sure) == "beyond"
+    (few,) = calibration.tenths_over([answers(calibration.LEAST_COUNT - 1, 0)])
+    assert calibration.verdict(few) == ""
+    (small,) = calibration.tenths_over([answers(1000, 520)])
+    assert calibration.verdict(small) == ""
+
+
 # -- Commands --------------------------------------------------------------------------------------
 
 

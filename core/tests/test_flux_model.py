@@ -179,6 +179,24 @@ def test_totals_are_of_the_background_and_scatter_by_chance() -> None:
     assert total.var() == pytest.approx(variance, rel=0.25)
 
 
+@pytest.mark.parametrize("exposure", [3, 4, 6])
+def test_a_background_that_fires_every_pulse_is_found(exposure: float) -> None:
+    capture = Condition("uniform", 0.04, 0.1041 * exposure).capture(0)
+    background = flux_model_of(capture).typical_background
+    # Its first fifth is free of echoes and shows the background to 0.1 %; missed ones add to it.
+    assert background == pytest.approx(capture.background, rel=0.004)
+    right = [estimated_right(capture, method) for method in ("likelihood", "oracle")]
+    # Pixels that only one of them ranges are the chance of the difference.
+    chance = math.sqrt(np.count_nonzero(right[0] != right[1])) / right[0].size
+    assert right[0].mean() >= right[1].mean() - 0.01 - 4 * chance
+
+
+def estimated_right(capture: Capture, method: str) -> np.ndarray:
+    """Whether each estimate is within three bins of the truth."""
+    error_m = np.abs(estimate(capture, method).range_m - capture.truth_range_m)
+    return np.asarray(error_m <= 3 * capture.acquisition.bin_length_m)
+
+
 def test_depths_that_are_alike_are_found_alike() -> None:
     depth = flux_model_of(drawn(SIGNAL)).depth
     # Echoes begin in bins 0 to 21; a pixel or more in each, over five bins of smoothing.

@@ -116,7 +116,7 @@ def test_a_clear_choice_is_certain() -> None:
     best = best_within(points, 5)
     assert best is not None
     assert best.point is points[1]
-    assert (best.is_best, best.keeps, best.runners_up) == (1, 1, ())
+    assert (best.is_best, best.keeps, best.runners_up, best.optimism) == (1, 1, (), 0)
     cheapest = cheapest_reaching(points, 0.91)
     assert cheapest is not None
     assert cheapest.point is points[2]
@@ -161,6 +161,11 @@ def test_the_certainty_of_a_choice_follows_the_normal_law() -> None:
     # Four standard deviations of a share of 1000 draws, and two ends of whole counts.
     expected = stats.norm.cdf(shift)
     assert found.is_best == pytest.approx(expected, abs=4 * math.sqrt(0.25 / 1000) + 0.01)
+    # The winner gains where the difference is above 0: in standard errors, E[z; z > -1] = φ(1).
+    error = difference.std() / math.sqrt(n) / 100
+    assert found.optimism == pytest.approx(
+        stats.norm.pdf(shift) * error, abs=(4 / math.sqrt(1000) + 0.01) * error
+    )
 
 
 def test_a_limit_that_is_barely_kept_is_uncertain() -> None:

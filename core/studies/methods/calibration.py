@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, product
 from typing import Any, get_args
 
@@ -22,6 +22,7 @@ from core.metrics import Interval, ReliabilityBin, calibration_error, reliabilit
 from core.reductions import merge_bins
 from core.studies.outputs import Table, table
 from core.studies.paper.printed import TABLE_2
+from core.studies.statistics import mean_interval
 from core.studies.trials import Condition, mapped
 from core.trigger import draw_counts, rate_per_bin
 
@@ -42,6 +43,9 @@ CONDITIONS = tuple(
 
 LEAST_COUNT = 200
 """Estimates in a tenth of confidence whose gap is judged."""
+
+MOST_GAP = 0.05
+"""Gap up to which the confidence in a tenth is called calibrated."""
 
 LEVELS = (0.68, 0.95)
 """Levels of the intervals whose coverage is measured."""
@@ -64,6 +68,45 @@ def confidence_and_right(capture: Capture, image: RangeImage) -> tuple[Floats, N
     return image.confidence[image.valid], (error <= TOLERANCE_BINS)[image.valid]
 
 
+Pair = tuple[Floats, NDArray[np.bool_]]
+"""Confidence of the estimates of a capture, and whether each is right."""
+
+
+def tenths_over(captures: Sequence[Pair]) -> list[ReliabilityBin]:
+    """Group estimates of several captures by tenths of confidence.
+
+    Intervals are those of `core.metrics.reliability`, or wider if the captures differ by more than
+    chance: the pixels of a capture share one estimate of its fluxes and depths. The sums over
+    captures have Student's interval.
+    """
+    joined = [np.concatenate(parts) for parts in zip(*captures, strict=True)]
+    found = reliability(joined[0], joined[1])
+    if len(captures) < 2:
+        return found
+    by_capture = [{each.tenth: each for each in reliability(*pair)} for pair in captures]
+    wider = []
+    for each in found:
+        parts = [of_one[each.tenth] for of_one in by_capture if each.tenth in of_one]
+        deviation = np.zeros(len(captures))
+        deviation[: len(parts)] = [x.count * (x.gap.value - each.gap.value) for x in parts]
+        half = len(captures) * mean_interval(deviation).high / each.count
+        share = each.right.value
+        student = Interval(share, max(share - half, 0.0), min(share + half, 1.0))
+        wider.append(replace(each, right=each.right.joined(student)))
+    return wider
+
+
+def verdict(tenth: ReliabilityBin) -> str:
+    """Return ``"beyond"`` if a gap exceeds `MOST_GAP`, ``"chance"`` if its interval does not.
+
+    Empty if the gap does not exceed it or there are too few estimates to judge.
+    """
+    if tenth.count < LEAST_COUNT or abs(tenth.gap.value) <= MOST_GAP:
+        return ""
+    within = tenth.gap.overlaps(Interval(0.0, -MOST_GAP, MOST_GAP))
+    return "chance" if within else "beyond"
+
+
 @dataclass(frozen=True)
 class Report:
     """One method under one condition, or under all of a scene's in `CONDITIONS` (None)."""
@@ -72,7 +115,7 @@ class Report:
     condition: Condition | None
     method: str
     tenths: list[ReliabilityBin]
-    """Estimates by tenths of confidence, from `core.metrics.reliability`."""
+    """Estimates by tenths of confidence, from `tenths_over`."""
 
     @property
     def error(self) -> float:
@@ -94,27 +137,27 @@ class Report:
 def reports(seeds: Sequence[int], conditions: Sequence[Condition] = CONDITIONS) -> Iterator[Report]:
     """Yield a report per condition and method, and last of each scene one over all conditions."""
     for scene, group in groupby(conditions, lambda condition: condition.scene):
-        found: dict[str, list[tuple[Floats, NDArray[np.bool_]]]] = {name: [] for name in METHODS}
+        found: dict[str, list[Pair]] = {name: [] for name in METHODS}
         for condition in group:
             captures = [condition.capture(seed) for seed in seeds]
             for method in METHODS:
                 pairs = [confidence_and_right(c, estimate(c, method)) for c in captures]
-                found[method].append(_joined(pairs))
-                yield Report(scene, condition, method, reliability(*found[method][-1]))
+                found[method] += pairs
+                yield Report(scene, condition, method, tenths_over(pairs))
         for method in METHODS:
-            yield Report(scene, None, method, reliability(*_joined(found[method])))
-
-
-def _joined(
-    pairs: Sequence[tuple[Floats, NDArray[np.bool_]]],
-) -> tuple[Floats, NDArray[np.bool_]]:
-    confidence, right = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    return confidence, right
+            yield Report(scene, None, method, tenths_over(found[method]))
 
 
 def calibration_tables(seeds: Sequence[int]) -> Iterator[Table]:
     """Yield calibration error and largest gap of each report, and the gaps of all tenths."""
     found = list(reports(seeds))
+    judged = [
+        verdict(each)
+        for report in found
+        if report.condition
+        for each in report.tenths
+        if each.count >= LEAST_COUNT
+    ]
     named: dict[str, Callable[[Report], Any]] = {
         "scene": lambda report: report.scene,
         "pulses": lambda report: report.condition.n_pulses if report.condition else "all",
@@ -131,25 +174,33 @@ def calibration_tables(seeds: Sequence[int]) -> Iterator[Table]:
             "calibration error": lambda report: report.error,
             "largest gap": lambda report: report.widest.gap if report.widest else math.nan,
             "at confidence": lambda report: report.widest.confidence if report.widest else math.nan,
+            f"beyond {MOST_GAP}": lambda report: verdict(report.widest) if report.widest else "",
         },
         note="Gap: share of right estimates minus mean confidence, in a tenth of confidence. The "
         f"largest is that of the tenths with at least {LEAST_COUNT} estimates, with its 95 % "
-        "interval (Wilson); the largest of ten gaps is some two standard deviations by chance "
-        f"alone. With {_FEW_PULSES} pulses or fewer, more signal is sent per pulse.",
+        "interval: Wilson's, or Student's over the captures where that is wider, since the pixels "
+        "of a capture share one estimate of fluxes and depths. The largest of ten gaps is some two "
+        f"standard deviations by chance alone; it is beyond {MOST_GAP} if all of its interval is, "
+        f"and otherwise chance. Of {len(judged)} tenths with as many estimates, not counting rows "
+        f"over all conditions, {len(judged) - judged.count('')} exceed {MOST_GAP}, "
+        f"{judged.count('beyond')} of them beyond chance. With {_FEW_PULSES} pulses or fewer, more "
+        "signal is sent per pulse.",
         formats={"largest gap": "+.3f", "at confidence": ".2f"},
     )
     shown = [report for report in found if report.method in ("likelihood", "tracking")]
 
     def gap(tenth: int) -> Callable[[Report], str]:
-        return lambda report: next(
-            (f"{t.gap.value:+.2f} ({t.count})" for t in report.tenths if t.tenth == tenth), "–"
-        )
+        def text(of: ReliabilityBin) -> str:
+            return f"{of.gap.value:+.2f} ({', '.join(filter(None, (str(of.count), verdict(of))))})"
+
+        return lambda report: next((text(t) for t in report.tenths if t.tenth == tenth), "–")
 
     yield table(
         "reliability",
         "Gap of each tenth of confidence (estimates)",
         shown,
         named | {f"{k / 10:.1f} to {(k + 1) / 10:.1f}": gap(k) for k in range(10)},
+        note=f"Gaps beyond {MOST_GAP} of at least {LEAST_COUNT} estimates are marked as above.",
     )
 
 

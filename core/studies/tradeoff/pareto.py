@@ -87,12 +87,17 @@ class Recommendation:
     runners_up : tuple of (Point, float)
         Points that cannot be distinguished from it, each with the share of the draws in which it
         is chosen instead, in falling order.
+    optimism : float
+        Mean over the draws by which the restoration degree of what is chosen exceeds that over all
+        seeds: about as much too high is that of `point` on the seeds from which it was chosen
+        (Efron 1983).
     """
 
     point: Point
     is_best: float
     keeps: float
     runners_up: tuple[tuple[Point, float], ...]
+    optimism: float
 
 
 def best_within(
@@ -182,8 +187,10 @@ def _chosen(points: Sequence[Point], tolerance_bins: int, judge: _Judge) -> Reco
     if not allowed.any():
         return None
     index = int(np.where(allowed, loss, np.inf).argmin())
-    losses, allowed = judge(_resampled(eligible, tolerance_bins))
-    winners = np.where(allowed, losses, np.inf).argmin(axis=1)[allowed.any(axis=1)]
+    resampled = _resampled(eligible, tolerance_bins)
+    losses, allowed = judge(resampled)
+    draws = np.flatnonzero(allowed.any(axis=1))
+    winners = np.where(allowed, losses, np.inf).argmin(axis=1)[draws]
     won = np.bincount(winners, minlength=len(eligible)) / DRAWS
     others = [i for i in np.argsort(-won, kind="stable") if i != index and won[i] >= MIN_SHARE]
     return Recommendation(
@@ -191,6 +198,7 @@ def _chosen(points: Sequence[Point], tolerance_bins: int, judge: _Judge) -> Reco
         float(won[index]),
         float(allowed[:, index].mean()),
         tuple((eligible[i], float(won[i])) for i in others),
+        float((resampled.rd[draws, winners] - measured.rd[0, winners]).mean()),
     )
 
 
