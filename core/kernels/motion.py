@@ -2,7 +2,7 @@
 
 Groups of pulses are added up with displacements that grow with time, so that the echoes of a
 surface with one velocity meet in the bins of the middle of the recording. What a displacement moves
-out of the gate counts for nothing.
+out of the gate counts for nothing: of echoes near its ends that is a part of the tail.
 """
 
 from __future__ import annotations
