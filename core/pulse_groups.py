@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from core.checks import require
 
+USUAL_GROUPS = 40
+"""Groups that resolve displacements of up to about as many bins."""
+
 
 @dataclass(frozen=True, eq=False)
 class PulseGroups:

@@ -105,12 +105,13 @@ def test_evidence_of_a_velocity_is_that_of_the_equation() -> None:
     travel = np.array([0, 6, -12])  # whole steps in every group: nothing is interpolated
     found = velocity_evidence(capture, groups, flux, travel)[0, 0]
     delays = np.arange(GATE.n_bins) + 1 / 8  # the first step of each bin
+    left_out = 2e-3 * float(flux.signal.max()) * 60  # photons of an echo beyond its taps
     for travel_bins, log in zip(travel, found, strict=True):
         likelihoods = [
             share * np.mean([np.exp(ratio(capture, level, each, travel_bins)) for each in delays])
             for level, share in enumerate(flux.share[1:], 1)
         ]
-        assert log == pytest.approx(np.log(flux.share[0] + sum(likelihoods)), abs=2e-3)
+        assert log == pytest.approx(np.log(flux.share[0] + sum(likelihoods)), abs=left_out)
 
 
 @pytest.mark.compiled
