@@ -39,6 +39,15 @@ def defaults_of(answer: Answer) -> dict[str, Any]:
     return {"pixel": telling_pixel(answer.capture, answer.run.image)}
 
 
+def offer_kinds(state: State, answer: Answer) -> None:
+    """Offer the kinds of images that an answer has, and leave one that it lacks."""
+    for name, possible in possible_kinds(answer).items():
+        if state.param[name].objects != possible:
+            state.param[name].objects = possible
+        if getattr(state, name) not in possible:
+            setattr(state, name, possible[0])
+
+
 def enter(state: State, answer: Answer, previous: Answer | None) -> None:
     """Adapt the state to another capture; keep what still holds for it.
 
@@ -48,10 +57,7 @@ def enter(state: State, answer: Answer, previous: Answer | None) -> None:
     answer, previous : Answer
         Its estimate, and the one before.
     """
-    for name, possible in possible_kinds(answer).items():
-        state.param[name].objects = possible
-        if getattr(state, name) not in possible:
-            setattr(state, name, possible[0])
+    offer_kinds(state, answer)
     own = defaults_of(answer)
     here = {"pixel": state.pixel, "pins": state.pins, "region": state.region}
     kept: dict[str, Any] = {} if previous is None else carried(here, previous, answer)

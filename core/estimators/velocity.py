@@ -35,6 +35,8 @@ from core.inference.posterior import mass_near, tolerance_probability
 from core.inference.refinement import sharpened
 from core.parameters import Number, Settings, parameter
 
+_COARSE_BINS = 2  # between the displacements from which fluxes are estimated
+
 
 @dataclass(frozen=True)
 class VelocityParameters(Settings):
@@ -48,7 +50,7 @@ class VelocityParameters(Settings):
     )
     most_bins: int = parameter(
         24,
-        Number("Largest displacement", 4, 64, whole=True, unit="bins", least=1, most=256),
+        Number("Largest displacement", 4, 64, whole=True, unit="bins", least=2, most=256),
         "Displacement of a surface from the first to the last pulse, either way, up to which "
         "velocities are tried.",
     )
@@ -69,7 +71,7 @@ def motion_of(capture: Capture, parameters: VelocityParameters) -> Motion | None
     if groups is None:
         return None
     flux = flux_model_of(capture)
-    velocity = shared_velocity(capture, groups, flux, parameters.most_bins, size)
+    velocity = shared_velocity(capture, groups, flux, parameters.most_bins, size, _COARSE_BINS)
     if not velocity.travel_bins.any():
         return Motion(velocity, None)
     flux = flux_at_rest(capture, groups, velocity.travel_bins)

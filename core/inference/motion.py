@@ -10,6 +10,7 @@ Velocities are displacements over the whole recording in bins, positive if a sur
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -34,6 +35,7 @@ STEPS_PER_BIN = 4
 """Delays tried in each bin for moving surfaces. In steps of half a bin, the interpolation between
 displacements would make velocities of a whole step per group less likely than others."""
 
+_SIGMAS = 1.96  # of a 95 % interval
 _AT_REST = 0.5  # prior probability of a velocity of 0
 _FINE = 4  # velocities per bin for which delays are found
 
@@ -55,6 +57,30 @@ class RadialVelocity:
     bins: Floats
     sd_bins: Floats
     m_per_s: float | None = None
+
+    @property
+    def values(self) -> Floats:
+        """Velocity in `unit`, shape (row, col)."""
+        return self.bins * (self.m_per_s or 1.0)
+
+    @property
+    def unit(self) -> str:
+        """Metres per second where the pulse rate is known."""
+        return "bins per 1000 pulses" if self.m_per_s is None else "m/s"
+
+    def text_at(self, row: int, col: int) -> str:
+        """Velocity of a pixel with its 95 % interval, such as ``-20.1 m/s, -20.8 to -19.4 (95 %)``.
+
+        Without an interval where the fastest velocity that was tried is the likeliest.
+        """
+        scale = self.m_per_s or 1.0
+        value, half = float(self.values[row, col]), _SIGMAS * scale * float(self.sd_bins[row, col])
+        found = f"{value:.3g} {self.unit}"
+        if not math.isfinite(half):
+            return f"{found} or more, the fastest that was tried"
+        decimals = max(0, 1 - math.floor(math.log10(half)))
+        low, high = f"{value - half:.{decimals}f}", f"{value + half:.{decimals}f}"
+        return f"{value:.{decimals}f} {self.unit}, {low} to {high} (95 %)"
 
     def planes(self, valid: NDArray[np.bool_]) -> dict[str, Plane]:
         """Return velocities and their standard deviations as images, NaN where not `valid`."""
@@ -130,7 +156,12 @@ def velocity_evidence(
 
 
 def shared_velocity(
-    capture: Capture, groups: PulseGroups, flux: FluxModel, most_bins: int, window_size: int
+    capture: Capture,
+    groups: PulseGroups,
+    flux: FluxModel,
+    most_bins: int,
+    window_size: int,
+    step_bins: int = 1,
 ) -> Velocity:
     """Find the velocity of each pixel by the evidence of the pixels around it.
 
@@ -147,12 +178,15 @@ def shared_velocity(
         Largest displacement over the recording.
     window_size : int
         Rows and columns of the neighbourhood, odd.
+    step_bins : int
+        Difference of the displacements tried; a parabola refines between them.
     """
-    travel_bins = np.arange(-most_bins, most_bins + 1)
+    at_rest = most_bins // step_bins
+    travel_bins = np.arange(-at_rest, at_rest + 1) * step_bins
     alone = velocity_evidence(capture, groups, flux, travel_bins)
     evidence = box_sum(alone, window_size, "constant")
-    prior = np.full(travel_bins.size, (1 - _AT_REST) / (2 * most_bins))
-    prior[most_bins] = _AT_REST
+    prior = np.full(travel_bins.size, (1 - _AT_REST) / max(2 * at_rest, 1))
+    prior[at_rest] = _AT_REST
     best = (evidence + np.log(prior)).argmax(axis=2)
     around = np.clip(best + np.arange(-1, 2)[:, np.newaxis, np.newaxis], 0, travel_bins.size - 1)
     before, at, after = np.take_along_axis(evidence, np.moveaxis(around, 0, 2), axis=2).transpose(
@@ -161,10 +195,9 @@ def shared_velocity(
     curvature = np.maximum(2 * at - before - after, 1e-9)
     inside = (best > 0) & (best < travel_bins.size - 1)
     shift = np.where(inside, np.clip((after - before) / (2 * curvature), -0.5, 0.5), 0.0)
-    is_at_rest = best == most_bins
     return Velocity(
-        np.where(is_at_rest, 0.0, travel_bins[best] + shift),
-        np.where(inside, 1 / np.sqrt(curvature), np.inf),
+        np.where(best == at_rest, 0.0, travel_bins[best] + step_bins * shift),
+        np.where(inside, step_bins / np.sqrt(curvature), np.inf),
     )
 
 
