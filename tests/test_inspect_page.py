@@ -866,7 +866,7 @@ def test_a_line_drawn_on_the_map_pins_its_ends_and_bends_for_a_profile(building)
 def test_the_likelihood_with_velocity_shows_velocities():
     session = Session({"approach": built_in_sources()["approach"]}, tasks=HeldTasks())
     assert VELOCITY not in session.state.param.map.objects
-    session.state.param.update(method="velocity", pixel=(32, 32), map="Estimate")
+    change(session, method="velocity", pixel=(32, 32))
     assert VELOCITY in session.state.param.map.objects
     session.state.map = VELOCITY
     answer = session.answer
@@ -876,6 +876,6 @@ def test_the_likelihood_with_velocity_shows_velocities():
     section = on_screen(PixelSection(session, "pixel"))
     velocity = answer.run.image.velocity
     assert values(section.facts)["Velocity"] == velocity.text_at(32, 32)
-    session.state.method = "likelihood"
+    change(session, method="likelihood")
     assert VELOCITY not in session.state.param.map.objects
     assert session.state.map == "Estimate"

@@ -11,6 +11,7 @@ from app.model.state import (
     IMAGES,
     MAPS,
     NEEDED,
+    VELOCITY,
     Crop,
     State,
 )
@@ -29,6 +30,8 @@ def possible_kinds(answer: Answer) -> dict[str, list[str]]:
     """Return the possible values of the parameters `KINDS`; the first is the default."""
 
     def exists(kind: str) -> bool:
+        if kind == VELOCITY:
+            return answer.run.image.velocity is not None
         return kind not in NEEDED or getattr(answer.capture, NEEDED[kind]) is not None
 
     return {name: [kind for kind in kinds if exists(kind)] for name, kinds in KINDS.items()}
@@ -42,7 +45,7 @@ def defaults_of(answer: Answer) -> dict[str, Any]:
 def offer_kinds(state: State, answer: Answer) -> None:
     """Offer the kinds of images that an answer has, and leave one that it lacks."""
     for name, possible in possible_kinds(answer).items():
-        if state.param[name].objects != possible:
+        if list(state.param[name].objects) != possible:
             state.param[name].objects = possible
         if getattr(state, name) not in possible:
             setattr(state, name, possible[0])
