@@ -41,9 +41,11 @@ class PulseGroups:
 
     def __post_init__(self) -> None:
         counts, rate_hz = self.counts, self.pulse_rate_hz
-        fits = counts.ndim == 4 and counts.dtype.kind == "u" and min(counts.shape) > 0
+        is_counts = counts.dtype.kind == "u" and counts.dtype.itemsize <= 4
+        fits = counts.ndim == 4 and is_counts and min(counts.shape) > 0
         found = f"{counts.dtype} array of shape {counts.shape}"
-        require("counts", found, fits, "unsigned counts of shape (group, row, col, bin)")
+        accepted = "uint8, uint16 or uint32 counts of shape (group, row, col, bin), none of them 0"
+        require("counts", found, fits, accepted)
         fits = len(self.n_pulses) == len(counts) and min(self.n_pulses) > 0
         require("n_pulses", self.n_pulses, fits, f"{len(counts)} positive numbers, one a group")
         known = rate_hz is None or 0 < rate_hz < np.inf

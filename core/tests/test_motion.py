@@ -21,6 +21,7 @@ from core.io.readers import read_capture
 from core.pulse_groups import PulseGroups, group_sizes
 from core.scene import Scene, scenes
 from core.simulation import simulate
+from core.studies.methods import motion as study
 from core.trigger import rate_per_bin
 
 GATE = Acquisition(32, 1e-9, 280e-9, n_pulses=60)
@@ -274,3 +275,18 @@ def test_photons_of_all_kinds_have_velocities() -> None:
     assert found.velocity is not None
     assert np.median(found.velocity.bins) == pytest.approx(8 / 400 * 1000, abs=1.5)
     np.testing.assert_allclose(found.bin, 13.5, atol=0.5)
+
+
+@pytest.mark.compiled
+def test_the_study_compares_methods_that_know_less_and_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in (("SPEEDS", (10.0,)), ("SBRS", (0.06,)), ("STILL", ("wall",))):
+        monkeypatch.setattr(study, name, value)
+    moving, still, velocity = study.tables(range(2))
+    restored = {row[0]: row[1].value for row in moving.rows}
+    assert restored["likelihood, at rest"] < 0.8
+    assert restored["shared velocity"] > restored["true velocity"] - 0.02
+    assert [row[0] for row in still.rows] == list(study.METHODS)
+    assert [row[1] for row in velocity.rows][1] == "share within 1"
+    assert velocity.rows[1][2].value > 0.98
