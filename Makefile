@@ -7,12 +7,12 @@ BIN := $(VENV)/bin
 
 # Tests of what has kernels run as plain Python, too: there their lines count as covered, and an index
 # out of bounds is an error. What is marked `compiled` is left out.
-KERNELS := blocks fit image_posterior more_estimators posterior reductions refinement simulate speed tracking
+KERNELS := blocks fit image_posterior more_estimators motion posterior reductions refinement simulate speed tracking
 
 # Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform neighbours tuning tuned calibration fit results field large fuzz attack wheel clean
+.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform neighbours motion tuning tuned calibration fit results field large fuzz attack wheel clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z0-9]*\):.* ## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -61,6 +61,9 @@ uniform: $(VENV)/.app ## every method on random and smooth depths over the gate
 neighbours: $(VENV)/.app ## what neighbouring pixels add, inside surfaces and at edges
 	$(BIN)/python -m core neighbours
 
+motion: $(VENV)/.app ## surfaces that move during the pulses: ranges and velocities
+	$(BIN)/python -m core motion
+
 tuning: $(VENV)/.app ## the same search for the settings of every method
 	$(BIN)/python -m core tuning
 
@@ -77,6 +80,7 @@ results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core paper --repetitions 100 --results assets/results/paper.md
 	$(BIN)/python -m core uniform --results assets/results/uniform.md
 	$(BIN)/python -m core neighbours --results assets/results/neighbours.md
+	$(BIN)/python -m core motion --results assets/results/motion.md
 	$(BIN)/python -m core budget --results assets/results/budget.md
 	$(BIN)/python -m core tuning --results assets/results/tuning.md
 	$(BIN)/python -m core tuned --results assets/results/tuned.md

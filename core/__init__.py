@@ -58,6 +58,7 @@ from core.io import (
 from core.out_of_core import Window, as_image, estimate_large, read_window, sampled_flux_prior
 from core.photon_budget import PhotonBudget
 from core.pipeline import Run, run
+from core.pulse_groups import USUAL_GROUPS, PulseGroups
 from core.report import save_report
 from core.scene import PARTS, Scene, parts_of, scenes, without
 from core.simulation import first_photons, simulate
@@ -111,6 +112,7 @@ __all__ = [
     "ESTIMATORS",
     "PARTS",
     "PRESETS",
+    "USUAL_GROUPS",
     "Acquisition",
     "Capture",
     "CaptureError",
@@ -118,6 +120,7 @@ __all__ = [
     "Flux",
     "PhotonBudget",
     "Pulse",
+    "PulseGroups",
     "RangeImage",
     "RangeInterval",
     "Run",

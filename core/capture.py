@@ -28,6 +28,7 @@ from core.deprecation import renamed
 from core.kernels.blocks import Blocks, to_blocks
 from core.labels import dataset
 from core.notebook import html_table
+from core.pulse_groups import PulseGroups
 from core.typesetting import typeset
 
 if TYPE_CHECKING:
@@ -119,11 +120,15 @@ class Capture:
     guesses : mapping, optional
         Options that the reader of the file chose and no other field holds, such as the array's
         name as ``variable``, by their names in `core.io.ReadOptions`.
+    groups : PulseGroups, optional
+        Counts of successive groups of pulses, which add up to the cube; None if the order of the
+        pulses is not known. Pass ``groups=None`` to ``dataclasses.replace`` with other counts.
 
     Raises
     ------
     ValueError
-        If shapes or types do not match, or a pixel has more first photons than pulses.
+        If shapes or types do not match, a pixel has more first photons than pulses, or groups do
+        not add up to the cube and the pulses.
     """
 
     cube: NDArray[np.unsignedinteger]
@@ -139,6 +144,7 @@ class Capture:
     n_records: int | None = None
     stated_flux: StatedFlux | None = None
     guesses: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    groups: PulseGroups | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         cube = self.cube
@@ -172,6 +178,12 @@ class Capture:
             most, name = int(self.counts.max()), f"n_pulses = {self.gated_pulses}, counts"
             accepted = "no more first photons than pulses in a pixel, or 'all' for its detection"
             require(name, most, most <= self.gated_pulses, accepted)
+        if self.groups is not None:
+            sent, n_pulses = sum(self.groups.n_pulses), self.acquisition.n_pulses
+            require("pulses of the groups", sent, sent == n_pulses, f"{n_pulses}, the capture's")
+            same = np.array_equal(self.groups.total, cube)
+            accepted = "groups that add up to the cube, or None with other counts"
+            require("groups", f"shape {self.groups.counts.shape}", same, accepted)
 
     @property
     def shape(self) -> tuple[int, int]:

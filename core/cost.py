@@ -56,6 +56,7 @@ _FEW_PIXELS = 24  # whose fluxes are estimated one by one (`core.inspection.mean
 _FLUX_S, _MIXTURE_S = 20e-6, 5e-6  # per bin of a pixel
 _FIT_S, _FIT_BYTES = 0.5e-6, 80_000_000  # per bin of a pixel; of the pixels tested at once
 _INTERVAL_S, _INTERVAL_BYTES = 6e-6, 50_000_000  # per bin near an estimate; of pixels at once
+_MOVING_S = 1.2e-9  # per velocity, count, and group of pulses or tap
 _WINDOW_ECHOES = 4  # width of nearly all of an echo, in `Capture.echo_bins`
 _ECHOES = 64  # noise-free echoes of the lag calibration
 _USUAL_LEVELS = 4  # signal levels of a capture
@@ -99,6 +100,7 @@ _RATES = {
     "unmixing": _Rates(200e-9, 5e-6, 300.0, 130e6, finds_delay=True),
     "image_posterior": _Rates(300e-9, 20e-6, 500.0, 60e6, 24.0, 70.0, finds_delay=True),
     "likelihood": _Rates(0.0, 0.3e-6, 40.0, finds_delay=True),
+    "velocity": _Rates(0.0, 0.3e-6, 40.0, finds_delay=True),
     "oracle": _Rates(0.0, 0.3e-6, 60.0, finds_delay=True),
 }
 
@@ -137,6 +139,8 @@ def predicted(
     steps = 0
     if method in ("likelihood", "oracle"):
         steps = 2 if settings is None else settings.steps_per_bin
+    elif method == "velocity":
+        steps = 2
 
     n_bytes = _FIXED_BYTES + rates.fixed_bytes * min(1.0, n_counts / 1e6)
     n_bytes += (_PIXEL_BYTES + rates.pixel_bytes) * n_pixels + rates.count_bytes * n_counts
@@ -220,7 +224,7 @@ def cost_of(
     """Predict working memory and time of an estimate of a capture; see `predicted`."""
     echo, _ = capture.pulse.taps(capture.acquisition.n_bins, capture.acquisition.bin_width_s)
     rows, cols, n_bins = capture.cube.shape
-    return predicted(
+    cost = predicted(
         (rows, cols, n_bins),
         method,
         settings,
@@ -228,6 +232,14 @@ def cost_of(
         n_taps=echo.size,
         posterior_is_cached=has_posterior(capture),
     )
+    if method != "velocity" or capture.groups is None:
+        return cost
+    n_groups, n_counts = len(capture.groups.counts), capture.cube.size
+    n_velocities = 2 * (24 if settings is None else settings.most_bins) + 1
+    n_bytes = cost.working_bytes + 4 * n_groups * n_counts + 16 * n_counts
+    n_bytes += 40 * n_velocities * rows * cols
+    seconds = cost.seconds + _MOVING_S * n_velocities * (n_groups + echo.size) * n_counts
+    return Cost(n_bytes, seconds)
 
 
 def require_memory(

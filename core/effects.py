@@ -190,8 +190,8 @@ class Motion:
 
     Each pulse meets the surface at another range. Its trigger probabilities are those of Eq. 1 at
     that range, and those of the histogram are their mean over the pulses. Histograms are drawn from
-    this mean; pulses in order would scatter slightly less, in bin k by the variance of ``P_k`` over
-    the pulses relative to its mean, which is a few hundredths at the echo.
+    this mean; pulses in order (``n_groups`` of `core.simulate`) scatter slightly less, in bin k by
+    the variance of ``P_k`` over the pulses relative to its mean, a few hundredths at the echo.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ class Motion:
         require("pulse_rate_hz", rate_hz, 0 < rate_hz < np.inf, "pulses a second, positive")
 
     def shifts_bins(self, pulse: Pulse, acquisition: Acquisition, n_pulses: int) -> Floats:
-        """Displacement in bins at each group of pulses, shape (group,).
+        """Displacement in bins at each group of pulses in increasing order, shape (group,).
 
         Groups are single pulses, or lie a quarter of a bin apart (or of the pulse's time constant,
         if that is shorter) where pulses lie closer.

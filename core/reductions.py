@@ -17,10 +17,11 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from core.acquisition import Acquisition, Floats
-from core.capture import Capture
+from core.capture import Capture, Detection
 from core.checks import require, require_whole
 from core.kernels.parallel import PARALLEL, entering
 from core.kernels.streams import pixel_key, uniform_at
+from core.pulse_groups import PulseGroups
 
 __all__ = [
     "Reduction",
@@ -50,13 +51,18 @@ def merge_bins(capture: Capture, factor: int) -> Capture:
     require_whole("factor", factor, before.n_bins)
     n_bins = before.n_bins // factor
     end = n_bins * factor
+
+    def merged(cube: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
+        return _sum([cube[:, :, i:end:factor] for i in range(factor)])
+
     return replace(
         capture,
-        cube=_sum([capture.cube[:, :, i:end:factor] for i in range(factor)]),
+        cube=merged(capture.cube),
         acquisition=replace(before, n_bins=n_bins, bin_width_s=before.bin_width_s * factor),
         background=_share(capture.background, end / before.n_bins),
         source=f"{capture.source}; {factor} bins merged",
         flux_prior=None,
+        groups=capture.groups and capture.groups.mapped(merged),
     )
 
 
@@ -85,6 +91,7 @@ def cut_gate(capture: Capture, first_bin: int, end_bin: int) -> Capture:
         most = int(cube.sum(axis=2, dtype=np.int64).max())
         n_pulses = max(round(capture.gated_pulses - float(fired.mean())), most, 1)
         source += f", at whose opening {n_pulses} pulses are armed on average"
+    groups = capture.groups and capture.groups.mapped(lambda cube: cube[:, :, first_bin:end_bin])
     return replace(
         capture,
         cube=cube,
@@ -98,6 +105,7 @@ def cut_gate(capture: Capture, first_bin: int, end_bin: int) -> Capture:
         source=source,
         flux_prior=None,
         stated_flux=None,
+        groups=groups and groups.resized(n_pulses or 0),
     )
 
 
@@ -115,6 +123,7 @@ def skip_pixels(capture: Capture, step: int) -> Capture:
         **capture.images(lambda image: image[kept]),
         source=f"{capture.source}; 1 pixel of each {step} x {step}",
         flux_prior=None,
+        groups=capture.groups and capture.groups.mapped(lambda cube: cube[kept]),
     )
 
 
@@ -131,14 +140,17 @@ def pool_pixels(capture: Capture, side: int) -> Capture:
     images = capture.images(lambda image: _median(_each_of_tile(image, side)))
     if capture.signal is not None:
         images["signal"] = np.mean(_each_of_tile(capture.signal, side), axis=0)
+    n_pulses = n_pulses and n_pulses * side * side
+    groups = capture.groups and capture.groups.mapped(lambda cube: _sum(_each_of_tile(cube, side)))
     return replace(
         capture,
         cube=_sum(_each_of_tile(capture.cube, side)),
-        acquisition=replace(acquisition, n_pulses=n_pulses and n_pulses * side * side),
+        acquisition=replace(acquisition, n_pulses=n_pulses),
         **images,
         source=f"{capture.source}; {side} x {side} pixels added",
         flux_prior=None,
         stated_flux=None,
+        groups=groups and groups.resized(n_pulses or 0),
     )
 
 
@@ -153,15 +165,19 @@ def first_pulses(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
     With the same seed, the detections of fewer pulses are a subset of those of more, unless there
     are more than `DRAWN_ONE_BY_ONE`. The number of pulses must be known, and at most `MOST_PULSES`
     in that case.
+
+    Where the capture keeps `Capture.groups`, each gives its share of the pulses, so that the
+    recording lasts as long as before.
     """
     sent = capture.acquisition.n_pulses
     if sent is None:
         raise ValueError("n_pulses = None is not accepted: give a capture that knows its pulses.")
     require_whole("n_pulses", n_pulses, sent)
-    if capture.detection == "all":
-        cube = _thinned(capture.cube, n_pulses / sent, seed)
+    groups = capture.groups and _fewer_of_each(capture.groups, n_pulses, capture.detection, seed)
+    if groups is not None:
+        cube: NDArray[np.unsignedinteger] = groups.total.astype(capture.cube.dtype)
     else:
-        cube = _of_pulses(capture, sent, n_pulses, seed)
+        cube = _fewer(capture.cube, sent, n_pulses, capture.detection, seed)
     return replace(
         capture,
         cube=cube,
@@ -169,6 +185,7 @@ def first_pulses(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
         source=f"{capture.source}; {n_pulses} of {sent} pulses, seed {seed}",
         flux_prior=None,
         stated_flux=None,
+        groups=groups,
     )
 
 
@@ -194,22 +211,44 @@ def share_of_pulses(capture: Capture, share: float, seed: int = 0) -> Capture:
     )
 
 
+def _fewer_of_each(
+    groups: PulseGroups, n_pulses: int, detection: Detection, seed: int
+) -> PulseGroups:
+    """Draw `n_pulses` of the pulses of all groups, from each its share."""
+    fewer = groups.resized(n_pulses)
+    cubes = [
+        _fewer(cube, sent, kept, detection, seed + group)
+        for group, (cube, sent, kept) in enumerate(
+            zip(groups.counts, groups.n_pulses, fewer.n_pulses, strict=True)
+        )
+    ]
+    return replace(fewer, counts=np.stack(cubes))
+
+
+def _fewer(
+    cube: NDArray[np.unsignedinteger], sent: int, n_pulses: int, detection: Detection, seed: int
+) -> NDArray[np.unsignedinteger]:
+    """Draw `n_pulses` of the pulses of a cube."""
+    if detection == "all":
+        return _thinned(cube, n_pulses / sent, seed)
+    return _of_pulses(cube, sent, n_pulses, seed)
+
+
 def _of_pulses(
-    capture: Capture, sent: int, n_pulses: int, seed: int
+    fired_in: NDArray[np.unsignedinteger], sent: int, n_pulses: int, seed: int
 ) -> NDArray[np.unsignedinteger]:
     """First photons of `n_pulses` of the pulses."""
-    if _are_few(capture.cube):
-        drawn = np.empty(capture.cube.shape, capture.cube.dtype)
-        with entering(drawn.size):
-            _draw_pulses(capture.cube, sent, n_pulses, np.uint64(seed), drawn)
-        return drawn
+    cube = np.empty(fired_in.shape, fired_in.dtype)
+    if _are_few(fired_in):
+        with entering(cube.size):
+            _draw_pulses(fired_in, sent, n_pulses, np.uint64(seed), cube)
+        return cube
     require("n_pulses of the capture", sent, sent <= MOST_PULSES, f"{MOST_PULSES} or fewer")
     rng = np.random.default_rng(seed)
-    cube = np.empty(capture.cube.shape, capture.cube.dtype)
-    rest = np.full(capture.shape, sent)  # pulses not decided yet
-    left = np.full(capture.shape, n_pulses)  # still to be drawn among them
+    rest = np.full(cube.shape[:2], sent)  # pulses not decided yet
+    left = np.full(cube.shape[:2], n_pulses)  # still to be drawn among them
     for k in range(cube.shape[2]):
-        fired = capture.cube[:, :, k].astype(np.int64)
+        fired = fired_in[:, :, k].astype(np.int64)
         rest -= fired
         found = rng.hypergeometric(fired, rest, left)
         cube[:, :, k] = found

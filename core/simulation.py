@@ -33,6 +33,7 @@ from core.kernels.simulate import (
     fill_probability,
     fire_once,
 )
+from core.pulse_groups import PulseGroups, group_sizes
 from core.scene import Scene, parts_of
 
 _Flux = TypeVar("_Flux", float, Floats)
@@ -50,6 +51,7 @@ def simulate(
     pulse: Pulse = Pulse(),
     seed: int = 0,
     name: str = "",
+    n_groups: int | None = None,
 ) -> Capture:
     """Draw one first-photon histogram for each pixel of a scene.
 
@@ -67,6 +69,11 @@ def simulate(
         The same seed gives the same capture, for any number of threads.
     name : str, optional
         Name of the scene, which the source of the capture states.
+    n_groups : int, optional
+        Keep the counts of so many successive groups of pulses, `Capture.groups`. The pulses of a
+        moving scene are then drawn in order, each at the range that the scene has reached
+        (`core.effects.Motion.shifts_bins`), otherwise from their mean. A scene at rest has the same
+        counts with groups and without, for up to `PULSES_DRAWN_ONE_BY_ONE` pulses.
 
     Returns
     -------
@@ -84,14 +91,19 @@ def simulate(
     require("n_pulses", n_pulses, n_pulses < 2**32, "fewer than 2**32")
     _require_seed(seed)
     shape = np.shape(scene.range_m)
-    triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
-    cube = np.zeros(
-        (len(triggered), acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32
+    cube: NDArray[np.unsignedinteger] = np.zeros(
+        (np.size(scene.range_m), acquisition.n_bins), np.uint16 if n_pulses < 2**16 else np.uint32
     )
-    if n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
+    groups = None
+    if n_groups is not None:
+        groups = _draw_groups(scene, acquisition, flux, pulse, seed, n_groups)
+        cube = groups.total.astype(cube.dtype)
+    elif n_pulses <= PULSES_DRAWN_ONE_BY_ONE:
+        triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
         with KERNEL_LOCK:
-            draw_pulses(triggered, n_pulses, np.uint64(seed), cube)
+            draw_pulses(triggered, 0, n_pulses, np.uint64(seed), cube)
     else:
+        triggered = cumulative_trigger_probability(scene, acquisition, flux, pulse)
         _draw_multinomial(triggered, n_pulses, seed, cube)
     is_plain = set(parts_of(scene)) <= {"reflectivity", "falloff"}
     source = f"simulated, seed {seed}, SBR {flux.sbr:g}, PPP {flux.signal:g}"
@@ -103,7 +115,37 @@ def simulate(
         signal=next(echoes(scene, flux))[1] if is_plain else None,
         background=flux.background if is_plain else None,
         source=f"{name}, {source}" if name else source,
+        groups=groups,
     )
+
+
+def _draw_groups(
+    scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse, seed: int, n_groups: int
+) -> PulseGroups:
+    """Draw the pulses of a scene in order, and count them in groups."""
+    n_pulses = pulses_sent(acquisition)
+    sizes = group_sizes(n_pulses, n_groups)
+    counts = np.zeros(
+        (n_groups, np.size(scene.range_m), acquisition.n_bins),
+        np.uint16 if max(sizes) < 2**16 else np.uint32,
+    )
+    shifts_bins, ends = _shifts_bins(scene, acquisition, pulse), np.cumsum(sizes)
+    if scene.motion is not None and scene.motion.speed_m_per_s < 0:
+        shifts_bins = shifts_bins[::-1]
+    shift_ends = np.cumsum(group_sizes(n_pulses, shifts_bins.size))
+    begin, drawn_at = 0, -1
+    for end in np.union1d(ends, shift_ends).tolist():
+        # The stretches of pulses that share a group and a displacement.
+        group, shift = (int(np.searchsorted(each, end)) for each in (ends, shift_ends))
+        if shift != drawn_at:
+            at = shifts_bins[shift : shift + 1]
+            triggered, drawn_at = _triggered_at(scene, acquisition, flux, pulse, at), shift
+        with KERNEL_LOCK:
+            draw_pulses(triggered, begin, end, np.uint64(seed), counts[group])
+        begin = end
+    shape = (n_groups, *np.shape(scene.range_m), acquisition.n_bins)
+    rate_hz = None if scene.motion is None else scene.motion.pulse_rate_hz
+    return PulseGroups(counts.reshape(shape), sizes, rate_hz)
 
 
 def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
@@ -154,6 +196,7 @@ def first_photons(capture: Capture, n_pulses: int, seed: int = 0) -> Capture:
         source=source,
         flux_prior=None,
         stated_flux=None,
+        groups=None,
     )
 
 
@@ -183,6 +226,21 @@ def cumulative_trigger_probability(
     ValueError
         If the scene moves and the number of pulses is unknown.
     """
+    shifts_bins = _shifts_bins(scene, acquisition, pulse)
+    return _triggered_at(scene, acquisition, flux, pulse, shifts_bins)
+
+
+def _shifts_bins(scene: Scene, acquisition: Acquisition, pulse: Pulse) -> Floats:
+    """Displacement of the scene in bins at each of equal parts of the recording, shape (part,)."""
+    if scene.motion is None:
+        return np.zeros(1)
+    return scene.motion.shifts_bins(pulse, acquisition, pulses_sent(acquisition))
+
+
+def _triggered_at(
+    scene: Scene, acquisition: Acquisition, flux: Flux, pulse: Pulse, shifts_bins: Floats
+) -> Floats:
+    """Compute the mean of `cumulative_trigger_probability` over displacements of the scene."""
     n_edges = acquisition.n_bins + 1
     share_of_gate = np.linspace(0.0, 1.0, n_edges)
     steady = flux.background * share_of_gate
@@ -190,9 +248,6 @@ def cumulative_trigger_probability(
         steady = np.ravel(scene.ambient)[:, np.newaxis] * steady
     if scene.backscatter is not None:
         steady += scene.backscatter.photons_before(flux.signal, pulse, acquisition)
-    shifts_bins = np.zeros(1)
-    if scene.motion is not None:
-        shifts_bins = scene.motion.shifts_bins(pulse, acquisition, pulses_sent(acquisition))
     onsets = [
         (np.ravel(acquisition.range_m_to_bin(range_m)), np.ravel(signal))
         for range_m, signal in echoes(scene, flux)

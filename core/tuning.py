@@ -258,6 +258,7 @@ def _part(capture: Capture) -> Capture:
         **capture.images(lambda _: None),
         flux_prior=None,
         stated_flux=None,
+        groups=None,
     )
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from core.acquisition import Acquisition, Flux
 from core.capture import Capture
+from core.effects import Motion
 from core.estimators import ESTIMATORS, estimate
 from core.inference import fit_of
 from core.inspection import pixel_report
@@ -28,6 +31,8 @@ def warm_up() -> None:
     # The image posterior uses neighbours only where they agree.
     wall = scenes["wall"](16)
     estimate(simulate(wall, wall.acquisition, Flux(sbr=1.0)), "image_posterior")
+    passing = replace(wall, motion=Motion(speed_m_per_s=20.0, pulse_rate_hz=20e3))
+    estimate(simulate(passing, wall.acquisition, Flux(sbr=1.0), n_groups=8), "velocity")
     images = {method: estimate(small, method) for method in ESTIMATORS}
     fit_of(small)
     pixel_report(small, images["tracking"], 0, 0)  # `scipy.signal` takes a second to import

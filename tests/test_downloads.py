@@ -40,7 +40,15 @@ from app.model.exports import (
     table_file,
 )
 from app.model.script import script_of
-from app.model.state import MAPS, REGION, Crop, Illumination, ReductionSettings, Viewing
+from app.model.state import (
+    MAPS,
+    REGION,
+    VELOCITY,
+    Crop,
+    Illumination,
+    ReductionSettings,
+    Viewing,
+)
 from app.model.store import built_in_sources, inspect
 from app.pages.inspect.views import rectangle
 from app.pages.layout import Layout
@@ -326,7 +334,7 @@ def test_descriptions_state_version_method_all_settings_and_source(explore, sess
     assert f"settings: {viewing}" in settings
 
 
-@pytest.mark.parametrize("kind", MAPS)
+@pytest.mark.parametrize("kind", [kind for kind in MAPS if kind != VELOCITY])
 def test_arrays_and_pages_hold_the_map_that_is_shown(explore, session, kind):
     viewing = Viewing(least_confidence=1 - 1e-9)
     values, look = map_of(session.answer, kind, viewing)

@@ -13,7 +13,15 @@ import pytest
 import core
 from app.model.colors import map_of
 from app.model.script import script_of
-from app.model.state import MAPS, NEEDED, Crop, Illumination, ReductionSettings, Viewing
+from app.model.state import (
+    MAPS,
+    NEEDED,
+    VELOCITY,
+    Crop,
+    Illumination,
+    ReductionSettings,
+    Viewing,
+)
 from app.model.store import built_in_sources, file_source
 from app.pages.inspect import text
 from app.pages.inspect.capture import CaptureSection
@@ -145,7 +153,7 @@ def test_every_map_is_offered_where_possible_and_drawn(name, request):
     capture = session.answer.capture
     offered = session.state.param.map.objects
     has_truth = capture.truth_range_m is not None
-    absent = {"Reported"} if has_truth else NEEDED.keys()
+    absent = {VELOCITY, *({"Reported"} if has_truth else NEEDED)}
     assert offered == [each for each in MAPS if each not in absent]
     maps = {kind: map_of(session.answer, kind, Viewing()) for kind in offered}
     for image, look in maps.values():
@@ -853,3 +861,21 @@ def test_a_line_drawn_on_the_map_pins_its_ends_and_bends_for_a_profile(building)
     assert state.pins == ((10, 3), (30, 3), (30, cols - 1))
     page.navigator.drawn.data = {"xs": [[7.0, 7.1]], "ys": [[7.0, 7.1]]}  # not a line
     assert len(state.pins) == 3
+
+
+def test_the_likelihood_with_velocity_shows_velocities():
+    session = Session({"approach": built_in_sources()["approach"]}, tasks=HeldTasks())
+    assert VELOCITY not in session.state.param.map.objects
+    change(session, method="velocity", pixel=(32, 32))
+    assert VELOCITY in session.state.param.map.objects
+    session.state.map = VELOCITY
+    answer = session.answer
+    drawn, look = map_of(answer, VELOCITY, Viewing(least_confidence=0.9))
+    assert look.unit == "m/s"
+    assert np.nanmedian(drawn) == pytest.approx(-20, rel=0.05)  # the scene's
+    section = on_screen(PixelSection(session, "pixel"))
+    velocity = answer.run.image.velocity
+    assert values(section.facts)["Velocity"] == velocity.text_at(32, 32)
+    change(session, method="likelihood")
+    assert VELOCITY not in session.state.param.map.objects
+    assert session.state.map == "Estimate"

@@ -50,6 +50,7 @@ for folder in sys.argv[1:]:
     for name, image in answers.items():
         kept |= {f"{name} {each}": value for each, value in vars(image).items()}
         kept[f"{name} made_by"] = str(image.made_by)
+        kept[f"{name} velocity"] = 0 if image.velocity is None else image.velocity.values
     for name, signals in ({"signals": found.get("signals")} | found.get("pinned", {})).items():
         if isinstance(signals, np.ndarray):
             kept[f"{name} score"] = signals
@@ -119,7 +120,8 @@ def same(found: dict, name: str, expected) -> None:
         if each == "made_by":
             assert str(found[f"{name} made_by"]) == str(value)
             continue
-        assert np.array_equal(found[f"{name} {each}"], np.asarray(value), equal_nan=True), each
+        numbers = 0 if value is None else getattr(value, "values", value)
+        assert np.array_equal(found[f"{name} {each}"], np.asarray(numbers), equal_nan=True), each
 
 
 def same_pixel(found: dict, name: str, pixel: Pixel) -> None:

@@ -29,6 +29,7 @@ from core.scene import parts_of
 from core.studies.ablation import Requirement
 from core.studies.sensitivity import numbers
 from core.studies.tradeoff import Cancelled, best_within, cheapest_reaching, pareto_front
+from core.studies.trials import default_methods
 from tests.browser import chosen, eventually
 from tests.threads import HeldTasks, change, control
 
@@ -140,7 +141,7 @@ def test_the_page_shows_what_core_recommends(section, measured):
     assert section.plot.source("chosen").data["x"] == chosen
     for sentence, each in zip(section.advice, recommended, strict=True):
         assert text.name_of(each.point.candidate) in sentence.text
-    assert len(section.plot.source("points").data["x"]) == len(measured) == len(ESTIMATORS)
+    assert len(section.plot.source("points").data["x"]) == len(measured) == len(default_methods())
     pareto = [point.milliseconds.value for point in pareto_front(measured)]
     np.testing.assert_allclose(section.plot.source("front").data["x"], pareto)
 
@@ -182,7 +183,7 @@ def test_every_method_has_a_colour_and_a_shape_of_its_own(section):
     for colors in (DARK, LIGHT):
         section.paint(colors is DARK)
         data = section.plot.source("points").data
-        assert len({*zip(data["color"], data["marker"], strict=True)}) == len(ESTIMATORS)
+        assert len({*zip(data["color"], data["marker"], strict=True)}) == len(default_methods())
         assert section.plot.figure.title.text_color == colors.text
 
 
@@ -331,7 +332,7 @@ def open_a_configuration(here):
     expect(done).to_be_visible(timeout=300_000)  # 120 images, on a machine that may be busy
     expect(here.get_by_text("2 repetitions, 6 timing rounds")).to_be_visible()
     expect(here.get_by_text(re.compile("^Most accurate within 10 ms: "))).to_be_visible()
-    expect(here.locator("tbody tr")).to_have_count(len(ESTIMATORS))
+    expect(here.locator("tbody tr")).to_have_count(len(default_methods()))
     open_other = f"Open: {ESTIMATORS['cfar'].title}"
     here.get_by_role("button", name=open_other, exact=True).press("Enter")
     expect(chosen(here, "Method")).to_have_text(ESTIMATORS["cfar"].title)

@@ -11,6 +11,7 @@ from app.model.state import (
     IMAGES,
     MAPS,
     NEEDED,
+    VELOCITY,
     Crop,
     State,
 )
@@ -29,6 +30,8 @@ def possible_kinds(answer: Answer) -> dict[str, list[str]]:
     """Return the possible values of the parameters `KINDS`; the first is the default."""
 
     def exists(kind: str) -> bool:
+        if kind == VELOCITY:
+            return answer.run.image.velocity is not None
         return kind not in NEEDED or getattr(answer.capture, NEEDED[kind]) is not None
 
     return {name: [kind for kind in kinds if exists(kind)] for name, kinds in KINDS.items()}
@@ -37,6 +40,15 @@ def possible_kinds(answer: Answer) -> dict[str, list[str]]:
 def defaults_of(answer: Answer) -> dict[str, Any]:
     """Return the defaults that a capture brings, by the state's parameter."""
     return {"pixel": telling_pixel(answer.capture, answer.run.image)}
+
+
+def offer_kinds(state: State, answer: Answer) -> None:
+    """Offer the kinds of images that an answer has, and leave one that it lacks."""
+    for name, possible in possible_kinds(answer).items():
+        if list(state.param[name].objects) != possible:
+            state.param[name].objects = possible
+        if getattr(state, name) not in possible:
+            setattr(state, name, possible[0])
 
 
 def enter(state: State, answer: Answer, previous: Answer | None) -> None:
@@ -48,10 +60,7 @@ def enter(state: State, answer: Answer, previous: Answer | None) -> None:
     answer, previous : Answer
         Its estimate, and the one before.
     """
-    for name, possible in possible_kinds(answer).items():
-        state.param[name].objects = possible
-        if getattr(state, name) not in possible:
-            setattr(state, name, possible[0])
+    offer_kinds(state, answer)
     own = defaults_of(answer)
     here = {"pixel": state.pixel, "pins": state.pins, "region": state.region}
     kept: dict[str, Any] = {} if previous is None else carried(here, previous, answer)

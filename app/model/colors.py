@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from app.model.budget import spending
 from app.model.mesh import point_cloud
-from app.model.state import FIT, Viewing
+from app.model.state import FIT, VELOCITY, Viewing
 from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS
-from core import inspection
+from core import ESTIMATORS, inspection
 from core.cost import predicted_fit_time
 from core.geometry import WHOLE, Box, pixel_angle_of
 from core.inference import fit_of, fit_p_values, has_fit, share_below
@@ -45,6 +45,7 @@ NO_VALUE = {
     "Error": "without an estimate or truth",
     "Reported": "without a reported distance",
     "Confidence": "without an estimate",
+    VELOCITY: "without an estimate",
 }
 """Pixels that are blank in images of a kind, hidden estimates aside."""
 
@@ -62,7 +63,7 @@ class Unseen(NamedTuple):
 
 def unseen(answer: Answer, kind: str, viewing: Viewing, values: Array, look: ColorScale) -> Unseen:
     """Count the pixels of an image that are blank or grey; parameters are those of `legend`."""
-    hides = kind in ("Estimate", "Error")
+    hides = kind in ("Estimate", "Error", VELOCITY)
     n_hidden = n_below(answer, viewing.least_confidence) if hides else 0
     return Unseen(int(np.isnan(values).sum()) - n_hidden, n_hidden, look.n_outside(values))
 
@@ -92,6 +93,8 @@ def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
 
 def doubt(answer: Answer) -> str:
     """Return why confidences are not to be relied on; empty unless known (`has_fit`)."""
+    if ESTIMATORS[answer.method].follows_motion and answer.capture.groups is not None:
+        return ""  # the fit is that of surfaces at rest
     misfit = fit_of(answer.capture).remark if has_fit(answer.capture) else ""
     return f"{misfit.capitalize()}." if misfit else ""
 
@@ -162,8 +165,10 @@ def image_of(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorS
 
 def map_of(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorScale]:
     """Return the image (row, col) of one of `MAPS`, NaN without a value, and its colour scale."""
-    if kind not in inspection.maps:
+    if kind not in (VELOCITY, *inspection.maps):
         return image_of(answer, kind, viewing)
+    if kind == VELOCITY:
+        return velocity_of(answer, viewing)
     if kind == FIT:
         rows, cols, n_bins = answer.capture.cube.shape
         cost = predicted_fit_time(rows * cols, n_bins)
@@ -175,6 +180,17 @@ def map_of(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorSca
     is_unknown = kind == "Fired" and answer.capture.gated_pulses is None
     title = FIRED_UNKNOWN if is_unknown else MAP_TITLES[kind]
     return values, ColorScale(title, "", low, max(high, low + 1e-6), COUNT_COLORS)
+
+
+def velocity_of(answer: Answer, viewing: Viewing) -> tuple[Array, ColorScale]:
+    """Return the radial velocities of shown pixels (row, col), and a scale around 0."""
+    velocity, visible = answer.run.image.velocity, shown(answer, viewing.least_confidence)
+    values = np.full(visible.shape, np.nan) if velocity is None else velocity.values
+    values = np.where(visible, values, np.nan)
+    limit = float(np.nanpercentile(np.abs(values), 99)) if visible.any() else 0.0
+    unit = "" if velocity is None else velocity.unit
+    title = "Radial velocity: positive if the surface recedes"
+    return values, ColorScale(title, unit, -limit or -1.0, limit or 1.0, ERROR_COLORS)
 
 
 def color_values(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorScale]:

@@ -184,7 +184,8 @@ def image_files(
     values, own = map_of(answer, kind, viewing)
     look = look or own
     name = {"Estimate": "range_m", FIT: P_VALUE}.get(kind, kind.lower())
-    plane = Plane(values, look.unit if look.unit == "m" else "1", look.legend)
+    unit = {"m": "m", "m/s": "m s-1"}.get(look.unit, "1")
+    plane = Plane(values, unit, look.legend)
     product = _product(answer, viewing.least_confidence, shown={name: plane})
     rows, cols = in_view(figure, answer.grid, values.shape)
     picture = Picture(

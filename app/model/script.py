@@ -11,8 +11,8 @@ from dataclasses import fields
 from itertools import chain
 from textwrap import indent
 
-from app.model.state import CLOUDS, State, Viewing
-from app.model.store import Answer
+from app.model.state import CLOUDS, VELOCITY, State, Viewing
+from app.model.store import Answer, bare, groups_of
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
 from core.geometry import WHOLE, Box
 from core.io import RangeColors
@@ -25,6 +25,7 @@ IMAGES = {
     "Reported": "capture.reported_range_m",
     "Confidence": "np.where(image.valid, image.confidence, np.nan)",
     "Counts": "capture.counts",
+    VELOCITY: "np.where(shown.valid, image.velocity.values, np.nan)",
     **{name: f'core.inspection.maps["{name}"](capture)' for name in inspection.maps},
 }
 """Code of the images of Explore and Inspect."""
@@ -114,7 +115,9 @@ def _simulation(answer: Answer) -> Lines:
         yield assign("acquisition", "replace", acquisition, n_pulses=pulses)
         acquisition = "acquisition"
     seed = {"seed": literal(light.seed)} if light.seed else {}
-    yield assign("capture", "core.simulate", "scene", acquisition, flux, **seed)
+    groups = groups_of(bare(source.scene(), request.absent), light.acquisition(own).n_pulses)
+    order = {"n_groups": literal(groups)} if groups else {}
+    yield assign("capture", "core.simulate", "scene", acquisition, flux, **seed, **order)
 
 
 def _file(answer: Answer) -> Lines:

@@ -269,8 +269,12 @@ IMAGES = ("Estimate", "Truth", "Error", "Counts")
 FIT = "Goodness of fit"
 """The map of the p-values of pixels."""
 
+VELOCITY = "Velocity"
+"""The map of radial velocities, of methods that estimate them."""
+
 MAPS = (
-    *("Estimate", "Truth", "Error", "Reported", "Confidence", "Counts", "Peak", "Fired", "SBR"),
+    *("Estimate", "Truth", "Error", "Reported", VELOCITY),
+    *("Confidence", "Counts", "Peak", "Fired", "SBR"),
     FIT,
 )
 UNITS = ("bins", "ns", "m")

@@ -56,7 +56,7 @@ from core.inspection import (
 from core.io.readers import SUFFIXES, bytes_of, open_capture, read_capture
 from core.io.readers.guards import MAX_CUBE_BYTES
 from core.io.readers.labelled import describe
-from core.io.readers.options import ReadOptions, add_read_options
+from core.io.readers.options import MOST_PULSE_GROUPS, ReadOptions, add_read_options
 from core.io.readers.truth import (
     add_truth_options,
     possible_truths,
@@ -77,6 +77,7 @@ from core.io.writers.product import guessed_view
 from core.metrics import Interval
 from core.parameters import doubts
 from core.pipeline import figures_of, run
+from core.pulse_groups import USUAL_GROUPS
 from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.tracking import PRESETS
@@ -367,7 +368,19 @@ def _range_at_once(
     }
     if capture.truth_range_m is not None:
         facts |= _targets(capture.truth_range_m)
-    return capture, found.image, facts
+    return capture, found.image, facts | _velocity_facts(found.image)
+
+
+def _velocity_facts(image: RangeImage) -> dict[str, float]:
+    """Return the median velocities of confident pixels, in each unit."""
+    if image.velocity is None:
+        return {}
+    kept = image.velocity.planes(image.confidence >= _CONFIDENT)
+    return {
+        f"median_{name}": float(np.nanmedian(plane.values))
+        for name, plane in kept.items()
+        if np.isfinite(plane.values).any()
+    }
 
 
 def _range_in_tiles(
@@ -419,6 +432,11 @@ def _add_simulate(commands: Any) -> None:
     ):
         group.add_argument(flag, dest=name, type=kind, help=help)
     add_flux(command)
+    command.add_argument(
+        "--pulse-groups",
+        type=whole_from_to(1, MOST_PULSE_GROUPS),
+        help="groups in which the order of the pulses is kept, such as 40, for scenes that move",
+    )
     _add_out(command, "the capture", CAPTURE_SUFFIXES, required=True)
     _add_json(command)
     command.set_defaults(work=_simulate)
@@ -430,7 +448,9 @@ def _simulate(chosen: argparse.Namespace) -> None:
     acquisition = scene.acquisition
     if chosen.pulses is not None:
         acquisition = replace(acquisition, n_pulses=chosen.pulses)
-    capture = simulate(scene, acquisition, flux_of(chosen), seed=chosen.seed or 0)
+    capture = simulate(
+        scene, acquisition, flux_of(chosen), seed=chosen.seed or 0, n_groups=chosen.pulse_groups
+    )
     given = {"unit": chosen.unit_m, "distance": chosen.distance_m}
     options = [f"{name} {value:g}" for name, value in given.items() if value is not None]
     source = ", ".join((printable(chosen.scene), capture.source, *options))
@@ -525,6 +545,10 @@ def _capture(chosen: argparse.Namespace) -> Capture:
         require_none(vars(chosen), FLUX_OPTIONS, "a capture has its own flux")
         return read_capture(chosen.capture, **reading(chosen))
     options = reading(chosen)
+    n_groups = options.pop("pulse_groups")
+    if ESTIMATORS[chosen.method].follows_motion:
+        n_groups = n_groups or USUAL_GROUPS
     require_none(options, list(options), "a scene is not read from a file")
     scene = scenes[chosen.scene]()
-    return simulate(scene, scene.acquisition, flux_of(chosen), seed=chosen.seed or 0)
+    seed = chosen.seed or 0
+    return simulate(scene, scene.acquisition, flux_of(chosen), seed=seed, n_groups=n_groups)

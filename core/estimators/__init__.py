@@ -23,6 +23,7 @@ from core.estimators import (
     shi,
     tracking,
     unmixing,
+    velocity,
 )
 from core.estimators.base import FALSE_ALARM, Estimator, Provenance, RangeImage
 
@@ -50,6 +51,7 @@ ESTIMATORS: dict[str, Estimator] = {
     "cfar": cfar.ESTIMATOR,
     "unmixing": unmixing.ESTIMATOR,
     "likelihood": likelihood.ESTIMATOR,
+    "velocity": velocity.ESTIMATOR,
     "image_posterior": image_posterior.ESTIMATOR,
     "oracle": oracle.ESTIMATOR,
 }

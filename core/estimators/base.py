@@ -20,6 +20,7 @@ from core.inference.fit import fit_of
 from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
 from core.inference.likelihood import Conditions
+from core.inference.motion import RadialVelocity
 from core.inference.neighbours import patches, pooled_at, pooled_in
 from core.inference.posterior import tolerance_probability
 from core.labels import Plane, images_dataset, software
@@ -123,6 +124,9 @@ class RangeImage:
         Whether the pixel has an estimate.
     made_by : Provenance, optional
         Method and settings; None where they are not known.
+    velocity : RadialVelocity, optional
+        Of methods that estimate it: velocity of the surfaces, whose ranges are those in the middle
+        of the recording.
     """
 
     range_m: Floats
@@ -131,10 +135,12 @@ class RangeImage:
     confidence: Floats
     valid: NDArray[np.bool_]
     made_by: Provenance | None = field(default=None, repr=False)
+    velocity: RadialVelocity | None = field(default=None, repr=False)
 
     @property
     def planes(self) -> dict[str, Plane]:
         """Images with unit and meaning, by name."""
+        moving = {} if self.velocity is None else self.velocity.planes(self.valid)
         return {
             "range_m": Plane(self.range_m, "m", "range of the surface, NaN without an estimate"),
             "confidence": Plane(
@@ -143,6 +149,7 @@ class RangeImage:
             "bin": Plane(self.bin, "1", "delay of the echo in bins, from the opening of the gate"),
             "score": Plane(self.score, "1", "score of the estimate, of the estimator's own scale"),
             "valid": Plane(self.valid, "1", "whether there is an estimate"),
+            **moving,
         }
 
     def to_xarray(self) -> xr.Dataset:
@@ -228,6 +235,10 @@ class Evidence(NamedTuple):
     """From both."""
 
 
+NOT_JUDGED = "the goodness of fit, which is that of surfaces at rest, is not judged"
+"""Remark of methods that follow motion."""
+
+
 class Calibration(NamedTuple):
     """Quantities of an estimator that all pixels of an image share."""
 
@@ -286,6 +297,10 @@ class Estimator:
     confidence : callable, optional
         ``(capture, flux_model, delay_bin, parameters) -> probability``, likewise: the confidence by
         a posterior of the estimator's own instead of `core.inference.posterior`.
+    follows_motion : bool
+        Whether groups of pulses are used, so that motion does not contradict the model.
+    velocity : callable, optional
+        ``(capture, parameters) -> RadialVelocity``, or None where it is not known.
     evidence : callable, optional
         ``(capture, flux_model, row, col) -> Evidence``, or None where neighbours have no
         influence: the parts of a pixel's posterior.
@@ -308,6 +323,8 @@ class Estimator:
     fills: bool = False
     refine: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
     confidence: Callable[[Capture, FluxModel, Floats, Any], Floats] | None = None
+    follows_motion: bool = False
+    velocity: Callable[[Capture, Any], RadialVelocity | None] = lambda *_: None
     evidence: Callable[[Capture, FluxModel, int, int], Evidence | None] | None = None
 
     light = renamed("flux_model")
@@ -339,7 +356,9 @@ class Estimator:
 
         Also whether `false_alarm` of the call has no effect. Clauses are separated by semicolons.
         """
-        clauses = [fit_of(capture).remark, self.omits(capture)]
+        follows_motion = self.follows_motion and capture.groups is not None
+        fit = NOT_JUDGED if follows_motion else fit_of(capture).remark
+        clauses = [fit, self.omits(capture)]
         if self.undoes_pile_up and capture.gated_pulses is None:
             known = capture.detection == "all"
             why = "the capture holds all photons" if known else "the number of pulses is not known"
@@ -373,6 +392,7 @@ class Estimator:
             score=score,
             confidence=confidence,
             valid=np.isfinite(bins),
+            velocity=self.velocity(capture, parameters),
         )
 
     def delays(

@@ -45,14 +45,9 @@ from core.estimators.image_model import (
 from core.estimators.likelihood import Depths, LikelihoodParameters, curve
 from core.estimators.likelihood import locate as locate_alone
 from core.inference.flux_model import FluxModel
-from core.inference.posterior import (
-    TOLERANCE_BINS,
-    States,
-    probability_at,
-    tolerance_probability,
-)
+from core.inference.posterior import States, mass_near, tolerance_probability
 from core.kernels.blocks import LANES
-from core.kernels.messages import fill_modes, fill_posterior, fill_window_masses
+from core.kernels.messages import fill_modes, fill_posterior
 from core.kernels.parallel import entering
 from core.kernels.planes import fill_planes
 from core.parameters import Settings, parameter
@@ -199,15 +194,7 @@ def _confidence(
     if not _neighbours_agree(flux):
         return tolerance_probability(capture, delay_bin)
     found = image_posterior_of(capture, flux)
-    merged = found.by_bin.reshape(delay_bin.size, -1)
-
-    def masses(first: NDArray[np.intp]) -> NDArray[np.float32]:
-        window = np.empty((first.size, 2), np.float32)
-        with entering(2 * window.size * TOLERANCE_BINS):
-            fill_window_masses(merged, found.factor, TOLERANCE_BINS, first, window)
-        return window
-
-    return probability_at(delay_bin, capture.acquisition.n_bins - 1, masses)
+    return mass_near(found.by_bin, found.factor, delay_bin, capture.acquisition.n_bins)
 
 
 def _evidence(capture: Capture, flux: FluxModel, row: int, col: int) -> Evidence | None:

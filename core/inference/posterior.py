@@ -28,7 +28,8 @@ from core.inference.likelihood import (
     prepared_groups,
 )
 from core.kernels.confidence import fill_masses, fill_states
-from core.kernels.parallel import in_parts
+from core.kernels.messages import fill_window_masses
+from core.kernels.parallel import entering, in_parts
 
 TOLERANCE_BINS = 3
 """Tolerance within which an estimate is right; it reproduces the paper's tables."""
@@ -169,6 +170,31 @@ def probability_at(
     return _between(bins, below, masses(below))
 
 
+def mass_near(by_bin: NDArray[np.float32], factor: int, delay_bin: Floats, n_bins: int) -> Floats:
+    """Return the probability of a surface within `TOLERANCE_BINS` of a delay by a given posterior.
+
+    Parameters
+    ----------
+    by_bin : ndarray, shape (row, col, merged bin)
+        Probability of a surface in each merged bin.
+    factor : int
+        Bins in a merged one.
+    delay_bin : ndarray, shape (row, col)
+        Delays in fractional bins; NaN gives 0.
+    n_bins : int
+        Bins in the gate.
+    """
+    merged = by_bin.reshape(delay_bin.size, -1)
+
+    def masses(first: NDArray[np.intp]) -> NDArray[np.float32]:
+        window = np.empty((first.size, 2), np.float32)
+        with entering(2 * window.size * TOLERANCE_BINS):
+            fill_window_masses(merged, factor, TOLERANCE_BINS, first, window)
+        return window
+
+    return probability_at(delay_bin, n_bins - 1, masses)
+
+
 def tolerance_probability_at(capture: Capture, row: int, col: int, bins: Floats) -> Floats:
     """Return `tolerance_probability` of one pixel at several delays (n,), shape (n,)."""
     table = posterior_of(capture).tolerance_probability[row, col]
@@ -249,13 +275,13 @@ def _answers(
     """Yield blocks, their delays in steps and their scores, (block, lane) each."""
     if rule == "density":
         step, around = likeliest_delays(prepared)
-        found = _vertex(step, prepared.depth.size - 1, np.moveaxis(around, 2, 0))
+        found = vertex(step, prepared.depth.size - 1, np.moveaxis(around, 2, 0))
         yield slice(0, len(step)), found, around[:, :, 1]
         return
     for some, density, _, weighted in delay_densities(prepared):
         if rule == "window":
             step = _most_in_window(density, TOLERANCE_BINS * steps_per_bin)
-            found = _vertex(step, prepared.depth.size - 1, _log_around(prepared, weighted, step))
+            found = vertex(step, prepared.depth.size - 1, _log_around(prepared, weighted, step))
         elif rule == "mean":
             steps = np.arange(density.shape[1]) + 0.5
             found = np.einsum("bdl,d->bl", density, steps) / density.sum(axis=1, dtype=float)
@@ -276,7 +302,7 @@ def _log_around(
     return np.asarray(log.transpose(1, 0, 2))
 
 
-def _vertex(step: NDArray[np.intp], last: int, log: Floats) -> Floats:
+def vertex(step: NDArray[np.intp], last: int, log: Floats) -> Floats:
     """Refine steps from 0 to `last` by a parabola through the logarithms before, at and after."""
     left, middle, right = log
     curvature = np.minimum(left - 2 * middle + right, -1e-9)

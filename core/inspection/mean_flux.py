@@ -208,7 +208,7 @@ def selected_pixels(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
 def _of_counts(capture: Capture, counts: NDArray[Any]) -> Capture:
     """Return a capture of a row of pixels (col, bin), without truth and flux prior."""
     cube, images = counts[np.newaxis], capture.images(lambda _: None)
-    return replace(capture, cube=cube, **images, flux_prior=None)
+    return replace(capture, cube=cube, **images, flux_prior=None, groups=None)
 
 
 def _coarse(capture: Capture) -> Capture:

@@ -116,4 +116,5 @@ def _summed(capture: Capture, mask: NDArray[np.bool_]) -> Capture:
         source=f"{capture.source}; {n_pixels} pixels added",
         flux_prior=None,
         stated_flux=None,
+        groups=None,
     )

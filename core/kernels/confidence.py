@@ -22,7 +22,7 @@ _FEW_WINDOWS = 2  # of a pixel; more are computed for all delays of all pixels a
 
 
 @njit(**COMPILED)
-def _fill_highest(ratio, highest):  # type: ignore[no-untyped-def]
+def fill_highest(ratio, highest):  # type: ignore[no-untyped-def]
     """Fill `highest` (lane,) with the maximum over the rows of `ratio` (row, lane).
 
     Two rows at a time, by way of a second one: without AVX-512, storing where a number is larger
@@ -61,7 +61,7 @@ def _fill_evidence(b, prepared, depth, evidence):  # type: ignore[no-untyped-def
     for level in range(1, n_levels):
         fill_level(b, level, prepared, fired, armed, ratio)
         fill_flat(b, level, prepared, all_fired, all_unfired, offset)
-        _fill_highest(ratio.reshape(-1, lanes), highest)
+        fill_highest(ratio.reshape(-1, lanes), highest)
         total = np.zeros(lanes)
         for step in range(n_steps):
             for k in range(n_bins):
@@ -95,7 +95,7 @@ def _fill_densities(b, prepared, density):  # type: ignore[no-untyped-def]
     for level in range(1, n_levels):
         fill_level(b, level, prepared, fired, armed, ratio)
         fill_flat(b, level, prepared, all_fired, all_unfired, offset)
-        _fill_highest(ratio.reshape(-1, lanes), highest)
+        fill_highest(ratio.reshape(-1, lanes), highest)
         for i in range(lanes):
             top[i] = max(top[i], highest[i] + offset[i])
         # A few pixels at a time: their rows are far apart, and the cache holds few such lines.
@@ -113,7 +113,7 @@ def _fill_densities(b, prepared, density):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
+def add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
     """Add ``exp(ratio + offset)`` (step, bin, lane) to `density`, in units of ``exp(top)``.
 
     `density` is of shape (delay, lane), `offset` and `top` of shape (lane,); `top` becomes that of
@@ -121,7 +121,7 @@ def _add_level(ratio, offset, density, top):  # type: ignore[no-untyped-def]
     """
     n_delays, lanes = density.shape
     highest, kept, unit = np.empty((3, lanes), np.float32)
-    _fill_highest(ratio.reshape(-1, lanes), highest)
+    fill_highest(ratio.reshape(-1, lanes), highest)
     for i in range(lanes):
         previous = top[i]
         top[i] = max(previous, highest[i] + offset[i])
@@ -148,7 +148,7 @@ def _fill_density(b, prepared, ratio, offset, density, top):  # type: ignore[no-
         fill_level(b, level, prepared, fired, armed, ratio[at])
         fill_flat(b, level, prepared, all_fired, all_unfired, offset[at])
         offset[at] += prepared.log_share[level]
-        _add_level(ratio[at], offset[at], density, top)
+        add_level(ratio[at], offset[at], density, top)
     for d in range(n_delays):
         for i in range(lanes):
             density[d, i] *= prepared.depth[d]

@@ -123,7 +123,7 @@ def smoothed(density):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _correlate(taps, values, first, sums):  # type: ignore[no-untyped-def]
+def correlate(taps, values, first, sums):  # type: ignore[no-untyped-def]
     """Add ``Σ_j taps[j] values[d + first + j]`` to the sums of each d; (tap or bin, lane) each."""
     n_bins, lanes = values.shape
     begin, end = max(0, -first), n_bins - first - len(taps) + 1
@@ -142,7 +142,7 @@ def _correlate(taps, values, first, sums):  # type: ignore[no-untyped-def]
 
 @njit(**COMPILED)
 def _correlate_inside(taps, values, first, begin, end, sums):  # type: ignore[no-untyped-def]
-    """As `_correlate` from `begin` to `end`, a multiple of four apart, all of whose bins exist.
+    """As `correlate` from `begin` to `end`, a multiple of four apart, all of whose bins exist.
 
     Four by four, so that most operands stay in registers. One dimension and constant distances,
     since the compiler vectorises what it knows not to overlap.
@@ -207,8 +207,8 @@ def counts_of(b, prepared):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _fill_gain(b, level, node, prepared, gain):  # type: ignore[no-untyped-def]
-    """Fill `gain` (step, tap, lane) with what each count adds to ``T(d)``; see `fill_level`.
+def fill_log_gain(b, level, node, prepared, gain):  # type: ignore[no-untyped-def]
+    """Fill `gain` (step, tap, lane) with the logarithm that multiplies a count in ``T(d)``.
 
     `node` is the background relative to its mean.
     """
@@ -233,10 +233,19 @@ def _fill_gain(b, level, node, prepared, gain):  # type: ignore[no-untyped-def]
                 row[i] = met
     for step in range(n_steps):
         for tap in range(n_taps):
-            missed = prepared.echo_tail[step, tap] if prepared.n_pulses > 0 else 0.0
             for i in range(lanes):
                 # (1 - exp(-b - s)) / (1 - exp(-b)), without cancellation.
                 gain[step, tap, i] = log1p32(gain[step, tap, i] * unit[i])
+
+
+@njit(**COMPILED)
+def _fill_gain(b, level, node, prepared, gain):  # type: ignore[no-untyped-def]
+    """Fill `gain` (step, tap, lane) with what each count adds to ``T(d)``; see `fill_level`."""
+    n_steps, n_taps, lanes = gain.shape
+    fill_log_gain(b, level, node, prepared, gain)
+    for step in range(n_steps):
+        for tap in range(n_taps):
+            missed = prepared.echo_tail[step, tap] if prepared.n_pulses > 0 else 0.0
             for i in range(lanes):
                 gain[step, tap, i] += np.float32(missed * prepared.signal[level, b, i])
 
@@ -268,7 +277,7 @@ def fill_level(b, level, prepared, fired, armed, ratio):  # type: ignore[no-unty
     for node in range(n_nodes):
         _fill_gain(b, level, prepared.node[node], prepared, gain)
         for step in range(n_steps):
-            _correlate(gain[step], fired[node], prepared.first_tap, ratio[step])
+            correlate(gain[step], fired[node], prepared.first_tap, ratio[step])
 
 
 @njit(**COMPILED)

@@ -57,8 +57,10 @@ def fill_probability(photons):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
-    """Add `n_pulses` first-photon draws to `counts`, whose last element counts "no trigger".
+def _draw_pixel(fired_by, begin, end, key, guide, uniform, counts):  # type: ignore[no-untyped-def]
+    """Add the first-photon draws of the pulses from `begin` to before `end` to `counts`.
+
+    The last element of `counts` counts "no trigger".
 
     ``fired_by[k]`` is the probability of a trigger by the end of bin k; its last element, above 1,
     ends every search. The guide table holds the bin of the lowest number in each of its cells of
@@ -67,13 +69,13 @@ def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignor
     """
     n_cells = guide.size - 1
     guide[:] = 0
-    for end in range(fired_by.size - 1):
-        guide[np.int64(math.ceil(fired_by[end] * n_cells))] += np.uint32(1)
+    for each in range(fired_by.size - 1):
+        guide[np.int64(math.ceil(fired_by[each] * n_cells))] += np.uint32(1)
     for cell in range(n_cells):
         guide[cell + 1] += guide[cell]
-    done = 0
-    while done < n_pulses:
-        batch = min(uniform.size, n_pulses - done)
+    done = begin
+    while done < end:
+        batch = min(uniform.size, end - done)
         for i in range(batch):
             uniform[i] = uniform_at(key, done + i)
         for i in range(batch):
@@ -87,8 +89,8 @@ def _draw_pixel(fired_by, n_pulses, key, guide, uniform, counts):  # type: ignor
 
 
 @njit(**PARALLEL)
-def draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-def]
-    """Draw first-photon counts (pixel, bin) pulse by pulse."""
+def draw_pulses(triggered, begin, end, seed, cube):  # type: ignore[no-untyped-def]
+    """Add first-photon counts (pixel, bin) of the pulses from `begin` to before `end`."""
     n_pixels, n_bins = cube.shape
     for pixel in prange(n_pixels):
         fired_by = np.full(n_bins + 1, 2.0)
@@ -96,9 +98,9 @@ def draw_pulses(triggered, n_pulses, seed, cube):  # type: ignore[no-untyped-def
         guide = np.empty(_CELLS + 1, np.uint32)
         uniform = np.empty(64)
         counts = np.zeros(n_bins + 1, np.int64)
-        _draw_pixel(fired_by, n_pulses, pixel_key(seed, pixel), guide, uniform, counts)
+        _draw_pixel(fired_by, begin, end, pixel_key(seed, pixel), guide, uniform, counts)
         for k in range(n_bins):
-            cube[pixel, k] = counts[k]
+            cube[pixel, k] += counts[k]
 
 
 @njit(**PARALLEL)

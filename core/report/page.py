@@ -130,7 +130,7 @@ def page_of(
         *_fluxes(capture, capture_found, has_t_n),
         *_maps(capture, image, shown, scale, pixel, step),
         *_all_pixels(capture, capture_found, has_t_n),
-        *_pixel(capture, made_by, pixel_found),
+        *_pixel(capture, image, made_by, pixel_found),
         *cloud,
         *_reported(capture, image),
         *_accuracy(capture, image),
@@ -234,6 +234,7 @@ def _maps(
             f"{_hidden(image, shown)}{grey} The square marks the pixel below.",
         ),
         *_map_reported(capture, scale),
+        *_map_velocity(shown),
         (
             "Confidence",
             confidence,
@@ -271,6 +272,15 @@ def _map_reported(
     yield "Reported distance", capture.reported_range_m, of_sensor, caption
 
 
+def _map_velocity(shown: RangeImage) -> Iterator[tuple[str, Floats, ColorScale, str]]:
+    if shown.velocity is None or not shown.valid.any():
+        return
+    values = np.where(shown.valid, shown.velocity.values, np.nan)
+    limit = float(np.nanmax(np.abs(values))) or 1.0
+    scale = ColorScale("Radial velocity", shown.velocity.unit, -limit, limit, colors_of("viridis"))
+    yield "Radial velocity", values, scale, "Positive where the surface recedes."
+
+
 def _all_pixels(capture: Capture, report: CaptureReport, has_t_n: bool) -> Iterator[str]:
     acquisition, suggestion = capture.acquisition, report.suggestion
     begin_m, end_m = acquisition.bin_to_range_m(suggestion.gate).tolist()
@@ -286,7 +296,9 @@ def _all_pixels(capture: Capture, report: CaptureReport, has_t_n: bool) -> Itera
     yield _figure(drawn, "Histogram of the detections of all pixels over range", caption)
 
 
-def _pixel(capture: Capture, made_by: Provenance, report: PixelReport) -> Iterator[str]:
+def _pixel(
+    capture: Capture, image: RangeImage, made_by: Provenance, report: PixelReport
+) -> Iterator[str]:
     acquisition, row, col = capture.acquisition, report.row, report.col
     truth_m = None if capture.truth_range_m is None else float(capture.truth_range_m[row, col])
     inner, outer = report.interval_68_m, report.interval_95_m
@@ -308,6 +320,11 @@ def _pixel(capture: Capture, made_by: Provenance, report: PixelReport) -> Iterat
         ("68 % interval", _between(inner, capture, decimals)),
         ("95 % interval", _between(outer, capture, decimals)),
         ("Confidence", _number(report.confidence)),
+        *(
+            [("Radial velocity", _text(image.velocity.text_at(row, col)))]
+            if image.velocity is not None
+            else []
+        ),
         ("Detections", _number(int(report.counts.sum()))),
         ("Verdict", _text(f"{report.verdict.health}. {report.verdict.why}")),
     ]

@@ -72,8 +72,15 @@ class Method:
 
 
 def default_methods() -> list[Method]:
-    """Return every registered estimator with its default settings."""
-    return [Method(name, name, each.parameters()) for name, each in ESTIMATORS.items()]
+    """Return every registered estimator with its default settings.
+
+    But those that follow motion: these captures keep no pulses in order.
+    """
+    return [
+        Method(name, name, each.parameters())
+        for name, each in ESTIMATORS.items()
+        if not each.follows_motion
+    ]
 
 
 as_they_come = default_methods  # deprecated name, to be removed after the next release

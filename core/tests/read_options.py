@@ -22,4 +22,6 @@ EXAMPLES: dict[str, Any] = {
     "no_trigger": -1,
     "first_detections": 3,
     "records": (3, 7),
+    "pulse_groups": 4,
+    "pulse_rate_hz": 2e4,
 }

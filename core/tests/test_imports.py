@@ -16,7 +16,7 @@ PACKAGE = Path(core.__file__).parent
 ROOMS = (
     {"kernels", "checks", "deprecation", "notebook", "scripts", "typesetting", "version"},
     {"parameters", "acquisition"},
-    {"trigger", "effects", "geometry", "labels", "metrics", "tracking_parameters"},
+    {"trigger", "effects", "geometry", "labels", "metrics", "pulse_groups", "tracking_parameters"},
     {"scene", "tracking", "capture"},
     {"simulation", "reductions", "inference"},
     {"corrections", "cost", "photon_budget"},

@@ -33,6 +33,9 @@ FILE = Path(__file__).with_suffix(".npz")
 FINGERPRINT = "fingerprint"  # key of the description of the machine
 SAMPLE = Path(core.__file__).parents[1] / "assets" / "sample_capture.npz"
 
+METHODS = [name for name, each in core.ESTIMATORS.items() if not each.follows_motion]
+"""Methods with cases; without groups of pulses, those that follow motion are the likelihood."""
+
 Answers = Iterable[tuple[str, Any]]
 """Names, and values of any type that contain numbers."""
 
@@ -159,7 +162,7 @@ def estimates(name: str, _: Path) -> Answers:
     capture = CAPTURES[name]()
     yield "capture", capture
     known = capture.signal is not None and capture.background is not None
-    for method in core.ESTIMATORS:
+    for method in METHODS:
         if known or method != "oracle":
             yield method, core.estimate(capture, method, whole_bins(method))
 
@@ -349,7 +352,7 @@ def scene_files(folder: Path) -> Answers:
 
 CASES: dict[str, Callable[[Path], Answers]] = {
     **{f"estimate: {name}": partial(estimates, name) for name in CAPTURES},
-    **{f"settings: {method}": partial(settings, method) for method in core.ESTIMATORS},
+    **{f"settings: {method}": partial(settings, method) for method in METHODS},
     "tracking signals": tracking,
     "reductions": reductions,
     "corrections and parts": corrections,

@@ -134,6 +134,7 @@ def _pixel_facts(found: Inspected, unit: str) -> list[Fact]:
     facts = [
         *estimate_facts(pixel, along, has_truth),
         *_reported_facts(answer, pixel),
+        *_velocity_facts(answer, pixel),
         ("Pixel", place, "Row and column."),
     ]
     counts, help = count(pixel.counts), "Counts in the histogram of this pixel"
@@ -154,6 +155,15 @@ def _reported_facts(answer: Answer, pixel: Pixel) -> list[Fact]:
         ("Reported", number(reported_m, "m", decimals=decimals), "Distance that the sensor found."),
         ("Estimate − reported", difference, "Estimate minus the distance that the sensor found."),
     ]
+
+
+def _velocity_facts(answer: Answer, pixel: Pixel) -> list[Fact]:
+    """Return the radial velocity of a pixel with its interval, of methods that estimate it."""
+    velocity, row, col = answer.run.image.velocity, pixel.row, pixel.col
+    if velocity is None or not answer.run.image.valid[row, col]:
+        return []
+    help = "Radial velocity with its 95 % interval; positive if the surface recedes."
+    return [("Velocity", velocity.text_at(row, col), help)]
 
 
 def _region_facts(found: Inspected, unit: str) -> list[Fact]:

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import param
 
-from app.model.capture_defaults import enter
+from app.model.capture_defaults import enter, offer_kinds
 from app.model.restore import parameters_of, request_of
 from app.model.state import State
 from app.model.store import (
@@ -112,6 +112,8 @@ class CurrentEstimate:
         self._take_reduction(answer)
         if not same_view(answer.request, previous.request):
             enter(self._state, answer, previous)
+        else:
+            offer_kinds(self._state, answer)  # those of the method
         with self._tasks.hold():  # one message for all consequences
             self._failures.clear(no_estimates(answer))
             self._end()

@@ -37,7 +37,7 @@ from core.capture import Capture
 from core.checks import require
 from core.io.readers.dense import capture_of, count_dtype, description_of, with_guesses
 from core.io.readers.guards import require_fits
-from core.io.readers.options import TRUTH_HINT, ReadOptions
+from core.io.readers.options import IN_ORDER, TRUTH_HINT, ReadOptions
 from core.io.readers.quantities import time_text
 
 NATIVE_BIN_S = 8e-12
@@ -82,6 +82,7 @@ def arrivals_capture(
     _require_times(times, pixel, shape, name)
     request.refuse(["shape", "no_trigger"], "lists of photons lie in pixels already")
     request.refuse(["records"], "lists of photons are no sequence of records")
+    request.refuse(IN_ORDER, "lists of photons keep no order of the pulses")
     if request.first_detections is not None:
         kept = _rank(pixel) < request.first_detections
         times, pixel = times[kept], pixel[kept]

@@ -18,7 +18,7 @@ from core.acquisition import MOST_BINS, Acquisition, Pulse
 from core.capture import COUNT_TYPES, Capture, Detection
 from core.checks import printable, require
 from core.io.readers.guards import require_fits
-from core.io.readers.options import TRUTH_HINT, ReadOptions
+from core.io.readers.options import IN_ORDER, TRUTH_HINT, ReadOptions
 from core.io.readers.pulse_guess import guessed_pulse
 from core.io.readers.quantities import time_text
 
@@ -164,6 +164,7 @@ def dense_capture(
     request.refuse(["first_detections"], "a histogram cube keeps no order of its photons")
     request.refuse(["shape", "no_trigger"], "a histogram cube has its own pixels")
     request.refuse(["records"], "the file holds no sequence of records")
+    request.refuse(IN_ORDER, "a histogram cube keeps no order of its pulses")
     agrees = request.n_bins in (None, n_bins)
     require("n_bins", request.n_bins, agrees, f"{n_bins}, the cube's last axis, or None")
     bin_width_s = request.bin_width_s or bin_width_s or 1e-9

@@ -7,7 +7,8 @@ while the number of bins is still unknown, a stretch of `STRETCH` values takes 4
 Each frame is one pulse, and each pixel triggers once in it or never: these are first photons, as
 many pulses as frames. Without ``n_bins`` the gate ends with the last trigger, which may lie in one
 of the first 65,536 bins: a larger number more likely stands for no trigger. Each frame is a record:
-``records`` counts some of them, in the gate of all.
+``records`` counts some of them, in the gate of all. With ``pulse_groups`` the order of the pulses
+is kept in so many groups, each with a cube of its own, all of which must fit.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from core.io.readers.frame_guess import resembles_frames
 from core.io.readers.guards import decoding, require_fits
 from core.io.readers.options import AmbiguousError, ReadOptions
 from core.io.readers.records import chosen_records, described
+from core.pulse_groups import PulseGroups, group_sizes
 
 AXES = ("pulse", "row", "col")
 STRETCH = 2**20
@@ -131,13 +133,29 @@ def frames_capture(
     if first_bin is None and no_trigger == 0:
         first_bin, guessed = 1, [*guessed, "1 stands for the first bin"]
     size = shape[1], shape[2], request.n_bins
-    cube = _count_triggers(stretches, size, chosen, no_trigger, name, first_bin or 0)
+    if request.pulse_groups is None:
+        request.refuse(["pulse_rate_hz"], "it needs pulse_groups")
+    sizes = group_sizes(len(chosen), request.pulse_groups or 1)
+    counts = _count_triggers(stretches, size, chosen, no_trigger, name, first_bin or 0, len(sizes))
     detection = request.detection or "first"
     known = replace(
-        request, n_pulses=len(chosen), no_trigger=None, detection=detection, records=None
+        request,
+        n_pulses=len(chosen),
+        no_trigger=None,
+        detection=detection,
+        records=None,
+        pulse_groups=None,
+        pulse_rate_hz=None,
     )
+    in_groups = None if request.pulse_groups is None else counts
+    cube = counts[0] if in_groups is None else _sum_of_groups(counts)
     capture = dense_capture(cube, origin, known, guessed=guessed, bin_width_s=bin_width_s)
-    return replace(capture, n_records=n_frames)
+    if in_groups is None:
+        return replace(capture, n_records=n_frames)
+    if request.stop_s is not None:  # which reverses the bins
+        in_groups = np.ascontiguousarray(in_groups[..., ::-1])
+    groups = PulseGroups(in_groups, sizes, request.pulse_rate_hz)
+    return replace(capture, n_records=n_frames, groups=groups)
 
 
 def require_counts(array: NDArray[Any], name: str, axes: str | None) -> None:
@@ -193,15 +211,16 @@ def _count_triggers(
     no_trigger: int,
     name: str,
     first_bin: int,
+    n_groups: int,
 ) -> NDArray[np.unsignedinteger]:
-    """Return histograms (row, col, bin) of the chosen frames.
+    """Return histograms (group, row, col, bin) of groups of the chosen frames.
 
     Their `size` is that of the frames and the number of bins, by default up to the last trigger of
     all frames.
     """
     n_rows, n_cols, n_bins = size
     dtype = count_dtype(len(chosen))
-    cube = _more_bins(np.zeros((n_rows, n_cols, 0), dtype), n_bins or 0, name)
+    cube = _more_bins(np.zeros((n_groups, n_rows, n_cols, 0), dtype), n_bins or 0, name)
     end = first_bin + (n_bins or MOST_GUESSED_BINS)
     for start, frames in stretches:
         fired = frames != no_trigger
@@ -217,30 +236,41 @@ def _count_triggers(
         if not numbers.size:
             continue
         last = int(numbers.max()) - first_bin
-        if last >= cube.shape[2]:
+        if last >= cube.shape[3]:
             cube = _more_bins(cube, last + 1, name)
         inside = slice(*(max(edge - start[0], 0) for edge in (chosen.start, chosen.stop)))
         fired = fired[inside]
         if len(fired) < len(frames):
             numbers = frames[inside][fired]
         rows, cols = (k + np.arange(n) for k, n in zip(start[1:], frames.shape[1:], strict=True))
-        lowest = (rows[:, None] * n_cols + cols) * cube.shape[2]
+        lowest = (rows[:, None] * n_cols + cols) * cube.shape[3]
+        if n_groups > 1:
+            order = start[0] + np.arange(len(frames))[inside] - chosen.start
+            group = order * n_groups // len(chosen)
+            lowest = group[:, None, None] * cube[0].size + lowest
         place = np.broadcast_to(lowest, fired.shape)[fired] + numbers.astype(np.int64) - first_bin
         np.add.at(cube.reshape(-1), place, dtype.type(1))
-    require(f"triggers of {name}", 0, cube.shape[2] > 0, "n_bins, or frames in which a pixel fired")
+    require(f"triggers of {name}", 0, cube.shape[3] > 0, "n_bins, or frames in which a pixel fired")
     return cube
 
 
 def _more_bins(
     cube: NDArray[np.unsignedinteger], n_bins: int, name: str
 ) -> NDArray[np.unsignedinteger]:
-    n_rows, n_cols, before = cube.shape
+    *others, before = cube.shape
     remedy = "as no_trigger the value that stands where nothing fired"
+    if others[0] > 1:
+        remedy += ", or fewer pulse_groups"
     what = f"the cube of {name}, {n_bins:,} bins"
-    require_fits(what, n_rows * n_cols * n_bins * cube.dtype.itemsize, remedy)
-    wider = np.zeros((n_rows, n_cols, n_bins), cube.dtype)
-    wider[:, :, :before] = cube
+    require_fits(what, prod(others) * n_bins * cube.dtype.itemsize, remedy)
+    wider = np.zeros((*others, n_bins), cube.dtype)
+    wider[..., :before] = cube
     return wider
+
+
+def _sum_of_groups(counts: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
+    """Return the counts (row, col, bin) of all groups."""
+    return np.asarray(counts.sum(axis=0, dtype=counts.dtype))
 
 
 def boxes(shape: tuple[int, ...], most: int) -> Iterator[tuple[slice, ...]]:

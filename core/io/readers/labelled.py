@@ -45,7 +45,7 @@ from core.io.readers.layout import (
     require_pulse_in_gate,
     stated_flux,
 )
-from core.io.readers.options import ReadOptions
+from core.io.readers.options import IN_ORDER, ReadOptions
 from core.io.readers.quantities import UNITS_S as TIME_UNITS_S
 from core.io.readers.sample import sample_of
 from core.io.readers.stored import CLASSIC_SIGNATURES, HDF5_SIGNATURE, Stored, arrays, choose
@@ -350,6 +350,7 @@ def describe(
     request.refuse(["time_unit_s", "first_detections"], "labelled counts have bins")
     request.refuse(["shape", "no_trigger"], "labelled counts have axes")
     request.refuse(["records"], "labelled counts are no sequence")
+    request.refuse(IN_ORDER, "labelled counts keep no order of the pulses")
     n_bins, stop_s = counts.sizes["bin"], request.stop_s
     require("n_bins", request.n_bins, request.n_bins in (None, n_bins), f"{n_bins} or None")
     known = completed(request, counts.attrs)

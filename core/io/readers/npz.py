@@ -19,6 +19,9 @@ field                 shape           meaning
 ``stated_sbr``, ...   scalars         fields of `core.capture.StatedFlux`; may be absent
 ``detection``         text            ``"first"`` or ``"all"``, see `core.capture.Detection`
 ``source``            text            where the capture came from; may be absent
+``group_counts``      (group, ...)    cubes of successive groups of pulses, in order; may be absent
+``group_pulses``      (group,)        pulses of each group
+``pulse_rate_hz``     scalar          pulses per second, with groups; may be absent
 ====================  ==============  ==========================================================
 
 Text is an array of one unicode string. Where timing or pulse are absent they are guessed: bins of
@@ -33,6 +36,7 @@ accompany them. Frames that are stored without compression may be larger than me
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from math import prod
@@ -64,10 +68,20 @@ from core.io.readers.maps import Map
 from core.io.readers.npy import frames_in, read_array, read_header
 from core.io.readers.options import ReadOptions, choose_variable
 from core.labels import fields_of, stated_fields
+from core.pulse_groups import PulseGroups
 
 FORMAT = "firstphoton-capture-1"
 
-_FIELDS = (*TIMING, *PULSE, "format", "detection", "source", "no_trigger", "background")
+_FIELDS = (
+    *TIMING,
+    *PULSE,
+    "format",
+    "detection",
+    "source",
+    "no_trigger",
+    "background",
+    "pulse_rate_hz",
+)
 _MOST_BYTES = 2**16  # of a field that is one number or one text
 _MOST_BYTES_OF_SAMPLES = 2**23 + 2**12
 
@@ -84,6 +98,12 @@ def fields(capture: Capture) -> dict[str, NDArray[Any]]:
         "background": capture.background,
         **stated_fields(capture),
     }
+    if capture.groups is not None:
+        kept |= {
+            "group_counts": capture.groups.counts,
+            "group_pulses": capture.groups.n_pulses,
+            "pulse_rate_hz": capture.groups.pulse_rate_hz,
+        }
     return {name: np.asarray(value) for name, value in kept.items() if value is not None}
 
 
@@ -138,7 +158,20 @@ def read(path: Path, request: ReadOptions) -> Capture:
             signal=_image(archive, "signal", capture.shape),
             background=number(known, "background"),
             stated_flux=stated,
+            groups=capture.groups or _groups(archive, known),
         )
+
+
+def _groups(archive: ZipFile, known: Mapping[str, Any]) -> PulseGroups | None:
+    """Read the groups of pulses of an archive, if it has any."""
+    if "group_counts.npy" not in archive.namelist():
+        return None
+    counts, n_pulses = (_array(archive, name) for name in ("group_counts", "group_pulses"))
+    fits = n_pulses.ndim == 1 and n_pulses.dtype.kind in "iu"
+    found = f"{n_pulses.dtype} array of shape {n_pulses.shape}"
+    require("group_pulses", found, fits, "whole numbers, one for each group")
+    rate_hz = number(known, "pulse_rate_hz")
+    return PulseGroups(counts, tuple(n_pulses.tolist()), rate_hz)
 
 
 def maps(path: Path) -> list[Map]:

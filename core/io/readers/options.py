@@ -26,6 +26,9 @@ from core.io.readers.quantities import (
     time_as_typed,
 )
 
+MOST_PULSE_GROUPS = 1000
+"""Largest number of groups of pulses; each has a cube of its own."""
+
 Check = Callable[[str, Any], None]
 """Called with the name of a field and its value; raises ``ValueError``."""
 
@@ -143,6 +146,13 @@ _RECORDS = Kind(
     _required("a record from 0, or the first and the last one", _are_records),
     _records_as_typed,
 )
+_RATE = Kind(
+    "float",
+    float,
+    "pulses per second such as 20e3",
+    _required("pulses per second, positive", lambda value: 0 < value < np.inf),
+    lambda rate_hz: repr(float(rate_hz)),
+)
 _PULSE = Kind(
     "Pulse",
     lambda text: Pulse.gaussian(parsed_time(text)),
@@ -247,6 +257,20 @@ class ReadOptions:
         "such as 3-7. A frame of raw frames or of a scan is a record, and so is each file of a "
         "sequence such as 'run_*.npz'.",
     )
+    pulse_groups: int | None = _option(
+        "Groups of pulses",
+        "pulse-groups",
+        _count(MOST_PULSE_GROUPS),
+        "Number of groups in which the order of the pulses is kept, such as 40, for surfaces that "
+        "move; only for raw frames, and for a sequence of files, each of which is in one group.",
+    )
+    pulse_rate_hz: float | None = _option(
+        "Pulse rate (Hz)",
+        "pulse-rate",
+        _RATE,
+        "Pulses per second, such as 20e3, from which velocities in metres per second follow; only "
+        "with groups of pulses.",
+    )
 
     def __post_init__(self) -> None:
         for name, option in reading_options().items():
@@ -311,6 +335,10 @@ class ReadOptions:
         """Raise ``ValueError`` if a field is specified that does not apply to the file."""
         for name in names:
             require(name, getattr(self, name), getattr(self, name) is None, f"None: {why}")
+
+
+IN_ORDER = ("pulse_groups", "pulse_rate_hz")
+"""Options of `ReadOptions` for files that keep the order of the pulses."""
 
 
 class AmbiguousError(ValueError):

@@ -2,7 +2,8 @@
 
 A path with a pattern in its last part, such as ``runs/run_*.npz``, stands for the files that match
 it, numbers in their order: ``run_2`` comes before ``run_10``. They must agree in size, timing and
-kind of detection. The pulse is that of the first one that is read.
+kind of detection. The pulse is that of the first one that is read. With ``pulse_groups`` the order
+of the files is kept in so many groups (`core.pulse_groups`); each must state its pulses.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ import numpy as np
 from core.capture import IMAGES, Capture, CaptureError
 from core.checks import refusing, require
 from core.io.readers.dense import whole_counts
+from core.io.readers.guards import require_fits
 from core.io.readers.options import ReadOptions
 from core.io.readers.records import chosen_records, described
+from core.pulse_groups import PulseGroups, group_sizes
 
 _PATTERN = re.compile(r"[*?\[]")
 
@@ -73,17 +76,65 @@ def read_files(
     read : callable
         Reads one file.
     """
-    chosen, one = chosen_records(request, len(files)), replace(request, records=None)
+    chosen = chosen_records(request, len(files))
+    one = replace(request, records=None, pulse_groups=None, pulse_rate_hz=None)
     total: Capture | None = None
-    for file in files[chosen.start : chosen.stop]:
+    in_order: _InOrder | None = None
+    if request.pulse_groups is None:
+        request.refuse(["pulse_rate_hz"], "it needs pulse_groups")
+    for order, file in enumerate(files[chosen.start : chosen.stop]):
         with refusing(file, CaptureError):
-            found = read(file, one)
+            found = replace(read(file, one), groups=None)
             total = found if total is None else _sum(total, found)
+            if request.pulse_groups is not None:
+                in_order = in_order or _InOrder(request, len(chosen), found)
+                in_order.add(order, found)
         one = replace(one, pulse=total.pulse)
     assert total is not None
+    if in_order is not None:
+        total = replace(total, groups=in_order.groups)
     source = f"{described(chosen, len(files), 'file')}; {total.source}"
     stated = total.stated_flux if len(chosen) == 1 else None
     return replace(total, source=source, n_records=len(files), stated_flux=stated)
+
+
+class _InOrder:
+    """Counts of a sequence of files in groups.
+
+    Parameters
+    ----------
+    request : ReadOptions
+        With the number of groups.
+    n_files : int
+    like : Capture
+        One of the files.
+
+    Raises
+    ------
+    ValueError
+        If there are more groups than files, or the groups take too much memory.
+    """
+
+    def __init__(self, request: ReadOptions, n_files: int, like: Capture) -> None:
+        n_groups = len(group_sizes(n_files, request.pulse_groups or 1))
+        n_bytes = n_groups * like.cube.size * 4
+        require_fits(f"{n_groups} groups of pulses", n_bytes, "fewer pulse_groups")
+        self._counts = np.zeros((n_groups, *like.cube.shape), np.uint32)
+        self._n_pulses = [0] * n_groups
+        self._rate_hz, self._n_files = request.pulse_rate_hz, n_files
+
+    def add(self, order: int, capture: Capture) -> None:
+        """Add a file, counted from 0; it must state its pulses."""
+        group = order * len(self._n_pulses) // self._n_files
+        n_pulses = capture.acquisition.n_pulses
+        require("n_pulses", n_pulses, n_pulses is not None, "the pulses of a file, for groups")
+        self._counts[group] += capture.cube
+        self._n_pulses[group] += n_pulses or 0
+
+    @property
+    def groups(self) -> PulseGroups:
+        """The groups of all files."""
+        return PulseGroups(self._counts, tuple(self._n_pulses), self._rate_hz)
 
 
 def _sum(total: Capture, one: Capture) -> Capture:

@@ -104,13 +104,17 @@ def save_capture(
     Raises
     ------
     ValueError
-        If the name has another ending.
+        If the name has another ending, or the capture has groups of pulses, which only ``.npz``
+        keeps.
     FileExistsError
         If the file exists and is not to be replaced.
     OSError
         If the folder cannot be written; an older file is then left as it was.
     """
     path, suffix = _path_and_suffix(path, CAPTURE_SUFFIXES)
+    if suffix != ".npz" and capture.groups is not None:
+        n_groups = f"{len(capture.groups.counts)} groups of pulses"
+        require("groups", n_groups, False, "a name ending in .npz, or a capture without groups")
     if suffix == ".zarr":
         with whole_folder(path, overwrite=overwrite) as folder:
             netcdf.write_folder(capture.to_xarray(), folder)

@@ -131,6 +131,13 @@ class Product:
         return {} if self.p_value is None else {P_VALUE: self.p_value}
 
     @property
+    def velocity_columns(self) -> dict[str, NDArray[np.float64]]:
+        """Radial velocities, if the method estimates them, by name."""
+        velocity, valid = self.image.velocity, self.image.valid
+        known = {} if velocity is None else velocity.planes(valid)
+        return {name: plane.values for name, plane in known.items()}
+
+    @property
     def planes(self) -> dict[str, Plane]:
         """Images by name."""
         shown, own = dict(self.shown), self.image.planes

@@ -33,8 +33,8 @@ ROWS_AT_ONCE = 2**11
 def write(product: Product, file: BinaryIO) -> None:
     """Write row, col, range_m, confidence, counts and valid (1 or 0) of each pixel.
 
-    If the product has intervals, range_low_m, range_high_m and those with 68 follow range_m; if it
-    has p-values, fit_p_value is the last column.
+    If the product has intervals, range_low_m, range_high_m and those with 68 follow range_m; radial
+    velocities, if it has them, follow valid; if it has p-values, fit_p_value is the last column.
     """
     image = product.image
     row, col = map(np.asarray, np.indices(image.range_m.shape))
@@ -46,6 +46,7 @@ def write(product: Product, file: BinaryIO) -> None:
         "confidence": image.confidence,
         "counts": product.capture.counts,
         "valid": image.valid.astype(int),
+        **product.velocity_columns,
         **product.p_value_columns,
     }
     ranges = ("range_m", *product.interval_columns)

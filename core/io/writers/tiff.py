@@ -1,4 +1,5 @@
-"""TIFF: pages of 32-bit floats: images that the product adds, range, confidence, counts, intervals.
+"""TIFF: pages of 32-bit floats: images that the product adds, range, confidence, counts, intervals,
+radial velocities.
 
 Ranges are exact to 6e-8 of themselves, counts up to 2**24. Each page has its name (the tag
 PageName), its meaning and unit (ImageDescription, and for GIS the tags of GDAL), and as tags of
@@ -28,7 +29,8 @@ def write(product: Product, file: BinaryIO) -> None:
 
     planes = product.planes
     with TiffWriter(file) as pages:
-        for name in dict.fromkeys((*product.shown, *PAGES, *product.interval_columns)):
+        further = (*product.interval_columns, *product.velocity_columns)
+        for name in dict.fromkeys((*product.shown, *PAGES, *further)):
             plane = planes[name]
             tags = {_PAGE_NAME: name, _GDAL_METADATA: _gdal_metadata(name, plane, product)}
             if np.isnan(plane.values).any() or name == "range_m":

@@ -82,6 +82,7 @@ def _first_rows(capture: Capture) -> Capture:
         cube=capture.cube[:rows].copy(),
         **capture.images(lambda _: None),
         flux_prior=flux_prior_of(capture),
+        groups=None,
     )
     flux_model_of(part)
     return part

@@ -167,6 +167,7 @@ def _with_counts(capture: Capture, counts: NDArray[np.unsignedinteger]) -> Captu
         cube=counts[np.newaxis],
         **capture.images(lambda _: None),
         flux_prior=flux_prior_of(capture),
+        groups=None,
     )
 
 

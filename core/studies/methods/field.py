@@ -39,7 +39,9 @@ _WALL_BIN = 4000.0
 WITHIN_M = 0.03, 0.15
 
 GAUSSIAN = Pulse.gaussian(45 * NATIVE_BIN_S)
-METHODS = tuple(name for name in ESTIMATORS if name != "oracle")  # the true flux is unknown
+METHODS = tuple(
+    name for name, each in ESTIMATORS.items() if not (each.knows_flux or each.follows_motion)
+)
 TUNED = "tracking, tuned"
 """Tracking with settings that are chosen for each capture (`core.tuned`)."""
 

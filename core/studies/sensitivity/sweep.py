@@ -57,6 +57,9 @@ BASES = (0.06, 0.1, 0.2, 0.5, 1.0)
 
 SEED = 2000  # not used by the tables or by the search for the preset
 
+METHODS = {name: each for name, each in ESTIMATORS.items() if not each.follows_motion}
+"""Methods whose settings are swept; those that follow motion need pulses in order."""
+
 
 @dataclass(frozen=True, eq=False)
 class Point:
@@ -207,7 +210,7 @@ def scene_sweeps(progress: Callable[[], None] = lambda: None) -> list[Sweep]:
     for parameter, values in SCENE_VALUES.items():
         for value in values:
             for sbr in BASES:
-                methods = [method for method in ESTIMATORS if base_sbr(method) == sbr]
+                methods = [method for method in METHODS if base_sbr(method) == sbr]
                 if not methods:
                     continue
                 changed: dict[str, Any] = {"background": SIGNAL / sbr, parameter: value}
@@ -245,7 +248,7 @@ def numbers() -> list[tuple[str, str, Number, Any]]:
     """Return method, field, specification and default of every numeric setting."""
     return [
         (method, field.name, spec, field.default)
-        for method, each in ESTIMATORS.items()
+        for method, each in METHODS.items()
         for field in fields(each.parameters)
         if isinstance(spec := spec_of(field), Number)
     ]

@@ -434,6 +434,7 @@ def _middle(capture: Capture) -> Capture:
         capture,
         cube=np.ascontiguousarray(capture.cube[rows, cols]),
         **capture.images(lambda image: image[rows, cols]),
+        groups=capture.groups and capture.groups.mapped(lambda cube: cube[rows, cols]),
         source=f"{capture.source}; the middle {sides[0]} x {sides[1]} pixels",
     )
 
