@@ -28,6 +28,7 @@ def warm_up() -> None:
     # The image posterior uses neighbours only where they agree.
     wall = scenes["wall"](16)
     estimate(simulate(wall, wall.acquisition, Flux(sbr=1.0)), "image_posterior")
+    estimate(small, "peak", returns=2)
     images = {method: estimate(small, method) for method in ESTIMATORS}
     fit_of(small)
     pixel_report(small, images["tracking"], 0, 0)  # `scipy.signal` takes a second to import

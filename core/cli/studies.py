@@ -11,7 +11,17 @@ from typing import Any
 from core.cli.options import add_processes, show_progress, whole_from_to
 from core.cli.results import CheckFailed, add_results, publish
 from core.io.readers import read_capture
-from core.studies.methods import alarms, calibration, field, fit, neighbours, tuned, tuning, uniform
+from core.studies.methods import (
+    alarms,
+    calibration,
+    field,
+    fit,
+    neighbours,
+    returns,
+    tuned,
+    tuning,
+    uniform,
+)
 from core.studies.outputs import Table, as_markdown
 from core.studies.paper import figures as paper
 from core.studies.paper import page, recommend
@@ -42,6 +52,12 @@ def add(commands: Any) -> None:
 
     command = _added(
         commands, "neighbours", "compare methods that use neighbouring pixels", _neighbours
+    )
+    _add_count(command, "--seeds", 2, MAX_SEEDS, 10)
+    add_processes(command)
+
+    command = _added(
+        commands, "returns", "find two surfaces in a pixel, and count false ones", _returns
     )
     _add_count(command, "--seeds", 2, MAX_SEEDS, 10)
     add_processes(command)
@@ -142,6 +158,10 @@ def _uniform(chosen: argparse.Namespace) -> None:
 
 def _neighbours(chosen: argparse.Namespace) -> None:
     publish(neighbours.tables(range(chosen.seeds), chosen.processes), chosen)
+
+
+def _returns(chosen: argparse.Namespace) -> None:
+    publish(returns.tables(range(chosen.seeds), chosen.processes), chosen)
 
 
 def _tuning(chosen: argparse.Namespace) -> None:

@@ -257,7 +257,7 @@ class Overview:
 
 def as_image(ranged: xr.Dataset) -> tuple[Overview, RangeImage]:
     """Convert a computed dataset of `estimate_large` to the arguments of `core.save_image`."""
-    images = {name: ranged[name].to_numpy() for name in IMAGES}
+    images: dict[str, Any] = {name: ranged[name].to_numpy() for name in IMAGES}
     counts = images.pop("counts").astype(np.int64)
     known: dict[str, Any] = {each.name: ranged.attrs.get(each.name) for each in fields(Acquisition)}
     overview = Overview(
