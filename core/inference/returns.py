@@ -27,8 +27,10 @@ from numpy.typing import NDArray
 from core.acquisition import Floats, Pulse
 from core.capture import Capture, cached_per_capture
 from core.checks import require
+from core.inference.background import EchoFree, fitted_shape
 from core.inference.flux import flux_prior_of
 from core.inference.further_echo import further_echo_log_odds, probability_within
+from core.inference.likelihood import rate_and_n_armed
 from core.inference.posterior import TOLERANCE_BINS
 from core.kernels.parallel import entering
 from core.kernels.returns import EchoModel, fill_returns
@@ -47,6 +49,8 @@ _LEAST_FALSE_RETURN = 1e-3  # that so many pixels resolve
 _LEAST_GAIN = 2.0  # smaller gains are not computed
 _BIN_COST = 100  # counts that other kernels process in the time of one
 _PIXELS_AT_ONCE = 256
+_SHAPE_PIXELS = 512  # from which the shape of the background is estimated
+_SURE_GAIN = 6.0  # in log likelihood, for which an echo is no background
 
 _MEANINGS = (
     ("range_m", "m", "range of return"),
@@ -289,7 +293,11 @@ def _gains_of_one_surface(capture: Capture) -> Floats:
 
 
 def fitted_echoes(
-    capture: Capture, counts: NDArray[np.unsignedinteger], most: int, least: float
+    capture: Capture,
+    counts: NDArray[np.unsignedinteger],
+    most: int,
+    least: float,
+    background: Floats | None = None,
 ) -> Echoes:
     """Fit echoes of a capture's pulse to histograms of its kind.
 
@@ -301,11 +309,13 @@ def fitted_echoes(
         Echoes of a pixel.
     least : float
         Gain in log likelihood from which one more is accepted.
+    background : ndarray, shape (bin,), optional
+        Share of the background in each bin; that of the capture if None.
     """
     flat = pixel_counts(counts)
     values, gain = np.zeros((len(flat), 1 + 2 * most)), np.zeros((len(flat), most))
     number = np.zeros(len(flat), np.intp)
-    model = echo_model(capture)
+    model = echo_model(capture, background)
     with entering(flat.size * _BIN_COST):
         fill_returns(flat, model, float(least), values, gain, number)
     echo, many = np.arange(most), number[:, np.newaxis]
@@ -324,24 +334,46 @@ def pixel_counts(counts: NDArray[np.unsignedinteger]) -> NDArray[np.uint32]:
     return flat
 
 
-def echo_model(capture: Capture) -> EchoModel:
-    """Return what the kernels need to know of a capture."""
+def echo_model(capture: Capture, background: Floats | None = None) -> EchoModel:
+    """Return what the kernels need to know of a capture; `background` as for `fitted_echoes`."""
     n_bins, width_s = capture.acquisition.n_bins, capture.acquisition.bin_width_s
     echo, first = capture.pulse.taps(n_bins, width_s, np.linspace(0.0, 1.0, _STEPS + 1))
     n_pulses = capture.gated_pulses
     return EchoModel(
         echo,
         first,
-        _background_shares(capture),
+        _background_shares(capture) if background is None else background,
         n_pulses is not None,
         float(n_pulses or 1),
         resolved_bins(capture),
     )
 
 
+@cached_per_capture
 def _background_shares(capture: Capture) -> Floats:
-    """Share of the background in each bin."""
-    return np.asarray(flux_prior_of(capture).relative_background / capture.acquisition.n_bins)
+    """Share of the background in each bin.
+
+    The shape of the flux model takes surfaces that all pixels see for background. Where it is not
+    uniform, it is estimated again from the bins that hold none of the echoes fitted to a sample of
+    the pixels.
+    """
+    n_bins = capture.acquisition.n_bins
+    uniform = np.full(n_bins, 1 / n_bins)
+    if flux_prior_of(capture).background_shape is None:
+        return uniform
+    seen = np.flatnonzero(capture.counts)
+    pixels = np.sort(np.random.default_rng(0).permutation(seen)[:_SHAPE_PIXELS])
+    counts = capture.cube.reshape(-1, n_bins)[pixels]
+    found = fitted_echoes(capture, counts, MOST_RETURNS, _SURE_GAIN, uniform)
+    echo, first = capture.pulse.taps(n_bins, capture.acquisition.bin_width_s)
+    after = np.arange(n_bins) - np.floor(found.delay)[..., np.newaxis]
+    there = (np.arange(MOST_RETURNS) < found.number[:, np.newaxis])[..., np.newaxis]
+    free = ~(there & (after >= first - 1) & (after <= first + echo.size)).any(axis=1)
+    armed = rate_and_n_armed(counts.astype(float), capture.gated_pulses)[1]
+    expected = armed * found.background[:, np.newaxis] * uniform
+    sums = (np.where(free, each, 0.0).sum(axis=0) for each in (counts, expected, armed))
+    shape = fitted_shape(EchoFree(*sums))
+    return uniform if shape is None else shape / n_bins
 
 
 def _confidence(
