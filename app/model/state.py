@@ -271,6 +271,7 @@ FIT = "Goodness of fit"
 
 MAPS = (
     *("Estimate", "Truth", "Error", "Reported", "Confidence", "Counts", "Peak", "Fired", "SBR"),
+    "Returns",
     FIT,
 )
 UNITS = ("bins", "ns", "m")

@@ -240,6 +240,7 @@ def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
         "range_m": report.answer_m,
         "confidence": report.confidence,
         "interval": report.interval_text,
+        "surfaces": report.surfaces_text,
         **_interval_facts(report),
         **_reported_pixel_facts(capture, report),
         **_flux_facts(report),

@@ -159,6 +159,14 @@ def test_three_surfaces_are_found() -> None:
     assert abs(returns.strength.mean() - 0.1) < 0.01
 
 
+def test_the_map_of_returns_counts_surfaces() -> None:
+    capture, _ = two_surfaces(10.0, 0.5, 0.3, 16)
+    counted_map = core.inspection.maps["Returns"](capture)
+    assert np.count_nonzero(counted_map == 2) >= binom.ppf(0.001, 256, 0.97)
+    empty = replace(capture, cube=np.zeros_like(capture.cube))
+    assert (core.inspection.maps["Returns"](empty) == 0).all()
+
+
 def test_arguments_out_of_their_bounds_are_refused() -> None:
     capture, _ = two_surfaces(6.0, 0.3, 0.1, 8)
     for returns in (0, 5):
