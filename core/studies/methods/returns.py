@@ -80,19 +80,13 @@ class OneSurface(NamedTuple):
     method: str
 
 
-ONE_SURFACE = tuple(
-    OneSurface(scene, kind, sbr, "likelihood")
-    for scene in ("car", "uniform")
-    for kind, sbr in (
-        ("first photons", 0.1),
-        ("first photons", 0.06),
-        ("first photons, tail", 0.1),
-        ("all photons", 1.0),
-    )
-) + tuple(
-    OneSurface(scene, "first photons", sbr, "image_posterior")
-    for scene in ("car", "piecewise", "wall")
-    for sbr in (0.06, 0.04, 0.03)
+_KINDS = ("first photons", 0.1), ("first photons, tail", 0.1), ("all photons", 1.0)
+
+ONE_SURFACE = (
+    *(OneSurface(scene, *kind, "likelihood") for scene in ("car", "uniform") for kind in _KINDS),
+    OneSurface("car", "first photons", 0.06, "image_posterior"),
+    OneSurface("piecewise", "first photons", 0.03, "image_posterior"),
+    OneSurface("wall", "first photons", 0.03, "image_posterior"),
 )
 """Captures on which second returns are false."""
 
