@@ -31,7 +31,7 @@ from core.inference.background import EchoFree, fitted_shape
 from core.inference.flux import flux_prior_of
 from core.inference.further_echo import further_echo_log_odds, probability_within
 from core.inference.likelihood import rate_and_n_armed
-from core.inference.posterior import TOLERANCE_BINS
+from core.inference.posterior import TOLERANCE_BINS, posterior_of
 from core.kernels.parallel import entering
 from core.kernels.returns import EchoModel, fill_returns
 from core.labels import Plane
@@ -46,6 +46,8 @@ FALSE_RETURN = 0.01
 _STEPS = 8  # of the delay in a bin; echoes are interpolated between them
 _DRAWN = 4096  # pixels with one surface
 _LEAST_FALSE_RETURN = 1e-3  # that so many pixels resolve
+_LIKELY = 0.5  # probability of a surface from which a pixel has one
+_FEWEST = 16  # pixels that stand for those with a surface
 _LEAST_GAIN = 2.0  # smaller gains are not computed
 _BIN_COST = 100  # counts that other kernels process in the time of one
 _PIXELS_AT_ONCE = 256
@@ -263,7 +265,7 @@ def least_gain(capture: Capture, false_alarm: float = FALSE_RETURN) -> float:
     accepted = _LEAST_FALSE_RETURN <= false_alarm <= 1
     require("false_return", false_alarm, accepted, f"{_LEAST_FALSE_RETURN} to 1")
     gains = _gains_of_one_surface(capture)
-    kept = int(false_alarm * (gains.size + 1))
+    kept = min(int(false_alarm * (gains.size + 1)), gains.size)
     return max(float(np.partition(gains, -kept)[-kept]), _LEAST_GAIN) if kept else float("inf")
 
 
@@ -275,6 +277,8 @@ def _gains_of_one_surface(capture: Capture) -> Floats:
     seen = np.flatnonzero(capture.counts)
     if not seen.size:
         return np.zeros(1)
+    likely = np.flatnonzero(posterior_of(capture).surface >= _LIKELY)  # sky is no surface
+    seen = likely if likely.size >= _FEWEST else seen
     pixels = np.sort(rng.choice(seen, min(_DRAWN, seen.size), replace=False))
     one = fitted_echoes(capture, capture.cube.reshape(-1, n_bins)[pixels], 1, 0.0)
     again = np.resize(np.arange(pixels.size), _DRAWN)
