@@ -12,7 +12,7 @@ KERNELS := blocks fit image_posterior more_estimators motion posterior reduction
 # Some shells forbid compiled modules. The tests start hundreds of processes: each would compile all.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform neighbours motion tuning tuned calibration fit results field large fuzz attack wheel clean
+.PHONY: help app test bench load speed tradeoff stability requires paper table2 uniform neighbours returns motion tuning tuned calibration fit results field large fuzz attack wheel clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z0-9]*\):.* ## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -64,6 +64,9 @@ neighbours: $(VENV)/.app ## what neighbouring pixels add, inside surfaces and at
 motion: $(VENV)/.app ## surfaces that move during the pulses: ranges and velocities
 	$(BIN)/python -m core motion
 
+returns: $(VENV)/.app ## two surfaces in a pixel: how many are found, how often one is false
+	$(BIN)/python -m core returns
+
 tuning: $(VENV)/.app ## the same search for the settings of every method
 	$(BIN)/python -m core tuning
 
@@ -81,6 +84,7 @@ results: $(VENV)/.app ## write the result tables to assets/results/ (an hour)
 	$(BIN)/python -m core uniform --results assets/results/uniform.md
 	$(BIN)/python -m core neighbours --results assets/results/neighbours.md
 	$(BIN)/python -m core motion --results assets/results/motion.md
+	$(BIN)/python -m core returns --results assets/results/returns.md
 	$(BIN)/python -m core budget --results assets/results/budget.md
 	$(BIN)/python -m core tuning --results assets/results/tuning.md
 	$(BIN)/python -m core tuned --results assets/results/tuned.md

@@ -37,9 +37,10 @@ from core import inspection, metrics, reductions
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture, CaptureError, StatedFlux
 from core.corrections import CORRECTIONS, without_correction
-from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate
+from core.estimators import ESTIMATORS, Estimator, RangeImage, estimate, with_returns
 from core.inference import (
     RangeInterval,
+    Returns,
     limits,
     pixel_range_intervals,
     range_interval,
@@ -123,6 +124,7 @@ __all__ = [
     "PulseGroups",
     "RangeImage",
     "RangeInterval",
+    "Returns",
     "Run",
     "Scene",
     "SceneError",
@@ -165,6 +167,7 @@ __all__ = [
     "trigger_probability",
     "tuned",
     "warm_up",
+    "with_returns",
     "without",
     "without_correction",
 ]

@@ -348,6 +348,37 @@ def _wall_range_m(direction: Floats, box: _Box) -> Floats:
     return np.where(window, range_m + _WINDOW_DEPTH_M / facing, range_m)
 
 
+def net(
+    size: int = 64, separation_bins: float = 6.0, share: float = 0.3, first_bin: float = 40.0
+) -> Scene:
+    """A net before an oblique wall: every pixel sees both, the net returns less.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns, 8 or more, over a field of view of 128 mrad.
+    separation_bins : float
+        Distance of the wall behind the net, in bins, positive.
+    share : float
+        Share of the signal that the net returns, 0 to 1.
+    first_bin : float
+        Delay of the net's echo in the middle of the image, in bins.
+
+    Raises
+    ------
+    ValueError
+        If `size` is below 8, or an argument is out of its bounds.
+    """
+    acquisition = _gate_of(size)
+    positive = 0 < separation_bins < np.inf
+    require("separation_bins", separation_bins, positive, "finite and positive")
+    across = np.linspace(-_WALL_SPAN_BINS / 2, _WALL_SPAN_BINS / 2, size)
+    net_bin = np.broadcast_to(first_bin + across, (size, size))
+    net_m, wall_m = map(acquisition.bin_to_range_m, (net_bin, net_bin + separation_bins))
+    second = SecondSurface(net_m, np.full((size, size), share))
+    return Scene(wall_m, acquisition=acquisition, second_surface=second)
+
+
 _RAYS = 4  # across and down a pixel
 _APART_BINS = 2.0  # distance below which two surfaces return one echo
 
@@ -483,6 +514,7 @@ scenes: dict[str, Callable[..., Scene]] = {
     "wall": wall,
     "piecewise": piecewise,
     "edges": edges,
+    "net": net,
     "fog": fog,
     "approach": approach,
     "worn": worn,

@@ -33,6 +33,7 @@ def warm_up() -> None:
     estimate(simulate(wall, wall.acquisition, Flux(sbr=1.0)), "image_posterior")
     passing = replace(wall, motion=Motion(speed_m_per_s=20.0, pulse_rate_hz=20e3))
     estimate(simulate(passing, wall.acquisition, Flux(sbr=1.0), n_groups=8), "velocity")
+    estimate(small, "peak", returns=2)
     images = {method: estimate(small, method) for method in ESTIMATORS}
     fit_of(small)
     pixel_report(small, images["tracking"], 0, 0)  # `scipy.signal` takes a second to import

@@ -274,7 +274,7 @@ VELOCITY = "Velocity"
 
 MAPS = (
     *("Estimate", "Truth", "Error", "Reported", VELOCITY),
-    *("Confidence", "Counts", "Peak", "Fired", "SBR"),
+    *("Confidence", "Counts", "Peak", "Fired", "SBR", "Returns"),
     FIT,
 )
 UNITS = ("bins", "ns", "m")

@@ -191,6 +191,7 @@ def built_in_sources() -> dict[str, Source]:
         "uniform": scene_source("Random depths", "uniform"),
         "wall": scene_source("Oblique wall", "wall"),
         "piecewise": scene_source("Planes before a wall", "piecewise"),
+        "net": scene_source("Net before a wall", "net"),
         "edges": scene_source("Building, edges seen whole", "edges"),
         "fog": scene_source("Car in fog", "fog"),
         "approach": scene_source("Car approached at 20 m/s", "approach"),

@@ -24,6 +24,7 @@ from core.cli.options import (
     add_filters,
     add_flux,
     add_pixel,
+    add_returns,
     add_settings,
     angle,
     colors_given,
@@ -44,7 +45,13 @@ from core.cli.saving import (
     save_each,
     save_ranges,
 )
-from core.estimators import ESTIMATORS, RangeImage, estimate, suitable_method
+from core.estimators import (
+    ESTIMATORS,
+    RangeImage,
+    estimate,
+    suitable_method,
+    with_returns,
+)
 from core.inspection import (
     CaptureReport,
     PixelReport,
@@ -234,6 +241,7 @@ def _pixel_facts(capture: Capture, row: int, col: int) -> dict[str, Any]:
         "range_m": report.answer_m,
         "confidence": report.confidence,
         "interval": report.interval_text,
+        "surfaces": report.surfaces_text,
         **_interval_facts(report),
         **_reported_pixel_facts(capture, report),
         **_flux_facts(report),
@@ -285,6 +293,7 @@ def _add_estimate(commands: Any) -> None:
         add_truth_options(method)
         add_flux(method)
         add_filters(method)
+        add_returns(method)
         add_crop(method)
         add_colors(method)
         _add_out(method, "the range image", (*WRITERS, *FOLDER_WRITERS), more=_CLOUD_HELP)
@@ -312,6 +321,8 @@ def _estimate(chosen: argparse.Namespace) -> None:
         raise ValueError(f"--tuned cannot be combined with {why}.")
     if in_tiles:
         refuse_further_values(chosen.intervals, chosen.fit)
+        one = chosen.returns == 1
+        require("returns", chosen.returns, one, "1 for a capture that is ranged in tiles")
     described, image, facts = (_range_in_tiles if in_tiles else _range_at_once)(chosen, settings)
     save = save_ranges(
         described,
@@ -368,7 +379,13 @@ def _range_at_once(
     }
     if capture.truth_range_m is not None:
         facts |= _targets(capture.truth_range_m)
-    return capture, found.image, facts | _velocity_facts(found.image)
+    image = found.image
+    if chosen.returns > 1:
+        image = with_returns(capture, image, chosen.returns, chosen.false_return)
+        assert image.returns is not None
+        several = image.returns.count(capture.shape) > 1
+        facts["pixels_with_several_returns"] = int(several.sum())
+    return capture, image, facts | _velocity_facts(image)
 
 
 def _velocity_facts(image: RangeImage) -> dict[str, float]:

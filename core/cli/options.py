@@ -19,6 +19,7 @@ from core.acquisition import Flux
 from core.checks import require
 from core.estimators import FALSE_ALARM
 from core.geometry import Box
+from core.inference import FALSE_RETURN, MOST_RETURNS
 from core.io import read_options_from
 from core.io.readers.quantities import EXAMPLE_OF_ANGLE, parsed_angle
 from core.io.writers import RangeColors
@@ -97,6 +98,23 @@ def add_false_alarm(command: Any) -> None:
         f"{FALSE_ALARM.least:g} to {FALSE_ALARM.most:g}; by default all pixels have one; without "
         "effect on the methods unmixing and image_posterior, which have --false-acceptance and "
         "--pixels instead",
+    )
+
+
+def add_returns(command: Any) -> None:
+    """Add the options for several returns of a pixel."""
+    command.add_argument(
+        "--returns",
+        type=whole_from_to(1, MOST_RETURNS),
+        default=1,
+        help="surfaces of a pixel to look for (1); point clouds hold all of them, and LAS their "
+        f"numbers; at most {MOST_RETURNS}",
+    )
+    command.add_argument(
+        "--false-return",
+        type=float,
+        default=FALSE_RETURN,
+        help=f"accepted share of pixels with one surface that get a second ({FALSE_RETURN:g})",
     )
 
 

@@ -18,6 +18,7 @@ from core.studies.methods import (
     fit,
     motion,
     neighbours,
+    returns,
     tuned,
     tuning,
     uniform,
@@ -52,6 +53,12 @@ def add(commands: Any) -> None:
 
     command = _added(
         commands, "neighbours", "compare methods that use neighbouring pixels", _neighbours
+    )
+    _add_count(command, "--seeds", 2, MAX_SEEDS, 10)
+    add_processes(command)
+
+    command = _added(
+        commands, "returns", "find two surfaces in a pixel, and count false ones", _returns
     )
     _add_count(command, "--seeds", 2, MAX_SEEDS, 10)
     add_processes(command)
@@ -156,6 +163,10 @@ def _uniform(chosen: argparse.Namespace) -> None:
 
 def _neighbours(chosen: argparse.Namespace) -> None:
     publish(neighbours.tables(range(chosen.seeds), chosen.processes), chosen)
+
+
+def _returns(chosen: argparse.Namespace) -> None:
+    publish(returns.tables(range(chosen.seeds), chosen.processes), chosen)
 
 
 def _motion(chosen: argparse.Namespace) -> None:

@@ -26,6 +26,7 @@ from core.estimators import (
     velocity,
 )
 from core.estimators.base import FALSE_ALARM, Estimator, Provenance, RangeImage
+from core.estimators.returns import with_returns
 
 __all__ = [
     "ESTIMATORS",
@@ -37,6 +38,7 @@ __all__ = [
     "require_capture",
     "settings_of",
     "suitable_method",
+    "with_returns",
 ]
 
 ESTIMATORS: dict[str, Estimator] = {
@@ -63,6 +65,7 @@ def estimate(
     settings: Any = None,
     *,
     false_alarm: float | None = None,
+    returns: int = 1,
     **parameters: Any,
 ) -> RangeImage:
     """Estimate the range of every pixel of a capture.
@@ -78,6 +81,9 @@ def estimate(
         Give a range only where the score exceeds the threshold that this share of echo-free pixels
         exceeds. If None, every pixel with a detection gets one. The methods "unmixing" and
         "image_posterior" ignore it; see their settings ``false_acceptance`` and ``pixels``.
+    returns : int
+        Surfaces of a pixel to look for, at most 4; `RangeImage.returns` holds them if more than 1
+        (`with_returns`).
     **parameters
         Settings as single fields, instead of `settings`.
 
@@ -99,7 +105,8 @@ def estimate(
     made_by = Provenance(
         method, settings, false_alarm, partial(estimator.remark, capture, false_alarm)
     )
-    return replace(estimator(capture, settings, false_alarm), made_by=made_by)
+    image = replace(estimator(capture, settings, false_alarm), made_by=made_by)
+    return image if returns == 1 else with_returns(capture, image, returns)
 
 
 def suitable_method(capture: Capture) -> str:

@@ -23,6 +23,7 @@ from core.inference.likelihood import Conditions
 from core.inference.motion import RadialVelocity
 from core.inference.neighbours import patches, pooled_at, pooled_in
 from core.inference.posterior import tolerance_probability
+from core.inference.returns import Returns
 from core.labels import Plane, images_dataset, software
 from core.notebook import html_table
 from core.parameters import Choice, Number
@@ -74,6 +75,8 @@ class Provenance:
         Estimates of less confidence have been removed, see `RangeImage.confident`.
     box : Box, optional
         Estimates outside it have been removed, see `RangeImage.cropped`.
+    most_returns, false_return : int and float, optional
+        `most` and `false_return` of `core.with_returns`.
     """
 
     method: str
@@ -82,14 +85,16 @@ class Provenance:
     remark: _Deferred = _Deferred()
     least_confidence: float | None = None
     box: Box | None = None
+    most_returns: int | None = None
+    false_return: float | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields, with `remark` as text, for another process."""
         return vars(self) | {"remark": self.remark}
 
-    def after(self, **removal: Any) -> Provenance:
-        """Return a copy with the reason why estimates were removed; a deferred remark stays so."""
-        return replace(self, remark=vars(self)["remark"], **removal)
+    def after(self, **step: Any) -> Provenance:
+        """Return a copy with a further step, such as a removal; a deferred remark stays so."""
+        return replace(self, remark=vars(self)["remark"], **step)
 
     @property
     def facts(self) -> dict[str, str | float]:
@@ -127,6 +132,9 @@ class RangeImage:
     velocity : RadialVelocity, optional
         Of methods that estimate it: velocity of the surfaces, whose ranges are those in the middle
         of the recording.
+    returns : Returns, optional
+        All surfaces of each pixel, the estimate among them; None unless asked for
+        (`core.with_returns`).
     """
 
     range_m: Floats
@@ -136,6 +144,7 @@ class RangeImage:
     valid: NDArray[np.bool_]
     made_by: Provenance | None = field(default=None, repr=False)
     velocity: RadialVelocity | None = field(default=None, repr=False)
+    returns: Returns | None = field(default=None, repr=False)
 
     @property
     def planes(self) -> dict[str, Plane]:
@@ -150,7 +159,13 @@ class RangeImage:
             "score": Plane(self.score, "1", "score of the estimate, of the estimator's own scale"),
             "valid": Plane(self.valid, "1", "whether there is an estimate"),
             **moving,
+            **self.return_planes,
         }
+
+    @property
+    def return_planes(self) -> dict[str, Plane]:
+        """Images of the returns, by name; empty unless they were asked for."""
+        return {} if self.returns is None else self.returns.planes(self.valid.shape)
 
     def to_xarray(self) -> xr.Dataset:
         """Return the image as labelled arrays, as `core.save_image` writes them.
@@ -160,7 +175,8 @@ class RangeImage:
         xarray.Dataset
             Variables ``range_m``, ``confidence``, ``bin``, ``score`` and ``valid`` (1 or 0) over
             the coordinates ``row`` and ``col``, with units; method, settings (JSON) and version
-            are attributes.
+            are attributes. If they were asked for, ``returns``, the number of returns, and
+            ``return_1_range_m`` and so on, with strength and confidence.
         """
         about = {} if self.made_by is None else self.made_by.facts
         return images_dataset(self.planes, {**about, "software": software()})
@@ -191,21 +207,29 @@ class RangeImage:
             If `least` is not a probability.
         """
         require("least_confidence", least, 0 <= least <= 1, "a probability, 0 to 1")
-        return self._kept(self.confidence >= least, least_confidence=least)
+        found = self.returns and self.returns.where(self.returns.confidence >= least)
+        return self._kept(self.confidence >= least, found, least_confidence=least)
 
     def cropped(self, box: Box) -> RangeImage:
         """Return the image without estimates outside a box, which `made_by` then states.
 
         Their scores and confidences are kept.
         """
-        return self._kept(box.contains(self.range_m), box=box)
+        found = self.returns
+        if found:
+            shape, numbers = self.valid.shape, range(1, found.most + 1)
+            inside = [box.contains(found.image("range_m", number, shape)) for number in numbers]
+            found = found.where(np.array(inside)[found.number - 1, found.row, found.col])
+        return self._kept(box.contains(self.range_m), found, box=box)
 
-    def _kept(self, pixels: NDArray[np.bool_], **why: Any) -> RangeImage:
-        """Return the image without the estimates of other pixels, and the reason in `made_by`."""
+    def _kept(self, pixels: NDArray[np.bool_], returns: Returns | None, **why: Any) -> RangeImage:
+        """Return the image with some estimates and returns, and the reason in `made_by`."""
         kept = self.valid & pixels
         range_m, bins = (np.where(kept, each, np.nan) for each in (self.range_m, self.bin))
         made_by = self.made_by and self.made_by.after(**why)
-        return replace(self, range_m=range_m, bin=bins, valid=kept, made_by=made_by)
+        return replace(
+            self, range_m=range_m, bin=bins, valid=kept, made_by=made_by, returns=returns
+        )
 
 
 Pixels = Literal["estimate every pixel", "allow empty pixels"]

@@ -44,7 +44,7 @@ from core.estimators.image_model import (
 )
 from core.estimators.likelihood import Depths, LikelihoodParameters, curve
 from core.estimators.likelihood import locate as locate_alone
-from core.inference.flux_model import FluxModel
+from core.inference.flux_model import Agreement, FluxModel
 from core.inference.posterior import States, mass_near, tolerance_probability
 from core.kernels.blocks import LANES
 from core.kernels.messages import fill_modes, fill_posterior
@@ -130,11 +130,29 @@ def likeliest_delays(capture: Capture, flux: FluxModel) -> Floats:
 
 def _posterior(capture: Capture, flux: FluxModel) -> States:
     """Compute the posterior of each pixel, given the whole image."""
-    alone, prior, agreement = states_of_image(capture, flux), Prior.of(flux), flux.agreement
+    return solved(states_of_image(capture, flux), Prior.of(flux), flux.agreement)
+
+
+def solved(
+    alone: States, prior: Prior, agreement: Agreement, slopes: NDArray[np.float32] | None = None
+) -> States:
+    """Combine the evidence of each pixel with that of its neighbours.
+
+    Parameters
+    ----------
+    alone : States
+        Probabilities of the states of each pixel by itself, of shape (row, col, ...).
+    prior : Prior
+    agreement : Agreement
+    slopes : ndarray, shape (2, row, col), optional
+        Change of the delay from row to row and from column to column, if known; then messages pass
+        along these planes only.
+    """
     half, both, other = (States(*map(np.empty_like, alone)) for _ in range(3))
     links = Link.of(agreement.alike, agreement.scale_bins, prior), Link.of(*_ALONG_PLANES, prior)
-    per_row, per_col = np.zeros((2, *capture.shape), np.float32)
-    for k in range(_ROUNDS):
+    level = np.zeros((2, *alone.nothing.shape), np.float32)
+    per_row, per_col = level if slopes is None else slopes
+    for k in range(0 if slopes is None else _ROUNDS - 1, _ROUNDS):
         link = links[min(k, 1)]
         with entering(alone.surface.size):
             fill_posterior(*alone, per_col, True, link, *half)

@@ -29,8 +29,11 @@ from core.inference.posterior import (
     tolerance_probability,
 )
 from core.inference.predictive import Predictive, predictive_of
+from core.inference.returns import FALSE_RETURN, MOST_RETURNS, Returns
 
 __all__ = [
+    "FALSE_RETURN",
+    "MOST_RETURNS",
     "SMALL",
     "TOLERANCE_BINS",
     "Conditions",
@@ -40,6 +43,7 @@ __all__ = [
     "Posterior",
     "Predictive",
     "RangeInterval",
+    "Returns",
     "detailed_flux_prior_of",
     "fit_in",
     "fit_of",

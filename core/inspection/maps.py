@@ -11,6 +11,8 @@ from core.acquisition import Floats
 from core.capture import Capture, cached_per_capture
 from core.inference.fit import fit_p_values
 from core.inference.posterior import TOLERANCE_BINS, posterior_of
+from core.inference.returns import MOST_RETURNS, fitted_echoes, least_gain
+from core.inspection.surfaces import LIKELY
 from core.kernels.parallel import PARALLEL, entering
 
 
@@ -70,6 +72,18 @@ def sbr(capture: Capture) -> Floats:
         return np.asarray(signal * posterior_of(capture).surface / (background * n_bins))
 
 
+@cached_per_capture
+def number_of_returns(capture: Capture) -> Floats:
+    """Surfaces that each pixel shows by itself, shape (row, col).
+
+    As `core.with_returns` finds them with its default rate of false returns; 0 where a surface is
+    less likely than none.
+    """
+    n_echoes = fitted_echoes(capture, capture.cube, MOST_RETURNS, least_gain(capture)).number
+    has_any = posterior_of(capture).surface >= LIKELY
+    return np.where(has_any, n_echoes.reshape(capture.shape), 0).astype(float)
+
+
 @njit(**PARALLEL)
 def _count(cube, begin, end, before, inside):  # type: ignore[no-untyped-def]
     """Count detections of each pixel before the bin `begin`, and from there to `end`."""
@@ -88,6 +102,7 @@ maps = {
     "Peak": peak_counts,
     "Fired": share_fired,
     "SBR": sbr,
+    "Returns": number_of_returns,
     "Goodness of fit": fit_p_values,
 }
 """Functions from a capture to an image (row, col), by name on screen."""

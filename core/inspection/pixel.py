@@ -124,6 +124,21 @@ class PixelReport(OldFluxNames):
         return self.find_flux()
 
     @property
+    def surfaces_text(self) -> str:
+        """Surfaces that are likelier than not, where they are and how sure that is, as text.
+
+        Such as ``2 surfaces: 47.31 m (probability 0.99), 49.9 m (probability 0.95)``.
+        """
+        likely = [each for each in self.candidates if each.probability >= LIKELY]
+        places = []
+        for each in sorted(likely, key=lambda each: each.range_m):
+            interval = Interval(each.range_m, each.range_low_m, each.range_high_m)
+            digits = 3 if interval.decimals is None else interval.decimals
+            places.append(f"{each.range_m:.{digits}f} m (probability {each.probability:.2f})")
+        noun = "surface" if len(places) == 1 else "surfaces"
+        return f"{len(places) or 'no'} {noun}" + (f": {', '.join(places)}" if places else "")
+
+    @property
     def interval_text(self) -> str:
         """Range of the surface with its intervals, as text; a dash without an estimate.
 

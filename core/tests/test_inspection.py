@@ -248,6 +248,8 @@ def test_the_echo_of_another_surface_is_not_counted_as_background(n_pulses: int 
         has_net = row < 4
         if len(report.surfaces_bin) == 1 + has_net and abs(report.answer_bin - walls[row, col]) < 3:
             assert ("other surfaces" in report.flux_method) == has_net
+            assert report.surfaces_text.startswith("2 surfaces: " if has_net else "1 surface: ")
+            assert report.surfaces_text.count("probability") == 1 + has_net
             hits += covers(report.flux.signal, 30 * unit), covers(report.flux.background, 10 * unit)
             trials += 1
     assert trials >= 16

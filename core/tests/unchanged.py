@@ -242,7 +242,9 @@ def whole(_: Path) -> Answers:
     for name in ("car, SBR 2", "worn", "all photons", "unknown pulses", "sample"):
         capture = CAPTURES[name]()
         yield name, core.inspection.capture_report(capture)
-        yield f"{name}, maps", {key: of(capture) for key, of in core.inspection.maps.items()}
+        # Of newer maps, the tests are elsewhere.
+        maps = {key: of for key, of in core.inspection.maps.items() if key != "Returns"}
+        yield f"{name}, maps", {key: of(capture) for key, of in maps.items()}
     for name in ("car, SBR 2", "sample"):
         chosen = "tracking", whole_bins("tracking")
         steps = core.inspection.accuracy_over_pulses(CAPTURES[name](), [0.1, 0.5], *chosen)

@@ -47,6 +47,7 @@ from core.inspection import (
     FaultyPixel,
     FluxEstimate,
     LineProfile,
+    PixelReport,
     reported_check,
 )
 from core.io import changed_settings
@@ -75,7 +76,8 @@ map *Goodness of fit* shows where it fails.
 MAP_HELP = (
     "Quantity shown on the map. Peak: largest count of a pixel. Fired: share of pulses with a "
     "detection. SBR: estimated from the counts. Goodness of fit: p-value, below 0.05 in 5 % of the "
-    "pixels where the model holds. Reported: distance that the sensor itself found."
+    "pixels where the model holds. Returns: surfaces that each pixel shows by itself; 1 % of those "
+    "with one get a second. Reported: distance that the sensor itself found."
 )
 MODE_HELP = (
     "What dragging on the map does: zoom, select a region by a rectangle or a lasso, or draw the "
@@ -274,13 +276,19 @@ def remark(found: Inspected) -> str:
     """Return the sentence below the facts of a pixel or a region."""
     if found.region is None:
         verdict = found.report.verdict
-        several = len(found.report.surfaces_bin) > 1
-        others = " Several surfaces: S is that of one, and B is without the echoes of the others."
-        return f"Verdict: {verdict.health}. {verdict.why}{others if several else ''}"
+        return f"Verdict: {verdict.health}. {verdict.why}{_several(found.report)}"
     return (
-        f"{found.region.fit.verdict} The plots show the summed histogram of the region. Mean flux "
-        f"of a pixel: {found.region.flux_method}."
+        f"{found.region.fit.verdict}{_several(found.region.pixel)} The plots show the summed "
+        f"histogram of the region. Mean flux of a pixel: {found.region.flux_method}."
     )
+
+
+def _several(report: PixelReport) -> str:
+    """Return where the surfaces are if there are several, and what that means for the fluxes."""
+    if len(report.surfaces_bin) < 2:
+        return ""
+    others = "S is that of one, and B is without the echoes of the others"
+    return f" {report.surfaces_text}. {others}."
 
 
 def fit_explanation(p_value: float) -> str:

@@ -2,10 +2,10 @@
 
 Coordinates are whole multiples of a step: the power of ten that is a thousandth of a bin or less,
 down to a hundredth of that; only a cloud too wide for 32 bits gets coarser ones. ``intensity`` is
-the counts, at most 65535, and colours fill 16 bits as the standard requires. Extra bytes hold the
-other columns, with units in their descriptions. A record (VLR) of the user "firstphoton" holds the
-acquisition, method, settings (JSON), version and source as lines ``name: value`` of UTF-8, cut off
-at the 65,535 bytes that fit.
+the counts, at most 65535, ``return_number`` and ``number_of_returns`` are those of the image, or 1,
+and colours fill 16 bits as the standard requires. Extra bytes hold the other columns, with units in
+their descriptions. A record (VLR) of the user "firstphoton" holds the acquisition, method, settings
+(JSON), version and source as lines ``name: value`` of UTF-8, cut off at the 65,535 bytes that fit.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ DESCRIPTIONS = {
     "counts": "detections of the pixel",
     "confidence": "probability within 3 bins, 0-1",
     "range_sd_m": "half the 68 % interval, m",
+    "strength": "signal photons per pulse",
     "row": "row of the pixel, 0 on top",
     "col": "column of the pixel",
 }
@@ -48,6 +49,7 @@ def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
     points = product.points()
     columns = product.point_columns(points)
     colors = {name: columns.pop(name) for name in COLORS if name in columns}
+    numbers = {name: columns.pop(name, 1) for name in ("return_number", "number_of_returns")}
     header = laspy.LasHeader(version="1.4", point_format=7 if colors else 6)
     header.generating_software = software()
     text = "\n".join(product.lines).encode()[:_MOST_IN_RECORD].decode(errors="ignore").encode()
@@ -63,7 +65,8 @@ def _write(product: Product, file: BinaryIO, *, compressed: bool) -> None:
     las = laspy.LasData(header)
     las.xyz = points.xyz_m
     las.intensity = np.minimum(columns["counts"], 2**16 - 1).astype(np.uint16)
-    las.return_number[:] = las.number_of_returns[:] = 1
+    for name, number in numbers.items():
+        las[name][:] = number
     for name, values in columns.items():
         las[name] = values
     for name, values in colors.items():

@@ -1,11 +1,13 @@
 """NumPy ``.npz``: the arrays of a range image as they are, without pickles.
 
-In addition to `RangeImage`'s fields and ``counts``, and if they are given the limits of intervals
-(``range_low_m`` and ``range_high_m`` for 95 %, ``range_low_68_m`` and ``range_high_68_m`` for 68 %)
-and the p-values ``fit_p_value``, it holds scalars ``bin_width_s``, ``gate_delay_s``, ``n_pulses``
-(0 where not known), ``pixel_angle_rad`` (absent where not known), and the texts ``format``,
-``detection`` (`core.capture.Detection`), ``method``, ``settings`` (JSON), ``software`` and
-``source``; where they apply, ``false_alarm``, ``least_confidence``, ``remark``.
+In addition to `RangeImage`'s fields and ``counts``, it holds, if they are given, the limits of
+intervals (``range_low_m`` and ``range_high_m`` for 95 %, ``range_low_68_m`` and
+``range_high_68_m`` for 68 %), the p-values ``fit_p_value``, and the returns: ``returns``, their
+number, and ``return_1_range_m`` and so on, with strength and confidence. Scalars are
+``bin_width_s``, ``gate_delay_s``, ``n_pulses`` (0 where not known) and ``pixel_angle_rad`` (absent
+where not known), texts ``format``, ``detection`` (`core.capture.Detection`), ``method``,
+``settings`` (JSON), ``software`` and ``source``; where they apply, ``false_alarm``,
+``least_confidence``, ``remark``.
 """
 
 from __future__ import annotations

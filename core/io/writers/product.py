@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from core.capture import CaptureInfo
 from core.checks import require
 from core.estimators import RangeImage
-from core.geometry import Points, guessed_field_of_view_deg, pixel_angle_of, points_m
+from core.geometry import (
+    Points,
+    guessed_field_of_view_deg,
+    pixel_angle_of,
+    points_m,
+    sight_lines,
+)
 from core.inference import RangeInterval
 from core.io.writers.colors import RangeColors
 from core.labels import Plane, software
@@ -188,7 +194,7 @@ class Product:
         return [part for line in escaped for part in wrap(line, _MOST_IN_LINE)]
 
     def points(self) -> Points:
-        """Return the estimates in space.
+        """Return the estimates in space; all returns of the pixels, if there are any.
 
         Raises
         ------
@@ -203,7 +209,12 @@ class Product:
                 "pixel_angle_rad = None is not accepted: give the angle between neighbouring "
                 "pixels in radians, which the capture does not know and a cloud needs."
             )
-        return points_m(self.image.range_m, angle_rad)
+        found = self.image.returns
+        if found is None:
+            return points_m(self.image.range_m, angle_rad)
+        lines = sight_lines(self.image.range_m.shape, angle_rad)[found.row, found.col]
+        row, col = (each.astype(np.int32) for each in (found.row, found.col))
+        return Points(found.range_m[:, np.newaxis] * lines, row, col)
 
     def point_columns(self, points: Points) -> dict[str, NDArray[Any]]:
         """Return the columns of a point cloud other than coordinates; each of shape (point,)."""
@@ -211,11 +222,23 @@ class Product:
         sd_m = self.range_sd_m
         deviation = {} if sd_m is None else {"range_sd_m": sd_m[here].astype(np.float32)}
         rgb = {} if self.rgb is None else dict(zip(COLORS, self.rgb[here].T, strict=True))
+        found, range_m = self.image.returns, self.image.range_m[here]
+        confidence, of_returns = self.image.confidence[here], dict[str, NDArray[Any]]()
+        if found is not None:
+            is_other = found.range_m != range_m  # than the estimate, whose interval is known
+            deviation = {name: np.where(is_other, np.nan, sd) for name, sd in deviation.items()}
+            range_m, confidence = found.range_m, found.confidence
+            of_returns = {
+                "strength": found.strength.astype(np.float32),
+                "return_number": found.number.astype(np.uint8),
+                "number_of_returns": found.count(self.image.range_m.shape)[here].astype(np.uint8),
+            }
         return {
-            "range_m": self.image.range_m[here],
+            "range_m": range_m,
             "counts": np.minimum(self.capture.counts[here], 2**32 - 1).astype(np.uint32),
-            "confidence": self.image.confidence[here].astype(np.float32),
+            "confidence": confidence.astype(np.float32),
             **deviation,
+            **of_returns,
             "row": points.row,
             "col": points.col,
             **rgb,

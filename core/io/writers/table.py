@@ -34,7 +34,9 @@ def write(product: Product, file: BinaryIO) -> None:
     """Write row, col, range_m, confidence, counts and valid (1 or 0) of each pixel.
 
     If the product has intervals, range_low_m, range_high_m and those with 68 follow range_m; radial
-    velocities, if it has them, follow valid; if it has p-values, fit_p_value is the last column.
+    velocities, if it has them, follow valid, and then fit_p_value, if it has p-values. If the image
+    has returns, the last columns are returns, their number, and return_1_range_m and so on, with
+    strength and confidence.
     """
     image = product.image
     row, col = map(np.asarray, np.indices(image.range_m.shape))
@@ -48,8 +50,9 @@ def write(product: Product, file: BinaryIO) -> None:
         "valid": image.valid.astype(int),
         **product.velocity_columns,
         **product.p_value_columns,
+        **{name: plane.values for name, plane in product.image.return_planes.items()},
     }
-    ranges = ("range_m", *product.interval_columns)
+    ranges = [name for name in columns if name.startswith("range_") or name.endswith("_range_m")]
     decimals = dict.fromkeys(ranges, decimals_of(product.range_step_m))
     write_columns(columns, file, product.lines, decimals)
 

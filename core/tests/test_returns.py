@@ -1,0 +1,208 @@
+"""Tests of several returns of a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+import core
+from core import Acquisition, Capture, Flux, Pulse, Scene, simulate
+from core.effects import SecondSurface
+from core.inference import FALSE_RETURN
+from core.scene import net
+from core.trigger import draw_counts
+
+GATE = Acquisition(100, 1e-9, 280e-9, n_pulses=1000)
+_TIME = np.arange(40)
+_PEAK, _TAIL = np.exp(-0.5 * ((_TIME - 6) / 3) ** 2), np.exp(-_TIME / 12) * (_TIME > 6)
+PULSE, TAILED = Pulse(), Pulse.measured(0.9 * _PEAK + 0.1 * _TAIL, 0.4e-9)
+
+
+def two_surfaces(
+    separation: float, share: float, sbr: float, side: int = 16, pulse: Pulse = PULSE
+) -> tuple[Capture, tuple[np.ndarray, np.ndarray]]:
+    """Random depths in bins 20 to 30, and a second surface of a share of the signal behind."""
+    near = np.random.default_rng(1).uniform(20, 30, (side, side))
+    near_m, far_m = map(GATE.bin_to_range_m, (near, near + separation))
+    second = SecondSurface(far_m, np.full(near.shape, share))
+    scene = Scene(near_m, acquisition=GATE, second_surface=second if share else None)
+    return simulate(scene, GATE, Flux(0.1041, sbr), pulse, seed=2), (near, near + separation)
+
+
+def counted(capture: Capture, photons: float, background: float, seed: int = 0) -> Capture:
+    """Draw a capture of all photons with the depths of another."""
+    assert capture.truth_range_m is not None
+    delay = capture.acquisition.range_m_to_bin(capture.truth_range_m)
+    n_bins = capture.acquisition.n_bins
+    echo = capture.pulse.bin_probability(delay, n_bins, capture.acquisition.bin_width_s)
+    rng = np.random.default_rng(seed)
+    cube = rng.poisson(photons * echo + background / n_bins).astype(np.uint16)
+    return replace(capture, cube=cube, detection="all", signal=None, background=None)
+
+
+def found_both(image: core.RangeImage, delays: tuple[np.ndarray, ...]) -> float:
+    """Return the share of pixels with two returns, each within two bins of a surface."""
+    returns = image.returns
+    assert returns is not None
+    shape = image.valid.shape
+    errors = [
+        np.abs(returns.image("bin", number, shape) - delay)
+        for number, delay in enumerate(delays, 1)
+    ]
+    right = (errors[0] <= 2) & (errors[1] <= 2) & (returns.count(shape) == 2)
+    return float(right.mean())
+
+
+@pytest.mark.parametrize(
+    ("separation", "share", "sbr", "least"),
+    [(3, 0.5, 0.1, 0.58), (6, 0.5, 0.1, 0.87), (3, 0.3, 0.3, 0.63), (6, 0.3, 0.3, 0.94)],
+)
+def test_both_surfaces_of_a_pixel_are_found(
+    separation: float, share: float, sbr: float, least: float
+) -> None:
+    capture, delays = two_surfaces(separation, share, sbr)
+    found = found_both(core.estimate(capture, "likelihood", returns=2), delays)
+    n = capture.counts.size
+    assert found * n >= binom.ppf(0.001, n, least)
+
+
+@pytest.mark.parametrize("kind", ["first photons", "all photons", "tail"])
+def test_few_pixels_with_one_surface_get_a_second_return(kind: str) -> None:
+    capture, _ = two_surfaces(0.0, 0.0, 0.1, 32, TAILED if kind == "tail" else PULSE)
+    if kind == "all photons":
+        capture = counted(capture, 20.0, 20.0)
+    image = core.estimate(capture, "likelihood", returns=2)
+    assert image.returns is not None
+    n = capture.counts.size
+    false = np.count_nonzero(image.returns.count(capture.shape) > 1)
+    assert false <= binom.ppf(0.999, n, FALSE_RETURN)
+    asked = core.with_returns(capture, image, 2, false_return=0.1).returns
+    assert asked is not None
+    more = np.count_nonzero(asked.count(capture.shape) > 1)
+    assert binom.ppf(0.0001, n, 0.07) <= more <= binom.ppf(0.999, n, 0.1)
+
+
+def test_a_single_return_is_the_estimate() -> None:
+    capture, _ = two_surfaces(6.0, 0.3, 0.1)
+    plain = core.estimate(capture, "tracking", false_alarm=0.01)
+    image = core.estimate(capture, "tracking", false_alarm=0.01, returns=2)
+    returns = image.returns
+    assert plain.returns is None
+    assert returns is not None
+    count = returns.count(capture.shape)
+    assert np.array_equal(count > 0, plain.valid)
+    one = count == 1
+    assert np.array_equal(image.bin[one], plain.bin[one])
+    assert np.array_equal(returns.image("range_m", 1, capture.shape)[one], plain.range_m[one])
+    row, col = np.argwhere(count == 2)[0]
+    those = returns.at(row, col)
+    assert those.number.tolist() == [1, 2]
+    assert (np.diff(those.range_m) > 0).all()
+    assert image.range_m[row, col] in those.range_m
+    assert image.confidence[row, col] >= those.confidence.max() - 1e-3
+    assert image.made_by is not None
+    assert image.made_by.facts["most_returns"] == 2
+
+
+def test_confidences_of_returns_are_probabilities() -> None:
+    capture, delays = two_surfaces(8.0, 0.2, 0.15, 32)
+    returns = core.estimate(capture, "likelihood", returns=3).returns
+    assert returns is not None
+    error = np.min(
+        [np.abs(returns.bin - each[returns.row, returns.col]) for each in delays], axis=0
+    )
+    right, stated = error <= 3, returns.confidence
+    deviation = np.sqrt((stated * (1 - stated)).sum())
+    assert abs(right.sum() - stated.sum()) < 4 * deviation + 0.01 * right.size
+
+
+@pytest.mark.parametrize("separation", [3.0, 25.0])
+def test_neighbours_show_a_net_that_single_pixels_do_not(separation: float) -> None:
+    scene = net(32, separation)
+    capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.06), seed=1)
+    assert scene.second_surface is not None
+    delays = tuple(
+        scene.acquisition.range_m_to_bin(each)
+        for each in (scene.second_surface.range_m, scene.range_m)
+    )
+    assert found_both(core.estimate(capture, "likelihood", returns=2), delays) < 0.2
+    image = core.estimate(capture, "image_posterior", returns=2)
+    assert found_both(image, delays) > 0.96
+    assert image.returns is not None
+    assert image.returns.confidence.mean() > 0.96
+
+
+def test_neighbours_add_no_second_surface_to_one() -> None:
+    scene = core.scenes["wall"](32)
+    capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.04), seed=1)
+    returns = core.estimate(capture, "image_posterior", returns=2).returns
+    assert returns is not None
+    false = np.count_nonzero(returns.count(capture.shape) > 1)
+    assert false <= binom.ppf(0.9999, capture.counts.size, FALSE_RETURN)
+
+
+def test_three_surfaces_are_found() -> None:
+    delay = np.array([12.0, 30.0, 50.0]) + np.random.default_rng(0).uniform(0, 40, (64, 1))
+    echoes = Pulse().bin_probability(delay, 100, 1e-9)
+    counts = draw_counts(0.002 + 0.1 * echoes.sum(axis=1), 1000, np.random.default_rng(1))
+    capture = Capture(counts.reshape(8, 8, 100), GATE)
+    returns = core.estimate(capture, "likelihood", returns=4).returns
+    assert returns is not None
+    three = (returns.count((8, 8)) == 3).ravel()
+    assert np.count_nonzero(three) >= binom.ppf(0.001, 64, 0.95)
+    found = np.array([returns.at(*divmod(i, 8)).bin for i in np.flatnonzero(three)])
+    assert np.mean(np.abs(found - delay[three])) < 0.3
+    assert abs(returns.strength.mean() - 0.1) < 0.01
+
+
+def test_the_map_of_returns_counts_surfaces() -> None:
+    capture, _ = two_surfaces(10.0, 0.5, 0.3, 16)
+    counted_map = core.inspection.maps["Returns"](capture)
+    assert np.count_nonzero(counted_map == 2) >= binom.ppf(0.001, 256, 0.97)
+    empty = replace(capture, cube=np.zeros_like(capture.cube))
+    assert (core.inspection.maps["Returns"](empty) == 0).all()
+
+
+def test_arguments_out_of_their_bounds_are_refused() -> None:
+    capture, _ = two_surfaces(6.0, 0.3, 0.1, 8)
+    for returns in (0, 5):
+        with pytest.raises(ValueError, match="returns"):
+            core.estimate(capture, "peak", returns=returns)
+    image = core.estimate(capture, "peak")
+    with pytest.raises(ValueError, match="false_return"):
+        core.with_returns(capture, image, 2, false_return=0.0)
+
+
+def test_files_hold_all_returns(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    scene = net(16, separation_bins=12.0)
+    capture = simulate(scene, scene.acquisition, Flux(0.3, 0.5), seed=1)
+    image = core.estimate(capture, "likelihood", returns=2)
+    returns = image.returns
+    assert returns is not None
+    assert (returns.count(capture.shape) == 2).mean() > 0.9
+    for suffix in (".laz", ".csv", ".npz", ".ply"):
+        core.save_image(capture, image, tmp_path / f"cloud{suffix}")
+    las = laspy.read(tmp_path / "cloud.laz")
+    assert np.array_equal(las.return_number, returns.number)
+    count = returns.count(capture.shape)
+    assert np.array_equal(las.number_of_returns, count[returns.row, returns.col])
+    assert np.array_equal(las["range_m"], returns.range_m)
+    with np.load(tmp_path / "cloud.npz") as stored:
+        assert np.array_equal(stored["returns"], count)
+        second = returns.image("range_m", 2, capture.shape)
+        assert np.array_equal(stored["return_2_range_m"], second, equal_nan=True)
+    lines = (tmp_path / "cloud.csv").read_text().splitlines()
+    head = next(line for line in lines if line[0] != "#")
+    assert "returns,return_1_range_m,return_1_strength,return_1_confidence" in head
+    assert image.to_xarray().return_1_range_m.attrs["units"] == "m"
+    half = image.cropped(core.geometry.Box(to_m=float(np.median(returns.range_m)))).returns
+    assert half is not None
+    assert 0 < len(half) < len(returns)
+    sure = image.confident(0.9).returns
+    assert sure is not None
+    assert (sure.confidence >= 0.9).all()
