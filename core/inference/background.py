@@ -43,6 +43,7 @@ _RANGE = 3.0  # largest logarithm of the shape, on either side of 0
 _ERROR = 1e-5  # of the interpolation, relative
 _BEFORE, _BEHIND = 1, 4  # lengths of a pulse around a delay that may hold an echo of another shape
 _NOISE = 3.0  # standard deviations of a sum of squares
+_MOST_FIRING = 0.5  # of the pulses that reach a bin, for a rate that few of them decide
 _FEWEST_COUNTS = 0.5
 _WIGGLES = 0.1  # of a slope, that are no second direction
 
@@ -137,13 +138,16 @@ def echo_free(
 def mean_background(free: EchoFree, is_first: bool, guess: Floats) -> float:
     """Estimate the mean background per pulse over the gate from bins without an echo.
 
-    Takes the shape for which `free` was found. NaN if no bin is free of echoes.
+    Takes the shape for which `free` was found. NaN if no bin is free of echoes, or if more than
+    half of the pulses that reach one fire there.
     """
     exposed = float((free.armed * guess).sum())
     if exposed == 0:
         return math.nan
     rate = max(float(free.counts.sum()), _FEWEST_COUNTS) / exposed
-    return guess.size * (-math.log1p(-min(rate, 0.5)) if is_first else rate)
+    if is_first and rate > _MOST_FIRING:
+        return math.nan
+    return guess.size * (-math.log1p(-rate) if is_first else rate)
 
 
 def fitted_shape(free: EchoFree) -> Floats | None:

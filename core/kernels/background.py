@@ -10,6 +10,7 @@ from numba import njit
 from core.kernels.parallel import SUMMING
 
 _LEAST_SHARE = 1e-6  # probability that no echo is near, below which a bin is left out
+_TINY = 1e-300  # probability, instead of 0
 _SMALL_RATE = 0.125  # photons per bin, below which eleven terms of a series are exact
 
 
@@ -53,7 +54,7 @@ def add_echo_free(density, prior, background, counts, n_pulses, echo_window, sha
             alone[k] = total - (behind[k] - ahead[k])
         behind, ahead = dimmed_before[until], dimmed_before[begin]
         for k in range(n_bins):
-            mean = (photons - (behind[k] - ahead[k])) / alone[k]
+            mean = (photons - (behind[k] - ahead[k])) / max(alone[k], _TINY)
             is_alone = alone[k] > _LEAST_SHARE * total
             fires[k] = mean / n_bins * shape[k] if is_alone and mean > 0.0 else 0.0
         if n_pulses > 0:

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.stats import binom
 
 import core
 from core import Acquisition, Capture, Flux, Pulse, Scene, simulate
 from core.effects import SecondSurface
 from core.inference import FALSE_RETURN
+from core.inference.returns import fitted_echoes
 from core.scene import net
 from core.trigger import draw_counts
+
+compiled = pytest.mark.compiled  # all but the test that compares the kernel with its definition
 
 GATE = Acquisition(100, 1e-9, 280e-9, n_pulses=1000)
 _TIME = np.arange(40)
@@ -57,6 +61,43 @@ def found_both(image: core.RangeImage, delays: tuple[np.ndarray, ...]) -> float:
     return float(right.mean())
 
 
+def log_likelihood(capture: Capture, counts: np.ndarray, values: np.ndarray) -> float:
+    """Log likelihood of counts (bin,) for background, two signals and two delays (5,)."""
+    n_bins, n_pulses = counts.size, capture.gated_pulses
+    echoes = capture.pulse.bin_probability(values[3:], n_bins, capture.acquisition.bin_width_s)
+    rate = np.maximum(values[0] / n_bins + values[1:3] @ echoes, 1e-12)
+    if n_pulses is None:
+        return float(counts @ np.log(rate) - rate.sum())
+    armed = n_pulses - np.cumsum(counts) + counts
+    return float(counts @ np.log(-np.expm1(-rate)) - (armed - counts) @ rate)
+
+
+@pytest.mark.parametrize("detection", ["first", "all"])
+def test_no_two_echoes_are_likelier_than_those_fitted(detection: str) -> None:
+    capture, (near, far) = two_surfaces(8.0, 0.5, 1.0, 2)
+    capture = counted(capture, 60.0, 20.0) if detection == "all" else capture
+    n = 1.0 if detection == "all" else 1e3
+    counts = capture.cube.reshape(-1, 100)
+    if detection == "all":
+        counts = counts + np.roll(counts, 8, axis=1)
+    fitted = fitted_echoes(capture, counts, 2, 0.0)
+    assert (fitted.number == 2).all()
+    for pixel in range(len(counts)):
+        here = counts[pixel].astype(float)
+        values = np.array([fitted.background[pixel], *fitted.signal[pixel], *fitted.delay[pixel]])
+        found = log_likelihood(capture, here, values)
+        start = [*(here.sum() / n * np.array([0.6, 0.2, 0.2])), near.flat[pixel], far.flat[pixel]]
+        best = minimize(
+            lambda each, here=here: -log_likelihood(capture, here, np.abs(each)),
+            start,
+            method="Nelder-Mead",
+            options={"maxiter": 4000, "xatol": 1e-4, "fatol": 1e-6},
+        )
+        # Delays are fitted in eighths of a bin.
+        assert found >= -best.fun - 0.1
+
+
+@compiled
 @pytest.mark.parametrize(
     ("separation", "share", "sbr", "least"),
     [(3, 0.5, 0.1, 0.58), (6, 0.5, 0.1, 0.87), (3, 0.3, 0.3, 0.63), (6, 0.3, 0.3, 0.94)],
@@ -70,6 +111,7 @@ def test_both_surfaces_of_a_pixel_are_found(
     assert found * n >= binom.ppf(0.001, n, least)
 
 
+@compiled
 @pytest.mark.parametrize("kind", ["first photons", "all photons", "tail"])
 def test_few_pixels_with_one_surface_get_a_second_return(kind: str) -> None:
     capture, _ = two_surfaces(0.0, 0.0, 0.1, 32, TAILED if kind == "tail" else PULSE)
@@ -86,6 +128,7 @@ def test_few_pixels_with_one_surface_get_a_second_return(kind: str) -> None:
     assert binom.ppf(0.0001, n, 0.07) <= more <= binom.ppf(0.999, n, 0.1)
 
 
+@compiled
 def test_a_single_return_is_the_estimate() -> None:
     capture, _ = two_surfaces(6.0, 0.3, 0.1)
     plain = core.estimate(capture, "tracking", false_alarm=0.01)
@@ -108,6 +151,7 @@ def test_a_single_return_is_the_estimate() -> None:
     assert image.made_by.facts["most_returns"] == 2
 
 
+@compiled
 def test_confidences_of_returns_are_probabilities() -> None:
     capture, delays = two_surfaces(8.0, 0.2, 0.15, 32)
     returns = core.estimate(capture, "likelihood", returns=3).returns
@@ -120,6 +164,7 @@ def test_confidences_of_returns_are_probabilities() -> None:
     assert abs(right.sum() - stated.sum()) < 4 * deviation + 0.01 * right.size
 
 
+@compiled
 @pytest.mark.parametrize("separation", [3.0, 25.0])
 def test_neighbours_show_a_net_that_single_pixels_do_not(separation: float) -> None:
     scene = net(32, separation)
@@ -136,6 +181,7 @@ def test_neighbours_show_a_net_that_single_pixels_do_not(separation: float) -> N
     assert image.returns.confidence.mean() > 0.96
 
 
+@compiled
 def test_neighbours_add_no_second_surface_to_one() -> None:
     scene = core.scenes["wall"](32)
     capture = simulate(scene, scene.acquisition, Flux(0.1041, 0.04), seed=1)
@@ -145,6 +191,7 @@ def test_neighbours_add_no_second_surface_to_one() -> None:
     assert false <= binom.ppf(0.9999, capture.counts.size, FALSE_RETURN)
 
 
+@compiled
 def test_three_surfaces_are_found() -> None:
     delay = np.array([12.0, 30.0, 50.0]) + np.random.default_rng(0).uniform(0, 40, (64, 1))
     echoes = Pulse().bin_probability(delay, 100, 1e-9)
@@ -159,6 +206,7 @@ def test_three_surfaces_are_found() -> None:
     assert abs(returns.strength.mean() - 0.1) < 0.01
 
 
+@compiled
 def test_the_map_of_returns_counts_surfaces() -> None:
     capture, _ = two_surfaces(10.0, 0.5, 0.3, 16)
     counted_map = core.inspection.maps["Returns"](capture)
@@ -167,6 +215,7 @@ def test_the_map_of_returns_counts_surfaces() -> None:
     assert (core.inspection.maps["Returns"](empty) == 0).all()
 
 
+@compiled
 def test_arguments_out_of_their_bounds_are_refused() -> None:
     capture, _ = two_surfaces(6.0, 0.3, 0.1, 8)
     for returns in (0, 5):
@@ -177,6 +226,7 @@ def test_arguments_out_of_their_bounds_are_refused() -> None:
         core.with_returns(capture, image, 2, false_return=0.0)
 
 
+@compiled
 def test_files_hold_all_returns(tmp_path: Path) -> None:
     laspy = pytest.importorskip("laspy")
     scene = net(16, separation_bins=12.0)
