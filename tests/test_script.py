@@ -48,9 +48,9 @@ for folder in sys.argv[1:]:
     answers = {"image": found["image"]} | found.get("images", {})
     kept = {"picture": found.get("picture", 0)}
     for name, image in answers.items():
-        kept |= {f"{name} {each}": value for each, value in vars(image).items()}
+        for each, value in vars(image).items():
+            kept[f"{name} {each}"] = 0 if value is None else getattr(value, "values", value)
         kept[f"{name} made_by"] = str(image.made_by)
-        kept[f"{name} velocity"] = 0 if image.velocity is None else image.velocity.values
     for name, signals in ({"signals": found.get("signals")} | found.get("pinned", {})).items():
         if isinstance(signals, np.ndarray):
             kept[f"{name} score"] = signals
