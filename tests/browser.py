@@ -52,7 +52,7 @@ def browser_path() -> str | None:
     return named or next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
-TIMEOUT_MS = 60_000
+TIMEOUT_MS = 120_000
 """Limit of each wait for a page: pages are drawn in software, on few cores."""
 
 TOUR = "firstphoton.tour"
