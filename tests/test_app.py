@@ -716,6 +716,10 @@ def test_the_score_is_explained_where_it_is_drawn(car):
     assert f"maximum − lag ({lag_ns:.1f} ns)" in titles["target", "tracking"]
     assert "its maximum is the estimate" in titles["target", "likelihood"]
     assert all("no target" in titles["none", method] for method in ("tracking", "likelihood"))
+    source = built_in_sources()["approach"]
+    moving = compute(replace(car.request, source=source, method="velocity"), None)
+    views.update(inspect(moving, 32, 30), moving.gate, with_difference=False, unit="ns")
+    assert views.score.figure.title.text == "Score of a surface at rest"
 
 
 def test_a_weight_that_needs_pulses_is_refused_without_them(layout, small_file):

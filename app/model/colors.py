@@ -13,7 +13,7 @@ from app.model.mesh import point_cloud
 from app.model.state import FIT, VELOCITY, Viewing
 from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS
-from core import ESTIMATORS, inspection
+from core import inspection
 from core.cost import predicted_fit_time
 from core.geometry import WHOLE, Box, pixel_angle_of
 from core.inference import fit_of, fit_p_values, has_fit, share_below
@@ -94,7 +94,7 @@ def legend(answer: Answer, kind: str, viewing: Viewing, values: Array, look: Col
 
 def doubt(answer: Answer) -> str:
     """Return why confidences are not to be relied on; empty unless known (`has_fit`)."""
-    if ESTIMATORS[answer.method].follows_motion and answer.capture.groups is not None:
+    if answer.follows_motion:
         return ""  # the fit is that of surfaces at rest
     misfit = fit_of(answer.capture).remark if has_fit(answer.capture) else ""
     return f"{misfit.capitalize()}." if misfit else ""
@@ -176,11 +176,14 @@ def map_of(answer: Answer, kind: str, viewing: Viewing) -> tuple[Array, ColorSca
         with spending((rows, cols, n_bins), FIT.lower(), cost):
             return fit_p_values(answer.capture), p_value_scale()
     values = inspection.maps[kind](answer.capture)
-    known = values[np.isfinite(values)]
-    low, high = np.percentile(known, [1, 99]).tolist() if known.size else (0.0, 1.0)
+    known, whole = values[np.isfinite(values)], np.issubdtype(values.dtype, np.integer)
+    # A few pixels with several surfaces are what the map is for.
+    ends = [0, 100] if kind == "Returns" else [1, 99]
+    low, high = np.percentile(known, ends).tolist() if known.size else (0.0, 1.0)
     is_unknown = kind == "Fired" and answer.capture.gated_pulses is None
     title = FIRED_UNKNOWN if is_unknown else MAP_TITLES[kind]
-    return values, ColorScale(title, "", low, max(high, low + 1e-6), COUNT_COLORS)
+    high = max(high, low + (1 if whole else 1e-6))
+    return values, ColorScale(title, "", low, high, COUNT_COLORS, whole=whole)
 
 
 def velocity_of(answer: Answer, viewing: Viewing) -> tuple[Array, ColorScale]:

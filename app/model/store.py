@@ -321,6 +321,11 @@ class Answer:
         """Settings of the estimator."""
         return self.request.settings_of(self.method)
 
+    @property
+    def follows_motion(self) -> bool:
+        """Whether surfaces may have moved while the pulses were sent."""
+        return ESTIMATORS[self.method].follows_motion and self.capture.groups is not None
+
     def field_of_view_deg(self, viewing: Viewing) -> float:
         """Return the field of view that the user has set, else the capture's own."""
         chosen = viewing.field_of_view_deg
@@ -517,6 +522,8 @@ class Pixel:
     """None where the truth is unknown."""
     confidence: float
     counts: int
+    at_rest: bool
+    """Whether the score is that of a surface at rest, while the estimate follows its motion."""
 
     @property
     def peak_lag_bins(self) -> float:
@@ -564,6 +571,7 @@ def inspect(answer: Answer, row: int, col: int, report: PixelReport | None = Non
         None if capture.truth_range_m is None else bool(np.isfinite(truth_m)),
         float(image.confidence[row, col]),
         int(capture.counts[row, col]),
+        answer.follows_motion,
     )
 
 

@@ -76,6 +76,8 @@ def score_title(what: str, pixel: Pixel, along: Scale) -> str:
     """
     if pixel.has_target is False:
         return f"{what}: no target here, its maximum is noise"
+    if pixel.at_rest:
+        return f"{what} of a surface at rest"
     lag = pixel.peak_lag_bins
     if abs(lag) < 1:
         return f"{what}: its maximum is the estimate"

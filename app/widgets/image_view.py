@@ -59,6 +59,7 @@ class ImageView:
             self._plot.layers[layer]["glyph_renderer"].level = "overlay"
         self._mapper = picture["color_mapper"]
         (self._bar,) = color_bars(self.figure)
+        self._bar.ticker = BasicTicker()
         (zoom,) = self.figure.select(BoxZoomTool)
         zoom.match_aspect = True
         # Else Bokeh activates the first of the tools that HoloViews adds.
@@ -141,6 +142,7 @@ class ImageView:
             high_color=look.outside,
         )
         self._bar.title = look.unit
+        self._bar.ticker.min_interval = 1 if look.whole else 0
         self._read_out.args = {"source": self._plot.source("picture"), "unit": look.unit}
         self.figure.title.text = look.title
 

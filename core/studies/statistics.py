@@ -35,11 +35,14 @@ def median_interval(values: Floats) -> Interval:
     return Interval(float(np.median(ordered)), float(low), float(high))
 
 
-def mean_interval(values: Floats) -> Interval:
-    """Return the mean with Student's 95 % interval, NaN where there are fewer than two values."""
+def mean_interval(values: Floats, least: float = -math.inf, most: float = math.inf) -> Interval:
+    """Return the mean with Student's 95 % interval, NaN where there are fewer than two values.
+
+    The interval is cut to the means that are possible, from `least` to `most`.
+    """
     n = len(values)
     if n < 2:
         return Interval(math.nan, math.nan, math.nan)
     mean = float(np.mean(values))
     half = float(stdtrit(n - 1, 0.975) * np.std(values, ddof=1) / math.sqrt(n))
-    return Interval(mean, mean - half, mean + half)
+    return Interval(mean, max(mean - half, least), min(mean + half, most))

@@ -79,6 +79,8 @@ class ColorScale:
     high: float
     colors: list[str]
     outside: str | None = None
+    whole: bool = False
+    """Whether values are whole numbers."""
 
     @property
     def legend(self) -> str:

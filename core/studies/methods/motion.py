@@ -153,6 +153,5 @@ def _mean(
 ) -> Interval:
     """Return the mean of a result over the seeds, of one of `METHODS` where it has several."""
     values = [getattr(found[condition, seed], name) for seed in seeds]
-    mean = mean_interval(np.array(values if place is None else [each[place] for each in values]))
-    high = mean.high if name == "error_bins" else min(mean.high, 1.0)
-    return Interval(mean.value, max(mean.low, 0.0), high)
+    of_seeds = np.array(values if place is None else [each[place] for each in values])
+    return mean_interval(of_seeds, 0.0, np.inf if name == "error_bins" else 1.0)

@@ -116,8 +116,7 @@ def _table(
 
     def cell(condition: Condition, name: str, part: int) -> Interval:
         of_seeds = np.array([found[condition, seed][name][part] for seed in seeds])
-        mean = mean_interval(of_seeds)
-        return Interval(mean.value, max(mean.low, 0.0), min(mean.high, 1.0))
+        return mean_interval(of_seeds, 0.0, 1.0)
 
     return Table(
         f"neighbours_{scene}",

@@ -149,7 +149,10 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
             (
                 sbr,
                 share,
-                *(mean_interval(shares[sbr][:, i, j]) for j in range(len(SEPARATIONS_BINS))),
+                *(
+                    mean_interval(shares[sbr][:, i, j], 0.0, 1.0)
+                    for j in range(len(SEPARATIONS_BINS))
+                ),
             )
             for sbr in SBRS
             for i, share in enumerate(SHARES)
@@ -157,6 +160,7 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
         f"{n} Signal {SIGNAL} per pulse in all, 1000 pulses, nearer surface in bins "
         f"{_FRONT_BINS[0]:g} to {_FRONT_BINS[1]:g} of 100: farther back, pile-up leaves fewer "
         f"pulses. A second return is accepted at a false rate of {FALSE_RETURN:g}.",
+        formats={"SBR": "g", "share of the weaker": "g"},
     )
     wrong = dict(mapped(false, [(each, seed) for each in ONE_SURFACE for seed in seeds], processes))
     yield Table(
@@ -169,11 +173,12 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
                 each.kind,
                 each.sbr,
                 "with neighbours" if each.method == "image_posterior" else "by itself",
-                mean_interval(np.array([wrong[each, seed] for seed in seeds])),
+                mean_interval(np.array([wrong[each, seed] for seed in seeds]), 0.0, 1.0),
             )
             for each in ONE_SURFACE
         ),
         f"{n} At most {FALSE_RETURN:g} is asked for. The tail holds a tenth of the photons.",
+        formats={"SBR": "g"},
     )
     several = [(separation, seed) for separation in NET_SEPARATIONS_BINS for seed in seeds]
     found = dict(mapped(with_neighbours, several, processes))
@@ -185,8 +190,10 @@ def tables(seeds: Sequence[int], processes: int = 1) -> Iterator[Table]:
             (
                 separation,
                 *(
-                    mean_interval(np.array([found[separation, seed][part] for seed in seeds]))
-                    for part in range(3)
+                    mean_interval(
+                        np.array([found[separation, seed][part] for seed in seeds]), 0.0, most
+                    )
+                    for part, most in enumerate((1.0, 1.0, np.inf))
                 ),
             )
             for separation in NET_SEPARATIONS_BINS
