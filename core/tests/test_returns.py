@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -228,7 +229,6 @@ def test_arguments_out_of_their_bounds_are_refused() -> None:
 
 @compiled
 def test_files_hold_all_returns(tmp_path: Path) -> None:
-    laspy = pytest.importorskip("laspy")
     scene = net(16, separation_bins=12.0)
     capture = simulate(scene, scene.acquisition, Flux(0.3, 0.5), seed=1)
     image = core.estimate(capture, "likelihood", returns=2)
