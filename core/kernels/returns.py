@@ -38,7 +38,7 @@ _SHARES = ((0.5, 0.5, 1.0), (0.3, 0.7, 1.5), (0.7, 0.3, 1.5))
 
 
 class EchoModel(NamedTuple):
-    """What the pixels of a capture share."""
+    """Quantities that the pixels of a capture share."""
 
     echo: NDArray[np.float64]
     """Share of the photons of an echo per bin, for delays from 0 to 1 bin, shape (step, tap)."""
