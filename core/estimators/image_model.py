@@ -11,6 +11,10 @@ Laplace density K of scale a, the pair is ::
 times as likely with one surface as with two. ``mean log (1 - ρ + ρ c)`` over pairs of neighbours is
 maximised over ρ and a; the same maximum of pairs at random, which see two surfaces, is subtracted.
 If nothing remains, neighbours carry no information about each other.
+
+Where no surface of these levels is likely, one that must be there is fainter. Its level may be any
+from a small part to twice the typical signal (`with_any_level`), so that its pixel follows its
+neighbours rather than the background.
 """
 
 from __future__ import annotations
@@ -43,6 +47,7 @@ _SURE = 3.0  # standard errors
 _ECHO_BINS = 4  # merged bins of an echo; more add no information
 _LEAST_SHARE = 1e-6  # of the pixels
 _LEAST_DEPTH = 0.3  # relative to a uniform prior; fewer pixels teach depths than are estimated
+_ANY_LEVEL = np.geomspace(0.06, 2.0, 8)  # relative to the typical signal
 _LEAST_EVIDENCE = 1e-20  # so that no product of messages is subnormal
 
 
@@ -56,7 +61,20 @@ def image_model_of(capture: Capture) -> FluxModel:
         here = _agreement(merged, merged_flux(flux, factor))
         if here.gain > best.gain:
             found, best = flux, here
-    return replace(found, agreement=best)
+    depth = tempered(found.depth) if best.alike > 0 else found.depth
+    return replace(found, depth=depth, agreement=best)
+
+
+def tempered(depth: Floats) -> Floats:
+    """Return a weaker prior of the delays than the pixels by themselves teach, of shape (bin,).
+
+    Its square root, and no less than `_LEAST_DEPTH`. The delays of pixels by themselves are those
+    of the large and bright surfaces; at a low SBR, a delay that few pixels have is not found at
+    all. Neighbours show such a delay together, and must be able to.
+    """
+    root = np.sqrt(depth)
+    weaker = np.maximum(root / root.mean(), _LEAST_DEPTH)
+    return np.asarray(weaker / weaker.mean())
 
 
 def merged_bins(capture: Capture) -> tuple[Capture, int]:
@@ -157,6 +175,23 @@ class Prior(NamedTuple):
         nothing = min(max(float(flux.share[0]), _LEAST_SHARE), 1 - _LEAST_SHARE)
         depth = np.maximum(flux.depth, _LEAST_DEPTH) / flux.depth.size
         return cls((1 - nothing) * depth, nothing)
+
+
+def with_any_level(capture: Capture, flux: FluxModel, empty: float) -> FluxModel:
+    """Return a flux model with levels of any strength, and a share `empty` without a surface."""
+    typical = float(flux.typical_signal.mean())
+    share = np.append(empty, np.full(_ANY_LEVEL.size, (1 - empty) / _ANY_LEVEL.size))
+    prior = FluxPrior(
+        np.append(0.0, typical * _ANY_LEVEL),
+        share,
+        flux.depth,
+        np.asarray(flux.typical_background.mean()),
+        detailed_flux_prior_of(capture).own_weight,
+        flux.contrast,
+        flux.pile_up,
+        flux.background_shape,
+    )
+    return replace(flux_model_with(capture, prior), agreement=flux.agreement)
 
 
 def states_of_image(capture: Capture, flux: FluxModel) -> States:

@@ -7,6 +7,9 @@ neighbours, the second lies with probability ρ on the plane of the first, and a
 **Evidence.** The likelihood ratio of each delay, averaged over the signal levels, which are
 estimated from pooled pixels (`core.estimators.image_model`).
 
+Where no surface is likely although every pixel has to be estimated, its level is unknown, and any
+level is as likely (`core.estimators.image_model.with_any_level`).
+
 **Messages.** A posterior of each pixel given the others of its row, then of each given all rows by
 the same along the columns: sum-product messages (`core.kernels.messages`), in which each other
 pixel counts once. The same with columns first; the posterior is the mean of both.
@@ -41,6 +44,7 @@ from core.estimators.image_model import (
     merged_flux,
     states_of_image,
     states_of_pixels,
+    with_any_level,
 )
 from core.estimators.likelihood import Depths, LikelihoodParameters, curve
 from core.estimators.likelihood import locate as locate_alone
@@ -55,6 +59,8 @@ from core.parameters import Settings, parameter
 _ROUNDS = 3
 _LEAST_ODDS = 1e-12
 _EMPTY_SHARE = 0.01  # of pixels without an echo, if every pixel is estimated
+_UNLIKELY = 0.1  # probability of a surface below which its signal level is unknown
+_FALSE_SURFACE = 0.01  # share of the empty pixels that get a range, if pixels may be empty
 _ALONG_PLANES = 0.8, 0.15  # ρ and the scale of K in bins
 _HALF = 5  # of the window to which a plane is fitted, without the pixel in its middle
 
@@ -67,7 +73,8 @@ class ImageParameters(Settings):
         "estimate every pixel",
         PIXELS,
         "Estimate every pixel: each gets its likeliest range, as if nearly all had a surface. "
-        "Allow empty pixels: only those get a range in which a surface is likelier than none. "
+        "Allow empty pixels: only those get a range in which a surface is likelier than none, and "
+        "so likely that about 1 % of the empty pixels get one. "
         "Confidence never assumes a surface.",
     )
 
@@ -120,12 +127,22 @@ def image_posterior_of(capture: Capture, flux: FluxModel) -> ImagePosterior:
 
 @cached_per_capture
 def likeliest_delays(capture: Capture, flux: FluxModel) -> Floats:
-    """Find the likeliest delay of each pixel in bins if nearly all have a surface, (row, col)."""
+    """Find the likeliest delay of each pixel in bins if nearly all have a surface, (row, col).
+
+    Where a surface of the levels of the image is unlikely, its level is unknown.
+    """
     merged, factor = merged_bins(capture)
+
+    def delays(chosen: FluxModel) -> Floats:
+        return peaks(_posterior(merged, merged_flux(chosen, factor)).surface)[0] * factor
+
     dark = _EMPTY_SHARE
     share = np.append(dark, (1 - dark) * flux.share[1:] / (flux.share[1:].sum() or 1.0))
-    posterior = _posterior(merged, merged_flux(replace(flux, share=share), factor))
-    return peaks(posterior.surface)[0] * factor
+    found = delays(replace(flux, share=share))
+    is_faint = image_posterior_of(capture, flux).surface < _UNLIKELY
+    if not is_faint.any():
+        return found
+    return np.where(is_faint, delays(with_any_level(capture, flux, dark)), found)
 
 
 def _posterior(capture: Capture, flux: FluxModel) -> States:
@@ -200,10 +217,21 @@ def _locate(
     found = image_posterior_of(capture, flux)
     surface = np.clip(found.surface, _LEAST_ODDS, 1 - _LEAST_ODDS)
     if parameters.pixels == "allow empty pixels":
-        delay = np.where(surface >= 0.5, found.delay, np.nan)
+        delay = np.where(surface >= least_probability(surface), found.delay, np.nan)
     else:
         delay = likeliest_delays(capture, flux)
     return delay, np.log(surface / (1 - surface))
+
+
+def least_probability(surface: Floats) -> float:
+    """Return the probability of a surface, 0.5 at least, from which a pixel gets a range.
+
+    Such that the expected share of the empty pixels that get one is at most `_FALSE_SURFACE`.
+    """
+    likeliest_first = np.sort(surface, axis=None)[::-1]
+    false = np.cumsum(1 - likeliest_first)
+    n_accepted = int(np.searchsorted(false, _FALSE_SURFACE * false[-1], side="right"))
+    return max(0.5, float(likeliest_first[max(n_accepted - 1, 0)]))
 
 
 def _confidence(

@@ -11,8 +11,14 @@ import pytest
 from core.acquisition import Acquisition, Flux, Pulse
 from core.capture import Capture
 from core.estimators import ESTIMATORS, estimate
-from core.estimators.image_model import Prior, image_model_of, merged_bins, merged_flux
-from core.estimators.image_posterior import Link, planes
+from core.estimators.image_model import (
+    Prior,
+    image_model_of,
+    merged_bins,
+    merged_flux,
+    tempered,
+)
+from core.estimators.image_posterior import Link, image_posterior_of, least_probability, planes
 from core.inference.flux_model import FluxModel
 from core.inspection import pixel_report
 from core.kernels.messages import fill_posterior
@@ -126,8 +132,43 @@ def test_the_sky_is_empty_if_empty_pixels_are_allowed() -> None:
         for each in ("estimate every pixel", "allow empty pixels")
     )
     assert every.all()
-    assert some[is_sky].mean() < 0.08  # next to the car, neighbours favour a surface
-    assert some[~is_sky].mean() > 0.85
+    assert some[is_sky].mean() < 0.05  # next to the car, neighbours favour a surface
+    assert some[~is_sky].mean() > 0.95
+
+
+def test_few_empty_pixels_get_a_range() -> None:
+    rng = np.random.default_rng(0)
+    empty, seen = rng.uniform(0, 0.3, 20_000), rng.uniform(0.999, 1.0, 20_000)
+    assert least_probability(np.concatenate([empty, seen])) == 0.5
+    ambiguous = rng.uniform(0.3, 0.9, 2_000)
+    surface = np.concatenate([empty, seen, ambiguous])
+    least, false = least_probability(surface), 1 - surface
+    assert 0.5 < least < 0.9
+    assert false[surface >= least].sum() / false.sum() == pytest.approx(0.01, rel=0.01)
+
+
+def test_a_tempered_prior_keeps_the_order_of_delays_and_excludes_none() -> None:
+    depth = np.array([0.0, 1e-6, 0.5, 1.5, 8.0])
+    found = tempered(depth / depth.mean())
+    assert found.mean() == pytest.approx(1.0)
+    assert found.min() > 0.1
+    assert (np.diff(found) >= 0).all()
+    assert found[-1] / found[-2] == pytest.approx((8.0 / 1.5) ** 0.5)
+    np.testing.assert_allclose(tempered(np.ones(7)), 1.0)
+
+
+@pytest.mark.compiled
+def test_dark_pixels_follow_their_neighbours() -> None:
+    scene = scenes["wall"](32, seed=1)
+    dark = np.zeros((32, 32), bool)
+    dark[10:20, 12:22] = True
+    scene = replace(scene, reflectivity=np.where(dark, 0.02, 1.0))
+    capture = simulate(scene, Acquisition(), Flux(0.1041, sbr=0.1), seed=900)
+    flux = image_model_of(capture)
+    assert image_posterior_of(capture, flux).surface[dark].mean() < 0.5  # taken for empty
+    found = estimate(capture, "image_posterior").range_m
+    right = np.abs(found - scene.range_m) <= 3 * capture.acquisition.bin_length_m
+    assert right.mean() > 0.97
 
 
 evidence_at = ESTIMATORS["image_posterior"].evidence_at
