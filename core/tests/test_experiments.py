@@ -436,6 +436,7 @@ def test_scatter_plots_and_bands_are_written_with_their_intervals(tmp_path: Path
         "a,1.0,0.9,1.1,1.0,0.9,1.1",
         "a,2.0,1.8,2.5,2.0,1.8,2.5",
     ]
+    assert b"<svg" in files["points.svg"] and files["points.png"].startswith(b"\x89PNG")
     assert files["curve.csv"].decode().splitlines()[1] == "1.0,1.0,0.0,2.0"
     write([scatter, plot], tmp_path, "once", ())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
