@@ -6,7 +6,7 @@ import json
 import math
 import pickle
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,7 +24,7 @@ from core.inference.flux import detailed_flux_prior_of, flux_prior_of
 from core.inference.limits import cramer_rao_bins
 from core.inference.resolution import FEW, HIDDEN, RESOLVED, Difference
 from core.metrics import Interval
-from core.scene import Scene
+from core.scene import Scene, scenes
 from core.simulation import simulate
 from core.studies.ablation import corrections, plain, power
 from core.studies.ablation.criterion import UNKNOWN, judged
@@ -90,8 +90,10 @@ def test_the_rule(part: str, evidence: float, rd: Interval, rmse_m: Interval, ve
 
 @pytest.mark.compiled
 def test_the_parts_of_a_scene_are_judged_by_their_effect() -> None:
-    fast = requirements(wall(motion=Motion(30.0, 20e3)), Flux(0.1, 2.0), seeds=range(4))
-    slow = requirements(wall(motion=Motion(1e-4, 20e3)), Flux(0.1, 2.0), seeds=range(4))
+    fast, slow = (
+        requirements(wall(size, motion=Motion(speed, 20e3)), Flux(0.1, 2.0), seeds=range(3))
+        for size, speed in ((32, 30.0), (8, 1e-4))
+    )
     assert [row.part for row in fast] == ["pile_up", "pulse_shape", "signal_levels", "motion"]
     moved, still = fast[-1], slow[-1]
     assert moved.verdict == "needed"
@@ -107,7 +109,7 @@ def test_the_parts_of_a_scene_are_judged_by_their_effect() -> None:
 
 @pytest.mark.compiled
 def test_pile_up_needs_a_correction_by_day_and_none_by_night() -> None:
-    day, night = (requirements(wall(), flux, seeds=range(4))[0] for flux in (DAY, NIGHT))
+    day, night = (requirements(wall(), flux, seeds=range(3))[0] for flux in (DAY, NIGHT))
     assert day.verdict == "needed"
     assert day.rd_change.low > 0.1
     assert day.total_variation > day.resolvable
@@ -364,8 +366,9 @@ def test_coates_corrects_pile_up_only_where_it_is_detectable() -> None:
 @pytest.mark.compiled
 @pytest.mark.usefixtures("blank_figures")
 def test_the_command_judges_a_scene_and_writes_a_page(
-    tmp_path, capsys: pytest.CaptureFixture[str]
+    tmp_path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setitem(scenes, "car", partial(wall, 8))
     page = tmp_path / "page"
     arguments = ["requires", "--scene", "car", "--pulses", "50", "--seeds", "2", "--falloff"]
     assert main([*arguments, "--folder", str(page)]) == ACCEPTED

@@ -111,6 +111,11 @@ def test_a_gate_cut_to_the_true_ranges_is_never_chosen() -> None:
     assert best is not None and best.point is honest
 
 
+def test_every_method_is_measured_with_each_number_of_merged_bins() -> None:
+    tried = [(each.method.name, each.reduction.merge) for each in measure.candidates()]
+    assert sorted(tried) == sorted((m.name, n) for m in default_methods() for n in measure.MERGES)
+
+
 def test_a_clear_choice_is_certain() -> None:
     points = [steady(50, 1), steady(90, 4), steady(95, 9), steady(99, 2, "oracle")]
     best = best_within(points, 5)
@@ -501,6 +506,9 @@ def test_the_best_exposure_is_the_best_by_theory(car: Simulation) -> None:
 
 @pytest.fixture
 def small_car(monkeypatch: pytest.MonkeyPatch, car: Simulation) -> None:
+    """Little to measure: each scene, method and setting once."""
+    few = [method(name) for name in ("peak", "tracking", "oracle")]
+    monkeypatch.setattr(measure, "default_methods", lambda: few)
     monkeypatch.setitem(scenes, "car", lambda: car.scene)
     monkeypatch.setattr(acquiring, "PULSES", (50, 500))
     monkeypatch.setattr(acquiring, "EXPOSURES", (0.5, 1.0))
@@ -509,7 +517,7 @@ def small_car(monkeypatch: pytest.MonkeyPatch, car: Simulation) -> None:
 
 
 @pytest.mark.compiled
-@pytest.mark.usefixtures("small_car", "one_process")
+@pytest.mark.usefixtures("small_car", "one_process", "blank_figures")
 def test_the_command_recommends_and_writes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -525,11 +533,10 @@ def test_the_command_recommends_and_writes(
         rows = list(csv.DictReader(file))
     assert [row["configuration"] for row in rows] == [each["configuration"] for each in known]
     assert [float(row["ms, low"]) for row in rows] == [each["milliseconds"][1] for each in known]
-    assert {each["method"] for each in known} == {each.name for each in default_methods()}
+    assert {each["method"] for each in known} == {"peak", "tracking", "oracle"}
     for key in ("front_car_0.06_1000", "pulses_car_0.06", "exposure_car_0.06", "gate_car_0.06"):
         assert (tmp_path / f"{key}.csv").exists()
-        assert (tmp_path / f"{key}.png").exists()
-        assert b"<svg" in (tmp_path / f"{key}.svg").read_bytes()
+        assert (tmp_path / f"{key}.png").exists() and (tmp_path / f"{key}.svg").exists()
 
 
 @pytest.mark.compiled
@@ -538,9 +545,7 @@ def test_the_command_studies_a_capture(
     stairs: Simulation,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(measure, "default_methods", lambda: [method("peak"), method("tracking")])
     path = tmp_path / "stairs.npz"
     save_capture(replace(stairs.capture(1), truth_range_m=None, signal=None), path)
     arguments = ["tradeoff", "--short", "--processes", "1", "--seeds", "2", "--capture", str(path)]
