@@ -12,7 +12,7 @@ from itertools import chain
 from textwrap import indent
 
 from app.model.state import CLOUDS, VELOCITY, State, Viewing
-from app.model.store import Answer, bare, groups_of
+from app.model.store import Answer, bare
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
 from core.geometry import WHOLE, Box
 from core.io import RangeColors
@@ -115,7 +115,7 @@ def _simulation(answer: Answer) -> Lines:
         yield assign("acquisition", "replace", acquisition, n_pulses=pulses)
         acquisition = "acquisition"
     seed = {"seed": literal(light.seed)} if light.seed else {}
-    groups = groups_of(bare(source.scene(), request.absent), light.acquisition(own).n_pulses)
+    groups = bare(source.scene(), request.absent).groups_of(light.acquisition(own).n_pulses)
     order = {"n_groups": literal(groups)} if groups else {}
     yield assign("capture", "core.simulate", "scene", acquisition, flux, **seed, **order)
 

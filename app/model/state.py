@@ -10,14 +10,22 @@ from typing import Any
 import param
 
 from app.model.methods import FIRST_METHODS, OTHERS, default_settings
-from core import ESTIMATORS, Acquisition, Flux, PhotonBudget, TrackingParameters, Window
+from core import (
+    CORRECTIONS,
+    ESTIMATORS,
+    PARTS,
+    Acquisition,
+    Flux,
+    PhotonBudget,
+    TrackingParameters,
+    Window,
+)
 from core.checks import require
 from core.estimators import FALSE_ALARM
 from core.geometry import Box
 from core.io import RangeColors, ReadOptions
 from core.parameters import Choice, Number, Settings, check_fields, parameter
 from core.reductions import Reduction
-from core.studies.ablation import TITLES
 
 
 @dataclass(frozen=True)
@@ -355,8 +363,9 @@ def _is_pair(value: Any, kind: type, least: int) -> bool:
 
 
 def _check_absent(name: str, value: Any) -> None:
-    known = isinstance(value, frozenset) and value <= set(TITLES)
-    require(name, value, known, "some of " + ", ".join(TITLES))
+    can_be = [*CORRECTIONS, *PARTS]
+    known = isinstance(value, frozenset) and value <= set(can_be)
+    require(name, value, known, "some of " + ", ".join(can_be))
 
 
 class State(param.Parameterized):

@@ -22,7 +22,6 @@ from core import (
     CORRECTIONS,
     ESTIMATORS,
     PARTS,
-    USUAL_GROUPS,
     Capture,
     PhotonBudget,
     Run,
@@ -126,13 +125,8 @@ def simulated(request: Request) -> Capture:
     """Return a capture of the scene of a request, which its source names."""
     scene, light = request.scene, request.illumination
     acquisition, name = light.acquisition(scene.acquisition), request.source.name
-    n_groups = groups_of(scene, acquisition.n_pulses)
+    n_groups = scene.groups_of(acquisition.n_pulses)
     return simulate(scene, acquisition, light.flux, seed=light.seed, name=name, n_groups=n_groups)
-
-
-def groups_of(scene: Scene, n_pulses: int | None) -> int | None:
-    """Return the groups in which the pulses of a moving scene are kept; None for one at rest."""
-    return min(USUAL_GROUPS, n_pulses or 1) if scene.motion is not None else None
 
 
 def file_source(

@@ -328,4 +328,5 @@ def affordable(source: Source, chosen: Sequence[Candidate]) -> list[Candidate]:
 def methods(answer: Answer) -> list[Method]:
     """Return all methods with their defaults, tracking with the settings of the session."""
     tracking = Method("tracking", "tracking", answer.request.tracking)
-    return [tracking if each.name == "tracking" else each for each in default_methods()]
+    known = default_methods(with_motion=answer.whole.groups is not None)
+    return [tracking if each.name == "tracking" else each for each in known]
