@@ -234,6 +234,10 @@ AUTOMATIC = "automatic"
 
 CLOUDS = "3D clouds"
 
+MOST_PROBABLE, ALL_RETURNS = "most probable", "all returns"
+RETURNS = (MOST_PROBABLE, ALL_RETURNS)
+"""Surfaces of a pixel that the 3D cloud, Inspect and files hold."""
+
 KINDS = ("Range", "Error", "Confidence", CLOUDS)
 """Kinds of pictures of methods."""
 
@@ -403,6 +407,11 @@ class State(param.Parameterized):
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
     settings: Any = Checked(
         default_settings(), _check_settings, doc="Settings of each other estimator."
+    )
+    returns = param.Selector(
+        default=MOST_PROBABLE,
+        objects=list(RETURNS),
+        doc="Surfaces of a pixel that are shown: the most probable, or up to two.",
     )
     pixel: Any = Checked((31, 24), _check_pixel, doc="Selected row and column.")
     image = param.Selector(default="Estimate", objects=list(IMAGES))
