@@ -373,11 +373,12 @@ def test_a_region_is_its_pixels_added_to_one() -> None:
 def test_a_region_of_two_surfaces_says_so_and_a_slope_does_not() -> None:
     for scene, sbr, several in ((scenes["net"](16), 0.06, True), (scenes["wall"](16), 0.3, False)):
         capture = simulate(scene, scene.acquisition, Flux(sbr=sbr))
-        mask = np.ones(capture.shape, bool)
+        mask = np.zeros(capture.shape, bool)
+        mask[:, 6:9] = True
         image = estimate(capture, "peak")
         report = inspection.region_report(capture, image, mask, "likelihood")
         found = np.sort(report.pixel.surfaces_bin)
-        middle_m = np.mean(scene.surfaces_m, axis=(1, 2))
+        middle_m = np.mean(scene.surfaces_m[:, mask], axis=1)
         np.testing.assert_allclose(
             found, np.sort(capture.acquisition.range_m_to_bin(middle_m)), atol=1.0
         )
