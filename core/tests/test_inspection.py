@@ -376,6 +376,35 @@ def test_a_region_is_its_pixels_added_to_one() -> None:
         inspection.region_report(capture, image, np.zeros((8, 7), bool))
 
 
+@pytest.mark.compiled
+def test_a_region_of_two_surfaces_says_so_and_a_slope_does_not() -> None:
+    for scene, sbr, several in ((scenes["net"](16), 0.06, True), (scenes["wall"](16), 0.3, False)):
+        capture = simulate(scene, scene.acquisition, Flux(sbr=sbr))
+        mask = np.zeros(capture.shape, bool)
+        mask[:, 6:9] = True
+        image = estimate(capture, "peak")
+        report = inspection.region_report(capture, image, mask, "likelihood")
+        found = np.sort(report.pixel.surfaces_bin)
+        middle_m = np.mean(scene.surfaces_m[:, mask], axis=1)
+        np.testing.assert_allclose(
+            found, np.sort(capture.acquisition.range_m_to_bin(middle_m)), atol=1.0
+        )
+        assert report.pixel.surfaces_text.startswith("2 surfaces: " if several else "1 surface: ")
+
+
+@pytest.mark.compiled
+def test_returns_with_neighbours_are_candidates_of_a_pixel() -> None:
+    scene = scenes["net"](24)
+    capture = simulate(scene, scene.acquisition, Flux(sbr=0.1))
+    image = estimate(capture, "image_posterior", returns=2)
+    assert image.returns is not None
+    report = inspection.pixel_report(capture, image, 12, 12, "image_posterior")
+    here = image.returns.at(12, 12)
+    probability = {each.bin: each.probability for each in report.candidates}
+    assert [probability[each] for each in here.bin.tolist()] == here.confidence.tolist()
+    assert len(report.surfaces_bin) == 2
+
+
 def test_fluxes_of_a_region_are_with_the_pulse_of_its_echoes() -> None:
     wall = Scene(np.full((8, 8), ACQUISITION.bin_to_range_m(30.3)), acquisition=ACQUISITION)
     capture = simulate(wall, ACQUISITION, Flux(0.2, 0.5), Pulse.gaussian(2e-9), seed=1)

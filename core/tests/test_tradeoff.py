@@ -26,7 +26,7 @@ from core.io.writers import save_capture
 from core.metrics import Interval
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
-from core.scene import Scene, scenes
+from core.scene import PAPER_GATE, Scene, scenes
 from core.simulation import simulate
 from core.studies import trials
 from core.studies.tradeoff import acquisition as acquiring
@@ -38,6 +38,8 @@ from core.studies.tradeoff.measure import (
     Candidate,
     Piece,
     Point,
+    applicable,
+    candidates,
     scored,
     study,
     variations,
@@ -272,7 +274,8 @@ def test_a_study_measures_every_applicable_candidate(
     capture = stairs.capture(6)
     image = estimators.estimate(reduction.of(capture), known["method"], **known["parameters"])
     truth_m, bin_m = np.asarray(capture.truth_range_m), capture.acquisition.bin_length_m
-    again = trials.compare(reduction.spread(image.range_m, capture.shape), truth_m, bin_m, 0.0)
+    found_m = reduction.spread(image.range_m, capture.shape)
+    again = trials.compare(found_m[np.newaxis], truth_m[np.newaxis], bin_m, 0.0)
     assert replace(points[2].scores[1], seconds=0.0) == again
 
 
@@ -282,6 +285,25 @@ def test_a_score_equals_that_of_trials() -> None:
     (found,) = scored(Piece(0, simulation, (CONFIGURATIONS[1],), 3))
     expected = trials.score(Condition("car", 0.06).capture(3), method("tracking"))
     assert [replace(each, seconds=0.0) for each in found] == [replace(expected, seconds=0.0)]
+
+
+@pytest.mark.compiled
+def test_two_returns_and_velocities_are_measured_where_scenes_have_them() -> None:
+    two, moving = scenes["net"](16, separation_bins=20.0, share=0.5), scenes["approach"]()
+    moving = replace(moving, range_m=moving.range_m[24:32, 24:32])
+    found = {}
+    for name, scene in (("two", two), ("moving", moving)):
+        source = Simulation(name, scene, replace(PAPER_GATE, n_pulses=500), Flux(0.3, 1.0))
+        _, chosen = applicable(source, candidates(merges=(1,)))
+        found[name] = {str(each) for each in chosen}
+    assert found["two"] - found["moving"] == {"likelihood, 2 returns", "image_posterior, 2 returns"}
+    assert found["moving"] - found["two"] == {"velocity"}
+    source = Simulation("two", two, PAPER_GATE, Flux(0.3, 1.0))
+    chosen = tuple(Candidate(method("likelihood"), returns=n) for n in (1, 2))
+    (one,), (both,) = scored(Piece(0, source, chosen, 0))
+    assert one.targets == 2 * 16 * 16
+    assert one.restored[2] / one.targets == pytest.approx(0.5, abs=0.02)
+    assert both.restored[2] / both.targets > 0.97
 
 
 @pytest.mark.compiled
@@ -361,7 +383,7 @@ def test_a_capture_with_a_truth_is_scored_by_parts(
     assert {score.targets for score in point.scores} == {16}
     expected = trials.score(capture, method("tracking"))
     assert sum(score.restored[2] for score in point.scores) == expected.restored[2]
-    monkeypatch.setattr(measure, "MAX_COUNTS", capture.cube.size // 4)
+    monkeypatch.setattr("core.studies.middle.MAX_COUNTS", capture.cube.size // 4)
     middle = measure.studied(capture)
     assert isinstance(middle, Capture)
     assert middle.cube.shape == (8, 8, 100)
@@ -508,7 +530,7 @@ def test_the_best_exposure_is_the_best_by_theory(car: Simulation) -> None:
 def small_car(monkeypatch: pytest.MonkeyPatch, car: Simulation) -> None:
     """Little to measure: each scene, method and setting once."""
     few = [method(name) for name in ("peak", "tracking", "oracle")]
-    monkeypatch.setattr(measure, "default_methods", lambda: few)
+    monkeypatch.setattr(measure, "default_methods", lambda **_: few)
     monkeypatch.setitem(scenes, "car", lambda: car.scene)
     monkeypatch.setattr(acquiring, "PULSES", (50, 500))
     monkeypatch.setattr(acquiring, "EXPOSURES", (0.5, 1.0))
