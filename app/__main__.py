@@ -15,7 +15,8 @@ import os
 import signal
 import sys
 import webbrowser
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
@@ -106,7 +107,8 @@ def main(arguments: list[str] | None = None) -> int:
     # An exception raised at an arbitrary place can be lost: handle SIGTERM like Ctrl+C, for which
     # Panel stops the loop below.
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
-    prepare()
+    with ended_at_once():
+        prepare()
     link = access.link(chosen.origin[0] if chosen.origin else chosen.address, port)
     print(f"Open {link} in a browser; Ctrl+C stops.", flush=True)
     if chosen.show:
@@ -121,15 +123,35 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+@contextmanager
+def ended_at_once() -> Iterator[None]:
+    """Let Ctrl+C and SIGTERM end the process at once.
+
+    Panel's handler ends a loop, which has not begun while kernels are compiled: that may take
+    minutes.
+    """
+    handlers = {
+        each: signal.signal(each, signal.SIG_DFL) for each in (signal.SIGINT, signal.SIGTERM)
+    }
+    yield
+    for each, handler in handlers.items():
+        signal.signal(each, handler)
+
+
 def prepare() -> None:
     """Prepare this process for serving."""
-    print("Compiling kernels that are not cached ...", flush=True)
-    core.warm_up()
+    core.warm_up(say_compiled)
     tune()
     apply_patches()
     garbage.freeze_all()
     gc.set_threshold(*THRESHOLD)
     gettempdir()  # is chosen by writing to it: on a full disk, Python would find no folder at all
+
+
+def say_compiled(done: int, of: int) -> None:
+    """Draw a progress bar of what `core.warm_up` has compiled."""
+    end = "\n" if done == of else ""
+    print(f"\rCompiling kernels that are not cached [{'#' * done:<{of}}]", end=end, flush=True)
 
 
 def parser_of_arguments() -> argparse.ArgumentParser:

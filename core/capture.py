@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from core.acquisition import Acquisition, Floats, Pulse
 from core.checks import require
 from core.deprecation import renamed
-from core.kernels.blocks import Blocks, to_blocks
+from core.kernels.blocks import Blocks, pixel_sums, to_blocks
 from core.labels import dataset
 from core.notebook import html_table
 from core.pulse_groups import PulseGroups
@@ -193,7 +193,7 @@ class Capture:
     @cached_property
     def counts(self) -> NDArray[np.int64]:
         """Detections of each pixel, shape (row, col)."""
-        return np.asarray(self.cube.sum(axis=2, dtype=np.int64))
+        return pixel_sums(self.cube)
 
     @cached_property
     def blocks(self) -> Blocks:

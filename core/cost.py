@@ -30,6 +30,7 @@ __all__ = [
     "predicted_fit_time",
     "predicted_flux_time",
     "predicted_interval_time",
+    "predicted_returns_time",
     "require_memory",
 ]
 
@@ -56,6 +57,7 @@ _FEW_PIXELS = 24  # whose fluxes are estimated one by one (`core.inspection.mean
 _FLUX_S, _MIXTURE_S = 20e-6, 5e-6  # per bin of a pixel
 _FIT_S, _FIT_BYTES = 0.5e-6, 80_000_000  # per bin of a pixel; of the pixels tested at once
 _INTERVAL_S, _INTERVAL_BYTES = 6e-6, 50_000_000  # per bin near an estimate; of pixels at once
+_RETURN_S, _RETURN_BYTES, _RETURN_DRAWN = 2e-6, 16.0, 2**13  # per bin of a pixel; those drawn
 _MOVING_S = 1.2e-9  # per velocity, count, and group of pulses or tap
 _WINDOW_ECHOES = 4  # width of nearly all of an echo, in `Capture.echo_bins`
 _ECHOES = 64  # noise-free echoes of the lag calibration
@@ -211,6 +213,13 @@ def predicted_interval_time(n_pixels: int, echo_bins: int) -> Cost:
     """
     n_bins = _WINDOW_ECHOES * echo_bins + 2 * TOLERANCE_BINS + 1
     return Cost(_INTERVAL_BYTES, _INTERVAL_S * n_bins * n_pixels)
+
+
+def predicted_returns_time(n_pixels: int, n_bins: int) -> Cost:
+    """Predict memory and time of the returns of pixels (`core.with_returns`), those drawn too."""
+    n_counts = n_pixels * n_bins
+    seconds = _RETURN_S * (n_counts + _RETURN_DRAWN * n_bins)
+    return Cost(int(_FIXED_BYTES + _RETURN_BYTES * n_counts), seconds)
 
 
 def _filled(n_pixels: int, lanes: int) -> int:

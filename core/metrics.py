@@ -40,6 +40,8 @@ __all__ = [
     "restoration_degree",
     "restored",
     "rmse_m",
+    "surface_errors_m",
+    "surfaces_found",
     "wilson",
 ]
 
@@ -105,6 +107,43 @@ def restoration_degree(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: floa
     """
     hits, targets = restored(range_m, truth_m, tolerance_m)
     return hits / targets if targets else math.nan
+
+
+def surfaces_found(range_m: ArrayLike, truth_m: ArrayLike, tolerance_m: float) -> tuple[int, int]:
+    """Number of surfaces found within `tolerance_m`, and the number that it is to be divided by.
+
+    For several surfaces and several returns of a pixel, which are matched one to one. The second
+    number is that of the surfaces of each target pixel, or of its returns where these are more: a
+    false return costs as much as a surface that is missed. With one surface and at most one return
+    in each pixel, both numbers are those of `restored`.
+
+    Parameters
+    ----------
+    range_m : array_like, shape (return, row, col)
+        NaN where a pixel has fewer returns.
+    truth_m : array_like, shape (surface, row, col)
+        NaN where a pixel has fewer surfaces.
+    """
+    found, truth = _targets(range_m, truth_m)
+    # The longest common subsequence: matched in order of range, no two pairs cross.
+    pairs = np.zeros((len(found) + 1, len(truth) + 1, truth.shape[1]), int)
+    for i, return_m in enumerate(found, 1):
+        for j, surface_m in enumerate(truth, 1):
+            matched = pairs[i - 1, j - 1] + _within(return_m - surface_m, tolerance_m)
+            pairs[i, j] = np.maximum(matched, np.maximum(pairs[i - 1, j], pairs[i, j - 1]))
+    most = np.maximum(*(np.isfinite(each).sum(axis=0) for each in (found, truth)))
+    return int(pairs[-1, -1].sum()), int(most.sum())
+
+
+def surface_errors_m(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:
+    """Errors in metres of the returns nearest to each surface of their pixels, flat.
+
+    NaN where the pixel has no return; parameters as for `surfaces_found`.
+    """
+    found, truth = _targets(range_m, truth_m)
+    error = found[:, np.newaxis] - truth
+    nearest = np.where(np.isnan(error), np.inf, np.abs(error)).argmin(axis=0)
+    return np.asarray(np.take_along_axis(error, nearest[np.newaxis], axis=0)[0, np.isfinite(truth)])
 
 
 def rd_variance(rd_per_repetition: ArrayLike) -> float:
@@ -234,6 +273,15 @@ def wilson(hits: int, trials: int, level: float = 0.95) -> Interval:
     half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
     half /= 1 + z * z / trials
     return Interval(share, min(max(centre - half, 0.0), share), max(min(centre + half, 1.0), share))
+
+
+def _targets(range_m: ArrayLike, truth_m: ArrayLike) -> tuple[Floats, Floats]:
+    """Return the ranges and surfaces (n, pixel) of pixels with a surface, the nearest first."""
+    found, truth = (np.sort(np.asarray(each, float), axis=0) for each in (range_m, truth_m))
+    of = found.shape[1:]
+    require("range_m", f"shape (n, {of})", of == truth.shape[1:], f"(n, {truth.shape[1:]})")
+    target = np.isfinite(truth[0])
+    return found[:, target], truth[:, target]
 
 
 def _found_errors_m(range_m: ArrayLike, truth_m: ArrayLike) -> Floats:

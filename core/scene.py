@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from core.acquisition import Acquisition, Floats
 from core.checks import require
 from core.effects import Backscatter, Falloff, FaultyPixels, Jitter, Motion, SecondSurface
+from core.pulse_groups import USUAL_GROUPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,24 @@ class Scene:
             if factor is not None:
                 low, high = float(np.min(factor)), float(np.max(factor))
                 require(name, (low, high), 0 <= low <= high < np.inf, "finite factors >= 0")
+
+    def groups_of(self, n_pulses: int | None) -> int | None:
+        """Return the groups in which its pulses are kept; None for a scene at rest.
+
+        Their order shows the motion (`core.Capture.groups`).
+        """
+        return None if self.motion is None else min(USUAL_GROUPS, n_pulses or 1)
+
+    @property
+    def surfaces_m(self) -> Floats:
+        """Ranges of all surfaces that return light, (surface, row, col); NaN for fewer of them."""
+        first_m, second = np.asarray(self.range_m, float), self.second_surface
+        if second is None:
+            return first_m[np.newaxis]
+        share = second.effective_share
+        return np.stack(
+            [np.where(share < 1, first_m, np.nan), np.where(share > 0, second.range_m, np.nan)]
+        )
 
 
 PARTS = {

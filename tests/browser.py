@@ -271,9 +271,9 @@ def _gone(server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 60.0) 
 
 
 def when_up(
-    address: str, server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 120.0
+    address: str, server: subprocess.Popen[bytes], log: IO[str], limit_s: float = 600.0
 ) -> str:
-    """Return the address when it responds; a first start compiles the kernels."""
+    """Return the address when it responds; a first start compiles the kernels for minutes."""
     until = time.monotonic() + limit_s
     while time.monotonic() < until:
         if server.poll() is not None:

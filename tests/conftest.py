@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,9 @@ expect.set_options(timeout=TIMEOUT_MS)
 
 
 OWN_SCHEMES = ("data", "blob")
+
+# Else distributed, once imported, would silence the loggers of Tornado and Bokeh, which tests read.
+os.environ |= {"DASK_LOGGING__VERSION": "1", "DASK_LOGGING__DISABLE_EXISTING_LOGGERS": "False"}
 
 
 def pytest_sessionstart() -> None:

@@ -157,7 +157,7 @@ COMPARED = (
     "&comparison.false_alarm=0.1&settings.kde.bandwidth_bins=0.7&tracking.l=0.01"
 )
 FAR = CAPTURES / "21km_K11_night.mat"
-N_RANDOM = 4
+N_RANDOM = 2
 
 
 def random_session(seed: int) -> Session:

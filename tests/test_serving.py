@@ -259,3 +259,25 @@ def test_sigterm_stops_at_any_time_and_cancels_long_work():
         rest = server.communicate(timeout=60)[0]
     assert {"begun", "now", "ended"} <= set(rest.split())
     assert server.returncode == 0
+
+
+COMPILING = """
+import sys, time
+import core
+from app.__main__ import main
+
+def compiling(progress):
+    print("compiling", flush=True)
+    time.sleep(600)
+
+core.warm_up = compiling
+sys.exit(main(["--port", "0"]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_ends_the_app_does_so_while_kernels_are_compiled(number):
+    with run("-c", COMPILING) as server:
+        assert next(server.stdout) == "compiling\n"
+        server.send_signal(number)
+        assert server.wait(timeout=60) == -number

@@ -9,11 +9,11 @@ import pyvista as pv
 from numpy.typing import NDArray
 
 from app.model.budget import spending
-from app.model.mesh import point_cloud
+from app.model.mesh import point_cloud, returns_cloud
 from app.model.state import FIT, VELOCITY, Viewing
 from app.model.store import Answer, is_wrong
 from app.theme import COUNT_COLORS, ERROR_COLORS
-from core import inspection
+from core import RangeImage, inspection
 from core.cost import predicted_fit_time
 from core.geometry import WHOLE, Box, pixel_angle_of
 from core.inference import fit_of, fit_p_values, has_fit, share_below
@@ -216,6 +216,8 @@ class ColoredCloud(NamedTuple):
 
 def cloud_of(answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE) -> ColoredCloud:
     """Return the confident points inside a box, with their colours."""
+    if answer.run.image.returns is not None:
+        return _cloud_of_returns(answer, kind, viewing, box)
     image = answer.run.image
     inside, visible = (shown(answer, least, box) for least in (0.0, viewing.least_confidence))
     values, look = color_values(answer, kind, viewing)
@@ -227,6 +229,30 @@ def cloud_of(answer: Answer, kind: str, viewing: Viewing, box: Box = WHOLE) -> C
         look.rgb(values[visible]),
         None if wrong is None else wrong[visible],
         Unseen(n_hidden=int((inside & ~visible).sum()), n_outside=look.n_outside(values[visible])),
+    )
+
+
+def shown_image(answer: Answer, least_confidence: float, box: Box = WHOLE) -> RangeImage:
+    """Return the estimate without what is not confident enough to be shown, or outside a box."""
+    image = answer.run.image.confident(least_confidence)
+    return image if box == WHOLE else image.cropped(box)
+
+
+def _cloud_of_returns(answer: Answer, kind: str, viewing: Viewing, box: Box) -> ColoredCloud:
+    """Return the confident returns; a truth of one surface does not show which are wrong."""
+    every, found = (
+        shown_image(answer, least, box).returns for least in (0.0, viewing.least_confidence)
+    )
+    assert every is not None
+    assert found is not None
+    values, look = color_values(answer, kind, viewing)
+    of_points = found.range_m if kind == "Range" else values[found.row, found.col]
+    angle_rad = pixel_angle_of(answer.field_of_view_deg(viewing), answer.capture.shape[1])
+    return ColoredCloud(
+        returns_cloud(found, answer.capture.shape, angle_rad),
+        look.rgb(of_points),
+        None,
+        Unseen(n_hidden=len(every) - len(found), n_outside=look.n_outside(of_points)),
     )
 
 

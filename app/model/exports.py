@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from app.model.budget import fits
-from app.model.colors import cloud_of, map_of, shown
+from app.model.colors import cloud_of, map_of, shown, shown_image
 from app.model.download_text import NO_INTERVALS, NO_POINTS, NO_POINTS_INSIDE, NOTHING_DRAWN
 from app.model.large import Grid
 from app.model.script import script_of
@@ -282,8 +282,7 @@ def _in_view(axis_range: Any, place: Array, half: float) -> NDArray[np.bool_]:
 def _product(answer: Answer, least_confidence: float, box: Box = WHOLE, **more: Any) -> Product:
     """Return the visible pixels of an estimate, for `core.io.writers`."""
     more.setdefault("pixel_angle_rad", answer.capture.acquisition.pixel_angle_rad)
-    image = answer.run.image.confident(least_confidence)
-    return Product(answer.capture, image if box == WHOLE else image.cropped(box), **more)
+    return Product(answer.capture, shown_image(answer, least_confidence, box), **more)
 
 
 # Reports
@@ -354,10 +353,11 @@ def _cloud(answer: Answer, kind: str, viewing: Viewing, box: Box, remark: str) -
     rgb = rgb.copy()
     if wrong is not None:
         rgb[wrong] = tuple(bytes.fromhex(WRONG_COLOR[1:]))
-    image = np.zeros((*answer.capture.shape, 3), np.uint8)
-    image[shown(answer, viewing.least_confidence, box)] = rgb
+    if answer.run.image.returns is None:
+        of_points, rgb = rgb, np.zeros((*answer.capture.shape, 3), np.uint8)
+        rgb[shown(answer, viewing.least_confidence, box)] = of_points
     angle_rad = float(cloud.field_data["pixel_angle_rad"][0])
-    more = {"pixel_angle_rad": angle_rad, "rgb": image, "remark": remark}
+    more = {"pixel_angle_rad": angle_rad, "rgb": rgb, "remark": remark}
     return _with_intervals(answer, _product(answer, viewing.least_confidence, box, **more))
 
 

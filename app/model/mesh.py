@@ -6,7 +6,8 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
-from core.geometry import points_m
+from core.geometry import points_m, sight_lines
+from core.inference import Returns
 from core.inspection import CONFIDENT
 
 Floats = NDArray[np.float64]
@@ -50,6 +51,20 @@ def point_cloud(range_m: ArrayLike, pixel_angle_rad: float, **images: ArrayLike)
             )
         cloud[name] = values[row, col]
     cloud.field_data["image_shape"] = np.array(ranges.shape, np.int32)
+    cloud.field_data["pixel_angle_rad"] = np.array([pixel_angle_rad])
+    return cloud
+
+
+def returns_cloud(returns: Returns, shape: tuple[int, int], pixel_angle_rad: float) -> pv.PolyData:
+    """Turn the returns of an image of a shape (row, col) into a cloud, in their order.
+
+    With the data of `point_cloud`, and the confidence of each return.
+    """
+    lines = sight_lines(shape, pixel_angle_rad)[returns.row, returns.col]
+    cloud = pv.PolyData(returns.range_m[:, np.newaxis] * lines)
+    for name in ("range_m", "row", "col", "confidence"):
+        cloud[name] = getattr(returns, name)
+    cloud.field_data["image_shape"] = np.array(shape, np.int32)
     cloud.field_data["pixel_angle_rad"] = np.array([pixel_angle_rad])
     return cloud
 

@@ -11,8 +11,8 @@ from dataclasses import fields
 from itertools import chain
 from textwrap import indent
 
-from app.model.state import CLOUDS, VELOCITY, State, Viewing
-from app.model.store import Answer, bare, groups_of
+from app.model.state import CLOUDS, MOST_PROBABLE, VELOCITY, State, Viewing
+from app.model.store import Answer, bare
 from core import CORRECTIONS, ESTIMATORS, PARTS, inspection
 from core.geometry import WHOLE, Box
 from core.io import RangeColors
@@ -115,7 +115,7 @@ def _simulation(answer: Answer) -> Lines:
         yield assign("acquisition", "replace", acquisition, n_pulses=pulses)
         acquisition = "acquisition"
     seed = {"seed": literal(light.seed)} if light.seed else {}
-    groups = groups_of(bare(source.scene(), request.absent), light.acquisition(own).n_pulses)
+    groups = bare(source.scene(), request.absent).groups_of(light.acquisition(own).n_pulses)
     order = {"n_groups": literal(groups)} if groups else {}
     yield assign("capture", "core.simulate", "scene", acquisition, flux, **seed, **order)
 
@@ -168,7 +168,8 @@ def _estimate(answer: Answer, state: State) -> Lines:
     method, settings = literal(answer.method), changed_fields(answer.settings)
     yield "\n# Estimate the ranges. `shown` has only pixels of sufficient confidence."
     yield assign("settings", f"core.ESTIMATORS[{method}].parameters", **settings)
-    yield assign("image", "core.estimate", "capture", method, "settings")
+    several = {} if answer.request.returns == MOST_PROBABLE else {"returns": "2"}
+    yield assign("image", "core.estimate", "capture", method, "settings", **several)
     yield from _shown(state.viewing.least_confidence)
 
 

@@ -10,14 +10,22 @@ from typing import Any
 import param
 
 from app.model.methods import FIRST_METHODS, OTHERS, default_settings
-from core import ESTIMATORS, Acquisition, Flux, PhotonBudget, TrackingParameters, Window
+from core import (
+    CORRECTIONS,
+    ESTIMATORS,
+    PARTS,
+    Acquisition,
+    Flux,
+    PhotonBudget,
+    TrackingParameters,
+    Window,
+)
 from core.checks import require
 from core.estimators import FALSE_ALARM
 from core.geometry import Box
 from core.io import RangeColors, ReadOptions
 from core.parameters import Choice, Number, Settings, check_fields, parameter
 from core.reductions import Reduction
-from core.studies.ablation import TITLES
 
 
 @dataclass(frozen=True)
@@ -226,6 +234,10 @@ AUTOMATIC = "automatic"
 
 CLOUDS = "3D clouds"
 
+MOST_PROBABLE, ALL_RETURNS = "most probable", "all returns"
+RETURNS = (MOST_PROBABLE, ALL_RETURNS)
+"""Surfaces of a pixel that the 3D cloud, Inspect and files hold."""
+
 KINDS = ("Range", "Error", "Confidence", CLOUDS)
 """Kinds of pictures of methods."""
 
@@ -355,8 +367,9 @@ def _is_pair(value: Any, kind: type, least: int) -> bool:
 
 
 def _check_absent(name: str, value: Any) -> None:
-    known = isinstance(value, frozenset) and value <= set(TITLES)
-    require(name, value, known, "some of " + ", ".join(TITLES))
+    can_be = [*CORRECTIONS, *PARTS]
+    known = isinstance(value, frozenset) and value <= set(can_be)
+    require(name, value, known, "some of " + ", ".join(can_be))
 
 
 class State(param.Parameterized):
@@ -394,6 +407,11 @@ class State(param.Parameterized):
     tracking = param.ClassSelector(class_=TrackingParameters, default=TrackingParameters())
     settings: Any = Checked(
         default_settings(), _check_settings, doc="Settings of each other estimator."
+    )
+    returns = param.Selector(
+        default=MOST_PROBABLE,
+        objects=list(RETURNS),
+        doc="Surfaces of a pixel that are shown: the most probable, or up to two.",
     )
     pixel: Any = Checked((31, 24), _check_pixel, doc="Selected row and column.")
     image = param.Selector(default="Estimate", objects=list(IMAGES))

@@ -13,16 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from app.model.budget import fits, fitting, ranging, require_fitting
+from app.model.budget import fits, fitting, ranging, require_fitting, spending
 from app.model.large import Cutout, Grid, LargeFile, open_large, require_small
 from app.model.methods import default_settings
-from app.model.state import AUTOMATIC, Illumination, ReductionSettings, Viewing
+from app.model.state import (
+    ALL_RETURNS,
+    AUTOMATIC,
+    MOST_PROBABLE,
+    Illumination,
+    ReductionSettings,
+    Viewing,
+)
 from app.units import ShownGate
 from core import (
     CORRECTIONS,
     ESTIMATORS,
     PARTS,
-    USUAL_GROUPS,
     Capture,
     PhotonBudget,
     Run,
@@ -38,10 +44,11 @@ from core import (
     simulate,
     tracking_signals,
     trigger_probability,
+    with_returns,
     without,
     without_correction,
 )
-from core.cost import Cost, predicted
+from core.cost import Cost, predicted, predicted_returns_time
 from core.estimators import suitable_method
 from core.geometry import guessed_field_of_view_deg
 from core.inference import has_posterior, pixel_range_intervals, posterior_of
@@ -126,13 +133,8 @@ def simulated(request: Request) -> Capture:
     """Return a capture of the scene of a request, which its source names."""
     scene, light = request.scene, request.illumination
     acquisition, name = light.acquisition(scene.acquisition), request.source.name
-    n_groups = groups_of(scene, acquisition.n_pulses)
+    n_groups = scene.groups_of(acquisition.n_pulses)
     return simulate(scene, acquisition, light.flux, seed=light.seed, name=name, n_groups=n_groups)
-
-
-def groups_of(scene: Scene, n_pulses: int | None) -> int | None:
-    """Return the groups in which the pulses of a moving scene are kept; None for one at rest."""
-    return min(USUAL_GROUPS, n_pulses or 1) if scene.motion is not None else None
 
 
 def file_source(
@@ -214,6 +216,8 @@ class Request:
     """Key of `core.ESTIMATORS`, or `AUTOMATIC`."""
     settings: Mapping[str, Any] = field(default_factory=default_settings, hash=False)
     """Settings of the other estimators by their keys."""
+    returns: str = MOST_PROBABLE
+    """One of `app.model.state.RETURNS`."""
     absent: frozenset[str] = frozenset()
     """Parts of the scene and corrections of the estimators that are switched off."""
     window: Window | None = None
@@ -418,6 +422,7 @@ def _estimate(capture: Capture, request: Request, previous: Answer | None) -> tu
         previous is not None
         and capture is previous.capture
         and (method, settings) == (previous.method, previous.settings)
+        and request.returns == previous.request.returns
     ):
         return previous.run, 0.0
     with ranging(capture, method, settings):
@@ -426,7 +431,13 @@ def _estimate(capture: Capture, request: Request, previous: Answer | None) -> tu
             started = perf_counter()
             posterior_of(capture)  # every confidence is computed from it, whatever the method
             flux_s = perf_counter() - started
-        return run(capture, method, settings), flux_s
+        found = run(capture, method, settings)
+    if request.returns == ALL_RETURNS:
+        rows, cols, n_bins = capture.cube.shape
+        cost = predicted_returns_time(rows * cols, n_bins)
+        with spending((rows, cols, n_bins), ALL_RETURNS, cost):
+            found = replace(found, image=with_returns(capture, found.image))
+    return found, flux_s
 
 
 def _reduced_shape(whole: Capture, request: Request) -> tuple[int, int, int]:

@@ -497,16 +497,17 @@ class Estimator:
         )
         first = max(self.first_bin(parameters), 0.1 * n_bins)
         places = np.round(np.linspace(first, 0.9 * n_bins, 8))
-        onset = (places[:, np.newaxis] + np.arange(8) / 8).ravel()
-        # The maximum of the score that the echo adds: the score of the falling background itself
-        # may be larger than that of a weak echo.
-        no_echo = _expected(onset[:1], given._replace(signal=np.zeros(())))
-        without = self.curve(no_echo, given, parameters)
+        # The first one is no echo. The maximum of the score that an echo adds: the score of the
+        # falling background itself may be larger than that of a weak echo.
+        onset = np.append(math.nan, places[:, np.newaxis] + np.arange(8) / 8)
         most, at = np.empty(onset.size), np.empty(onset.size, np.intp)
         at_once = max(1, NUMBERS_AT_ONCE // n_bins)
         for first in range(0, onset.size, at_once):
             some = slice(first, first + at_once)
-            added = self.curve(_expected(onset[some], given), given, parameters) - without
+            score = self.curve(_expected(onset[some], given), given, parameters)
+            if first == 0:
+                without = score[0].copy()
+            added = score - without
             most[some], at[some] = added.max(axis=1), added.argmax(axis=1)
         found = most > 0
         if not found.any():
@@ -574,7 +575,7 @@ def conditions_of(capture: Capture, flux: FluxModel, window_size: int = 1) -> Co
 
 
 def _expected(onset_bin: Floats, given: Conditions) -> Floats:
-    """Expected counts of echoes at given delays, shape (delay, bin)."""
+    """Expected counts of echoes at given delays, NaN for no echo, shape (delay, bin)."""
     signal = np.full(onset_bin.size, given.signal)
     rate = rate_per_bin(onset_bin, signal, float(given.background), given.pulse, given.acquisition)
     if given.background_shape is not None:

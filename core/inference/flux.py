@@ -189,7 +189,8 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
     for some in (_sampled(total.size, SAMPLE // 4)[np.newaxis], pixels):
         flux = found.model(total.ravel()[some], least)
         evidence = level_evidence(prepare(capture, flat[some], flux, 1))
-        share = _shares(evidence)
+        levels_of = _relative(evidence)
+        share = _shares(levels_of.likelihood)
         mean = np.asarray(share @ levels)
         variance = float(share @ (levels - mean) ** 2)
         found = found._replace(
@@ -197,7 +198,7 @@ def _flux_prior(capture: Capture, shape: Floats | None) -> tuple[FluxPrior, Floa
             own_weight=_own_weight(total, chance + variance),
         )
     prior, free_shape = _completed(capture, found, share)
-    if _mean_log_likelihood(evidence, share) < _CLEAR:
+    if _mean_log_likelihood(levels_of, share) < _CLEAR:
         other, other_shape = _completed(capture, found, _shares_of_one_level(capture, start))
         gain = _log_likelihood(capture, other) - _log_likelihood(capture, prior)
         if gain > _LEAST_JOINT_GAIN:
@@ -216,11 +217,11 @@ def _completed(
     pixels, density = _sampled_densities(capture, found, DEPTH_SAMPLE)
     share, depth = shares_and_depths(density, found.share)
     # Given the delays, and one background for all levels, faint levels are less plausible.
-    evidence = _evidence(density, depth)
+    likelihood = _evidence(density, depth).likelihood
     found = found._replace(share=share, depth=depth)
     free = _background(capture, found, pixels, density)
-    share = _shares(evidence)
-    learn_shares(_likelihood(evidence), share)  # of the levels that are left
+    share = _shares(likelihood)
+    learn_shares(likelihood, share)  # of the levels that are left
     levels, share = _joined(found.levels, share, pair)
     kept = _kept(share)
     levels, share = levels[kept], share[kept] / share[kept].sum()
@@ -251,14 +252,30 @@ def _sampled_densities(
     return pixels, level_densities(prepare(capture, cube, flux, 1))
 
 
-def _evidence(density: NDArray[np.float32], depth: Floats) -> Floats:
-    """Logarithm of the mean of densities (pixel, level, bin) over the delays, (pixel, level)."""
-    return np.asarray(np.log(np.maximum(density @ depth.astype(np.float32), _TINY)))
+class _Evidence(NamedTuple):
+    """Likelihood of the signal levels of pixels."""
+
+    likelihood: Floats
+    """Relative to the likeliest level of the pixel, shape (pixel, level)."""
+    highest: Floats
+    """Logarithm of that of the likeliest level, shape (pixel,)."""
 
 
-def _mean_log_likelihood(evidence: Floats, share: Floats) -> float:
-    """Mean over the pixels, given the evidence (pixel, level) and the shares of the levels."""
-    return float((np.log(_likelihood(evidence) @ share) + evidence.max(axis=1)).mean())
+def _relative(log: Floats) -> _Evidence:
+    """Return the evidence of log likelihoods (pixel, level)."""
+    highest = log.max(axis=1)
+    return _Evidence(np.asarray(np.exp(log - highest[:, np.newaxis])), highest)
+
+
+def _evidence(density: NDArray[np.float32], depth: Floats) -> _Evidence:
+    """Mean of densities (pixel, level, bin) over the delays."""
+    mean = np.maximum(density @ depth.astype(np.float32), _TINY)
+    return _relative(np.asarray(np.log(mean)))
+
+
+def _mean_log_likelihood(evidence: _Evidence, share: Floats) -> float:
+    """Mean over the pixels, given the shares of the levels."""
+    return float((np.log(evidence.likelihood @ share) + evidence.highest).mean())
 
 
 def _log_likelihood(capture: Capture, flux_prior: FluxPrior) -> float:
@@ -266,7 +283,7 @@ def _log_likelihood(capture: Capture, flux_prior: FluxPrior) -> float:
     pixels = _sampled(capture.counts.size, DEPTH_SAMPLE)
     background = np.maximum(flux_prior.background, _least_background(capture))
     log = level_likelihoods(capture, pixels, flux_prior._replace(background=background), 1)
-    return pixels.size * _mean_log_likelihood(log, flux_prior.share)
+    return pixels.size * _mean_log_likelihood(_relative(log), flux_prior.share)
 
 
 def _shares_of_one_level(capture: Capture, start: FluxPrior) -> Floats:
@@ -497,20 +514,14 @@ def _kept(share: Floats) -> NDArray[np.bool_]:
     return kept
 
 
-def _likelihood(evidence: Floats) -> Floats:
-    """Likelihood of each level relative to the likeliest of the pixel (pixel, level)."""
-    return np.asarray(np.exp(evidence - evidence.max(axis=1, keepdims=True)))
-
-
-def _shares(evidence: Floats) -> Floats:
-    """Estimate the shares of levels from the evidence (pixel, level), in logarithms.
+def _shares(likelihood: Floats) -> Floats:
+    """Estimate the shares of levels from the likelihood of each, as `_Evidence.likelihood`.
 
     A tenth of an additional pixel has no echo, so that its share is never 0. The faintest levels
     cannot be distinguished from no echo; they are merged with it as long as the likelihood
     decreases little.
     """
-    n_levels = evidence.shape[1]
-    likelihood = _likelihood(evidence)
+    n_levels = likelihood.shape[1]
     share = np.full(n_levels, 1 / n_levels)
     learn_shares(likelihood, share)
     least = np.log(likelihood @ share).sum() - _LEAST_GAIN

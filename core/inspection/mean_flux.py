@@ -499,7 +499,8 @@ def _gamma_weights(levels: Floats, bright: Floats, share: Floats, shape: Floats)
     x = levels * (shape / np.maximum(bright, 1e-12 * levels[-1]))[..., np.newaxis]
     k = np.broadcast_to(shape[..., np.newaxis], x.shape)
     below = scipy.special.gammainc(k, x)  # share of the signals below each level
-    at_level = np.exp(scipy.special.xlogy(k, x) - x - scipy.special.gammaln(k + 1))
+    norm = scipy.special.gammaln(shape + 1)[..., np.newaxis]
+    at_level = np.exp(scipy.special.xlogy(k, x) - x - norm)
     moment = (below - at_level) * bright[..., np.newaxis]
     mass = np.diff(below)
     upper = (np.diff(moment) - mass * levels[:-1]) / np.diff(levels)

@@ -26,6 +26,7 @@ from core.inference.posterior import (
     same_echo_bins,
     tolerance_probability_at,
 )
+from core.inference.returns import Returns
 from core.inspection.flux import METHOD, estimate_flux
 from core.inspection.profile import FluxEstimate, OldFluxNames
 from core.inspection.surfaces import LIKELY, surface_probabilities
@@ -41,7 +42,7 @@ class RangeCandidate:
     """A possible delay of the surface: a peak of an estimator's score, or of its log posterior.
 
     Peaks within one pulse, or 3 bins, of each other or of the estimate are one candidate, that of
-    the highest score.
+    the highest score. Where the image has several returns of the pixel, each of them is one.
     """
 
     bin: float
@@ -57,7 +58,7 @@ class RangeCandidate:
     """Score over that of the best candidate; 1 for that one."""
     probability: float
     """Probability of a surface within 3 bins, beside others where the pixel has several
-    (`core.inspection.surfaces`); for the estimate that of the report."""
+    (`core.inspection.surfaces`); for the estimate that of the report, for returns theirs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +171,8 @@ def pixel_report(
     ----------
     capture : Capture
     image : RangeImage
-        Estimate of the capture with this method and these settings.
+        Estimate of the capture with this method and these settings; with returns, several of the
+        pixel are candidates (`core.with_returns`).
     row, col : int
     method, settings
         As for `core.estimate`.
@@ -287,7 +289,13 @@ def _candidates(
     is_moved = ESTIMATORS[method].refine is not None and math.isfinite(estimate_bin)
     if is_estimate.any() or is_moved:
         bins[is_estimate.argmax()] = estimate_bin
-    kept = _apart(bins, width_bins)
+    returns = _several(image, row, col)
+    if returns is not None:  # found together: the score of one surface may not show both
+        at = np.round(returns.bin + lag_bins).astype(int).clip(0, curve.size - 1)
+        bins, peaks = np.append(returns.bin, bins), np.append(at, peaks)
+    n_returns = 0 if returns is None else len(returns)
+    kept = _apart(bins, width_bins, n_returns)
+    kept.sort(key=lambda i: -curve[peaks[i]])
     bins, score = bins[kept], curve[peaks[kept]]
     of_one = (
         tolerance_probability_at(capture, row, col, bins)
@@ -295,6 +303,8 @@ def _candidates(
         else _mass_around(evidence.posterior, bins)
     )
     probability = surface_probabilities(capture, row, col, bins, of_one)
+    if returns is not None:
+        probability[np.argsort(kept)[:n_returns]] = returns.confidence
     is_estimate = bins == estimate_bin
     if ESTIMATORS[method].confidence is not None:  # which knows more than the pixel
         probability[is_estimate] = confidence
@@ -315,10 +325,16 @@ def _mass_around(by_bin: Floats, bins: Floats) -> Floats:
     return np.asarray(high - low)
 
 
-def _apart(bins: Floats, width_bins: float) -> list[int]:
-    """Return the indices of the first delays that are at least a width from all before them."""
-    kept: list[int] = []
-    for i, delay in enumerate(bins):
+def _several(image: RangeImage, row: int, col: int) -> Returns | None:
+    """Return the returns of a pixel, if they were looked for and there are several."""
+    found = None if image.returns is None else image.returns.at(row, col)
+    return None if found is None or len(found) < 2 else found
+
+
+def _apart(bins: Floats, width_bins: float, n_first: int) -> list[int]:
+    """Return the indices of the first delays, and of others a width from all before them."""
+    kept = list(range(n_first))
+    for i, delay in list(enumerate(bins))[n_first:]:
         if np.all(np.abs(bins[kept] - delay) >= width_bins):
             kept.append(i)
         if len(kept) == MOST_CANDIDATES:

@@ -13,6 +13,7 @@ from core.capture import Capture
 from core.checks import require
 from core.estimators import RangeImage, estimate
 from core.inference.fit import Fit, fit_in
+from core.inference.posterior import same_echo_bins
 from core.inspection.mean_flux import METHOD, mean_flux_of, selected_pixels
 from core.inspection.pixel import PixelReport, flux_unit, pixel_flux, pixel_report
 from core.inspection.profile import FluxEstimate, OldFluxNames
@@ -31,7 +32,7 @@ class RegionReport(OldFluxNames):
     summed: Capture
     """Sum of the histograms, shape (1, 1, bin), and of the pulses."""
     image: RangeImage
-    """Estimate of the sum, shape (1, 1)."""
+    """Estimate of the sum, shape (1, 1), with two returns if it shows two surfaces."""
     pixel: PixelReport
     """Report on the sum; its fluxes are with the pulse that fits the echoes of the region."""
     share_answered: float
@@ -78,7 +79,7 @@ def region_report(
     n_pixels = int(np.count_nonzero(mask))
     require("region", f"{n_pixels} pixels", n_pixels > 0, "one that contains the centre of a pixel")
     own, summed = selected_pixels(capture, mask), _summed(capture, mask)
-    of_sum = estimate(summed, method, settings)
+    of_sum = _ranged(summed, method, settings)
     mean_flux = mean_flux_of(own)
     fitted = replace(summed, pulse=mean_flux.pulse)
     pixel = pixel_report(summed, of_sum, 0, 0, method, settings)
@@ -101,6 +102,19 @@ def region_report(
         flux_method=METHOD,
         fit=fit_in(capture, np.flatnonzero(mask)),
     )
+
+
+def _ranged(summed: Capture, method: str, settings: Any) -> RangeImage:
+    """Estimate the sum with two returns, unless these may be one surface that slopes.
+
+    Within the region a slope widens its echo, and two returns closer than an echo fit it better.
+    """
+    found = estimate(summed, method, settings, returns=2)
+    assert found.returns is not None
+    bins = found.returns.bin
+    if bins.size > 1 and np.ptp(bins) < same_echo_bins(summed):
+        return estimate(summed, method, settings)
+    return found
 
 
 def _summed(capture: Capture, mask: NDArray[np.bool_]) -> Capture:

@@ -115,6 +115,27 @@ def _fill_spread(counts, n_bins, largest, sigma):  # type: ignore[no-untyped-def
             sigma[b, i] = math.sqrt(max(squares[i] / n_bins - mean * mean, 0.0))
 
 
+def pixel_sums(cube: NDArray[np.unsignedinteger]) -> NDArray[np.int64]:
+    """Add up the counts (..., bin) of each pixel, (...)."""
+    if not cube.flags.c_contiguous:
+        return np.asarray(cube.sum(axis=-1, dtype=np.int64))
+    sums = np.empty(cube.shape[:-1], np.int64)
+    pixels = cube.reshape(-1, cube.shape[-1])
+    pixels.setflags(write=False)  # as in `lane_counts`
+    _fill_sums(pixels, sums.reshape(-1))
+    return sums
+
+
+@njit(**COMPILED)
+def _fill_sums(pixels, sums):  # type: ignore[no-untyped-def]
+    """Fill the sum of each row of pixels (pixel, bin)."""
+    for i in range(len(pixels)):
+        total = np.int64(0)
+        for count in pixels[i]:
+            total += np.int64(count)
+        sums[i] = total
+
+
 @njit(**COMPILED, inline="always")
 def _with(count, first, sums):  # type: ignore[no-untyped-def]
     """Add a count to sum, sum of squares and maximum.

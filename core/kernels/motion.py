@@ -20,9 +20,16 @@ from core.kernels.posterior import correlate, counts_of, fill_flat, fill_log_gai
 
 
 @njit(**COMPILED)
-def _fill_groups(b, counts, n_pulses, prepared, fired, unfired):  # type: ignore[no-untyped-def]
-    """Fill counts (group, node, bin, lane) and unfired pulses (group, bin, lane) of a block."""
-    n_groups, n_nodes, n_bins, lanes = fired.shape
+def _groups_of(b, prepared, counts, n_pulses):  # type: ignore[no-untyped-def]
+    """Return counts (group, node, bin, lane) and unfired pulses (group, bin, lane) of a block.
+
+    And room for their sums: (node, step, bin, lane) and (step, bin, lane).
+    """
+    n_groups, _, n_bins, lanes = counts.shape
+    n_nodes, n_steps = len(prepared.node), len(prepared.echo)
+    fired = lane_rows(n_groups * n_nodes * n_bins, lanes)
+    fired = fired.reshape(n_groups, n_nodes, n_bins, lanes)
+    unfired = lane_rows(n_groups * n_bins, lanes).reshape(n_groups, n_bins, lanes)
     left = np.empty(lanes)
     for g in range(n_groups):
         left[:] = n_pulses[g]
@@ -37,16 +44,28 @@ def _fill_groups(b, counts, n_pulses, prepared, fired, unfired):  # type: ignore
                 unfired[g, k] = left
             else:
                 unfired[g, k] = n_pulses[g]
+    met_fired = lane_rows(n_nodes * n_steps * n_bins, lanes)
+    met_unfired = lane_rows(n_steps * n_bins, lanes)
+    return (
+        fired,
+        unfired,
+        met_fired.reshape(n_nodes, n_steps, n_bins, lanes),
+        met_unfired.reshape(n_steps, n_bins, lanes),
+    )
 
 
 @njit(**COMPILED)
-def _fill_taps(b, prepared, gain, loss):  # type: ignore[no-untyped-def]
-    """Fill what a count and an unfired pulse add to ``T(d)``.
+def _taps_of(b, prepared, lanes):  # type: ignore[no-untyped-def]
+    """Return what a count and an unfired pulse add to ``T(d)``, without "no echo".
 
-    `gain` is of shape (level, node, step, tap, lane), `loss` (level, step, tap, lane); without "no
-    echo".
+    Of shapes (level, node, step, tap, lane) and (level, step, tap, lane).
     """
-    n_levels, n_nodes, n_steps, n_taps, lanes = gain.shape
+    n_levels, n_nodes = len(prepared.signal) - 1, len(prepared.node)
+    n_steps, n_taps = prepared.echo.shape
+    gain = lane_rows(n_levels * n_nodes * n_steps * n_taps, lanes)
+    gain = gain.reshape(n_levels, n_nodes, n_steps, n_taps, lanes)
+    loss = lane_rows(n_levels * n_steps * n_taps, lanes)
+    loss = loss.reshape(n_levels, n_steps, n_taps, lanes)
     for level in range(n_levels):
         for node in range(n_nodes):
             fill_log_gain(b, level + 1, prepared.node[node], prepared, gain[level, node])
@@ -55,6 +74,7 @@ def _fill_taps(b, prepared, gain, loss):  # type: ignore[no-untyped-def]
                 share = prepared.echo[step, tap]
                 for i in range(lanes):
                     loss[level, step, tap, i] = -prepared.signal[level + 1, b, i] * share
+    return gain, loss
 
 
 @njit(**COMPILED)
@@ -102,17 +122,10 @@ def fill_velocity_evidence(prepared, counts, n_pulses, displaced, evidence):  # 
     """
     n_velocities, n_blocks, lanes = evidence.shape
     n_groups, n_bins, n_nodes = len(counts), counts.shape[2], len(prepared.node)
-    n_levels, (n_steps, n_taps) = len(prepared.signal) - 1, prepared.echo.shape
+    n_levels = len(prepared.signal) - 1
     for b in prange(n_blocks):
-        fired = lane_rows(n_groups * n_nodes * n_bins, lanes)
-        fired = fired.reshape(n_groups, n_nodes, n_bins, lanes)
-        unfired = lane_rows(n_groups * n_bins, lanes).reshape(n_groups, n_bins, lanes)
-        gain = lane_rows(n_levels * n_nodes * n_steps * n_taps, lanes)
-        gain = gain.reshape(n_levels, n_nodes, n_steps, n_taps, lanes)
-        loss = lane_rows(n_levels * n_steps * n_taps, lanes)
-        loss = loss.reshape(n_levels, n_steps, n_taps, lanes)
-        met = lane_rows(n_nodes * n_steps * n_bins, lanes).reshape(n_nodes, n_steps, n_bins, lanes)
-        left = lane_rows(n_steps * n_bins, lanes).reshape(n_steps, n_bins, lanes)
+        fired, unfired, met, left = _groups_of(b, prepared, counts, n_pulses)
+        gain, loss = _taps_of(b, prepared, lanes)
         ratio = lane_rows(n_bins, lanes).reshape(1, n_bins, lanes)
         flat, total = np.empty((n_levels, lanes)), np.empty(lanes)
         highest, row = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
@@ -120,8 +133,6 @@ def fill_velocity_evidence(prepared, counts, n_pulses, displaced, evidence):  # 
         for level in range(n_levels):
             fill_flat(b, level + 1, prepared, all_fired, all_unfired, flat[level])
             flat[level] += prepared.log_share[level + 1]
-        _fill_groups(b, counts, n_pulses, prepared, fired, unfired)
-        _fill_taps(b, prepared, gain, loss)
         for v in range(n_velocities):
             met[:], left[:] = 0.0, 0.0
             for g in range(n_groups):
@@ -156,24 +167,15 @@ def fill_moving_delays(prepared, counts, n_pulses, displaced, velocity, best, ar
     """
     n_blocks, lanes, n_bins = surface.shape
     n_groups, n_nodes = len(counts), len(prepared.node)
-    n_levels, (n_steps, n_taps) = len(prepared.signal) - 1, prepared.echo.shape
+    n_levels, n_steps = len(prepared.signal) - 1, len(prepared.echo)
     n_delays, none = n_steps * n_bins, prepared.log_share[0]
     for b in prange(n_blocks):
-        fired = lane_rows(n_groups * n_nodes * n_bins, lanes)
-        fired = fired.reshape(n_groups, n_nodes, n_bins, lanes)
-        unfired = lane_rows(n_groups * n_bins, lanes).reshape(n_groups, n_bins, lanes)
-        gain = lane_rows(n_levels * n_nodes * n_steps * n_taps, lanes)
-        gain = gain.reshape(n_levels, n_nodes, n_steps, n_taps, lanes)
-        loss = lane_rows(n_levels * n_steps * n_taps, lanes)
-        loss = loss.reshape(n_levels, n_steps, n_taps, lanes)
-        met = lane_rows(n_nodes * n_steps * n_bins, lanes).reshape(n_nodes, n_steps, n_bins, lanes)
-        left = lane_rows(n_steps * n_bins, lanes).reshape(n_steps, n_bins, lanes)
+        fired, unfired, met, left = _groups_of(b, prepared, counts, n_pulses)
+        gain, loss = _taps_of(b, prepared, lanes)
         ratio = lane_rows(n_levels * n_delays, lanes).reshape(n_levels, n_steps, n_bins, lanes)
         density = lane_rows(n_delays, lanes).reshape(n_delays, lanes)
         offset, top = np.empty((n_levels, lanes)), np.full(lanes, -np.inf)
         _, all_fired, _, all_unfired = counts_of(b, prepared)
-        _fill_groups(b, counts, n_pulses, prepared, fired, unfired)
-        _fill_taps(b, prepared, gain, loss)
         met[:], left[:], density[:] = 0.0, 0.0, 0.0
         for g in range(n_groups):
             for i in range(lanes):

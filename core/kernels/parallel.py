@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -85,8 +87,20 @@ def in_parts(kernel: Callable[..., None], n_blocks: int, work: int, *arguments: 
         kernel(0, n_blocks, *arguments)
         return
     (first, end), *others = pairwise(n_blocks * part // n_parts for part in range(n_parts + 1))
-    with ThreadPoolExecutor(n_parts - 1) as threads:
-        running = [threads.submit(kernel, *other, *arguments) for other in others]
+    running = [_threads().submit(kernel, *other, *arguments) for other in others]
+    try:
         kernel(first, end, *arguments)
+    finally:
+        wait(running)
     for each in running:
         each.result()
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """Threads for parts of kernels, started once: that takes as long as a small part."""
+    return ThreadPoolExecutor(max(1, numba.config.NUMBA_NUM_THREADS - 1), "kernels")
+
+
+if hasattr(os, "register_at_fork"):  # threads do not survive in a child
+    os.register_at_fork(after_in_child=_threads.cache_clear)

@@ -71,15 +71,15 @@ class Method:
     settings: Any
 
 
-def default_methods() -> list[Method]:
+def default_methods(with_motion: bool = False) -> list[Method]:
     """Return every registered estimator with its default settings.
 
-    But those that follow motion: these captures keep no pulses in order.
+    Those that follow motion only if asked for: most captures keep no pulses in order.
     """
     return [
         Method(name, name, each.parameters())
         for name, each in ESTIMATORS.items()
-        if not each.follows_motion
+        if with_motion or not each.follows_motion
     ]
 
 
@@ -111,13 +111,18 @@ def score(capture: Capture, method: Method) -> Score:
     bins, _ = ESTIMATORS[method.estimator].delays(capture, method.settings)
     seconds = perf_counter() - started
     acquisition, truth_m = capture.acquisition, np.asarray(capture.truth_range_m)
-    return compare(acquisition.bin_to_range_m(bins), truth_m, acquisition.bin_length_m, seconds)
+    ranges_m = acquisition.bin_to_range_m(bins)[np.newaxis], truth_m[np.newaxis]
+    return compare(*ranges_m, acquisition.bin_length_m, seconds)
 
 
 def compare(range_m: Floats, truth_m: Floats, bin_m: float, seconds: float) -> Score:
-    """Score estimates against the truth, both of one shape."""
-    within = [metrics.restored(range_m, truth_m, t * bin_m) for t in TOLERANCES_BINS]
-    error = metrics.errors_m(range_m, truth_m)
+    """Score estimates (return, ...) against the truth (surface, ...).
+
+    Where a pixel has several of either, targets are surfaces, as `metrics.surfaces_found` counts
+    them, and errors those of the nearest return.
+    """
+    within = [metrics.surfaces_found(range_m, truth_m, t * bin_m) for t in TOLERANCES_BINS]
+    error = metrics.surface_errors_m(range_m, truth_m)
     error = error[np.isfinite(error)]
     inlier = error[np.abs(error) <= TOLERANCES_BINS[-1] * bin_m + 5e-7]
     return Score(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.kernels.blocks import LANES, lane_rows, lane_spread, to_blocks
+from core.kernels.blocks import LANES, lane_rows, lane_spread, pixel_sums, to_blocks
 
 DTYPES = [np.uint8, np.uint16, np.uint32]
 
@@ -32,6 +32,20 @@ def test_blocks_hold_the_cube_and_zeros(n_pixels: int, n_bins: int, dtype: type)
 def test_blocks_of_a_view_are_those_of_its_copy() -> None:
     view = random_cube(70, 6).reshape(7, 10, 6)[::2, ::-1, ::2]
     np.testing.assert_array_equal(to_blocks(view).counts, to_blocks(view.copy()).counts)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sums_of_pixels_do_not_overflow(dtype: type) -> None:
+    cube = np.full((2, 3, 5), np.iinfo(dtype).max, dtype)
+    assert (pixel_sums(cube) == 5 * int(np.iinfo(dtype).max)).all()
+    assert cube.flags.writeable
+
+
+def test_sums_of_a_view_are_those_of_its_copy() -> None:
+    view = random_cube(70, 6).reshape(7, 10, 6)[::2, ::-1, ::2]
+    assert pixel_sums(view).shape == view.shape[:2]
+    np.testing.assert_array_equal(pixel_sums(view), view.sum(axis=2))
+    np.testing.assert_array_equal(pixel_sums(view), pixel_sums(view.copy()))
 
 
 def test_a_cube_may_be_kept_from_being_written() -> None:

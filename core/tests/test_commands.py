@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -430,10 +431,19 @@ for command in sys.argv[1:]:
 """Run one command after the other, and print its exit code between NUL characters."""
 
 
-@pytest.mark.parametrize(
-    ("locale", "name"), [("C", "gr\u00f6\u00dfe".encode()), ("C.UTF-8", b"n\xff")]
-)
-def test_names_that_the_terminal_cannot_show(locale: str, name: bytes, frames: Path) -> None:
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_outputs_show_names_that_are_no_text(
+    encoding: str, frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = io.TextIOWrapper(io.BytesIO(), encoding, errors="strict")
+    monkeypatch.setattr(sys, "stdout", shown)
+    assert main(["info", str(frames.rename(frames.with_name("n\udcff\xe4.npy"))), *READING]) == 0
+    assert isinstance(shown.buffer, io.BytesIO)
+    assert b"n\\xff" in shown.buffer.getvalue()
+
+
+def test_names_that_the_terminal_cannot_show(frames: Path) -> None:
+    locale, name = "C", "gr\u00f6\u00dfe".encode() + b"\xff"
     known = {key: value for key, value in os.environ.items() if not key.startswith("PYTHONIO")}
     plain = {**known, "LC_ALL": locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     folder = os.fsencode(frames.parent)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from itertools import product
 from typing import Any
 
@@ -42,6 +43,12 @@ ACQUISITION = Acquisition(n_bins=60, n_pulses=400)
 def random_depths(side: int, seed: int = 0, acquisition: Acquisition = ACQUISITION) -> Scene:
     onset = np.random.default_rng(seed).uniform(10, acquisition.n_bins - 8, (side, side))
     return Scene(acquisition.bin_to_range_m(onset), acquisition=acquisition)
+
+
+@cache
+def seen(signal: float, sbr: float) -> Capture:
+    """Return a capture that tests share: it keeps what is estimated of it."""
+    return simulate(random_depths(8), ACQUISITION, Flux(signal, sbr), seed=4)
 
 
 def covers(found: Interval, truth: float) -> bool:
@@ -104,7 +111,7 @@ def test_more_pixels_narrow_the_interval() -> None:
 
 @pytest.mark.parametrize("method", [name for name in ESTIMATORS if name != "oracle"])
 def test_the_best_candidate_is_the_estimate(method: str) -> None:
-    capture = simulate(random_depths(8), ACQUISITION, Flux(0.6, 1.0), seed=4)
+    capture = seen(0.6, 1.0)
     image = estimate(capture, method)
     right = 0
     for row, col in np.ndindex(3, 3):
@@ -130,9 +137,9 @@ def test_the_best_candidate_is_the_estimate(method: str) -> None:
     ids=["tracking", "tracking in whole bins", "likelihood", "unmixing", "image_posterior"],
 )
 def test_the_candidate_at_the_estimate_is_the_estimate(method: str, settings: Any) -> None:
-    capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)
+    capture = seen(0.3, 0.3)
     image = estimate(capture, method, settings)
-    for row, col in np.ndindex(4, 8):
+    for row, col in np.ndindex(3, 5):
         report = inspection.pixel_report(capture, image, row, col, method, settings)
         near = [c for c in report.candidates if abs(c.bin - report.answer_bin) < capture.echo_bins]
         # Neighbours may move a spatial method's estimate away from all peaks.
@@ -194,9 +201,9 @@ def net_before_wall(
 def test_estimate_and_candidates_of_a_region_agree(n_pulses: int | None, sigma_bins: float) -> None:
     capture = net_before_wall(n_pulses, sigma_bins)[0]
     rng, width_bins, n_sure = np.random.default_rng(0), same_echo_bins(capture), []
-    for method in ("tracking", "matched_filter", "peak"):
+    for method in ("tracking", "peak"):
         image = estimate(capture, method)
-        for share in (0.0, 0.05, 0.5):
+        for share in (0.0, 0.1):
             mask = rng.random(capture.shape) < share
             mask[rng.integers(4), rng.integers(8)] = True
             region = inspection.region_report(capture, image, mask, method)
@@ -257,7 +264,7 @@ def test_the_echo_of_another_surface_is_not_counted_as_background(n_pulses: int 
 
 
 def test_a_report_has_the_intervals_of_the_range() -> None:
-    capture = simulate(random_depths(8), ACQUISITION, Flux(0.3, 0.3), seed=4)
+    capture = seen(0.3, 0.3)
     image = estimate(capture, "tracking")
     report = inspection.pixel_report(capture, image, 2, 3)
     inner, outer = report.interval_68_m, report.interval_95_m
@@ -367,6 +374,35 @@ def test_a_region_is_its_pixels_added_to_one() -> None:
         inspection.region_report(capture, image, np.zeros((8, 8), bool))
     with pytest.raises(ValueError, match="mask = "):
         inspection.region_report(capture, image, np.zeros((8, 7), bool))
+
+
+@pytest.mark.compiled
+def test_a_region_of_two_surfaces_says_so_and_a_slope_does_not() -> None:
+    for scene, sbr, several in ((scenes["net"](16), 0.06, True), (scenes["wall"](16), 0.3, False)):
+        capture = simulate(scene, scene.acquisition, Flux(sbr=sbr))
+        mask = np.zeros(capture.shape, bool)
+        mask[:, 6:9] = True
+        image = estimate(capture, "peak")
+        report = inspection.region_report(capture, image, mask, "likelihood")
+        found = np.sort(report.pixel.surfaces_bin)
+        middle_m = np.mean(scene.surfaces_m[:, mask], axis=1)
+        np.testing.assert_allclose(
+            found, np.sort(capture.acquisition.range_m_to_bin(middle_m)), atol=1.0
+        )
+        assert report.pixel.surfaces_text.startswith("2 surfaces: " if several else "1 surface: ")
+
+
+@pytest.mark.compiled
+def test_returns_with_neighbours_are_candidates_of_a_pixel() -> None:
+    scene = scenes["net"](24)
+    capture = simulate(scene, scene.acquisition, Flux(sbr=0.1))
+    image = estimate(capture, "image_posterior", returns=2)
+    assert image.returns is not None
+    report = inspection.pixel_report(capture, image, 12, 12, "image_posterior")
+    here = image.returns.at(12, 12)
+    probability = {each.bin: each.probability for each in report.candidates}
+    assert [probability[each] for each in here.bin.tolist()] == here.confidence.tolist()
+    assert len(report.surfaces_bin) == 2
 
 
 def test_fluxes_of_a_region_are_with_the_pulse_of_its_echoes() -> None:
@@ -595,7 +631,7 @@ def _counts(shape: tuple[int, int, int], kind: str, n_pulses: int | None) -> np.
 @pytest.mark.uncounted
 @pytest.mark.parametrize("kind", ["empty", "full", "one"])
 @pytest.mark.parametrize("n_pulses", [1, 1000, None])
-@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 5, 1), (5, 6, 30)])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 4, 30)])
 def test_extreme_captures_have_reports(
     shape: tuple[int, int, int], n_pulses: int | None, kind: str
 ) -> None:

@@ -35,7 +35,7 @@ APART = [name for name, each in ESTIMATORS.items() if not each.whole_image and n
 def small_car() -> Capture:
     """Some of the car, wider than high."""
     scene = scenes["car"]()
-    return simulate(Scene(scene.range_m[20:45, 10:50]), scene.acquisition, Flux(sbr=0.1))
+    return simulate(Scene(scene.range_m[20:45:2, 10:50:2]), scene.acquisition, Flux(sbr=0.1))
 
 
 CAPTURE = small_car()
@@ -45,7 +45,7 @@ COUNTS = dataset(CAPTURE).counts
 @pytest.mark.parametrize("method", APART)
 @pytest.mark.parametrize(
     ("chunks", "false_alarm"),
-    [({"row": 7, "col": 13}, 0.05), ({"row": 25, "col": 1, "bin": 30}, None)],
+    [({"row": 4, "col": 7}, 0.05), ({"row": 13, "col": 1, "bin": 30}, None)],
     ids=["small chunks, some invalid pixels", "chunks of a column"],
 )
 def test_tiles_give_the_estimates_of_the_whole(
@@ -54,7 +54,7 @@ def test_tiles_give_the_estimates_of_the_whole(
     false_alarm: float | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(base, "NULL_SIDE", 48)  # 256 rows and columns take twenty times as long
+    monkeypatch.setattr(base, "NULL_SIDE", 32)  # 256 rows and columns take twenty times as long
     whole = estimate(CAPTURE, method, false_alarm=false_alarm)
     parts = estimate_large(COUNTS.chunk(chunks), method, false_alarm=false_alarm).compute()
     for name in set(IMAGES) - {"counts"}:
@@ -95,7 +95,7 @@ def test_nothing_is_estimated_before_compute(monkeypatch: pytest.MonkeyPatch) ->
     parts = estimate_large(COUNTS.chunk(row=5), "peak")
     assert calls == []
     parts.compute(scheduler="synchronous")
-    assert len(calls) == 5
+    assert len(calls) == 3
 
 
 def test_a_large_image_is_learned_from_patches(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -132,7 +132,29 @@ def test_reliability_compares_like_with_like() -> None:
     assert metrics.calibration_error([low, high]) == pytest.approx(expected)
 
 
+def test_surfaces_are_matched_one_to_one() -> None:
+    nan = np.nan
+    truth_m = np.array([[10.0, 10.0, 10.0, nan, 10.0], [12.0, 12.0, nan, nan, 10.5]])
+    range_m = np.array([[12.1, 11.0, 10.0, 1.0, 10.1], [9.9, nan, 30.0, 2.0, nan]])
+    # Both; one return between both; a false return; no target; one return near two surfaces.
+    assert metrics.surfaces_found(range_m, truth_m, 1.0) == (2 + 1 + 1 + 0 + 1, 2 + 2 + 2 + 0 + 2)
+    error_m = metrics.surface_errors_m(range_m[:, :2], truth_m[:, :2])
+    np.testing.assert_allclose(error_m, [-0.1, 1.0, 0.1, -1.0], atol=1e-12)
+
+
+def test_one_surface_counts_as_before() -> None:
+    rng = np.random.default_rng(0)
+    truth_m, range_m = rng.uniform(0, 9, (2, 20, 20))
+    truth_m[rng.random((20, 20)) < 0.2] = range_m[rng.random((20, 20)) < 0.2] = np.nan
+    given = range_m[np.newaxis], truth_m[np.newaxis]
+    assert metrics.surfaces_found(*given, 1.0) == metrics.restored(range_m, truth_m, 1.0)
+    np.testing.assert_array_equal(
+        metrics.surface_errors_m(*given), metrics.errors_m(range_m, truth_m)
+    )
+
+
 REFUSED = [
+    (metrics.surfaces_found, (np.ones((1, 2, 2)), TRUTH_M[np.newaxis], 1.0), "range_m = "),
     (metrics.rmse_m, (np.ones((2, 2)), TRUTH_M), r"range_m = 'shape \(2, 2\)' .*\(2, 3\)"),
     (metrics.precision_recall, (np.ones((3, 2), bool), TRUTH_M), r"valid = 'shape .*\(2, 3\)"),
     *(

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -713,6 +713,8 @@ def captures(draw: st.DrawFn) -> Capture:
     )
 
 
+@pytest.mark.uncounted
+@settings(max_examples=30)
 @given(captures())
 def test_round_trip(capture: Capture) -> None:
     with tempfile.TemporaryDirectory() as folder:

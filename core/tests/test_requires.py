@@ -6,7 +6,7 @@ import json
 import math
 import pickle
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,10 +24,10 @@ from core.inference.flux import detailed_flux_prior_of, flux_prior_of
 from core.inference.limits import cramer_rao_bins
 from core.inference.resolution import FEW, HIDDEN, RESOLVED, Difference
 from core.metrics import Interval
-from core.scene import Scene
+from core.scene import Scene, scenes
 from core.simulation import simulate
-from core.studies.ablation import corrections, plain, power
-from core.studies.ablation.criterion import UNKNOWN, judged
+from core.studies.ablation import corrections, extensions, plain, power, study
+from core.studies.ablation.criterion import UNKNOWN, improved, judged
 from core.studies.ablation.evidence import (
     POWER,
     SIZE,
@@ -85,13 +85,43 @@ def test_the_rule(part: str, evidence: float, rd: Interval, rmse_m: Interval, ve
     assert found.detectable_share == (evidence >= RESOLVED)
 
 
+@pytest.mark.parametrize(
+    ("rd", "rmse_m", "verdict"),
+    [
+        (MORE, UNKNOWN, "needed"),
+        (STAY, LESS, "needed"),
+        (STAY, UNKNOWN, "not needed"),
+        (LESS, STAY, "not needed"),  # it harms
+        (WIDE, UNKNOWN, "cannot tell"),
+        (STAY, WIDE, "cannot tell"),
+    ],
+)
+def test_an_extension_is_judged_by_its_estimates(
+    rd: Interval, rmse_m: Interval, verdict: str
+) -> None:
+    found = improved("neighbours", 0.15, rd, rmse_m, note="in a note")
+    assert found.verdict == verdict
+    assert found.why.endswith("; in a note")
+    assert math.isnan(found.total_variation)
+
+
 # -- Scenes ----------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def without_extensions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the rows that take longest, which have tests of their own."""
+    monkeypatch.setattr(study, "EXTENSIONS", {})
+    monkeypatch.setattr(extensions, "rows", lambda *_: [])
+
+
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_the_parts_of_a_scene_are_judged_by_their_effect() -> None:
-    fast = requirements(wall(motion=Motion(30.0, 20e3)), Flux(0.1, 2.0), seeds=range(4))
-    slow = requirements(wall(motion=Motion(1e-4, 20e3)), Flux(0.1, 2.0), seeds=range(4))
+    fast, slow = (
+        requirements(wall(size, motion=Motion(speed, 20e3)), Flux(0.1, 2.0), seeds=range(3))
+        for size, speed in ((32, 30.0), (8, 1e-4))
+    )
     assert [row.part for row in fast] == ["pile_up", "pulse_shape", "signal_levels", "motion"]
     moved, still = fast[-1], slow[-1]
     assert moved.verdict == "needed"
@@ -105,9 +135,10 @@ def test_the_parts_of_a_scene_are_judged_by_their_effect() -> None:
     assert str(pickle.loads(pickle.dumps(fast))) == str(fast)  # NaN is not equal to itself
 
 
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_pile_up_needs_a_correction_by_day_and_none_by_night() -> None:
-    day, night = (requirements(wall(), flux, seeds=range(4))[0] for flux in (DAY, NIGHT))
+    day, night = (requirements(wall(), flux, seeds=range(3))[0] for flux in (DAY, NIGHT))
     assert day.verdict == "needed"
     assert day.rd_change.low > 0.1
     assert day.total_variation > day.resolvable
@@ -117,6 +148,7 @@ def test_pile_up_needs_a_correction_by_day_and_none_by_night() -> None:
     assert [row[1] for row in table.rows] == ["needed", "not needed"]
 
 
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_rows_are_reported_one_by_one_and_can_be_cancelled() -> None:
     calls: list[tuple[int, int]] = []
@@ -168,6 +200,63 @@ def test_a_gaussian_of_the_same_mean_gives_the_same_ranges() -> None:
     assert abs(np.median(other_m - one_m)) < 0.1 * GATE.bin_length_m
 
 
+# -- Extensions ------------------------------------------------------------------------------------
+
+
+def captures_of(scene: Scene, flux: Flux, n_groups: int | None = None) -> list[Capture]:
+    return [
+        simulate(scene, scene.acquisition, flux, seed=seed, n_groups=n_groups) for seed in (0, 1)
+    ]
+
+
+def blind(capture: Capture) -> Capture:
+    """Return the capture without what an instrument does not know."""
+    return replace(capture, truth_range_m=None, signal=None, background=None)
+
+
+@pytest.mark.compiled
+def test_neighbours_are_needed_where_they_agree_and_pixels_are_dark() -> None:
+    smooth = scenes["wall"](20)
+    truth_m = smooth.range_m[np.newaxis]
+    captures = captures_of(smooth, Flux(sbr=0.03))
+    measured = extensions.judged_on_scene("neighbours", captures, truth_m, "likelihood")
+    assert measured.verdict == "needed"
+    assert measured.rd_change.low > 0.1
+    expected = extensions.neighbours(blind(captures[0]))
+    assert expected.verdict == "needed"
+    assert expected.rd_change.overlaps(measured.rd_change)
+    random = simulate(wall(20), GATE, Flux(0.1, 2.0))
+    alone = extensions.neighbours(blind(random))
+    assert (alone.verdict, alone.why[:15]) == ("not needed", "neighbours agre")
+    few = extensions.neighbours(Capture(random.cube[:2, :2].copy(), GATE))
+    assert few.verdict == "cannot tell"
+
+
+@pytest.mark.compiled
+def test_a_second_return_is_needed_where_pixels_see_two_surfaces() -> None:
+    two = scenes["net"](16, separation_bins=12.0, share=0.5)
+    captures = captures_of(two, Flux(0.3, 2.0))
+    both_m, one_m = (
+        each(captures[0]) for each in extensions.rangings("second_return", "likelihood")
+    )
+    rd = [corrections.score(each, two.surfaces_m, captures[0])[0] for each in (both_m, one_m)]
+    assert rd == pytest.approx([1.0, 0.5], abs=0.05)
+    assert extensions.second_return(blind(captures[0]), "likelihood").verdict == "needed"
+
+
+@pytest.mark.compiled
+def test_a_velocity_is_needed_where_surfaces_move() -> None:
+    moving = wall(16, motion=Motion(30.0, 20e3))
+    (capture, _) = captures_of(moving, Flux(0.1, 0.2), n_groups=40)
+    for each in (capture, blind(capture)):
+        assert extensions.velocity(each).verdict == "needed"
+    still = simulate(wall(16), GATE, Flux(0.1, 0.2), n_groups=40)
+    assert extensions.velocity(blind(still)).verdict == "not needed"
+    unordered = extensions.velocity(replace(still, groups=None))
+    assert unordered.verdict == "cannot tell"
+    assert unordered.why == "the capture keeps no order of pulses"
+
+
 # -- Captures --------------------------------------------------------------------------------------
 
 
@@ -175,6 +264,7 @@ def verdicts(capture: Capture) -> dict[str, str]:
     return {row.part: row.verdict for row in requirements(capture)}
 
 
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_a_capture_with_echoes_alone_needs_no_parts() -> None:
     found = verdicts(replace(seen(Flux(0.1, 2.0), size=64), truth_range_m=None, signal=None))
@@ -196,6 +286,7 @@ def parts_of_walls() -> dict[str, Scene]:
     }
 
 
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 @pytest.mark.parametrize("part", parts_of_walls())
 def test_a_capture_reveals_its_parts(part: str) -> None:
@@ -204,6 +295,7 @@ def test_a_capture_reveals_its_parts(part: str) -> None:
     )
 
 
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_pile_up_depends_on_detection_and_pulses() -> None:
     photons = replace(seen(), detection="all", signal=None, background=None)
@@ -212,6 +304,7 @@ def test_pile_up_depends_on_detection_and_pulses() -> None:
     assert verdicts(unknown)["pile_up"] == "cannot tell"
 
 
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_without_certain_pixels_parts_are_unknown() -> None:
     noise = np.random.default_rng(0).poisson(0.02, (2, 40, 100)).astype(np.uint16)
@@ -220,6 +313,7 @@ def test_without_certain_pixels_parts_are_unknown() -> None:
         assert found[part] == "cannot tell"
 
 
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 @pytest.mark.parametrize(
     ("part", "value"),
@@ -243,6 +337,7 @@ def test_pixels_together_reveal_what_single_ones_do_not(part: str, value: float)
         assert "needed" not in {found[each].verdict for each in others}
 
 
+@pytest.mark.usefixtures("without_extensions")
 @pytest.mark.compiled
 def test_a_part_that_could_not_have_been_seen_is_not_excluded() -> None:
     bright, faint = (power.Case("second_surface", 0.0, sbr).capture(0) for sbr in (0.3, 0.03))
@@ -364,19 +459,22 @@ def test_coates_corrects_pile_up_only_where_it_is_detectable() -> None:
 @pytest.mark.compiled
 @pytest.mark.usefixtures("blank_figures")
 def test_the_command_judges_a_scene_and_writes_a_page(
-    tmp_path, capsys: pytest.CaptureFixture[str]
+    tmp_path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setitem(scenes, "car", partial(wall, 8))
     page = tmp_path / "page"
     arguments = ["requires", "--scene", "car", "--pulses", "50", "--seeds", "2", "--falloff"]
     assert main([*arguments, "--folder", str(page)]) == ACCEPTED
     out = capsys.readouterr().out
-    assert "| part or correction | verdict |" in out
+    assert "| part, correction or extension | verdict |" in out
     assert "| fall of the signal with range | " in out
+    assert "| search for a velocity | not needed | " in out
     assert "Cost of absent parts" in out
     assert {path.name for path in page.iterdir()} >= {"index.html", "requirements.csv"}
 
 
 @pytest.mark.compiled
+@pytest.mark.usefixtures("without_extensions")
 def test_the_command_judges_a_capture(capsys: pytest.CaptureFixture[str]) -> None:
     sample = str(plain.__file__).rsplit("core", 1)[0] + "assets/sample_capture.npz"
     assert main(["requires", "--capture", sample, "--json"]) == ACCEPTED

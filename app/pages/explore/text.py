@@ -106,8 +106,11 @@ def cloud_caption(
     is_width_guessed: bool = False,
 ) -> str:
     """Return the line under the cloud."""
-    total, where = int(answer.run.image.valid.sum()), "" if box == WHOLE else " in the box"
-    line = f"{n_shown:,} of {total:,} estimates shown{where}"
+    image, where = answer.run.image, "" if box == WHOLE else " in the box"
+    total, noun = int(image.valid.sum()), "estimates"
+    if image.returns is not None:
+        total, noun = len(image.returns), "returns"
+    line = f"{n_shown:,} of {total:,} {noun} shown{where}"
     if n_wrong is not None:
         line += f", {n_wrong:,} of them wrong (crosses)"
     return line + ("; width is a guess" if is_width_guessed else "")

@@ -13,7 +13,7 @@ from app.model.state import AUTOMATIC
 from app.model.store import Answer
 from app.pages.session import Session
 from app.pages.shared.tuning import SettingsChooser
-from app.widgets.cards import part, select
+from app.widgets.cards import choice, part, select
 from app.widgets.controls import Sentence, SettingsPanel
 from core import ESTIMATORS
 
@@ -48,7 +48,10 @@ class MethodChoice:
         self.panels: dict[str, SettingsPanel[Any]] = {}
         self._settings = pn.Column(sizing_mode="stretch_width", margin=0)
         self.chooser = SettingsChooser(session)
-        self.part = part("Method", self.menu, self.note, self._settings, self.chooser.part)
+        self.returns = choice(text.RETURNS_HELP, session.state.param.returns)
+        self.part = part(
+            "Method", self.menu, self.note, self._settings, self.returns, self.chooser.part
+        )
         self.menu.param.watch(lambda event: setattr(self._state, "method", event.new), "value")
 
     def show(self, answer: Answer) -> None:

@@ -1,4 +1,4 @@
-"""The ablation study: which parts of the scene and corrections of the likelihood are needed."""
+"""The ablation study: parts of the scene, corrections and extensions of the likelihood."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from app.tasks.scheduler import Work
 from app.widgets.cards import part
 from app.widgets.controls import Sentence, Table
 from core import CORRECTIONS, parts_of
-from core.studies.ablation import Requirement, requirements
+from core.studies.ablation import EXTENSIONS, Requirement, requirements
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,9 @@ class Verdicts:
 
 
 class AblationSection(SettingsSection[Repetitions]):
-    """A verdict on each part and correction, with a button that switches it off or on.
+    """A verdict on each part, correction and extension, with a button that switches it off or on.
+
+    Extensions are other methods or settings and have no button.
 
     Parameters
     ----------
@@ -112,12 +114,12 @@ class AblationSection(SettingsSection[Repetitions]):
         request = self.session.answer.request
         absent = self.session.state.absent
         parts = parts_of(request.whole_scene) if request.source.is_scene else ()
-        own = [*CORRECTIONS, *parts]
+        can_switch = (*CORRECTIONS, *parts)
         with self.session.tasks.hold():
             self.subject.text = text.subject(
                 request.source.title, self._repetitions if self._found else 0, absent
             )
             self.table.rows = [
-                text.row(name, self._found.get(name), name in own, name in absent)
-                for name in dict.fromkeys([*own, *self._found])
+                text.row(name, self._found.get(name), name in can_switch, name in absent)
+                for name in dict.fromkeys([*CORRECTIONS, *EXTENSIONS, *parts, *self._found])
             ]

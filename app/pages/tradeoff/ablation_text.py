@@ -10,17 +10,21 @@ from core.studies.ablation import NOTE, TITLES, Requirement
 
 __all__ = ["COLUMNS", "EXPLANATION", "NOTE", "TITLE", "row", "subject"]
 
-TITLE = "Parts and corrections: whether the model needs them."
+TITLE = "Parts, corrections and extensions: whether they are needed."
 
 EXPLANATION = """
 Each part of the scene and each correction of the likelihood is left out in turn, and the change is
 compared with what the pulses can resolve. A capture is tested for them on all its pixels together:
 "not needed" means that an effect large enough to matter would have been seen. A button switches a
 part off, or on again, on all pages.
+
+The likelihood is also compared with its extensions: the evidence of neighbouring pixels (the image
+posterior), the search for a second return of each pixel, and the search for a velocity. These are
+choices of the estimator; a second surface and motion are parts of the scene.
 """
 
 COLUMNS = (
-    ("Part or correction", "Part of the model, and why it is needed or not.", 1),
+    ("Part, correction or extension", "What is judged, and why it is needed or not.", 1),
     ("Verdict", "Whether the model needs it.", 1),
     (
         "Change",

@@ -15,7 +15,7 @@ from app.model.download_text import NOTHING_DRAWN
 from app.model.exports import table_file
 from app.model.methods import METHOD_PLACES, method_style
 from app.model.restore import parameters_of
-from app.model.state import ReductionSettings
+from app.model.state import ALL_RETURNS, MOST_PROBABLE, ReductionSettings
 from app.model.store import Answer, Request, same_capture
 from app.pages.session import Session
 from app.pages.shared.downloads import TABLE, Shown, Subject, below, looked_at
@@ -273,7 +273,8 @@ def show_point(session: Session, point: Point, measured_on: Request) -> None:
     state, candidate = session.state, point.candidate
     method, settings = candidate.method.estimator, candidate.settings
     less = ReductionSettings.of(candidate.reduction, point.shape[2])
-    kept = {"tracking": state.tracking, "settings": state.settings}
+    kept: dict[str, Any] = {"tracking": state.tracking, "settings": state.settings}
+    kept["returns"] = MOST_PROBABLE if candidate.returns == 1 else ALL_RETURNS
     request = replace(measured_on, less=less, method=method, **kept).with_settings(settings)
     state.param.update(page="Explore", **parameters_of(request, session.sources))
 
@@ -328,4 +329,5 @@ def affordable(source: Source, chosen: Sequence[Candidate]) -> list[Candidate]:
 def methods(answer: Answer) -> list[Method]:
     """Return all methods with their defaults, tracking with the settings of the session."""
     tracking = Method("tracking", "tracking", answer.request.tracking)
-    return [tracking if each.name == "tracking" else each for each in default_methods()]
+    known = default_methods(with_motion=answer.whole.groups is not None)
+    return [tracking if each.name == "tracking" else each for each in known]

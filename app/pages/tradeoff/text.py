@@ -59,8 +59,9 @@ COLUMNS = (
 def name_of(candidate: Candidate) -> str:
     """Return the name of a configuration."""
     title = METHOD_TITLES[candidate.method.estimator]
-    reduction = str(candidate.reduction)
-    return title if reduction == "whole" else f"{title}, {reduction}"
+    returns = "" if candidate.returns == 1 else f"{candidate.returns} returns"
+    reduction = str(candidate.reduction).removeprefix("whole")
+    return ", ".join(filter(None, (title, returns, reduction)))
 
 
 def rows(points: Sequence[Point], pareto: Sequence[Point]) -> list[dict[str, object]]:

@@ -134,8 +134,9 @@ def range_scale(
 ) -> ColorScale:
     """Return the colour scale of a capture's ranges.
 
-    A limit that is not chosen follows from the true ranges, if they are known, otherwise from the
-    confident estimates, otherwise from all estimates, otherwise from the gate.
+    A limit that is not chosen follows from the confident returns of an image that has several of a
+    pixel, otherwise from the true ranges, if they are known, otherwise from the confident
+    estimates, otherwise from all estimates, otherwise from the gate.
 
     Parameters
     ----------
@@ -168,7 +169,11 @@ def _automatic_limits_m(capture: CaptureInfo, image: RangeImage) -> tuple[float,
     acquisition = capture.acquisition
     truth_m = getattr(capture, "truth_range_m", None)
     ends: Array
-    if truth_m is not None and np.isfinite(truth_m).any():
+    returns = image.returns
+    if returns is not None and (returns.confidence >= _CONFIDENT).any():
+        # Surfaces before and behind that of the estimate, which a truth leaves out.
+        ends = np.percentile(returns.range_m[returns.confidence >= _CONFIDENT], [1, 99])
+    elif truth_m is not None and np.isfinite(truth_m).any():
         ends = np.array([np.nanmin(truth_m), np.nanmax(truth_m)])
     elif image.valid.any():
         sure = image.range_m[image.valid & (image.confidence >= _CONFIDENT)]

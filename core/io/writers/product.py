@@ -48,7 +48,7 @@ class Product:
     title : str
         Title; see `heading`.
     rgb : ndarray of uint8, shape (row, col, 3), optional
-        Colours of the points of a cloud.
+        Colours of the points of a cloud; of an image with returns also theirs, (return, 3).
     shown : mapping of str to Plane
         Further or replacing images of the capture; they come first among `planes`.
     remark : str
@@ -87,7 +87,9 @@ class Product:
         require("image", f"shape {shape}", shape == known, f"shape {known}, the capture's")
         if self.rgb is not None:
             of, dtype = self.rgb.shape, self.rgb.dtype
-            fits = of == (*shape, 3) and dtype == np.uint8
+            returns = self.image.returns
+            per_return = returns is not None and of == (len(returns), 3)
+            fits = (of == (*shape, 3) or per_return) and dtype == np.uint8
             require("rgb", f"{dtype} of shape {of}", fits, f"uint8 of shape {(*shape, 3)}")
         for name, plane in self.shown.items():
             of = plane.values.shape
@@ -221,7 +223,10 @@ class Product:
         here = points.row, points.col
         sd_m = self.range_sd_m
         deviation = {} if sd_m is None else {"range_sd_m": sd_m[here].astype(np.float32)}
-        rgb = {} if self.rgb is None else dict(zip(COLORS, self.rgb[here].T, strict=True))
+        rgb = {}
+        if self.rgb is not None:
+            of_points = self.rgb if self.rgb.ndim == 2 else self.rgb[here]
+            rgb = dict(zip(COLORS, of_points.T, strict=True))
         found, range_m = self.image.returns, self.image.range_m[here]
         confidence, of_returns = self.image.confidence[here], dict[str, NDArray[Any]]()
         if found is not None:

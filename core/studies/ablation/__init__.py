@@ -1,6 +1,6 @@
 """Ablation: which parts of a model a scene needs."""
 
-from core.studies.ablation.criterion import TITLES, Requirement
+from core.studies.ablation.criterion import EXTENSIONS, TITLES, Requirement
 from core.studies.ablation.study import NOTE, requirements
 
-__all__ = ["NOTE", "TITLES", "Requirement", "requirements"]
+__all__ = ["EXTENSIONS", "NOTE", "TITLES", "Requirement", "requirements"]

@@ -13,19 +13,18 @@ from functools import partial
 
 import numpy as np
 
-from core.acquisition import Floats
 from core.capture import Capture
 from core.corrections import without_correction
 from core.inference import faults, resolution
 from core.inference.flux import flux_model_of
 from core.inference.resolution import FEW, Difference
-from core.metrics import Interval
-from core.studies.ablation import corrections
+from core.studies.ablation import corrections, extensions
 from core.studies.ablation.criterion import (
     MARGIN_BINS,
     Requirement,
     judged,
     tested,
+    unknown,
 )
 from core.studies.ablation.evidence import Evidence, evidence_of_share
 from core.studies.ablation.pooled import pile_up_evidence, pooled_evidence, signal_evidence
@@ -53,9 +52,10 @@ scatter by 20 to 30 % are taken for equal ones.
 
 
 def rows(capture: Capture, method: str) -> list[Callable[[], Requirement]]:
-    """Return one function per part and correction."""
+    """Return one function per part, correction and extension."""
     return [
         *(partial(_timed, judge, capture, method) for judge in (pile_up, signal_levels)),
+        *extensions.rows(capture, method),
         *(
             partial(judge, capture)
             for judge in (pulse_shape, second_surface, backscatter, faulty_pixels, motion, jitter)
@@ -92,14 +92,14 @@ def pile_up(capture: Capture, method: str) -> Requirement:
     if capture.detection == "all":
         why = "in multi-detection data no photon hides another"
         return Requirement("pile_up", "not needed", why, 0.0, 0.0, detectable_share=0.0)
-    return _unknown("pile_up", "the number of pulses is unknown")
+    return unknown("pile_up", "the number of pulses is unknown")
 
 
 def signal_levels(capture: Capture, method: str) -> Requirement:
     """Judge whether the signal differs from pixel to pixel."""
     apart, evidence = corrections.level_deviation(capture), signal_evidence(capture)
     if evidence is None:
-        return _unknown("signal_levels", "too few pixels have a certain estimate")
+        return unknown("signal_levels", "too few pixels have a certain estimate")
     found = "the signal scatters by {} of its mean over the pixels with a certain estimate"
     if math.isinf(evidence.smallest):
         found += ", which are too few to stand for all"
@@ -125,23 +125,11 @@ def _corrected(
     shown = tested(correction, evidence, margin, found, note=note)
     if capture.truth_range_m is None:
         return shown
-    known = judged(
-        correction, apart, bin_length_m, *_changes(capture, with_m, without_m), note=note
-    )
+    changes = corrections.changes_over_rows(capture, with_m[np.newaxis], without_m[np.newaxis])
+    known = judged(correction, apart, bin_length_m, *changes, note=note)
     return replace(
         known, effect=shown.effect, smallest_effect=shown.smallest_effect, p_value=shown.p_value
     )
-
-
-def _changes(capture: Capture, with_m: Floats, without_m: Floats) -> tuple[Interval, Interval]:
-    """Return the changes of restoration degree and RMSE, paired over the rows of the image."""
-    truth_m = np.asarray(capture.truth_range_m)
-    rows = np.flatnonzero(np.isfinite(truth_m).any(axis=1))
-    scores = (
-        np.array([corrections.score(range_m[row], truth_m[row], capture) for row in rows])
-        for range_m in (with_m, without_m)
-    )
-    return corrections.changes(*scores)
 
 
 # -- Parts that all pixels share -------------------------------------------------------------------
@@ -183,7 +171,7 @@ def _widening(capture: Capture, part: str) -> Requirement:
     pulse = pulse_shape(capture)
     if pulse.verdict == "not needed":
         return replace(pulse, part=part)
-    return _unknown(part, f"it widens echoes like another pulse: {pulse.why}")
+    return unknown(part, f"it widens echoes like another pulse: {pulse.why}")
 
 
 # -- Shares of the pixels --------------------------------------------------------------------------
@@ -193,7 +181,7 @@ def second_surface(capture: Capture) -> Requirement:
     """Judge whether pixels see a second surface."""
     evidence = pooled_evidence(capture).second_surface
     if evidence is None:
-        return _unknown("second_surface", "too few pixels have an echo, or the gate is too short")
+        return unknown("second_surface", "too few pixels have an echo, or the gate is too short")
     found = "{} of the pixels see a second surface, as strong as the first"
     requirement = tested("second_surface", evidence, FEW, found)
     if requirement.verdict == "needed" and pulse_shape(capture).verdict == "needed":
@@ -215,7 +203,7 @@ def faulty_pixels(capture: Capture) -> Requirement:
     """
     found = faults.outlier_pixels(capture)
     if found is None:
-        return _unknown("faulty_pixels", "the image is too narrow")
+        return unknown("faulty_pixels", "the image is too narrow")
     n_pulses, usual = capture.gated_pulses, faults.neighbour_median(capture)
     rng = np.random.default_rng(0)
     if n_pulses is None:
@@ -235,7 +223,3 @@ def faulty_pixels(capture: Capture) -> Requirement:
     )
     note = f"{hot} hot and {dead} dead"
     return tested("faulty_pixels", evidence, FEW, "{} of the pixels are hot or dead", note=note)
-
-
-def _unknown(part: str, why: str) -> Requirement:
-    return Requirement(part, "cannot tell", why)

@@ -54,11 +54,24 @@ def ranges_m(capture: Capture, method: str) -> Floats:
 
 
 def score(range_m: Floats, truth_m: Floats, capture: Capture) -> tuple[float, float]:
-    """Return restoration degree within 3 bins and RMSE in metres, over some of the pixels."""
+    """Return restoration degree within 3 bins and RMSE in metres, over some of the pixels.
+
+    Parameters
+    ----------
+    range_m : ndarray, shape (return, ...)
+        NaN where a pixel has fewer returns.
+    truth_m : ndarray, shape (surface, ...)
+        NaN where a pixel has fewer surfaces. The restoration degree is the share of surfaces that
+        are found (`metrics.surfaces_found`), errors are those of the nearest return.
+    capture : Capture
+    """
     tolerance_m = TOLERANCE_BINS * capture.acquisition.bin_length_m
+    hits, of = metrics.surfaces_found(range_m, truth_m, tolerance_m)
+    error_m = metrics.surface_errors_m(range_m, truth_m)
+    error_m = error_m[np.isfinite(error_m)]
     return (
-        metrics.restoration_degree(range_m, truth_m, tolerance_m),
-        metrics.rmse_m(range_m, truth_m),
+        hits / of if of else np.nan,
+        float(np.sqrt(np.mean(error_m**2))) if error_m.size else np.nan,
     )
 
 
@@ -66,6 +79,19 @@ def changes(with_it: Floats, without_it: Floats) -> tuple[Interval, Interval]:
     """Return the mean changes of restoration degree and RMSE, from paired scores (n, 2)."""
     rd, rmse_m = (mean_interval(each[np.isfinite(each)]) for each in (with_it - without_it).T)
     return rd, rmse_m
+
+
+def changes_over_rows(
+    capture: Capture, with_m: Floats, without_m: Floats
+) -> tuple[Interval, Interval]:
+    """Return the changes for estimates (return, row, col), paired over the rows of a truth."""
+    truth_m = np.asarray(capture.truth_range_m)
+    rows = np.flatnonzero(np.isfinite(truth_m).any(axis=1))
+    scores = (
+        np.array([score(range_m[:, row], truth_m[np.newaxis, row], capture) for row in rows])
+        for range_m in (with_m, without_m)
+    )
+    return changes(*scores)
 
 
 def ranging_ratio(with_it: Capture, without_it: Capture, method: str) -> Interval:

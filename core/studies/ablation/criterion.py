@@ -9,6 +9,8 @@ Neither is needed if hardly a histogram could reveal it, or if the whole 95 % in
 lies within the margins (the equivalence test of Schuirmann 1987; a correction may do harm, too).
 Otherwise the data do not decide.
 
+An extension of the estimator is judged like a correction, by its estimates alone.
+
 A part of a capture is tested on all pixels together (`core.studies.ablation.pooled`). It is needed
 if an effect is seen that is large enough to matter, and not needed only where such an effect would
 have been seen.
@@ -37,15 +39,25 @@ MARGIN_BINS = 0.5
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
-TITLES = CORRECTIONS | PARTS
+EXTENSIONS = {
+    "neighbours": "evidence of neighbouring pixels",
+    "second_return": "search for a second return",
+    "velocity": "search for a velocity",
+}
+"""What an estimator may do beyond ranging a pixel by itself, with one surface at rest, by key."""
+
+TITLES = CORRECTIONS | EXTENSIONS | PARTS
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """Whether a part of a scene or a correction of an estimator is needed; NaN where unknown."""
+    """Whether a part of a scene, or a correction or extension of an estimator, is needed.
+
+    What is not known is NaN.
+    """
 
     part: str
-    """A key of `core.PARTS`, or of `core.CORRECTIONS`."""
+    """A key of `core.PARTS`, `core.CORRECTIONS` or `EXTENSIONS`."""
     verdict: Verdict
     why: str
     total_variation: float = math.nan
@@ -61,7 +73,7 @@ class Requirement:
     rmse_change_m: Interval = UNKNOWN
     """RMSE with it minus without it, paired."""
     time_ratio: Interval = UNKNOWN
-    """With it over without it: time of simulating for a part, of ranging for a correction."""
+    """With it over without it: time of simulating for a part, otherwise of ranging."""
     effect: float = math.nan
     """Size in a capture, tested on all pixels together, in the unit that `why` states."""
     smallest_effect: float = math.nan
@@ -109,6 +121,37 @@ def judged(
     )
 
 
+def improved(
+    part: str,
+    bin_length_m: float,
+    rd_change: Interval,
+    rmse_change_m: Interval = UNKNOWN,
+    time_ratio: Interval = UNKNOWN,
+    note: str = "",
+) -> Requirement:
+    """Decide whether an extension of an estimator is needed, by the change of its estimates.
+
+    Parameters
+    ----------
+    rmse_change_m : Interval
+        Where it is not known, the change of the restoration degree decides.
+    note : str
+        Added to the reason.
+    """
+    rd = _in_margins(rd_change, MARGIN_RD)
+    rmse = _in_margins(rmse_change_m, MARGIN_BINS * bin_length_m)
+    known = Interval(0.0, 0.0, 0.0) if math.isnan(rmse.value) else rmse
+    verdict, why = _judge_changes(rd, known) or ("cannot tell", _VARIES)
+    return Requirement(
+        part,
+        verdict,
+        f"{why}; {note}" if note else why,
+        rd_change=rd_change,
+        rmse_change_m=rmse_change_m,
+        time_ratio=time_ratio,
+    )
+
+
 def tested(
     part: str, evidence: Evidence, margin: float, found: str, explained: float = 0.0, note: str = ""
 ) -> Requirement:
@@ -150,6 +193,11 @@ def tested(
     )
 
 
+def unknown(part: str, why: str) -> Requirement:
+    """Return that a capture does not decide, and why."""
+    return Requirement(part, "cannot tell", why)
+
+
 def _percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
@@ -164,11 +212,19 @@ _VARIES = "the interval of the change exceeds a margin"
 
 def _judge_correction(difference: Difference, rd: Interval, rmse: Interval) -> tuple[Verdict, str]:
     """Judge by known changes in units of their margins."""
+    found = _judge_changes(rd, rmse)
+    if found is None:
+        return ("not needed", _HIDDEN) if difference.is_hidden else ("cannot tell", _VARIES)
+    return found
+
+
+def _judge_changes(rd: Interval, rmse: Interval) -> tuple[Verdict, str] | None:
+    """Judge by known changes in units of their margins; None where they do not decide."""
     if rd.low > 1 or rmse.high < -1:
         return "needed", "estimates are better with it"
     if rd.high <= 1 and rmse.low >= -1:
         return "not needed", "estimates are no better with it"
-    return ("not needed", _HIDDEN) if difference.is_hidden else ("cannot tell", _VARIES)
+    return None
 
 
 def _judge_part(difference: Difference, rd: Interval, rmse: Interval) -> tuple[Verdict, str]:

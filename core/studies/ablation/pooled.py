@@ -150,6 +150,13 @@ def _mean_shape(capture: Capture, residuals: Residuals) -> Floats:
     return np.asarray(ratio[group])
 
 
+def with_second_surfaces(capture: Capture) -> Capture:
+    """Simulate pixels that have an echo (1, pixel, bin) with half of it at another delay."""
+    residuals = drawn_residuals(capture, _parts(capture, faults.ordinary_pixels(capture))[0])
+    simulated = _with_second_surface(capture, residuals)
+    return _with_counts(simulated, simulated.cube[0, np.isfinite(residuals.delay_bin)])
+
+
 def _with_second_surface(capture: Capture, residuals: Residuals) -> Capture:
     """Simulate the pixels with half the signal at another delay, which is uniform over the gate."""
     n_pixels, n_bins = residuals.counts.shape

@@ -19,10 +19,17 @@ from core.inference.resolution import Difference, difference
 from core.metrics import Interval
 from core.scene import Scene, parts_of, without
 from core.simulation import cumulative_trigger_probability, simulate
-from core.studies.ablation import capture_parts, corrections
-from core.studies.ablation.criterion import MARGIN_RD, TITLES, Requirement, judged
+from core.studies.ablation import capture_parts, corrections, extensions
+from core.studies.ablation.criterion import (
+    EXTENSIONS,
+    MARGIN_RD,
+    TITLES,
+    Requirement,
+    judged,
+)
 from core.studies.ablation.evidence import POWER, SIZE
 from core.studies.outputs import Table, table
+from core.studies.statistics import MIN_REPEATS
 from core.studies.timing import time_ratio
 
 
@@ -37,7 +44,7 @@ def requirements(
     progress: Callable[[int, int], None] = lambda done, of: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[Requirement, ...]:
-    """Judge every part of a scene and every correction of an estimator.
+    """Judge every part of a scene, and every correction and extension of an estimator.
 
     Parameters
     ----------
@@ -74,6 +81,7 @@ def requirements(
         gate = acquisition or subject.acquisition
         study = _Study(subject, gate, flux or Flux(), pulse, method, tuple(seeds))
         rows = [partial(_correction, study, name) for name in CORRECTIONS]
+        rows += [partial(_extension, study, name) for name in EXTENSIONS]
         rows += [partial(_part, study, name) for name in parts_of(subject)]
     found: list[Requirement] = []
     for row in rows:
@@ -82,6 +90,10 @@ def requirements(
         found.append(row())
         progress(len(found), len(rows))
     return tuple(found)
+
+
+EXTENDED_CAPTURES = MIN_REPEATS
+"""Captures of a scene by which extensions are judged, at most: they take longest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +125,14 @@ class _Study:
         edges = cumulative_trigger_probability(self.scene, self.acquisition, self.flux, self.pulse)
         return np.maximum(np.diff(edges), 0.0)  # rounding may make it negative
 
-    def capture(self, seed: int) -> Capture:
-        return simulate(self.scene, self.acquisition, self.flux, self.pulse, seed)
+    def capture(self, seed: int, n_groups: int | None = None) -> Capture:
+        given = self.scene, self.acquisition, self.flux, self.pulse, seed
+        return simulate(*given, n_groups=n_groups)
 
     def scored(self, captures: Sequence[Capture]) -> Floats:
         """Return `corrections.score` of each capture, shape (capture, 2)."""
-        truth_m = np.asarray(self.scene.range_m, float)
-        found = ((corrections.ranges_m(each, self.method), each) for each in captures)
+        truth_m = np.asarray(self.scene.range_m, float)[np.newaxis]
+        found = ((corrections.ranges_m(each, self.method)[np.newaxis], each) for each in captures)
         return np.array([corrections.score(range_m, truth_m, each) for range_m, each in found])
 
     def difference(self, other: _Study) -> Difference:
@@ -156,10 +169,23 @@ def _correction(study: _Study, correction: str) -> Requirement:
     )
 
 
+def _extension(study: _Study, extension: str) -> Requirement:
+    seeds, truth_m = study.seeds[:EXTENDED_CAPTURES], np.asarray(study.scene.range_m, float)
+    captures, truth_m = iter(study.captures[: len(seeds)]), truth_m[np.newaxis]
+    if extension == "second_return":
+        truth_m = study.scene.surfaces_m
+    if extension == "velocity":
+        n_groups = study.scene.groups_of(study.n_pulses)
+        if n_groups is None:
+            return Requirement(extension, "not needed", "the scene is at rest")
+        captures = (study.capture(seed, n_groups) for seed in seeds)
+    return extensions.judged_on_scene(extension, captures, truth_m, study.method)
+
+
 def requirements_table(rows: Sequence[Requirement], title: str) -> Table:
-    """Return one row per part and correction, without columns that are unknown in all rows."""
+    """Return one row each, without columns that are unknown in all rows."""
     columns: dict[str, Callable[[Requirement], str | float | Interval]] = {
-        "part or correction": lambda row: TITLES[row.part],
+        "part, correction or extension": lambda row: TITLES[row.part],
         "verdict": lambda row: row.verdict,
         "p": lambda row: row.p_value,
         "effect": lambda row: row.effect,
@@ -213,11 +239,16 @@ RULE_OF_CAPTURES = (
 )
 
 NOTE = (
+    "Corrections undo what a simpler estimator ignores; extensions go beyond one pixel by itself, "
+    "with one surface at rest; parts belong to the scene. "
     "Total variation: how far the part, or what the correction corrects, changes the trigger "
     "probabilities of a pulse, mean over the pixels and in the worst. Detectable from: total "
     "variation that the pulses of one pixel reveal with errors of 5 %. Effect: estimated from all "
     "pixels of a capture, in the unit that the reason states. Seen from: effect that would have "
     f"been seen with a probability of {POWER:.0%}. RD within 3 bins, RMSE and time compare with "
-    "and without it, with 95 % intervals; time is that of ranging for a correction, of simulating "
-    "for a part."
+    "and without it, with 95 % intervals; time is that of simulating for a part, otherwise of "
+    f"ranging, for an extension with its flux model. Extensions are judged by {EXTENDED_CAPTURES} "
+    "captures of a scene. For the search for a second return, RD is the share of all surfaces that "
+    "are found, where a return more than there are surfaces counts as one that is not, and the "
+    "RMSE is that of the return nearest to each surface."
 )

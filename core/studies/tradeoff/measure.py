@@ -26,12 +26,13 @@ from core.acquisition import Floats
 from core.capture import Capture
 from core.checks import require
 from core.deprecation import renamed
-from core.estimators import ESTIMATORS, Estimator
+from core.estimators import ESTIMATORS, Estimator, estimate
 from core.inference.flux import flux_model_of
 from core.inference.flux_model import FluxModel
 from core.metrics import Interval
 from core.parameters import Number, spec_of
 from core.reductions import Reduction
+from core.studies.middle import middle
 from core.studies.statistics import MIN_REPEATS, median_interval
 from core.studies.timing import interleaved, kernel_threads
 from core.studies.tradeoff.surrogate import Simulation, surrogate_of
@@ -50,9 +51,6 @@ Source = Simulation | Capture
 
 TILES = 16
 """Parts of a measured capture, in reading order, which take the place of seeds."""
-
-MAX_COUNTS = 2**21
-"""Larger captures are studied by their middle."""
 
 
 def _all_signals(
@@ -87,6 +85,9 @@ class Candidate:
         Threads of kernels; numba's setting where None.
     knows_truth : bool
         Whether its gate is cut to the true ranges of the targets.
+    returns : int
+        Surfaces of a pixel to look for, as for `core.estimate`; more than 1 only by the method's
+        own kernel.
 
     Raises
     ------
@@ -99,6 +100,7 @@ class Candidate:
     kernel: str = ""
     threads: int | None = None
     knows_truth: bool = False
+    returns: int = 1
 
     is_told_the_light = renamed("knows_flux")
 
@@ -129,22 +131,36 @@ class Candidate:
     def range_m(
         self, reduced: Capture, shape: tuple[int, int], flux: FluxModel | None = None
     ) -> Floats:
-        """Return ranges at full resolution `shape` from the reduced capture.
+        """Return ranges (return, row, col) at full resolution `shape` from the reduced capture.
 
-        A given flux model is not estimated again, except by methods with one of their own.
+        A given flux model is not estimated again, except by methods with one of their own, and for
+        several returns.
         """
+        if self.returns > 1:
+            with kernel_threads(self.threads):
+                image = estimate(
+                    reduced, self.method.estimator, self.settings, returns=self.returns
+                )
+            found = image.returns
+            assert found is not None
+            numbers = range(1, self.returns + 1)
+            images = (found.image("range_m", number, reduced.shape) for number in numbers)
+            return np.stack([self.reduction.spread(each, shape) for each in images])
         estimator = self.estimator
         if flux is not None and estimator.flux_model is flux_model_of:
             estimator = replace(estimator, flux_model=lambda _: flux)
         with kernel_threads(self.threads):
             bins, _ = estimator.delays(reduced, self.settings)
-        return self.reduction.spread(reduced.acquisition.bin_to_range_m(bins), shape)
+        range_m = self.reduction.spread(reduced.acquisition.bin_to_range_m(bins), shape)
+        return range_m[np.newaxis]
 
     def __str__(self) -> str:
         plural = "" if self.threads == 1 else "s"
         threads = "" if self.threads is None else f"{self.threads} thread{plural}"
+        returns = "" if self.returns == 1 else f"{self.returns} returns"
         reduction = "" if self.reduction == Reduction() else str(self.reduction)
-        return ", ".join(filter(None, (self.method.name, reduction, self.kernel, threads)))
+        parts = (self.method.name, returns, reduction, self.kernel, threads)
+        return ", ".join(filter(None, parts))
 
 
 _MERGE_POWERS = {"bins": -1, "1/bin": 1}
@@ -191,7 +207,7 @@ class Point:
     candidate : Candidate
     scores : tuple of Score
         One per seed, or per part (`TILES`) of a measured capture; the same for all points of a
-        condition, so that differences are paired.
+        condition, so that differences are paired. Where pixels see two surfaces, both are targets.
     seconds : tuple of float
         Times to reduce a capture and range it with known flux model, one per round; rounds are
         shared by all points of a condition.
@@ -263,6 +279,7 @@ class Point:
             "parameters": asdict(self.candidate.settings),
             **asdict(self.candidate.reduction),
             "kernel": self.candidate.kernel,
+            "returns": self.candidate.returns,
             "threads": self.candidate.threads,
         }
 
@@ -275,13 +292,19 @@ MERGES = (1, 2, 4)
 VARIED = ("tracking", "cfar", "coates", "likelihood")
 """Methods that make up Pareto fronts, of which more variations are measured."""
 
+RETURNING = ("likelihood", "image_posterior")
+"""Methods of which two returns of a pixel are measured, by itself and with its neighbours."""
+
 
 def candidates(methods: Sequence[Method] = (), merges: Sequence[int] = MERGES) -> list[Candidate]:
-    """Return methods (by default all registered ones) with each number of bins merged."""
+    """Return methods (by default all registered ones) with each number of bins merged.
+
+    Those of `RETURNING` also with two returns.
+    """
+    chosen = methods or default_methods(with_motion=True)
     return [
-        Candidate(method, Reduction(merge=merge))
-        for method in methods or default_methods()
-        for merge in merges
+        *(Candidate(method, Reduction(merge=merge)) for method in chosen for merge in merges),
+        *(Candidate(method, returns=2) for method in chosen if method.name in RETURNING),
     ]
 
 
@@ -325,8 +348,10 @@ def study(
     plan : sequence
         Sources and the candidates that range them. A `Simulation` is simulated with each seed. A
         `Capture` with a truth is scored by parts (`TILES`); one without is replaced by a simulation
-        like it (`surrogate_of`); of one above `MAX_COUNTS` the middle is taken. The points' notes
-        say so. Candidates that need an unknown flux, or a larger capture, are left out.
+        like it (`surrogate_of`); of a large one the middle is taken (`core.studies.middle`). The
+        points' notes say so. Candidates that need an unknown flux, pulses in order, or a larger
+        capture, are left out, and those that look for two surfaces where no pixel is known to have
+        them: their second returns are all false.
     seeds : sequence of int
         At least 2.
     repeats : int
@@ -353,7 +378,7 @@ def study(
     """
     require("seeds", len(seeds), len(seeds) >= 2, "at least 2")
     require("repeats", repeats, repeats >= MIN_REPEATS, f"at least {MIN_REPEATS}")
-    known = [_applicable(source, configurations) for source, configurations in plan]
+    known = [applicable(source, configurations) for source, configurations in plan]
     pieces = [
         Piece(place, source, tuple(configurations), seed)
         for place, (source, configurations) in enumerate(known)
@@ -400,43 +425,35 @@ def studied(capture: Capture) -> Source:
     ValueError
         If it has no truth and no pixel is clear enough for a surrogate.
     """
-    middle = _middle(capture)
-    return surrogate_of(middle, middle.source) if middle.truth_range_m is None else middle
+    part = middle(capture)
+    return surrogate_of(part, part.source) if part.truth_range_m is None else part
 
 
-def _applicable(
+def applicable(
     source: Source, configurations: Sequence[Candidate]
 ) -> tuple[Source, list[Candidate]]:
-    """Return what is studied instead of a source, and the candidates that can range it."""
+    """Return what is studied instead of a source, and the candidates that can range it.
+
+    Raises
+    ------
+    ValueError
+        If there is no target; as `studied`.
+    """
     source = studied(source) if isinstance(source, Capture) else source
     capture = _capture(source, 0)
     targets = int(np.isfinite(np.asarray(capture.truth_range_m)).sum())
     require("targets", targets, targets > 0, "a scene in which some pixel sees a surface")
     has_flux = capture.signal is not None and capture.background is not None
     shape = (*capture.shape, capture.acquisition.n_bins)
+    most = len(source.scene.surfaces_m) if isinstance(source, Simulation) else 1
     return source, [
         each
         for each in configurations
-        if each.reduction.fits(shape) and (has_flux or not each.knows_flux)
+        if each.reduction.fits(shape)
+        and (has_flux or not each.knows_flux)
+        and each.returns <= most
+        and (capture.groups is not None or not each.estimator.follows_motion)
     ]
-
-
-def _middle(capture: Capture) -> Capture:
-    if capture.cube.size <= MAX_COUNTS:
-        return capture
-    share = math.sqrt(MAX_COUNTS / capture.cube.size)
-    sides = [max(1, int(size * share)) for size in capture.shape]
-    rows, cols = (
-        slice((size - side) // 2, (size - side) // 2 + side)
-        for size, side in zip(capture.shape, sides, strict=True)
-    )
-    return replace(
-        capture,
-        cube=np.ascontiguousarray(capture.cube[rows, cols]),
-        **capture.images(lambda image: image[rows, cols]),
-        groups=capture.groups and capture.groups.mapped(lambda cube: cube[rows, cols]),
-        source=f"{capture.source}; the middle {sides[0]} x {sides[1]} pixels",
-    )
 
 
 def _capture(source: Source, seed: int) -> Capture:
@@ -454,10 +471,14 @@ class Piece(NamedTuple):
 
 def scored(piece: Piece) -> list[list[Score]]:
     """Score each candidate on one capture: once, or once per part of a measured one."""
-    capture = _capture(piece.source, piece.seed)
-    truth_m, bin_m = np.asarray(capture.truth_range_m), capture.acquisition.bin_length_m
-    parts = 1 if isinstance(piece.source, Simulation) else TILES
-    targets = np.array_split(np.flatnonzero(np.isfinite(truth_m)), parts)
+    capture, source = _capture(piece.source, piece.seed), piece.source
+    bin_m = capture.acquisition.bin_length_m
+    if isinstance(source, Simulation):
+        truth_m, parts = source.scene.surfaces_m, 1
+    else:
+        truth_m, parts = np.asarray(capture.truth_range_m)[np.newaxis], TILES
+    surfaces_m = truth_m.reshape(len(truth_m), -1)
+    targets = np.array_split(np.flatnonzero(np.isfinite(surfaces_m).any(axis=0)), parts)
     reduced = {each.reduction: each.reduction.of(capture) for each in piece.candidates}
     scores = []
     for candidate in piece.candidates:
@@ -465,9 +486,10 @@ def scored(piece: Piece) -> list[list[Score]]:
         started = perf_counter()
         range_m = candidate.range_m(reduced[candidate.reduction], capture.shape)
         seconds = perf_counter() - started
+        found_m = range_m.reshape(len(range_m), -1)
         scores.append(
             [
-                compare(range_m.flat[part], truth_m.flat[part], bin_m, seconds)
+                compare(found_m[:, part], surfaces_m[:, part], bin_m, seconds)
                 for part in targets
                 if part.size
             ]

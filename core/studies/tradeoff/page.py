@@ -209,9 +209,11 @@ def fronts_table(points: Sequence[Point], tolerance_bins: int = 3) -> Table:
         _CONFIGURATION | _RESULTS,
         "Milliseconds are those of reducing the capture and ranging it with its flux model known; "
         "estimating that model, once per capture, is a separate column, or included and shown as "
-        "0. Memory is the peak of numpy's allocations beyond the capture. Errors are those of the "
-        "whole image at the capture's own bin width: pixels that are left out take the estimate "
-        "of their neighbour.",
+        "0; searching for several returns includes it. Where pixels see two surfaces, RD is the "
+        "share of surfaces that are found; a return more than there are surfaces counts as one "
+        "that is not. Memory is the peak of numpy's allocations beyond the capture. Errors are "
+        "those of the whole image at the capture's own bin width: pixels that are left out take "
+        "the estimate of their neighbour.",
         _FORMATS,
     )
 
@@ -239,7 +241,7 @@ def differences(points: Sequence[Point]) -> Table:
         return lambda pair: mean_interval(
             np.array(
                 [
-                    (one.restored[n - 1] - other.restored[n - 1]) / one.targets
+                    one.restored[n - 1] / one.targets - other.restored[n - 1] / other.targets
                     for one, other in zip(pair[0].scores, pair[1].scores, strict=True)
                 ]
             )

@@ -63,7 +63,9 @@ class Simulation:
     def capture(self, seed: int) -> Capture:
         """Simulate one capture, with its truth."""
         if self.holds_first_photons:
-            return simulate(self.scene, self.acquisition, self.flux, self.pulse, seed)
+            given = self.scene, self.acquisition, self.flux, self.pulse, seed
+            n_groups = self.scene.groups_of(self.acquisition.n_pulses)
+            return simulate(*given, n_groups=n_groups)
         truth_m = np.asarray(self.scene.range_m, float)
         reflectivity = 1.0 if self.scene.reflectivity is None else self.scene.reflectivity
         rate = rate_per_bin(
