@@ -49,6 +49,7 @@ class MethodChoice:
         self._settings = pn.Column(sizing_mode="stretch_width", margin=0)
         self.chooser = SettingsChooser(session)
         self.returns = choice(text.RETURNS_HELP, session.state.param.returns)
+        self.returns.param.update(label="Returns", sizing_mode="stretch_width")
         self.part = part(
             "Method", self.menu, self.note, self._settings, self.returns, self.chooser.part
         )
