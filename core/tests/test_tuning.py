@@ -96,7 +96,7 @@ def test_the_defaults_are_kept_if_none_restores_more(monkeypatch: pytest.MonkeyP
 
 
 def test_a_large_capture_is_judged_by_patches() -> None:
-    small = Condition("piecewise", 0.02).capture(0)
+    small = Condition("piecewise", 0.03).capture(0)
     large = replace(
         small,
         cube=np.tile(small.cube, (3, 3, 1)),
