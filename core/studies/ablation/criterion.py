@@ -44,7 +44,7 @@ EXTENSIONS = {
     "second_return": "search for a second return",
     "velocity": "search for a velocity",
 }
-"""What an estimator may do beyond ranging a pixel by itself, with one surface at rest, by key."""
+"""Extensions of an estimator that ranges each pixel by itself, with one surface at rest."""
 
 TITLES = CORRECTIONS | EXTENSIONS | PARTS
 
