@@ -201,9 +201,9 @@ def net_before_wall(
 def test_estimate_and_candidates_of_a_region_agree(n_pulses: int | None, sigma_bins: float) -> None:
     capture = net_before_wall(n_pulses, sigma_bins)[0]
     rng, width_bins, n_sure = np.random.default_rng(0), same_echo_bins(capture), []
-    for method in ("tracking", "peak"):
+    for method in ("tracking", "matched_filter", "peak"):
         image = estimate(capture, method)
-        for share in (0.0, 0.1):
+        for share in (0.0, 0.05, 0.5):
             mask = rng.random(capture.shape) < share
             mask[rng.integers(4), rng.integers(8)] = True
             region = inspection.region_report(capture, image, mask, method)
@@ -631,7 +631,7 @@ def _counts(shape: tuple[int, int, int], kind: str, n_pulses: int | None) -> np.
 @pytest.mark.uncounted
 @pytest.mark.parametrize("kind", ["empty", "full", "one"])
 @pytest.mark.parametrize("n_pulses", [1, 1000, None])
-@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 4, 30)])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 5, 1), (3, 4, 30)])
 def test_extreme_captures_have_reports(
     shape: tuple[int, int, int], n_pulses: int | None, kind: str
 ) -> None:
